@@ -1,0 +1,63 @@
+"""Rendered-video datasets of 2D rigid bodies, with every ground truth.
+
+    import gen2d
+    gen2d.generate("bouncing.yaml", n=1000, out="datasets/bouncing")  # or: python -m gen2d --config bouncing.yaml --n 1000
+    ds = gen2d.open("datasets/bouncing")
+    for batch in gen2d.DataLoader(ds, batch_size=32): ...
+
+Names are imported on first use: a training process that only reads data never imports jax.
+"""
+
+import importlib
+import importlib.machinery
+import pathlib
+import sys
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from gen2d.config import load_config
+    from gen2d.generate import generate
+    from gen2d.loader import DataLoader, open
+    from gen2d.verify import verify
+
+__version__ = "0.1.0"
+__all__ = ["DataLoader", "generate", "load_config", "open", "verify"]
+
+_HOME = {
+    "DataLoader": "gen2d.loader",
+    "generate": "gen2d.generate",
+    "load_config": "gen2d.config",
+    "open": "gen2d.loader",
+    "verify": "gen2d.verify",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME:
+        raise AttributeError(f"module 'gen2d' has no attribute {name!r}")
+    return getattr(importlib.import_module(_HOME[name]), name)
+
+
+def __dir__() -> list[str]:
+    return sorted([*globals(), *_HOME])
+
+
+class _BesideThePackage:
+    """Finds `gen2d.renderers` and `gen2d.configs`, and nothing else, beside the package: where a checkout keeps them.
+
+    In a wheel they lie inside the package. The checkout's root itself must not be on `__path__`: that would make
+    `gen2d.datasets` and a second `gen2d.gen2d` importable.
+    """
+
+    root = pathlib.Path(__file__).parent.parent
+    names = ("gen2d.renderers", "gen2d.configs")
+
+    @classmethod
+    def find_spec(cls, name: str, path: Any = None, target: Any = None) -> importlib.machinery.ModuleSpec | None:
+        if name not in cls.names:
+            return None
+        return importlib.machinery.PathFinder.find_spec(name, [str(cls.root)])
+
+
+if not (pathlib.Path(__file__).parent / "renderers").is_dir():
+    sys.meta_path.insert(0, _BesideThePackage)  # type: ignore[arg-type]  # a class with a find_spec is a finder

@@ -1,0 +1,79 @@
+"""How images are compressed: gzip (read by every HDF5 program), zstd (smaller) or none. All of it releases the GIL.
+
+gzip is ordinary deflate in a zlib envelope, which HDF5's own filter reads; isal writes it several times faster than
+zlib does. zstd carries its size and a checksum in each frame, because HDF5's zstd filter checks nothing by itself.
+"""
+
+import threading
+
+import numpy as np
+import zstandard
+from isal import isal_zlib
+
+from gen2d.errors import DamagedError
+
+CODECS = ("gzip", "zstd", "none")
+
+# The filter that HDF5 names in the file, and its options (the level, for information only).
+HDF5_FILTERS: dict[str, tuple[int, tuple[int, ...]]] = {"gzip": (1, (1,)), "zstd": (32015, (3,))}
+
+crc32 = isal_zlib.crc32
+
+# isal's stub calls its exception class an instance.
+_ERRORS: tuple[type[Exception], ...] = (isal_zlib.error, zstandard.ZstdError, MemoryError)  # pyright: ignore
+
+# A zstd context is costly to make and serves one thread at a time.
+_contexts = threading.local()
+
+
+def encode(codec: str, array: np.ndarray) -> bytes:
+    """The array's bytes in C order, compressed."""
+    data = np.ascontiguousarray(array).data
+    if codec == "gzip":
+        return isal_zlib.compress(data, 1)
+    if codec == "zstd":
+        return _compressor().compress(data)
+    return data.tobytes()
+
+
+def decode_into(codec: str, data: bytes | memoryview, out: np.ndarray) -> None:
+    """Fills the contiguous array `out` with what `encode` was given.
+
+    Raises DamagedError unless `data` is whole, ends where it should and fills `out` exactly.
+    """
+    try:
+        plain = _decode(codec, data, out.nbytes)
+    except _ERRORS as error:
+        raise DamagedError(f"compressed data is damaged ({error})") from error
+    if len(plain) != out.nbytes:
+        raise DamagedError(f"compressed data holds {len(plain)} bytes, but must hold {out.nbytes}")
+    if out.nbytes:
+        out.reshape(-1)[...] = np.frombuffer(plain, out.dtype)
+
+
+def _decode(codec: str, data: bytes | memoryview, size: int) -> bytes | memoryview:
+    if codec == "gzip":
+        stream = isal_zlib.decompressobj()
+        # One byte more than expected: a longer stream is noticed, and the buffer need not grow to see the end.
+        plain = stream.decompress(data, size + 1)
+        if not stream.eof or stream.unused_data:
+            raise DamagedError("compressed data does not end where it should")
+        return plain
+    if codec == "zstd":
+        # Asked before decompressing, so that a damaged size cannot ask for all the memory there is.
+        if zstandard.frame_content_size(data) != size:
+            raise DamagedError(f"compressed data does not hold the {size} bytes that it must hold")
+        return _decompressor().decompress(data, allow_extra_data=False)
+    return memoryview(data).cast("B")
+
+
+def _compressor() -> zstandard.ZstdCompressor:
+    if not hasattr(_contexts, "compressor"):
+        _contexts.compressor = zstandard.ZstdCompressor(level=3, write_checksum=True, write_content_size=True)
+    return _contexts.compressor
+
+
+def _decompressor() -> zstandard.ZstdDecompressor:
+    if not hasattr(_contexts, "decompressor"):
+        _contexts.decompressor = zstandard.ZstdDecompressor()
+    return _contexts.decompressor

@@ -1,0 +1,347 @@
+"""What a dataset is made from: every option with its unit, default and range, read from YAML and checked once, here.
+
+An error is one sentence with the file, the field, its value and what is allowed.
+"""
+
+import dataclasses
+import hashlib
+import json
+import math
+import pathlib
+import re
+from collections.abc import Mapping, Sequence
+from types import ModuleType
+from typing import Any
+
+import yaml
+
+from gen2d import plugins
+from gen2d.codecs import CODECS
+from gen2d.errors import ConfigError
+from gen2d.factors import Distribution, parse
+
+MAX_SEED = 2**63 - 1
+MAX_SLOTS = 254  # a slot's mask id is one byte, 0 is the background
+
+
+@dataclasses.dataclass(frozen=True)
+class Option:
+    """What an option may be. `parts` > 0: a list of so many values. `draw`: a distribution, else a single value."""
+
+    kind: type  # int, float or str
+    unit: str
+    meaning: str
+    low: float | None = None
+    high: float | None = None
+    above: float | None = None
+    choices: tuple[str, ...] = ()
+    draw: bool = False
+    parts: int = 0
+    optional: bool = False  # may be null: decided by the program
+
+    @property
+    def allowed(self) -> str:
+        """What the option may be, for a sentence."""
+        if self.choices:
+            return "one of " + ", ".join(self.choices)
+        noun = {int: "whole number", float: "number", str: "text"}[self.kind]
+        ends = [
+            f"above {self.above:g}" if self.above is not None else "",
+            f"{self.low:g} or more" if self.low is not None else "",
+        ]
+        ends.append(f"{self.high:g} or less" if self.high is not None else "")
+        limits = " and ".join(end for end in ends if end)
+        text = f"a {noun}" if not self.parts else f"a list of {self.parts} {noun}s"
+        return text + (f", {limits}" if limits else "") + (" (or null)" if self.optional else "")
+
+
+def option(default: Any, kind: type, unit: str, meaning: str, **limits: Any) -> Any:
+    """A dataclass field that is an option; a drawn one's default is written as in a config."""
+    spec = Option(kind, unit, meaning, **limits)
+    if spec.draw:
+        default = [parse(v, kind is int) for v in default] if spec.parts else parse(default, kind is int)
+    if isinstance(default, list):
+        default = tuple(default)
+    return dataclasses.field(default=default, metadata={"option": spec})
+
+
+@dataclasses.dataclass(frozen=True)
+class VideoOptions:
+    """How long, how fast and how large."""
+
+    frames: int = option(64, int, "frames", "in a video, the initial state included", low=1, high=100_000)
+    fps: float = option(30.0, float, "1/s", "frames per second of the world's time", above=0, high=100_000)
+    height: int = option(64, int, "px", "of a frame", low=4, high=8192)
+    width: int = option(64, int, "px", "of a frame", low=4, high=8192)
+
+
+@dataclasses.dataclass(frozen=True)
+class PhysicsOptions:
+    """How the world is stepped, and how two materials make one contact."""
+
+    substeps: int | None = option(
+        None, int, "steps/frame", "null: as many as max_step asks for", low=1, high=10_000, optional=True
+    )
+    max_step: float = option(1 / 240, float, "s", "longest step where substeps is null", above=0, high=1)
+    mixing: str = option(
+        "product", str, "", "of two elasticities or frictions", choices=("product", "mean", "max", "geometric")
+    )
+    damping: float = option(0.0, float, "1/s", "rate at which velocity and spin die away", low=0, high=1000)
+    bounce_threshold: float = option(0.01, float, "m/s", "slower impacts do not bounce", low=0)
+    contact_hertz: float = option(
+        30.0, float, "Hz", "stiffness of an overlapping contact; at most 1/8 of the step rate", above=0
+    )
+    contact_damping_ratio: float = option(10.0, float, "1", "of an overlapping contact", above=0)
+    push_speed: float = option(3.0, float, "m/s", "an overlap is undone no faster", above=0)
+
+
+@dataclasses.dataclass(frozen=True)
+class CameraOptions:
+    """What part of the world a frame shows; null: all of the scene."""
+
+    center: tuple[float, ...] | None = option(
+        None, float, "m", "world point in the middle of the frame", parts=2, optional=True
+    )
+    scale: float | None = option(None, float, "px/m", "pixels per metre", above=0, optional=True)
+    margin: float = option(0.0, float, "m", "shown around the scene where scale is null", low=0)
+
+
+@dataclasses.dataclass(frozen=True)
+class StorageOptions:
+    """How videos lie on disk."""
+
+    format: str = option("hdf5", str, "", "file format of a shard", choices=("hdf5",))
+    codec: str = option(
+        "gzip", str, "", "of the frames: gzip opens everywhere, zstd is smaller, none can be mapped", choices=CODECS
+    )
+    videos_per_shard: int | None = option(
+        None,
+        int,
+        "videos",
+        "null: the largest power of two with raw frames of 1 GiB at most, up to 1024",
+        low=1,
+        high=65536,
+        optional=True,
+    )
+    lanes: int | None = option(
+        None,
+        int,
+        "videos",
+        "simulated at once by a device; null: up to 128. Changes the last bits of a simulation",
+        low=1,
+        high=65536,
+        optional=True,
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class Plugin:
+    """A named plug-in and its options."""
+
+    name: str
+    module: ModuleType
+    options: Any
+
+
+@dataclasses.dataclass(frozen=True)
+class Config:
+    """Everything that decides what a dataset holds, but for its number of videos."""
+
+    name: str
+    seed: int
+    video: VideoOptions
+    scene: Plugin
+    physics: PhysicsOptions
+    camera: CameraOptions
+    look: Plugin
+    storage: StorageOptions
+
+    def plain(self) -> dict[str, Any]:
+        """The config as YAML and JSON hold it, every default filled in."""
+        sections = {s: _plain(getattr(self, s)) for s in SECTIONS}
+        plugs = {p: {"name": getattr(self, p).name, **_plain(getattr(self, p).options)} for p in PLUGINS}
+        return {"name": self.name, "seed": self.seed, **sections, **plugs}
+
+    def text(self) -> str:
+        """The resolved config as YAML; read again it gives the same config."""
+        return yaml.safe_dump(self.plain(), sort_keys=False)
+
+    def sha256(self) -> str:
+        """A hash of the resolved config, its seed left out: the seed is compared by itself."""
+        values = {key: value for key, value in self.plain().items() if key != "seed"}
+        return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()
+
+
+SECTIONS = {"video": VideoOptions, "physics": PhysicsOptions, "camera": CameraOptions, "storage": StorageOptions}
+PLUGINS = {"scene": "bouncing", "look": "flat"}
+
+
+def _plain(options: Any) -> dict[str, Any]:
+    def value(v: Any) -> Any:
+        if isinstance(v, tuple):
+            return [value(x) for x in v]
+        return v.plain() if isinstance(v, Distribution) else v
+
+    return {f.name: value(getattr(options, f.name)) for f in dataclasses.fields(options)}
+
+
+# Reading ------------------------------------------------------------------------------------------------------------
+
+
+class _Loader(yaml.SafeLoader):
+    """YAML with 1e-3 as a number (YAML 1.1 takes it for text) and without silently doubled keys."""
+
+
+_Loader.add_implicit_resolver(
+    "tag:yaml.org,2002:float", re.compile(r"^[-+]?(\d[\d_]*)(\.[\d_]*)?[eE][-+]?\d+$"), list("-+0123456789")
+)
+
+
+def _mapping(loader: _Loader, node: yaml.MappingNode) -> dict:
+    seen = set()
+    for key, _ in node.value:
+        if key.value in seen:
+            raise yaml.constructor.ConstructorError(None, None, f"{key.value} stands there twice", key.start_mark)
+        seen.add(key.value)
+    return loader.construct_mapping(node, deep=True)
+
+
+_Loader.add_constructor("tag:yaml.org,2002:map", _mapping)
+
+
+def parse_yaml(text: str, source: str) -> Any:
+    """The value that a YAML text stands for."""
+    try:
+        return yaml.load(text, _Loader)  # noqa: S506 (a SafeLoader)
+    except yaml.YAMLError as error:
+        mark = getattr(error, "problem_mark", None)
+        where = f" in line {mark.line + 1}" if mark else ""
+        raise ConfigError(f"{source}: not valid YAML{where}: {getattr(error, 'problem', None) or error}") from None
+
+
+def _check(spec: Option, low: float, high: float) -> bool:
+    return (
+        (spec.low is None or low >= spec.low)
+        and (spec.above is None or low > spec.above)
+        and (spec.high is None or high <= spec.high)
+    )
+
+
+def _single(spec: Option, value: Any) -> Any:
+    """A checked value, or ValueError with what is allowed."""
+    if spec.draw:
+        distribution = parse(value, spec.kind is int)
+        if not _check(spec, *distribution.support):
+            raise ValueError(spec.allowed + (" for every value drawn" if distribution.kind != "constant" else ""))
+        return distribution
+    if spec.kind is str:
+        if not isinstance(value, str) or (spec.choices and value not in spec.choices):
+            raise ValueError(spec.allowed)
+        return value
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise ValueError(spec.allowed)
+    if (spec.kind is int and not float(value).is_integer()) or not _check(spec, value, value):
+        raise ValueError(spec.allowed)
+    return spec.kind(value)
+
+
+def _value(spec: Option, value: Any) -> Any:
+    if value is None and spec.optional:
+        return None
+    if not spec.parts:
+        return _single(spec, value)
+    if not isinstance(value, list) or len(value) != spec.parts:
+        raise ValueError(spec.allowed)
+    return tuple(_single(spec, part) for part in value)
+
+
+def build(cls: type, values: Any, where: str, source: str) -> Any:
+    """An options dataclass from a mapping; `where` is the path of the mapping in the config."""
+    if not isinstance(values, Mapping):
+        raise ConfigError(f"{source}: {where} is {values!r}, but must be a mapping of options")
+    known = {f.name: f.metadata["option"] for f in dataclasses.fields(cls)}
+    filled = {}
+    for key, value in values.items():
+        if key not in known:
+            raise ConfigError(f"{source}: {where}.{key} is not an option; {plugins.nearest(key, list(known))}")
+        try:
+            filled[key] = _value(known[key], value)
+        except ValueError as error:
+            raise ConfigError(f"{source}: {where}.{key} is {value!r}, but must be {error}") from None
+    return cls(**filled)
+
+
+def _plugin(kind: str, values: Any, default: str, source: str) -> Plugin:
+    """A plug-in with its options; its bare name is enough."""
+    values = {"name": values} if isinstance(values, str) else {} if values is None else values
+    if not isinstance(values, Mapping):
+        raise ConfigError(f"{source}: {kind} is {values!r}, but must be a name, or a mapping with a name and options")
+    name = values.get("name", default)
+    if not isinstance(name, str):
+        raise ConfigError(f"{source}: {kind}.name is {name!r}, but must be one of {', '.join(plugins.names(kind))}")
+    module = plugins.load(kind, name, source)
+    options = build(module.Options, {k: v for k, v in values.items() if k != "name"}, kind, source)
+    if hasattr(module, "check"):
+        try:
+            module.check(options)
+        except ValueError as error:
+            raise ConfigError(f"{source}: {kind}.{error}") from None
+    return Plugin(name, module, options)
+
+
+def _overridden(values: dict, sets: Sequence[str]) -> dict:
+    """The mapping with each `a.b=value` put in its place."""
+    for text in sets:
+        path, equals, value = text.partition("=")
+        keys = path.strip().split(".")
+        if not equals or not all(keys):
+            raise ConfigError(f"--set is {text!r}, but must be section.option=value, such as physics.substeps=8")
+        place = values
+        for key in keys[:-1]:
+            inner = place.get(key)
+            place[key] = {"name": inner} if isinstance(inner, str) else dict(inner or {})
+            place = place[key]
+        place[keys[-1]] = parse_yaml(value, f"--set {path}")
+    return values
+
+
+def checked_seed(value: Any, what: str = "--seed") -> int:
+    """The seed, if it is one; `what` names it in the error."""
+    if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value <= MAX_SEED:
+        raise ConfigError(f"{what} is {value!r}, but must be a whole number from 0 to 2**63 - 1")
+    return value
+
+
+def from_mapping(values: Any, source: str, name: str = "dataset") -> Config:
+    """The config that a mapping stands for; every error names `source`."""
+    if not isinstance(values, Mapping):
+        raise ConfigError(f"{source}: holds {type(values).__name__}, but must hold a mapping of sections")
+    known = ["name", "seed", *SECTIONS, *PLUGINS]
+    for key in values:
+        if key not in known:
+            raise ConfigError(f"{source}: {key} is not a section; {plugins.nearest(key, known)}")
+    name = values.get("name", name)
+    if not isinstance(name, str) or not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}", name):
+        raise ConfigError(f"{source}: name is {name!r}, but must be letters, digits, '.', '_' and '-', 100 at most")
+    seed = checked_seed(values.get("seed", 0), f"{source}: seed")
+    sections = {s: build(cls, values.get(s) or {}, s, source) for s, cls in SECTIONS.items()}
+    plugs = {p: _plugin(p, values.get(p), default, source) for p, default in PLUGINS.items()}
+    return Config(name=name, seed=seed, **sections, **plugs)
+
+
+def load_config(config: "Config | Mapping | str | pathlib.Path", sets: Sequence[str] = ()) -> Config:
+    """A Config from a file's name or path, from a mapping, or from a Config; `sets` overrides: 'physics.substeps=8'."""
+    if isinstance(config, Config):
+        return from_mapping(_overridden(config.plain(), sets), "config") if sets else config
+    if isinstance(config, Mapping):
+        return from_mapping(_overridden(dict(config), sets), "config")
+    path = plugins.find_config(str(config))
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: cannot be read as text ({error})") from None
+    values = parse_yaml(text, str(path))
+    if values is not None and not isinstance(values, Mapping):
+        raise ConfigError(f"{path}: holds {type(values).__name__}, but must hold a mapping of sections")
+    stem = re.sub(r"[^A-Za-z0-9._-]+", "-", path.stem).lstrip("._-")[:100] or "dataset"
+    return from_mapping(_overridden(dict(values or {}), sets), str(path), stem)

@@ -1,0 +1,107 @@
+"""How shards are stored: one file per format, each with `write` and `read`, and the Block that they all store.
+
+A Block is made in host threads, while the device computes what follows: images are compressed, every piece gets its
+checksum, and what the statistics need is summed.
+"""
+
+import dataclasses
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import numpy as np
+
+from gen2d import codecs
+from gen2d.fields import Field
+
+# What `Block.moments` are of, told in the manifest.
+MOMENTS_OF = "frames: every 8th frame, of it every 4th row and column; states: every frame, objects that are present"
+
+
+@dataclasses.dataclass(frozen=True)
+class Block:
+    """m consecutive videos, ready to store."""
+
+    arrays: Mapping[str, np.ndarray]  # fields stored as they are, [m, ...]
+    chunks: Mapping[str, list[bytes]]  # images, compressed, m of each
+    crc: Mapping[str, np.ndarray]  # uint32 [m] of every field: over the chunk, or over the bytes of the row
+    moments: Mapping[str, np.ndarray]  # float64 [m, 5, components]: count, sum, sum of squares, least, largest
+
+
+@dataclasses.dataclass(frozen=True)
+class Places:
+    """Where in the file each field's bytes lie."""
+
+    chunks: Mapping[str, np.ndarray]  # images: uint64 [count, 2], offset and size of each video's chunk
+    rows: Mapping[str, int]  # the others: offset of the first video, the rest follow without gaps
+
+
+def encode(columns: Mapping[str, np.ndarray], fields: Mapping[str, Field], codec: str) -> Block:
+    """A Block of m videos from columns `[m, ...]` as stored; spends its time in code that releases the GIL."""
+    columns = {name: _checked(name, columns[name], field) for name, field in fields.items() if field.per_video}
+    chunks = {
+        name: [codecs.encode(codec, video) for video in column]
+        for name, column in columns.items()
+        if fields[name].is_image
+    }
+    arrays = {name: column for name, column in columns.items() if name not in chunks}
+    crc = {name: _crc(video_chunks) for name, video_chunks in chunks.items()}
+    crc |= {name: _crc(_rows(column)) for name, column in arrays.items()}
+    present = columns.get("objects/present")
+    moments = {name: _moments(columns[name], fields[name], present) for name in columns if _is_measured(name)}
+    return Block(arrays, chunks, crc, moments)
+
+
+def head(block: Block, count: int) -> Block:
+    """The block's first `count` videos."""
+    return Block(*({name: values[:count] for name, values in part.items()} for part in vars(block).values()))
+
+
+def _checked(name: str, column: np.ndarray, field: Field) -> np.ndarray:
+    if column.dtype != np.dtype(field.dtype):
+        raise ValueError(f"{name} is {column.dtype}, but must be {field.dtype}")
+    return np.ascontiguousarray(column)
+
+
+def _rows(column: np.ndarray) -> np.ndarray:
+    """The bytes of each video, uint8 [m, size]."""
+    return column.view(np.uint8).reshape(len(column), -1)
+
+
+def _crc(pieces: Iterable[Any]) -> np.ndarray:
+    return np.array([codecs.crc32(piece) for piece in pieces], np.uint32)
+
+
+def _is_measured(name: str) -> bool:
+    return name == "frames" or name.startswith("states/")
+
+
+def _moments(column: np.ndarray, field: Field, present: np.ndarray | None) -> np.ndarray:
+    """Count, sum, sum of squares, least and largest of each channel or component, float64 [m, 5, components].
+
+    Sums of uint8 are exact. Each video is summed by itself, so that no grouping of videos changes a bit.
+    """
+    axes = field.axes.split()
+    if field.is_image:
+        column = column[:, ::8, ::4, ::4]  # all pixels would cost more than the rest of `encode` together
+    components = column.shape[-1] if axes[-1].isdigit() else 1
+    # Components before values, so that each is summed in one piece of memory.
+    values = column.reshape(len(column), -1, components).transpose(0, 2, 1).astype(np.float64, order="C")
+    count, low, high = np.full(values.shape[:2], values.shape[2], np.float64), values, values
+    if "K" in axes and present is not None:
+        there = _spread(present, axes, column.shape)
+        count = np.broadcast_to(there, values.shape).sum(-1, dtype=np.float64)
+        low, high = np.where(there, values, np.inf), np.where(there, values, -np.inf)
+        values = np.where(there, values, 0.0)
+    sums = count, values.sum(-1), (values * values).sum(-1)
+    return np.stack([*sums, low.min(-1, initial=np.inf), high.max(-1, initial=-np.inf)], axis=1)
+
+
+def _spread(present: np.ndarray, axes: list[str], shape: tuple[int, ...]) -> np.ndarray:
+    """Whether the object that each value belongs to is there, bool [m, 1, values]; `present` is [m, K]."""
+    steps = [size if axis in "nK" else 1 for axis, size in zip(axes, shape, strict=True) if not axis.isdigit()]
+    return np.broadcast_to(present.reshape(steps), shape[: len(steps)]).reshape(shape[0], 1, -1)
+
+
+def merged(moments: np.ndarray) -> np.ndarray:
+    """The moments of all together, [5, components], from [m, 5, components]."""
+    return np.concatenate([moments[:, :3].sum(0), moments[:, 3:4].min(0), moments[:, 4:].max(0)])

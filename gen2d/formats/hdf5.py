@@ -1,0 +1,132 @@
+"""HDF5 shards: images in one compressed chunk a video, everything else contiguous, readable by any HDF5 program.
+
+The bytes depend on what is stored and on nothing else: no times, hosts or users, and not on how the videos were grouped
+into blocks. h5py serves one thread at a time, so compression happens elsewhere and chunks pass through it untouched.
+"""
+
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
+
+import h5py
+import numpy as np
+
+from gen2d import codecs
+from gen2d.fields import Field
+from gen2d.formats import Block, Places
+
+_ZSTD = codecs.HDF5_FILTERS["zstd"][0]
+
+
+def write(
+    path: Path,
+    fields: Mapping[str, Field],
+    sizes: Mapping[str, int],
+    count: int,
+    blocks: Iterable[Block],
+    codec: str,
+    attributes: Mapping[str, str | int | float],
+    constants: Mapping[str, np.ndarray],
+) -> Places:
+    """Writes a file of `count` videos and returns where in it each field lies.
+
+    `blocks` hold the videos in order; chunks are written as they arrive, so that memory holds one block, never a shard
+    of images. `constants` are the values of the fields that are one for all videos. Raises OSError when the disk does.
+    """
+    images = sorted(name for name, field in fields.items() if field.is_image)
+    rows = sorted(name for name, field in fields.items() if field.per_video and not field.is_image)
+    with h5py.File(path, "w", libver=("v110", "v110")) as file:
+        file.attrs.update(attributes)
+        shapes = {name: (count, *fields[name].shape(sizes)) for name in images + rows}
+        chunked = {name: _chunked(file, name, fields[name].dtype, shapes[name], codec) for name in images}
+        table = {name: np.zeros(shapes[name], fields[name].dtype) for name in rows}
+        for first, block in _numbered(blocks, count, path):
+            _write_chunks(chunked, block, first)
+            for name in rows:
+                _fill(table[name], first, block.arrays[name], name)
+        for name, values in sorted((table | dict(constants)).items()):
+            file.create_dataset(name, data=np.asarray(values, fields[name].dtype))
+        for name, field in sorted(fields.items()):
+            file[name].attrs.update(axes=field.axes, unit=field.unit, meaning=field.meaning)
+        return Places(
+            chunks={name: _chunk_places(dataset, count) for name, dataset in chunked.items()},
+            # A dataset without a single byte has no place.
+            rows={name: file[name].id.get_offset() or 0 for name in rows},  # pyright: ignore[reportAttributeAccessIssue]
+        )
+
+
+def read(path: Path) -> dict[str, np.ndarray]:
+    """Every field of the file as one array, by h5py; zstd is decoded here, where h5py needs a plugin."""
+    found: dict[str, np.ndarray] = {}
+    with h5py.File(path, "r") as file:
+
+        def visit(name: str, item: h5py.Group | h5py.Dataset) -> None:
+            if isinstance(item, h5py.Dataset):
+                found[name] = _read_zstd(item) if _has_zstd(item) else item[()]
+
+        file.visititems(visit)
+    return found
+
+
+def _chunked(file: h5py.File, name: str, dtype: str, shape: tuple[int, ...], codec: str) -> h5py.Dataset:
+    """A new dataset with a chunk per video; made by hand, as h5py refuses a filter that it has no plugin for."""
+    settings = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+    settings.set_chunk((1, *shape[1:]))
+    settings.set_obj_track_times(False)
+    if codec in codecs.HDF5_FILTERS:
+        number, options = codecs.HDF5_FILTERS[codec]
+        settings.set_filter(number, h5py.h5z.FLAG_OPTIONAL, options)
+    space = h5py.h5s.create_simple(shape)
+    kind = h5py.h5t.py_create(np.dtype(dtype), logical=True)
+    links = h5py.h5p.create(h5py.h5p.LINK_CREATE)
+    links.set_create_intermediate_group(True)
+    return h5py.Dataset(h5py.h5d.create(file.id, name.encode(), kind, space, settings, links))
+
+
+def _numbered(blocks: Iterable[Block], count: int, path: Path) -> Iterator[tuple[int, Block]]:
+    """Each block with the row of its first video; insists on `count` videos in all."""
+    first = 0
+    for block in blocks:
+        size = len(next(iter(block.crc.values())))
+        if first + size > count:
+            raise ValueError(f"{path.name} takes {count} videos, but was given {first + size} or more")
+        yield first, block
+        first += size
+    if first != count:
+        raise ValueError(f"{path.name} takes {count} videos, but was given {first}")
+
+
+def _write_chunks(chunked: Mapping[str, h5py.Dataset], block: Block, first: int) -> None:
+    # Video by video, so that the file does not depend on the size of a block.
+    for row in range(len(next(iter(block.crc.values())))):
+        for name, dataset in chunked.items():
+            corner = (first + row,) + (0,) * (dataset.ndim - 1)
+            dataset.id.write_direct_chunk(corner, block.chunks[name][row])
+
+
+def _fill(table: np.ndarray, first: int, values: np.ndarray, name: str) -> None:
+    # Assignment alone would broadcast a wrong shape in silence.
+    if values.shape[1:] != table.shape[1:]:
+        raise ValueError(f"{name} has shape {values.shape[1:]} a video, but must have {table.shape[1:]}")
+    table[first : first + len(values)] = values
+
+
+def _chunk_places(dataset: h5py.Dataset, count: int) -> np.ndarray:
+    places = np.zeros((count, 2), np.uint64)
+
+    def note(chunk: h5py.h5d.StoreInfo) -> None:
+        places[chunk.chunk_offset[0]] = chunk.byte_offset, chunk.size
+
+    dataset.id.chunk_iter(note)
+    return places
+
+
+def _has_zstd(dataset: h5py.Dataset) -> bool:
+    return dataset.id.get_create_plist().get_filter_by_id(_ZSTD) is not None
+
+
+def _read_zstd(dataset: h5py.Dataset) -> np.ndarray:
+    out = np.empty(dataset.shape, dataset.dtype)
+    for row in range(len(out)):
+        _, data = dataset.id.read_direct_chunk((row,) + (0,) * (out.ndim - 1))
+        codecs.decode_into("zstd", data, out[row])
+    return out

@@ -1,0 +1,124 @@
+"""From a scene and its initial state to the state at every frame: frame 0 is the initial state, frame t is t / fps."""
+
+import dataclasses
+import math
+
+import jax
+import jax.numpy as jnp
+
+from gen2d.contacts import Segments
+from gen2d.solver import Discs, Impulse, Memory, Motion, Row, Rules, Setup, row, step
+from gen2d.tournament import halves, tournament
+from gen2d.types import Array, Layout, Objects, Quality, Scene, State, Trajectory
+
+
+def substeps(fps: float, asked: int | None, max_step: float) -> int:
+    """Steps per frame: as asked, else the smallest number that keeps a step at or under `max_step` seconds."""
+    return asked or max(1, math.ceil(1 / (fps * max_step) - 1e-9))
+
+
+def _inverse(value: Array, present: Array) -> Array:
+    usable = present & jnp.isfinite(value) & (value > 0)
+    return jnp.where(usable, 1 / jnp.where(usable, value, 1.0), 0.0)
+
+
+def _clean(values: Objects | State, present: Array) -> Objects | State:
+    """The record with nothing in its empty slots, so that whatever stood there (NaN, too) cannot matter."""
+    return jax.tree.map(lambda x: jnp.where(present, x, jnp.zeros_like(x)), values)
+
+
+def _discs(objects: Objects, count: int, padded: int) -> Discs:
+    def first(x: Array) -> Array:
+        return jnp.pad(x[:count], [(0, padded - count)] + [(0, 0)] * (x.ndim - 1))
+
+    inverse_mass, inverse_moment = (_inverse(x, objects.present) for x in (objects.mass, objects.moment))
+    return Discs(*map(first, (objects.radius, inverse_mass, inverse_moment, objects.elasticity, objects.friction)))
+
+
+def _pair_rows(discs: Discs, mixing: str) -> list[Row]:
+    def play(_: int, a: Discs, b: Discs) -> tuple[Discs, Discs, Row]:
+        return a, b, row(a, b, (a.inverse_mass > 0) & (b.inverse_mass > 0), mixing)
+
+    return tournament(discs, discs.radius.shape[0] - 1, play)[1]
+
+
+def _setup(scene: Scene, state: State, layout: Layout, mixing: str) -> Setup:
+    discs = _discs(scene.objects, layout.discs, layout.discs + layout.discs % 2)
+    segments, walls = [], []
+    for k in range(layout.discs, layout.slots):
+        angle = state.angle[k]
+        direction = jnp.stack([jnp.cos(angle), jnp.sin(angle)])
+        nothing = jnp.zeros_like(discs.radius)
+        e, mu = (jnp.broadcast_to(x[k], nothing.shape) for x in (scene.objects.elasticity, scene.objects.friction))
+        fixed = Discs(nothing, nothing, nothing, e, mu)
+        present = scene.objects.present[k] & (discs.inverse_mass > 0)
+        walls.append(row(fixed, discs, present, mixing))
+        size = scene.objects.half_length[k], scene.objects.radius[k]
+        segments.append(Segments(state.position[:, k, None], direction[:, None], *size))
+    one = 1.0 + jnp.maximum(-jnp.max(discs.radius), 0.0)  # no radius is negative, but the compiler cannot know
+    return Setup(scene.gravity, _pair_rows(discs, mixing), walls, segments, discs.radius, one)
+
+
+def _nothing_yet(setup: Setup) -> Memory:
+    def zero(rows: list[Row]) -> list[Impulse]:
+        return [Impulse(jnp.zeros_like(r.normal_mass), jnp.zeros_like(r.normal_mass)) for r in rows]
+
+    lanes, count = setup.radius.shape[1:], setup.radius.shape[0]
+    pairs, walls = (count // 2, *lanes), (count, *lanes)
+    kinds = [jnp.zeros(shape, kind) for shape in (pairs, walls) for kind in (jnp.float32, jnp.int32)]
+    kinds = [k.astype(setup.radius.dtype) if k.dtype == jnp.float32 else k for k in kinds]
+    return Memory(zero(setup.pairs), zero(setup.walls), *kinds)
+
+
+def simulate(scene: Scene, state: State, layout: Layout, rules: Rules, frames: int, steps: int) -> Trajectory:
+    """The trajectory of `frames` frames, `steps` steps apart; device layout, any number of scenes at once.
+
+    Scene and state have bodies before scenes: position [2, K, n] in m, angle [K, n] in rad, and so on (types.py); the
+    result has frames first: position [T, 2, K, n]. What stands in empty slots is ignored; they come back as zeros.
+    """
+    scene = dataclasses.replace(scene, objects=_clean_objects(scene.objects))
+    state = _clean(state, scene.objects.present)
+    setup = _setup(scene, state, layout, rules.mixing)
+    discs, padding = layout.discs, layout.discs % 2
+
+    def moving(x: Array) -> Array:
+        widths = [(0, 0)] * (x.ndim - 2) + [(0, padding), (0, 0)]
+        return jnp.pad(x[..., :discs, :], widths)
+
+    start = (
+        *map(moving, (state.position, state.angle)),
+        Motion(*map(moving, (state.velocity, state.angular_velocity))),
+        _nothing_yet(setup),
+    )
+
+    def frame(carry: tuple, _: None) -> tuple:
+        carry = jax.lax.fori_loop(0, steps, lambda _, c: step(*c, setup, rules), carry)
+        position, angle, motion, _ = carry
+        return carry, tuple(x[..., :discs, :] for x in (position, angle, *motion))
+
+    (*_, memory), later = jax.lax.scan(frame, start, None, length=frames - 1)
+    return Trajectory(_states(state, later, layout), _quality(memory))
+
+
+def _clean_objects(objects: Objects) -> Objects:
+    return jax.tree.map(lambda x: jnp.where(objects.present, x, jnp.zeros_like(x)), objects)
+
+
+def _states(start: State, later: tuple, layout: Layout) -> State:
+    """All frames of all slots: the first from the initial state, of what is fixed throughout."""
+
+    def joined(first: Array, moved: Array) -> Array:
+        fixed = jnp.broadcast_to(first[..., layout.discs :, :], (*moved.shape[:-2], layout.segments, moved.shape[-1]))
+        return jnp.concatenate([first[None], jnp.concatenate([moved, fixed], axis=-2)], axis=0)
+
+    first = start.position, start.angle, start.velocity, start.angular_velocity
+    return State(*map(joined, first, later))
+
+
+def _quality(memory: Memory) -> Quality:
+    depth = jnp.maximum(jnp.max(memory.pair_depth, axis=0), jnp.max(memory.wall_depth, axis=0))
+    begins = jnp.sum(memory.pair_begins, axis=0) + jnp.sum(memory.wall_begins, axis=0)
+    return Quality(depth, begins)
+
+
+__all__ = ["halves", "simulate", "substeps"]

@@ -1,0 +1,113 @@
+"""Small datasets for the tests of storage: every kind of field, and discs that move so that images compress."""
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+import numpy as np
+
+from gen2d import shards
+from gen2d.fields import Field
+from gen2d.shards import Dataset, Shard
+
+FIELDS = {
+    "frames": Field("uint8", "n T H W 3", "sRGB", "what is seen"),
+    "index": Field("int64", "n", "", "the video's number in its split"),
+    "time": Field("float64", "T", "s", "of each frame"),
+    "states/position": Field("float32", "n T K 2", "m", "of the centre of mass"),
+    "states/angle": Field("float32", "n T K", "rad", "unwrapped"),
+    "objects/present": Field("bool", "n K", "", "whether the slot is used"),
+    "objects/mass": Field("float32", "n K", "kg", "infinite for static bodies"),
+    "objects/color": Field("uint8", "n K 3", "sRGB", "of the fill"),
+    "masks/instance": Field("uint8", "n T H W", "id", "what is seen"),
+    "flow/forward": Field("float16", "n T H W 2", "px/frame", "to the next frame"),
+    "quality/contacts": Field("int32", "n", "1", "how many there were"),
+}
+
+
+def dataset(root: Path, train: int = 20, codec: str = "gzip", **changes: object) -> Dataset:
+    """A dataset of `train` videos and 3 of a split called test, in shards of 8."""
+    values: dict[str, object] = {
+        "root": root,
+        "name": "toy",
+        "fields": FIELDS,
+        "sizes": {"T": 5, "H": 8, "W": 8, "K": 3},
+        "seed": 7,
+        "config": {"scene": {"name": "toy", "balls": 3}, "fps": 10},
+        "config_text": "scene: {name: toy, balls: 3}\nfps: 10\n",
+        "producer": {"gen2d": "0", "fingerprint": {"jaxlib": "0", "lanes": 8}},
+        "splits": {"train": train, "test": 3},
+        "videos_per_shard": 8,
+        "codec": codec,
+        "fps": 10.0,
+        "constants": {"time": np.arange(5) / 10},
+        "conventions": "Pixel centres at (j + 0.5) — y up.",
+        "command": "gen2d --config toy.yaml",
+        "licence": "CC0-1.0",
+    }
+    return Dataset(**(values | changes))  # pyright: ignore[reportArgumentType]
+
+
+def video(made: Dataset, split: str, number: int) -> dict[str, np.ndarray]:
+    """One video, which depends on (seed, split, number) only."""
+    random = np.random.default_rng([made.seed, len(split), number])
+    frames, height, width, slots = (made.sizes[axis] for axis in "THWK")
+    values: dict[str, np.ndarray] = {}
+    for name, field in made.fields.items():
+        shape = field.shape(made.sizes)
+        values[name] = (random.random(shape) * 100).astype(field.dtype)
+    place = random.random((slots, 2)) * (height, width) + np.arange(frames)[:, None, None] * random.random((slots, 2))
+    rows, columns = np.mgrid[:height, :width] + 0.5
+    mask = np.zeros((frames, height, width), np.uint8)
+    for slot in range(slots):
+        row, column = np.moveaxis(place[:, slot, :, None, None], 1, 0)
+        mask[(rows - row % height) ** 2 + (columns - column % width) ** 2 < (height / 6) ** 2] = slot + 1
+    colors = random.integers(0, 256, (slots + 1, 3), np.uint8)
+    present = np.arange(slots) <= number % slots
+    values |= {"index": np.array(number), "objects/present": present, "masks/instance": mask, "frames": colors[mask]}
+    values["objects/mass"][0] = np.inf
+    return values
+
+
+def columns(made: Dataset, shard: Shard, rows: range | None = None) -> dict[str, np.ndarray]:
+    """The shard's videos, or some of them, stacked."""
+    rows = range(shard.count) if rows is None else rows
+    videos = [video(made, shard.split, shard.first + row) for row in rows]
+    names = [name for name, field in made.fields.items() if field.per_video]
+    return {name: np.stack([values[name] for values in videos]).astype(made.fields[name].dtype) for name in names}
+
+
+def blocks(made: Dataset, shard: Shard, size: int = 3) -> Iterator[shards.Block]:
+    """The shard in blocks of `size` videos, made one at a time."""
+    for first in range(0, shard.count, size):
+        rows = range(first, min(first + size, shard.count))
+        yield shards.encode(columns(made, shard, rows), made.fields, made.codec)
+
+
+def make(made: Dataset, size: int = 3, **options: bool) -> Dataset:
+    """The dataset, complete on disk."""
+    for shard in shards.open_folder(made, **options):
+        shards.write(made, shard, blocks(made, shard, size))
+    assert shards.finish(made)
+    return made
+
+
+def tree(root: Path) -> Mapping[str, bytes]:
+    """Every published file and its bytes."""
+    files = (path for path in root.rglob("*") if path.is_file() and ".gen2d" not in path.parts)
+    return {path.relative_to(root).as_posix(): path.read_bytes() for path in files}
+
+
+def discs(count: int, frames: int = 64, size: int = 64, bodies: int = 8, seed: int = 0) -> np.ndarray:
+    """Videos of moving discs with soft edges, uint8 [count, frames, size, size, 3]; for measuring speed."""
+    random = np.random.default_rng(seed)
+    rows, columns_ = np.mgrid[:size, :size] + 0.5
+    out = np.full((count, frames, size, size, 3), 230, np.uint8)
+    for movie in out:
+        place, speed = random.uniform(0, size, (bodies, 2)), random.uniform(-2, 2, (bodies, 2))
+        color, radius = random.integers(0, 256, (bodies, 3)), random.uniform(size / 20, size / 8, bodies)
+        for step, image in enumerate(movie):
+            for body in range(bodies):
+                row, column = abs((place[body] + speed[body] * step) % (2 * size) - size)
+                cover = np.clip(radius[body] + 0.5 - np.hypot(rows - row, columns_ - column), 0, 1)[..., None]
+                image[...] = np.round(image * (1 - cover) + color[body] * cover)
+    return out

@@ -1,0 +1,71 @@
+"""A codec gives back what it was given, or says that it cannot."""
+
+import zlib
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from gen2d import codecs
+from gen2d.errors import DamagedError
+
+SHAPES = hnp.array_shapes(min_dims=0, max_dims=4, min_side=0, max_side=7)
+ARRAYS = st.one_of(hnp.arrays(dtype, SHAPES) for dtype in (np.uint8, np.bool_, np.float16, np.int32))
+COMPRESSED = ("gzip", "zstd")
+
+
+def images() -> np.ndarray:
+    return np.repeat(np.random.default_rng(0).integers(0, 256, (6, 16), np.uint8), 50, axis=1)
+
+
+@pytest.mark.parametrize("codec", codecs.CODECS)
+@settings(max_examples=40, deadline=None)
+@given(array=ARRAYS)
+def test_what_is_decoded_is_what_was_encoded(codec: str, array: np.ndarray) -> None:
+    out = np.empty_like(array)
+    codecs.decode_into(codec, codecs.encode(codec, array), out)
+    assert out.tobytes() == array.tobytes()
+
+
+@pytest.mark.parametrize("codec", codecs.CODECS)
+def test_memory_order_does_not_matter(codec: str) -> None:
+    array = np.arange(60, dtype=np.int16).reshape(3, 4, 5)
+    assert codecs.encode(codec, array.T) == codecs.encode(codec, np.ascontiguousarray(array.T))
+
+
+def test_gzip_is_what_zlib_reads() -> None:
+    assert zlib.decompress(codecs.encode("gzip", images())) == images().tobytes()
+
+
+@pytest.mark.parametrize("codec", COMPRESSED)
+def test_no_flipped_bit_passes(codec: str) -> None:
+    data, out = codecs.encode(codec, images()), np.empty_like(images())
+    for bit in range(0, 8 * len(data), 7):
+        flipped = bytearray(data)
+        flipped[bit // 8] ^= 1 << bit % 8
+        try:
+            codecs.decode_into(codec, bytes(flipped), out)
+        except DamagedError:
+            continue
+        assert np.array_equal(out, images())  # some bits of the header mean nothing
+
+
+@pytest.mark.parametrize("codec", COMPRESSED)
+def test_no_other_length_passes(codec: str) -> None:
+    data, out = codecs.encode(codec, images()), np.empty_like(images())
+    for wrong in (*(data[:-cut] for cut in (1, 2, 4, 5, 40)), data[:3], b"", data + b"\0"):
+        with pytest.raises(DamagedError):
+            codecs.decode_into(codec, wrong, out)
+
+
+@pytest.mark.parametrize("codec", codecs.CODECS)
+@pytest.mark.parametrize("size", [0, 1, 4799, 4801, 9600])
+def test_a_target_of_another_size_is_refused(codec: str, size: int) -> None:
+    with pytest.raises(DamagedError):
+        codecs.decode_into(codec, codecs.encode(codec, images()), np.empty(size, np.uint8))
+
+
+def test_crc32_is_the_usual_one() -> None:
+    assert codecs.crc32(b"123456789") == zlib.crc32(b"123456789") == 0xCBF43926

@@ -1,0 +1,378 @@
+"""A folder holds whole shards of one dataset or nothing, and its bytes follow from what is stored."""
+
+import dataclasses
+import errno
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+import synthetic
+from numpy.testing import assert_allclose, assert_array_equal
+
+from gen2d import codecs, shards
+from gen2d.errors import DamagedError, FolderError
+from gen2d.formats import hdf5
+
+CODECS = pytest.mark.parametrize("codec", codecs.CODECS)
+DEAD = 2**22 + 1  # above the largest process number of Linux
+
+
+@pytest.mark.parametrize("count", [0, 1, 7, 8, 9, 100])
+@pytest.mark.parametrize("size", [1, 8])
+def test_a_plan_covers_each_video_once(count: int, size: int) -> None:
+    planned = shards.plan({"train": count, "val": 3}, size)
+    covered = [(s.split, s.first + row) for s in planned for row in range(s.count)]
+    assert covered == [("train", i) for i in range(count)] + [("val", i) for i in range(3)]
+    assert len({s.name for s in planned}) == len(planned)
+    assert all(s.count == size for s in planned if s.first + s.count < {"train": count, "val": 3}[s.split])
+
+
+def test_workers_share_the_plan_whatever_is_done() -> None:
+    planned = shards.plan({"train": 50}, 4)
+    remaining = planned[3:]
+    shares = [shards.mine(remaining, worker, 3) for worker in range(3)]
+    assert sorted(s.number for share in shares for s in share) == [s.number for s in remaining]
+    assert shares[1] == [s for s in shards.mine(planned, 1, 3) if s in remaining]
+
+
+@CODECS
+def test_every_field_is_read_back(tmp_path: Path, codec: str) -> None:
+    made = synthetic.make(synthetic.dataset(tmp_path / "toy", codec=codec))
+    for shard in shards.plan(made.splits, made.videos_per_shard):
+        expected = synthetic.columns(made, shard) | dict(made.constants)
+        found = hdf5.read(tmp_path / "toy" / "shards" / f"{shard.name}.h5")
+        assert found.keys() == expected.keys()
+        for name, values in expected.items():
+            assert_array_equal(found[name], values)
+            assert found[name].dtype == np.dtype(made.fields[name].dtype)
+
+
+@pytest.mark.parametrize("codec", ["gzip", "none"])
+def test_h5py_alone_reads_every_field(tmp_path: Path, codec: str) -> None:
+    made = synthetic.make(synthetic.dataset(tmp_path / "toy", codec=codec))
+    shard = shards.plan(made.splits, made.videos_per_shard)[1]
+    with h5py.File(tmp_path / "toy" / "shards" / f"{shard.name}.h5") as file:
+        for name, values in synthetic.columns(made, shard).items():
+            stored = file[name]
+            assert isinstance(stored, h5py.Dataset)
+            assert_array_equal(stored[()], values)
+            about = {
+                "axes": made.fields[name].axes,
+                "unit": made.fields[name].unit,
+                "meaning": made.fields[name].meaning,
+            }
+            assert dict(stored.attrs) == about
+        assert file.attrs["conventions"] == made.conventions
+        assert (file.attrs["split"], file.attrs["first"], file.attrs["fps"]) == (shard.split, shard.first, 10.0)
+
+
+@CODECS
+def test_the_index_says_where_the_bytes_are(tmp_path: Path, codec: str) -> None:
+    made = synthetic.make(synthetic.dataset(tmp_path, codec=codec))
+    names = [shard["name"] for shard in shards.read_manifest(tmp_path)["shards"]]
+    table = np.load(tmp_path / "index" / "masks" / "instance.npy")
+    videos = np.load(tmp_path / "index" / "videos.npy")
+    assert len(table) == len(videos) == 23
+    for (number, offset, size, crc), row in zip(table.tolist(), videos["row"].tolist(), strict=True):
+        data = (tmp_path / "shards" / f"{names[number]}.h5").read_bytes()[offset : offset + size]
+        shard = shards.plan(made.splits, made.videos_per_shard)[number]
+        mask = np.empty((5, 8, 8), np.uint8)
+        codecs.decode_into(codec, data, mask)
+        assert_array_equal(mask, synthetic.video(made, shard.split, shard.first + row)["masks/instance"])
+        assert codecs.crc32(data) == crc
+
+
+@CODECS
+def test_bytes_depend_on_content_only(tmp_path: Path, codec: str) -> None:
+    synthetic.make(synthetic.dataset(tmp_path / "a", codec=codec), size=1)
+    if codec == "gzip":
+        time.sleep(1.1)  # HDF5 counts whole seconds, where it is let
+    synthetic.make(synthetic.dataset(tmp_path / "b", codec=codec), size=8)
+    assert synthetic.tree(tmp_path / "a") == synthetic.tree(tmp_path / "b")
+
+
+def test_head_is_what_encoding_fewer_gives(tmp_path: Path) -> None:
+    made = synthetic.dataset(tmp_path)
+    shard = shards.plan(made.splits, 8)[1]
+    some = shards.encode(synthetic.columns(made, shard, range(3)), made.fields, "gzip")
+    first = shards.head(shards.encode(synthetic.columns(made, shard), made.fields, "gzip"), 3)
+    for part in ("arrays", "chunks", "crc", "moments"):
+        for name, values in getattr(some, part).items():
+            assert_array_equal(getattr(first, part)[name], values)
+
+
+def test_statistics_are_of_what_is_stored(tmp_path: Path) -> None:
+    made = synthetic.make(synthetic.dataset(tmp_path))
+    stats = shards.read_manifest(tmp_path)["stats"]["train"]
+    videos = [synthetic.video(made, "train", number) for number in range(20)]
+    frames = np.stack([video["frames"] for video in videos])[:, ::8, ::4, ::4].reshape(-1, 3)
+    place = np.concatenate([video["states/position"][:, video["objects/present"]].reshape(-1, 2) for video in videos])
+    for name, values in (("frames", frames), ("states/position", place)):
+        for key in ("mean", "std", "min", "max"):
+            assert_allclose(stats[name][key], getattr(values.astype(float), key)(0), rtol=1e-12)
+
+
+def test_a_column_of_another_type_is_refused(tmp_path: Path) -> None:
+    made = synthetic.dataset(tmp_path)
+    columns = synthetic.columns(made, shards.plan(made.splits, 8)[0])
+    with pytest.raises(ValueError, match="states/angle is float64, but must be float32"):
+        shards.encode(columns | {"states/angle": columns["states/angle"].astype(float)}, made.fields, "gzip")
+
+
+@pytest.mark.parametrize("videos", [7, 9])
+def test_a_shard_of_another_count_is_refused(tmp_path: Path, videos: int) -> None:
+    made = synthetic.dataset(tmp_path)
+    shard = next(s for s in shards.open_folder(made) if s.count == 8)
+    blocks = synthetic.blocks(made, dataclasses.replace(shard, count=videos))
+    with pytest.raises(ValueError, match="takes 8 videos"):
+        shards.write(made, shard, blocks)
+    assert not list((tmp_path / "shards").iterdir())
+
+
+def test_what_is_done_is_not_made_again(tmp_path: Path) -> None:
+    made = synthetic.dataset(tmp_path)
+    todo = shards.open_folder(made)
+    shards.write(made, todo[1], synthetic.blocks(made, todo[1]))
+    assert not shards.finish(made)
+    assert shards.open_folder(made) == [todo[0], *todo[2:]]
+    synthetic.make(made)
+    assert shards.open_folder(made) == []
+
+
+@pytest.mark.parametrize("damage", ["shard shorter", "shard gone", "record cut", "record gone", "tables changed"])
+def test_what_is_not_whole_is_made_again(tmp_path: Path, damage: str) -> None:
+    made = synthetic.make(synthetic.dataset(tmp_path))
+    before = synthetic.tree(tmp_path)
+    folder = "shards" if damage.startswith("shard") else ".gen2d/done"
+    ending = {"shard": "h5", "record": "json", "tables": "npz"}[damage.split()[0]]
+    path = tmp_path / folder / f"train-00001.{ending}"
+    if damage.endswith("gone"):
+        path.unlink()
+    else:
+        path.write_bytes(path.read_bytes()[:-9] + (b"" if ending != "npz" else b"012345678"))
+    assert [shard.name for shard in shards.open_folder(made)] == ["train-00001"]
+    assert not (tmp_path / "manifest.json").exists()
+    synthetic.make(made)
+    assert synthetic.tree(tmp_path) == before
+
+
+def test_a_forgotten_shard_is_made_again(tmp_path: Path) -> None:
+    made = synthetic.make(synthetic.dataset(tmp_path))
+    shards.forget(tmp_path, "test-00000")
+    assert [shard.name for shard in shards.open_folder(made)] == ["test-00000"]
+
+
+def test_more_videos_extend_and_equal_one_run(tmp_path: Path) -> None:
+    synthetic.make(synthetic.dataset(tmp_path / "a", train=12))
+    first = (tmp_path / "a" / "shards" / "train-00000.h5").stat().st_mtime_ns
+    longer = synthetic.dataset(tmp_path / "a", train=30)
+    assert [s.name for s in shards.open_folder(longer)] == ["train-00001", "train-00002", "train-00003"]
+    synthetic.make(longer)
+    synthetic.make(synthetic.dataset(tmp_path / "b", train=30))
+    assert synthetic.tree(tmp_path / "a") == synthetic.tree(tmp_path / "b")
+    assert (tmp_path / "a" / "shards" / "train-00000.h5").stat().st_mtime_ns == first
+
+
+def test_fewer_videos_keep_what_is_there(tmp_path: Path) -> None:
+    synthetic.make(synthetic.dataset(tmp_path, train=20))
+    before = synthetic.tree(tmp_path)
+    fewer = synthetic.dataset(tmp_path, train=5)
+    assert shards.open_folder(fewer) == []
+    assert shards.finish(fewer)
+    assert synthetic.tree(tmp_path) == before
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        ({"seed": 8}, "seed is 7 there and 8 here"),
+        ({"config": {"scene": {"name": "toy", "balls": 4}, "fps": 10}}, "config.scene.balls is 3 there and 4 here"),
+        ({"producer": {"fingerprint": {"jaxlib": "1", "lanes": 8}}}, "fingerprint.jaxlib is 0 there and 1 here"),
+        ({"codec": "zstd"}, "codec is gzip there and zstd here"),
+    ],
+)
+@pytest.mark.parametrize("marked_by", [".gen2d", "manifest.json"])
+def test_another_dataset_is_refused(tmp_path: Path, change: dict[str, object], told: str, marked_by: str) -> None:
+    synthetic.make(synthetic.dataset(tmp_path, train=3))
+    if marked_by == ".gen2d":
+        (tmp_path / "manifest.json").unlink()
+    else:
+        (tmp_path / ".gen2d").rename(tmp_path.parent / f"{tmp_path.name}-mark")
+    before = synthetic.tree(tmp_path)
+    with pytest.raises(FolderError, match="--overwrite") as caught:
+        shards.open_folder(synthetic.dataset(tmp_path, train=3, **change))
+    assert told in str(caught.value)
+    assert synthetic.tree(tmp_path) == before
+
+
+def test_overwrite_replaces_a_dataset(tmp_path: Path) -> None:
+    synthetic.make(synthetic.dataset(tmp_path / "a", train=20))
+    synthetic.make(synthetic.dataset(tmp_path / "a", train=3, seed=8), overwrite=True)
+    synthetic.make(synthetic.dataset(tmp_path / "b", train=3, seed=8))
+    assert synthetic.tree(tmp_path / "a") == synthetic.tree(tmp_path / "b")
+
+
+@pytest.mark.parametrize("overwrite", [False, True])
+def test_what_is_no_dataset_is_left_alone(tmp_path: Path, overwrite: bool) -> None:
+    (tmp_path / "thesis.tex").write_text("years of work")
+    with pytest.raises(FolderError, match="something else"):
+        shards.open_folder(synthetic.dataset(tmp_path), overwrite)
+    with pytest.raises(FolderError, match="is a file, not a folder"):
+        shards.open_folder(synthetic.dataset(tmp_path / "thesis.tex"), overwrite)
+    with pytest.raises(FolderError, match="is a file, not a folder"):
+        shards.open_folder(synthetic.dataset(tmp_path / "thesis.tex" / "toy"), overwrite)
+    assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
+
+
+@pytest.mark.parametrize(("code", "told"), [(errno.EACCES, "permission"), (errno.EROFS, "read-only")])
+def test_a_folder_that_cannot_be_made_is_explained(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: int, told: str
+) -> None:
+    def mkdir(path: Path, **_: object) -> None:
+        raise OSError(code, os.strerror(code), str(path))
+
+    monkeypatch.setattr(Path, "mkdir", mkdir)
+    with pytest.raises(FolderError, match=told):
+        shards.open_folder(synthetic.dataset(tmp_path / "toy"))
+
+
+def test_leftovers_of_the_dead_go_and_others_stay(tmp_path: Path) -> None:
+    synthetic.make(synthetic.dataset(tmp_path, train=3))
+    names = [f"a.h5.tmp.{socket.gethostname()}.{DEAD}", f"b.h5.tmp.{socket.gethostname()}.{os.getppid()}"]
+    names.append(f"c.h5.tmp.other-host.{DEAD}")
+    for name in names:
+        (tmp_path / "shards" / name).touch()
+    shards.open_folder(synthetic.dataset(tmp_path, train=3))
+    assert [(tmp_path / "shards" / name).exists() for name in names] == [False, True, True]
+
+
+@pytest.mark.parametrize("raised", [ValueError, KeyboardInterrupt, SystemExit])
+def test_nothing_half_written_stays(tmp_path: Path, raised: type[BaseException]) -> None:
+    made = synthetic.dataset(tmp_path)
+    shard = shards.open_folder(made)[1]
+
+    def failing() -> Iterator[shards.Block]:
+        yield next(synthetic.blocks(made, shard))
+        raise raised
+
+    with pytest.raises(raised):
+        shards.write(made, shard, failing())
+    assert not list((tmp_path / "shards").iterdir())
+    assert not list((tmp_path / ".gen2d" / "done").iterdir())
+
+
+# The limit on a file's size stands in for a full disk: HDF5 meets both in the same place.
+FULL = """
+import resource, signal, sys
+from pathlib import Path
+sys.path.insert(0, {tests!r})
+import synthetic
+from gen2d import shards
+from gen2d.errors import FolderError
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+made = synthetic.dataset(Path({root!r}))
+shard = shards.open_folder(made)[1]
+resource.setrlimit(resource.RLIMIT_FSIZE, (9000, 9000))
+try:
+    shards.write(made, shard, synthetic.blocks(made, shard))
+except OSError as error:
+    print("refused", error.errno)
+"""
+
+
+def test_a_write_that_the_disk_refuses_leaves_nothing(tmp_path: Path) -> None:
+    script = FULL.format(tests=str(Path(__file__).parent), root=str(tmp_path))
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
+    assert done.stdout.startswith(f"refused {errno.EFBIG}"), done.stderr
+    assert done.returncode == 0, done.stderr
+    assert not list((tmp_path / "shards").iterdir())
+
+
+def test_a_full_disk_is_explained(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    made = synthetic.dataset(tmp_path)
+    shard = shards.open_folder(made)[1]
+
+    def write(path: Path, *_: object) -> None:
+        path.write_bytes(b"some")
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(hdf5, "write", write)
+    with pytest.raises(FolderError, match=r"MB are missing.*same command again") as caught:
+        shards.write(made, shard, synthetic.blocks(made, shard))
+    assert caught.value.exit_code == 1
+    assert not list((tmp_path / "shards").iterdir())
+
+
+# Says when it has written half a shard, then waits to be killed.
+KILLED = """
+import sys, time
+from pathlib import Path
+sys.path.insert(0, {tests!r})
+import synthetic
+from gen2d import shards
+made = synthetic.dataset(Path({root!r}))
+todo = shards.open_folder(made)
+shards.write(made, todo[1], synthetic.blocks(made, todo[1]))
+def slow():
+    for block in synthetic.blocks(made, todo[2]):
+        yield block
+        print("half", flush=True)
+        time.sleep(60)
+shards.write(made, todo[2], slow())
+"""
+
+
+def test_a_killed_writer_publishes_nothing_and_is_resumed(tmp_path: Path) -> None:
+    script = KILLED.format(tests=str(Path(__file__).parent), root=str(tmp_path / "a"))
+    with subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE) as process:
+        assert process.stdout
+        assert process.stdout.readline() == b"half\n"
+        process.send_signal(signal.SIGKILL)
+    names = [path.name for path in (tmp_path / "a" / "shards").iterdir()]
+    assert sorted(name for name in names if ".tmp." not in name) == ["train-00000.h5"]
+    assert len(names) == 2
+    synthetic.make(synthetic.dataset(tmp_path / "a"))
+    synthetic.make(synthetic.dataset(tmp_path / "b"))
+    assert synthetic.tree(tmp_path / "a") == synthetic.tree(tmp_path / "b")
+
+
+def test_the_manifest_keeps_to_the_schema_and_to_itself(tmp_path: Path) -> None:
+    made = synthetic.make(synthetic.dataset(tmp_path))
+    manifest = shards.read_manifest(tmp_path)
+    assert manifest["schema"] == "gen2d.dataset/1"
+    assert manifest["splits"] == {"train": 20, "test": 3}
+    assert manifest["config"] == made.config
+    assert socket.gethostname() not in json.dumps(manifest)
+    text = (tmp_path / "manifest.json").read_text()
+    (tmp_path / "manifest.json").write_text(text.replace('"fps": 10.0', '"fps": 11.0'))
+    with pytest.raises(DamagedError, match="not what was written"):
+        shards.read_manifest(tmp_path)
+
+
+def test_the_cards_name_every_field_and_file(tmp_path: Path) -> None:
+    made = synthetic.make(synthetic.dataset(tmp_path))
+    readme = (tmp_path / "README.md").read_text()
+    assert all(f"| {name} | {field.dtype} | {field.axes} |" in readme for name, field in made.fields.items())
+    assert all(word in readme for word in (made.command, made.licence, made.conventions))
+    croissant = json.loads((tmp_path / "croissant.json").read_text())
+    for part in croissant["distribution"]:
+        assert part["sha256"] == shards.file_sha256(tmp_path / part["contentUrl"])
+        assert part["contentSize"] == f"{(tmp_path / part['contentUrl']).stat().st_size} B"
+
+
+def test_the_log_takes_one_line_a_time(tmp_path: Path) -> None:
+    shards.open_folder(synthetic.dataset(tmp_path))
+    shards.log(tmp_path, {"speed": 1.5})
+    shards.log(tmp_path, {"speed": 2})
+    lines = (tmp_path / ".gen2d" / "run.jsonl").read_text().splitlines()
+    assert [json.loads(line)["speed"] for line in lines] == [1.5, 2]
+    assert shards.free_bytes(tmp_path / "not" / "yet") > 0

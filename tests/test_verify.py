@@ -1,0 +1,145 @@
+"""Whatever byte of a dataset changes, `full` finds it; whatever is complete passes."""
+
+import shutil
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+import synthetic
+
+from gen2d import loader, shards
+from gen2d.errors import ConfigError, DamagedError
+from gen2d.verify import damaged_shards, verify
+
+
+@pytest.fixture(scope="module")
+def pristine(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return synthetic.make(synthetic.dataset(tmp_path_factory.mktemp("data") / "toy", train=10)).root
+
+
+@pytest.fixture
+def root(pristine: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(pristine, tmp_path / "toy"))
+
+
+def flip(path: Path, bit: int) -> None:
+    data = bytearray(path.read_bytes())
+    data[bit // 8 % len(data)] ^= 1 << bit % 8
+    path.write_bytes(data)
+
+
+@pytest.mark.parametrize("codec", ["gzip", "zstd", "none"])
+@pytest.mark.parametrize("level", ["quick", "full"])
+def test_what_was_written_passes(tmp_path: Path, codec: str, level: str) -> None:
+    synthetic.make(synthetic.dataset(tmp_path, codec=codec))
+    assert verify(tmp_path, level) == []
+    assert damaged_shards(tmp_path, level) == []
+
+
+@pytest.mark.parametrize("kind", ["shards/*.h5", "index/**/*.npy", "manifest.json", "config.yaml"])
+def test_a_flipped_bit_anywhere_is_found(root: Path, kind: str) -> None:
+    random = np.random.default_rng(0)
+    for path in sorted(root.glob(kind)):
+        for bit in random.integers(0, 8 * path.stat().st_size, 5).tolist():
+            flip(path, bit)
+            found = verify(root, "full")
+            assert found, f"bit {bit} of {path}"
+            assert any(str(path) in sentence for sentence in found)
+            flip(path, bit)
+    assert verify(root, "full") == []
+
+
+def test_a_damaged_piece_is_named_and_not_returned(root: Path) -> None:
+    names = {shard["name"]: number for number, shard in enumerate(shards.read_manifest(root)["shards"])}
+    table = np.load(root / "index" / "frames.npy")
+    (row,) = np.flatnonzero(table["shard"] == names["train-00000"])[5:6]
+    flip(root / "shards" / "train-00000.h5", 8 * int(table["offset"][row] + table["size"][row] // 2))
+    assert any("frames of train video 5" in sentence for sentence in verify(root, "full"))
+    assert damaged_shards(root, "full") == ["train-00000"]
+    dataset = loader.open(root)
+    with pytest.raises(DamagedError, match=r"train-00000.h5: frames of train video 5"):
+        dataset[5]
+    assert dataset[4].keys() == dataset.fields.keys()
+
+
+def test_a_damaged_state_is_named_and_not_returned(root: Path) -> None:
+    with h5py.File(root / "shards" / "train-00001.h5") as file:
+        stored = file["states/position"]
+        assert isinstance(stored, h5py.Dataset)
+        offset = stored.id.get_offset()
+    assert offset
+    flip(root / "shards" / "train-00001.h5", 8 * offset)
+    with pytest.raises(DamagedError, match=r"train-00001.h5: states/position of train video 8"):
+        loader.open(root)[8]
+    assert loader.open(root, fields=("frames", "states/angle"))[8]
+    assert loader.open(root, verify="none")[8]
+
+
+@pytest.mark.parametrize("level", ["quick", "full"])
+def test_missing_cut_empty_and_extra_files_are_found(root: Path, level: str) -> None:
+    (root / "shards" / "train-00000.h5").unlink()
+    (root / "shards" / "test-00000.h5").write_bytes(b"")
+    path = root / "shards" / "train-00001.h5"
+    path.write_bytes(path.read_bytes()[:-1])
+    (root / "shards" / "train-00007.h5").write_bytes(b"more")
+    (root / "index" / "videos.npy").unlink()
+    (root / "index" / "extra.npy").write_bytes(b"")
+    found = verify(root, level)
+    wrong = ("train-00000.h5 is missing", "test-00000.h5 has 0 bytes", "train-00001.h5 has", "train-00007.h5 does not")
+    for part in (*wrong, "videos.npy is missing", "extra.npy does not belong"):
+        assert any(part in sentence for sentence in found), part
+    assert damaged_shards(root, level) == ["test-00000", "train-00000", "train-00001"]
+
+
+@pytest.mark.parametrize("level", ["quick", "full"])
+def test_an_incomplete_dataset_says_how_to_go_on(root: Path, level: str) -> None:
+    (root / "manifest.json").unlink()
+    (sentence,) = verify(root, level)
+    assert "incomplete: run the command that made it again" in sentence
+    (sentence,) = verify(root.parent, level)
+    assert "is not a gen2d dataset" in sentence
+
+
+def test_a_shard_that_lies_is_found_although_its_checksums_fit(tmp_path: Path) -> None:
+    made = synthetic.dataset(tmp_path, train=10)
+    for shard in shards.open_folder(made):
+        columns = synthetic.columns(made, shard)
+        if shard.name == "train-00000":
+            columns["states/angle"][2, 1, 0] = np.nan
+            columns["states/position"][3, 1, 0, 0] = np.inf
+            columns["objects/mass"][4, 2] = np.nan
+            columns["index"][5] = 99
+        shards.write(made, shard, [shards.encode(columns, made.fields, made.codec)])
+    assert shards.finish(made)
+    assert verify(tmp_path, "quick") == []
+    found = verify(tmp_path, "full")
+    assert len(found) == 4
+    wrong = (
+        "states/angle of video 2",
+        "states/position of video 3",
+        "objects/mass of video 4",
+        "index of video 5 is 99",
+    )
+    assert all(any(part in sentence for sentence in found) for part in wrong)
+    assert damaged_shards(tmp_path, "full") == ["train-00000"]
+
+
+def test_a_repair_makes_the_bad_shards_again(root: Path) -> None:
+    before = synthetic.tree(root)
+    flip(root / "shards" / "train-00001.h5", 80000)
+    (root / "shards" / "test-00000.h5").unlink()
+
+    def repair(names: list[str]) -> None:
+        assert names == ["test-00000", "train-00001"]
+        for name in names:
+            shards.forget(root, name)
+        synthetic.make(synthetic.dataset(root, train=10))
+
+    assert verify(root, "full", repair) == []
+    assert synthetic.tree(root) == before
+
+
+def test_an_unknown_level_is_refused(root: Path) -> None:
+    with pytest.raises(ConfigError, match="level is 'fast'"):
+        verify(root, "fast")
