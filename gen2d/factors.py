@@ -12,6 +12,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from gen2d.types import Array
 
@@ -110,9 +111,12 @@ def draw(key: Array, wanted: Mapping[str, tuple[Drawn, tuple[int, ...]]]) -> dic
     return drawn
 
 
-def video_keys(seed: int, split: str, indices: Array) -> Array:
-    """A key per video: `fold_in(fold_in(key(seed), split), i)`, for seeds up to 2**63 - 1 without 64-bit mode."""
-    words = jnp.asarray([seed >> 32, seed & 0xFFFFFFFF], jnp.uint32)
-    root = jax.random.wrap_key_data(words, impl="threefry2x32")
-    root = jax.random.fold_in(root, zlib.crc32(split.encode()))
-    return jax.vmap(lambda i: jax.random.fold_in(root, i))(indices)
+def seed_words(seed: int, split: int) -> np.ndarray:
+    """A seed up to 2**63 - 1 and a split's number as three 32-bit words, so that jax needs no 64-bit mode."""
+    return np.array([seed >> 32, seed & 0xFFFFFFFF, split], np.uint32)
+
+
+def video_keys(words: Array, numbers: Array) -> Array:
+    """A key per video: `fold_in(fold_in(key(seed), split), i)`; `words` as `seed_words` gives them."""
+    root = jax.random.fold_in(jax.random.wrap_key_data(words[:2], impl="threefry2x32"), words[2])
+    return jax.vmap(lambda i: jax.random.fold_in(root, i))(numbers)

@@ -220,7 +220,7 @@ def write(dataset: Dataset, shard: Shard, blocks: Iterable[Block]) -> dict[str, 
     try:
         return _write(dataset, shard, seen.passing(blocks), seen)
     except OSError as error:
-        if error.errno not in (errno.ENOSPC, errno.EDQUOT) and "No space left" not in str(error):
+        if error.errno not in (errno.ENOSPC, errno.EDQUOT):
             raise
         raise _full(dataset, shard, seen) from error
 
@@ -239,9 +239,8 @@ class _Seen:
                 self.crc.setdefault(name, []).append(values)
             for name, values in block.moments.items():
                 self.moments.setdefault(name, []).append(values)
-            self.videos += len(next(iter(block.crc.values())))
-            self.bytes += sum(len(chunk) for chunks in block.chunks.values() for chunk in chunks)
-            self.bytes += sum(values.nbytes for values in block.arrays.values())
+            self.videos += len(block)
+            self.bytes += block.nbytes
             yield block
 
 
@@ -374,7 +373,7 @@ def _sealed(manifest: Mapping[str, Any]) -> dict[str, Any]:
 def _manifest(
     dataset: Dataset, shards: Iterable[Shard], records: list[dict[str, Any]], files: Mapping[str, str]
 ) -> dict[str, Any]:
-    """No time, host or folder is in it: the same config and versions give the same bytes."""
+    """No time, host or folder is in it: the same files give the same bytes."""
     shown = ("name", "split", "first", "count", "bytes", "sha256")
     splits: dict[str, int] = {}
     for shard in shards:
@@ -521,7 +520,7 @@ video = file["{field}"][0]
 
 ## How it was made
 
-By `{command}` with seed {seed}. The same recipe, seed and versions make the same bytes.
+By `{command}` with seed {seed}. The same recipe, seed and versions make the same videos.
 
 ## Licence
 

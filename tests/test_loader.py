@@ -1,5 +1,6 @@
 """The loader gives what h5py gives, in an order that is a permutation and can be resumed anywhere."""
 
+import itertools
 import multiprocessing
 import pickle
 import subprocess
@@ -185,8 +186,8 @@ def test_an_epoch_gives_each_video_once(toy: Path) -> None:
     for shuffle in (True, False):
         batches = numbers(list(loader.DataLoader(dataset, 6, epochs=1, shuffle=shuffle, remainder="keep")))
         assert [len(batch) for batch in batches] == [6, 6, 6, 2]
-        assert sorted(sum(batches, [])) == list(range(TRAIN))
-        assert (sum(batches, []) == list(range(TRAIN))) is not shuffle
+        assert sorted(itertools.chain(*batches)) == list(range(TRAIN))
+        assert (list(itertools.chain(*batches)) == list(range(TRAIN))) is not shuffle
     dropped = loader.DataLoader(dataset, 6, epochs=1)
     assert [len(batch) for batch in numbers(list(dropped))] == [6, 6, 6]
     assert len(dropped) == 3
@@ -207,7 +208,7 @@ def test_ranks_share_each_global_batch(toy: Path, remainder: str) -> None:
             numbers(list(loader.DataLoader(dataset, 6 // world_size, 0, True, 2, rank, world_size, remainder)))
             for rank in range(world_size)
         ]
-        assert [sum(parts, []) for parts in zip(*ranks, strict=True)] == alone
+        assert [list(itertools.chain(*parts)) for parts in zip(*ranks, strict=True)] == alone
 
 
 @pytest.mark.parametrize("remainder", ["drop", "keep"])
@@ -280,14 +281,14 @@ def test_a_transform_gets_each_batch(toy: Path) -> None:
 )
 def test_a_wrong_loader_option_is_refused(toy: Path, options: dict[str, Any]) -> None:
     with pytest.raises(ConfigError):
-        loader.DataLoader(loader.open(toy), **({"batch_size": 4} | options))
+        loader.DataLoader(loader.open(toy), **{"batch_size": 4, **options})
 
 
 # ---- Processes
 
 
 def read_in_process(dataset: loader.Dataset, send: Callable[[Any], None]) -> None:
-    send(numbers(list(loader.DataLoader(dataset, 4, epochs=1))) + [dataset[3]["frames"].sum()])
+    send([*numbers(list(loader.DataLoader(dataset, 4, epochs=1))), int(dataset[3]["frames"].sum())])
 
 
 @pytest.mark.filterwarnings("ignore:.*multi-threaded.*fork.*:DeprecationWarning")
@@ -297,7 +298,7 @@ def test_processes_read_the_same(toy: Path, method: str) -> None:
     dataset = loader.open(toy, fields=("index", "frames"))
     found: list[Any] = []
     read_in_process(dataset, found.append)
-    context = multiprocessing.get_context(method)
+    context: Any = multiprocessing.get_context(method)
     receiver, sender = context.Pipe(duplex=False)
     process = context.Process(target=read_in_process, args=(dataset, sender.send))
     process.start()

@@ -11,6 +11,7 @@ import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -91,10 +92,10 @@ def test_the_index_says_where_the_bytes_are(tmp_path: Path, codec: str) -> None:
         assert codecs.crc32(data) == crc
 
 
-@CODECS
+@pytest.mark.parametrize("codec", ["zstd", "none"])  # isal does not promise it
 def test_bytes_depend_on_content_only(tmp_path: Path, codec: str) -> None:
     synthetic.make(synthetic.dataset(tmp_path / "a", codec=codec), size=1)
-    if codec == "gzip":
+    if codec == "zstd":
         time.sleep(1.1)  # HDF5 counts whole seconds, where it is let
     synthetic.make(synthetic.dataset(tmp_path / "b", codec=codec), size=8)
     assert synthetic.tree(tmp_path / "a") == synthetic.tree(tmp_path / "b")
@@ -150,7 +151,7 @@ def test_what_is_done_is_not_made_again(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("damage", ["shard shorter", "shard gone", "record cut", "record gone", "tables changed"])
 def test_what_is_not_whole_is_made_again(tmp_path: Path, damage: str) -> None:
-    made = synthetic.make(synthetic.dataset(tmp_path))
+    made = synthetic.make(synthetic.dataset(tmp_path, codec="zstd"))
     before = synthetic.tree(tmp_path)
     folder = "shards" if damage.startswith("shard") else ".gen2d/done"
     ending = {"shard": "h5", "record": "json", "tables": "npz"}[damage.split()[0]]
@@ -172,12 +173,12 @@ def test_a_forgotten_shard_is_made_again(tmp_path: Path) -> None:
 
 
 def test_more_videos_extend_and_equal_one_run(tmp_path: Path) -> None:
-    synthetic.make(synthetic.dataset(tmp_path / "a", train=12))
+    synthetic.make(synthetic.dataset(tmp_path / "a", train=12, codec="zstd"))
     first = (tmp_path / "a" / "shards" / "train-00000.h5").stat().st_mtime_ns
-    longer = synthetic.dataset(tmp_path / "a", train=30)
+    longer = synthetic.dataset(tmp_path / "a", train=30, codec="zstd")
     assert [s.name for s in shards.open_folder(longer)] == ["train-00001", "train-00002", "train-00003"]
     synthetic.make(longer)
-    synthetic.make(synthetic.dataset(tmp_path / "b", train=30))
+    synthetic.make(synthetic.dataset(tmp_path / "b", train=30, codec="zstd"))
     assert synthetic.tree(tmp_path / "a") == synthetic.tree(tmp_path / "b")
     assert (tmp_path / "a" / "shards" / "train-00000.h5").stat().st_mtime_ns == first
 
@@ -201,7 +202,7 @@ def test_fewer_videos_keep_what_is_there(tmp_path: Path) -> None:
     ],
 )
 @pytest.mark.parametrize("marked_by", [".gen2d", "manifest.json"])
-def test_another_dataset_is_refused(tmp_path: Path, change: dict[str, object], told: str, marked_by: str) -> None:
+def test_another_dataset_is_refused(tmp_path: Path, change: dict[str, Any], told: str, marked_by: str) -> None:
     synthetic.make(synthetic.dataset(tmp_path, train=3))
     if marked_by == ".gen2d":
         (tmp_path / "manifest.json").unlink()
@@ -216,8 +217,8 @@ def test_another_dataset_is_refused(tmp_path: Path, change: dict[str, object], t
 
 def test_overwrite_replaces_a_dataset(tmp_path: Path) -> None:
     synthetic.make(synthetic.dataset(tmp_path / "a", train=20))
-    synthetic.make(synthetic.dataset(tmp_path / "a", train=3, seed=8), overwrite=True)
-    synthetic.make(synthetic.dataset(tmp_path / "b", train=3, seed=8))
+    synthetic.make(synthetic.dataset(tmp_path / "a", train=3, codec="zstd", seed=8), overwrite=True)
+    synthetic.make(synthetic.dataset(tmp_path / "b", train=3, codec="zstd", seed=8))
     assert synthetic.tree(tmp_path / "a") == synthetic.tree(tmp_path / "b")
 
 
@@ -319,7 +320,7 @@ from pathlib import Path
 sys.path.insert(0, {tests!r})
 import synthetic
 from gen2d import shards
-made = synthetic.dataset(Path({root!r}))
+made = synthetic.dataset(Path({root!r}), codec={codec!r})
 todo = shards.open_folder(made)
 shards.write(made, todo[1], synthetic.blocks(made, todo[1]))
 def slow():
@@ -331,8 +332,9 @@ shards.write(made, todo[2], slow())
 """
 
 
-def test_a_killed_writer_publishes_nothing_and_is_resumed(tmp_path: Path) -> None:
-    script = KILLED.format(tests=str(Path(__file__).parent), root=str(tmp_path / "a"))
+@CODECS
+def test_a_killed_writer_publishes_nothing_and_is_resumed(tmp_path: Path, codec: str) -> None:
+    script = KILLED.format(tests=str(Path(__file__).parent), root=str(tmp_path / "a"), codec=codec)
     with subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE) as process:
         assert process.stdout
         assert process.stdout.readline() == b"half\n"
@@ -340,9 +342,14 @@ def test_a_killed_writer_publishes_nothing_and_is_resumed(tmp_path: Path) -> Non
     names = [path.name for path in (tmp_path / "a" / "shards").iterdir()]
     assert sorted(name for name in names if ".tmp." not in name) == ["train-00000.h5"]
     assert len(names) == 2
-    synthetic.make(synthetic.dataset(tmp_path / "a"))
-    synthetic.make(synthetic.dataset(tmp_path / "b"))
-    assert synthetic.tree(tmp_path / "a") == synthetic.tree(tmp_path / "b")
+    synthetic.make(synthetic.dataset(tmp_path / "a", codec=codec))
+    synthetic.make(synthetic.dataset(tmp_path / "b", codec=codec))
+    resumed, whole = synthetic.tree(tmp_path / "a"), synthetic.tree(tmp_path / "b")
+    assert resumed.keys() == whole.keys()
+    assert resumed == whole or codec == "gzip"
+    for path in sorted((tmp_path / "a" / "shards").iterdir()):
+        found, expected = hdf5.read(path), hdf5.read(tmp_path / "b" / "shards" / path.name)
+        assert all(np.array_equal(found[name], expected[name]) for name in expected)
 
 
 def test_the_manifest_keeps_to_the_schema_and_to_itself(tmp_path: Path) -> None:

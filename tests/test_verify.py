@@ -15,7 +15,7 @@ from gen2d.verify import damaged_shards, verify
 
 @pytest.fixture(scope="module")
 def pristine(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return synthetic.make(synthetic.dataset(tmp_path_factory.mktemp("data") / "toy", train=10)).root
+    return synthetic.make(synthetic.dataset(tmp_path_factory.mktemp("data") / "toy", train=10, codec="zstd")).root
 
 
 @pytest.fixture
@@ -134,7 +134,7 @@ def test_a_repair_makes_the_bad_shards_again(root: Path) -> None:
         assert names == ["test-00000", "train-00001"]
         for name in names:
             shards.forget(root, name)
-        synthetic.make(synthetic.dataset(root, train=10))
+        synthetic.make(synthetic.dataset(root, train=10, codec="zstd"))
 
     assert verify(root, "full", repair) == []
     assert synthetic.tree(root) == before

@@ -26,6 +26,15 @@ class Block:
     crc: Mapping[str, np.ndarray]  # uint32 [m] of every field: over the chunk, or over the bytes of the row
     moments: Mapping[str, np.ndarray]  # float64 [m, 5, components]: count, sum, sum of squares, least, largest
 
+    def __len__(self) -> int:
+        return len(next(iter(self.crc.values())))
+
+    @property
+    def nbytes(self) -> int:
+        """What it takes on disk."""
+        chunks = sum(len(chunk) for chunks in self.chunks.values() for chunk in chunks)
+        return chunks + sum(values.nbytes for values in self.arrays.values())
+
 
 @dataclasses.dataclass(frozen=True)
 class Places:

@@ -1,9 +1,13 @@
 """HDF5 shards: images in one compressed chunk a video, everything else contiguous, readable by any HDF5 program.
 
-The bytes depend on what is stored and on nothing else: no times, hosts or users, and not on how the videos were grouped
-into blocks. h5py serves one thread at a time, so compression happens elsewhere and chunks pass through it untouched.
+The bytes depend on the compressed chunks and values and on nothing else: no times, hosts or users, and not on how the
+videos were grouped into blocks. h5py serves one thread at a time, so compression happens elsewhere and chunks pass
+through it untouched.
 """
 
+import contextlib
+import errno
+import re
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 
@@ -34,7 +38,7 @@ def write(
     """
     images = sorted(name for name, field in fields.items() if field.is_image)
     rows = sorted(name for name, field in fields.items() if field.per_video and not field.is_image)
-    with h5py.File(path, "w", libver=("v110", "v110")) as file:
+    with _new(path) as file:
         file.attrs.update(attributes)
         shapes = {name: (count, *fields[name].shape(sizes)) for name in images + rows}
         chunked = {name: _chunked(file, name, fields[name].dtype, shapes[name], codec) for name in images}
@@ -65,6 +69,23 @@ def read(path: Path) -> dict[str, np.ndarray]:
 
         file.visititems(visit)
     return found
+
+
+@contextlib.contextmanager
+def _new(path: Path) -> Iterator[h5py.File]:
+    """A new file, closed at the end; what went wrong while writing is raised, not what closing then says of it."""
+    file = h5py.File(path, "w", libver=("v110", "v110"))
+    try:
+        yield file
+    except BaseException:
+        with contextlib.suppress(RuntimeError, OSError):
+            file.close()
+        raise
+    try:
+        file.close()
+    except RuntimeError as error:  # HDF5 writes much only now, and h5py then forgets what kind of error it was
+        number = re.search(r"errno = (\d+)", str(error))
+        raise OSError(int(number[1]) if number else errno.EIO, str(error)) from error
 
 
 def _chunked(file: h5py.File, name: str, dtype: str, shape: tuple[int, ...], codec: str) -> h5py.Dataset:

@@ -1,0 +1,83 @@
+"""Which devices compute, and what identifies the bits that they give."""
+
+import os
+import pathlib
+import platform
+import sys
+
+import h5py
+import isal
+import jax
+import numpy as np
+import zstandard
+
+from gen2d.errors import UserError
+
+DEVICES = ("auto", "cpu", "gpu")
+
+
+class DeviceError(UserError):
+    """A device that is not there."""
+
+
+def cores() -> int:
+    """How many CPU cores this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def prepare(device: str = "auto") -> list[jax.Device]:
+    """The devices to compute on. CPU cores count as devices, one each, unless this process already runs jax.
+
+    Also keeps compiled programs between runs, in $JAX_COMPILATION_CACHE_DIR or the user's cache folder.
+    """
+    if device not in DEVICES:
+        raise DeviceError(f"--device is {device!r}, but must be one of {', '.join(DEVICES)}")
+    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
+    if jax.config.jax_compilation_cache_dir is None:
+        home = pathlib.Path(os.environ.get("XDG_CACHE_HOME") or pathlib.Path.home() / ".cache")
+        jax.config.update("jax_compilation_cache_dir", str(home / "gen2d"))
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
+    try:
+        jax.config.update("jax_num_cpu_devices", cores())
+        if device == "cpu":
+            jax.config.update("jax_platforms", "cpu")
+    except RuntimeError:
+        pass  # jax already runs: its devices are what there is; the videos are the same on any number of them
+    if device == "auto":
+        return jax.devices()
+    try:
+        return jax.devices(device)
+    except RuntimeError as error:
+        hint = "; install gen2d[cuda], or use --device cpu" if device == "gpu" else ""
+        raise DeviceError(f"--device is {device!r}, but jax finds none{hint} ({error})") from None
+
+
+def instruction_set() -> str:
+    """The widest vector instructions of this CPU, which decide how sums are rounded."""
+    try:
+        flags = set(pathlib.Path("/proc/cpuinfo").read_text().split())
+    except OSError:
+        return platform.machine()
+    return next((isa for isa in ("avx512f", "avx2", "avx") if isa in flags), platform.machine())
+
+
+def fingerprint(device: jax.Device, lanes: int) -> dict[str, object]:
+    """What decides the bits of a simulation; a dataset holds videos of one fingerprint only."""
+    kind = device.device_kind if device.platform != "cpu" else f"cpu {instruction_set()}"
+    return {"jaxlib": jax.lib.__version__, "device": kind, "lanes": lanes, "xla_flags": os.environ.get("XLA_FLAGS", "")}
+
+
+def producer(device: jax.Device, lanes: int, version: str) -> dict[str, object]:
+    """The versions that made a dataset, and the fingerprint."""
+    return {
+        "gen2d": version,
+        "python": ".".join(map(str, sys.version_info[:3])),
+        "jax": jax.__version__,
+        "jaxlib": jax.lib.__version__,
+        "numpy": np.__version__,
+        "h5py": h5py.__version__,
+        "hdf5": h5py.version.hdf5_version,
+        "isal": isal.__version__,
+        "zstandard": zstandard.__version__,
+        "fingerprint": fingerprint(device, lanes),
+    }

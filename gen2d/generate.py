@@ -1,0 +1,256 @@
+"""The one loop: which videos are missing, made batch by batch, written shard by shard."""
+
+import dataclasses
+import os
+import shlex
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import jax
+from tqdm import tqdm
+
+from gen2d import __version__, devices, shards
+from gen2d.config import Config, checked_seed, load_config
+from gen2d.errors import ConfigError, FolderError, UserError
+from gen2d.pipeline import Encoder, Writers, batches, jobs_of, threads_for
+from gen2d.rollout import Rollout
+from gen2d.shards import Dataset, Shard
+
+MAX_VIDEOS = 2**32 - 1
+CONVENTIONS = (
+    "World: metres, y up, radians counter-clockwise, seconds. Pixels: (row, column) from the top left, pixel centres at "
+    "j + 0.5. Frame 0 is the initial state, frame t the state at t / fps. An empty slot is zero everywhere."
+)
+
+
+@dataclasses.dataclass(frozen=True)
+class Summary:
+    """What a run did."""
+
+    out: Path
+    made: int  # videos
+    total: int  # videos in the folder's plan
+    seconds: float
+    bytes: int  # written
+    complete: bool  # False while other workers' shards are missing
+
+    @property
+    def videos_per_second(self) -> float:
+        return self.made / self.seconds if self.seconds else 0.0
+
+
+class DeviceMemoryError(UserError):
+    """A batch that does not fit the device."""
+
+
+def generate(
+    config: Config | Mapping | str | Path,
+    n: int,
+    out: str | Path | None = None,
+    *,
+    seed: int | None = None,
+    split: str = "train",
+    sets: Sequence[str] = (),
+    device: str = "auto",
+    worker: tuple[int, int] = (0, 1),
+    overwrite: bool = False,
+    say: Callable[[str], None] | None = None,
+) -> Summary:
+    """Makes what is missing of a dataset of `n` videos, and returns what it did.
+
+    `config` is a file's name or path, a mapping or a Config; `sets` overrides single options ('physics.substeps=8').
+    Video i depends on the config, the seed, the split and i alone, so a run may be stopped and repeated, extended to a
+    larger `n`, or shared by workers (`worker=(r, W)`: this one is number r of W). `out` is datasets/NAME by default.
+    `say` takes lines for a person. Raises ConfigError, FolderError or DeviceError (all UserError) with one sentence.
+    """
+    say = say or (lambda line: None)
+    config = load_config(config, sets)
+    if seed is not None:
+        config = dataclasses.replace(config, seed=checked_seed(seed))
+    _check_run(n, worker)
+    out = Path(out) if out is not None else Path("datasets") / config.name
+    rollout = Rollout(config, devices.prepare(device))
+    dataset = dataset_of(rollout, out, {split: n})
+    todo = shards.mine(shards.open_folder(dataset, overwrite), *worker)
+    began, made, size = time.perf_counter(), sum(shard.count for shard in todo), 0
+    if todo:
+        size = _make(rollout, dataset, todo, say)
+    complete = shards.finish(dataset)
+    seconds = time.perf_counter() - began
+    if todo:
+        entry = {"time": time.time(), "host": os.uname().nodename, "videos": made, "seconds": seconds, "bytes": size}
+        shards.log(out, entry | {"devices": len(rollout.devices), "platform": rollout.devices[0].platform})
+    return Summary(out, made, n, seconds, size, complete)
+
+
+def _check_run(n: Any, worker: tuple[int, int]) -> None:
+    if isinstance(n, bool) or not isinstance(n, int) or not 1 <= n <= MAX_VIDEOS:
+        raise ConfigError(f"--n is {n!r}, but must be a whole number from 1 to 2**32 - 1")
+    if not 0 <= worker[0] < worker[1]:
+        raise ConfigError(f"--worker is {worker[0]}/{worker[1]}, but must be r/W with r from 0 to W - 1")
+
+
+def dataset_of(rollout: Rollout, out: Path, counts: Mapping[str, int]) -> Dataset:
+    """What the folder `out` is to hold."""
+    config = rollout.config
+    plain = {key: value for key, value in config.plain().items() if key != "seed"}
+    return Dataset(
+        root=out,
+        name=config.name,
+        fields=rollout.fields,
+        sizes=rollout.sizes,
+        seed=config.seed,
+        config=plain,
+        config_text=config.text(),
+        producer=devices.producer(rollout.devices[0], rollout.lanes, __version__),
+        splits=counts,
+        videos_per_shard=rollout.videos_per_shard,
+        codec=config.storage.codec,
+        fps=config.video.fps,
+        constants={"time": rollout.time},
+        conventions=CONVENTIONS,
+        command=f"python -m gen2d --config config.yaml --n {sum(counts.values())}",
+    )
+
+
+def _make(rollout: Rollout, dataset: Dataset, todo: list[Shard], say: Callable[[str], None]) -> int:
+    """The bytes written for these shards."""
+    encoder, writers = Encoder(rollout, dataset, threads_for(devices.cores())), Writers(dataset)
+    work = batches(todo, rollout.lanes)
+    size = 0
+    try:
+        with _stopping_on_sigterm():
+            count = sum(shard.count for shard in todo)
+            _prepare(rollout, encoder, work, count, say)
+            with _progress(count, say) as advance:
+                for shard, block in encoder.blocks(work):
+                    writers.put(shard, block)
+                    size += block.nbytes
+                    advance(len(block))
+            writers.finish()
+    except BaseException:
+        writers.drop()
+        raise
+    finally:
+        encoder.close()
+    return size
+
+
+def _prepare(rollout: Rollout, encoder: Encoder, work: list, count: int, say: Callable[[str], None]) -> None:
+    """Compiles, measures a slice, says how much and how long it will be, and refuses what the disk cannot hold."""
+    name = f"{len(rollout.devices)} {rollout.devices[0].platform} device{'s' if len(rollout.devices) > 1 else ''}"
+    say(f"Compiling for {name} (a few seconds, kept for the next run) ...")
+    began = time.perf_counter()
+    split, first, pieces = work[0]
+    firsts = [first] * len(rollout.devices)
+    batch = _fitted(lambda: jax.block_until_ready(rollout.begin(split, firsts)))
+    while True:
+        try:
+            jax.block_until_ready(rollout.draw(batch, 0, rollout.slice))
+            break
+        except jax.errors.JaxRuntimeError as error:
+            if "RESOURCE_EXHAUSTED" not in str(error) or rollout.slice == 1:
+                raise _explained(error) from None
+            rollout.slice //= 2
+    compiled = time.perf_counter()
+    jax.block_until_ready(rollout.begin(split, firsts))
+    simulated = time.perf_counter()
+    job = jobs_of(firsts, [pieces, *([] for _ in firsts[1:])], rollout.lanes, rollout.slice)[0]
+    frames = jax.block_until_ready(rollout.draw(batch, job.start, rollout.slice))
+    drawn = time.perf_counter()
+    block = encoder.encode(job, rollout.host_columns(batch)[0], frames)
+    encoded = time.perf_counter()
+    per_video = (simulated - compiled) / (rollout.lanes * len(rollout.devices))
+    per_video += (drawn - simulated) / (rollout.slice * len(rollout.devices))
+    per_video += (encoded - drawn) / len(block) / threads_for(devices.cores())
+    size = block.nbytes / len(block) * count
+    say(f"Compiled in {compiled - began:.1f} s. {count:,} videos will take about {in_bytes(size)} and {in_time(per_video * count)}.")
+    free = shards.free_bytes(encoder.dataset.root)
+    if size > free:
+        raise FolderError(
+            f"{encoder.dataset.root} would need about {in_bytes(size)}, but its disk has {in_bytes(free)} free; "
+            "ask for fewer videos, or name another disk with --out"
+        )
+
+
+def _fitted(call: Callable[[], Any]) -> Any:
+    try:
+        return call()
+    except jax.errors.JaxRuntimeError as error:
+        raise _explained(error) from None
+
+
+def _explained(error: Exception) -> Exception:
+    if "RESOURCE_EXHAUSTED" in str(error):
+        return DeviceMemoryError("the device has too little memory for a batch: lower storage.lanes, or use --device cpu")
+    return error
+
+
+@contextmanager
+def _progress(count: int, say: Callable[[str], None]) -> Iterator[Callable[[int], None]]:
+    """A bar on a terminal; elsewhere a plain line every ten seconds. Yields what to call with each number of videos."""
+    if sys.stderr.isatty():
+        with tqdm(total=count, unit=" videos", smoothing=0.1, dynamic_ncols=True) as bar:
+            yield bar.update
+        return
+    began = told = time.perf_counter()
+    done = 0
+
+    def advance(videos: int) -> None:
+        nonlocal done, told
+        done += videos
+        now = time.perf_counter()
+        if now - told >= 10 and done < count:
+            told, speed = now, done / (now - began)
+            say(f"{done:,} of {count:,} videos, {speed:,.0f} videos/s, {in_time((count - done) / speed)} left")
+
+    yield advance
+
+
+@contextmanager
+def _stopping_on_sigterm() -> Iterator[None]:
+    """Makes SIGTERM stop the run as Ctrl-C does; a second signal of either kind ends the process at once."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def stop(number: int, _: Any) -> None:
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
+        raise KeyboardInterrupt(number)
+
+    before = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def in_bytes(size: float) -> str:
+    """A size for a person, such as 7.6 GB."""
+    for unit in ("B", "kB", "MB", "GB", "TB"):
+        if size < 1000 or unit == "TB":
+            break
+        size /= 1000
+    return f"{size:.0f} {unit}" if unit == "B" or size >= 100 else f"{size:.1f} {unit}"
+
+
+def in_time(seconds: float) -> str:
+    """A duration for a person, such as 2 min 5 s."""
+    if seconds < 59.5:
+        return f"{seconds:.0f} s" if seconds >= 10 else f"{seconds:.1f} s"
+    minutes, seconds = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours} h {minutes} min" if hours else f"{minutes} min {seconds} s"
+
+
+def command(arguments: Sequence[str]) -> str:
+    """The shell command that runs gen2d with these arguments."""
+    return " ".join(["python -m gen2d", *map(shlex.quote, arguments)])

@@ -1,0 +1,211 @@
+"""Between the device and the disk: host threads that compress, and writers that fill one shard after the other.
+
+The device is never waited for by the threads that write, nor they by it, beyond a fixed number of slices in flight, so
+memory is bounded by a batch and not by the number of videos.
+"""
+
+import dataclasses
+import os
+import queue
+from collections import deque
+from collections.abc import Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+
+import numpy as np
+
+from gen2d import shards
+from gen2d.errors import UserError
+from gen2d.rollout import Batch, Rollout, parts
+from gen2d.shards import Block, Dataset, Shard
+from gen2d.types import Array
+
+Piece = tuple[Shard, int, int]  # a shard's videos among those of a batch: lanes from the first to before the second
+
+
+class NoPlaceError(UserError):
+    """A scene in which the objects do not fit."""
+
+
+def batches(todo: Sequence[Shard], lanes: int) -> list[tuple[str, int, list[Piece]]]:
+    """The batches that hold these shards' videos, in order: split, number of the first video, and the shards' pieces.
+
+    Batch b holds the videos from b * lanes on, whatever the shards are, so that every video keeps its lane.
+    """
+    found: dict[tuple[str, int], list[Piece]] = {}
+    for shard in todo:
+        end = shard.first + shard.count
+        for first in range(shard.first // lanes * lanes, end, lanes):
+            piece = shard, max(shard.first - first, 0), min(end - first, lanes)
+            found.setdefault((shard.split, first), []).append(piece)
+    return [(split, first, pieces) for (split, first), pieces in found.items()]
+
+
+def groups(work: Sequence[tuple[str, int, list[Piece]]], devices: int) -> Iterator[tuple[str, list[int], list[list[Piece]]]]:
+    """The batches, as many at a time as there are devices; a device left over repeats the last batch for nothing."""
+    line = list(work)
+    while line:
+        split = line[0][0]
+        taken = [entry for entry in line[:devices] if entry[0] == split]
+        line = line[len(taken) :]
+        idle = devices - len(taken)
+        yield split, [e[1] for e in taken] + [taken[-1][1]] * idle, [e[2] for e in taken] + [[]] * idle
+
+
+@dataclasses.dataclass(eq=False)
+class Job:
+    """Videos of one shard that are drawn and compressed together: lanes `rows` of a device's batch."""
+
+    shard: Shard
+    device: int
+    first: int  # number of the video in the batch's lane 0
+    start: int  # lane of the slice's first video
+    rows: slice
+    future: Future[Block] | None = None
+
+
+def jobs_of(firsts: list[int], pieces: list[list[Piece]], lanes: int, size: int) -> list[Job]:
+    """The jobs of a group of batches in the order of their videos, in slices of `size` lanes."""
+    return [
+        Job(shard, device, firsts[device], start, slice(max(low, start), min(high, start + size)))
+        for device, own in enumerate(pieces)
+        for shard, low, high in own
+        for start in range(0, lanes, size)
+        if max(low, start) < min(high, start + size)
+    ]
+
+
+class Encoder:
+    """Draws batches slice by slice and compresses them in threads; `blocks` gives them back in order."""
+
+    def __init__(self, rollout: Rollout, dataset: Dataset, threads: int) -> None:
+        self.rollout, self.dataset = rollout, dataset
+        self.pool = ThreadPoolExecutor(threads, "encode")
+        self.limit = 2 * (len(rollout.devices) + threads)  # jobs in flight
+        self.running: deque[Future[Block]] = deque()
+
+    def encode(self, job: Job, columns: dict[str, np.ndarray], frames: Array) -> Block:
+        """The block of a job, from its device's columns and the frames of its slice on all devices."""
+        rows, start = job.rows, job.start
+        own = {name: column[rows] for name, column in columns.items()}
+        own["frames"] = parts(frames)[job.device][rows.start - start : rows.stop - start]
+        own["index"] = np.arange(job.first + rows.start, job.first + rows.stop, dtype=np.int64)
+        return shards.encode(own | self.rollout.camera(rows.stop - rows.start), self.dataset.fields, self.dataset.codec)
+
+    def blocks(self, work: Sequence[tuple[str, int, list[Piece]]]) -> Iterator[tuple[Shard, Block]]:
+        """Every block of these batches with its shard, in the order of the videos.
+
+        The next batch is begun before the last slices of this one are compressed, so neither waits for the other.
+        """
+        line: deque[Job] = deque()
+        waiting = list(groups(work, len(self.rollout.devices)))
+        batch = self.rollout.begin(*waiting[0][:2]) if waiting else None
+        for place, (_, firsts, pieces) in enumerate(waiting):
+            assert batch is not None
+            _check_placed(batch, firsts, pieces)
+            jobs = jobs_of(firsts, pieces, self.rollout.lanes, self.rollout.slice)
+            line.extend(jobs)
+            for _ in self._submitted(jobs, batch):
+                while line and line[0].future is not None and line[0].future.done():
+                    yield _result(line.popleft())
+            batch = self.rollout.begin(*waiting[place + 1][:2]) if place + 1 < len(waiting) else None
+        while line:
+            yield _result(line.popleft())
+
+    def _submitted(self, jobs: list[Job], batch: Batch) -> Iterator[int]:
+        columns = self.rollout.host_columns(batch)
+        for start in sorted({job.start for job in jobs}):
+            frames = self.rollout.draw(batch, start, self.rollout.slice)
+            for job in jobs:
+                if job.start == start:
+                    job.future = self._submit(job, columns[job.device], frames)
+            yield start
+
+    def _submit(self, job: Job, columns: dict[str, np.ndarray], frames: Array) -> Future[Block]:
+        while len(self.running) >= self.limit:
+            self.running.popleft().result()
+        self.running.append(self.pool.submit(self.encode, job, columns, frames))
+        return self.running[-1]
+
+    def close(self) -> None:
+        """Drops what has not begun and waits for the rest."""
+        self.pool.shutdown(wait=True, cancel_futures=True)
+
+
+def _result(job: Job) -> tuple[Shard, Block]:
+    assert job.future is not None
+    return job.shard, job.future.result()
+
+
+def _check_placed(batch: Batch, firsts: list[int], pieces: list[list[Piece]]) -> None:
+    for first, own, placed in zip(firsts, pieces, parts(batch.placed), strict=True):
+        for _, start, stop in own:
+            if not placed[start:stop].all():
+                number = first + start + int(np.argmin(placed[start:stop]))
+                raise NoPlaceError(
+                    f"scene: video {number} could not be placed without overlap in 100 attempts; "
+                    "ask for fewer or smaller objects, or for a larger box"
+                )
+
+
+class _Dropped(BaseException):
+    """Ends a writer whose shard is not wanted any more."""
+
+
+class Writers:
+    """Writes blocks into shards, each in a thread, so that hashing and syncing one goes on while the next fills."""
+
+    def __init__(self, dataset: Dataset) -> None:
+        self.dataset = dataset
+        self.pool = ThreadPoolExecutor(2, "write")
+        self.shard: Shard | None = None
+        self.line: queue.Queue[Block | None | _Dropped] = queue.Queue()
+        self.futures: deque[Future[dict]] = deque()
+
+    def put(self, shard: Shard, block: Block) -> None:
+        """Adds a block to its shard; blocks come in order, so another shard means that the last one is whole."""
+        if shard != self.shard:
+            self._end()
+            while len(self.futures) > 1:
+                self.futures.popleft().result()
+            self.shard, self.line = shard, queue.Queue(maxsize=16)
+            self.futures.append(self.pool.submit(shards.write, self.dataset, shard, _drained(self.line)))
+        self._send(block)
+
+    def _send(self, entry: Block | None | _Dropped) -> None:
+        while True:
+            try:
+                return self.line.put(entry, timeout=0.1)
+            except queue.Full:
+                if self.futures[-1].done():
+                    return  # it failed; whoever waits for it hears why
+
+    def _end(self) -> None:
+        if self.shard is not None:
+            self._send(None)
+        for future in [f for f in self.futures if f.done()]:
+            future.result()
+
+    def finish(self) -> None:
+        """Waits until every shard is written."""
+        self._end()
+        for future in self.futures:
+            future.result()
+        self.pool.shutdown()
+
+    def drop(self) -> None:
+        """Leaves the current shard unwritten; those that are whole are finished."""
+        if self.shard is not None:
+            self._send(_Dropped())
+        self.pool.shutdown(wait=True, cancel_futures=True)
+
+
+def _drained(line: queue.Queue) -> Iterator[Block]:
+    while (entry := line.get()) is not None:
+        if isinstance(entry, _Dropped):
+            raise entry
+        yield entry
+
+
+def threads_for(cores: int) -> int:
+    """How many host threads compress."""
+    return max(1, min(cores, int(os.environ.get("GEN2D_THREADS", cores))))

@@ -1,0 +1,192 @@
+"""The device's side of generation: video numbers in, ground truth and frames out, a fixed number of videos at a time.
+
+Two programs. `simulate` samples and simulates `lanes` videos on every device; `draw` draws a slice of them, small enough
+that its frames stay in the cache until they are compressed. `lanes` comes from the config, never from the machine, so
+more devices mean more batches, not wider ones, and video i always sits in lane i % lanes of the same program: its bits
+do not depend on how many videos are made, or where.
+"""
+
+import functools
+import zlib
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+
+from gen2d import factors, raster, types
+from gen2d.config import Config
+from gen2d.fields import Field
+from gen2d.simulate import simulate, substeps
+from gen2d.solver import Rules
+from gen2d.types import Array
+
+SLICE_BYTES = 16 * 2**20  # of raw frames drawn at once; larger buffers cost page faults
+SHARD_BYTES = 2**30  # of raw frames in a shard
+LANES, SHARD_VIDEOS = 128, 1024  # at most, unless the config says otherwise
+VIDEOS = PartitionSpec("videos")
+
+
+class Batch(NamedTuple):
+    """`lanes` simulated videos on each device, ready to be drawn."""
+
+    columns: dict[str, Array]  # stored fields but for the frames, [n, ...]
+    backdrops: Array
+    discs: raster.Moving
+    placed: Array  # [n] whether the sampler found a scene
+
+
+def _power_of_two(limit: int) -> int:
+    return 1 << max(0, limit.bit_length() - 1)
+
+
+class Rollout:
+    """The compiled programs of one config on some devices."""
+
+    def __init__(self, config: Config, devices: Sequence[jax.Device]) -> None:
+        self.config, self.devices = config, list(devices)
+        family, options, video = config.scene.module, config.scene.options, config.video
+        self.layout = family.layout(options)
+        self.view = _view(config, self.layout)
+        self.steps = substeps(video.fps, config.physics.substeps, config.physics.max_step)
+        frame_bytes = video.frames * video.height * video.width * 3
+        auto = min(SHARD_VIDEOS, _power_of_two(SHARD_BYTES // frame_bytes))
+        self.videos_per_shard = config.storage.videos_per_shard or auto
+        self.lanes = config.storage.lanes or min(LANES, auto)  # not the shard size: that must not change a video
+        self.slice = min(self.lanes, _power_of_two(max(1, SLICE_BYTES // frame_bytes)))
+        while self.lanes % self.slice:
+            self.slice -= 1
+        self.mesh = Mesh(np.array(self.devices), ("videos",))
+        self._simulate = jax.jit(self._shared(self._made, (PartitionSpec(), VIDEOS)))
+
+    def _shared(self, function: Any, specs: tuple) -> Any:
+        return jax.shard_map(function, mesh=self.mesh, in_specs=specs, out_specs=VIDEOS, check_vma=False)
+
+    @property
+    def sizes(self) -> dict[str, int]:
+        """The sizes of the lettered axes of every field."""
+        video, family = self.config.video, self.config.scene.module
+        own = {"T": video.frames, "K": self.layout.slots, "H": video.height, "W": video.width}
+        return own | family.sizes(self.config.scene.options)
+
+    @property
+    def fields(self) -> dict[str, Field]:
+        """Every stored field."""
+        records = (types.Objects, types.Scene, types.State, types.Quality)
+        fields = {name: field for record in records for name, (_, field) in types.described(record).items()}
+        fields["frames"] = Field("uint8", "n T H W 3", "sRGB", "the video")
+        fields["index"] = Field("int64", "n", "1", "the video's number in its split")
+        fields["time"] = Field("float64", "T", "s", "of each frame; frame 0 is the initial state")
+        fields["quality/rejected_draws"] = Field("int32", "n", "1", "places drawn again as they did not fit")
+        for name, axes, unit, meaning in CAMERA:
+            fields[f"camera/{name}"] = Field("float32", axes, unit, meaning)
+        for name, option in _factor_options(self.config).items():
+            axes = self.config.scene.module.FACTORS[name] + (f" {option.parts}" if option.parts else "")
+            fields[f"factors/{name}"] = Field("float32", axes, option.unit or "1", f"as drawn: {option.meaning}")
+        return dict(sorted(fields.items()))
+
+    @property
+    def time(self) -> np.ndarray:
+        """Of each frame, in seconds: t / fps exactly."""
+        return np.arange(self.config.video.frames, dtype=np.float64) / self.config.video.fps
+
+    def begin(self, split: str, firsts: Sequence[int]) -> Batch:
+        """Starts `lanes` videos on each device, from these numbers on; one number per device."""
+        numbers = np.concatenate([np.arange(first, first + self.lanes, dtype=np.uint32) for first in firsts])
+        root = np.asarray(factors.seed_words(self.config.seed, zlib.crc32(split.encode())))
+        return self._simulate(root, jax.device_put(numbers, NamedSharding(self.mesh, VIDEOS)))
+
+    def draw(self, batch: Batch, start: int, count: int) -> Array:
+        """Starts the frames [devices * count, T, H, W, 3] of `count` videos of each device, from lane `start` on."""
+        return self._draw(count)(batch.backdrops, batch.discs, np.int32(start))
+
+    @functools.lru_cache(maxsize=8)  # noqa: B019 (a Rollout lives as long as its run)
+    def _draw(self, count: int) -> Any:
+        def drawn(backdrops: Array, discs: raster.Moving, start: Array) -> Array:
+            cut = jax.tree.map(lambda x: jax.lax.dynamic_slice_in_dim(x, start, count), (backdrops, discs))
+            return raster.draw(*cut, self.layout.reach * self.view.scale)
+
+        return jax.jit(self._shared(drawn, (VIDEOS, VIDEOS, PartitionSpec())))
+
+    def _made(self, root: Array, numbers: Array) -> Batch:
+        """One device's share: from numbers to everything but the frames."""
+        config, layout = self.config, self.layout
+        keys = factors.video_keys(root, numbers)
+        drawn, scene, state, rejected, placed = jax.vmap(self._sampled)(keys)
+        rules = rules_of(config, self.steps)
+        device = types.to_device(scene), types.to_device(state)
+        made = types.to_stored(simulate(*device, layout, rules, config.video.frames, self.steps))
+        paint = jax.vmap(lambda s: config.look.module.paint(s, layout, config.look.options))(scene)
+        backdrops = jax.vmap(lambda s, t, p: raster.backdrop(s, t, p, layout, self.view))(scene, state, paint)
+        discs = raster.moving(scene, made.states, paint.color, layout, self.view)
+        columns = types.columns(scene) | types.columns(made)
+        columns |= {f"factors/{name}": values.astype(jnp.float32) for name, values in drawn.items()}
+        columns["quality/rejected_draws"] = rejected
+        return Batch(columns, backdrops, discs, placed)
+
+    def _sampled(self, key: Array) -> tuple:
+        family, options = self.config.scene.module, self.config.scene.options
+        sizes = family.sizes(options)
+        wanted = {
+            name: (getattr(options, name), tuple(sizes[a] for a in axes.split()[1:]))
+            for name, axes in family.FACTORS.items()
+        }
+        draw_key, place_key = jax.random.split(key)
+        drawn = factors.draw(draw_key, wanted)
+        return drawn, *family.sample(place_key, drawn, options)
+
+    def host_columns(self, batch: Batch) -> list[dict[str, np.ndarray]]:
+        """For each device its columns as NumPy arrays; waits until they are there."""
+        pieces = {name: parts(array) for name, array in batch.columns.items()}
+        return [{name: arrays[d] for name, arrays in pieces.items()} for d in range(len(self.devices))]
+
+    def camera(self, count: int) -> dict[str, np.ndarray]:
+        """The camera's fields for `count` videos."""
+        shape = (count, self.config.video.frames)
+        return {
+            "camera/center": np.broadcast_to(np.float32(self.view.center), (*shape, 2)),
+            "camera/scale": np.full(shape, self.view.scale, np.float32),
+            "camera/angle": np.zeros(shape, np.float32),
+        }
+
+
+CAMERA = (
+    ("center", "n T 2", "m", "world point in the middle of the frame"),
+    ("scale", "n T", "px/m", "pixels per metre"),
+    ("angle", "n T", "rad", "of the camera, counter-clockwise"),
+)
+
+
+def parts(array: Array) -> list[np.ndarray]:
+    """Each device's part of an array, in the order of the mesh, without a copy where the device is a CPU."""
+    pieces = sorted(array.addressable_shards, key=lambda piece: piece.index[0].start or 0)
+    return [np.asarray(piece.data) for piece in pieces]
+
+
+def rules_of(config: Config, steps: int) -> Rules:
+    """The solver's numbers, from the config."""
+    physics, step = config.physics, 1 / (config.video.fps * steps)
+    return Rules(
+        step=step,
+        bounce_threshold=physics.bounce_threshold,
+        hertz=min(physics.contact_hertz, 0.125 / step),
+        damping_ratio=physics.contact_damping_ratio,
+        push_speed=physics.push_speed,
+        damping=physics.damping,
+        mixing=physics.mixing,
+    )
+
+
+def _view(config: Config, layout: types.Layout) -> raster.View:
+    video, camera = config.video, config.camera
+    fitted = raster.fitted(layout.bounds, video.height, video.width, camera.margin)
+    center = camera.center or fitted.center
+    return raster.View(video.height, video.width, (center[0], center[1]), camera.scale or fitted.scale)
+
+
+def _factor_options(config: Config) -> dict[str, Any]:
+    """The option behind each factor that the family draws."""
+    known = type(config.scene.options).__dataclass_fields__
+    return {name: known[name].metadata["option"] for name in config.scene.module.FACTORS}
