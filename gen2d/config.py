@@ -87,7 +87,7 @@ class PhysicsOptions:
         "product", str, "", "of two elasticities or frictions", choices=("product", "mean", "max", "geometric")
     )
     damping: float = option(0.0, float, "1/s", "rate at which velocity and spin die away", low=0, high=1000)
-    bounce_threshold: float = option(0.01, float, "m/s", "slower impacts do not bounce", low=0)
+    bounce_threshold: float = option(0.01, float, "m/s", "slower impacts do not bounce, nor any that gravity makes in two steps", low=0)
     contact_hertz: float = option(
         30.0, float, "Hz", "stiffness of an overlapping contact; at most 1/8 of the step rate", above=0
     )

@@ -18,6 +18,7 @@ from tqdm import tqdm
 from gen2d import __version__, devices, shards
 from gen2d.config import Config, checked_seed, load_config
 from gen2d.errors import ConfigError, FolderError, UserError
+from gen2d.report import in_bytes, in_time
 from gen2d.pipeline import Encoder, Writers, batches, jobs_of, threads_for
 from gen2d.rollout import Rollout
 from gen2d.shards import Dataset, Shard
@@ -231,24 +232,6 @@ def _stopping_on_sigterm() -> Iterator[None]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
-
-
-def in_bytes(size: float) -> str:
-    """A size for a person, such as 7.6 GB."""
-    for unit in ("B", "kB", "MB", "GB", "TB"):
-        if size < 1000 or unit == "TB":
-            break
-        size /= 1000
-    return f"{size:.0f} {unit}" if unit == "B" or size >= 100 else f"{size:.1f} {unit}"
-
-
-def in_time(seconds: float) -> str:
-    """A duration for a person, such as 2 min 5 s."""
-    if seconds < 59.5:
-        return f"{seconds:.0f} s" if seconds >= 10 else f"{seconds:.1f} s"
-    minutes, seconds = divmod(round(seconds), 60)
-    hours, minutes = divmod(minutes, 60)
-    return f"{hours} h {minutes} min" if hours else f"{minutes} min {seconds} s"
 
 
 def command(arguments: Sequence[str]) -> str:

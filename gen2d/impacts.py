@@ -6,7 +6,9 @@ from gen2d.contacts import dot
 from gen2d.types import Array
 
 SLOWEST = 1e-12  # m/s or m: keeps a division finite where nothing moves or nothing has a size
-NEVER = -1.0  # s: of an impact that does not come within the step
+# In place of a time of impact, in s:
+NONE = -1.0  # a slow approach, or none: the soft contact has the say
+PASSES = -2.0  # a fast approach that stays apart in this step: nothing may touch it, it is an impact in a later one
 
 
 def _root(x: Array) -> Array:
@@ -14,7 +16,7 @@ def _root(x: Array) -> Array:
 
 
 def disc_impact(
-    apart: Array, inverse: Array, reach: Array, velocity: Array, elasticity: Array, h: float, threshold: float
+    apart: Array, inverse: Array, reach: Array, velocity: Array, h: float, threshold: Array
 ) -> tuple[Array, Array]:
     """Time of impact of two discs, and what scales their offset at that time to a unit normal.
 
@@ -27,26 +29,26 @@ def disc_impact(
     left = gap * (gap + 2 * reach)
     inside = closing**2 - dot(velocity, velocity) * left
     tau = left / jnp.maximum(_root(inside) - closing, SLOWEST)
-    bounces = (closing * inverse < -threshold) & (inside > 0) & (tau <= h) & (elasticity > 0)
-    return jnp.where(bounces, tau, NEVER), jnp.where(bounces & (gap > 0), 1 / jnp.maximum(reach, SLOWEST), inverse)
+    fast, meet = closing * inverse < -threshold, (inside > 0) & (tau <= h)
+    scale = jnp.where(fast & meet & (gap > 0), 1 / jnp.maximum(reach, SLOWEST), inverse)
+    return jnp.where(fast, jnp.where(meet, tau, PASSES), NONE), scale
 
 
 def wall_impact(
-    gap: Array, speed: Array, pull: Array, elasticity: Array, h: float, threshold: float
+    gap: Array, speed: Array, pull: Array, elasticity: Array, h: float, threshold: Array
 ) -> tuple[Array, Array]:
     """Time of impact of a disc on a fixed plane, and its normal speed at the end of the step.
 
     `gap` is the distance at the start, `speed` the normal speed with this step's gravity in it, `pull` gravity's part
     towards the plane (a below). With V the approach speed at the start the disc arrives at u = sqrt(V^2 + 2 a gap),
-    after tau = 2 gap / (V + u), and leaves at e u, of which gravity takes a (h - tau) until the end. An impact so slow
-    that the disc would fall again within the step is left to the soft contact.
+    after tau = 2 gap / (V + u), and leaves at e u, of which gravity takes a (h - tau) until the end. Where gravity takes
+    all of it the disc has come to rest.
     """
     approach = -speed - pull * h
     above = jnp.maximum(gap, 0.0)
     squared = approach**2 + 2 * pull * above
     arrival = _root(squared)
     tau = 2 * above / jnp.maximum(approach + arrival, SLOWEST)
-    target = elasticity * arrival - pull * (h - tau)
+    target = jnp.maximum(elasticity * arrival - pull * (h - tau), 0.0)
     closes = gap + h * speed + 0.5 * h**2 * pull < 0
-    bounces = closes & (squared > 0) & (approach > threshold) & (target > 0) & (elasticity > 0)
-    return jnp.where(bounces, tau, NEVER), target
+    return jnp.where(approach > threshold, jnp.where(closes & (squared > 0), tau, PASSES), NONE), target

@@ -42,7 +42,7 @@ def _pair_rows(discs: Discs, mixing: str) -> list[Row]:
     return tournament(discs, discs.radius.shape[0] - 1, play)[1]
 
 
-def _setup(scene: Scene, state: State, layout: Layout, mixing: str) -> Setup:
+def _setup(scene: Scene, state: State, layout: Layout, rules: Rules) -> Setup:
     discs = _discs(scene.objects, layout.discs, layout.discs + layout.discs % 2)
     segments, walls = [], []
     for k in range(layout.discs, layout.slots):
@@ -52,11 +52,15 @@ def _setup(scene: Scene, state: State, layout: Layout, mixing: str) -> Setup:
         e, mu = (jnp.broadcast_to(x[k], nothing.shape) for x in (scene.objects.elasticity, scene.objects.friction))
         fixed = Discs(nothing, nothing, nothing, e, mu)
         present = scene.objects.present[k] & (discs.inverse_mass > 0)
-        walls.append(row(fixed, discs, present, mixing))
+        walls.append(row(fixed, discs, present, rules.mixing))
         size = scene.objects.half_length[k], scene.objects.radius[k]
         segments.append(Segments(state.position[:, k, None], direction[:, None], *size))
     one = 1.0 + jnp.maximum(-jnp.max(discs.radius), 0.0)  # no radius is negative, but the compiler cannot know
-    return Setup(scene.gravity, _pair_rows(discs, mixing), walls, segments, discs.radius, one)
+    # In a pile at rest, what has to be stopped anew each step is what gravity gave: that must not count as a bounce.
+    at_rest = 2 * rules.step * jnp.sqrt(jnp.sum(scene.gravity**2, axis=0))
+    threshold = jnp.maximum(rules.bounce_threshold, at_rest)
+    fall = scene.gravity[:, None] * (discs.inverse_mass > 0)
+    return Setup(scene.gravity, fall, threshold, _pair_rows(discs, rules.mixing), walls, segments, discs.radius, one)
 
 
 def _nothing_yet(setup: Setup) -> Memory:
@@ -78,7 +82,7 @@ def simulate(scene: Scene, state: State, layout: Layout, rules: Rules, frames: i
     """
     scene = dataclasses.replace(scene, objects=_clean_objects(scene.objects))
     state = _clean(state, scene.objects.present)
-    setup = _setup(scene, state, layout, rules.mixing)
+    setup = _setup(scene, state, layout, rules)
     discs, padding = layout.discs, layout.discs % 2
 
     def moving(x: Array) -> Array:

@@ -31,7 +31,7 @@ import jax
 import jax.numpy as jnp
 
 from gen2d.contacts import Segments, dot, inverse_length, segment_disc, turned
-from gen2d.impacts import NEVER, disc_impact, wall_impact
+from gen2d.impacts import NONE, PASSES, disc_impact, wall_impact
 from gen2d.tournament import settled, tournament
 from gen2d.types import Array
 
@@ -41,7 +41,7 @@ class Rules:
     """The numbers of a step; `simulate.rules` makes them from the config."""
 
     step: float  # s
-    bounce_threshold: float  # m/s: slower impacts do not bounce
+    bounce_threshold: float  # m/s: slower impacts do not bounce, nor do those that gravity makes in two steps
     hertz: float  # stiffness of an overlapping contact; twice that against a fixed object
     damping_ratio: float
     push_speed: float  # m/s: an overlap is undone no faster
@@ -88,7 +88,7 @@ class Drift(NamedTuple):
 
 
 class Touch(NamedTuple):
-    """A row as it stands in this step; tau < 0 where it does not bounce."""
+    """A row as it stands in this step; tau < 0 where it does not bounce (impacts.py)."""
 
     normal: Array
     gap: Array
@@ -105,7 +105,9 @@ class Impulse(NamedTuple):
 class Setup(NamedTuple):
     """What stays the same for a whole video."""
 
-    gravity: Array  # [2, ...]
+    gravity: Array  # [2, ...] m/s^2
+    fall: Array  # [2, N, ...] m/s^2: gravity where there is a body, else 0
+    threshold: Array  # [...] m/s: slower impacts do not bounce
     pairs: list[Row]
     walls: list[Row]
     segments: list[Segments]
@@ -163,22 +165,34 @@ def row(a: Discs, b: Discs, present: Array, mixing: str) -> Row:
 def biased(row: Row, touch: Touch, speed: Array, target: Array, old: Impulse, hertz: float, rules: Rules) -> Array:
     """The accumulated normal impulse after the biased solve of a row.
 
-    Apart: the gap may be closed, no more. Overlapping: a soft push. Bouncing: `target` exactly.
+    Apart: the gap may be closed, no more. Overlapping: a soft push. Bouncing: `target` exactly. Passing: nothing, as
+    the straight line of a soft contact would stop a body that only grazes the other, or that comes a step later.
     """
     rate, mass_scale, impulse_scale = rules.softness(hertz)
     apart = touch.gap > 0
     bias = jnp.where(apart, touch.gap / rules.step, jnp.maximum(rate * touch.gap, -rules.push_speed))
     soft = old.normal - jnp.where(apart, 1.0, mass_scale) * row.normal_mass * (speed + bias)
     soft = jnp.maximum(soft - jnp.where(apart, 0.0, impulse_scale) * old.normal, 0.0)
+    soft = jnp.where(touch.tau == PASSES, 0.0, soft)
     hard = old.normal + row.normal_mass * (target - speed)
     return jnp.where(row.normal_mass > 0, jnp.where(touch.tau >= 0, hard, soft), 0.0)
 
 
-def relaxed(row: Row, touch: Touch, speed: Array, old: Impulse) -> Array:
-    """The accumulated normal impulse after the relaxing solve: no bias, and no say for a row that bounced or that is
-    apart and carried nothing (else it would brake a body one step before its impact)."""
-    pushes = (touch.tau < 0) & ((old.normal > 0) | (touch.gap <= 0)) & (row.normal_mass > 0)
-    return jnp.where(pushes, jnp.maximum(old.normal - row.normal_mass * speed, 0.0), old.normal)
+def struck(row: Row, touch: Touch, speed: Array, threshold: Array) -> Array:
+    """Where a neighbour's bounce has closed a row that is in contact: it bounces, too."""
+    return (speed < -threshold) & (touch.gap <= 0) & (row.normal_mass > 0)
+
+
+def relaxed(row: Row, touch: Touch, speed: Array, old: Impulse, threshold: Array) -> Array:
+    """The accumulated normal impulse after the relaxing solve, without bias.
+
+    No say has a row that bounced and parts, one that is apart and carried nothing (it would brake a body one step
+    before its impact), and one that a neighbour closes across a gap (it bounces in a later step).
+    """
+    pushes = (touch.tau < 0) & ((old.normal > 0) | (touch.gap <= 0)) & (speed >= -threshold) & (row.normal_mass > 0)
+    soft = jnp.where(pushes, jnp.maximum(old.normal - row.normal_mass * speed, 0.0), old.normal)
+    hard = old.normal - (1 + row.elasticity) * row.normal_mass * speed
+    return jnp.where(struck(row, touch, speed, threshold), hard, soft)
 
 
 def rubbed(row: Row, normal_impulse: Array, slip: Array, old: Impulse) -> Array:
@@ -192,9 +206,9 @@ def difference(new: Impulse, old: Impulse) -> Impulse:
     return Impulse(new.normal - old.normal, new.tangent - old.tangent)
 
 
-def remembered(touch: Touch, impulse: Impulse) -> Impulse:
-    """What may warm-start the next step: a bounce may not."""
-    return jax.tree.map(lambda x: jnp.where(touch.tau >= 0, 0.0, x), impulse)
+def remembered(touch: Touch, again: Array, impulse: Impulse) -> Impulse:
+    """What may warm-start the next step: a bounce may not, be it in the biased pass or now."""
+    return jax.tree.map(lambda x: jnp.where((touch.tau >= 0) | again, 0.0, x), impulse)
 
 
 def slip_of(row: Row, normal: Array, velocity: Array, spin_a: Array | float, spin_b: Array) -> Array:
@@ -244,19 +258,19 @@ def warm(position: Array, motion: Motion, memory: Memory, setup: Setup) -> tuple
         normal, gap = settled(segment_disc(segment, position, setup.radius), setup.one)
         push = along(normal, old)
         motion = settled(pushed(motion, push, old.tangent, row.inverse_mass_b, row.turn_b), setup.one)
-        touches.append(Touch(normal, gap, jnp.full_like(gap, NEVER)))
+        touches.append(Touch(normal, gap, jnp.full_like(gap, NONE)))
     return motion, offsets, touches
 
 
 def solve(motion: Motion, offsets: list, touches: list[Touch], memory: Memory, setup: Setup, rules: Rules) -> tuple:
     """Motion and drift after the biased pass, and (touch, impulse) of every row of pairs and of walls."""
-    h, threshold = rules.step, rules.bounce_threshold
+    h, threshold = rules.step, setup.threshold
 
     def play(k: int, a: tuple, b: tuple) -> tuple:
         row, old, (apart, inverse) = setup.pairs[k], memory.pairs[k], offsets[k]
         (motion_a, drift_a), (motion_b, drift_b) = a, b
         velocity, reach = motion_b.velocity - motion_a.velocity, row.arm_a + row.arm_b
-        impact = disc_impact(apart, inverse, reach, velocity, row.elasticity, h, threshold)
+        impact = disc_impact(apart, inverse, reach, velocity, h, threshold)
         tau, scale = settled(impact, setup.one)
         normal = settled((apart + jnp.maximum(tau, 0.0) * velocity) * scale, setup.one)
         touch, speed = Touch(normal, 1 / inverse - reach, tau), dot(normal, velocity)
@@ -292,27 +306,29 @@ def relax(motion: Motion, pairs: list, walls: list, setup: Setup) -> tuple[Motio
     """The motion after the relaxing pass, and what each row leaves to the next step."""
 
     def again(row: Row, touch: Touch, old: Impulse, velocity: Array, slip: Array) -> tuple[Impulse, Impulse]:
-        pressed = settled(relaxed(row, touch, dot(touch.normal, velocity), old), setup.one)
+        speed = dot(touch.normal, velocity)
+        pressed = settled(relaxed(row, touch, speed, old, setup.threshold), setup.one)
         impulse = Impulse(pressed, settled(rubbed(row, pressed, slip, old), setup.one))
-        return impulse, difference(impulse, old)
+        left = settled(remembered(touch, struck(row, touch, speed, setup.threshold), impulse), setup.one)
+        return left, difference(impulse, old)
 
     def play(k: int, a: Motion, b: Motion) -> tuple:
         row, (touch, old) = setup.pairs[k], pairs[k]
         velocity = b.velocity - a.velocity
-        impulse, added = again(row, touch, old, velocity, slip_of(row, touch.normal, velocity, a.spin, b.spin))
+        left, added = again(row, touch, old, velocity, slip_of(row, touch.normal, velocity, a.spin, b.spin))
         push = along(touch.normal, added)
         a = pushed(a, -push, added.tangent, row.inverse_mass_a, row.turn_a)
         b = pushed(b, push, added.tangent, row.inverse_mass_b, row.turn_b)
-        return a, b, settled(remembered(touch, impulse), setup.one)
+        return a, b, left
 
     motion, pair_memory = tournament(motion, len(setup.pairs), play, setup.one)
     wall_memory = []
     for row, (touch, old) in zip(setup.walls, walls, strict=True):
         slip = slip_of(row, touch.normal, motion.velocity, 0.0, motion.spin)
-        impulse, added = again(row, touch, old, motion.velocity, slip)
+        left, added = again(row, touch, old, motion.velocity, slip)
         push = along(touch.normal, added)
         motion = settled(pushed(motion, push, added.tangent, row.inverse_mass_b, row.turn_b), setup.one)
-        wall_memory.append(settled(remembered(touch, impulse), setup.one))
+        wall_memory.append(left)
     return motion, pair_memory, wall_memory
 
 
@@ -326,14 +342,14 @@ def seen(depth: Array, begins: Array, rows: list[Row], touched: list, memory: li
 
 def step(position: Array, angle: Array, motion: Motion, memory: Memory, setup: Setup, rules: Rules) -> tuple:
     """Position [2, N, ...], angle [N, ...], motion and memory one step later."""
-    h, gravity = rules.step, setup.gravity[:, None]
+    h = rules.step
     slowed = math.exp(-rules.damping * h)
-    falling = Motion((motion.velocity + h * gravity) * slowed, motion.spin * slowed)
+    falling = Motion((motion.velocity + h * setup.fall) * slowed, motion.spin * slowed)
     warmed, offsets, touches = warm(position, settled(falling, setup.one), memory, setup)
     moving, drift, pairs, walls = solve(warmed, offsets, touches, memory, setup, rules)
     # Free fall is an exact parabola: x += h v + h^2 g / 2 with v from before, that is, h v_new - h^2 g / 2.
     free = 0.5 * h**2 * (1 - drift.held)
-    position = position + h * moving.velocity + drift.shift - free * gravity
+    position = position + h * moving.velocity + drift.shift - free * setup.fall
     angle = angle + h * moving.spin + drift.turn
     position, angle = settled((position, angle), setup.one)
     motion, pair_memory, wall_memory = relax(moving, pairs, walls, setup)

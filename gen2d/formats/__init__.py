@@ -44,6 +44,21 @@ class Places:
     rows: Mapping[str, int]  # the others: offset of the first video, the rest follow without gaps
 
 
+def image_names(fields: Mapping[str, Field]) -> list[str]:
+    """The fields that are stored compressed, sorted."""
+    return sorted(name for name, field in fields.items() if field.is_image)
+
+
+def row_names(fields: Mapping[str, Field]) -> list[str]:
+    """The fields of each video that are stored as they are, sorted."""
+    return sorted(name for name, field in fields.items() if field.per_video and not field.is_image)
+
+
+def stored_bytes(field: Field, sizes: Mapping[str, int]) -> int:
+    """What one video's value takes before compression."""
+    return int(np.prod(field.shape(sizes))) * np.dtype(field.dtype).itemsize
+
+
 def encode(columns: Mapping[str, np.ndarray], fields: Mapping[str, Field], codec: str) -> Block:
     """A Block of m videos from columns `[m, ...]` as stored; spends its time in code that releases the GIL."""
     columns = {name: _checked(name, columns[name], field) for name, field in fields.items() if field.per_video}

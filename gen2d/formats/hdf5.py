@@ -16,7 +16,7 @@ import numpy as np
 
 from gen2d import codecs
 from gen2d.fields import Field
-from gen2d.formats import Block, Places
+from gen2d.formats import Block, Places, image_names, row_names
 
 _ZSTD = codecs.HDF5_FILTERS["zstd"][0]
 
@@ -36,8 +36,7 @@ def write(
     `blocks` hold the videos in order; chunks are written as they arrive, so that memory holds one block, never a shard
     of images. `constants` are the values of the fields that are one for all videos. Raises OSError when the disk does.
     """
-    images = sorted(name for name, field in fields.items() if field.is_image)
-    rows = sorted(name for name, field in fields.items() if field.per_video and not field.is_image)
+    images, rows = image_names(fields), row_names(fields)
     with _new(path) as file:
         file.attrs.update(attributes)
         shapes = {name: (count, *fields[name].shape(sizes)) for name in images + rows}
@@ -107,18 +106,17 @@ def _numbered(blocks: Iterable[Block], count: int, path: Path) -> Iterator[tuple
     """Each block with the row of its first video; insists on `count` videos in all."""
     first = 0
     for block in blocks:
-        size = len(next(iter(block.crc.values())))
-        if first + size > count:
-            raise ValueError(f"{path.name} takes {count} videos, but was given {first + size} or more")
+        if first + len(block) > count:
+            raise ValueError(f"{path.name} takes {count} videos, but was given {first + len(block)} or more")
         yield first, block
-        first += size
+        first += len(block)
     if first != count:
         raise ValueError(f"{path.name} takes {count} videos, but was given {first}")
 
 
 def _write_chunks(chunked: Mapping[str, h5py.Dataset], block: Block, first: int) -> None:
     # Video by video, so that the file does not depend on the size of a block.
-    for row in range(len(next(iter(block.crc.values())))):
+    for row in range(len(block)):
         for name, dataset in chunked.items():
             corner = (first + row,) + (0,) * (dataset.ndim - 1)
             dataset.id.write_direct_chunk(corner, block.chunks[name][row])

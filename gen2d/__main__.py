@@ -1,0 +1,197 @@
+"""The command line: `python -m gen2d --config bouncing.yaml --n 100000`, and verbs for what a dataset needs later."""
+
+import argparse
+import json
+import os
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NoReturn
+
+from gen2d import __version__
+from gen2d.errors import DamagedError, UserError
+
+VERBS = {
+    "verify": "check a dataset against its checksums",
+    "info": "tell what a dataset holds",
+    "list": "list scene families, looks and configs, with all options",
+    "preview": "draw a contact sheet and an animation of a dataset or a config",
+}
+
+GUIDE = """\
+what people do:
+  python -m gen2d --config bouncing.yaml --n 1000            make 1000 videos in datasets/bouncing
+  python -m gen2d --config bouncing.yaml --n 100000          make 99000 more: what is there stays
+  python -m gen2d --config my.yaml --n 1000 --seed 7 --out /data/mine
+  python -m gen2d --config bouncing.yaml --n 1000 --set video.height=128 --set video.width=128
+  python -m gen2d preview bouncing.yaml                      look at it first
+
+other verbs (each has its own --help):
+"""
+
+
+class Parser(argparse.ArgumentParser):
+    """Says what is wrong in one sentence and exits with code 2."""
+
+    def error(self, message: str) -> NoReturn:
+        fail(f"{message}; see {self.prog} --help", 2)
+
+
+def fail(sentence: str, code: int) -> NoReturn:
+    """Ends the program with a sentence for a person."""
+    print(f"gen2d: {sentence}", file=sys.stderr)
+    raise SystemExit(code)
+
+
+def generating() -> Parser:
+    """The parser of the main job."""
+    verbs = "\n".join(f"  python -m gen2d {name:<10} {what}" for name, what in VERBS.items())
+    parser = Parser(
+        prog="python -m gen2d",
+        description="Make a dataset of rendered videos of 2D rigid bodies, with every ground truth.",
+        epilog=GUIDE + verbs,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--config", required=True, metavar="YAML", help="a file, or the name of one that comes with gen2d")
+    parser.add_argument("--n", required=True, type=int, metavar="N", help="how many videos the dataset is to hold")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="where (default: datasets/NAME in the current folder)")
+    parser.add_argument("--seed", type=int, metavar="S", help="0 to 2**63 - 1 (default: the config's, else 0)")
+    parser.add_argument("--split", default="train", metavar="NAME", help="the split that the videos belong to (train)")
+    parser.add_argument(
+        "--set", action="append", default=[], metavar="A.B=V", dest="sets", help="override one option, such as physics.substeps=8"
+    )
+    parser.add_argument("--device", default="auto", choices=("auto", "cpu", "gpu"), help="where to compute (auto: a GPU if there is one)")
+    parser.add_argument("--worker", default="0/1", metavar="R/W", help="make every W-th shard, from the R-th on, beside other workers")
+    parser.add_argument("--overwrite", action="store_true", help="replace a dataset of another config or seed")
+    parser.add_argument("--version", action="version", version=f"gen2d {__version__}")
+    return parser
+
+
+def _verb_parser(verb: str) -> Parser:
+    parser = Parser(prog=f"python -m gen2d {verb}", description=VERBS[verb].capitalize() + ".")
+    if verb == "list":
+        parser.add_argument("name", nargs="?", help="a family, look or config: only this one")
+        return parser
+    help_text = "a dataset's folder" + (", or a config" if verb == "preview" else "")
+    parser.add_argument("dataset", metavar="DIR" + ("|CONFIG" if verb == "preview" else ""), help=help_text)
+    if verb == "verify":
+        parser.add_argument("--level", choices=("quick", "full"), default="full", help="quick: sizes and index; full: every byte")
+        parser.add_argument("--json", action="store_true", help="print the problems as JSON")
+    if verb == "preview":
+        parser.add_argument("--out", type=Path, metavar="FOLDER", help="where to put the pictures (default: the current folder)")
+        parser.add_argument("--videos", type=int, default=8, help="how many rows of the sheet (8)")
+        parser.add_argument("--seed", type=int, default=None, help="of a config")
+        parser.add_argument("--set", action="append", default=[], dest="sets", metavar="A.B=V", help="override an option of a config")
+    return parser
+
+
+def _worker(text: str) -> tuple[int, int]:
+    number, slash, count = text.partition("/")
+    if not slash or not number.isdigit() or not count.isdigit():
+        raise UserError(f"--worker is {text!r}, but must be R/W, such as 0/4")
+    return int(number), int(count)
+
+
+def generate(arguments: Sequence[str]) -> int:
+    """The main job; 0, or 130 when it was interrupted."""
+    options = generating().parse_args(arguments)
+    from gen2d import generate as job  # imports jax: only now
+
+    begin = job.generate
+    try:
+        summary = begin(
+            options.config,
+            options.n,
+            options.out,
+            seed=options.seed,
+            split=options.split,
+            sets=options.sets,
+            device=options.device,
+            worker=_worker(options.worker),
+            overwrite=options.overwrite,
+            say=lambda line: print(line, file=sys.stderr, flush=True),
+        )
+    except KeyboardInterrupt:
+        again = [a for a in arguments if a != "--overwrite"]
+        fail(f"stopped; whole shards are kept. To go on: {job.command(again)}", 130)
+    print(_told(summary))
+    return 0
+
+
+def _told(summary: Any) -> str:
+    from gen2d.report import in_bytes, in_time
+
+    if not summary.made:
+        ready = "is complete" if summary.complete else "has all of this worker's shards"
+        return f"{summary.out} {ready}: nothing to do."
+    text = f"{summary.made:,} videos in {in_time(summary.seconds)} ({summary.videos_per_second:,.0f} videos/s), {in_bytes(summary.bytes)}, in {summary.out}"
+    return text if summary.complete else text + "; other workers' shards are still missing"
+
+
+def verify(arguments: Sequence[str]) -> int:
+    """0 if the dataset is whole, else 1 and what is wrong."""
+    options = _verb_parser("verify").parse_args(arguments)
+    from gen2d.verify import verify as check
+
+    problems = check(options.dataset, options.level)
+    if options.json:
+        print(json.dumps({"dataset": options.dataset, "level": options.level, "problems": problems}))
+    else:
+        print("\n".join(problems) if problems else f"{options.dataset}: whole ({options.level} check)")
+    return 1 if problems else 0
+
+
+def info(arguments: Sequence[str]) -> int:
+    """0, and a data sheet."""
+    options = _verb_parser("info").parse_args(arguments)
+    from gen2d.report import sheet
+
+    print(sheet(Path(options.dataset)))
+    return 0
+
+
+def listing(arguments: Sequence[str]) -> int:
+    """0, and every plug-in and option."""
+    options = _verb_parser("list").parse_args(arguments)
+    from gen2d.report import plugins_text
+
+    print(plugins_text(options.name))
+    return 0
+
+
+def preview(arguments: Sequence[str]) -> int:
+    """0, and the names of the pictures made."""
+    options = _verb_parser("preview").parse_args(arguments)
+    from gen2d.preview import preview as draw
+
+    made = draw(options.dataset, options.out or Path(), options.videos, seed=options.seed, sets=options.sets)
+    print("\n".join(map(str, made)))
+    return 0
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """The exit code: 0, 1 for damaged data or a full disk, 2 for what the user can mend, 130 when interrupted."""
+    arguments = sys.argv[1:] if arguments is None else list(arguments)
+    verbs = {"verify": verify, "info": info, "list": listing, "preview": preview}
+    verb = verbs.get(arguments[0]) if arguments else None
+    try:
+        if verb:
+            return verb(arguments[1:])
+        if not arguments:
+            generating().print_help()
+            return 0
+        if not arguments[0].startswith("-"):
+            known = ", ".join(VERBS)
+            fail(f"{arguments[0]!r} is not a verb; there are {known}, and without a verb --config and --n", 2)
+        return generate(arguments)
+    except (UserError, DamagedError) as error:
+        fail(str(error), error.exit_code)
+    except KeyboardInterrupt:
+        fail("stopped", 130)
+    except BrokenPipeError:  # the reader of our output went away, as `head` does
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

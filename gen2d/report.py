@@ -1,0 +1,101 @@
+"""What a dataset holds, and what gen2d knows, as text for a terminal."""
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+from gen2d.errors import ConfigError
+from gen2d.shards import read_manifest
+
+
+def in_bytes(size: float) -> str:
+    """A size for a person, such as 7.6 GB."""
+    for unit in ("B", "kB", "MB", "GB", "TB"):
+        if size < 1000 or unit == "TB":
+            break
+        size /= 1000
+    return f"{size:.0f} {unit}" if unit == "B" or size >= 100 else f"{size:.1f} {unit}"
+
+
+def in_time(seconds: float) -> str:
+    """A duration for a person, such as 2 min 5 s."""
+    if seconds < 59.5:
+        return f"{seconds:.0f} s" if seconds >= 10 else f"{seconds:.1f} s"
+    minutes, seconds = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours} h {minutes} min" if hours else f"{minutes} min {seconds} s"
+
+
+def _table(rows: list[tuple[str, ...]]) -> list[str]:
+    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
+    return ["  " + "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
+
+
+def sheet(root: Path) -> str:
+    """The data sheet of a dataset: what it holds, field by field, and what made it."""
+    manifest = read_manifest(root)
+    splits = ", ".join(f"{name}: {count:,} videos" for name, count in manifest["splits"].items())
+    size = sum(shard["bytes"] for shard in manifest["shards"])
+    sizes = ", ".join(f"{name} = {value}" for name, value in manifest["sizes"].items())
+    rows = [("field", "type", "axes", "unit", "meaning")]
+    rows += [(name, f["dtype"], f["axes"], f["unit"], f["meaning"]) for name, f in manifest["fields"].items()]
+    producer = manifest["producer"]
+    versions = ", ".join(f"{key} {value}" for key, value in producer.items() if key != "fingerprint")
+    fingerprint = ", ".join(f"{key} {value or '-'}" for key, value in manifest["fingerprint"].items())
+    return "\n".join(
+        [
+            f"{manifest['name']} ({root})",
+            f"  {splits}; {in_bytes(size)} in {len(manifest['shards'])} shards; seed {manifest['seed']}, {manifest['fps']:g} frames/s",
+            f"  sizes: {sizes}",
+            "",
+            *_table(rows),
+            "",
+            f"  made by {versions}",
+            f"  bits fixed by {fingerprint}",
+        ]
+    )
+
+
+def plugins_text(name: str | None = None) -> str:
+    """Families, looks and configs with their options; only `name` if it is given."""
+    from gen2d import config, plugins  # imports jax
+
+    lines: list[str] = []
+    for kind, title in (("scene", "Scene families"), ("look", "Looks")):
+        found = [n for n in plugins.names(kind) if name in (None, n)]
+        lines += [f"{title}:"] if found else []
+        for plugin in found:
+            module = plugins.load(kind, plugin)
+            lines += [f" {plugin}: {(module.__doc__ or '').strip().splitlines()[0]}", *_options(kind, module.Options), ""]
+    configs = [c for c in plugins.config_names() if name in (None, c, c.removesuffix(".yaml"))]
+    if configs:
+        lines += [f"Configs (in {plugins.config_folder()}):", *(f"  {c}" for c in configs), ""]
+    if name is None:
+        lines.append("Sections that every config has:")
+        for section, options in config.SECTIONS.items():
+            lines += [f" {section}: {(options.__doc__ or '').strip().splitlines()[0]}", *_options(section, options), ""]
+    if not lines:
+        names = [*plugins.names("scene"), *plugins.names("look"), *plugins.config_names()]
+        raise ConfigError(f"{name!r} is not known; {plugins.nearest(name or '', names)}")
+    return "\n".join(lines).rstrip()
+
+
+def _options(where: str, options: type) -> list[str]:
+    rows = []
+    for field in dataclasses.fields(options):
+        spec = field.metadata["option"]
+        unit = f" {spec.unit}" if spec.unit not in ("", "1") else ""
+        about = f"{spec.meaning}; {spec.allowed}" + (", drawn" if spec.draw else "")
+        rows.append((f"{where}.{field.name}", f"{_shown(field.default)}{unit}", about))
+    return _table(rows)
+
+
+def _shown(value: Any) -> str:
+    if isinstance(value, tuple):
+        return "[" + ", ".join(map(_shown, value)) + "]"
+    if hasattr(value, "plain"):
+        plain = value.plain()
+        if isinstance(plain, dict) and set(plain) <= {"uniform", "integer"}:
+            plain = next(iter(plain.values()))
+        return str(plain).replace("'", "")
+    return "null" if value is None else f"{value:.6g}" if isinstance(value, float) else str(value)

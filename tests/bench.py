@@ -1,0 +1,404 @@
+"""How fast gen2d is, part by part, beside peer.py, and whether it keeps what it promises.
+
+    python tests/bench.py                 # all, about 5 minutes
+    python tests/bench.py --quick         # only what a change to the code should be tried on
+
+Machines are noisy, so whatever is compared is measured in turns, and a ratio is the median of the ratios of the turns.
+Every measurement runs in a process of its own, on the cores that it is given, and in folders that vanish.
+"""
+
+import argparse
+import contextlib
+import importlib.metadata
+import json
+import os
+import platform
+import re
+import resource
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+HERE = Path(__file__).resolve()
+CONFIG = "benchmark.yaml"
+FRAMES_BYTES = 64 * 64 * 64 * 3  # of a raw video
+STAGES = ("sampler", "simulate", "render", "transfer", "compress", "write")
+CORES = sorted(os.sched_getaffinity(0))
+Turns = Mapping[str, Sequence[float]]  # by name: what was measured in each turn
+
+
+# ---- Measurements, each in a process of its own
+
+
+def in_turns(works: Mapping[str, Callable[[], float]], turns: int) -> dict[str, list[float]]:
+    """What each of the works returns, in each turn; one round before them is not counted."""
+    found = [{name: work() for name, work in works.items()} for _ in range(turns + 1)][1:]
+    return {name: [turn[name] for turn in found] for name in works}
+
+
+def stages(folder: Path, turns: int = 5, peer_videos: int = 32, sets: Sequence[str] = ()) -> Turns:
+    """Seconds a video of each stage of gen2d, and of the peer's stepping and drawing, on this process's cores."""
+    import cv2
+    import peer
+
+    cv2.setNumThreads(1)
+    works = {name: _timed(work, videos) for name, (work, videos) in _parts(folder, sets).items()}
+    works |= {
+        f"peer {read}": lambda read=read: peer.seconds_to_step(peer_videos, read) / peer_videos for read in peer.READERS
+    }
+    return in_turns(works | {"peer draw": lambda: peer.seconds_to_draw(peer_videos) / peer_videos}, turns)
+
+
+def _timed(work: Callable[[], Any], videos: int) -> Callable[[], float]:
+    def seconds() -> float:
+        began = time.perf_counter()
+        work()
+        return (time.perf_counter() - began) / videos
+
+    return seconds
+
+
+def _parts(folder: Path, sets: Sequence[str]) -> dict[str, tuple[Callable[[], Any], int]]:
+    """For each stage of gen2d what does it for a batch, and of how many videos."""
+    import jax
+
+    from gen2d import devices, pipeline, shards
+    from gen2d.generate import dataset_of
+    from gen2d.rollout import parts
+
+    rollout = _rollout(sets)
+    sample, simulate, numbers = _physics(rollout)
+    drawn, batch = sample(numbers), rollout.begin("train", [0] * len(rollout.devices))
+    whole = rollout.videos_per_shard // rollout.lanes * rollout.lanes
+    dataset = dataset_of(rollout, folder / "data", {"train": whole})
+    (shard, *_), columns = shards.open_folder(dataset), rollout.host_columns(batch)[0]
+    encoder = pipeline.Encoder(rollout, dataset, pipeline.threads_for(devices.cores()))
+    jobs = pipeline.jobs_of([0], [[(shard, 0, rollout.lanes)]], rollout.lanes, rollout.slice)
+    frames = [jax.block_until_ready(rollout.draw(batch, job.start, rollout.slice)) for job in jobs]
+    encode = lambda: [encoder.encode(job, columns, f) for job, f in zip(jobs, frames, strict=True)]  # noqa: E731
+    blocks = encode() * (whole // rollout.lanes)
+
+    def draw() -> None:
+        for job in jobs:
+            jax.block_until_ready(rollout.draw(batch, job.start, rollout.slice))
+
+    return {
+        "sampler": (lambda: jax.block_until_ready(sample(numbers)), rollout.lanes),
+        "simulate": (lambda: jax.block_until_ready(simulate(*drawn)), rollout.lanes),
+        "begin": (lambda: jax.block_until_ready(rollout.begin("train", [0] * len(rollout.devices))), rollout.lanes),
+        "render": (draw, rollout.lanes),
+        "transfer": (lambda: [rollout.host_columns(batch), *map(parts, frames)], rollout.lanes),
+        "compress": (encode, rollout.lanes),
+        "write": (lambda: shards.write(dataset, shard, blocks), whole),
+    }
+
+
+def _rollout(sets: Sequence[str] = ()) -> Any:
+    from gen2d import devices
+    from gen2d.config import load_config
+    from gen2d.rollout import Rollout
+
+    return Rollout(load_config(CONFIG, sets), devices.prepare())
+
+
+def _physics(rollout: Any) -> tuple[Callable, Callable, np.ndarray]:
+    """The sampler and the simulation alone, as programs of their own, and the numbers of a batch of videos."""
+    import jax
+
+    from gen2d import factors, types
+    from gen2d.rollout import rules_of
+    from gen2d.simulate import simulate
+
+    root, length = factors.seed_words(0, 0), (rollout.config.video.frames, rollout.steps)
+
+    def sampled(numbers: Any) -> Any:
+        return jax.vmap(rollout._sampled)(factors.video_keys(root, numbers))[1:3]
+
+    def simulated(scene: Any, state: Any) -> Any:
+        device = types.to_device(scene), types.to_device(state)
+        return types.to_stored(simulate(*device, rollout.layout, rules_of(rollout.config, rollout.steps), *length))
+
+    return jax.jit(sampled), jax.jit(simulated), np.arange(rollout.lanes, dtype=np.uint32)
+
+
+def steady(folder: Path, videos: int = 4096, turns: int = 3, peer_videos: int = 0) -> Turns:
+    """Videos a second of gen2d once it is compiled, from the first batch to the manifest; its use of the cores; the peer's speed."""
+    rollout, usage = _rollout(), []
+
+    def ours() -> float:
+        before, began = _cpu_seconds(), time.perf_counter()
+        make(rollout, folder, videos)
+        seconds = time.perf_counter() - began
+        usage.append((_cpu_seconds() - before) / seconds / len(os.sched_getaffinity(0)))
+        return videos / seconds
+
+    reads = ("body", "batch") if peer_videos else ()
+    works = {f"peer {read}": lambda read=read: peer_command(peer_videos, read)[0] for read in reads}
+    return in_turns({"gen2d": ours} | works, turns) | {"usage": usage[1:]}
+
+
+def make(rollout: Any, folder: Path, videos: int) -> None:
+    """Returns nothing; makes a dataset as `gen2d.generate` does, with programs that are compiled already."""
+    from gen2d import devices, pipeline, shards
+    from gen2d.generate import dataset_of
+
+    with tempfile.TemporaryDirectory(dir=folder) as name:
+        dataset = dataset_of(rollout, Path(name), {"train": videos})
+        encoder = pipeline.Encoder(rollout, dataset, pipeline.threads_for(devices.cores()))
+        writers = pipeline.Writers(dataset)
+        for shard, block in encoder.blocks(pipeline.batches(shards.open_folder(dataset), rollout.lanes)):
+            writers.put(shard, block)
+        writers.finish()
+        encoder.close()
+        assert shards.finish(dataset)
+
+
+def _cpu_seconds() -> float:
+    return sum(resource.getrusage(resource.RUSAGE_SELF)[:2])
+
+
+def bounds(folder: Path) -> dict[str, float]:
+    """How many videos have a ball that is nowhere, or whose centre is nearer to a wall than 3/4 of its radius; the deepest overlaps."""
+    import gen2d
+
+    dataset = gen2d.open(folder, fields=("states/*", "objects/radius", "objects/kind", "objects/present", "quality/*"))
+    bad, walls, overlap = 0, 0.0, 0.0
+    for first in range(0, len(dataset), 500):
+        videos = dataset[first : first + 500]
+        balls = (videos["objects/present"] & (videos["objects/kind"] == 0))[:, None]
+        place, radius = videos["states/position"], videos["objects/radius"][:, None]
+        gap = np.where(balls, np.minimum(place, 10.0 - place).min(-1) - radius, 0.0)
+        finite = [np.isfinite(values).reshape(len(values), -1).all(1) for name, values in videos.items() if "states" in name]
+        bad += int((~((gap >= -0.25 * radius).all((1, 2)) & np.all(finite, axis=0))).sum())
+        walls, overlap = max(walls, float(-gap.min())), max(overlap, float(videos["quality/max_penetration"].max()))
+    return {"videos": len(dataset), "bad": bad, "walls": walls, "overlap": overlap}
+
+
+MEASUREMENTS = {work.__name__: work for work in (stages, steady, bounds)}
+
+
+# ---- Processes
+
+
+class Ran(NamedTuple):
+    """A command that has run."""
+
+    seconds: float
+    peak: int  # bytes of memory
+    text: str
+
+
+def run(command: Sequence[object], cores: Sequence[int] = CORES, env: Mapping[str, str] | None = None) -> Ran:
+    """Runs a command on these cores to its end."""
+    path = os.pathsep.join([str(HERE.parent.parent), os.environ.get("PYTHONPATH", "")])
+    began = time.perf_counter()
+    process = subprocess.Popen(
+        list(map(str, command)), cwd=tempfile.gettempdir(), env={**os.environ, "PYTHONPATH": path, **(env or {})},
+        stdout=subprocess.PIPE, text=True, preexec_fn=lambda: os.sched_setaffinity(0, cores),
+    )  # fmt: skip
+    assert process.stdout is not None
+    text = process.stdout.read()
+    _, status, usage = os.wait4(process.pid, 0)
+    process.returncode = os.waitstatus_to_exitcode(status)
+    if process.returncode:
+        raise SystemExit(f"bench.py: {' '.join(map(str, command))} failed")
+    return Ran(time.perf_counter() - began, usage.ru_maxrss * 1024, text)
+
+
+def measured(work: Callable, folder: Path, cores: Sequence[int] = CORES, **options: Any) -> Any:
+    """What one of MEASUREMENTS gives in a process of its own."""
+    ran = run([sys.executable, HERE, "--measure", work.__name__, folder, json.dumps(options)], cores)
+    return json.loads(ran.text.splitlines()[-1])
+
+
+def command(videos: int, out: Path, *sets: str, cache: Path | None = None) -> Ran:
+    """The product's own command, on a dataset that is not there yet."""
+    arguments = ["--config", CONFIG, "--n", videos, "--out", out, *(part for s in sets for part in ("--set", s))]
+    env = {"JAX_COMPILATION_CACHE_DIR": str(cache)} if cache else {}
+    return run([sys.executable, "-m", "gen2d", *arguments], env=env)
+
+
+def peer_command(videos: int, read: str = "body") -> tuple[float, float]:
+    """The peer's videos a second with gzip, and the seconds of its start."""
+    with tempfile.TemporaryDirectory() as out:
+        ran = run([sys.executable, HERE.with_name("peer.py"), "--n", videos, "--read", read, "--out", out])
+    seconds = float(re.findall(r"in ([\d.]+) s", ran.text)[-1])
+    return videos / seconds, ran.seconds - seconds
+
+
+# ---- Sections
+
+
+class Row(NamedTuple):
+    """A line of the table of speeds."""
+
+    name: str
+    rate: float  # videos/s
+    peer: float | None = None
+    share: float | None = None  # of the time of one core
+    note: str = ""
+
+
+class Promise(NamedTuple):
+    """What the project promises, and what came of it; without a target it is told for information."""
+
+    name: str
+    value: float
+    unit: str = "x"
+    target: float | None = None
+    most: bool = False  # whether the target is the most, not the least
+    note: str = ""
+
+    @property
+    def kept(self) -> bool:
+        return self.target is None or (self.value <= self.target if self.most else self.value >= self.target)
+
+
+Found = Iterator[Row | Promise]
+
+
+def _ratio(of: Sequence[float], to: Sequence[float]) -> float:
+    return statistics.median(a / b for a, b in zip(of, to, strict=True))
+
+
+def parts_section(folder: Path, quick: bool) -> Found:
+    """Every stage on one core, and physics and drawing beside the peer's."""
+    turns = measured(stages, folder, CORES[:1], turns=4 if quick else 9)
+    best = {name: statistics.median(values) for name, values in turns.items()}
+    best["begin"] -= best["sampler"] + best["simulate"]
+    ours = [*STAGES[:2], *STAGES[2:]]
+    total = sum(best[name] for name in ours) + max(best["begin"], 0)
+    peers = {"simulate": "peer body", "render": "peer draw"}
+    for name in ours:
+        yield Row(name, 1 / best[name], 1 / best[peers[name]] if name in peers else None, best[name] / total)
+    yield Row("backdrops, layout", 1 / max(best["begin"], 1e-9), None, max(best["begin"], 0) / total)
+    yield Row("all parts, 1 core", 1 / total, None, 1.0)
+    yield Promise("3 simulate, one core, against pymunk", _ratio(turns["peer body"], turns["simulate"]), target=5)
+    yield Promise("  the same, against pymunk.batch", _ratio(turns["peer batch"], turns["simulate"]), note="beta interface")
+    yield Promise("4 render, one core, against OpenCV", _ratio(turns["peer draw"], turns["render"]), target=5)
+
+
+def steady_section(folder: Path, quick: bool) -> Found:
+    """The whole path once it is compiled."""
+    count, repeats = (2048, 2) if quick else (4096, 5)
+    turns = measured(steady, folder, videos=count, turns=repeats, peer_videos=256 if quick else 512)
+    middle = {name: statistics.median(values) for name, values in turns.items()}
+    note = f"{middle['usage']:.0%} of {len(CORES)} cores in use"
+    yield Row(f"end to end, {len(CORES)} cores", middle["gen2d"], middle["peer body"], note=note)
+    yield Promise("1 end to end, against the peer", _ratio(turns["gen2d"], turns["peer body"]), target=5)
+    yield Promise("  the same, it with pymunk.batch", _ratio(turns["gen2d"], turns["peer batch"]), note="beta interface")
+
+
+def command_section(folder: Path, quick: bool) -> Found:
+    """The whole command, with programs compiled by an earlier run."""
+    count, peer_count, ours, theirs = 8192, 512, [], []
+    for turn in range(4):
+        with tempfile.TemporaryDirectory(dir=folder) as out:
+            ours.append(command(count if turn else 128, Path(out)).seconds)
+        rate, start = peer_command(peer_count)
+        theirs.append(start + count / rate)
+    ratio = _ratio(theirs[1:], ours[1:])
+    seconds = [statistics.median(values[1:]) for values in (ours, theirs)]
+    note = f"{seconds[0]:.1f} s; the peer {seconds[1]:.1f} s, scaled from {peer_count} videos"
+    yield Promise(f"2 whole command, {count} videos", ratio, target=3, note=note)
+
+
+def memory_section(folder: Path, quick: bool) -> Found:
+    """Peak memory of a small and a large dataset, and whether the large one's physics holds."""
+    small, large = command(2000, folder / "small"), command(20000, folder / "large")
+    yield Promise("5 peak memory, 20,000 videos", large.peak / 2**30, "GiB", 3, most=True)
+    yield Promise("  the same, against 2,000 videos", large.peak / small.peak, target=1.1, most=True)
+    found = measured(bounds, folder / "large")
+    note = f"deepest: {found['walls']:.3f} m into a wall, {found['overlap']:.3f} m at any step between any two"
+    yield Promise(f"8 broken of {found['videos']:,} videos", found["bad"], "videos", 0, most=True, note=note)
+
+
+def scaling_section(folder: Path, quick: bool) -> Found:
+    """One core against two, end to end."""
+    if len(CORES) < 2:
+        return
+    turns = [[max(measured(steady, folder, CORES[:k], videos=2048, turns=2)["gen2d"]) for k in (1, 2)] for _ in range(3)]
+    one, two = zip(*turns, strict=True)
+    note = f"{statistics.median(one):.0f} and {statistics.median(two):.0f} videos/s"
+    yield Promise("6 two cores against one", _ratio(two, one), target=1.7, note=note)
+
+
+def start_section(folder: Path, quick: bool) -> Found:
+    """From the start of the process to the first finished shard, with programs not compiled yet, and compiled."""
+    seconds = []
+    for turn in range(4):
+        out, began = folder / f"start{turn}", time.time()
+        command(64, out, "storage.videos_per_shard=64", cache=folder / "cache")
+        seconds.append((out / ".gen2d" / "done" / "train-00000.json").stat().st_mtime - began)
+    yield Promise("7 first shard, warm cache", statistics.median(seconds[1:]), "s", 8, most=True)
+    yield Promise("  first shard, cold cache", seconds[0], "s", 40, most=True)
+
+
+SECTIONS = {
+    "parts": parts_section, "steady": steady_section, "command": command_section, "memory": memory_section,
+    "scaling": scaling_section, "start": start_section,
+}  # fmt: skip
+QUICK = ("parts", "steady")
+
+
+# ---- What is told
+
+
+def machine() -> dict[str, Any]:
+    """The facts that explain the figures."""
+    lines = Path("/proc/cpuinfo").read_text().splitlines() if Path("/proc/cpuinfo").exists() else []
+    model = next((line.partition(": ")[2] for line in lines if line.startswith("model name")), platform.machine())
+    packages = ("jax", "jaxlib", "numpy", "h5py", "isal", "pymunk", "opencv-python-headless")
+    versions = {"python": platform.python_version()} | {name: importlib.metadata.version(name) for name in packages}
+    return {"cpu": model, "cores": len(CORES), "load": os.getloadavg()[0], **versions}
+
+
+def text_of(facts: Mapping[str, Any], found: Sequence[Row | Promise]) -> str:
+    """The tables."""
+    lines = [", ".join(f"{key} {value}" for key, value in facts.items()), ""]
+    lines += [f"{'':24} {'videos/s':>9} {'MB/s':>7} {'share':>6} {'peer':>9} {'ratio':>6}"]
+    for row in (row for row in found if isinstance(row, Row)):
+        share = f"{row.share:6.0%}" if row.share is not None else " " * 6
+        peer = f"{row.peer:9,.0f} {row.rate / row.peer:6.2f}" if row.peer else " " * 16
+        lines += [f"{row.name:24} {row.rate:9,.0f} {row.rate * FRAMES_BYTES / 1e6:7,.0f} {share} {peer}  {row.note}".rstrip()]
+    lines += [""]
+    for p in (p for p in found if isinstance(p, Promise)):
+        target = "" if p.target is None else f"{'at most' if p.most else 'at least'} {p.target:g}: {'kept' if p.kept else 'NOT KEPT'}"
+        lines += [f"{p.name:38} {p.value:7.2f} {p.unit:7} {target:24} {p.note}".rstrip()]
+    return "\n".join(lines)
+
+
+def main() -> None:
+    """Measures, prints the tables, and writes them as JSON if asked."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true", help=f"only {' and '.join(QUICK)}, with fewer turns")
+    parser.add_argument("--only", nargs="+", choices=tuple(SECTIONS), help="only these sections")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures there, too")
+    parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu", help="where gen2d computes (cpu)")
+    parser.add_argument("--measure", nargs=3, help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    if options.measure:
+        name, folder, more = options.measure
+        print(json.dumps(MEASUREMENTS[name](Path(folder), **json.loads(more))))
+        return
+    os.environ["JAX_PLATFORMS"] = options.device
+    facts, found = machine(), []
+    for name in options.only or (QUICK if options.quick else SECTIONS):
+        with tempfile.TemporaryDirectory(prefix="gen2d-bench-") as folder:
+            found += SECTIONS[name](Path(folder), options.quick)
+    print(text_of(facts, found))
+    if options.json:
+        kinds = {"rows": Row, "promises": Promise}
+        tables = {key: [f._asdict() for f in found if isinstance(f, kind)] for key, kind in kinds.items()}
+        options.json.write_text(json.dumps({"machine": facts} | tables, indent=1))
+
+
+if __name__ == "__main__":
+    main()

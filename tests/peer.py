@@ -1,0 +1,183 @@
+"""What a user would write today: Chipmunk (pymunk), OpenCV and h5py, one process a core; bench.py's yardstick.
+
+    python tests/peer.py --n 512 --out /tmp/peer      # the scene of configs/benchmark.yaml
+"""
+
+import argparse
+import itertools
+import math
+import multiprocessing
+import os
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import cv2
+import h5py
+import numpy as np
+import pymunk
+from pymunk import batch
+
+BALLS, SIDE, GRAVITY = 8, 10.0, -9.8  # m, m/s^2
+RADIUS, SPEED = (0.5, 1.0), 3.0  # m, m/s: uniform, and the deviation of each component
+ELASTICITY, FRICTION = 0.9, 0.2  # of balls and walls; Chipmunk multiplies
+FRAMES, SIZE, FPS, SUBSTEPS = 64, 64, 30, 4
+BACKGROUND, COLORS = 20, (40, 255)
+SHARD = 64  # videos
+STATE = batch.BodyFields.POSITION | batch.BodyFields.ANGLE | batch.BodyFields.VELOCITY | batch.BodyFields.ANGULAR_VELOCITY
+BITS = 4  # of a pixel's fraction
+
+
+class Start(NamedTuple):
+    """What a video is made of."""
+
+    radii: list[float]  # m
+    places: list[tuple[float, float]]  # m
+    velocities: list[list[float]]  # m/s
+    colors: list[list[int]]
+
+
+def sampled(number: int) -> Start:
+    """The start of video `number`: balls that do not overlap, each placed anew until it fits."""
+    rng = np.random.default_rng([0, number])
+    radii = rng.uniform(*RADIUS, BALLS).tolist()
+    while (places := _places(rng, radii)) is None:
+        pass
+    velocities, colors = rng.normal(0, SPEED, (BALLS, 2)), rng.integers(*COLORS, (BALLS, 3))
+    return Start(radii, places, velocities.tolist(), colors.tolist())
+
+
+def _places(rng: np.random.Generator, radii: list[float]) -> list[tuple[float, float]] | None:
+    places: list[tuple[float, float]] = []
+    for radius in radii:
+        for unit in rng.random((100, 2)).tolist():
+            x, y = (radius + u * (SIDE - 2 * radius) for u in unit)
+            if all(math.hypot(x - a, y - b) > radius + r for (a, b), r in zip(places, radii, strict=False)):
+                places.append((x, y))
+                break
+        else:
+            return None
+    return places
+
+
+def space_of(start: Start) -> pymunk.Space:
+    """A closed box with the balls in it."""
+    space = pymunk.Space()
+    space.gravity = 0, GRAVITY
+    corners = [(0, 0), (SIDE, 0), (SIDE, SIDE), (0, SIDE), (0, 0)]
+    shapes: list[pymunk.Shape] = [pymunk.Segment(space.static_body, a, b, 0) for a, b in itertools.pairwise(corners)]
+    for radius, place, velocity in zip(start.radii, start.places, start.velocities, strict=True):
+        mass = math.pi * radius**2
+        body = pymunk.Body(mass, pymunk.moment_for_circle(mass, 0, radius))
+        body.position, body.velocity = place, (velocity[0], velocity[1])
+        shapes.append(pymunk.Circle(body, radius))
+        space.add(body)
+    for shape in shapes:
+        shape.elasticity, shape.friction = ELASTICITY, FRICTION
+    space.add(*shapes)
+    return space
+
+
+def stepped(space: pymunk.Space, read: str = "body") -> np.ndarray:
+    """The states [T, N, 6], float32: x, y, angle, their velocities and the spin."""
+    dt, states, take = 1 / FPS / SUBSTEPS, [], READERS[read](space)
+    for t in range(FRAMES):
+        for _ in range(SUBSTEPS if t else 0):
+            space.step(dt)
+        states.append(take())
+    return np.array(states, np.float32)
+
+
+def _by_body(space: pymunk.Space) -> Callable[[], Any]:
+    bodies = space.bodies
+    return lambda: [(*b.position, b.angle, *b.velocity, b.angular_velocity) for b in bodies]
+
+
+def _by_batch(space: pymunk.Space) -> Callable[[], Any]:
+    buffer = batch.Buffer()
+
+    def take() -> np.ndarray:
+        buffer.clear()
+        batch.get_space_bodies(space, STATE, buffer)
+        return np.frombuffer(buffer.float_buf()).reshape(-1, 6)[:BALLS].copy()  # then the body that bears the walls
+
+    return take
+
+
+# How states leave Chipmunk: by a body's attributes, as its manual shows, or by one call for all, in pymunk's beta interface.
+READERS = {"body": _by_body, "batch": _by_batch}
+
+
+def drawn(start: Start, states: np.ndarray, frames: np.ndarray) -> None:
+    """Returns nothing; fills frames [T, H, W, 3] uint8 with antialiased discs on a dark background."""
+    scale = SIZE / SIDE
+    pixels = np.stack([states[..., 0] * scale - 0.5, (SIDE - states[..., 1]) * scale - 0.5], axis=-1)
+    centers = np.rint(pixels * 2**BITS).astype(int).tolist()
+    radii = [round(radius * scale * 2**BITS) for radius in start.radii]
+    frames[:] = BACKGROUND
+    for frame, places in zip(frames, centers, strict=True):
+        for center, radius, color in zip(places, radii, start.colors, strict=True):
+            cv2.circle(frame, center, radius, color, -1, cv2.LINE_AA, BITS)
+
+
+def write_shard(path: Path, numbers: range, compression: str = "gzip", read: str = "body") -> None:
+    """Returns nothing; makes these videos and writes them into one HDF5 file, a chunk each."""
+    frames = np.empty((len(numbers), FRAMES, SIZE, SIZE, 3), np.uint8)
+    states = np.empty((len(numbers), FRAMES, BALLS, 6), np.float32)
+    for row, number in enumerate(numbers):
+        start = sampled(number)
+        states[row] = stepped(space_of(start), read)
+        drawn(start, states[row], frames[row])
+    filters = {"compression": "gzip", "compression_opts": 1} if compression == "gzip" else {}
+    with h5py.File(path, "w") as file:
+        file.create_dataset("frames", data=frames, chunks=(1, *frames.shape[1:]), **filters)
+        file.create_dataset("states", data=states)
+
+
+def make(count: int, workers: int, compression: str, read: str, out: Path) -> float:
+    """Makes the dataset and returns how many seconds it took, from the start of the workers to the last closed file."""
+    out.mkdir(parents=True, exist_ok=True)
+    parts = [range(first, min(first + SHARD, count)) for first in range(0, count, SHARD)]
+    jobs = [(out / f"shard-{part.start // SHARD:05d}.h5", part, compression, read) for part in parts]
+    began = time.perf_counter()
+    with multiprocessing.get_context("fork").Pool(workers, cv2.setNumThreads, (1,)) as pool:
+        pool.starmap(write_shard, jobs, chunksize=1)
+    return time.perf_counter() - began
+
+
+def seconds_to_step(count: int, read: str = "body") -> float:
+    """How long stepping `count` videos takes, without sampling and building them."""
+    spaces = [space_of(sampled(number)) for number in range(count)]
+    began = time.perf_counter()
+    for space in spaces:
+        stepped(space, read)
+    return time.perf_counter() - began
+
+
+def seconds_to_draw(count: int) -> float:
+    """How long drawing `count` videos takes, of which the states are there."""
+    starts = [sampled(number) for number in range(count)]
+    states = [stepped(space_of(start)) for start in starts]
+    frames = np.zeros((FRAMES, SIZE, SIZE, 3), np.uint8)
+    began = time.perf_counter()
+    for start, moved in zip(starts, states, strict=True):
+        drawn(start, moved, frames)
+    return time.perf_counter() - began
+
+
+def main() -> None:
+    """Makes a dataset as the command line says."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--n", type=int, default=512)
+    parser.add_argument("--workers", type=int, default=len(os.sched_getaffinity(0)))
+    parser.add_argument("--compression", choices=("gzip", "none"), default="gzip")
+    parser.add_argument("--read", choices=tuple(READERS), default="body", help="how states leave Chipmunk")
+    parser.add_argument("--out", type=Path, required=True)
+    options = parser.parse_args()
+    seconds = make(options.n, options.workers, options.compression, options.read, options.out)
+    print(f"{options.n / seconds:.1f} videos/s ({options.n} videos in {seconds:.3f} s)")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,130 @@
+"""Small worlds for the law tests: discs and segments by hand, simulated with the product's own programs.
+
+All tests share a few shapes (how many discs, segments, frames, steps), so that each is compiled once.
+"""
+
+import functools
+from collections.abc import Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from gen2d import types
+from gen2d.simulate import simulate
+from gen2d.solver import Rules
+from gen2d.types import Layout, Objects, Scene, State, Trajectory
+
+STEP = 1 / 240
+
+
+def rules(step: float = STEP, **changes: object) -> Rules:
+    """The solver's default numbers at a step, but for the changes."""
+    numbers = {
+        "bounce_threshold": 0.01, "hertz": min(30.0, 0.125 / step), "damping_ratio": 10.0, "push_speed": 3.0,
+        "damping": 0.0, "mixing": "product",
+    }  # fmt: skip
+    return Rules(step=step, **(numbers | changes))  # type: ignore[arg-type]
+
+
+def world(
+    discs: Sequence[dict], segments: Sequence[dict] = (), gravity: Sequence[float] = (0.0, 0.0), slots: int | None = None
+) -> tuple[Scene, State, Layout]:
+    """One scene in the sampler's layout. A disc: x, v, radius, spin, elasticity, friction, mass; a segment: a, b (its
+    ends), elasticity, friction. Slots that are left over stay empty."""
+    count = max(slots or len(discs), 1)
+    rows = [{"x": (0, 0), "v": (0, 0), "radius": 0.5, "spin": 0, "elasticity": 1, "friction": 0, **d} for d in discs]
+    rows += [{"x": (0, 0), "v": (0, 0), "radius": 0, "spin": 0, "elasticity": 0, "friction": 0}] * (count - len(discs))
+    walls = [{"elasticity": 1, "friction": 0, **s} for s in segments]
+    ends = np.array([[s["a"], s["b"]] for s in walls], float).reshape(-1, 2, 2)
+    radius = np.array([r["radius"] for r in rows], float)
+    mass = np.array([r.get("mass", np.pi * r["radius"] ** 2) for r in rows], float)
+    there = [*(k < len(discs) for k in range(count)), *(True for _ in walls)]
+
+    def both(of_discs: object, of_walls: object, dtype: object = np.float32) -> jax.Array:
+        parts = np.asarray(of_discs, float), np.asarray(of_walls, float)
+        parts = [p.reshape(len(p), *np.shape(of_discs)[1:]) for p in parts]
+        return jnp.asarray(np.concatenate(parts).astype(dtype))
+
+    nothing, ones = np.zeros(len(walls)), np.ones(len(walls))
+    span = ends[:, 1] - ends[:, 0]
+    objects = Objects(
+        present=jnp.asarray(there),
+        kind=both(np.zeros(count), ones, np.uint8),
+        shape=both(np.zeros(count), ones, np.uint8),
+        radius=both(radius, nothing),
+        half_length=both(np.zeros(count), np.hypot(*span.T) / 2),
+        depth=both(np.arange(count), nothing, np.int16),
+        mass=both(mass, np.inf * ones),
+        moment=both(mass * radius**2 / 2, np.inf * ones),
+        elasticity=both([r["elasticity"] for r in rows], [s["elasticity"] for s in walls]),
+        friction=both([r["friction"] for r in rows], [s["friction"] for s in walls]),
+        color=jnp.zeros((count + len(walls), 3), jnp.uint8),
+    )
+    state = State(
+        position=both([r["x"] for r in rows], ends.mean(axis=1)),
+        angle=both(np.zeros(count), np.arctan2(span[:, 1], span[:, 0])),
+        velocity=both([r["v"] for r in rows], np.zeros((len(walls), 2))),
+        angular_velocity=both([r["spin"] for r in rows], nothing),
+    )
+    layout = Layout(count, len(walls), (0.0, 0.0, 1.0, 1.0), float(radius.max()))
+    return Scene(objects, jnp.asarray(gravity, jnp.float32)), state, layout
+
+
+@functools.lru_cache(maxsize=64)
+def _program(layout: Layout, numbers: Rules, frames: int, steps: int):  # noqa: ANN202
+    def run(scene: Scene, state: State) -> Trajectory:
+        made = simulate(types.to_device(scene), types.to_device(state), layout, numbers, frames, steps)
+        return types.to_stored(made)
+
+    return jax.jit(run)
+
+
+def run(worlds: Sequence[tuple[Scene, State, Layout]], frames: int, steps: int, numbers: Rules | None = None) -> Trajectory:
+    """The trajectories of worlds of one layout, videos first, as NumPy arrays in float64 where they are numbers."""
+    layout = worlds[0][2]
+    layout = Layout(layout.discs, layout.segments, (0.0, 0.0, 1.0, 1.0), 1.0)
+    scene, state = (jax.tree.map(lambda *x: jnp.stack(x), *(w[i] for w in worlds)) for i in (0, 1))
+    made = _program(layout, numbers or rules(), frames, steps)(scene, state)
+    return jax.tree.map(np.asarray, made)
+
+
+def box(side: float, elasticity: float = 1.0, friction: float = 0.0, centre: Sequence[float] = (5, 5)) -> list[dict]:
+    """Four segments around a square."""
+    x, y = centre
+    corners = [(x - side / 2, y - side / 2), (x + side / 2, y - side / 2), (x + side / 2, y + side / 2), (x - side / 2, y + side / 2)]
+    return [
+        {"a": a, "b": b, "elasticity": elasticity, "friction": friction}
+        for a, b in zip(corners, [*corners[1:], corners[0]], strict=True)
+    ]
+
+
+def turned(vector: Sequence[float], degrees: float) -> tuple[float, float]:
+    """The vector turned counter-clockwise."""
+    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    return float(c * vector[0] - s * vector[1]), float(s * vector[0] + c * vector[1])
+
+
+def energies(worlds: Sequence[tuple[Scene, State, Layout]], made: Trajectory) -> np.ndarray:
+    """Kinetic and potential energy of each video and frame, J [n, T]."""
+    total = []
+    for i, (scene, _, layout) in enumerate(worlds):
+        mass, moment = (np.asarray(x, float)[: layout.discs] for x in (scene.objects.mass, scene.objects.moment))
+        x, v, w = (np.asarray(a[i], float)[:, : layout.discs] for a in
+                   (made.states.position, made.states.velocity, made.states.angular_velocity))  # fmt: skip
+        fall = -np.einsum("tkd,d->tk", x, np.asarray(scene.gravity, float)) * mass
+        total.append((0.5 * mass * (v**2).sum(-1) + 0.5 * moment * w**2 + fall).sum(-1))
+    return np.array(total)
+
+
+def momenta(worlds: Sequence[tuple[Scene, State, Layout]], made: Trajectory) -> tuple[np.ndarray, np.ndarray]:
+    """Linear [n, T, 2] and angular [n, T] momentum about the origin."""
+    linear, angular = [], []
+    for i, (scene, _, layout) in enumerate(worlds):
+        mass, moment = (np.asarray(x, float)[: layout.discs] for x in (scene.objects.mass, scene.objects.moment))
+        x, v, w = (np.asarray(a[i], float)[:, : layout.discs] for a in
+                   (made.states.position, made.states.velocity, made.states.angular_velocity))  # fmt: skip
+        linear.append((mass[:, None] * v).sum(1))
+        cross = x[..., 0] * v[..., 1] - x[..., 1] * v[..., 0]
+        angular.append((mass * cross + moment * w).sum(-1))
+    return np.array(linear), np.array(angular)
