@@ -1,27 +1,27 @@
-"""Datasets for training: `open` gives videos by number, `DataLoader` gives batches in an order that can be resumed.
+"""Videos by number: what `open` gives of a complete dataset, one by one or as batches.
 
-Pieces are read by offset straight from the shards, without h5py and its one lock per process, and decoded into the
-batch by threads. No jax is imported, and nothing here depends on the process, so fork and spawn are both safe.
+Pieces are read by offset straight from the shards, without h5py and its one lock per process, and decoded where they
+are wanted. Neither jax nor h5py is imported, and no open file outlives a fork, so fork and spawn are both safe.
 """
 
 import dataclasses
 import difflib
 import fnmatch
 import functools
-import importlib
-import itertools
 import os
-from collections import deque
-from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from gen2d import codecs, shards
+from gen2d import codecs
 from gen2d.errors import ConfigError, DamagedError
 from gen2d.fields import Field
+from gen2d.files import file_sha256
+from gen2d.formats import stored_bytes
+from gen2d.manifest import field_of, read_manifest
+from gen2d.plan import shard_path
 
 Batch = dict[str, np.ndarray]
 Numbers = Sequence[int] | np.ndarray
@@ -50,7 +50,7 @@ def open(
     Raises FolderError, ConfigError, and DamagedError, then and whenever videos are read.
     """
     root = Path(path)
-    manifest = shards.read_manifest(root)
+    manifest = read_manifest(root)
     split = _chosen_split(root, manifest, split)
     names = _chosen_fields(root, manifest, [fields] if isinstance(fields, str) else fields)
     options = Options(split, tuple(names), window, stride, start, layout, dtype, verify)
@@ -87,14 +87,14 @@ class Dataset:
 
     def __init__(self, root: Path, manifest: Mapping[str, Any], options: Options) -> None:
         self.root, self.manifest, self.options = root, manifest, options
-        self.fields = {name: _field(manifest["fields"][name]) for name in options.fields}
+        self.fields = {name: field_of(manifest["fields"][name]) for name in options.fields}
         self.stats = {name: values for name, values in manifest["stats"][options.split].items() if name in self.fields}
         self._columns = [_Column(name, field, manifest, options) for name, field in self.fields.items()]
         self._count = manifest["splits"][options.split]
         sizes = {split: count for split, count in sorted(manifest["splits"].items()) if split < options.split}
         self._base = sum(sizes.values())  # the index holds one split after the other
         self._videos = self._table("videos")
-        self._places = self._table("shards")
+        self._rows = self._table("shards")
         self._chunks = {column.name: self._table(column.name) for column in self._columns if column.is_image}
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -146,37 +146,26 @@ class Dataset:
         videos = self._videos[self._base + numbers]
         for column in self._columns:
             whole = None if column.is_direct else np.empty((1, *column.stored), column.field.dtype)
-            for step, place in enumerate(self._pieces(column, numbers, videos)):
+            for step, place in enumerate(self._places(column, numbers, videos)):
                 target = out[column.name][row + step : row + step + 1]
                 self._read(column, place, int(numbers[step]), target if whole is None else whole)
                 if whole is not None:
                     column.convert(whole, int(first[step]), target)
 
-    def _pieces(
-        self, column: "_Column", numbers: np.ndarray, videos: np.ndarray
-    ) -> Iterator[tuple[int, int, int, int]]:
-        """Shard, offset, size and checksum of the videos' pieces."""
+    def _places(self, column: "_Column", numbers: np.ndarray, videos: np.ndarray) -> "Iterable[_Place]":
+        """Where the videos' pieces lie."""
         if column.is_image:
-            return iter(self._chunks[column.name][self._base + numbers].tolist())
-        shard, size = videos["shard"], column.size
-        offset = self._places[column.name][shard] + videos["row"].astype(np.uint64) * np.uint64(size)
-        crc = videos[column.name].tolist()
-        return zip(shard.tolist(), offset.tolist(), [size] * len(numbers), crc, strict=True)
+            return map(_Place._make, self._chunks[column.name][self._base + numbers].tolist())
+        offset = self._rows[column.name][videos["shard"]] + videos["row"].astype(np.uint64) * np.uint64(column.size)
+        parts = videos["shard"], offset, np.full(len(numbers), column.size), videos[column.name]
+        return map(_Place, *(part.tolist() for part in parts))
 
-    def _read(self, column: "_Column", place: tuple[int, int, int, int], video: int, target: np.ndarray) -> None:
-        shard, offset, size, crc = place
-        path = self.root / "shards" / f"{self.manifest['shards'][shard]['name']}.h5"
+    def _read(self, column: "_Column", place: "_Place", video: int, target: np.ndarray) -> None:
+        shard = self.manifest["shards"][place.shard]
+        path = shard_path(self.root, shard["name"])
         try:
-            file = _opened(path, self.manifest["shards"][shard]["sha256"], os.getpid())
-            if column.codec == "none":
-                data = target.data
-                got = os.preadv(file.descriptor, [data], offset) if size else 0
-            else:
-                data = os.pread(file.descriptor, size, offset)
-                got = len(data)
-            if got != size:
-                raise DamagedError("the file ends too early")
-            if self.options.verify == "checksum" and codecs.crc32(data) != crc:
+            data = _piece(_opened(path, shard["sha256"], os.getpid()), column, place, target)
+            if self.options.verify == "checksum" and codecs.crc32(data) != place.crc32:
                 raise DamagedError("its checksum differs")
             if column.codec != "none":
                 codecs.decode_into(column.codec, data, target)
@@ -205,7 +194,7 @@ class Dataset:
         path = f"index/{name}.npy"
         if not (self.root / path).is_file():
             raise DamagedError(f"{self.root / path} is missing")
-        if self.options.verify == "checksum" and shards.file_sha256(self.root / path) != self.manifest["files"][path]:
+        if self.options.verify == "checksum" and file_sha256(self.root / path) != self.manifest["files"][path]:
             raise DamagedError(f"{self.root / path} is not what was written")
         return np.load(self.root / path, mmap_mode="r")
 
@@ -217,7 +206,7 @@ class _Column:
         self.name, self.field, self.is_image = name, field, field.is_image
         self.codec = manifest["fields"][name]["codec"]
         self.stored = field.shape(manifest["sizes"])
-        self.size = int(np.prod(self.stored)) * np.dtype(field.dtype).itemsize
+        self.size = stored_bytes(field, manifest["sizes"])
         axes = field.axes.split()[1:]
         self.order = LAYOUTS[options.layout] if self.is_image and len(axes) == 4 else tuple(range(len(axes)))
         self.window, self.stride = (options.window if axes[:1] == ["T"] else None), options.stride
@@ -239,6 +228,15 @@ class _Column:
             target[...] = whole
 
 
+class _Place(NamedTuple):
+    """Where a piece lies, and the checksum of its bytes; in the order of the index."""
+
+    shard: int
+    offset: int
+    size: int
+    crc32: int
+
+
 class _File:
     """A file that is open for reading, closed when nobody uses it any more."""
 
@@ -252,14 +250,23 @@ class _File:
             os.close(self.descriptor)
 
 
+def _piece(file: _File, column: _Column, place: _Place, target: np.ndarray) -> bytes | memoryview:
+    """The bytes of a piece; one that is not compressed is read right into `target`."""
+    if column.codec == "none":
+        data = target.data
+        got = os.preadv(file.descriptor, [data], place.offset) if place.size else 0
+    else:
+        data = os.pread(file.descriptor, place.size, place.offset)
+        got = len(data)
+    if got != place.size:
+        raise DamagedError("the file ends too early")
+    return data
+
+
 @functools.lru_cache(maxsize=128)
 def _opened(path: Path, sha256: str, process: int) -> _File:
     """The open file; one that was made again since, or opened before a fork, is another."""
     return _File(path)
-
-
-def _field(about: Mapping[str, Any]) -> Field:
-    return Field(*(about[part.name] for part in dataclasses.fields(Field)))
 
 
 def _chosen_split(root: Path, manifest: Mapping[str, Any], split: str | None) -> str:
@@ -273,7 +280,7 @@ def _chosen_split(root: Path, manifest: Mapping[str, Any], split: str | None) ->
 
 
 def _chosen_fields(root: Path, manifest: Mapping[str, Any], patterns: Sequence[str]) -> list[str]:
-    names = [name for name, about in manifest["fields"].items() if _field(about).per_video]
+    names = [name for name, about in manifest["fields"].items() if field_of(about).per_video]
     chosen: dict[str, None] = {}
     for pattern in patterns:
         found = fnmatch.filter(names, pattern)
@@ -302,197 +309,3 @@ def _check(options: Options, frames: int) -> None:
     if options.window is not None and options.first + options.span > frames:
         need = f"window {options.window}, stride {options.stride} and start {options.start} need"
         raise ConfigError(f"{need} {options.first + options.span} frames, but the videos have {frames}")
-
-
-# ---- Batches in an order that can be resumed
-
-
-class DataLoader:
-    """Batches as dictionaries of arrays, each rank its slice of every global batch of `batch_size * world_size`.
-
-    Video and window at each position follow from (seed, epoch, position) alone, so a state is a few numbers and fits
-    another world size. An iteration ends when `epochs` epochs are through, and the next goes on with the epochs that
-    follow; after `break` or `load_state_dict` it goes on with the batch after the last one delivered.
-
-    `shuffle` is "global" (or True) or False. `remainder` says what happens to the last videos of an epoch that fill no
-    global batch: "drop" or "keep" (then the ranks' shares may differ by one, or be empty). `transform` gets each batch
-    in a thread. `to` is "numpy", "torch" or "jax".
-    """
-
-    def __init__(
-        self,
-        dataset: Dataset,
-        batch_size: int,
-        seed: int = 0,
-        shuffle: bool | str = "global",
-        epochs: int | None = None,
-        rank: int = 0,
-        world_size: int = 1,
-        remainder: str = "drop",
-        num_threads: int | None = None,
-        prefetch: int = 2,
-        transform: Callable[[Batch], Any] | None = None,
-        to: str = "numpy",
-    ) -> None:
-        threads = num_threads or min(os.cpu_count() or 1, 8)
-        if to not in _DELIVER or shuffle not in ("global", True, False) or remainder not in ("drop", "keep"):
-            raise ConfigError("to must be numpy, torch or jax, shuffle global or False, and remainder drop or keep")
-        if min(batch_size, world_size, prefetch, threads) < 1 or not 0 <= rank < world_size:
-            raise ConfigError(
-                "batch_size, world_size, prefetch and num_threads must be positive, rank under world_size"
-            )
-        self.dataset, self.seed, self.shuffle, self.epochs = dataset, seed, bool(shuffle), epochs
-        self.rank, self.world_size, self.global_size = rank, world_size, batch_size * world_size
-        self.least = 1 if remainder == "keep" else self.global_size  # how many videos still make a global batch
-        self.threads, self.prefetch, self.transform, self.to = threads, prefetch, transform, to
-        self._epoch = self._position = 0
-        self._running: Generator[Any, None, None] | None = None
-        if len(dataset) < self.least:
-            raise ConfigError(f"{self.global_size} videos make a global batch, but there are only {len(dataset)}")
-
-    def __len__(self) -> int:
-        """The number of batches in one epoch."""
-        whole, rest = divmod(len(self.dataset), self.global_size)
-        return whole + (rest >= self.least)
-
-    def __iter__(self) -> Iterator[Any]:
-        self.close()
-        self._running = self._batches()
-        return self._running
-
-    def __enter__(self) -> "DataLoader":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
-    def close(self) -> None:
-        """Returns when the threads of the iteration in progress have ended."""
-        if self._running is not None:
-            self._running.close()
-
-    def state_dict(self) -> dict[str, Any]:
-        """Where the iteration stands: what has been delivered, not what was read ahead."""
-        fixed = {"seed": self.seed, "shuffle": self.shuffle, "videos": len(self.dataset)}
-        return fixed | {"epoch": self._epoch, "position": self._position}
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Returns nothing; the next iteration goes on where `state` was taken, on whatever number of ranks."""
-        for name, here in self.state_dict().items():
-            if name not in ("epoch", "position") and state[name] != here:
-                raise ConfigError(
-                    f"the state has {name} {state[name]}, but this loader has {here}: orders would differ"
-                )
-        self.close()
-        self._epoch, self._position = self._settled(state["epoch"], state["position"])
-
-    def _settled(self, epoch: int, position: int) -> tuple[int, int]:
-        """Where the next global batch begins."""
-        return (epoch, position) if len(self.dataset) - position >= self.least else (epoch + 1, 0)
-
-    def _steps(self) -> Iterator[tuple[int, int, int]]:
-        """Epoch, position and size of the global batches to come."""
-        epoch, position = self._epoch, self._position
-        end = None if self.epochs is None else (epoch // self.epochs + 1) * self.epochs
-        while end is None or epoch < end:
-            size = min(self.global_size, len(self.dataset) - position)
-            yield epoch, position, size
-            epoch, position = self._settled(epoch, position + size)
-
-    def _batches(self) -> Generator[Any, None, None]:
-        steps = self._steps()
-        pool = ThreadPoolExecutor(self.threads, "gen2d")
-        try:
-            ahead = deque((step, self._submit(pool, *step)) for step in itertools.islice(steps, self.prefetch))
-            while ahead:
-                (epoch, position, size), coming = ahead.popleft()
-                batch = _DELIVER[self.to](coming.result())
-                # Asked for before this one is handed out, so that threads read while the caller trains.
-                ahead.extend((step, self._submit(pool, *step)) for step in itertools.islice(steps, 1))
-                self._epoch, self._position = self._settled(epoch, position + size)
-                yield batch
-        finally:
-            pool.shutdown(cancel_futures=True)
-
-    def _submit(self, pool: ThreadPoolExecutor, epoch: int, position: int, size: int) -> Future[Any]:
-        """This rank's slice of a global batch, being filled by all threads."""
-        share = (size * rank // self.world_size for rank in (self.rank, self.rank + 1))
-        positions = position + np.arange(*share)
-        indices = order(self.seed, epoch, positions, len(self.dataset)) if self.shuffle else positions
-        starts = self._starts(epoch, positions)
-        # A new batch each time, never one used before: jax may keep the very memory that it is given.
-        out = self.dataset.empty(len(indices))
-        parts = [
-            pool.submit(self.dataset.fill, out, part[0], indices[part], None if starts is None else starts[part])
-            for part in np.array_split(np.arange(len(indices)), min(self.threads, len(indices) or 1))
-            if len(part)
-        ]
-        # Queued behind its parts, so they have all begun when a thread takes this up: it waits, but never for ever.
-        return pool.submit(self._whole, out, parts)
-
-    def _whole(self, out: Batch, parts: list[Future[None]]) -> Any:
-        for part in parts:
-            part.result()
-        return out if self.transform is None else self.transform(out)
-
-    def _starts(self, epoch: int, positions: np.ndarray) -> np.ndarray | None:
-        options = self.dataset.options
-        if options.window is None or options.start != "random":
-            return None
-        choices = self.dataset.manifest["sizes"]["T"] - options.span + 1
-        return (_hashed(_WINDOWS, self.seed, epoch, positions) % np.uint64(choices)).astype(np.int64)
-
-
-def _to_torch(batch: Batch) -> dict[str, Any]:
-    torch = importlib.import_module("torch")
-    return {name: torch.from_numpy(values) for name, values in batch.items()}
-
-
-def _to_jax(batch: Batch) -> dict[str, Any]:
-    return importlib.import_module("jax").device_put(batch)
-
-
-_DELIVER: dict[str, Callable[[Any], Any]] = {"numpy": lambda batch: batch, "torch": _to_torch, "jax": _to_jax}
-
-# What a random number is for, so that no two uses share one.
-_ORDER, _WINDOWS = 0, 1
-
-
-def order(seed: int, epoch: int, positions: np.ndarray, count: int) -> np.ndarray:
-    """The numbers of the videos at these positions of an epoch: a permutation of 0 to count - 1, nowhere stored.
-
-    A Feistel network permutes the smallest square power of two that holds `count`; what falls outside goes through
-    again until it falls inside (Black and Rogaway, CT-RSA 2002).
-    """
-    half = np.uint64(max(1, ((count - 1).bit_length() + 1) // 2))
-    keys = [_hashed(_ORDER, seed, epoch, step) for step in range(8)]
-    values = positions.astype(np.uint64)
-    outside = np.ones(values.shape, bool)
-    while outside.any():
-        values[outside] = _feistel(values[outside], keys, half)
-        outside = values >= count
-    return values.astype(np.int64)
-
-
-def _feistel(values: np.ndarray, keys: list[np.ndarray], half: np.uint64) -> np.ndarray:
-    mask = (np.uint64(1) << half) - np.uint64(1)
-    left, right = values >> half, values & mask
-    for key in keys:
-        left, right = right, left ^ (_mixed(right ^ key) & mask)
-    return (left << half) | right
-
-
-def _hashed(*parts: int | np.ndarray) -> np.ndarray:
-    """64 random bits that the parts decide, uint64, for each element of the parts."""
-    bits = np.zeros(1, np.uint64)
-    for part in parts:
-        bits = _mixed(bits ^ np.asarray(part).astype(np.uint64))
-    return bits
-
-
-def _mixed(bits: np.ndarray) -> np.ndarray:
-    """The next output of SplitMix64 (Steele, Lea and Flood, OOPSLA 2014), for each element."""
-    bits = bits + np.uint64(0x9E3779B97F4A7C15)
-    bits = (bits ^ (bits >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
-    bits = (bits ^ (bits >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
-    return bits ^ (bits >> np.uint64(31))

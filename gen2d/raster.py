@@ -2,7 +2,7 @@
 
 Pixels are (row, column) from the top left, pixel centres at (j + 0.5); the world is in metres, y up. A pixel takes an
 object's colour in proportion to its coverage, estimated from the signed distance d (in pixels) of the pixel's centre
-to the object's rim: clip(1/2 - d, 0, 1). Blending is done on sRGB values, as most tools do.
+to the object's rim: clip(1/2 - d, 0, 1), with the radius of a disc so that its area is kept. Blending is done on sRGB values, as most tools do.
 
 What never moves is drawn once a video. Moving discs are drawn in one of two forms that give the same image: on a CPU
 each disc touches a patch of its own size, in one flat loop over frames and discs (under `vmap` the loop would become a
@@ -75,6 +75,11 @@ def backdrop(scene: Scene, state: State, paint: Paint, layout: Layout, view: Vie
     return image.astype(jnp.uint8)
 
 
+def ramped(radius: Array) -> Array:
+    """The radius at which a disc drawn with a rim one pixel wide has the area of `radius`: the rim adds pi / 12 px^2."""
+    return jnp.where(radius > 0, jnp.sqrt(jnp.maximum(radius**2 - 1 / 12, 0.0)), radius)
+
+
 class Moving(NamedTuple):
     """The moving discs of some videos in pixels, back to front."""
 
@@ -96,11 +101,12 @@ def draw_dense(backdrops: Array, discs: Moving) -> Array:
     """Frames [n, T, H, W, 3] uint8: every pixel looks at every disc. The form for GPUs."""
     videos, frames, count = discs.column.shape
     height, width = backdrops.shape[1:3]
+    radius = ramped(discs.radius)
     x, y = jnp.arange(width) + 0.5, (jnp.arange(height) + 0.5)[:, None]
     image = jnp.broadcast_to(backdrops[:, None], (videos, frames, height, width, 3)).astype(jnp.float32)
     for k in range(count):
         dx, dy = x - discs.column[:, :, k, None, None], y - discs.row[:, :, k, None, None]
-        distance = jnp.sqrt(dx * dx + dy * dy) - discs.radius[:, None, k, None, None]
+        distance = jnp.sqrt(dx * dx + dy * dy) - radius[:, None, k, None, None]
         coverage = jnp.clip(0.5 - distance, 0, 1)[..., None]
         image = _blended(image, coverage, discs.color[:, None, k, None, None])
     return image.astype(jnp.uint8)
@@ -114,7 +120,7 @@ def draw_patches(backdrops: Array, discs: Moving, reach: float) -> Array:
     rows, columns = min(side, height), min(side, width)
     x = np.repeat(np.arange(columns, dtype=np.float32) + 0.5, 3)  # pixels lie as rows of red, green, blue, red ...
     y = np.arange(rows, dtype=np.float32)[:, None] + 0.5
-    flat = Moving(discs.column.reshape(-1), discs.row.reshape(-1), discs.radius, discs.color)
+    flat = Moving(discs.column.reshape(-1), discs.row.reshape(-1), ramped(discs.radius), discs.color)
 
     def draw(i: Array, buffer: Array) -> Array:
         frame, disc = i // count, i % count

@@ -10,8 +10,11 @@ from typing import Any
 import h5py
 import numpy as np
 
-from gen2d import loader, shards
+from gen2d import loader
 from gen2d.errors import ConfigError, DamagedError, FolderError
+from gen2d.files import file_sha256
+from gen2d.manifest import field_of, read_manifest
+from gen2d.plan import shard_path
 
 LEVELS = ("quick", "full")
 
@@ -53,7 +56,7 @@ def problems(root: str | Path, level: str = "quick") -> Iterator[Problem]:
     if level not in LEVELS:
         raise ConfigError(f"level is {level!r}, but must be one of {', '.join(LEVELS)}")
     try:
-        manifest = shards.read_manifest(root)
+        manifest = read_manifest(root)
     except (FolderError, DamagedError) as error:
         yield Problem(str(error))
         return
@@ -73,7 +76,7 @@ def _hashed_files(root: Path, manifest: Mapping[str, Any]) -> Iterator[Problem]:
     for name, sha256 in manifest["files"].items():
         if not (root / name).is_file():
             yield Problem(f"{root / name} is missing")
-        elif shards.file_sha256(root / name) != sha256:
+        elif file_sha256(root / name) != sha256:
             yield Problem(f"{root / name} is not what was written")
     for path in (root / "index").rglob("*"):
         if path.is_file() and path.relative_to(root).as_posix() not in manifest["files"]:
@@ -81,23 +84,22 @@ def _hashed_files(root: Path, manifest: Mapping[str, Any]) -> Iterator[Problem]:
 
 
 def _shard_files(root: Path, manifest: Mapping[str, Any]) -> Iterator[Problem]:
-    expected = {f"{shard['name']}.h5" for shard in manifest["shards"]}
-    for shard in manifest["shards"]:
-        path = root / "shards" / f"{shard['name']}.h5"
+    expected = {shard_path(root, shard["name"]): shard for shard in manifest["shards"]}
+    for path, shard in expected.items():
         size = path.stat().st_size if path.is_file() else None
         if size is None:
             yield Problem(f"{path} is missing", shard["name"])
         elif size != shard["bytes"]:
             yield Problem(f"{path} has {size} bytes, but was written with {shard['bytes']}", shard["name"])
     for path in sorted((root / "shards").glob("*")):
-        if path.name not in expected:
+        if path not in expected:
             yield Problem(f"{path} does not belong to the dataset")
 
 
 def _contents(root: Path, manifest: Mapping[str, Any], shard: Mapping[str, Any], indexed: bool) -> Iterator[Problem]:
-    path = root / "shards" / f"{shard['name']}.h5"
+    path = shard_path(root, shard["name"])
     try:
-        intact = shards.file_sha256(path) == shard["sha256"]
+        intact = file_sha256(path) == shard["sha256"]
     except OSError as error:
         yield Problem(f"{path} cannot be read ({error})", shard["name"])
         return
@@ -137,8 +139,7 @@ def _not_finite(values: Mapping[str, np.ndarray]) -> Iterator[tuple[str, str]]:
 
 def _structure(root: Path, manifest: Mapping[str, Any], shard: Mapping[str, Any]) -> Iterator[str]:
     """What differs between the file as HDF5 sees it and the manifest."""
-    path = root / "shards" / f"{shard['name']}.h5"
-    with h5py.File(path, "r") as file:
+    with h5py.File(shard_path(root, shard["name"]), "r") as file:
         if (file.attrs["split"], file.attrs["first"]) != (shard["split"], shard["first"]):
             yield f"it says that it begins with {file.attrs['split']} video {file.attrs['first']}"
         for name, about in manifest["fields"].items():
@@ -146,14 +147,17 @@ def _structure(root: Path, manifest: Mapping[str, Any], shard: Mapping[str, Any]
             if not isinstance(dataset, h5py.Dataset):
                 yield f"{name} is missing"
                 continue
-            shape = (shard["count"], *about["shape"]) if about["axes"].split()[:1] == ["n"] else tuple(about["shape"])
-            if dataset.shape != shape or dataset.dtype != np.dtype(about["dtype"]):
-                yield f"{name} is {dataset.dtype} {dataset.shape}, but must be {about['dtype']} {shape}"
-            yield from (
-                f"{name} has {key} {dataset.attrs.get(key)!r}, but must have {about[key]!r}"
-                for key in ("axes", "unit", "meaning")
-                if dataset.attrs.get(key) != about[key]
-            )
+            count = (shard["count"],) if field_of(about).per_video else ()
+            yield from (f"{name} {wrong}" for wrong in _misdescribed(dataset, about, (*count, *about["shape"])))
             constant = manifest["constants"].get(name)
             if constant is not None and not np.array_equal(dataset[()], constant):
                 yield f"{name} is not what the manifest says"
+
+
+def _misdescribed(dataset: h5py.Dataset, about: Mapping[str, Any], shape: tuple[int, ...]) -> Iterator[str]:
+    if dataset.shape != shape or dataset.dtype != np.dtype(about["dtype"]):
+        yield f"is {dataset.dtype} {dataset.shape}, but must be {about['dtype']} {shape}"
+    for key in ("axes", "unit", "meaning"):
+        found = dataset.attrs.get(key)
+        if found != about[key]:
+            yield f"has {key} {found!r}, but must have {about[key]!r}"

@@ -8,7 +8,6 @@ Every measurement runs in a process of its own, on the cores that it is given, a
 """
 
 import argparse
-import contextlib
 import importlib.metadata
 import json
 import os
@@ -29,7 +28,6 @@ import numpy as np
 HERE = Path(__file__).resolve()
 CONFIG = "benchmark.yaml"
 FRAMES_BYTES = 64 * 64 * 64 * 3  # of a raw video
-STAGES = ("sampler", "simulate", "render", "transfer", "compress", "write")
 CORES = sorted(os.sched_getaffinity(0))
 Turns = Mapping[str, Sequence[float]]  # by name: what was measured in each turn
 
@@ -73,7 +71,7 @@ def _parts(folder: Path, sets: Sequence[str]) -> dict[str, tuple[Callable[[], An
     from gen2d.generate import dataset_of
     from gen2d.rollout import parts
 
-    rollout = _rollout(sets)
+    rollout = rollout_of(sets)
     sample, simulate, numbers = _physics(rollout)
     drawn, batch = sample(numbers), rollout.begin("train", [0] * len(rollout.devices))
     whole = rollout.videos_per_shard // rollout.lanes * rollout.lanes
@@ -92,7 +90,6 @@ def _parts(folder: Path, sets: Sequence[str]) -> dict[str, tuple[Callable[[], An
     return {
         "sampler": (lambda: jax.block_until_ready(sample(numbers)), rollout.lanes),
         "simulate": (lambda: jax.block_until_ready(simulate(*drawn)), rollout.lanes),
-        "begin": (lambda: jax.block_until_ready(rollout.begin("train", [0] * len(rollout.devices))), rollout.lanes),
         "render": (draw, rollout.lanes),
         "transfer": (lambda: [rollout.host_columns(batch), *map(parts, frames)], rollout.lanes),
         "compress": (encode, rollout.lanes),
@@ -100,7 +97,8 @@ def _parts(folder: Path, sets: Sequence[str]) -> dict[str, tuple[Callable[[], An
     }
 
 
-def _rollout(sets: Sequence[str] = ()) -> Any:
+def rollout_of(sets: Sequence[str] = ()) -> Any:
+    """The compiled programs of the benchmark's config, on all devices of this process."""
     from gen2d import devices
     from gen2d.config import load_config
     from gen2d.rollout import Rollout
@@ -129,43 +127,47 @@ def _physics(rollout: Any) -> tuple[Callable, Callable, np.ndarray]:
 
 
 def steady(folder: Path, videos: int = 4096, turns: int = 3, peer_videos: int = 0) -> Turns:
-    """Videos a second of gen2d once it is compiled, from the first batch to the manifest; its use of the cores; the peer's speed."""
-    rollout, usage = _rollout(), []
+    """Videos/s of gen2d once it is compiled, first batch to manifest, and of the peer; the cores' use meanwhile."""
+    rollout, used, idle = rollout_of(), [], []
 
     def ours() -> float:
-        before, began = _cpu_seconds(), time.perf_counter()
-        make(rollout, folder, videos)
-        seconds = time.perf_counter() - began
-        usage.append((_cpu_seconds() - before) / seconds / len(os.sched_getaffinity(0)))
+        with tempfile.TemporaryDirectory(dir=folder) as out:
+            before, began = _cpu_seconds(), time.perf_counter()
+            make(rollout, videos, Path(out))
+            seconds = time.perf_counter() - began
+        own, nobody = (after - b for after, b in zip(_cpu_seconds(), before, strict=True))
+        used.append(own / seconds / len(os.sched_getaffinity(0)))
+        idle.append(nobody / seconds / (os.cpu_count() or 1))
         return videos / seconds
 
     reads = ("body", "batch") if peer_videos else ()
     works = {f"peer {read}": lambda read=read: peer_command(peer_videos, read)[0] for read in reads}
-    return in_turns({"gen2d": ours} | works, turns) | {"usage": usage[1:]}
+    return in_turns({"gen2d": ours} | works, turns) | {"used": used[1:], "idle": idle[1:]}
 
 
-def make(rollout: Any, folder: Path, videos: int) -> None:
+def make(rollout: Any, videos: int, out: Path) -> None:
     """Returns nothing; makes a dataset as `gen2d.generate` does, with programs that are compiled already."""
     from gen2d import devices, pipeline, shards
     from gen2d.generate import dataset_of
 
-    with tempfile.TemporaryDirectory(dir=folder) as name:
-        dataset = dataset_of(rollout, Path(name), {"train": videos})
-        encoder = pipeline.Encoder(rollout, dataset, pipeline.threads_for(devices.cores()))
-        writers = pipeline.Writers(dataset)
-        for shard, block in encoder.blocks(pipeline.batches(shards.open_folder(dataset), rollout.lanes)):
-            writers.put(shard, block)
-        writers.finish()
-        encoder.close()
-        assert shards.finish(dataset)
+    dataset = dataset_of(rollout, out, {"train": videos})
+    encoder = pipeline.Encoder(rollout, dataset, pipeline.threads_for(devices.cores()))
+    writers = pipeline.Writers(dataset)
+    for shard, block in encoder.blocks(pipeline.batches(shards.open_folder(dataset), rollout.lanes)):
+        writers.put(shard, block)
+    writers.finish()
+    encoder.close()
+    assert shards.finish(dataset)
 
 
-def _cpu_seconds() -> float:
-    return sum(resource.getrusage(resource.RUSAGE_SELF)[:2])
+def _cpu_seconds() -> tuple[float, float]:
+    """What this process has used, and what nobody on this machine has."""
+    idle = sum(map(int, Path("/proc/stat").read_text().split()[4:6])) / os.sysconf("SC_CLK_TCK")
+    return sum(resource.getrusage(resource.RUSAGE_SELF)[:2]), idle
 
 
 def bounds(folder: Path) -> dict[str, float]:
-    """How many videos have a ball that is nowhere, or whose centre is nearer to a wall than 3/4 of its radius; the deepest overlaps."""
+    """How many videos are broken: a state is not finite, or a centre nearer to a wall than 3/4 of the radius."""
     import gen2d
 
     dataset = gen2d.open(folder, fields=("states/*", "objects/radius", "objects/kind", "objects/present", "quality/*"))
@@ -175,8 +177,9 @@ def bounds(folder: Path) -> dict[str, float]:
         balls = (videos["objects/present"] & (videos["objects/kind"] == 0))[:, None]
         place, radius = videos["states/position"], videos["objects/radius"][:, None]
         gap = np.where(balls, np.minimum(place, 10.0 - place).min(-1) - radius, 0.0)
-        finite = [np.isfinite(values).reshape(len(values), -1).all(1) for name, values in videos.items() if "states" in name]
-        bad += int((~((gap >= -0.25 * radius).all((1, 2)) & np.all(finite, axis=0))).sum())
+        states = [values for name, values in videos.items() if name.startswith("states/")]
+        finite = np.all([np.isfinite(values.reshape(len(values), -1)).all(1) for values in states], axis=0)
+        bad += int((~((gap >= -0.25 * radius).all((1, 2)) & finite)).sum())
         walls, overlap = max(walls, float(-gap.min())), max(overlap, float(videos["quality/max_penetration"].max()))
     return {"videos": len(dataset), "bad": bad, "walls": walls, "overlap": overlap}
 
@@ -196,13 +199,12 @@ class Ran(NamedTuple):
 
 
 def run(command: Sequence[object], cores: Sequence[int] = CORES, env: Mapping[str, str] | None = None) -> Ran:
-    """Runs a command on these cores to its end."""
+    """Runs a command on these cores to its end; taskset, as a fork of a process that runs jax may hang."""
     path = os.pathsep.join([str(HERE.parent.parent), os.environ.get("PYTHONPATH", "")])
+    env = {**os.environ, "PYTHONPATH": path, **(env or {})}
+    line = ["taskset", "-c", ",".join(map(str, cores)), *map(str, command)]
     began = time.perf_counter()
-    process = subprocess.Popen(
-        list(map(str, command)), cwd=tempfile.gettempdir(), env={**os.environ, "PYTHONPATH": path, **(env or {})},
-        stdout=subprocess.PIPE, text=True, preexec_fn=lambda: os.sched_setaffinity(0, cores),
-    )  # fmt: skip
+    process = subprocess.Popen(line, cwd=tempfile.gettempdir(), env=env, stdout=subprocess.PIPE, text=True)
     assert process.stdout is not None
     text = process.stdout.read()
     _, status, usage = os.wait4(process.pid, 0)
@@ -253,7 +255,7 @@ class Promise(NamedTuple):
     value: float
     unit: str = "x"
     target: float | None = None
-    most: bool = False  # whether the target is the most, not the least
+    most: bool = False  # the target is the most, not the least
     note: str = ""
 
     @property
@@ -262,6 +264,7 @@ class Promise(NamedTuple):
 
 
 Found = Iterator[Row | Promise]
+BETA = "an interface that pymunk calls highly experimental"
 
 
 def _ratio(of: Sequence[float], to: Sequence[float]) -> float:
@@ -271,17 +274,15 @@ def _ratio(of: Sequence[float], to: Sequence[float]) -> float:
 def parts_section(folder: Path, quick: bool) -> Found:
     """Every stage on one core, and physics and drawing beside the peer's."""
     turns = measured(stages, folder, CORES[:1], turns=4 if quick else 9)
-    best = {name: statistics.median(values) for name, values in turns.items()}
-    best["begin"] -= best["sampler"] + best["simulate"]
-    ours = [*STAGES[:2], *STAGES[2:]]
-    total = sum(best[name] for name in ours) + max(best["begin"], 0)
-    peers = {"simulate": "peer body", "render": "peer draw"}
-    for name in ours:
-        yield Row(name, 1 / best[name], 1 / best[peers[name]] if name in peers else None, best[name] / total)
-    yield Row("backdrops, layout", 1 / max(best["begin"], 1e-9), None, max(best["begin"], 0) / total)
-    yield Row("all parts, 1 core", 1 / total, None, 1.0)
+    middle = {name: statistics.median(values) for name, values in turns.items()}
+    peers = {"simulate": middle["peer body"], "render": middle["peer draw"]}
+    ours = {name: seconds for name, seconds in middle.items() if not name.startswith("peer")}
+    total = sum(ours.values())
+    for name, seconds in ours.items():
+        yield Row(name, 1 / seconds, 1 / peers[name] if name in peers else None, seconds / total)
+    yield Row("all of these, 1 core", 1 / total)
     yield Promise("3 simulate, one core, against pymunk", _ratio(turns["peer body"], turns["simulate"]), target=5)
-    yield Promise("  the same, against pymunk.batch", _ratio(turns["peer batch"], turns["simulate"]), note="beta interface")
+    yield Promise("  the same, against pymunk.batch", _ratio(turns["peer batch"], turns["simulate"]), note=BETA)
     yield Promise("4 render, one core, against OpenCV", _ratio(turns["peer draw"], turns["render"]), target=5)
 
 
@@ -290,10 +291,10 @@ def steady_section(folder: Path, quick: bool) -> Found:
     count, repeats = (2048, 2) if quick else (4096, 5)
     turns = measured(steady, folder, videos=count, turns=repeats, peer_videos=256 if quick else 512)
     middle = {name: statistics.median(values) for name, values in turns.items()}
-    note = f"{middle['usage']:.0%} of {len(CORES)} cores in use"
+    note = f"of the cores gen2d uses {middle['used']:.0%}, {middle['idle']:.0%} are idle"
     yield Row(f"end to end, {len(CORES)} cores", middle["gen2d"], middle["peer body"], note=note)
     yield Promise("1 end to end, against the peer", _ratio(turns["gen2d"], turns["peer body"]), target=5)
-    yield Promise("  the same, it with pymunk.batch", _ratio(turns["gen2d"], turns["peer batch"]), note="beta interface")
+    yield Promise("  the same, it with pymunk.batch", _ratio(turns["gen2d"], turns["peer batch"]), note=BETA)
 
 
 def command_section(folder: Path, quick: bool) -> Found:
@@ -324,8 +325,8 @@ def scaling_section(folder: Path, quick: bool) -> Found:
     """One core against two, end to end."""
     if len(CORES) < 2:
         return
-    turns = [[max(measured(steady, folder, CORES[:k], videos=2048, turns=2)["gen2d"]) for k in (1, 2)] for _ in range(3)]
-    one, two = zip(*turns, strict=True)
+    rates = [measured(steady, folder, CORES[:k], videos=2048, turns=2)["gen2d"] for _ in range(3) for k in (1, 2)]
+    one, two = list(map(max, rates[::2])), list(map(max, rates[1::2]))
     note = f"{statistics.median(one):.0f} and {statistics.median(two):.0f} videos/s"
     yield Promise("6 two cores against one", _ratio(two, one), target=1.7, note=note)
 
@@ -362,16 +363,18 @@ def machine() -> dict[str, Any]:
 
 def text_of(facts: Mapping[str, Any], found: Sequence[Row | Promise]) -> str:
     """The tables."""
-    lines = [", ".join(f"{key} {value}" for key, value in facts.items()), ""]
-    lines += [f"{'':24} {'videos/s':>9} {'MB/s':>7} {'share':>6} {'peer':>9} {'ratio':>6}"]
-    for row in (row for row in found if isinstance(row, Row)):
-        share = f"{row.share:6.0%}" if row.share is not None else " " * 6
-        peer = f"{row.peer:9,.0f} {row.rate / row.peer:6.2f}" if row.peer else " " * 16
-        lines += [f"{row.name:24} {row.rate:9,.0f} {row.rate * FRAMES_BYTES / 1e6:7,.0f} {share} {peer}  {row.note}".rstrip()]
+    lines = [", ".join(f"{key} {value}" for key, value in facts.items())]
+    rows, promises = ([f for f in found if isinstance(f, kind)] for kind in (Row, Promise))
+    lines += ["", f"{'':21} {'videos/s':>9} {'MB/s':>8} {'share':>6} {'peer':>7} {'ratio':>6}"]
+    for row in rows:
+        share = f"{row.share:.0%}" if row.share else ""
+        peer, ratio = (f"{row.peer:,.0f}", f"{row.rate / row.peer:.2f}") if row.peer else ("", "")
+        speed = f"{row.rate:9,.0f} {row.rate * FRAMES_BYTES / 1e6:8,.0f}"
+        lines += [f"{row.name:21} {speed} {share:>6} {peer:>7} {ratio:>6}  {row.note}".rstrip()]
     lines += [""]
-    for p in (p for p in found if isinstance(p, Promise)):
-        target = "" if p.target is None else f"{'at most' if p.most else 'at least'} {p.target:g}: {'kept' if p.kept else 'NOT KEPT'}"
-        lines += [f"{p.name:38} {p.value:7.2f} {p.unit:7} {target:24} {p.note}".rstrip()]
+    for p in promises:
+        bound = f"{'at most' if p.most else 'at least'} {p.target:g}: {'kept' if p.kept else 'NOT KEPT'}"
+        lines += [f"{p.name:38} {p.value:7.2f} {p.unit:7} {'' if p.target is None else bound:24} {p.note}".rstrip()]
     return "\n".join(lines)
 
 

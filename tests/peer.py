@@ -25,7 +25,9 @@ ELASTICITY, FRICTION = 0.9, 0.2  # of balls and walls; Chipmunk multiplies
 FRAMES, SIZE, FPS, SUBSTEPS = 64, 64, 30, 4
 BACKGROUND, COLORS = 20, (40, 255)
 SHARD = 64  # videos
-STATE = batch.BodyFields.POSITION | batch.BodyFields.ANGLE | batch.BodyFields.VELOCITY | batch.BodyFields.ANGULAR_VELOCITY
+STATE = (
+    batch.BodyFields.POSITION | batch.BodyFields.ANGLE | batch.BodyFields.VELOCITY | batch.BodyFields.ANGULAR_VELOCITY
+)
 BITS = 4  # of a pixel's fraction
 
 
@@ -105,7 +107,8 @@ def _by_batch(space: pymunk.Space) -> Callable[[], Any]:
     return take
 
 
-# How states leave Chipmunk: by a body's attributes, as its manual shows, or by one call for all, in pymunk's beta interface.
+# How states leave Chipmunk: by each body's attributes, as pymunk's manual shows, or all by one call of its batch module,
+# which calls itself 'highly experimental'.
 READERS = {"body": _by_body, "batch": _by_batch}
 
 

@@ -7,6 +7,7 @@ import numpy as np
 
 from gen2d import shards
 from gen2d.fields import Field
+from gen2d.formats import hdf5
 from gen2d.shards import Dataset, Shard
 
 FIELDS = {
@@ -89,6 +90,12 @@ def make(made: Dataset, size: int = 3, **options: bool) -> Dataset:
         shards.write(made, shard, blocks(made, shard, size))
     assert shards.finish(made)
     return made
+
+
+def stored(root: Path, split: str = "train") -> dict[str, np.ndarray]:
+    """A split's fields as they lie on disk, read by h5py, all videos together."""
+    files = [hdf5.read(path) for path in sorted((root / "shards").glob(f"{split}-*.h5"))]
+    return {name: np.concatenate([file[name] for file in files]) for name in files[0] if name != "time"}
 
 
 def tree(root: Path) -> Mapping[str, bytes]:

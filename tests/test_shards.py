@@ -92,7 +92,7 @@ def test_the_index_says_where_the_bytes_are(tmp_path: Path, codec: str) -> None:
         assert codecs.crc32(data) == crc
 
 
-@pytest.mark.parametrize("codec", ["zstd", "none"])  # isal does not promise it
+@CODECS
 def test_bytes_depend_on_content_only(tmp_path: Path, codec: str) -> None:
     synthetic.make(synthetic.dataset(tmp_path / "a", codec=codec), size=1)
     if codec == "zstd":
@@ -344,12 +344,7 @@ def test_a_killed_writer_publishes_nothing_and_is_resumed(tmp_path: Path, codec:
     assert len(names) == 2
     synthetic.make(synthetic.dataset(tmp_path / "a", codec=codec))
     synthetic.make(synthetic.dataset(tmp_path / "b", codec=codec))
-    resumed, whole = synthetic.tree(tmp_path / "a"), synthetic.tree(tmp_path / "b")
-    assert resumed.keys() == whole.keys()
-    assert resumed == whole or codec == "gzip"
-    for path in sorted((tmp_path / "a" / "shards").iterdir()):
-        found, expected = hdf5.read(path), hdf5.read(tmp_path / "b" / "shards" / path.name)
-        assert all(np.array_equal(found[name], expected[name]) for name in expected)
+    assert synthetic.tree(tmp_path / "a") == synthetic.tree(tmp_path / "b")
 
 
 def test_the_manifest_keeps_to_the_schema_and_to_itself(tmp_path: Path) -> None:
@@ -363,17 +358,6 @@ def test_the_manifest_keeps_to_the_schema_and_to_itself(tmp_path: Path) -> None:
     (tmp_path / "manifest.json").write_text(text.replace('"fps": 10.0', '"fps": 11.0'))
     with pytest.raises(DamagedError, match="not what was written"):
         shards.read_manifest(tmp_path)
-
-
-def test_the_cards_name_every_field_and_file(tmp_path: Path) -> None:
-    made = synthetic.make(synthetic.dataset(tmp_path))
-    readme = (tmp_path / "README.md").read_text()
-    assert all(f"| {name} | {field.dtype} | {field.axes} |" in readme for name, field in made.fields.items())
-    assert all(word in readme for word in (made.command, made.licence, made.conventions))
-    croissant = json.loads((tmp_path / "croissant.json").read_text())
-    for part in croissant["distribution"]:
-        assert part["sha256"] == shards.file_sha256(tmp_path / part["contentUrl"])
-        assert part["contentSize"] == f"{(tmp_path / part['contentUrl']).stat().st_size} B"
 
 
 def test_the_log_takes_one_line_a_time(tmp_path: Path) -> None:

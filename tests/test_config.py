@@ -1,0 +1,121 @@
+"""Configs: what is read is what is meant, and what cannot be is one sentence with file, field, value and what may be."""
+
+import dataclasses
+
+import pytest
+import yaml
+from hypothesis import given
+from hypothesis import strategies as st
+from tiny import CONFIG, changed
+
+from gen2d import plugins
+from gen2d.config import MAX_SEED, load_config, parse_yaml
+from gen2d.errors import ConfigError
+from gen2d.factors import parse
+
+BAD = {
+    "scene: {balls: 0}": ("scene.balls is 0", "1 or more"),
+    "scene: {balls: 2.5}": ("scene.balls is 2.5", "whole number"),
+    "scene: {balls: [5, 3]}": ("scene.balls is [5, 3]", "lower end first"),
+    "scene: {radius: -1}": ("scene.radius is -1", "above 0"),
+    "scene: {radius: big}": ("scene.radius is 'big'", "[low, high]"),
+    "scene: {radius: [1, 2, 3]}": ("scene.radius is [1, 2, 3]", "2 numbers"),
+    "scene: {radius: {gauss: [1, 2]}}": ("scene.radius is {'gauss': [1, 2]}", "normal"),
+    "scene: {radius: {log_uniform: [0, 2]}}": ("log_uniform", "above 0"),
+    "scene: {radius: {normal: [1, 0.1]}}": ("scene.radius is", "above 0 for every value drawn"),
+    "scene: {radius: 7}": ("scene.radius may be 7 m", "must fit a box"),
+    "scene: {elasticity: 1.5}": ("scene.elasticity is 1.5", "1 or less"),
+    "scene: {gravity: -9.8}": ("scene.gravity is -9.8", "a list of 2 numbers"),
+    "scene: {ball: 3}": ("scene.ball is not an option", "did you mean balls?"),
+    "scene: bounce": ("scene is 'bounce'", "did you mean bouncing?"),
+    "look: {name: flatt}": ("look is 'flatt'", "did you mean flat?"),
+    "look: 3": ("look is 3", "a name"),
+    "video: {frames: 0}": ("video.frames is 0", "1 or more"),
+    "video: {frames: true}": ("video.frames is True", "whole number"),
+    "video: {width: 1e9}": ("video.width is 1000000000.0", "8192 or less"),
+    "video: [64, 64]": ("video is [64, 64]", "a mapping"),
+    "vidoe: {frames: 3}": ("vidoe is not a section", "did you mean video?"),
+    "physics: {substeps: .nan}": ("physics.substeps is nan", "whole number"),
+    "physics: {mixing: average}": ("physics.mixing is 'average'", "one of product"),
+    "storage: {codec: mp4}": ("storage.codec is 'mp4'", "one of gzip"),
+    "camera: {center: [1]}": ("camera.center is [1]", "a list of 2 numbers"),
+    "seed: -1": ("seed is -1", "0 to 2**63 - 1"),
+    "seed: 9223372036854775808": ("seed is 9223372036854775808", "0 to 2**63 - 1"),
+    "name: a/b": ("name is 'a/b'", "letters"),
+    "video: {frames: 3, frames: 4}": ("frames stands there twice", "line 1"),
+    "video: {frames: [3": ("not valid YAML", "line"),
+    "- 1": ("holds list", "mapping of sections"),
+    "a.b": ("holds str", "mapping of sections"),
+}
+
+
+@pytest.mark.parametrize("text", BAD)
+def test_a_bad_config_is_one_sentence_that_names_file_field_value_and_range(tmp_path, text):
+    path = tmp_path / "mine.yaml"
+    path.write_text(text)
+    with pytest.raises(ConfigError) as caught:
+        load_config(path)
+    sentence = str(caught.value)
+    assert str(path) in sentence
+    assert "\n" not in sentence
+    for part in BAD[text]:
+        assert part in sentence
+
+
+@pytest.mark.parametrize("text", ["physics.substeps", "=3", "physics.substeps=0", "physics..x=1", "nothing.at=1", "video=[1"])
+def test_a_bad_override_is_one_sentence(text):
+    with pytest.raises(ConfigError):
+        load_config(CONFIG, [text])
+
+
+def test_overrides_reach_every_level():
+    config = load_config("bouncing.yaml", ["physics.substeps=8", "scene.gravity=[0, [-12, -4]]", "look.wall_width=0", "name=mine"])
+    assert config.physics.substeps == 8
+    assert config.scene.options.gravity[1].support == (-12, -4)
+    assert (config.look.options.wall_width, config.name) == (0, "mine")
+
+
+def test_scientific_notation_is_a_number():
+    assert parse_yaml("[1e-3, 1E6, -2e+1, 1.5e3]", "here") == [1e-3, 1e6, -20.0, 1500.0]
+
+
+@pytest.mark.parametrize("name", plugins.config_names())
+def test_a_resolved_config_means_the_same(name):
+    config = load_config(name)
+    again = load_config(yaml.safe_load(config.text()))
+    assert again.plain() == config.plain()
+    assert again.sha256() == config.sha256()
+
+
+def test_the_hash_sees_every_option_but_not_the_seed():
+    config = load_config(CONFIG)
+    assert load_config({**CONFIG, "seed": 5}).sha256() == config.sha256()
+    assert load_config(changed(physics={"damping": 0.1})).sha256() != config.sha256()
+    assert load_config(changed(scene={"friction": 0.1})).sha256() != config.sha256()
+
+
+@given(st.integers(0, MAX_SEED))
+def test_every_seed_is_kept(seed):
+    assert load_config({**CONFIG, "seed": seed}).seed == seed
+
+
+def test_every_option_says_its_unit_and_meaning():
+    config = load_config(CONFIG)
+    for options in (config.video, config.physics, config.camera, config.storage, config.scene.options, config.look.options):
+        for field in dataclasses.fields(options):
+            assert field.metadata["option"].meaning
+            assert field.metadata["option"].allowed
+
+
+def test_a_family_of_ones_own_is_a_file(tmp_path):
+    own = tmp_path / "own.py"
+    own.write_text("from gen2d.scenes.bouncing import *\nfrom gen2d.scenes.bouncing import FACTORS, Options\n")
+    config = load_config({"scene": {"name": str(own), "balls": 2}})
+    assert config.scene.options.balls.support == (2, 2)
+    with pytest.raises(ConfigError, match="no such file"):
+        load_config({"scene": str(tmp_path / "other.py")})
+
+
+@given(st.floats(-1e6, 1e6), st.floats(0, 1e6))
+def test_a_range_keeps_its_ends(low, width):
+    assert parse([low, low + width]).support == (low, low + width)

@@ -1,0 +1,214 @@
+"""The order is a permutation that can be resumed anywhere, and batches are the same wherever they are made."""
+
+import itertools
+import multiprocessing
+import pickle
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import synthetic
+from numpy.testing import assert_array_equal
+
+from gen2d import loader
+from gen2d.dataloader import DataLoader, order
+from gen2d.errors import ConfigError
+
+TRAIN = 20
+
+
+@pytest.fixture(scope="module")
+def toy(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return synthetic.make(synthetic.dataset(tmp_path_factory.mktemp("data") / "toy")).root
+
+
+def numbers(batches: Sequence[dict[str, Any]]) -> list[list[int]]:
+    return [batch["index"].tolist() for batch in batches]
+
+
+# ---- The order
+
+
+@pytest.mark.parametrize("count", [*range(1, 70), 255, 256, 257, 1000, 4097])
+def test_the_order_is_a_permutation(count: int) -> None:
+    everything = order(3, 1, np.arange(count), count)
+    assert_array_equal(np.sort(everything), np.arange(count))
+    some = np.arange(count)[:: max(1, count // 7)]
+    assert_array_equal(order(3, 1, some, count), everything[some])
+
+
+def test_orders_differ_and_look_random() -> None:
+    orders = [order(seed, epoch, np.arange(1000), 1000) for seed in range(5) for epoch in range(20)]
+    assert len({found.tobytes() for found in orders}) == 100
+    # The mean of 100 places is normal around 499.5 with deviation 289 / sqrt(100).
+    assert abs(np.mean(orders, 0) - 499.5).max() < 5 * 28.9
+    assert abs(np.corrcoef(orders)[np.triu_indices(100, 1)]).max() < 0.2
+
+
+def test_a_huge_dataset_needs_no_memory() -> None:
+    found = order(0, 0, np.arange(10**12 - 5, 10**12), 10**12)
+    assert len(set(found.tolist())) == 5
+    assert ((found >= 0) & (found < 10**12)).all()
+
+
+# ---- Batches
+
+
+def test_an_epoch_gives_each_video_once(toy: Path) -> None:
+    dataset = loader.open(toy, fields="index")
+    for shuffle in (True, False):
+        batches = numbers(list(DataLoader(dataset, 6, epochs=1, shuffle=shuffle, remainder="keep")))
+        assert [len(batch) for batch in batches] == [6, 6, 6, 2]
+        assert sorted(itertools.chain(*batches)) == list(range(TRAIN))
+        assert (list(itertools.chain(*batches)) == list(range(TRAIN))) is not shuffle
+    dropped = DataLoader(dataset, 6, epochs=1)
+    assert [len(batch) for batch in numbers(list(dropped))] == [6, 6, 6]
+    assert len(dropped) == 3
+
+
+def test_each_iteration_goes_on_with_the_next_epoch(toy: Path) -> None:
+    dataset = loader.open(toy, fields="index")
+    one, two = (DataLoader(dataset, 6, epochs=epochs) for epochs in (1, 2))
+    assert numbers(list(one)) + numbers(list(one)) == numbers(list(two))
+
+
+@pytest.mark.parametrize("remainder", ["drop", "keep"])
+def test_ranks_share_each_global_batch(toy: Path, remainder: str) -> None:
+    dataset = loader.open(toy, fields="index")
+    alone = numbers(list(DataLoader(dataset, 6, epochs=2, remainder=remainder)))
+    for world_size in (2, 3):
+        ranks = [
+            numbers(list(DataLoader(dataset, 6 // world_size, 0, True, 2, rank, world_size, remainder)))
+            for rank in range(world_size)
+        ]
+        assert [list(itertools.chain(*parts)) for parts in zip(*ranks, strict=True)] == alone
+
+
+@pytest.mark.parametrize("remainder", ["drop", "keep"])
+def test_a_state_resumes_at_the_very_batch_on_any_world_size(toy: Path, remainder: str) -> None:
+    dataset = loader.open(toy, fields=("index", "states/angle"), window=2)
+    full = DataLoader(dataset, 6, epochs=2, remainder=remainder)
+    batches, states = [], [full.state_dict()]
+    for batch in full:
+        batches.append(batch)
+        states.append(pickle.loads(pickle.dumps(full.state_dict())))
+    for done, state in enumerate(states[:-1]):
+        for world_size in (1, 2, 3):
+            ranks = []
+            for rank in range(world_size):
+                part = DataLoader(dataset, 6 // world_size, 0, True, 2, rank, world_size, remainder)
+                part.load_state_dict(state)
+                ranks.append(list(part))
+            for parts, expected in zip(zip(*ranks, strict=True), batches[done:], strict=True):
+                for name, values in expected.items():
+                    assert_array_equal(np.concatenate([part[name] for part in parts]), values)
+
+
+def test_random_windows_follow_from_seed_epoch_and_position(toy: Path) -> None:
+    dataset, whole = loader.open(toy, fields=("index", "states/angle"), window=2), synthetic.stored(toy)["states/angle"]
+
+    def starts(**options: Any) -> list[int]:
+        found = []
+        for batch in DataLoader(dataset, 4, epochs=3, **options):
+            for index, angle in zip(batch["index"], batch["states/angle"], strict=True):
+                found += [start for start in range(4) if np.array_equal(whole[index, start : start + 2], angle)]
+        return found
+
+    assert starts() == starts(num_threads=1, prefetch=1)
+    assert starts() != starts(seed=1)
+    assert set(starts()) == {0, 1, 2, 3}
+    assert len(starts()) == 3 * TRAIN
+
+
+def test_a_state_of_another_order_is_refused(toy: Path) -> None:
+    dataset = loader.open(toy, fields="index")
+    state = DataLoader(dataset, 4, seed=1).state_dict()
+    with pytest.raises(ConfigError, match="the state has seed 1, but this loader has 0"):
+        DataLoader(dataset, 4).load_state_dict(state)
+
+
+def test_break_and_go_on(toy: Path) -> None:
+    dataset = loader.open(toy, fields="index")
+    expected = numbers(list(DataLoader(dataset, 4, epochs=1)))
+    with DataLoader(dataset, 4, epochs=1) as batches:
+        found = [next(iter(batches))["index"].tolist()]
+        found += numbers(list(batches))
+    assert found == expected
+
+
+def test_an_error_in_a_thread_reaches_the_caller(toy: Path) -> None:
+    def transform(batch: loader.Batch) -> loader.Batch:
+        raise ValueError("no such luck")
+
+    with pytest.raises(ValueError, match="no such luck"):
+        next(iter(DataLoader(loader.open(toy), 4, transform=transform)))
+
+
+def test_a_transform_gets_each_batch(toy: Path) -> None:
+    batches = DataLoader(loader.open(toy), 4, epochs=1, transform=lambda batch: {"sum": batch["frames"].sum()})
+    assert sum(int(batch["sum"]) for batch in batches) == synthetic.stored(toy)["frames"].sum()
+
+
+@pytest.mark.parametrize(
+    "options", [{"batch_size": 21}, {"batch_size": 0}, {"rank": 1}, {"to": "tensorflow"}, {"shuffle": "local"}]
+)
+def test_a_wrong_loader_option_is_refused(toy: Path, options: dict[str, Any]) -> None:
+    with pytest.raises(ConfigError):
+        DataLoader(loader.open(toy), **{"batch_size": 4, **options})
+
+
+# ---- Other kinds of arrays
+
+
+@pytest.fixture
+def aligned(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Batches begin at multiples of 64 bytes, where jax on a CPU takes over the memory itself."""
+
+    def aligned_like(values: np.ndarray) -> np.ndarray:
+        room = np.empty(values.nbytes + 64, np.uint8)
+        first = -room.ctypes.data % 64
+        return room[first : first + values.nbytes].view(values.dtype).reshape(values.shape)
+
+    empty = loader.Dataset.empty
+    monkeypatch.setattr(
+        loader.Dataset, "empty", lambda self, count: {k: aligned_like(v) for k, v in empty(self, count).items()}
+    )
+
+
+@pytest.mark.usefixtures("aligned")
+@pytest.mark.parametrize("kind", ["jax", "torch"])
+def test_batches_stay_as_they_were_while_others_follow(toy: Path, kind: str) -> None:
+    library = pytest.importorskip(kind)
+    dataset = loader.open(toy, fields="*", window=2)
+    expected = list(DataLoader(dataset, 4, epochs=3))
+    kept = list(DataLoader(dataset, 4, epochs=3, prefetch=1, to=kind))
+    for found, batch in zip(kept, expected, strict=True):
+        assert found.keys() == batch.keys()
+        for name, values in batch.items():
+            assert isinstance(found[name], library.Array if kind == "jax" else library.Tensor)
+            assert_array_equal(np.asarray(found[name]), values)
+
+
+# ---- Processes
+
+
+def read_in_process(dataset: loader.Dataset, send: Callable[[Any], None]) -> None:
+    send([*numbers(list(DataLoader(dataset, 4, epochs=1))), int(dataset[3]["frames"].sum())])
+
+
+@pytest.mark.filterwarnings("ignore:.*multi-threaded.*fork.*:DeprecationWarning")
+@pytest.mark.filterwarnings("ignore:os.fork.*:RuntimeWarning")
+@pytest.mark.parametrize("method", ["fork", "spawn"])
+def test_processes_read_the_same(toy: Path, method: str) -> None:
+    dataset = loader.open(toy, fields=("index", "frames"))
+    found: list[Any] = []
+    read_in_process(dataset, found.append)
+    context: Any = multiprocessing.get_context(method)
+    receiver, sender = context.Pipe(duplex=False)
+    process = context.Process(target=read_in_process, args=(dataset, sender.send))
+    process.start()
+    assert receiver.poll(60)
+    assert receiver.recv() == found[0]
+    process.join()

@@ -1,0 +1,278 @@
+"""What a run makes: the same videos in whatever way it is run, whole after any interruption, true to its config."""
+
+import json
+import os
+import random
+import signal
+import subprocess
+import time
+from pathlib import Path
+
+import h5py
+import jax
+import numpy as np
+import pytest
+import yaml
+from numpy.testing import assert_allclose, assert_array_equal
+from tiny import CONFIG, changed, command, everything, ran, same
+
+import gen2d
+from gen2d.errors import ConfigError, FolderError, UserError
+from gen2d.generate import generate
+
+N = 21
+
+
+@pytest.fixture(scope="module")
+def tiny(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("tiny") / "data"
+    generate(CONFIG, N, out)
+    return out
+
+
+def test_holds_exactly_what_was_asked(tiny: Path):
+    data = everything(tiny)
+    assert_array_equal(data["index"], np.arange(N))
+    assert data["frames"].shape == (N, 6, 16, 20, 3)
+    assert data["states/position"].shape == (N, 6, 7, 2)
+    ds = gen2d.open(tiny)
+    assert_array_equal(ds.time, np.arange(6) / 20)
+    assert gen2d.verify(tiny, "full") == []
+
+
+def test_frame_zero_is_the_drawn_start(tiny: Path):
+    data = everything(tiny)
+    balls = data["objects/kind"][:, :3] == 0
+    assert_array_equal(data["states/velocity"][:, 0, :3], data["factors/velocity"] * data["objects/present"][:, :3, None])
+    assert_array_equal(data["objects/present"][:, :3].sum(1), data["factors/balls"])
+    assert balls.all()
+    assert (data["states/angle"][:, 0, :3] == 0).all()
+
+
+def test_an_empty_slot_is_zero_everywhere(tiny: Path):
+    data = everything(tiny)
+    empty = ~data["objects/present"]
+    assert empty.any()
+    for name, values in data.items():
+        if name.startswith("objects/"):
+            assert (values[empty] == 0).all(), name
+        if name.startswith("states/"):
+            assert (np.moveaxis(values, 2, 1)[empty] == 0).all(), name
+
+
+def test_balls_start_apart_and_inside(tiny: Path):
+    data = everything(tiny)
+    for x, r, there in zip(data["states/position"][:, 0, :3], data["objects/radius"][:, :3], data["objects/present"], strict=True):
+        x, r = x[there[:3]].astype(float), r[there[:3]].astype(float)
+        assert (x >= r[:, None]).all()
+        assert (x <= [6, 5] - r[:, None]).all()
+        gaps = np.hypot(*(x[:, None] - x).transpose(2, 0, 1)) - r[:, None] - r
+        assert (gaps[~np.eye(len(x), dtype=bool)] > 0).all()
+
+
+def test_h5py_alone_reads_every_field_with_its_unit(tiny: Path):
+    manifest = json.loads((tiny / "manifest.json").read_text())
+    read: dict[str, list] = {name: [] for name in manifest["fields"]}
+    for shard in manifest["shards"]:
+        with h5py.File(tiny / "shards" / f"{shard['name']}.h5") as file:
+            for name, about in manifest["fields"].items():
+                assert {"axes", "unit", "meaning"} <= set(file[name].attrs)
+                assert file[name].attrs["unit"] == about["unit"]
+                read[name].append(file[name][...])
+    data = everything(tiny)
+    for name, values in data.items():
+        assert_array_equal(np.concatenate(read[name]), values)
+
+
+@pytest.mark.parametrize(
+    ("n", "options"),
+    [(5, {}), (40, {}), (N, {"videos_per_shard": 4}), (N, {"videos_per_shard": 7}), (N, {"codec": "zstd"})],
+)
+def test_a_video_does_not_depend_on_how_many_are_made_or_how_they_lie(tiny: Path, tmp_path: Path, n: int, options: dict):
+    generate(changed(storage=options), n, tmp_path / "other")
+    same(everything(tiny), everything(tmp_path / "other"), min(n, N))
+
+
+def test_a_video_does_not_depend_on_the_number_of_devices(tiny: Path, tmp_path: Path):
+    config = tmp_path / "tiny.yaml"
+    config.write_text(yaml.safe_dump(CONFIG))
+    for devices in ("1", "3"):
+        out = tmp_path / devices
+        code = (
+            "import jax; jax.config.update('jax_num_cpu_devices', %s); jax.devices();"
+            "from gen2d.generate import generate; generate(%r, %d, %r)" % (devices, str(config), N, str(out))
+        )
+        words, environment = command()
+        subprocess.run([words[0], "-c", code], env=environment, check=True, timeout=300)
+        same(everything(tiny), everything(out))
+
+
+def test_workers_together_make_what_one_makes(tiny: Path, tmp_path: Path):
+    out = tmp_path / "data"
+    assert not generate(CONFIG, N, out, worker=(1, 2)).complete
+    assert generate(CONFIG, N, out, worker=(0, 2)).complete
+    same(everything(tiny), everything(out))
+    assert (out / "manifest.json").read_bytes() == (tiny / "manifest.json").read_bytes()
+
+
+def test_another_seed_or_split_gives_other_videos_and_all_seeds_are_allowed(tiny: Path, tmp_path: Path):
+    starts = [everything(tiny)["factors/velocity"]]
+    for seed in (1, 2**32, 2**63 - 1):
+        generate(CONFIG, 4, tmp_path / str(seed), seed=seed)
+        starts.append(everything(tmp_path / str(seed))["factors/velocity"])
+    generate(CONFIG, 4, tmp_path / "test", split="test")
+    starts.append(everything(tmp_path / "test", "test")["factors/velocity"])
+    flat = np.concatenate([s.reshape(len(s), -1) for s in starts])
+    assert len(np.unique(flat, axis=0)) == len(flat)
+
+
+def test_running_again_does_nothing_and_a_larger_n_extends(tiny: Path, tmp_path: Path):
+    out = tmp_path / "data"
+    generate(CONFIG, 9, out)
+    first = (out / "shards" / "train-00000.h5").stat()
+    assert generate(CONFIG, 9, out).made == 0
+    assert generate(CONFIG, N, out).complete
+    assert (out / "shards" / "train-00000.h5").stat().st_mtime_ns == first.st_mtime_ns
+    same(everything(tiny), everything(out))
+
+
+def test_another_config_or_seed_is_refused_unless_overwritten(tmp_path: Path):
+    out = tmp_path / "data"
+    generate(CONFIG, 4, out)
+    before = everything(out)
+    with pytest.raises(FolderError, match="seed"):
+        generate(CONFIG, 4, out, seed=1)
+    with pytest.raises(FolderError, match="elasticity"):
+        generate(changed(scene={"elasticity": 0.5}), 4, out)
+    same(before, everything(out))
+    generate(CONFIG, 4, out, seed=1, overwrite=True)
+    assert not np.array_equal(before["frames"], everything(out)["frames"])
+
+
+def test_killed_at_random_moments_it_completes_to_the_same_bits(tiny: Path, tmp_path: Path):
+    config, out = tmp_path / "tiny.yaml", tmp_path / "data"
+    config.write_text(yaml.safe_dump(changed(storage={"videos_per_shard": 4})))
+    clean = tmp_path / "clean"
+    generate(str(config), 160, clean)
+    words, environment = command("--config", config, "--n", 160, "--out", out)
+    chance, killed = random.Random(0), 0
+    for attempt in range(12):
+        process = subprocess.Popen(words, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        shards = out / "shards"
+        wanted = chance.randint(1, 8) + 3 * attempt
+        while process.poll() is None and len(list(shards.glob("*.h5"))) < wanted:
+            time.sleep(0.001)
+        time.sleep(chance.random() * 0.02)
+        if process.poll() is None:
+            process.send_signal(signal.SIGKILL)
+            killed += 1
+        process.wait()
+        for path in shards.glob("*.h5"):
+            with h5py.File(path) as file:  # what has its final name is whole
+                assert file["frames"].shape[0] == 4
+    assert killed >= 4
+    assert ran("--config", config, "--n", 160, "--out", out).returncode == 0
+    same(everything(clean), everything(out))
+    same(everything(tiny), everything(out), N)
+    assert not list((out / "shards").glob("*.tmp*"))
+    assert gen2d.verify(out, "full") == []
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_stops_it_and_says_how_to_go_on(tmp_path: Path, number: int):
+    config, out = tmp_path / "tiny.yaml", tmp_path / "data"
+    config.write_text(yaml.safe_dump(changed(storage={"videos_per_shard": 4})))
+    arguments = ["--config", config, "--n", 4000, "--out", out]
+    words, environment = command(*arguments)
+    process = subprocess.Popen(words, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    while process.poll() is None and len(list((out / "shards").glob("*.h5"))) < 3:
+        time.sleep(0.005)
+    process.send_signal(number)
+    _, said = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert "To go on: python -m gen2d " + " ".join(map(str, arguments)) in said
+    assert "Traceback" not in said
+    assert not list((out / "shards").glob("*.tmp*"))
+
+
+def test_scenes_that_cannot_be_placed_are_an_error_with_the_options_to_change(tmp_path: Path):
+    crowded = changed(scene={"balls": 30, "radius": 1.0, "width": 8, "height": 8})
+    with pytest.raises(UserError, match="video 0 could not be placed"):
+        generate(crowded, 4, tmp_path / "data")
+
+
+def test_a_disk_too_small_is_refused_before_it_starts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("gen2d.shards.free_bytes", lambda path: 1000)
+    with pytest.raises(FolderError, match="disk has 1.0 kB free"):
+        generate(CONFIG, 64, tmp_path / "data")
+
+
+@pytest.mark.parametrize(("n", "worker"), [(0, (0, 1)), (-1, (0, 1)), (2**32, (0, 1)), (True, (0, 1)), (1, (1, 1)), (1, (0, 0))])
+def test_impossible_runs_are_refused(tmp_path: Path, n: int, worker: tuple[int, int]):
+    with pytest.raises(ConfigError):
+        generate(CONFIG, n, tmp_path, worker=worker)
+
+
+def test_the_frame_rate_does_not_change_the_motion(tmp_path: Path):
+    """Frame t is the state at t / fps: two rates agree where their frames fall together, at steps of one length."""
+    slow = changed(video={"fps": 10, "frames": 4}, physics={"substeps": 24}, scene={"elasticity": 1.0, "friction": 0})
+    fast = changed(video={"fps": 30, "frames": 10}, physics={"substeps": 8}, scene={"elasticity": 1.0, "friction": 0})
+    generate(slow, 8, tmp_path / "slow")
+    generate(fast, 8, tmp_path / "fast")
+    one, other = everything(tmp_path / "slow")["states/position"], everything(tmp_path / "fast")["states/position"]
+    assert_allclose(one, other[:, ::3], atol=1e-4)
+
+
+def test_the_command_line_tells_what_it_did(tmp_path: Path):
+    (tmp_path / "tiny.yaml").write_text(yaml.safe_dump(CONFIG))
+    done = ran("--config", "tiny.yaml", "--n", 9, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "9 videos in" in done.stdout
+    assert "datasets/tiny" in done.stdout
+    assert "will take about" in done.stderr
+    again = ran("--config", "tiny.yaml", "--n", 9, cwd=tmp_path)
+    assert (again.returncode, "nothing to do" in again.stdout) == (0, True)
+    sheet = ran("info", "datasets/tiny", cwd=tmp_path)
+    assert "train: 9 videos" in sheet.stdout
+    assert "m/s^2" in sheet.stdout
+    assert ran("verify", "datasets/tiny", cwd=tmp_path).returncode == 0
+    path = tmp_path / "datasets/tiny/shards/train-00001.h5"
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 4
+    path.write_bytes(content)
+    broken = ran("verify", "datasets/tiny", cwd=tmp_path)
+    assert broken.returncode == 1
+    assert "train-00001" in broken.stdout
+    pictures = ran("preview", "tiny.yaml", "--videos", 2, "--out", "pictures", cwd=tmp_path)
+    assert pictures.returncode == 0, pictures.stderr
+    for name in pictures.stdout.split():
+        assert os.path.getsize(tmp_path / name) > 500  # noqa: PTH202
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["--config", "nothing.yaml", "--n", "1"],
+        ["--config", "bouncing.yaml"],
+        ["--config", "bouncing.yaml", "--n", "many"],
+        ["--config", "bouncing.yaml", "--n", "0"],
+        ["--config", "bouncing.yaml", "--n", "1", "--seed", "-1"],
+        ["--config", "bouncing.yaml", "--n", "1", "--set", "scene.balls=0"],
+        ["--config", "bouncing.yaml", "--n", "1", "--worker", "3"],
+        ["--config", "bouncing.yaml", "--n", "1", "--device", "gpu"],
+        ["verify", "nowhere"],
+        ["info", "nowhere"],
+        ["preview", "nowhere"],
+        ["list", "nothing"],
+        ["bouncing.yaml"],
+    ],
+)
+def test_bad_commands_end_with_one_sentence_and_code_two(tmp_path: Path, arguments: list[str]):
+    if "gpu" in arguments and any(d.platform == "gpu" for d in jax.devices()):
+        return
+    done = ran(*arguments, cwd=tmp_path)
+    assert done.returncode == 2, done.stdout + done.stderr
+    sentences = [line for line in done.stderr.splitlines() if line.startswith("gen2d: ")]
+    assert len(sentences) == 1
+    assert "Traceback" not in done.stderr
+    assert not any(tmp_path.iterdir())
