@@ -1,7 +1,7 @@
 """Rendered-video datasets of 2D rigid bodies, with every ground truth.
 
     import gen2d
-    gen2d.generate("bouncing.yaml", n=1000, out="datasets/bouncing")  # or: python -m gen2d --config bouncing.yaml --n 1000
+    gen2d.generate("bouncing.yaml", n=1000, out="datasets/bouncing")
     ds = gen2d.open("datasets/bouncing")
     for batch in gen2d.DataLoader(ds, batch_size=32): ...
 
@@ -16,19 +16,20 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from gen2d.config import load_config
-    from gen2d.generate import generate
-    from gen2d.loader import DataLoader, open
-    from gen2d.verify import verify
+    from gen2d.dataloader import DataLoader
+    from gen2d.generation import generate
+    from gen2d.loader import open
+    from gen2d.verification import verify
 
 __version__ = "0.1.0"
 __all__ = ["DataLoader", "generate", "load_config", "open", "verify"]
 
 _HOME = {
-    "DataLoader": "gen2d.loader",
-    "generate": "gen2d.generate",
+    "DataLoader": "gen2d.dataloader",
+    "generate": "gen2d.generation",
     "load_config": "gen2d.config",
     "open": "gen2d.loader",
-    "verify": "gen2d.verify",
+    "verify": "gen2d.verification",
 }
 
 

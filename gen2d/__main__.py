@@ -52,16 +52,30 @@ def generating() -> Parser:
         epilog=GUIDE + verbs,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("--config", required=True, metavar="YAML", help="a file, or the name of one that comes with gen2d")
+    parser.add_argument(
+        "--config", required=True, metavar="YAML", help="a file, or the name of one that comes with gen2d"
+    )
     parser.add_argument("--n", required=True, type=int, metavar="N", help="how many videos the dataset is to hold")
     parser.add_argument("--out", type=Path, metavar="DIR", help="where (default: datasets/NAME in the current folder)")
     parser.add_argument("--seed", type=int, metavar="S", help="0 to 2**63 - 1 (default: the config's, else 0)")
     parser.add_argument("--split", default="train", metavar="NAME", help="the split that the videos belong to (train)")
     parser.add_argument(
-        "--set", action="append", default=[], metavar="A.B=V", dest="sets", help="override one option, such as physics.substeps=8"
+        "--set",
+        action="append",
+        default=[],
+        metavar="A.B=V",
+        dest="sets",
+        help="override one option, such as physics.substeps=8",
     )
-    parser.add_argument("--device", default="auto", choices=("auto", "cpu", "gpu"), help="where to compute (auto: a GPU if there is one)")
-    parser.add_argument("--worker", default="0/1", metavar="R/W", help="make every W-th shard, from the R-th on, beside other workers")
+    parser.add_argument(
+        "--device",
+        default="auto",
+        choices=("auto", "cpu", "gpu"),
+        help="where to compute (auto: a GPU if there is one)",
+    )
+    parser.add_argument(
+        "--worker", default="0/1", metavar="R/W", help="make every W-th shard, from the R-th on, beside other workers"
+    )
     parser.add_argument("--overwrite", action="store_true", help="replace a dataset of another config or seed")
     parser.add_argument("--version", action="version", version=f"gen2d {__version__}")
     return parser
@@ -75,13 +89,19 @@ def _verb_parser(verb: str) -> Parser:
     help_text = "a dataset's folder" + (", or a config" if verb == "preview" else "")
     parser.add_argument("dataset", metavar="DIR" + ("|CONFIG" if verb == "preview" else ""), help=help_text)
     if verb == "verify":
-        parser.add_argument("--level", choices=("quick", "full"), default="full", help="quick: sizes and index; full: every byte")
+        parser.add_argument(
+            "--level", choices=("quick", "full"), default="full", help="quick: sizes and index; full: every byte"
+        )
         parser.add_argument("--json", action="store_true", help="print the problems as JSON")
     if verb == "preview":
-        parser.add_argument("--out", type=Path, metavar="FOLDER", help="where to put the pictures (default: the current folder)")
+        parser.add_argument(
+            "--out", type=Path, metavar="FOLDER", help="where to put the pictures (default: the current folder)"
+        )
         parser.add_argument("--videos", type=int, default=8, help="how many rows of the sheet (8)")
         parser.add_argument("--seed", type=int, default=None, help="of a config")
-        parser.add_argument("--set", action="append", default=[], dest="sets", metavar="A.B=V", help="override an option of a config")
+        parser.add_argument(
+            "--set", action="append", default=[], dest="sets", metavar="A.B=V", help="override an option of a config"
+        )
     return parser
 
 
@@ -95,7 +115,7 @@ def _worker(text: str) -> tuple[int, int]:
 def generate(arguments: Sequence[str]) -> int:
     """The main job; 0, or 130 when it was interrupted."""
     options = generating().parse_args(arguments)
-    from gen2d import generate as job  # imports jax: only now
+    from gen2d import generation as job  # imports jax: only now
 
     begin = job.generate
     try:
@@ -124,14 +144,15 @@ def _told(summary: Any) -> str:
     if not summary.made:
         ready = "is complete" if summary.complete else "has all of this worker's shards"
         return f"{summary.out} {ready}: nothing to do."
-    text = f"{summary.made:,} videos in {in_time(summary.seconds)} ({summary.videos_per_second:,.0f} videos/s), {in_bytes(summary.bytes)}, in {summary.out}"
+    speed = f"{in_time(summary.seconds)} ({summary.videos_per_second:,.0f} videos/s)"
+    text = f"{summary.made:,} videos in {speed}, {in_bytes(summary.bytes)}, in {summary.out}"
     return text if summary.complete else text + "; other workers' shards are still missing"
 
 
 def verify(arguments: Sequence[str]) -> int:
     """0 if the dataset is whole, else 1 and what is wrong."""
     options = _verb_parser("verify").parse_args(arguments)
-    from gen2d.verify import verify as check
+    from gen2d.verification import verify as check
 
     problems = check(options.dataset, options.level)
     if options.json:

@@ -87,7 +87,9 @@ class PhysicsOptions:
         "product", str, "", "of two elasticities or frictions", choices=("product", "mean", "max", "geometric")
     )
     damping: float = option(0.0, float, "1/s", "rate at which velocity and spin die away", low=0, high=1000)
-    bounce_threshold: float = option(0.01, float, "m/s", "slower impacts do not bounce, nor any that gravity makes in two steps", low=0)
+    bounce_threshold: float = option(
+        0.01, float, "m/s", "slower impacts do not bounce, nor any that gravity makes in two steps", low=0
+    )
     contact_hertz: float = option(
         30.0, float, "Hz", "stiffness of an overlapping contact; at most 1/8 of the step rate", above=0
     )
@@ -212,7 +214,7 @@ _Loader.add_constructor("tag:yaml.org,2002:map", _mapping)
 def parse_yaml(text: str, source: str) -> Any:
     """The value that a YAML text stands for."""
     try:
-        return yaml.load(text, _Loader)  # noqa: S506 (a SafeLoader)
+        return yaml.load(text, _Loader)
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
         where = f" in line {mark.line + 1}" if mark else ""
@@ -324,8 +326,8 @@ def from_mapping(values: Any, source: str, name: str = "dataset") -> Config:
     if not isinstance(name, str) or not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}", name):
         raise ConfigError(f"{source}: name is {name!r}, but must be letters, digits, '.', '_' and '-', 100 at most")
     seed = checked_seed(values.get("seed", 0), f"{source}: seed")
-    sections = {s: build(cls, values.get(s) or {}, s, source) for s, cls in SECTIONS.items()}
-    plugs = {p: _plugin(p, values.get(p), default, source) for p, default in PLUGINS.items()}
+    sections: dict[str, Any] = {s: build(cls, values.get(s) or {}, s, source) for s, cls in SECTIONS.items()}
+    plugs: dict[str, Any] = {p: _plugin(p, values.get(p), default, source) for p, default in PLUGINS.items()}
     return Config(name=name, seed=seed, **sections, **plugs)
 
 

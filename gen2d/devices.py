@@ -4,6 +4,8 @@ import os
 import pathlib
 import platform
 import sys
+from importlib.metadata import version
+from typing import Any
 
 import h5py
 import isal
@@ -14,6 +16,7 @@ import zstandard
 from gen2d.errors import UserError
 
 DEVICES = ("auto", "cpu", "gpu")
+Device = Any  # jax.Device, which jax declares in a way that type checkers do not take
 
 
 class DeviceError(UserError):
@@ -25,7 +28,7 @@ def cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def prepare(device: str = "auto") -> list[jax.Device]:
+def prepare(device: str = "auto") -> list[Device]:
     """The devices to compute on. CPU cores count as devices, one each, unless this process already runs jax.
 
     Also keeps compiled programs between runs, in $JAX_COMPILATION_CACHE_DIR or the user's cache folder.
@@ -33,7 +36,7 @@ def prepare(device: str = "auto") -> list[jax.Device]:
     if device not in DEVICES:
         raise DeviceError(f"--device is {device!r}, but must be one of {', '.join(DEVICES)}")
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
-    if jax.config.jax_compilation_cache_dir is None:
+    if jax.config.values["jax_compilation_cache_dir"] is None:
         home = pathlib.Path(os.environ.get("XDG_CACHE_HOME") or pathlib.Path.home() / ".cache")
         jax.config.update("jax_compilation_cache_dir", str(home / "gen2d"))
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
@@ -61,19 +64,19 @@ def instruction_set() -> str:
     return next((isa for isa in ("avx512f", "avx2", "avx") if isa in flags), platform.machine())
 
 
-def fingerprint(device: jax.Device, lanes: int) -> dict[str, object]:
+def fingerprint(device: Device, lanes: int) -> dict[str, object]:
     """What decides the bits of a simulation; a dataset holds videos of one fingerprint only."""
     kind = device.device_kind if device.platform != "cpu" else f"cpu {instruction_set()}"
-    return {"jaxlib": jax.lib.__version__, "device": kind, "lanes": lanes, "xla_flags": os.environ.get("XLA_FLAGS", "")}
+    return {"jaxlib": version("jaxlib"), "device": kind, "lanes": lanes, "xla_flags": os.environ.get("XLA_FLAGS", "")}
 
 
-def producer(device: jax.Device, lanes: int, version: str) -> dict[str, object]:
+def producer(device: Device, lanes: int, gen2d: str) -> dict[str, object]:
     """The versions that made a dataset, and the fingerprint."""
     return {
-        "gen2d": version,
+        "gen2d": gen2d,
         "python": ".".join(map(str, sys.version_info[:3])),
         "jax": jax.__version__,
-        "jaxlib": jax.lib.__version__,
+        "jaxlib": version("jaxlib"),
         "numpy": np.__version__,
         "h5py": h5py.__version__,
         "hdf5": h5py.version.hdf5_version,

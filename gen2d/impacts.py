@@ -41,8 +41,8 @@ def wall_impact(
 
     `gap` is the distance at the start, `speed` the normal speed with this step's gravity in it, `pull` gravity's part
     towards the plane (a below). With V the approach speed at the start the disc arrives at u = sqrt(V^2 + 2 a gap),
-    after tau = 2 gap / (V + u), and leaves at e u, of which gravity takes a (h - tau) until the end. Where gravity takes
-    all of it the disc has come to rest.
+    after tau = 2 gap / (V + u), and leaves at e u, of which gravity takes a (h - tau) until the end. Where it takes all
+    of it the disc has come to rest.
     """
     approach = -speed - pull * h
     above = jnp.maximum(gap, 0.0)

@@ -40,7 +40,9 @@ def batches(todo: Sequence[Shard], lanes: int) -> list[tuple[str, int, list[Piec
     return [(split, first, pieces) for (split, first), pieces in found.items()]
 
 
-def groups(work: Sequence[tuple[str, int, list[Piece]]], devices: int) -> Iterator[tuple[str, list[int], list[list[Piece]]]]:
+def groups(
+    work: Sequence[tuple[str, int, list[Piece]]], devices: int
+) -> Iterator[tuple[str, list[int], list[list[Piece]]]]:
     """The batches, as many at a time as there are devices; a device left over repeats the last batch for nothing."""
     line = list(work)
     while line:
@@ -158,7 +160,7 @@ class Writers:
         self.dataset = dataset
         self.pool = ThreadPoolExecutor(2, "write")
         self.shard: Shard | None = None
-        self.line: queue.Queue[Block | None | _Dropped] = queue.Queue()
+        self.line: queue.Queue[Block | _Dropped | None] = queue.Queue()
         self.futures: deque[Future[dict]] = deque()
 
     def put(self, shard: Shard, block: Block) -> None:
@@ -171,7 +173,7 @@ class Writers:
             self.futures.append(self.pool.submit(shards.write, self.dataset, shard, _drained(self.line)))
         self._send(block)
 
-    def _send(self, entry: Block | None | _Dropped) -> None:
+    def _send(self, entry: Block | _Dropped | None) -> None:
         while True:
             try:
                 return self.line.put(entry, timeout=0.1)

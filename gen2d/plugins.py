@@ -36,7 +36,8 @@ def _load_path(kind: str, path: pathlib.Path, source: str) -> ModuleType:
     if not path.is_file():
         raise ConfigError(f"{source}: {kind} is {str(path)!r}, but there is no such file")
     spec = importlib.util.spec_from_file_location(f"gen2d_user_{kind}_{path.stem}", path)
-    assert spec is not None and spec.loader is not None  # a .py file always has a loader
+    assert spec is not None  # a .py file always has a loader
+    assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module

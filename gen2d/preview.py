@@ -76,7 +76,7 @@ def animate(path: Path, frames: np.ndarray, fps: float) -> None:
     rows = [np.concatenate([_tiled(v) for v in cells[i : i + across]], axis=2) for i in range(0, len(cells), across)]
     movie = cv2.Animation()
     movie.frames = [image[..., ::-1].copy() for image in np.concatenate(rows, axis=1)]
-    movie.durations = np.full(len(movie.frames), max(20, round(1000 / fps)), np.int32)
+    movie.durations = [max(20, round(1000 / fps))] * len(movie.frames)
     if not cv2.imwriteanimation(str(path), movie):
         raise OSError("OpenCV could not write a GIF")
 

@@ -2,7 +2,8 @@
 
 Pixels are (row, column) from the top left, pixel centres at (j + 0.5); the world is in metres, y up. A pixel takes an
 object's colour in proportion to its coverage, estimated from the signed distance d (in pixels) of the pixel's centre
-to the object's rim: clip(1/2 - d, 0, 1), with the radius of a disc so that its area is kept. Blending is done on sRGB values, as most tools do.
+to the object's rim: clip(1/2 - d, 0, 1), with the radius of a disc so that its area is kept. Blending is done on sRGB
+values, as most tools do.
 
 What never moves is drawn once a video. Moving discs are drawn in one of two forms that give the same image: on a CPU
 each disc touches a patch of its own size, in one flat loop over frames and discs (under `vmap` the loop would become a
@@ -11,7 +12,7 @@ scatter, half as fast); on a GPU every pixel looks at every disc, which fuses in
 
 import dataclasses
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -39,11 +40,11 @@ class View:
     center: tuple[float, float]  # m, world point in the middle of the frame
     scale: float  # px/m
 
-    def column(self, x: Array) -> Array:
+    def column(self, x: Any) -> Any:
         """Pixels from the left edge, of a world x."""
         return (x - self.center[0]) * self.scale + self.width / 2
 
-    def row(self, y: Array) -> Array:
+    def row(self, y: Any) -> Any:
         """Pixels from the top edge, of a world y."""
         return self.height / 2 - (y - self.center[1]) * self.scale
 
@@ -76,7 +77,7 @@ def backdrop(scene: Scene, state: State, paint: Paint, layout: Layout, view: Vie
 
 
 def ramped(radius: Array) -> Array:
-    """The radius at which a disc drawn with a rim one pixel wide has the area of `radius`: the rim adds pi / 12 px^2."""
+    """The radius whose disc, drawn with a rim one pixel wide, has the area of `radius`: the rim adds pi / 12 px^2."""
     return jnp.where(radius > 0, jnp.sqrt(jnp.maximum(radius**2 - 1 / 12, 0.0)), radius)
 
 

@@ -28,7 +28,9 @@ def in_time(seconds: float) -> str:
 
 def _table(rows: list[tuple[str, ...]]) -> list[str]:
     widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
-    return ["  " + "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
+    return [
+        "  " + "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows
+    ]
 
 
 def sheet(root: Path) -> str:
@@ -42,10 +44,11 @@ def sheet(root: Path) -> str:
     producer = manifest["producer"]
     versions = ", ".join(f"{key} {value}" for key, value in producer.items() if key != "fingerprint")
     fingerprint = ", ".join(f"{key} {value or '-'}" for key, value in manifest["fingerprint"].items())
+    volume = f"{in_bytes(size)} in {len(manifest['shards'])} shards"
     return "\n".join(
         [
             f"{manifest['name']} ({root})",
-            f"  {splits}; {in_bytes(size)} in {len(manifest['shards'])} shards; seed {manifest['seed']}, {manifest['fps']:g} frames/s",
+            f"  {splits}; {volume}; seed {manifest['seed']}, {manifest['fps']:g} frames/s",
             f"  sizes: {sizes}",
             "",
             *_table(rows),
@@ -66,7 +69,11 @@ def plugins_text(name: str | None = None) -> str:
         lines += [f"{title}:"] if found else []
         for plugin in found:
             module = plugins.load(kind, plugin)
-            lines += [f" {plugin}: {(module.__doc__ or '').strip().splitlines()[0]}", *_options(kind, module.Options), ""]
+            lines += [
+                f" {plugin}: {(module.__doc__ or '').strip().splitlines()[0]}",
+                *_options(kind, module.Options),
+                "",
+            ]
     configs = [c for c in plugins.config_names() if name in (None, c, c.removesuffix(".yaml"))]
     if configs:
         lines += [f"Configs (in {plugins.config_folder()}):", *(f"  {c}" for c in configs), ""]

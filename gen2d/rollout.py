@@ -1,6 +1,6 @@
 """The device's side of generation: video numbers in, ground truth and frames out, a fixed number of videos at a time.
 
-Two programs. `simulate` samples and simulates `lanes` videos on every device; `draw` draws a slice of them, small enough
+Two programs. `simulate` samples and simulates `lanes` videos on every device; `draw` draws a slice of them, so small
 that its frames stay in the cache until they are compressed. `lanes` comes from the config, never from the machine, so
 more devices mean more batches, not wider ones, and video i always sits in lane i % lanes of the same program: its bits
 do not depend on how many videos are made, or where.
@@ -45,7 +45,7 @@ def _power_of_two(limit: int) -> int:
 class Rollout:
     """The compiled programs of one config on some devices."""
 
-    def __init__(self, config: Config, devices: Sequence[jax.Device]) -> None:
+    def __init__(self, config: Config, devices: Sequence[Any]) -> None:
         self.config, self.devices = config, list(devices)
         family, options, video = config.scene.module, config.scene.options, config.video
         self.layout = family.layout(options)
@@ -106,7 +106,7 @@ class Rollout:
     def _draw(self, count: int) -> Any:
         def drawn(backdrops: Array, discs: raster.Moving, start: Array) -> Array:
             cut = jax.tree.map(lambda x: jax.lax.dynamic_slice_in_dim(x, start, count), (backdrops, discs))
-            return raster.draw(*cut, self.layout.reach * self.view.scale)
+            return raster.draw(cut[0], cut[1], self.layout.reach * self.view.scale)
 
         return jax.jit(self._shared(drawn, (VIDEOS, VIDEOS, PartitionSpec())))
 
@@ -146,7 +146,7 @@ class Rollout:
         """The camera's fields for `count` videos."""
         shape = (count, self.config.video.frames)
         return {
-            "camera/center": np.broadcast_to(np.float32(self.view.center), (*shape, 2)),
+            "camera/center": np.broadcast_to(np.array(self.view.center, np.float32), (*shape, 2)),
             "camera/scale": np.full(shape, self.view.scale, np.float32),
             "camera/angle": np.zeros(shape, np.float32),
         }

@@ -8,8 +8,8 @@ import jax.numpy as jnp
 
 from gen2d.contacts import Segments
 from gen2d.solver import Discs, Impulse, Memory, Motion, Row, Rules, Setup, row, step
-from gen2d.tournament import halves, tournament
-from gen2d.types import Array, Layout, Objects, Quality, Scene, State, Trajectory
+from gen2d.tournament import tournament
+from gen2d.types import Array, Layout, Objects, Quality, Record, Scene, State, Trajectory
 
 
 def substeps(fps: float, asked: int | None, max_step: float) -> int:
@@ -22,7 +22,7 @@ def _inverse(value: Array, present: Array) -> Array:
     return jnp.where(usable, 1 / jnp.where(usable, value, 1.0), 0.0)
 
 
-def _clean(values: Objects | State, present: Array) -> Objects | State:
+def _clean(values: Record, present: Array) -> Record:
     """The record with nothing in its empty slots, so that whatever stood there (NaN, too) cannot matter."""
     return jax.tree.map(lambda x: jnp.where(present, x, jnp.zeros_like(x)), values)
 
@@ -80,7 +80,7 @@ def simulate(scene: Scene, state: State, layout: Layout, rules: Rules, frames: i
     Scene and state have bodies before scenes: position [2, K, n] in m, angle [K, n] in rad, and so on (types.py); the
     result has frames first: position [T, 2, K, n]. What stands in empty slots is ignored; they come back as zeros.
     """
-    scene = dataclasses.replace(scene, objects=_clean_objects(scene.objects))
+    scene = dataclasses.replace(scene, objects=_clean(scene.objects, scene.objects.present))
     state = _clean(state, scene.objects.present)
     setup = _setup(scene, state, layout, rules)
     discs, padding = layout.discs, layout.discs % 2
@@ -104,10 +104,6 @@ def simulate(scene: Scene, state: State, layout: Layout, rules: Rules, frames: i
     return Trajectory(_states(state, later, layout), _quality(memory))
 
 
-def _clean_objects(objects: Objects) -> Objects:
-    return jax.tree.map(lambda x: jnp.where(objects.present, x, jnp.zeros_like(x)), objects)
-
-
 def _states(start: State, later: tuple, layout: Layout) -> State:
     """All frames of all slots: the first from the initial state, of what is fixed throughout."""
 
@@ -115,14 +111,16 @@ def _states(start: State, later: tuple, layout: Layout) -> State:
         fixed = jnp.broadcast_to(first[..., layout.discs :, :], (*moved.shape[:-2], layout.segments, moved.shape[-1]))
         return jnp.concatenate([first[None], jnp.concatenate([moved, fixed], axis=-2)], axis=0)
 
-    first = start.position, start.angle, start.velocity, start.angular_velocity
-    return State(*map(joined, first, later))
+    position, angle, velocity, spin = later
+    return State(
+        position=joined(start.position, position),
+        angle=joined(start.angle, angle),
+        velocity=joined(start.velocity, velocity),
+        angular_velocity=joined(start.angular_velocity, spin),
+    )
 
 
 def _quality(memory: Memory) -> Quality:
     depth = jnp.maximum(jnp.max(memory.pair_depth, axis=0), jnp.max(memory.wall_depth, axis=0))
     begins = jnp.sum(memory.pair_begins, axis=0) + jnp.sum(memory.wall_begins, axis=0)
     return Quality(depth, begins)
-
-
-__all__ = ["halves", "simulate", "substeps"]

@@ -20,7 +20,7 @@ def settled(values: Any, one: Array) -> Any:
 
 
 def halves(values: Any) -> tuple[Any, Any]:
-    """Two half-arrays over the bodies (the axis before the scenes'): every body of the first meets one of the second."""
+    """Two half-arrays over the bodies (the axis before the scenes'): each of the first meets one of the second."""
     count = jax.tree.leaves(values)[0].shape[-2] // 2
     return jax.tree.map(lambda x: x[..., :count, :], values), jax.tree.map(lambda x: x[..., count:, :], values)
 

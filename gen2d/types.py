@@ -6,7 +6,7 @@ is the one that SIMD lanes and GPU threads run over. `to_device` and `to_stored`
 """
 
 import dataclasses
-from typing import Any, TypeVar
+from typing import Any, TypeVar, dataclass_transform
 
 import jax
 import jax.numpy as jnp
@@ -24,6 +24,7 @@ def axes(name: str, axes: str, unit: str, meaning: str, dtype: str = "float32") 
     return dataclasses.field(metadata={"name": name, "field": Field(dtype, axes, unit, meaning)})
 
 
+@dataclass_transform(frozen_default=True, field_specifiers=(axes,))
 def record(cls: type[Record]) -> type[Record]:
     """The class as a frozen dataclass that jax takes as a pytree."""
     return jax.tree_util.register_dataclass(dataclasses.dataclass(frozen=True, eq=False)(cls))

@@ -68,7 +68,7 @@ def _parts(folder: Path, sets: Sequence[str]) -> dict[str, tuple[Callable[[], An
     import jax
 
     from gen2d import devices, pipeline, shards
-    from gen2d.generate import dataset_of
+    from gen2d.generation import dataset_of
     from gen2d.rollout import parts
 
     rollout = rollout_of(sets)
@@ -148,7 +148,7 @@ def steady(folder: Path, videos: int = 4096, turns: int = 3, peer_videos: int = 
 def make(rollout: Any, videos: int, out: Path) -> None:
     """Returns nothing; makes a dataset as `gen2d.generate` does, with programs that are compiled already."""
     from gen2d import devices, pipeline, shards
-    from gen2d.generate import dataset_of
+    from gen2d.generation import dataset_of
 
     dataset = dataset_of(rollout, out, {"train": videos})
     encoder = pipeline.Encoder(rollout, dataset, pipeline.threads_for(devices.cores()))
@@ -204,20 +204,21 @@ def run(command: Sequence[object], cores: Sequence[int] = CORES, env: Mapping[st
     env = {**os.environ, "PYTHONPATH": path, **(env or {})}
     line = ["taskset", "-c", ",".join(map(str, cores)), *map(str, command)]
     began = time.perf_counter()
-    process = subprocess.Popen(line, cwd=tempfile.gettempdir(), env=env, stdout=subprocess.PIPE, text=True)
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
+    process = subprocess.Popen(line, cwd=tempfile.gettempdir(), env=env, text=True, **pipes)
     assert process.stdout is not None
     text = process.stdout.read()
     _, status, usage = os.wait4(process.pid, 0)
     process.returncode = os.waitstatus_to_exitcode(status)
     if process.returncode:
-        raise SystemExit(f"bench.py: {' '.join(map(str, command))} failed")
+        raise SystemExit(f"{text}\nbench.py: {' '.join(line)} failed")
     return Ran(time.perf_counter() - began, usage.ru_maxrss * 1024, text)
 
 
 def measured(work: Callable, folder: Path, cores: Sequence[int] = CORES, **options: Any) -> Any:
     """What one of MEASUREMENTS gives in a process of its own."""
     ran = run([sys.executable, HERE, "--measure", work.__name__, folder, json.dumps(options)], cores)
-    return json.loads(ran.text.splitlines()[-1])
+    return json.loads(next(line for line in ran.text.splitlines() if line.startswith("{")))
 
 
 def command(videos: int, out: Path, *sets: str, cache: Path | None = None) -> Ran:
@@ -259,8 +260,12 @@ class Promise(NamedTuple):
     note: str = ""
 
     @property
-    def kept(self) -> bool:
-        return self.target is None or (self.value <= self.target if self.most else self.value >= self.target)
+    def verdict(self) -> str:
+        """The target, and whether it is reached; nothing where there is none."""
+        if self.target is None:
+            return ""
+        kept = self.value <= self.target if self.most else self.value >= self.target
+        return f"{'at most' if self.most else 'at least'} {self.target:g}: {'kept' if kept else 'NOT KEPT'}"
 
 
 Found = Iterator[Row | Promise]
@@ -373,8 +378,7 @@ def text_of(facts: Mapping[str, Any], found: Sequence[Row | Promise]) -> str:
         lines += [f"{row.name:21} {speed} {share:>6} {peer:>7} {ratio:>6}  {row.note}".rstrip()]
     lines += [""]
     for p in promises:
-        bound = f"{'at most' if p.most else 'at least'} {p.target:g}: {'kept' if p.kept else 'NOT KEPT'}"
-        lines += [f"{p.name:38} {p.value:7.2f} {p.unit:7} {'' if p.target is None else bound:24} {p.note}".rstrip()]
+        lines += [f"{p.name:38} {p.value:7.2f} {p.unit:7} {p.verdict:22} {p.note}".rstrip()]
     return "\n".join(lines)
 
 

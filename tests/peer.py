@@ -107,7 +107,7 @@ def _by_batch(space: pymunk.Space) -> Callable[[], Any]:
     return take
 
 
-# How states leave Chipmunk: by each body's attributes, as pymunk's manual shows, or all by one call of its batch module,
+# How states leave Chipmunk: by each body's attributes, as pymunk's manual shows, or all by one call of pymunk.batch,
 # which calls itself 'highly experimental'.
 READERS = {"body": _by_body, "batch": _by_batch}
 

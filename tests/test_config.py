@@ -1,4 +1,4 @@
-"""Configs: what is read is what is meant, and what cannot be is one sentence with file, field, value and what may be."""
+"""Configs: what is read is what is meant; what cannot be is one sentence with file, field, value and what may be."""
 
 import dataclasses
 
@@ -62,14 +62,18 @@ def test_a_bad_config_is_one_sentence_that_names_file_field_value_and_range(tmp_
         assert part in sentence
 
 
-@pytest.mark.parametrize("text", ["physics.substeps", "=3", "physics.substeps=0", "physics..x=1", "nothing.at=1", "video=[1"])
+@pytest.mark.parametrize(
+    "text", ["physics.substeps", "=3", "physics.substeps=0", "physics..x=1", "nothing.at=1", "video=[1"]
+)
 def test_a_bad_override_is_one_sentence(text):
     with pytest.raises(ConfigError):
         load_config(CONFIG, [text])
 
 
 def test_overrides_reach_every_level():
-    config = load_config("bouncing.yaml", ["physics.substeps=8", "scene.gravity=[0, [-12, -4]]", "look.wall_width=0", "name=mine"])
+    config = load_config(
+        "bouncing.yaml", ["physics.substeps=8", "scene.gravity=[0, [-12, -4]]", "look.wall_width=0", "name=mine"]
+    )
     assert config.physics.substeps == 8
     assert config.scene.options.gravity[1].support == (-12, -4)
     assert (config.look.options.wall_width, config.name) == (0, "mine")
@@ -101,7 +105,14 @@ def test_every_seed_is_kept(seed):
 
 def test_every_option_says_its_unit_and_meaning():
     config = load_config(CONFIG)
-    for options in (config.video, config.physics, config.camera, config.storage, config.scene.options, config.look.options):
+    for options in (
+        config.video,
+        config.physics,
+        config.camera,
+        config.storage,
+        config.scene.options,
+        config.look.options,
+    ):
         for field in dataclasses.fields(options):
             assert field.metadata["option"].meaning
             assert field.metadata["option"].allowed

@@ -1,4 +1,4 @@
-"""Draws: every value within its distribution, distributed as declared, and fixed by its name, seed, split and number."""
+"""Draws: every value within its distribution, distributed as declared, fixed by its name, seed, split and number."""
 
 import jax
 import jax.numpy as jnp
@@ -21,7 +21,7 @@ LAWS = {
 }
 
 
-def _normal(z):  # noqa: ANN001, ANN202
+def _normal(z):
     return (1 + np.vectorize(__import__("math").erf)(z / np.sqrt(2))) / 2
 
 
@@ -54,7 +54,9 @@ def test_a_factor_does_not_depend_on_the_others():
 
 def test_a_key_is_of_seed_split_and_number_alone():
     def keys(seed: int, split: int, numbers: list[int]) -> np.ndarray:
-        return np.asarray(jax.random.key_data(video_keys(jnp.asarray(seed_words(seed, split)), jnp.asarray(numbers, jnp.uint32))))
+        return np.asarray(
+            jax.random.key_data(video_keys(jnp.asarray(seed_words(seed, split)), jnp.asarray(numbers, jnp.uint32)))
+        )
 
     assert_array_equal(keys(7, 1, [0, 1, 2, 3])[2], keys(7, 1, [2])[0])
     every = np.concatenate([keys(s, p, [0, 1, 2**32 - 1]) for s in (0, 1, 2**32, 2**63 - 1) for p in (0, 1)])

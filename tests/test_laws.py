@@ -28,7 +28,14 @@ def gas(seed: int, elasticity: float, friction: float, gravity: tuple[float, flo
         if all(np.hypot(*(place - p)) > radius[k] + r for p, r in zip(places, radius, strict=False)):
             places.append(place)
     rows = [
-        {"x": x, "v": rng.normal(0, 3, 2), "radius": r, "spin": rng.normal(0, 5), "elasticity": elasticity, "friction": friction}
+        {
+            "x": x,
+            "v": rng.normal(0, 3, 2),
+            "radius": r,
+            "spin": rng.normal(0, 5),
+            "elasticity": elasticity,
+            "friction": friction,
+        }
         for x, r in zip(places, radius, strict=True)
     ]
     return world(rows, box(10, 1.0, friction), gravity)
@@ -103,7 +110,9 @@ def test_oblique_smooth_collision_exchanges_the_normal_components(offset):
 def test_bounces_rise_to_e_squared_of_the_height_before(elasticity, angle):
     height = 3.0
     floor = [{"a": turned((-50, 0), angle), "b": turned((50, 0), angle)}]
-    drop = world([{"x": turned((0, 0.5 + height), angle), "elasticity": elasticity}], floor, turned((0, -GRAVITY), angle))
+    drop = world(
+        [{"x": turned((0, 0.5 + height), angle), "elasticity": elasticity}], floor, turned((0, -GRAVITY), angle)
+    )
     made = run([drop], frames=960, steps=1)
     y = made.states.position[0, :, 0] @ np.array(turned((0, 1), angle)) - 0.5
     apexes = [y[i] for i in range(1, len(y) - 1) if y[i - 1] <= y[i] > y[i + 1]]
@@ -216,14 +225,16 @@ def test_empty_slots_change_nothing_whatever_they_hold():
     scene, state, layout = gas(3, 0.9, 0.2, (0, -GRAVITY), discs=5)
     layout = dataclasses.replace(layout, discs=8)
 
-    def padded(value: float, record):  # noqa: ANN001, ANN202
-        def widen(x):  # noqa: ANN001, ANN202
+    def padded(value: float, record):
+        def widen(x):
             fill = jnp.full((3, *x.shape[1:]), value if jnp.issubdtype(x.dtype, jnp.floating) else 0).astype(x.dtype)
             return jnp.concatenate([x[:5], fill, x[5:]])
 
         return jax.tree.map(widen, record)
 
-    worlds = [(types.Scene(padded(v, scene.objects), scene.gravity), padded(v, state), layout) for v in (0.0, np.nan, 1e9)]
+    worlds = [
+        (types.Scene(padded(v, scene.objects), scene.gravity), padded(v, state), layout) for v in (0.0, np.nan, 1e9)
+    ]
     made = run(worlds, 61, 8)
     for field in (made.states.position, made.states.velocity, made.states.angle, made.quality.max_penetration):
         assert_array_equal(field[0], field[1])
@@ -235,7 +246,7 @@ def test_gradient_through_a_bounce_is_right():
     """d x_T / d (x_0, v_0) of one elastic hit of a wall is (-1, -T); without the time of impact it is not."""
     scene, state, layout = types_of(world([{"x": (-2.0, 0)}], [{"a": (0, -50), "b": (0, 50)}]))
 
-    def last(x0, v0):  # noqa: ANN001, ANN202
+    def last(x0, v0):
         start = dataclasses.replace(
             state,
             position=state.position.at[0, 0, 0].set(x0),
@@ -253,7 +264,7 @@ def test_gradients_are_never_nan():
     layout = worlds[0][2]
     scene, state = (types.to_device(jax.tree.map(lambda *x: jnp.stack(x), *(w[i] for w in worlds))) for i in (0, 1))
 
-    def far(velocity):  # noqa: ANN001, ANN202
+    def far(velocity):
         made = simulate(scene, dataclasses.replace(state, velocity=velocity), layout, rules(), 13, 10)
         return jnp.sum(made.states.position**2)
 

@@ -15,10 +15,11 @@ ROOT = Path(gen2d.__file__).parent.parent
 PACKAGE = ROOT / "gen2d"
 # Each module may import those before it; a family or look may import all of a Python file's neighbours but the last.
 ORDER = [
-    "errors", "fields", "files", "codecs", "formats", "cards", "shards", "verification", "loader", "dataloader", "report",
-    "types", "shapes", "contacts", "impacts", "tournament", "solver", "simulate", "factors", "plugins", "config", "raster",
-    "placement", "scenes", "renderers", "devices", "rollout", "pipeline", "generation", "preview",
-]  # fmt: skip
+    *("errors", "fields", "files", "codecs", "formats", "plan", "manifest", "cards", "shards", "verification"),
+    *("loader", "dataloader", "report", "types", "shapes", "contacts", "impacts", "tournament", "solver", "simulate"),
+    *("factors", "plugins", "config", "raster", "placement", "scenes", "renderers", "devices", "rollout", "pipeline"),
+    *("generation", "preview"),
+]
 WITHOUT_JAX = ORDER[: ORDER.index("report") + 1]
 PLUGINS = ("scenes", "renderers", "formats")
 
@@ -35,7 +36,9 @@ def imports(path: Path) -> set[str]:
     return found - {"__version__"}
 
 
-@pytest.mark.parametrize("path", [p for p in PACKAGE.rglob("*.py") if p.name != "__init__.py" or p.parent != PACKAGE], ids=str)
+@pytest.mark.parametrize(
+    "path", [p for p in PACKAGE.rglob("*.py") if p.name != "__init__.py" or p.parent != PACKAGE], ids=str
+)
 def test_imports_point_down(path):
     name = path.relative_to(PACKAGE).parts[0].removesuffix(".py")
     if name == "__main__":

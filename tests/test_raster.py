@@ -1,4 +1,4 @@
-"""Frames: both forms the same image, discs where and as large as they are, what does not move the same in all frames."""
+"""Frames: both forms the same image, discs where and as large as they are, walls where they stand."""
 
 import jax
 import jax.numpy as jnp
@@ -14,7 +14,9 @@ from gen2d.raster import Moving, Paint, View, backdrop, draw_dense, draw_patches
 def one_disc(column: float, row: float, radius: float, size: int = 64) -> np.ndarray:
     """A white disc on black, [H, W] in grey levels."""
     discs = Moving(*(jnp.asarray(x, jnp.float32) for x in ([[[column]]], [[[row]]], [[radius]], [[[255.0] * 3]])))
-    return np.asarray(draw_patches(jnp.zeros((1, size, size, 3), jnp.uint8), discs, radius))[0, 0, :, :, 0].astype(float)
+    return np.asarray(draw_patches(jnp.zeros((1, size, size, 3), jnp.uint8), discs, radius))[0, 0, :, :, 0].astype(
+        float
+    )
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -36,7 +38,7 @@ def test_a_disc_has_its_area_and_its_centre(radius):
     grid = np.arange(64) + 0.5
     for column, row in rng.uniform(24, 40, (8, 2)):
         image = one_disc(column, row, radius)
-        assert_allclose(image.sum() / 255, np.pi * radius**2, rtol=0.02 if radius < 2 else 0.005)
+        assert_allclose(image.sum() / 255, np.pi * radius**2, rtol=2e-3, atol=0.15)  # px^2
         assert_allclose((image.sum(0) @ grid) / image.sum(), column, atol=0.05)
         assert_allclose((image.sum(1) @ grid) / image.sum(), row, atol=0.05)
 
@@ -46,7 +48,9 @@ def test_a_pixel_on_the_rim_is_half_covered():
 
 
 def test_discs_are_drawn_back_to_front():
-    discs = Moving(*(jnp.asarray(x, jnp.float32) for x in ([[[8.0, 10]]], [[[8.0, 8]]], [[4.0, 4]], [[[200.0] * 3, [90.0] * 3]])))
+    discs = Moving(
+        *(jnp.asarray(x, jnp.float32) for x in ([[[8.0, 10]]], [[[8.0, 8]]], [[4.0, 4]], [[[200.0] * 3, [90.0] * 3]]))
+    )
     image = np.asarray(draw_patches(jnp.zeros((1, 16, 16, 3), jnp.uint8), discs, 4.0))[0, 0, :, :, 0]
     assert (image[8, 5], image[8, 9]) == (200, 90)
 

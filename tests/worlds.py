@@ -5,6 +5,7 @@ All tests share a few shapes (how many discs, segments, frames, steps), so that 
 
 import functools
 from collections.abc import Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -28,7 +29,10 @@ def rules(step: float = STEP, **changes: object) -> Rules:
 
 
 def world(
-    discs: Sequence[dict], segments: Sequence[dict] = (), gravity: Sequence[float] = (0.0, 0.0), slots: int | None = None
+    discs: Sequence[dict],
+    segments: Sequence[dict] = (),
+    gravity: Sequence[float] = (0.0, 0.0),
+    slots: int | None = None,
 ) -> tuple[Scene, State, Layout]:
     """One scene in the sampler's layout. A disc: x, v, radius, spin, elasticity, friction, mass; a segment: a, b (its
     ends), elasticity, friction. Slots that are left over stay empty."""
@@ -41,7 +45,7 @@ def world(
     mass = np.array([r.get("mass", np.pi * r["radius"] ** 2) for r in rows], float)
     there = [*(k < len(discs) for k in range(count)), *(True for _ in walls)]
 
-    def both(of_discs: object, of_walls: object, dtype: object = np.float32) -> jax.Array:
+    def both(of_discs: Any, of_walls: Any, dtype: Any = np.float32) -> jax.Array:
         parts = np.asarray(of_discs, float), np.asarray(of_walls, float)
         parts = [p.reshape(len(p), *np.shape(of_discs)[1:]) for p in parts]
         return jnp.asarray(np.concatenate(parts).astype(dtype))
@@ -72,7 +76,7 @@ def world(
 
 
 @functools.lru_cache(maxsize=64)
-def _program(layout: Layout, numbers: Rules, frames: int, steps: int):  # noqa: ANN202
+def _program(layout: Layout, numbers: Rules, frames: int, steps: int):
     def run(scene: Scene, state: State) -> Trajectory:
         made = simulate(types.to_device(scene), types.to_device(state), layout, numbers, frames, steps)
         return types.to_stored(made)
@@ -80,7 +84,7 @@ def _program(layout: Layout, numbers: Rules, frames: int, steps: int):  # noqa: 
     return jax.jit(run)
 
 
-def run(worlds: Sequence[tuple[Scene, State, Layout]], frames: int, steps: int, numbers: Rules | None = None) -> Trajectory:
+def run(worlds: Sequence[tuple[Scene, State, Layout]], frames: int, steps: int, numbers: Rules | None = None) -> Any:
     """The trajectories of worlds of one layout, videos first, as NumPy arrays in float64 where they are numbers."""
     layout = worlds[0][2]
     layout = Layout(layout.discs, layout.segments, (0.0, 0.0, 1.0, 1.0), 1.0)
@@ -92,7 +96,12 @@ def run(worlds: Sequence[tuple[Scene, State, Layout]], frames: int, steps: int, 
 def box(side: float, elasticity: float = 1.0, friction: float = 0.0, centre: Sequence[float] = (5, 5)) -> list[dict]:
     """Four segments around a square."""
     x, y = centre
-    corners = [(x - side / 2, y - side / 2), (x + side / 2, y - side / 2), (x + side / 2, y + side / 2), (x - side / 2, y + side / 2)]
+    corners = [
+        (x - side / 2, y - side / 2),
+        (x + side / 2, y - side / 2),
+        (x + side / 2, y + side / 2),
+        (x - side / 2, y + side / 2),
+    ]
     return [
         {"a": a, "b": b, "elasticity": elasticity, "friction": friction}
         for a, b in zip(corners, [*corners[1:], corners[0]], strict=True)

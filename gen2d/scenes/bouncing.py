@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 
 from gen2d.config import option
+from gen2d.factors import Distribution
 from gen2d.placement import place
 from gen2d.shapes import disc_mass, disc_moment
 from gen2d.types import DYNAMIC, SHAPES, STATIC, Array, Layout, Objects, Scene, State
@@ -15,21 +16,25 @@ from gen2d.types import DYNAMIC, SHAPES, STATIC, Array, Layout, Objects, Scene, 
 class Options:
     """What is drawn at random, and the box."""
 
-    balls: object = option([3, 8], int, "balls", "in a video", low=1, high=64, draw=True)
+    balls: Distribution = option([3, 8], int, "balls", "in a video", low=1, high=64, draw=True)
     width: float = option(10.0, float, "m", "of the box, inside", above=0, high=1000)
     height: float = option(10.0, float, "m", "of the box, inside", above=0, high=1000)
-    radius: object = option([0.5, 1.0], float, "m", "of each ball", above=0, draw=True)
-    density: object = option(1.0, float, "kg/m^2", "of each ball", above=0, draw=True)
-    velocity: tuple = option(
+    radius: Distribution = option([0.5, 1.0], float, "m", "of each ball", above=0, draw=True)
+    density: Distribution = option(1.0, float, "kg/m^2", "of each ball", above=0, draw=True)
+    velocity: tuple[Distribution, ...] = option(
         [{"normal": [0, 3]}, {"normal": [0, 3]}], float, "m/s", "of each ball at the start", parts=2, draw=True
     )
-    spin: object = option(0.0, float, "rad/s", "of each ball at the start", draw=True)
-    elasticity: object = option(0.9, float, "1", "of each ball", low=0, high=1, draw=True)
-    friction: object = option(0.2, float, "1", "of each ball", low=0, high=100, draw=True)
-    wall_elasticity: object = option(0.9, float, "1", "of the box", low=0, high=1, draw=True)
-    wall_friction: object = option(0.2, float, "1", "of the box", low=0, high=100, draw=True)
-    gravity: tuple = option([0, -9.8], float, "m/s^2", "x right, y up; the same for a whole video", parts=2, draw=True)
-    color: tuple = option([[40, 254]] * 3, int, "sRGB", "of each ball", parts=3, draw=True, low=0, high=255)
+    spin: Distribution = option(0.0, float, "rad/s", "of each ball at the start", draw=True)
+    elasticity: Distribution = option(0.9, float, "1", "of each ball", low=0, high=1, draw=True)
+    friction: Distribution = option(0.2, float, "1", "of each ball", low=0, high=100, draw=True)
+    wall_elasticity: Distribution = option(0.9, float, "1", "of the box", low=0, high=1, draw=True)
+    wall_friction: Distribution = option(0.2, float, "1", "of the box", low=0, high=100, draw=True)
+    gravity: tuple[Distribution, ...] = option(
+        [0, -9.8], float, "m/s^2", "x right, y up; the same for a whole video", parts=2, draw=True
+    )
+    color: tuple[Distribution, ...] = option(
+        [[40, 254]] * 3, int, "sRGB", "of each ball", parts=3, draw=True, low=0, high=255
+    )
 
 
 # Axes of the factors: one number a video, or one for each of N balls.
@@ -50,20 +55,22 @@ FACTORS = {
 
 def check(options: Options) -> None:
     """ValueError where the box cannot hold a ball."""
-    largest = options.radius.support[1]  # type: ignore[attr-defined]  # a drawn option is a Distribution
+    largest = options.radius.support[1]
     if not 2 * largest < min(options.width, options.height):
-        raise ValueError(f"radius may be {largest:g} m, but a ball must fit a box of {options.width:g} x {options.height:g} m")
+        raise ValueError(
+            f"radius may be {largest:g} m, but a ball must fit a box of {options.width:g} x {options.height:g} m"
+        )
 
 
 def sizes(options: Options) -> dict[str, int]:
     """The sizes of the factors' axes."""
-    return {"N": int(options.balls.support[1])}  # type: ignore[attr-defined]
+    return {"N": int(options.balls.support[1])}
 
 
 def layout(options: Options) -> Layout:
     """N balls, then floor, right wall, ceiling, left wall."""
     bounds = (0.0, 0.0, options.width, options.height)
-    return Layout(sizes(options)["N"], 4, bounds, options.radius.support[1])  # type: ignore[attr-defined]
+    return Layout(sizes(options)["N"], 4, bounds, options.radius.support[1])
 
 
 def sample(key: Array, factors: dict[str, Array], options: Options) -> tuple[Scene, State, Array, Array]:

@@ -7,6 +7,7 @@ import signal
 import subprocess
 import time
 from pathlib import Path
+from typing import Any
 
 import h5py
 import jax
@@ -18,7 +19,7 @@ from tiny import CONFIG, changed, command, everything, ran, same
 
 import gen2d
 from gen2d.errors import ConfigError, FolderError, UserError
-from gen2d.generate import generate
+from gen2d.generation import generate
 
 N = 21
 
@@ -43,7 +44,9 @@ def test_holds_exactly_what_was_asked(tiny: Path):
 def test_frame_zero_is_the_drawn_start(tiny: Path):
     data = everything(tiny)
     balls = data["objects/kind"][:, :3] == 0
-    assert_array_equal(data["states/velocity"][:, 0, :3], data["factors/velocity"] * data["objects/present"][:, :3, None])
+    assert_array_equal(
+        data["states/velocity"][:, 0, :3], data["factors/velocity"] * data["objects/present"][:, :3, None]
+    )
     assert_array_equal(data["objects/present"][:, :3].sum(1), data["factors/balls"])
     assert balls.all()
     assert (data["states/angle"][:, 0, :3] == 0).all()
@@ -62,7 +65,9 @@ def test_an_empty_slot_is_zero_everywhere(tiny: Path):
 
 def test_balls_start_apart_and_inside(tiny: Path):
     data = everything(tiny)
-    for x, r, there in zip(data["states/position"][:, 0, :3], data["objects/radius"][:, :3], data["objects/present"], strict=True):
+    for x, r, there in zip(
+        data["states/position"][:, 0, :3], data["objects/radius"][:, :3], data["objects/present"], strict=True
+    ):
         x, r = x[there[:3]].astype(float), r[there[:3]].astype(float)
         assert (x >= r[:, None]).all()
         assert (x <= [6, 5] - r[:, None]).all()
@@ -76,9 +81,10 @@ def test_h5py_alone_reads_every_field_with_its_unit(tiny: Path):
     for shard in manifest["shards"]:
         with h5py.File(tiny / "shards" / f"{shard['name']}.h5") as file:
             for name, about in manifest["fields"].items():
-                assert {"axes", "unit", "meaning"} <= set(file[name].attrs)
-                assert file[name].attrs["unit"] == about["unit"]
-                read[name].append(file[name][...])
+                field: Any = file[name]
+                assert {"axes", "unit", "meaning"} <= set(field.attrs)
+                assert field.attrs["unit"] == about["unit"]
+                read[name].append(field[...])
     data = everything(tiny)
     for name, values in data.items():
         assert_array_equal(np.concatenate(read[name]), values)
@@ -88,7 +94,9 @@ def test_h5py_alone_reads_every_field_with_its_unit(tiny: Path):
     ("n", "options"),
     [(5, {}), (40, {}), (N, {"videos_per_shard": 4}), (N, {"videos_per_shard": 7}), (N, {"codec": "zstd"})],
 )
-def test_a_video_does_not_depend_on_how_many_are_made_or_how_they_lie(tiny: Path, tmp_path: Path, n: int, options: dict):
+def test_a_video_does_not_depend_on_how_many_are_made_or_how_they_lie(
+    tiny: Path, tmp_path: Path, n: int, options: dict
+):
     generate(changed(storage=options), n, tmp_path / "other")
     same(everything(tiny), everything(tmp_path / "other"), min(n, N))
 
@@ -99,8 +107,8 @@ def test_a_video_does_not_depend_on_the_number_of_devices(tiny: Path, tmp_path: 
     for devices in ("1", "3"):
         out = tmp_path / devices
         code = (
-            "import jax; jax.config.update('jax_num_cpu_devices', %s); jax.devices();"
-            "from gen2d.generate import generate; generate(%r, %d, %r)" % (devices, str(config), N, str(out))
+            f"import jax; jax.config.update('jax_num_cpu_devices', {devices}); jax.devices();"
+            f"from gen2d.generation import generate; generate({str(config)!r}, {N}, {str(out)!r})"
         )
         words, environment = command()
         subprocess.run([words[0], "-c", code], env=environment, check=True, timeout=300)
@@ -169,7 +177,8 @@ def test_killed_at_random_moments_it_completes_to_the_same_bits(tiny: Path, tmp_
         process.wait()
         for path in shards.glob("*.h5"):
             with h5py.File(path) as file:  # what has its final name is whole
-                assert file["frames"].shape[0] == 4
+                frames: Any = file["frames"]
+                assert len(frames) == 4
     assert killed >= 4
     assert ran("--config", config, "--n", 160, "--out", out).returncode == 0
     same(everything(clean), everything(out))
@@ -203,11 +212,13 @@ def test_scenes_that_cannot_be_placed_are_an_error_with_the_options_to_change(tm
 
 def test_a_disk_too_small_is_refused_before_it_starts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr("gen2d.shards.free_bytes", lambda path: 1000)
-    with pytest.raises(FolderError, match="disk has 1.0 kB free"):
+    with pytest.raises(FolderError, match="has 1.0 kB free".replace(".", "[.]")):
         generate(CONFIG, 64, tmp_path / "data")
 
 
-@pytest.mark.parametrize(("n", "worker"), [(0, (0, 1)), (-1, (0, 1)), (2**32, (0, 1)), (True, (0, 1)), (1, (1, 1)), (1, (0, 0))])
+@pytest.mark.parametrize(
+    ("n", "worker"), [(0, (0, 1)), (-1, (0, 1)), (2**32, (0, 1)), (True, (0, 1)), (1, (1, 1)), (1, (0, 0))]
+)
 def test_impossible_runs_are_refused(tmp_path: Path, n: int, worker: tuple[int, int]):
     with pytest.raises(ConfigError):
         generate(CONFIG, n, tmp_path, worker=worker)

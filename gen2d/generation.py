@@ -18,15 +18,15 @@ from tqdm import tqdm
 from gen2d import __version__, devices, shards
 from gen2d.config import Config, checked_seed, load_config
 from gen2d.errors import ConfigError, FolderError, UserError
-from gen2d.report import in_bytes, in_time
 from gen2d.pipeline import Encoder, Writers, batches, jobs_of, threads_for
+from gen2d.report import in_bytes, in_time
 from gen2d.rollout import Rollout
 from gen2d.shards import Dataset, Shard
 
 MAX_VIDEOS = 2**32 - 1
 CONVENTIONS = (
-    "World: metres, y up, radians counter-clockwise, seconds. Pixels: (row, column) from the top left, pixel centres at "
-    "j + 0.5. Frame 0 is the initial state, frame t the state at t / fps. An empty slot is zero everywhere."
+    "World: metres, y up, radians counter-clockwise, seconds. Pixels: (row, column) from the top left, pixel centres "
+    "at j + 0.5. Frame 0 is the initial state, frame t the state at t / fps. An empty slot is zero everywhere."
 )
 
 
@@ -171,7 +171,8 @@ def _prepare(rollout: Rollout, encoder: Encoder, work: list, count: int, say: Ca
     per_video += (drawn - simulated) / (rollout.slice * len(rollout.devices))
     per_video += (encoded - drawn) / len(block) / threads_for(devices.cores())
     size = block.nbytes / len(block) * count
-    say(f"Compiled in {compiled - began:.1f} s. {count:,} videos will take about {in_bytes(size)} and {in_time(per_video * count)}.")
+    cost = f"{in_bytes(size)} and {in_time(per_video * count)}"
+    say(f"Compiled in {compiled - began:.1f} s. {count:,} videos will take about {cost}.")
     free = shards.free_bytes(encoder.dataset.root)
     if size > free:
         raise FolderError(
@@ -189,7 +190,9 @@ def _fitted(call: Callable[[], Any]) -> Any:
 
 def _explained(error: Exception) -> Exception:
     if "RESOURCE_EXHAUSTED" in str(error):
-        return DeviceMemoryError("the device has too little memory for a batch: lower storage.lanes, or use --device cpu")
+        return DeviceMemoryError(
+            "the device has too little memory for a batch: lower storage.lanes, or use --device cpu"
+        )
     return error
 
 
@@ -198,7 +201,11 @@ def _progress(count: int, say: Callable[[str], None]) -> Iterator[Callable[[int]
     """A bar on a terminal; elsewhere a plain line every ten seconds. Yields what to call with each number of videos."""
     if sys.stderr.isatty():
         with tqdm(total=count, unit=" videos", smoothing=0.1, dynamic_ncols=True) as bar:
-            yield bar.update
+
+            def moved(videos: int) -> None:
+                bar.update(videos)
+
+            yield moved
         return
     began = told = time.perf_counter()
     done = 0

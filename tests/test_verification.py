@@ -10,7 +10,7 @@ import synthetic
 
 from gen2d import loader, shards
 from gen2d.errors import ConfigError, DamagedError
-from gen2d.verify import damaged_shards, verify
+from gen2d.verification import damaged_shards, verify
 
 
 @pytest.fixture(scope="module")
