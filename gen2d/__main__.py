@@ -154,7 +154,10 @@ def verify(arguments: Sequence[str]) -> int:
     options = _verb_parser("verify").parse_args(arguments)
     from gen2d.verification import verify as check
 
-    problems = check(options.dataset, options.level)
+    root = Path(options.dataset)
+    if not (root / "manifest.json").exists() and not (root / ".gen2d").is_dir():
+        raise UserError(f"{root} is not a dataset that gen2d made")
+    problems = check(root, options.level)
     if options.json:
         print(json.dumps({"dataset": options.dataset, "level": options.level, "problems": problems}))
     else:

@@ -96,7 +96,11 @@ def simulate(scene: Scene, state: State, layout: Layout, rules: Rules, frames: i
     )
 
     def frame(carry: tuple, _: None) -> tuple:
-        carry = jax.lax.fori_loop(0, steps, lambda _, c: step(*c, setup, rules), carry)
+        def once(_: int, now: tuple) -> tuple:
+            position, angle, motion, memory = now
+            return step(position, angle, motion, memory, setup, rules)
+
+        carry = jax.lax.fori_loop(0, steps, once, carry)
         position, angle, motion, _ = carry
         return carry, tuple(x[..., :discs, :] for x in (position, angle, *motion))
 

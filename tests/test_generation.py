@@ -205,7 +205,7 @@ def test_a_signal_stops_it_and_says_how_to_go_on(tmp_path: Path, number: int):
 
 
 def test_scenes_that_cannot_be_placed_are_an_error_with_the_options_to_change(tmp_path: Path):
-    crowded = changed(scene={"balls": 30, "radius": 1.0, "width": 8, "height": 8})
+    crowded = changed(scene={"balls": 6, "radius": 1.6, "width": 8, "height": 8})
     with pytest.raises(UserError, match="video 0 could not be placed"):
         generate(crowded, 4, tmp_path / "data")
 

@@ -15,8 +15,8 @@ ROOT = Path(gen2d.__file__).parent.parent
 PACKAGE = ROOT / "gen2d"
 # Each module may import those before it; a family or look may import all of a Python file's neighbours but the last.
 ORDER = [
-    *("errors", "fields", "files", "codecs", "formats", "plan", "manifest", "cards", "shards", "verification"),
-    *("loader", "dataloader", "report", "types", "shapes", "contacts", "impacts", "tournament", "solver", "simulate"),
+    *("errors", "fields", "files", "codecs", "formats", "plan", "manifest", "cards", "shards", "loader"),
+    *("verification", "dataloader", "report", "types", "shapes", "contacts", "impacts", "tournament", "solver", "simulate"),
     *("factors", "plugins", "config", "raster", "placement", "scenes", "renderers", "devices", "rollout", "pipeline"),
     *("generation", "preview"),
 ]

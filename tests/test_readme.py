@@ -1,0 +1,51 @@
+"""The README's own commands and code, run in an empty folder as a reader would run them, with fewer videos."""
+
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from tiny import ran
+
+README = Path(__file__).parent.parent / "README.md"
+BLOCKS = re.findall(r"```(\w+)\n(.*?)```", README.read_text(encoding="utf-8"), re.S)
+
+
+def test_the_set_up_is_one_line_each():
+    lines = [line for kind, block in BLOCKS if kind == "sh" for line in block.splitlines()]
+    installing = [line for line in lines if "pip install" in line]
+    assert len(installing) == 2
+    assert installing[0].endswith("&& python -m gen2d --config bouncing.yaml --n 10000")
+    assert installing[1].endswith("&& pytest")
+
+
+def test_every_block_runs(tmp_path: Path):
+    for kind, block in BLOCKS:
+        if kind == "yaml":
+            (tmp_path / "mine.yaml").write_text(block)
+        elif kind == "python":
+            done = subprocess.run([sys.executable, "-c", block], cwd=tmp_path, capture_output=True, text=True, check=False)
+            assert done.returncode == 0, block + done.stderr
+        elif kind == "sh":
+            for line in block.splitlines():
+                _run(line, tmp_path)
+    assert {path.name for path in (tmp_path / "datasets").iterdir()} == {"bouncing", "mine"}
+
+
+def _run(line: str, folder: Path) -> None:
+    """Runs the part of a line that is gen2d's, with few videos."""
+    words = shlex.split(line.rpartition("&& ")[2] if "pip install" in line else line, comments=True)
+    if words[:3] != ["python", "-m", "gen2d"]:
+        return
+    arguments = ["7" if before == "--n" else word for before, word in zip(["", *words[3:]], words[3:], strict=False)]
+    done = ran(*arguments, cwd=folder)
+    assert done.returncode == 0, line + done.stderr
+
+
+@pytest.mark.parametrize("page", sorted(README.parent.glob("*/README.md")), ids=lambda p: p.parent.name)
+def test_pages_name_only_files_that_are_there(page: Path):
+    for name in re.findall(r"`([\w./]+\.(?:py|yaml))`", page.read_text(encoding="utf-8")):
+        found = [page.parent / name, page.parent.parent / name]
+        assert any(path.exists() for path in found), f"{page} names {name}"
