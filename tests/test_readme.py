@@ -39,7 +39,7 @@ def _run(line: str, folder: Path) -> None:
     words = shlex.split(line.rpartition("&& ")[2] if "pip install" in line else line, comments=True)
     if words[:3] != ["python", "-m", "gen2d"]:
         return
-    arguments = ["7" if before == "--n" else word for before, word in zip(["", *words[3:]], words[3:], strict=False)]
+    arguments = ["40" if before == "--n" else word for before, word in zip(["", *words[3:]], words[3:], strict=False)]
     done = ran(*arguments, cwd=folder)
     assert done.returncode == 0, line + done.stderr
 
