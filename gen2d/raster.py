@@ -20,6 +20,7 @@ import numpy as np
 
 from gen2d.types import Array, Layout, Scene, State
 
+LANES = 8  # pixels: a patch's rows are whole SIMD vectors
 ABSENT = -1e6  # px: the radius of what is not drawn
 
 
@@ -118,7 +119,7 @@ def draw_patches(backdrops: Array, discs: Moving, reach: float) -> Array:
     videos, frames, count = discs.column.shape
     height, width = backdrops.shape[1:3]
     side = math.floor(2 * reach + 1) + 1  # pixel centres at most reach + 1/2 away
-    rows, columns = min(side, height), min(side, width)
+    rows, columns = min(side, height), min(-(-side // LANES) * LANES, width)
     x = np.repeat(np.arange(columns, dtype=np.float32) + 0.5, 3)  # pixels lie as rows of red, green, blue, red ...
     y = np.arange(rows, dtype=np.float32)[:, None] + 0.5
     flat = Moving(discs.column.reshape(-1), discs.row.reshape(-1), ramped(discs.radius), discs.color)

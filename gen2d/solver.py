@@ -252,7 +252,7 @@ def warm(position: Array, motion: Motion, memory: Memory, setup: Setup) -> tuple
         b = b[0], pushed(b[1], push, old.tangent, row.inverse_mass_b, row.turn_b)
         return a, b, (apart, inverse)
 
-    (_, motion), offsets = tournament((position, motion), len(setup.pairs), play, setup.one)
+    (_, motion), offsets = tournament((position, motion), len(setup.pairs), play)
     touches = []
     for row, old, segment in zip(setup.walls, memory.walls, setup.segments, strict=True):
         normal, gap = settled(segment_disc(segment, position, setup.radius), setup.one)
@@ -286,7 +286,7 @@ def solve(motion: Motion, offsets: list, touches: list[Touch], memory: Memory, s
         return a, b, (touch, impulse)
 
     drift = Drift(*(jnp.zeros_like(x) for x in (motion.velocity, motion.spin, motion.spin)))
-    (motion, drift), pairs = tournament((motion, drift), len(setup.pairs), play, setup.one)
+    (motion, drift), pairs = tournament((motion, drift), len(setup.pairs), play)
     walls = []
     for row, old, touch in zip(setup.walls, memory.walls, touches, strict=True):
         speed, pull = dot(touch.normal, motion.velocity), -dot(touch.normal, setup.gravity[:, None])
@@ -321,7 +321,7 @@ def relax(motion: Motion, pairs: list, walls: list, setup: Setup) -> tuple[Motio
         b = pushed(b, push, added.tangent, row.inverse_mass_b, row.turn_b)
         return a, b, left
 
-    motion, pair_memory = tournament(motion, len(setup.pairs), play, setup.one)
+    motion, pair_memory = tournament(motion, len(setup.pairs), play)
     wall_memory = []
     for row, (touch, old) in zip(setup.walls, walls, strict=True):
         slip = slip_of(row, touch.normal, motion.velocity, 0.0, motion.spin)

@@ -44,13 +44,11 @@ def moved_on(first: Any, second: Any) -> tuple[Any, Any]:
     return jax.tree.map(one_half, first, second), jax.tree.map(other_half, first, second)
 
 
-def tournament(values: Any, rounds: int, play: Callable, one: Array | None = None) -> tuple[Any, list]:
+def tournament(values: Any, rounds: int, play: Callable) -> tuple[Any, list]:
     """The bodies after all rounds, and what `play(k, first, second) -> (first, second, out)` gave in each."""
     first, second, outs = *halves(values), []
     for k in range(rounds):
         first, second, out = play(k, first, second)
         outs.append(out)
         first, second = moved_on(first, second)
-        if one is not None:
-            first, second = settled((first, second), one)
     return whole(first, second), outs
