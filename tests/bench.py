@@ -109,6 +109,7 @@ def rollout_of(sets: Sequence[str] = ()) -> Any:
 def _physics(rollout: Any) -> tuple[Callable, Callable, np.ndarray]:
     """The sampler and the simulation alone, as programs of their own, and the numbers of a batch of videos."""
     import jax
+    import jax.numpy as jnp
 
     from gen2d import factors, types
     from gen2d.rollout import rules_of
@@ -117,7 +118,7 @@ def _physics(rollout: Any) -> tuple[Callable, Callable, np.ndarray]:
     root, length = factors.seed_words(0, 0), (rollout.config.video.frames, rollout.steps)
 
     def sampled(numbers: Any) -> Any:
-        return jax.vmap(rollout._sampled)(factors.video_keys(root, numbers))[1:3]
+        return jax.vmap(rollout._sampled)(factors.video_keys(jnp.asarray(root), numbers))[1:3]
 
     def simulated(scene: Any, state: Any) -> Any:
         device = types.to_device(scene), types.to_device(state)
@@ -204,8 +205,9 @@ def run(command: Sequence[object], cores: Sequence[int] = CORES, env: Mapping[st
     env = {**os.environ, "PYTHONPATH": path, **(env or {})}
     line = ["taskset", "-c", ",".join(map(str, cores)), *map(str, command)]
     began = time.perf_counter()
-    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
-    process = subprocess.Popen(line, cwd=tempfile.gettempdir(), env=env, text=True, **pipes)
+    process = subprocess.Popen(
+        line, cwd=tempfile.gettempdir(), env=env, text=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT
+    )
     assert process.stdout is not None
     text = process.stdout.read()
     _, status, usage = os.wait4(process.pid, 0)
@@ -370,7 +372,7 @@ def machine() -> dict[str, Any]:
 def text_of(facts: Mapping[str, Any], found: Sequence[Row | Promise]) -> str:
     """The tables."""
     lines = [", ".join(f"{key} {value}" for key, value in facts.items())]
-    rows, promises = ([f for f in found if isinstance(f, kind)] for kind in (Row, Promise))
+    rows, promises = [f for f in found if isinstance(f, Row)], [f for f in found if isinstance(f, Promise)]
     lines += ["", f"{'':21} {'videos/s':>9} {'MB/s':>8} {'share':>6} {'peer':>7} {'ratio':>6}"]
     for row in rows:
         share = f"{row.share:.0%}" if row.share else ""

@@ -16,8 +16,20 @@ PACKAGE = ROOT / "gen2d"
 # Each module may import those before it; a family or look may import all of a Python file's neighbours but the last.
 ORDER = [
     *("errors", "fields", "files", "codecs", "formats", "plan", "manifest", "cards", "shards", "loader"),
-    *("verification", "dataloader", "report", "types", "shapes", "contacts", "impacts", "tournament", "solver", "simulate"),
-    *("factors", "plugins", "config", "raster", "placement", "scenes", "renderers", "devices", "rollout", "pipeline"),
+    *("verification", "dataloader", "report", "types", "shapes", "contacts", "impacts", "tournament", "solver"),
+    *(
+        "simulate",
+        "factors",
+        "plugins",
+        "config",
+        "raster",
+        "placement",
+        "scenes",
+        "renderers",
+        "devices",
+        "rollout",
+        "pipeline",
+    ),
     *("generation", "preview"),
 ]
 WITHOUT_JAX = ORDER[: ORDER.index("report") + 1]

@@ -26,7 +26,8 @@ def test_every_block_runs(tmp_path: Path):
         if kind == "yaml":
             (tmp_path / "mine.yaml").write_text(block)
         elif kind == "python":
-            done = subprocess.run([sys.executable, "-c", block], cwd=tmp_path, capture_output=True, text=True, check=False)
+            words = [sys.executable, "-c", block]
+            done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, check=False)
             assert done.returncode == 0, block + done.stderr
         elif kind == "sh":
             for line in block.splitlines():
