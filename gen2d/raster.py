@@ -58,13 +58,14 @@ def fitted(bounds: tuple[float, float, float, float], height: int, width: int, m
 
 
 def _blended(under: Array, coverage: Array, color: Array) -> Array:
-    """The colour after one more layer, rounded to a whole grey level as a uint8 buffer holds it."""
-    return jnp.floor(under + coverage * (color - under) + 0.5)
+    """The uint8 image after one more layer, each layer rounded, as in a frame buffer."""
+    under = under.astype(jnp.float32)
+    return (under + coverage * (color - under) + 0.5).astype(jnp.uint8)
 
 
 def backdrop(scene: Scene, state: State, paint: Paint, layout: Layout, view: View) -> Array:
     """One video's unmoving layer, [H, W, 3] uint8: background, then the fixed segments in slot order."""
-    image = jnp.broadcast_to(paint.background, (view.height, view.width, 3))
+    image = jnp.broadcast_to(paint.background, (view.height, view.width, 3)).astype(jnp.uint8)
     x, y = jnp.arange(view.width) + 0.5, (jnp.arange(view.height) + 0.5)[:, None]
     for i, k in enumerate(range(layout.discs, layout.slots)):
         cos, sin = jnp.cos(state.angle[k]), jnp.sin(state.angle[k])
@@ -74,7 +75,7 @@ def backdrop(scene: Scene, state: State, paint: Paint, layout: Layout, view: Vie
         aside = jnp.square(dx - along * cos) + jnp.square(dy - along * sin)
         distance = jnp.sqrt(aside) - scene.objects.radius[k] * view.scale - paint.line[i]
         image = _blended(image, jnp.clip(0.5 - distance, 0, 1)[..., None], paint.color[k])
-    return image.astype(jnp.uint8)
+    return image
 
 
 def ramped(radius: Array) -> Array:
@@ -105,13 +106,13 @@ def draw_dense(backdrops: Array, discs: Moving) -> Array:
     height, width = backdrops.shape[1:3]
     radius = ramped(discs.radius)
     x, y = jnp.arange(width) + 0.5, (jnp.arange(height) + 0.5)[:, None]
-    image = jnp.broadcast_to(backdrops[:, None], (videos, frames, height, width, 3)).astype(jnp.float32)
+    image = jnp.broadcast_to(backdrops[:, None], (videos, frames, height, width, 3))
     for k in range(count):
         dx, dy = x - discs.column[:, :, k, None, None], y - discs.row[:, :, k, None, None]
         distance = jnp.sqrt(dx * dx + dy * dy) - radius[:, None, k, None, None]
         coverage = jnp.clip(0.5 - distance, 0, 1)[..., None]
         image = _blended(image, coverage, discs.color[:, None, k, None, None])
-    return image.astype(jnp.uint8)
+    return image
 
 
 def draw_patches(backdrops: Array, discs: Moving, reach: float) -> Array:
@@ -122,19 +123,20 @@ def draw_patches(backdrops: Array, discs: Moving, reach: float) -> Array:
     rows, columns = min(side, height), min(-(-side // LANES) * LANES, width)
     x = np.repeat(np.arange(columns, dtype=np.float32) + 0.5, 3)  # pixels lie as rows of red, green, blue, red ...
     y = np.arange(rows, dtype=np.float32)[:, None] + 0.5
-    flat = Moving(discs.column.reshape(-1), discs.row.reshape(-1), ramped(discs.radius), discs.color)
+    column, row, radius = discs.column.reshape(-1), discs.row.reshape(-1), ramped(discs.radius).reshape(-1)
+    colors = jnp.tile(discs.color.reshape(-1, 3), (1, columns))  # ready to be read as a row of a patch
 
     def draw(i: Array, buffer: Array) -> Array:
-        frame, disc = i // count, i % count
-        video = frame // frames
-        top = jnp.clip(jnp.ceil(flat.row[i] - reach - 1).astype(jnp.int32), 0, height - rows)
-        left = jnp.clip(jnp.ceil(flat.column[i] - reach - 1).astype(jnp.int32), 0, width - columns)
-        dx, dy = x + (left - flat.column[i]), y + (top - flat.row[i])
-        distance = jnp.sqrt(dx * dx + dy * dy) - flat.radius[video, disc]
+        frame = i // count
+        disc = frame // frames * count + i % count
+        top = jnp.clip(jnp.ceil(row[i] - reach - 1).astype(jnp.int32), 0, height - rows)
+        left = jnp.clip(jnp.ceil(column[i] - reach - 1).astype(jnp.int32), 0, width - columns)
+        dx, dy = x + (left - column[i]), y + (top - row[i])
+        distance = jnp.sqrt(dx * dx + dy * dy) - radius[disc]
         place = frame * height + top, left * 3
-        under = jax.lax.dynamic_slice(buffer, place, (rows, columns * 3)).astype(jnp.float32)
-        patch = _blended(under, jnp.clip(0.5 - distance, 0, 1), jnp.tile(flat.color[video, disc], columns))
-        return jax.lax.dynamic_update_slice(buffer, patch.astype(jnp.uint8), place)
+        under = jax.lax.dynamic_slice(buffer, place, (rows, columns * 3))
+        patch = _blended(under, jnp.clip(0.5 - distance, 0, 1), colors[disc])
+        return jax.lax.dynamic_update_slice(buffer, patch, place)
 
     buffer = backdrops.reshape(videos, 1, height, width * 3)
     buffer = jnp.broadcast_to(buffer, (videos, frames, height, width * 3)).reshape(-1, width * 3)
