@@ -13,15 +13,16 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import numpy as np
 from tqdm import tqdm
 
 from gen2d import __version__, devices, shards
 from gen2d.config import Config, checked_seed, load_config
 from gen2d.errors import ConfigError, FolderError, UserError
-from gen2d.pipeline import Encoder, Writers, batches, jobs_of, threads_for
+from gen2d.pipeline import Encoder, Job, Writers, batches, jobs_of, threads_for
 from gen2d.report import in_bytes, in_time
-from gen2d.rollout import Rollout
-from gen2d.shards import Dataset, Shard
+from gen2d.rollout import Batch, Rollout, divisor
+from gen2d.shards import Block, Dataset, Shard
 
 MAX_VIDEOS = 2**32 - 1
 CONVENTIONS = (
@@ -151,34 +152,55 @@ def _prepare(rollout: Rollout, encoder: Encoder, work: list, count: int, say: Ca
     split, first, pieces = work[0]
     firsts = [first] * len(rollout.devices)
     batch = _fitted(lambda: jax.block_until_ready(rollout.begin(split, firsts)))
-    while True:
-        try:
-            jax.block_until_ready(rollout.draw(batch, 0, rollout.slice))
-            break
-        except jax.errors.JaxRuntimeError as error:
-            if "RESOURCE_EXHAUSTED" not in str(error) or rollout.slice == 1:
-                raise _explained(error) from None
-            rollout.slice //= 2
-    compiled = time.perf_counter()
-    jax.block_until_ready(rollout.begin(split, firsts))
-    simulated = time.perf_counter()
+    _fit_slice(rollout, batch)
+    compiled = time.perf_counter() - began
     job = jobs_of(firsts, [pieces, *([] for _ in firsts[1:])], rollout.lanes, rollout.slice)[0]
-    frames = jax.block_until_ready(rollout.draw(batch, job.start, rollout.slice))
-    drawn = time.perf_counter()
-    block = encoder.encode(job, rollout.host_columns(batch)[0], frames)
-    encoded = time.perf_counter()
-    per_video = (simulated - compiled) / (rollout.lanes * len(rollout.devices))
-    per_video += (drawn - simulated) / (rollout.slice * len(rollout.devices))
-    per_video += (encoded - drawn) / len(block) / threads_for(devices.cores())
-    size = block.nbytes / len(block) * count
-    cost = f"{in_bytes(size)} and {in_time(per_video * count)}"
-    say(f"Compiled in {compiled - began:.1f} s. {count:,} videos will take about {cost}.")
+    block, seconds = _measured(rollout, encoder, batch, split, firsts, job)
+    size, duration = block.nbytes / len(block) * count, seconds * count
+    say(f"Compiled in {compiled:.1f} s. {count:,} videos will take about {in_bytes(size)} and {in_time(duration)}.")
+    _warn_of_ratio(encoder.dataset, block, say)
     free = shards.free_bytes(encoder.dataset.root)
     if size > free:
         raise FolderError(
             f"{encoder.dataset.root} would need about {in_bytes(size)}, but its disk has {in_bytes(free)} free; "
             "ask for fewer videos, or name another disk with --out"
         )
+
+
+def _fit_slice(rollout: Rollout, batch: Batch) -> None:
+    """Returns nothing; compiles the drawing, of fewer videos at once where the device has no memory for more."""
+    while True:
+        try:
+            jax.block_until_ready(rollout.draw(batch, 0, rollout.slice))
+            return
+        except jax.errors.JaxRuntimeError as error:
+            if "RESOURCE_EXHAUSTED" not in str(error) or rollout.slice == 1:
+                raise _explained(error) from None
+            rollout.slice = divisor(rollout.lanes, rollout.slice // 2)
+
+
+def _measured(
+    rollout: Rollout, encoder: Encoder, batch: Batch, split: str, firsts: list[int], job: Job
+) -> tuple[Block, float]:
+    """The first block, and about how many seconds a video takes."""
+    marks = [time.perf_counter()]
+    jax.block_until_ready(rollout.begin(split, firsts))
+    marks.append(time.perf_counter())
+    frames = jax.block_until_ready(rollout.draw(batch, job.start, rollout.slice))
+    marks.append(time.perf_counter())
+    block = encoder.encode(job, rollout.host_columns(batch)[0], frames)
+    marks.append(time.perf_counter())
+    count, threads = len(rollout.devices), threads_for(devices.cores())
+    videos = rollout.lanes * count, rollout.slice * count, len(block) * threads
+    return block, sum((b - a) / n for a, b, n in zip(marks, marks[1:], videos, strict=False))
+
+
+def _warn_of_ratio(dataset: Dataset, block: Block, say: Callable[[str], None]) -> None:
+    """Says so, once, where gzip does not suit the frames."""
+    raw = len(block) * int(np.prod(dataset.fields["frames"].shape(dataset.sizes)))
+    ratio = raw / sum(map(len, block.chunks["frames"]))
+    if dataset.codec == "gzip" and ratio < 3:
+        say(f"gzip makes these frames only {ratio:.1f} times smaller; --set storage.codec=zstd may do better.")
 
 
 def _fitted(call: Callable[[], Any]) -> Any:

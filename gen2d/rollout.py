@@ -42,6 +42,11 @@ def _power_of_two(limit: int) -> int:
     return 1 << max(0, limit.bit_length() - 1)
 
 
+def divisor(number: int, limit: int) -> int:
+    """The largest divisor of a number up to a limit."""
+    return next(d for d in range(min(number, limit), 0, -1) if number % d == 0)
+
+
 class Rollout:
     """The compiled programs of one config on some devices."""
 
@@ -55,9 +60,7 @@ class Rollout:
         auto = min(SHARD_VIDEOS, _power_of_two(SHARD_BYTES // frame_bytes))
         self.videos_per_shard = config.storage.videos_per_shard or auto
         self.lanes = config.storage.lanes or min(LANES, auto)  # not the shard size: that must not change a video
-        self.slice = min(self.lanes, _power_of_two(max(1, SLICE_BYTES // frame_bytes)))
-        while self.lanes % self.slice:
-            self.slice -= 1
+        self.slice = divisor(self.lanes, max(1, SLICE_BYTES // frame_bytes))
         self.mesh = Mesh(np.array(self.devices), ("videos",))
         self._simulate = jax.jit(self._shared(self._made, (PartitionSpec(), VIDEOS)))
 
