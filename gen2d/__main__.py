@@ -31,7 +31,10 @@ other verbs (each has its own --help):
 
 
 class Parser(argparse.ArgumentParser):
-    """Says what is wrong in one sentence and exits with code 2."""
+    """Says what is wrong in one sentence and exits with code 2; options are written out in full."""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(allow_abbrev=False, **options)
 
     def error(self, message: str) -> NoReturn:
         fail(f"{message}; see {self.prog} --help", 2)
@@ -107,7 +110,7 @@ def _verb_parser(verb: str) -> Parser:
 
 def _worker(text: str) -> tuple[int, int]:
     number, slash, count = text.partition("/")
-    if not slash or not number.isdigit() or not count.isdigit():
+    if not slash or not all(part.isascii() and part.isdecimal() for part in (number, count)):
         raise UserError(f"--worker is {text!r}, but must be R/W, such as 0/4")
     return int(number), int(count)
 
@@ -133,7 +136,8 @@ def generate(arguments: Sequence[str]) -> int:
         )
     except KeyboardInterrupt:
         again = [a for a in arguments if a != "--overwrite"]
-        fail(f"stopped; whole shards are kept. To go on: {job.command(again)}", 130)
+        print(f"gen2d: stopped; whole shards are kept. To go on: {job.command(again)}", file=sys.stderr, flush=True)
+        os._exit(130)  # everything is closed; jax may still run in the background, and would crash at a normal end
     print(_told(summary))
     return 0
 

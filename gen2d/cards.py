@@ -22,7 +22,7 @@ def readme(manifest: Manifest, command: str) -> str:
         split="train" if "train" in splits else min(splits),
         field="frames" if "frames" in fields else min(fields),
         plugin=", hdf5plugin" if manifest["codec"] == "zstd" else "",
-        command=command or "gen2d",
+        command="` and `".join(f"{command} --n {n} --split {split}" for split, n in manifest["splits"].items()),
         seed=manifest["seed"],
         licence=manifest["licence"] or "None was chosen: choose one before publishing.",
     )

@@ -6,7 +6,6 @@ An error is one sentence with the file, the field, its value and what is allowed
 import dataclasses
 import hashlib
 import json
-import math
 import pathlib
 import re
 from collections.abc import Mapping, Sequence
@@ -18,7 +17,7 @@ import yaml
 from gen2d import plugins
 from gen2d.codecs import CODECS
 from gen2d.errors import ConfigError
-from gen2d.factors import Distribution, parse
+from gen2d.factors import Distribution, is_number, parse
 
 MAX_SEED = 2**63 - 1
 MAX_SLOTS = 254  # a slot's mask id is one byte, 0 is the background
@@ -104,7 +103,7 @@ class CameraOptions:
     center: tuple[float, ...] | None = option(
         None, float, "m", "world point in the middle of the frame", parts=2, optional=True
     )
-    scale: float | None = option(None, float, "px/m", "pixels per metre", above=0, optional=True)
+    scale: float | None = option(None, float, "px/m", "pixels per metre", above=0, high=1e6, optional=True)
     margin: float = option(0.0, float, "m", "shown around the scene where scale is null", low=0)
 
 
@@ -143,6 +142,12 @@ class Plugin:
     name: str
     module: ModuleType
     options: Any
+    sha256: str | None = None  # of a file of the user's own, which may change
+
+    def plain(self) -> dict[str, Any]:
+        """The plug-in as YAML and JSON hold it."""
+        own = {"sha256": self.sha256} if self.sha256 else {}
+        return {"name": self.name, **own, **_plain(self.options)}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -161,7 +166,7 @@ class Config:
     def plain(self) -> dict[str, Any]:
         """The config as YAML and JSON hold it, every default filled in."""
         sections = {s: _plain(getattr(self, s)) for s in SECTIONS}
-        plugs = {p: {"name": getattr(self, p).name, **_plain(getattr(self, p).options)} for p in PLUGINS}
+        plugs = {p: getattr(self, p).plain() for p in PLUGINS}
         return {"name": self.name, "seed": self.seed, **sections, **plugs}
 
     def text(self) -> str:
@@ -202,6 +207,8 @@ _Loader.add_implicit_resolver(
 def _mapping(loader: _Loader, node: yaml.MappingNode) -> dict:
     seen = set()
     for key, _ in node.value:
+        if not isinstance(key.value, str):
+            raise yaml.constructor.ConstructorError(None, None, "a name must be text", key.start_mark)
         if key.value in seen:
             raise yaml.constructor.ConstructorError(None, None, f"{key.value} stands there twice", key.start_mark)
         seen.add(key.value)
@@ -219,6 +226,8 @@ def parse_yaml(text: str, source: str) -> Any:
         mark = getattr(error, "problem_mark", None)
         where = f" in line {mark.line + 1}" if mark else ""
         raise ConfigError(f"{source}: not valid YAML{where}: {getattr(error, 'problem', None) or error}") from None
+    except ValueError as error:  # a date that does not exist
+        raise ConfigError(f"{source}: not valid YAML: {error}") from None
 
 
 def _check(spec: Option, low: float, high: float) -> bool:
@@ -240,7 +249,7 @@ def _single(spec: Option, value: Any) -> Any:
         if not isinstance(value, str) or (spec.choices and value not in spec.choices):
             raise ValueError(spec.allowed)
         return value
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+    if not is_number(value):
         raise ValueError(spec.allowed)
     if (spec.kind is int and not float(value).is_integer()) or not _check(spec, value, value):
         raise ValueError(spec.allowed)
@@ -252,7 +261,7 @@ def _value(spec: Option, value: Any) -> Any:
         return None
     if not spec.parts:
         return _single(spec, value)
-    if not isinstance(value, list) or len(value) != spec.parts:
+    if not isinstance(value, list | tuple) or len(value) != spec.parts:
         raise ValueError(spec.allowed)
     return tuple(_single(spec, part) for part in value)
 
@@ -282,13 +291,16 @@ def _plugin(kind: str, values: Any, default: str, source: str) -> Plugin:
     if not isinstance(name, str):
         raise ConfigError(f"{source}: {kind}.name is {name!r}, but must be one of {', '.join(plugins.names(kind))}")
     module = plugins.load(kind, name, source)
-    options = build(module.Options, {k: v for k, v in values.items() if k != "name"}, kind, source)
+    sha256 = plugins.sha256(name)
+    if values.get("sha256", sha256) != sha256:
+        raise ConfigError(f"{source}: {kind}.sha256 is of another version of {name}")
+    options = build(module.Options, {k: v for k, v in values.items() if k not in ("name", "sha256")}, kind, source)
     if hasattr(module, "check"):
         try:
             module.check(options)
         except ValueError as error:
             raise ConfigError(f"{source}: {kind}.{error}") from None
-    return Plugin(name, module, options)
+    return Plugin(name, module, options, sha256)
 
 
 def _overridden(values: dict, sets: Sequence[str]) -> dict:
@@ -301,6 +313,8 @@ def _overridden(values: dict, sets: Sequence[str]) -> dict:
         place = values
         for key in keys[:-1]:
             inner = place.get(key)
+            if not isinstance(inner, str | Mapping | None):
+                raise ConfigError(f"--set is {text!r}, but {key} is {inner!r}, which has no options of its own")
             place[key] = {"name": inner} if isinstance(inner, str) else dict(inner or {})
             place = place[key]
         place[keys[-1]] = parse_yaml(value, f"--set {path}")
@@ -326,7 +340,9 @@ def from_mapping(values: Any, source: str, name: str = "dataset") -> Config:
     if not isinstance(name, str) or not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}", name):
         raise ConfigError(f"{source}: name is {name!r}, but must be letters, digits, '.', '_' and '-', 100 at most")
     seed = checked_seed(values.get("seed", 0), f"{source}: seed")
-    sections: dict[str, Any] = {s: build(cls, values.get(s) or {}, s, source) for s, cls in SECTIONS.items()}
+    sections: dict[str, Any] = {
+        s: build(cls, {} if values.get(s) is None else values[s], s, source) for s, cls in SECTIONS.items()
+    }
     plugs: dict[str, Any] = {p: _plugin(p, values.get(p), default, source) for p, default in PLUGINS.items()}
     return Config(name=name, seed=seed, **sections, **plugs)
 

@@ -15,6 +15,7 @@ import jax
 import numpy as np
 import zstandard
 
+from gen2d import __version__
 from gen2d.errors import UserError
 
 DEVICES = ("auto", "cpu", "gpu")
@@ -49,9 +50,14 @@ def prepare(device: str = "auto") -> list[Device]:
         raise DeviceError(f"--device is {device!r}, but must be one of {', '.join(DEVICES)}")
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
     keep_freed_memory()
+    jax.config.update("jax_threefry_partitionable", True)  # the draws depend on it
+    if jax.config.values["jax_enable_x64"]:
+        raise DeviceError(
+            "jax is in 64-bit mode (JAX_ENABLE_X64), but gen2d stores and computes in 32 bits: switch it off"
+        )
     if jax.config.values["jax_compilation_cache_dir"] is None:
         home = pathlib.Path(os.environ.get("XDG_CACHE_HOME") or pathlib.Path.home() / ".cache")
-        jax.config.update("jax_compilation_cache_dir", str(home / "gen2d"))
+        jax.config.update("jax_compilation_cache_dir", str(home / "gen2d" / instruction_set()))
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
     try:
         jax.config.update("jax_num_cpu_devices", cores())
@@ -61,6 +67,10 @@ def prepare(device: str = "auto") -> list[Device]:
         pass  # jax already runs: its devices are what there is; the videos are the same on any number of them
     if device == "auto":
         return jax.devices()
+    if device == "cpu" and jax.default_backend() != "cpu":
+        raise DeviceError(
+            f"--device is 'cpu', but this process already runs jax on {jax.default_backend()}: start another"
+        )
     try:
         return jax.devices(device)
     except RuntimeError as error:
@@ -77,16 +87,17 @@ def instruction_set() -> str:
     return next((isa for isa in ("avx512f", "avx2", "avx") if isa in flags), platform.machine())
 
 
-def fingerprint(device: Device, lanes: int) -> dict[str, object]:
+def fingerprint(device: Device, lanes: int) -> dict[str, Any]:
     """What decides the bits of a simulation; a dataset holds videos of one fingerprint only."""
     kind = device.device_kind if device.platform != "cpu" else f"cpu {instruction_set()}"
-    return {"jaxlib": version("jaxlib"), "device": kind, "lanes": lanes, "xla_flags": os.environ.get("XLA_FLAGS", "")}
+    programs = {name: version(name) for name in ("jax", "jaxlib")} | {"gen2d": __version__}
+    return programs | {"device": kind, "lanes": lanes, "xla_flags": os.environ.get("XLA_FLAGS", "")}
 
 
-def producer(device: Device, lanes: int, gen2d: str) -> dict[str, object]:
+def producer(device: Device, lanes: int) -> dict[str, Any]:
     """The versions that made a dataset, and the fingerprint."""
     return {
-        "gen2d": gen2d,
+        "gen2d": __version__,
         "python": ".".join(map(str, sys.version_info[:3])),
         "jax": jax.__version__,
         "jaxlib": version("jaxlib"),

@@ -8,6 +8,7 @@ import dataclasses
 import math
 import zlib
 from collections.abc import Mapping
+from numbers import Integral, Real
 from typing import Any
 
 import jax
@@ -60,22 +61,31 @@ KINDS = (*LENGTHS, "choice")
 FORMS = "a number, [low, high], or one of " + ", ".join(f"{{{kind}: [...]}}" for kind in KINDS[1:])
 
 
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+LARGEST = 1e12  # in any unit: the square of a larger number leaves no room in a float32
+
+
+def is_number(value: Any) -> bool:
+    """Whether the value is a real number that a simulation can take."""
+    return isinstance(value, Real) and not isinstance(value, bool) and abs(float(value)) <= LARGEST
+
+
+def _far_in_the_tail(mean: float, deviation: float, low: float, high: float) -> bool:
+    """Where float32 has no probabilities left to draw from."""
+    return low > mean + 4 * deviation or high < mean - 4 * deviation
 
 
 def parse(value: Any, whole: bool = False) -> Distribution:
     """The distribution that a config's value stands for; ValueError with what is allowed where it stands for none."""
-    if _is_number(value):
+    if is_number(value):
         kind, numbers = "constant", [value]
-    elif isinstance(value, list):
+    elif isinstance(value, list | tuple):
         kind, numbers = "integer" if whole else "uniform", value
     elif isinstance(value, dict) and len(value) == 1 and next(iter(value)) in KINDS:
         kind, numbers = next(iter(value.items()))
         kind = "integer" if whole and kind == "uniform" else kind
     else:
         raise ValueError(FORMS)
-    if not isinstance(numbers, list) or not numbers or not all(map(_is_number, numbers)):
+    if not isinstance(numbers, list | tuple) or not numbers or not all(map(is_number, numbers)):
         raise ValueError(f"{kind} of finite numbers in a list")
     if kind != "choice" and len(numbers) not in LENGTHS[kind]:
         raise ValueError(f"{kind} of {' or '.join(map(str, LENGTHS[kind]))} numbers")
@@ -83,13 +93,15 @@ def parse(value: Any, whole: bool = False) -> Distribution:
         raise ValueError("a range with its lower end first")
     if kind == "log_uniform" and numbers[0] <= 0:
         raise ValueError("a log_uniform range above 0")
+    if len(numbers) == 4 and kind == "normal" and _far_in_the_tail(*numbers):
+        raise ValueError("a normal cut off within 4 deviations of its mean")
     if kind == "normal" and (numbers[1] <= 0 or (len(numbers) == 4 and numbers[2] >= numbers[3])):
         raise ValueError("normal: [mean, deviation above 0] or [mean, deviation, low, high]")
     if (whole or kind == "integer") and not all(float(x).is_integer() for x in numbers):
         raise ValueError("whole numbers")
     if whole and kind in ("log_uniform", "normal"):
         raise ValueError("a whole number, [low, high] or {choice: [...]}")
-    return Distribution(kind, tuple(numbers))
+    return Distribution(kind, tuple(int(x) if isinstance(x, Integral) else float(x) for x in numbers))
 
 
 Drawn = Distribution | tuple[Distribution, ...]

@@ -1,7 +1,9 @@
 """The one loop: which videos are missing, made batch by batch, written shard by shard."""
 
 import dataclasses
+import numbers
 import os
+import re
 import shlex
 import signal
 import sys
@@ -16,7 +18,7 @@ import jax
 import numpy as np
 from tqdm import tqdm
 
-from gen2d import __version__, devices, shards
+from gen2d import devices, shards
 from gen2d.config import Config, checked_seed, load_config
 from gen2d.errors import ConfigError, FolderError, UserError
 from gen2d.pipeline import Encoder, Job, Writers, batches, jobs_of, threads_for
@@ -75,11 +77,12 @@ def generate(
     config = load_config(config, sets)
     if seed is not None:
         config = dataclasses.replace(config, seed=checked_seed(seed))
-    _check_run(n, worker)
+    n = _check_run(n, split, worker)
     out = Path(out) if out is not None else Path("datasets") / config.name
     rollout = Rollout(config, devices.prepare(device))
     dataset = dataset_of(rollout, out, {split: n})
-    todo = shards.mine(shards.open_folder(dataset, overwrite), *worker)
+    remaining = [shard for shard in shards.open_folder(dataset, overwrite) if shard.split == split]
+    todo = shards.mine(remaining, *worker)
     began, made, size = time.perf_counter(), sum(shard.count for shard in todo), 0
     if todo:
         size = _make(rollout, dataset, todo, say)
@@ -91,11 +94,15 @@ def generate(
     return Summary(out, made, n, seconds, size, complete)
 
 
-def _check_run(n: Any, worker: tuple[int, int]) -> None:
-    if isinstance(n, bool) or not isinstance(n, int) or not 1 <= n <= MAX_VIDEOS:
+def _check_run(n: Any, split: str, worker: tuple[int, int]) -> int:
+    """n as an int, if all of it is possible."""
+    if isinstance(n, bool) or not isinstance(n, numbers.Integral) or not 1 <= int(n) <= MAX_VIDEOS:
         raise ConfigError(f"--n is {n!r}, but must be a whole number from 1 to 2**32 - 1")
+    if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}", split):
+        raise ConfigError(f"--split is {split!r}, but must be letters, digits, '.', '_' and '-', 64 at most")
     if not 0 <= worker[0] < worker[1]:
         raise ConfigError(f"--worker is {worker[0]}/{worker[1]}, but must be r/W with r from 0 to W - 1")
+    return int(n)
 
 
 def dataset_of(rollout: Rollout, out: Path, counts: Mapping[str, int]) -> Dataset:
@@ -110,14 +117,14 @@ def dataset_of(rollout: Rollout, out: Path, counts: Mapping[str, int]) -> Datase
         seed=config.seed,
         config=plain,
         config_text=config.text(),
-        producer=devices.producer(rollout.devices[0], rollout.lanes, __version__),
+        producer=devices.producer(rollout.devices[0], rollout.lanes),
         splits=counts,
         videos_per_shard=rollout.videos_per_shard,
         codec=config.storage.codec,
         fps=config.video.fps,
         constants={"time": rollout.time},
         conventions=CONVENTIONS,
-        command=f"python -m gen2d --config config.yaml --n {sum(counts.values())}",
+        command="python -m gen2d --config config.yaml",
     )
 
 
@@ -126,8 +133,8 @@ def _make(rollout: Rollout, dataset: Dataset, todo: list[Shard], say: Callable[[
     encoder, writers = Encoder(rollout, dataset, threads_for(devices.cores())), Writers(dataset)
     work = batches(todo, rollout.lanes)
     size = 0
-    try:
-        with _stopping_on_sigterm():
+    with _stopping_on_sigterm(say):  # also while it cleans up: then a second signal ends the process
+        try:
             count = sum(shard.count for shard in todo)
             _prepare(rollout, encoder, work, count, say)
             with _progress(count, say) as advance:
@@ -136,11 +143,11 @@ def _make(rollout: Rollout, dataset: Dataset, todo: list[Shard], say: Callable[[
                     size += block.nbytes
                     advance(len(block))
             writers.finish()
-    except BaseException:
-        writers.drop()
-        raise
-    finally:
-        encoder.close()
+        except BaseException:
+            writers.drop()
+            raise
+        finally:
+            encoder.close()
     return size
 
 
@@ -244,7 +251,7 @@ def _progress(count: int, say: Callable[[str], None]) -> Iterator[Callable[[int]
 
 
 @contextmanager
-def _stopping_on_sigterm() -> Iterator[None]:
+def _stopping_on_sigterm(say: Callable[[str], None]) -> Iterator[None]:
     """Makes SIGTERM stop the run as Ctrl-C does; a second signal of either kind ends the process at once."""
     if threading.current_thread() is not threading.main_thread():
         yield
@@ -253,6 +260,7 @@ def _stopping_on_sigterm() -> Iterator[None]:
     def stop(number: int, _: Any) -> None:
         signal.signal(signal.SIGINT, signal.SIG_DFL)
         signal.signal(signal.SIGTERM, signal.SIG_DFL)
+        say("Stopping; what is being compiled or written is finished or dropped first. A second signal does not wait.")
         raise KeyboardInterrupt(number)
 
     before = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}

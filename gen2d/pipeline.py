@@ -44,11 +44,11 @@ def groups(
     work: Sequence[tuple[str, int, list[Piece]]], devices: int
 ) -> Iterator[tuple[str, list[int], list[list[Piece]]]]:
     """The batches, as many at a time as there are devices; a device left over repeats the last batch for nothing."""
-    line = list(work)
-    while line:
-        split = line[0][0]
-        taken = [entry for entry in line[:devices] if entry[0] == split]
-        line = line[len(taken) :]
+    place = 0
+    while place < len(work):
+        split = work[place][0]
+        taken = [entry for entry in work[place : place + devices] if entry[0] == split]
+        place += len(taken)
         idle = devices - len(taken)
         yield split, [e[1] for e in taken] + [taken[-1][1]] * idle, [e[2] for e in taken] + [[]] * idle
 
@@ -91,7 +91,10 @@ class Encoder:
         own = {name: column[rows] for name, column in columns.items()}
         own["frames"] = parts(frames)[job.device][rows.start - start : rows.stop - start]
         own["index"] = np.arange(job.first + rows.start, job.first + rows.stop, dtype=np.int64)
-        return shards.encode(own | self.rollout.camera(rows.stop - rows.start), self.dataset.fields, self.dataset.codec)
+        own |= self.rollout.camera(rows.stop - rows.start)
+        block = shards.encode(own, self.dataset.fields, self.dataset.codec)
+        _check_finite(block, job.first + rows.start)
+        return block
 
     def blocks(self, work: Sequence[tuple[str, int, list[Piece]]]) -> Iterator[tuple[Shard, Block]]:
         """Every block of these batches with its shard, in the order of the videos.
@@ -141,12 +144,31 @@ def _result(job: Job) -> tuple[Shard, Block]:
 def _check_placed(batch: Batch, firsts: list[int], pieces: list[list[Piece]]) -> None:
     for first, own, placed in zip(firsts, pieces, parts(batch.placed), strict=True):
         for _, start, stop in own:
-            if not placed[start:stop].all():
-                number = first + start + int(np.argmin(placed[start:stop]))
-                raise NoPlaceError(
-                    f"scene: video {number} could not be placed without overlap in 100 attempts; "
-                    "ask for fewer or smaller objects, or for a larger box"
-                )
+            check_placed(placed[start:stop], first + start)
+
+
+def check_placed(placed: np.ndarray, first: int) -> None:
+    """Returns nothing; raises NoPlaceError if a scene, the first of which is video `first`, did not fit its box."""
+    if not placed.all():
+        raise NoPlaceError(
+            f"scene: video {first + int(np.argmin(placed))} could not be placed without overlap in 100 attempts; "
+            "ask for fewer or smaller objects, or for a larger box"
+        )
+
+
+def _check_finite(block: Block, first: int) -> None:
+    """Returns nothing; raises where the sums of a state's values, which the block holds anyway, are not numbers."""
+    for name, moments in block.moments.items():
+        finite = np.isfinite(moments[:, 1]).all(axis=-1)
+        if not finite.all():
+            number = first + int(np.argmin(finite))
+            raise NotFiniteError(
+                f"scene: {name} of video {number} is not finite; its speeds, sizes or masses are extreme"
+            )
+
+
+class NotFiniteError(UserError):
+    """A scene with numbers that a simulation cannot take."""
 
 
 class _Dropped(BaseException):

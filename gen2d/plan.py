@@ -57,6 +57,11 @@ class Shard:
     count: int
     number: int
 
+    @property
+    def place(self) -> int:
+        """Its place within its split, which stays the same when another split grows."""
+        return int(self.name.rpartition("-")[2])
+
 
 def plan(counts: Mapping[str, int], videos_per_shard: int) -> list[Shard]:
     """All shards of a dataset with these many videos in each split."""
@@ -70,7 +75,7 @@ def plan(counts: Mapping[str, int], videos_per_shard: int) -> list[Shard]:
 
 def mine(shards: Iterable[Shard], worker: int, workers: int) -> list[Shard]:
     """The shards that worker number `worker` of `workers` makes, whatever the others have done so far."""
-    return [shard for shard in shards if shard.number % workers == worker]
+    return [shard for shard in shards if shard.place % workers == worker]
 
 
 def shard_path(root: Path, name: str) -> Path:

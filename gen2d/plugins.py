@@ -1,10 +1,12 @@
 """A name in a config is a file in a folder: find it, load it, or say which names there are."""
 
 import difflib
+import hashlib
 import importlib
 import importlib.util
 import pathlib
 import pkgutil
+import sys
 from types import ModuleType
 
 from gen2d.errors import ConfigError
@@ -32,6 +34,11 @@ def load(kind: str, name: str, source: str = "--set") -> ModuleType:
     return importlib.import_module(f"{FOLDERS[kind]}.{name}")
 
 
+def sha256(name: str) -> str | None:
+    """The hash of a plug-in that is a file of the user's own; None of one that comes with gen2d."""
+    return hashlib.sha256(pathlib.Path(name).expanduser().read_bytes()).hexdigest() if name.endswith(".py") else None
+
+
 def _load_path(kind: str, path: pathlib.Path, source: str) -> ModuleType:
     if not path.is_file():
         raise ConfigError(f"{source}: {kind} is {str(path)!r}, but there is no such file")
@@ -39,7 +46,13 @@ def _load_path(kind: str, path: pathlib.Path, source: str) -> ModuleType:
     assert spec is not None  # a .py file always has a loader
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
+    sys.modules[spec.name] = module  # dataclasses look their module up
+    try:
+        spec.loader.exec_module(module)
+    except Exception as error:
+        raise ConfigError(f"{source}: {kind} is {str(path)!r}, which cannot be run ({error!r})") from error
+    if not hasattr(module, "Options"):
+        raise ConfigError(f"{source}: {kind} is {str(path)!r}, but it has no Options")
     return module
 
 
@@ -58,7 +71,7 @@ def find_config(name: str) -> pathlib.Path:
     path = pathlib.Path(name).expanduser()
     if path.is_file():
         return path
-    if path.is_dir():
+    if name and path.is_dir():
         raise ConfigError(f"--config is {name!r}, which is a folder; name a YAML file")
     for candidate in (path.name, f"{path.name}.yaml"):
         if path.parent == pathlib.Path() and (config_folder() / candidate).is_file():

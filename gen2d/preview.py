@@ -41,6 +41,7 @@ def _drawn(source: str, videos: int, seed: int | None, sets: Sequence[str]) -> t
 
     from gen2d import devices
     from gen2d.config import checked_seed, load_config
+    from gen2d.pipeline import check_placed
     from gen2d.rollout import Rollout, parts
 
     config = load_config(source, sets)
@@ -50,6 +51,7 @@ def _drawn(source: str, videos: int, seed: int | None, sets: Sequence[str]) -> t
     frames = []
     for first in range(0, videos, rollout.lanes):
         batch = rollout.begin("train", [first])
+        check_placed(parts(batch.placed)[0][: videos - first], first)
         for start in range(0, min(rollout.lanes, videos - first), rollout.slice):
             frames.append(parts(rollout.draw(batch, start, rollout.slice))[0])
     return config.name, np.concatenate(frames)[:videos], config.video.fps

@@ -125,9 +125,10 @@ def _explained(root: Path) -> Iterator[None]:
     except PermissionError as error:
         raise FolderError(f"you have no permission to write in {error.filename}: choose another --out") from error
     except OSError as error:
-        if error.errno != errno.EROFS:
-            raise
-        raise FolderError(f"{root} is on a disk that is read-only: choose another --out") from error
+        why = (
+            "is on a disk that is read-only" if error.errno == errno.EROFS else f"cannot be written ({error.strerror})"
+        )
+        raise FolderError(f"{root} {why}: choose another --out") from error
 
 
 # ---- One shard

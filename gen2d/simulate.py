@@ -7,14 +7,20 @@ import jax
 import jax.numpy as jnp
 
 from gen2d.contacts import Segments
+from gen2d.errors import ConfigError
 from gen2d.solver import Discs, Impulse, Memory, Motion, Row, Rules, Setup, row, step
 from gen2d.tournament import tournament
 from gen2d.types import Array, Layout, Objects, Quality, Record, Scene, State, Trajectory
 
+MOST_STEPS = 10_000  # a frame
+
 
 def substeps(fps: float, asked: int | None, max_step: float) -> int:
     """Steps per frame: as asked, else the smallest number that keeps a step at or under `max_step` seconds."""
-    return asked or max(1, math.ceil(1 / (fps * max_step) - 1e-9))
+    steps = asked or max(1, math.ceil(1 / (fps * max_step) - 1e-9))
+    if steps > MOST_STEPS:
+        raise ConfigError(f"video.fps is {fps:g}, which takes {steps:,} steps a frame, but {MOST_STEPS:,} is the most")
+    return steps
 
 
 def _inverse(value: Array, present: Array) -> Array:

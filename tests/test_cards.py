@@ -1,10 +1,13 @@
 """What a dataset says about itself is true, and its examples run."""
 
+import importlib.util
 import json
 import re
+import subprocess
+import sys
 from pathlib import Path
-from typing import Any
 
+import numpy as np
 import pytest
 import synthetic
 from numpy.testing import assert_array_equal
@@ -26,19 +29,19 @@ def test_the_cards_name_every_field_and_file(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("codec", codecs.CODECS)
 @pytest.mark.parametrize("example", ["gen2d", "torch", "h5py"])
-def test_the_examples_of_the_card_run(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, example: str, codec: str
-) -> None:
+def test_the_examples_of_the_card_run(tmp_path: Path, example: str, codec: str) -> None:
     made = synthetic.make(synthetic.dataset(tmp_path / "copied elsewhere", codec=codec))
     blocks = re.findall(r"```python\n(.*?)```", (made.root / "README.md").read_text(), re.S)
     (code,) = (block for block in blocks if example in block and (example == "torch" or "torch" not in block))
     for module in re.findall(r"import (.*)", code)[0].split(", "):
-        pytest.importorskip(module)
-    monkeypatch.chdir(made.root)
-    names: dict[str, Any] = {}
-    exec(code, names)
+        if not importlib.util.find_spec(module):
+            pytest.skip(f"{module} is not installed")
+    shown = {"torch": 'batch["frames"].numpy()', "gen2d": 'video["frames"]', "h5py": "video"}[example]
+    code += f"\nimport numpy\nnumpy.save('shown.npy', {shown})"
+    # In a process of its own: where hdf5plugin is imported, HDF5 writes the filter's name into new zstd files.
+    subprocess.run([sys.executable, "-c", code], cwd=made.root, check=True)
+    found = np.load(made.root / "shown.npy")
     if example == "torch":
-        assert names["batch"]["frames"].shape == (20, 5, 8, 8, 3)
-        return
-    video = names["video"] if example == "h5py" else names["video"]["frames"]
-    assert_array_equal(video, synthetic.video(made, "train", 0)["frames"])
+        assert found.shape == (20, 5, 8, 8, 3)
+    else:
+        assert_array_equal(found, synthetic.video(made, "train", 0)["frames"])

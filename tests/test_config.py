@@ -17,12 +17,12 @@ BAD = {
     "scene: {balls: 0}": ("scene.balls is 0", "1 or more"),
     "scene: {balls: 2.5}": ("scene.balls is 2.5", "whole number"),
     "scene: {balls: [5, 3]}": ("scene.balls is [5, 3]", "lower end first"),
-    "scene: {radius: -1}": ("scene.radius is -1", "above 0"),
+    "scene: {radius: -1}": ("scene.radius is -1", "0.001 or more"),
     "scene: {radius: big}": ("scene.radius is 'big'", "[low, high]"),
     "scene: {radius: [1, 2, 3]}": ("scene.radius is [1, 2, 3]", "2 numbers"),
     "scene: {radius: {gauss: [1, 2]}}": ("scene.radius is {'gauss': [1, 2]}", "normal"),
     "scene: {radius: {log_uniform: [0, 2]}}": ("log_uniform", "above 0"),
-    "scene: {radius: {normal: [1, 0.1]}}": ("scene.radius is", "above 0 for every value drawn"),
+    "scene: {radius: {normal: [1, 0.1]}}": ("scene.radius is", "0.001 or more for every value drawn"),
     "scene: {radius: 7}": ("scene.radius may be 7 m", "must fit a box"),
     "scene: {elasticity: 1.5}": ("scene.elasticity is 1.5", "1 or less"),
     "scene: {gravity: -9.8}": ("scene.gravity is -9.8", "a list of 2 numbers"),
@@ -46,6 +46,11 @@ BAD = {
     "video: {frames: [3": ("not valid YAML", "line"),
     "- 1": ("holds list", "mapping of sections"),
     "a.b": ("holds str", "mapping of sections"),
+    "video: 0": ("video is 0", "a mapping"),
+    "{[1, 2]: 3}": ("not valid YAML", "a name must be text"),
+    "video: {frames: 2001-99-99}": ("not valid YAML", "month"),
+    "scene: {velocity: [1e40, 0]}": ("scene.velocity is", "number"),
+    "scene: {spin: {normal: [0, 1, 6, 7]}}": ("scene.spin is", "within 4 deviations"),
 }
 
 
@@ -63,7 +68,8 @@ def test_a_bad_config_is_one_sentence_that_names_file_field_value_and_range(tmp_
 
 
 @pytest.mark.parametrize(
-    "text", ["physics.substeps", "=3", "physics.substeps=0", "physics..x=1", "nothing.at=1", "video=[1"]
+    "text",
+    ["physics.substeps", "=3", "physics.substeps=0", "physics..x=1", "nothing.at=1", "video=[1", "video.fps.x=3"],
 )
 def test_a_bad_override_is_one_sentence(text):
     with pytest.raises(ConfigError):
@@ -123,6 +129,12 @@ def test_a_family_of_ones_own_is_a_file(tmp_path):
     own.write_text("from gen2d.scenes.bouncing import *\nfrom gen2d.scenes.bouncing import FACTORS, Options\n")
     config = load_config({"scene": {"name": str(own), "balls": 2}})
     assert config.scene.options.balls.support == (2, 2)
+    before = config.sha256()
+    own.write_text(own.read_text() + "# changed\n")
+    assert load_config({"scene": {"name": str(own), "balls": 2}}).sha256() != before
+    own.write_text("import nothing_at_all")
+    with pytest.raises(ConfigError, match="cannot be run"):
+        load_config({"scene": str(own)})
     with pytest.raises(ConfigError, match="no such file"):
         load_config({"scene": str(tmp_path / "other.py")})
 

@@ -210,6 +210,22 @@ def test_scenes_that_cannot_be_placed_are_an_error_with_the_options_to_change(tm
         generate(crowded, 4, tmp_path / "data")
 
 
+def test_numbers_that_overflow_are_an_error_not_data(tmp_path: Path):
+    with pytest.raises(UserError, match="video 0 is not finite"):
+        generate(changed(scene={"velocity": [1e12, 1e12], "width": 1000, "height": 1000}), 4, tmp_path / "data")
+    assert not list((tmp_path / "data" / "shards").iterdir())
+
+
+def test_splits_grow_apart_whatever_the_workers(tmp_path: Path):
+    out = tmp_path / "data"
+    generate(CONFIG, 4, out)
+    generate(CONFIG, 32, out, split="val", worker=(0, 2))
+    generate(CONFIG, 12, out, worker=(1, 2))
+    generate(CONFIG, 12, out, worker=(0, 2))
+    assert generate(CONFIG, 32, out, split="val", worker=(1, 2)).complete
+    assert (len(gen2d.open(out, split="train")), len(gen2d.open(out, split="val"))) == (12, 32)
+
+
 def test_a_disk_too_small_is_refused_before_it_starts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr("gen2d.shards.free_bytes", lambda path: 1000)
     with pytest.raises(FolderError, match="has 1.0 kB free".replace(".", "[.]")):
@@ -270,6 +286,8 @@ def test_the_command_line_tells_what_it_did(tmp_path: Path):
         ["--config", "bouncing.yaml", "--n", "1", "--seed", "-1"],
         ["--config", "bouncing.yaml", "--n", "1", "--set", "scene.balls=0"],
         ["--config", "bouncing.yaml", "--n", "1", "--worker", "3"],
+        ["--config", "bouncing.yaml", "--n", "1", "--split", "../x"],
+        ["--config", "bouncing.yaml", "--n", "1", "--over"],
         ["--config", "bouncing.yaml", "--n", "1", "--device", "gpu"],
         ["verify", "nowhere"],
         ["info", "nowhere"],

@@ -88,7 +88,10 @@ def _new(path: Path) -> Iterator[h5py.File]:
 
 
 def _chunked(file: h5py.File, name: str, dtype: str, shape: tuple[int, ...], codec: str) -> h5py.Dataset:
-    """A new dataset with a chunk per video; made by hand, as h5py refuses a filter that it has no plugin for."""
+    """A new dataset with a chunk per video; made by hand, as h5py refuses a filter that it has no plugin for.
+
+    A process that has imported hdf5plugin writes zstd files with the filter's name in them: other bytes, same content.
+    """
     settings = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
     settings.set_chunk((1, *shape[1:]))
     settings.set_obj_track_times(False)

@@ -19,8 +19,8 @@ class Options:
     balls: Distribution = option([3, 8], int, "balls", "in a video", low=1, high=64, draw=True)
     width: float = option(10.0, float, "m", "of the box, inside", above=0, high=1000)
     height: float = option(10.0, float, "m", "of the box, inside", above=0, high=1000)
-    radius: Distribution = option([0.5, 1.0], float, "m", "of each ball", above=0, draw=True)
-    density: Distribution = option(1.0, float, "kg/m^2", "of each ball", above=0, draw=True)
+    radius: Distribution = option([0.5, 1.0], float, "m", "of each ball", low=1e-3, draw=True)
+    density: Distribution = option(1.0, float, "kg/m^2", "of each ball", low=1e-6, high=1e6, draw=True)
     velocity: tuple[Distribution, ...] = option(
         [{"normal": [0, 3]}, {"normal": [0, 3]}], float, "m/s", "of each ball at the start", parts=2, draw=True
     )
