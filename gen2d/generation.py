@@ -154,7 +154,7 @@ def _make(rollout: Rollout, dataset: Dataset, todo: list[Shard], say: Callable[[
 def _prepare(rollout: Rollout, encoder: Encoder, work: list, count: int, say: Callable[[str], None]) -> None:
     """Compiles, measures a slice, says how much and how long it will be, and refuses what the disk cannot hold."""
     name = f"{len(rollout.devices)} {rollout.devices[0].platform} device{'s' if len(rollout.devices) > 1 else ''}"
-    say(f"Compiling for {name} (a few seconds, kept for the next run) ...")
+    say(f"Compiling for {name} (seconds; up to a minute for dozens of objects; kept for the next run) ...")
     began = time.perf_counter()
     split, first, pieces = work[0]
     firsts = [first] * len(rollout.devices)

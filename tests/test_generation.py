@@ -20,6 +20,7 @@ from tiny import CONFIG, changed, command, everything, ran, same
 import gen2d
 from gen2d.errors import ConfigError, FolderError, UserError
 from gen2d.generation import generate
+from gen2d.rollout import Rollout
 
 N = 21
 
@@ -210,9 +211,19 @@ def test_scenes_that_cannot_be_placed_are_an_error_with_the_options_to_change(tm
         generate(crowded, 4, tmp_path / "data")
 
 
-def test_numbers_that_overflow_are_an_error_not_data(tmp_path: Path):
-    with pytest.raises(UserError, match="video 0 is not finite"):
-        generate(changed(scene={"velocity": [1e12, 1e12], "width": 1000, "height": 1000}), 4, tmp_path / "data")
+def test_states_that_are_no_numbers_are_an_error_not_data(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    columns = Rollout.host_columns
+
+    def broken(rollout: Rollout, batch: Any) -> list[dict[str, np.ndarray]]:
+        found = columns(rollout, batch)
+        for own in found:
+            own["states/velocity"] = own["states/velocity"].copy()
+            own["states/velocity"][1, 2, 0] = np.nan
+        return found
+
+    monkeypatch.setattr(Rollout, "host_columns", broken)
+    with pytest.raises(UserError, match="states/velocity of video 1 is not finite"):
+        generate(CONFIG, 4, tmp_path / "data")
     assert not list((tmp_path / "data" / "shards").iterdir())
 
 
