@@ -3,6 +3,7 @@
 import dataclasses
 import math
 
+import chex
 import jax
 import jax.numpy as jnp
 
@@ -85,7 +86,10 @@ def simulate(scene: Scene, state: State, layout: Layout, rules: Rules, frames: i
 
     Scene and state have bodies before scenes: position [2, K, n] in m, angle [K, n] in rad, and so on (types.py); the
     result has frames first: position [T, 2, K, n]. What stands in empty slots is ignored; they come back as zeros.
+    Raises AssertionError for records of another layout.
     """
+    chex.assert_shape(state.position, (2, layout.slots, ...))
+    chex.assert_equal_shape([state.angle, state.angular_velocity, scene.objects.present, scene.objects.mass])
     scene = dataclasses.replace(scene, objects=_clean(scene.objects, scene.objects.present))
     state = _clean(state, scene.objects.present)
     setup = _setup(scene, state, layout, rules)
