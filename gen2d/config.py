@@ -173,10 +173,13 @@ class Config:
         """The resolved config as YAML; read again it gives the same config."""
         return yaml.safe_dump(self.plain(), sort_keys=False)
 
+    def recipe(self) -> dict[str, Any]:
+        """The config without its seed, which a dataset keeps and compares by itself."""
+        return {key: value for key, value in self.plain().items() if key != "seed"}
+
     def sha256(self) -> str:
-        """A hash of the resolved config, its seed left out: the seed is compared by itself."""
-        values = {key: value for key, value in self.plain().items() if key != "seed"}
-        return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()
+        """A hash of the recipe."""
+        return hashlib.sha256(json.dumps(self.recipe(), sort_keys=True).encode()).hexdigest()
 
 
 SECTIONS = {"video": VideoOptions, "physics": PhysicsOptions, "camera": CameraOptions, "storage": StorageOptions}

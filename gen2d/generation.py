@@ -108,14 +108,13 @@ def _check_run(n: Any, split: str, worker: tuple[int, int]) -> int:
 def dataset_of(rollout: Rollout, out: Path, counts: Mapping[str, int]) -> Dataset:
     """What the folder `out` is to hold."""
     config = rollout.config
-    plain = {key: value for key, value in config.plain().items() if key != "seed"}
     return Dataset(
         root=out,
         name=config.name,
         fields=rollout.fields,
         sizes=rollout.sizes,
         seed=config.seed,
-        config=plain,
+        config=config.recipe(),
         config_text=config.text(),
         producer=devices.producer(rollout.devices[0], rollout.lanes),
         splits=counts,

@@ -15,7 +15,7 @@ import numpy as np
 
 from gen2d import shards
 from gen2d.errors import UserError
-from gen2d.rollout import Batch, Rollout, parts
+from gen2d.rollout import Batch, Rollout, part, parts
 from gen2d.shards import Block, Dataset, Shard
 from gen2d.types import Array
 
@@ -89,7 +89,7 @@ class Encoder:
         """The block of a job, from its device's columns and the frames of its slice on all devices."""
         rows, start = job.rows, job.start
         own = {name: column[rows] for name, column in columns.items()}
-        own["frames"] = parts(frames)[job.device][rows.start - start : rows.stop - start]
+        own["frames"] = part(frames, job.device)[rows.start - start : rows.stop - start]
         own["index"] = np.arange(job.first + rows.start, job.first + rows.stop, dtype=np.int64)
         own |= self.rollout.camera(rows.stop - rows.start)
         block = shards.encode(own, self.dataset.fields, self.dataset.codec)

@@ -162,10 +162,18 @@ CAMERA = (
 )
 
 
+def _pieces(array: Array) -> list[Any]:
+    return sorted(array.addressable_shards, key=lambda piece: piece.index[0].start or 0)
+
+
+def part(array: Array, device: int) -> np.ndarray:
+    """One device's part of an array, by its place in the mesh, without a copy where the device is a CPU."""
+    return np.asarray(_pieces(array)[device].data)
+
+
 def parts(array: Array) -> list[np.ndarray]:
-    """Each device's part of an array, in the order of the mesh, without a copy where the device is a CPU."""
-    pieces = sorted(array.addressable_shards, key=lambda piece: piece.index[0].start or 0)
-    return [np.asarray(piece.data) for piece in pieces]
+    """Each device's part of an array."""
+    return [np.asarray(piece.data) for piece in _pieces(array)]
 
 
 def rules_of(config: Config, steps: int) -> Rules:

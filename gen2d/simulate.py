@@ -76,9 +76,8 @@ def _nothing_yet(setup: Setup) -> Memory:
 
     lanes, count = setup.radius.shape[1:], setup.radius.shape[0]
     pairs, walls = (count // 2, *lanes), (count, *lanes)
-    kinds = [jnp.zeros(shape, kind) for shape in (pairs, walls) for kind in (jnp.float32, jnp.int32)]
-    kinds = [k.astype(setup.radius.dtype) if k.dtype == jnp.float32 else k for k in kinds]
-    return Memory(zero(setup.pairs), zero(setup.walls), *kinds)
+    seen = [jnp.zeros(shape, kind) for shape in (pairs, walls) for kind in (setup.radius.dtype, jnp.int32)]
+    return Memory(zero(setup.pairs), zero(setup.walls), *seen)
 
 
 def simulate(scene: Scene, state: State, layout: Layout, rules: Rules, frames: int, steps: int) -> Trajectory:

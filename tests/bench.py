@@ -80,7 +80,10 @@ def _parts(folder: Path, sets: Sequence[str]) -> dict[str, tuple[Callable[[], An
     encoder = pipeline.Encoder(rollout, dataset, pipeline.threads_for(devices.cores()))
     jobs = pipeline.jobs_of([0], [[(shard, 0, rollout.lanes)]], rollout.lanes, rollout.slice)
     frames = [jax.block_until_ready(rollout.draw(batch, job.start, rollout.slice)) for job in jobs]
-    encode = lambda: [encoder.encode(job, columns, f) for job, f in zip(jobs, frames, strict=True)]  # noqa: E731
+
+    def encode() -> list[Any]:
+        return [encoder.encode(job, columns, f) for job, f in zip(jobs, frames, strict=True)]
+
     blocks = encode() * (whole // rollout.lanes)
 
     def draw() -> None:

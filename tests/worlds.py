@@ -19,13 +19,13 @@ from gen2d.types import Layout, Objects, Scene, State, Trajectory
 STEP = 1 / 240
 
 
-def rules(step: float = STEP, **changes: object) -> Rules:
+def rules(step: float = STEP, **changes: Any) -> Rules:
     """The solver's default numbers at a step, but for the changes."""
-    numbers = {
+    numbers: dict[str, Any] = {
         "bounce_threshold": 0.01, "hertz": min(30.0, 0.125 / step), "damping_ratio": 10.0, "push_speed": 3.0,
         "damping": 0.0, "mixing": "product",
     }  # fmt: skip
-    return Rules(step=step, **(numbers | changes))  # type: ignore[arg-type]
+    return Rules(step=step, **(numbers | changes))
 
 
 def world(
