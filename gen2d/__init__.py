@@ -19,13 +19,15 @@ if TYPE_CHECKING:
     from gen2d.dataloader import DataLoader
     from gen2d.generation import generate
     from gen2d.loader import open
+    from gen2d.space import Space
     from gen2d.verification import verify
 
 __version__ = "0.1.0"
-__all__ = ["DataLoader", "generate", "load_config", "open", "verify"]
+__all__ = ["DataLoader", "Space", "generate", "load_config", "open", "verify"]
 
 _HOME = {
     "DataLoader": "gen2d.dataloader",
+    "Space": "gen2d.space",
     "generate": "gen2d.generation",
     "load_config": "gen2d.config",
     "open": "gen2d.loader",

@@ -27,7 +27,7 @@ MAX_SLOTS = 254  # a slot's mask id is one byte, 0 is the background
 class Option:
     """What an option may be. `parts` > 0: a list of so many values. `draw`: a distribution, else a single value."""
 
-    kind: type  # int, float or str
+    kind: type  # int, float, str or bool
     unit: str
     meaning: str
     low: float | None = None
@@ -43,6 +43,8 @@ class Option:
         """What the option may be, for a sentence."""
         if self.choices:
             return "one of " + ", ".join(self.choices)
+        if self.kind is bool:
+            return "true or false"
         noun = {int: "whole number", float: "number", str: "text"}[self.kind]
         ends = [
             f"above {self.above:g}" if self.above is not None else "",
@@ -108,6 +110,16 @@ class CameraOptions:
 
 
 @dataclasses.dataclass(frozen=True)
+class AnnotationOptions:
+    """What is stored beside frames and states."""
+
+    contacts: int = option(
+        0, int, "rows", "of contacts, per object and 16 frames; 4 is a good number, 0: none", low=0, high=1000
+    )
+    energy: bool = option(False, bool, "", "books of energy and momentum, and what they leave unexplained")
+
+
+@dataclasses.dataclass(frozen=True)
 class StorageOptions:
     """How videos lie on disk."""
 
@@ -161,6 +173,7 @@ class Config:
     physics: PhysicsOptions
     camera: CameraOptions
     look: Plugin
+    annotations: AnnotationOptions
     storage: StorageOptions
 
     def plain(self) -> dict[str, Any]:
@@ -182,7 +195,13 @@ class Config:
         return hashlib.sha256(json.dumps(self.recipe(), sort_keys=True).encode()).hexdigest()
 
 
-SECTIONS = {"video": VideoOptions, "physics": PhysicsOptions, "camera": CameraOptions, "storage": StorageOptions}
+SECTIONS = {
+    "video": VideoOptions,
+    "physics": PhysicsOptions,
+    "camera": CameraOptions,
+    "annotations": AnnotationOptions,
+    "storage": StorageOptions,
+}
 PLUGINS = {"scene": "bouncing", "look": "flat"}
 
 
@@ -252,7 +271,9 @@ def _single(spec: Option, value: Any) -> Any:
         if not isinstance(value, str) or (spec.choices and value not in spec.choices):
             raise ValueError(spec.allowed)
         return value
-    if not is_number(value):
+    if spec.kind is bool and isinstance(value, bool):
+        return value
+    if not is_number(value) or spec.kind is bool:
         raise ValueError(spec.allowed)
     if (spec.kind is int and not float(value).is_integer()) or not _check(spec, value, value):
         raise ValueError(spec.allowed)

@@ -1,5 +1,7 @@
 """When two shapes meet within a step, and how fast they part: exact, so that paths and their gradients are."""
 
+from typing import NamedTuple
+
 import jax.numpy as jnp
 
 from gen2d.contacts import dot
@@ -15,40 +17,61 @@ def _root(x: Array) -> Array:
     return jnp.sqrt(jnp.where(x > 0, x, 1.0))  # where it is not taken, its gradient is finite too
 
 
-def disc_impact(
-    apart: Array, inverse: Array, reach: Array, velocity: Array, h: float, threshold: Array
-) -> tuple[Array, Array]:
-    """Time of impact of two discs, and what scales their offset at that time to a unit normal.
+class Path(NamedTuple):
+    """c + 2 b tau + a tau^2 is how far apart two shapes are after tau s; b is negative where they approach."""
 
-    `apart` [2, ...] is the offset of their centres, `inverse` one over its length, `reach` the sum of their radii and
-    `velocity` [2, ...] the relative one. The time is the root of |apart + tau velocity| = reach, in the form that does
-    not cancel. Both discs fall alike, so gravity does not come into it.
+    a: Array
+    b: Array
+    c: Array
+
+
+def round_path(apart: Array, gap: Array, reach: Array, velocity: Array) -> Path:
+    """Of two discs: |apart + tau velocity|^2 - reach^2.
+
+    `apart` [2, ...] is the offset of their centres, `reach` the sum of their radii and `velocity` [2, ...] the relative
+    one. If they fall differently it is their mean velocity in the step, which is right to g h^2 / 8.
     """
-    gap = jnp.maximum(1 / inverse - reach, 0.0)
-    closing = dot(apart, velocity)
-    left = gap * (gap + 2 * reach)
-    inside = closing**2 - dot(velocity, velocity) * left
-    tau = left / jnp.maximum(_root(inside) - closing, SLOWEST)
-    fast, meet = closing * inverse < -threshold, (inside > 0) & (tau <= h)
-    scale = jnp.where(fast & meet & (gap > 0), 1 / jnp.maximum(reach, SLOWEST), inverse)
-    return jnp.where(fast, jnp.where(meet, tau, PASSES), NONE), scale
+    return Path(dot(velocity, velocity), dot(apart, velocity), gap * (gap + 2 * reach))
 
 
-def wall_impact(
-    gap: Array, speed: Array, pull: Array, elasticity: Array, h: float, threshold: Array
-) -> tuple[Array, Array]:
-    """Time of impact of a disc on a fixed plane, and its normal speed at the end of the step.
+def plane_path(gap: Array, approach: Array, pull: Array | float) -> Path:
+    """Of a point and a plane: gap - V tau - p tau^2 / 2, with V the approach speed at the start of the step and p the
+    part of gravity that pulls the point there."""
+    return Path(jnp.full_like(gap, -0.5) * pull, -0.5 * approach, gap)
 
-    `gap` is the distance at the start, `speed` the normal speed with this step's gravity in it, `pull` gravity's part
-    towards the plane (a below). With V the approach speed at the start the disc arrives at u = sqrt(V^2 + 2 a gap),
-    after tau = 2 gap / (V + u), and leaves at e u, of which gravity takes a (h - tau) until the end. Where it takes all
-    of it the disc has come to rest.
+
+def either(which: Array, x: Path, y: Path) -> Path:
+    """The first where `which`, else the second."""
+    return Path(*(jnp.where(which, *of) for of in zip(x, y, strict=True)))
+
+
+def time_of_impact(path: Path, approach: Array, h: float, threshold: Array) -> Array:
+    """Time of impact in s, from the start of the step; NONE or PASSES where there is none in it.
+
+    It is the smaller root of the path, in the form that does not cancel. `approach` is the speed that has to be over
+    the threshold.
     """
-    approach = -speed - pull * h
-    above = jnp.maximum(gap, 0.0)
-    squared = approach**2 + 2 * pull * above
-    arrival = _root(squared)
-    tau = 2 * above / jnp.maximum(approach + arrival, SLOWEST)
-    target = jnp.maximum(elasticity * arrival - pull * (h - tau), 0.0)
-    closes = gap + h * speed + 0.5 * h**2 * pull < 0
-    return jnp.where(approach > threshold, jnp.where(closes & (squared > 0), tau, PASSES), NONE), target
+    inside = path.b**2 - path.a * path.c
+    tau = path.c / jnp.maximum(_root(inside) - path.b, SLOWEST)
+    meet = (inside > 0) & (tau <= h)
+    return jnp.where(approach > threshold, jnp.where(meet, tau, PASSES), NONE)
+
+
+def plane_arrival(gap: Array, approach: Array, pull: Array | float) -> Array:
+    """The speed at which a point that falls from `gap` arrives at a plane; with its sign, if it does not approach."""
+    squared = approach**2 + 2 * pull * gap
+    return jnp.where((approach > 0) & (squared > 0), _root(squared), approach)
+
+
+def arrival(speed: Array, pull: Array | float, tau: Array, h: float) -> Array:
+    """The approach speed at time tau, of a normal speed that has the whole step's gravity in it."""
+    return -speed - pull * (h - tau)
+
+
+def rebound(arrival: Array, pull: Array | float, elasticity: Array, tau: Array, h: float) -> Array:
+    """The normal speed at the end of the step, of what arrives at tau.
+
+    It leaves at e times the speed of arrival, of which gravity takes a (h - tau); where it takes all of it, it has come
+    to rest.
+    """
+    return jnp.maximum(elasticity * arrival - pull * (h - tau), 0.0)

@@ -7,6 +7,7 @@ do not depend on how many videos are made, or where.
 """
 
 import functools
+import math
 import zlib
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -19,8 +20,8 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from gen2d import factors, raster, types
 from gen2d.config import Config
 from gen2d.fields import Field
-from gen2d.simulate import simulate, substeps
-from gen2d.solver import Rules
+from gen2d.rows import Rules
+from gen2d.simulate import Keep, simulate, substeps
 from gen2d.types import Array
 
 SLICE_BYTES = 16 * 2**20  # of raw frames drawn at once; larger buffers cost page faults
@@ -56,6 +57,8 @@ class Rollout:
         self.layout = family.layout(options)
         self.view = _view(config, self.layout)
         self.steps = substeps(video.fps, config.physics.substeps, config.physics.max_step)
+        spans = math.ceil(video.frames / 16)
+        self.keep = Keep(config.annotations.contacts * spans * self.layout.slots, config.annotations.energy)
         frame_bytes = video.frames * video.height * video.width * 3
         auto = min(SHARD_VIDEOS, _power_of_two(SHARD_BYTES // frame_bytes))
         self.videos_per_shard = config.storage.videos_per_shard or auto
@@ -72,13 +75,19 @@ class Rollout:
         """The sizes of the lettered axes of every field."""
         video, family = self.config.video, self.config.scene.module
         own = {"T": video.frames, "K": self.layout.slots, "H": video.height, "W": video.width}
+        own |= {"C": self.keep.contacts} if self.keep.contacts else {}
         return own | family.sizes(self.config.scene.options)
 
     @property
     def fields(self) -> dict[str, Field]:
         """Every stored field."""
-        records = (types.Objects, types.Scene, types.State, types.Quality)
-        fields = {name: field for record in records for name, (_, field) in types.described(record).items()}
+        _, scene, *_ = jax.eval_shape(self._sampled, jax.eval_shape(lambda: jax.random.key(0)))
+        made = [types.State, types.Quality, *([types.Contacts] if self.keep.contacts else [])]
+        made += [types.Energy] if self.keep.energy else []
+        fields = {name: field for record in made for name, (_, field) in types.described(record).items()}
+        fields |= types.fields_of(scene)
+        if not self.keep.energy:
+            del fields["quality/energy_residual"]
         fields["frames"] = Field("uint8", "n T H W 3", "sRGB", "the video")
         fields["index"] = Field("int64", "n", "1", "the video's number in its split")
         fields["time"] = Field("float64", "T", "s", "of each frame; frame 0 is the initial state")
@@ -120,7 +129,7 @@ class Rollout:
         drawn, scene, state, rejected, placed = jax.vmap(self._sampled)(keys)
         rules = rules_of(config, self.steps)
         device = types.to_device(scene), types.to_device(state)
-        made = types.to_stored(simulate(*device, layout, rules, config.video.frames, self.steps))
+        made = types.to_stored(simulate(*device, layout, rules, config.video.frames, self.steps, self.keep))
         paint = jax.vmap(lambda s: config.look.module.paint(s, layout, config.look.options))(scene)
         backdrops = jax.vmap(lambda s, t, p: raster.backdrop(s, t, p, layout, self.view))(scene, state, paint)
         discs = raster.moving(scene, made.states, paint.color, layout, self.view)
@@ -143,6 +152,8 @@ class Rollout:
     def host_columns(self, batch: Batch) -> list[dict[str, np.ndarray]]:
         """For each device its columns as NumPy arrays; waits until they are there."""
         pieces = {name: parts(array) for name, array in batch.columns.items()}
+        if "contacts/time" in pieces:  # a device may have no float64
+            pieces["contacts/time"] = [array.astype(np.float64) for array in pieces["contacts/time"]]
         return [{name: arrays[d] for name, arrays in pieces.items()} for d in range(len(self.devices))]
 
     def camera(self, count: int) -> dict[str, np.ndarray]:

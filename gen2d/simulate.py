@@ -2,18 +2,22 @@
 
 import dataclasses
 import math
+from collections.abc import Callable
 
 import chex
 import jax
 import jax.numpy as jnp
 
-from gen2d.contacts import Segments
+from gen2d import joints, ledger
 from gen2d.errors import ConfigError
-from gen2d.solver import Discs, Impulse, Memory, Motion, Row, Rules, Setup, row, step
-from gen2d.tournament import tournament
-from gen2d.types import Array, Layout, Objects, Quality, Record, Scene, State, Trajectory
+from gen2d.events import begun, compact, happening, unseen
+from gen2d.rows import Motion, Rules
+from gen2d.scenery import cleaned, moving, nothing_yet, padded, scenery_of, slots_of
+from gen2d.solver import Body, Scenery, Seen, World, step
+from gen2d.types import DYNAMIC, STATIC, Array, Energy, Layout, Quality, Scene, State, Trajectory
 
 MOST_STEPS = 10_000  # a frame
+Forces = Callable[[State, Array], tuple[Array, Array]]
 
 
 def substeps(fps: float, asked: int | None, max_step: float) -> int:
@@ -24,116 +28,164 @@ def substeps(fps: float, asked: int | None, max_step: float) -> int:
     return steps
 
 
-def _inverse(value: Array, present: Array) -> Array:
-    usable = present & jnp.isfinite(value) & (value > 0)
-    return jnp.where(usable, 1 / jnp.where(usable, value, 1.0), 0.0)
+@dataclasses.dataclass(frozen=True)
+class Keep:
+    """What to return beyond the states."""
+
+    contacts: int = 0  # slots for rows of contacts; 0: none
+    energy: bool = False
 
 
-def _clean(values: Record, present: Array) -> Record:
-    """The record with nothing in its empty slots, so that whatever stood there (NaN, too) cannot matter."""
-    return jax.tree.map(lambda x: jnp.where(present, x, jnp.zeros_like(x)), values)
-
-
-def _discs(objects: Objects, count: int, padded: int) -> Discs:
-    def first(x: Array) -> Array:
-        return jnp.pad(x[:count], [(0, padded - count)] + [(0, 0)] * (x.ndim - 1))
-
-    inverse_mass, inverse_moment = (_inverse(x, objects.present) for x in (objects.mass, objects.moment))
-    return Discs(*map(first, (objects.radius, inverse_mass, inverse_moment, objects.elasticity, objects.friction)))
-
-
-def _pair_rows(discs: Discs, mixing: str) -> list[Row]:
-    def play(_: int, a: Discs, b: Discs) -> tuple[Discs, Discs, Row]:
-        return a, b, row(a, b, (a.inverse_mass > 0) & (b.inverse_mass > 0), mixing)
-
-    return tournament(discs, discs.radius.shape[0] - 1, play)[1]
-
-
-def _setup(scene: Scene, state: State, layout: Layout, rules: Rules) -> Setup:
-    discs = _discs(scene.objects, layout.discs, layout.discs + layout.discs % 2)
-    segments, walls = [], []
-    for k in range(layout.discs, layout.slots):
-        angle = state.angle[k]
-        direction = jnp.stack([jnp.cos(angle), jnp.sin(angle)])
-        nothing = jnp.zeros_like(discs.radius)
-        e, mu = (jnp.broadcast_to(x[k], nothing.shape) for x in (scene.objects.elasticity, scene.objects.friction))
-        fixed = Discs(nothing, nothing, nothing, e, mu)
-        present = scene.objects.present[k] & (discs.inverse_mass > 0)
-        walls.append(row(fixed, discs, present, rules.mixing))
-        size = scene.objects.half_length[k], scene.objects.radius[k]
-        segments.append(Segments(state.position[:, k, None], direction[:, None], *size))
-    one = 1.0 + jnp.maximum(-jnp.max(discs.radius), 0.0)  # no radius is negative, but the compiler cannot know
-    # In a pile at rest, what has to be stopped anew each step is what gravity gave: that must not count as a bounce.
-    at_rest = 2 * rules.step * jnp.sqrt(jnp.sum(scene.gravity**2, axis=0))
-    threshold = jnp.maximum(rules.bounce_threshold, at_rest)
-    fall = scene.gravity[:, None] * (discs.inverse_mass > 0)
-    return Setup(scene.gravity, fall, threshold, _pair_rows(discs, rules.mixing), walls, segments, discs.radius, one)
-
-
-def _nothing_yet(setup: Setup) -> Memory:
-    def zero(rows: list[Row]) -> list[Impulse]:
-        return [Impulse(jnp.zeros_like(r.normal_mass), jnp.zeros_like(r.normal_mass)) for r in rows]
-
-    lanes, count = setup.radius.shape[1:], setup.radius.shape[0]
-    pairs, walls = (count // 2, *lanes), (count, *lanes)
-    seen = [jnp.zeros(shape, kind) for shape in (pairs, walls) for kind in (setup.radius.dtype, jnp.int32)]
-    return Memory(zero(setup.pairs), zero(setup.walls), *seen)
-
-
-def simulate(scene: Scene, state: State, layout: Layout, rules: Rules, frames: int, steps: int) -> Trajectory:
+def simulate(
+    scene: Scene,
+    state: State,
+    layout: Layout,
+    rules: Rules,
+    frames: int,
+    steps: int,
+    keep: Keep = Keep(),
+    forces: Forces | None = None,
+) -> Trajectory:
     """The trajectory of `frames` frames, `steps` steps apart; device layout, any number of scenes at once.
 
     Scene and state have bodies before scenes: position [2, K, n] in m, angle [K, n] in rad, and so on (types.py); the
     result has frames first: position [T, 2, K, n]. What stands in empty slots is ignored; they come back as zeros.
+    `forces(state, time)` gives force [2, K, n] in N and torque [K, n] in N m on every slot, in every step.
     Raises AssertionError for records of another layout.
     """
     chex.assert_shape(state.position, (2, layout.slots, ...))
     chex.assert_equal_shape([state.angle, state.angular_velocity, scene.objects.present, scene.objects.mass])
-    scene = dataclasses.replace(scene, objects=_clean(scene.objects, scene.objects.present))
-    state = _clean(state, scene.objects.present)
-    setup = _setup(scene, state, layout, rules)
-    discs, padding = layout.discs, layout.discs % 2
+    scene, state = cleaned(scene, state)
+    hook = _hook(scene, state, layout, forces)
+    scenery, points, slots = scenery_of(scene, state, layout, rules, hook, keep.contacts > 0)
+    start = _start(state, layout, scenery, points, keep, rules)
 
-    def moving(x: Array) -> Array:
-        widths = [(0, 0)] * (x.ndim - 2) + [(0, padding), (0, 0)]
-        return jnp.pad(x[..., :discs, :], widths)
+    def frame(world: World, number: Array) -> tuple[World, tuple]:
+        world = world._replace(time=number * (steps * rules.step))
+        if world.events is not None:
+            world = world._replace(events=[begun(event) for event in world.events])
+        world = jax.lax.fori_loop(0, steps, lambda _, now: step(now, scenery, rules), world)
+        return world, _kept(world, scenery)
 
-    start = (
-        *map(moving, (state.position, state.angle)),
-        Motion(*map(moving, (state.velocity, state.angular_velocity))),
-        _nothing_yet(setup),
+    numbers = jnp.arange(frames - 1, dtype=state.angle.dtype)
+    last, (bodies, sums, happened) = jax.lax.scan(frame, start, numbers)
+    states = _states(state, bodies, layout, numbers * (steps * rules.step) + steps * rules.step)
+    first = _sums(start, scenery)
+    energy = None if first is None else _energy(first, sums)
+    contacts = None
+    if keep.contacts:
+        a, b = (jnp.concatenate(side, axis=0) for side in zip(*slots, strict=True))
+        contacts = compact(happened, a, b, 1 / (steps * rules.step), keep.contacts)
+    return Trajectory(states, _quality(last, energy), contacts, energy)
+
+
+def _books(bodies: list[Body], scenery: Scenery, rules: Rules) -> ledger.Ledger:
+    driven = scenery.forces is not None or any(f.motion is not None for f in scenery.fixed)
+
+    def work(like: Array) -> ledger.Work:
+        nothing = jnp.zeros_like(like)
+        return ledger.Work(nothing, nothing if driven else None, nothing if rules.damping else None)
+
+    groups = [work(b.angle) for b in bodies]
+    if not scenery.ties:
+        return ledger.Ledger(groups, None)
+    lost, put_in, damped = (jnp.zeros_like(scenery.ties[0].rest) for _ in range(3))
+    return ledger.Ledger(groups, ledger.Work(lost, put_in, damped))
+
+
+def _start(state: State, layout: Layout, scenery: Scenery, points: list[int], keep: Keep, rules: Rules) -> World:
+    bodies = []
+    for run, first in moving(layout):
+        of = slots_of(state, first, run.count, padded(run.count))
+        nothing = Motion(jnp.zeros_like(of.position), jnp.zeros_like(of.angle))
+        bodies.append(Body(of.position, of.angle, Motion(of.velocity, of.angular_velocity), nothing))
+    lanes, kind = state.angle.shape[1:], state.angle.dtype
+    sizes = {row.present.shape[0] for row in scenery.setup.rows}
+    return World(
+        bodies=bodies,
+        time=jnp.zeros((), kind),
+        memory=nothing_yet(scenery, points),
+        ties=[joints.nothing(tied) for tied in scenery.ties],
+        seen={n: Seen(jnp.zeros((n, *lanes), kind), jnp.zeros((n, *lanes), jnp.int32)) for n in sizes},
+        ledger=_books(bodies, scenery, rules) if keep.energy else None,
+        events=[unseen(row.present.shape, kind) for row in scenery.setup.rows] if keep.contacts else None,
     )
 
-    def frame(carry: tuple, _: None) -> tuple:
-        def once(_: int, now: tuple) -> tuple:
-            position, angle, motion, memory = now
-            return step(position, angle, motion, memory, setup, rules)
 
-        carry = jax.lax.fori_loop(0, steps, once, carry)
-        position, angle, motion, _ = carry
-        return carry, tuple(x[..., :discs, :] for x in (position, angle, *motion))
-
-    (*_, memory), later = jax.lax.scan(frame, start, None, length=frames - 1)
-    return Trajectory(_states(state, later, layout), _quality(memory))
+def _kept(world: World, scenery: Scenery) -> tuple:
+    """What a frame leaves: the bodies, the sums of energy and momentum, and what happened."""
+    happened = None
+    if world.events is not None:
+        rows = [happening(*of) for of in zip(world.events, scenery.setup.rows, strict=True)]
+        happened = jax.tree.map(lambda *x: jnp.concatenate(x, axis=-2), *rows)
+    return [body._replace(rest=None) for body in world.bodies], _sums(world, scenery), happened
 
 
-def _states(start: State, later: tuple, layout: Layout) -> State:
-    """All frames of all slots: the first from the initial state, of what is fixed throughout."""
-
-    def joined(first: Array, moved: Array) -> Array:
-        fixed = jnp.broadcast_to(first[..., layout.discs :, :], (*moved.shape[:-2], layout.segments, moved.shape[-1]))
-        return jnp.concatenate([first[None], jnp.concatenate([moved, fixed], axis=-2)], axis=0)
-
-    position, angle, velocity, spin = later
-    return State(
-        position=joined(start.position, position),
-        angle=joined(start.angle, angle),
-        velocity=joined(start.velocity, velocity),
-        angular_velocity=joined(start.angular_velocity, spin),
-    )
+def _sums(world: World, scenery: Scenery) -> tuple | None:
+    if world.ledger is None:
+        return None
+    fixed = {i: Body(*f.at(world.time), f.still) for i, f in enumerate(scenery.fixed)}
+    springs = joints.springs_energy(scenery.ties, world.bodies, fixed)
+    springs = springs + jnp.zeros_like(scenery.setup.gravity[0])
+    now = ledger.balance(scenery.groups, world.bodies, scenery.setup.gravity, springs)
+    return now, ledger.closed(world.ledger, springs)
 
 
-def _quality(memory: Memory) -> Quality:
-    depth = jnp.maximum(jnp.max(memory.pair_depth, axis=0), jnp.max(memory.wall_depth, axis=0))
-    begins = jnp.sum(memory.pair_begins, axis=0) + jnp.sum(memory.wall_begins, axis=0)
-    return Quality(depth, begins)
+def _energy(first: tuple, later: tuple) -> Energy:
+    now, book = jax.tree.map(lambda x, y: jnp.concatenate([x[None], y]), first, later)
+    kinetic, rotational, potential, linear, angular = now
+    contact, driven, damping = (x - x[:1] for x in book)
+    total = kinetic + rotational + potential
+    residual = total - total[:1] + contact + damping - driven
+    return Energy(kinetic, rotational, potential, contact, damping, driven, residual, linear, angular)
+
+
+def _states(start: State, bodies: list[Body], layout: Layout, times: Array) -> State:
+    """All frames of all slots: what moves from the bodies, the rest from the initial state."""
+    groups, parts = iter(bodies), []
+    times = times[:, None, None]
+    for run, first in layout.spans:
+        of = slots_of(start, first, run.count)
+        if run.kind == DYNAMIC:
+            body = next(groups)
+            later = State(body.position, body.angle, *body.motion)
+            later = jax.tree.map(lambda x, run=run: x[..., : run.count, :], later)
+        else:
+            moves = of.velocity, of.angular_velocity
+            if run.kind == STATIC:
+                moves = jax.tree.map(jnp.zeros_like, moves)
+            way = times[:, None] * moves[0], times * moves[1]
+            later = State(
+                of.position + way[0], of.angle + way[1], *(x + 0 * w for x, w in zip(moves, way, strict=True))
+            )
+        parts.append(jax.tree.map(lambda x, y: jnp.concatenate([x[None], y]), of, later))
+    return jax.tree.map(lambda *x: jnp.concatenate(x, axis=-2), *parts)
+
+
+def _hook(scene: Scene, start: State, layout: Layout, forces: Forces | None) -> Callable | None:
+    """From bodies and time to force and torque on each group; None where there are none."""
+    force, torque, mine = scene.objects.force, scene.objects.torque, moving(layout)
+    if forces is None and force is None and torque is None:
+        return None
+    force = jnp.zeros_like(start.position) if force is None else force
+    torque = jnp.zeros_like(start.angle) if torque is None else torque
+
+    def on_groups(bodies: list[Body], time: Array) -> list[tuple[Array, Array]]:
+        pushes = force, torque
+        if forces is not None:
+            now = _states(start, jax.tree.map(lambda x: x[None], bodies), layout, time[None])
+            more = forces(jax.tree.map(lambda x: x[-1], now), time)
+            pushes = force + more[0], torque + more[1]
+        return [slots_of(pushes, first, run.count, padded(run.count)) for run, first in mine]
+
+    return on_groups
+
+
+def _quality(world: World, energy: Energy | None) -> Quality:
+    lanes = world.bodies[0].angle.shape[1:]
+    depth, begins = jnp.zeros(lanes, world.time.dtype), jnp.zeros(lanes, jnp.int32)
+    for seen in world.seen.values():
+        depth = jnp.maximum(depth, jnp.max(seen.depth, axis=0))
+        begins = begins + jnp.sum(seen.begins, axis=0)
+    residual = None if energy is None else jnp.max(jnp.abs(energy.residual), axis=0)
+    return Quality(depth, begins, residual)

@@ -2,20 +2,19 @@
 
 A step of h seconds reads as the sentences of `step`:
 
-1. gravity and damping change the velocities;
+1. gravity, forces and damping change the velocities;
 2. the impulses of the last step are applied again (warm starting, as all of a stack's weight is known by then);
-3. every pair is solved once with its soft bias (`biased`), bounces included, at the exact time of impact;
+3. every joint and pair is solved once with its soft bias, bounces included, at the exact time of impact;
 4. the bodies move;
-5. every pair is solved once more without the bias (`relaxed`), so that pushing apart leaves no speed behind.
+5. every joint and pair is solved once more without the bias, so that pushing apart leaves no speed behind.
 
-Pairs of discs are arranged as a round-robin tournament: in each of N - 1 rounds every disc meets one other, so a round
-is one vector operation over N / 2 pairs without conflicts, and the next round sees its result: Gauss-Seidel, which is
-what 'sequential' means. Between rounds the discs move one place on (two concatenations: no gather, no scatter).
-Fixed segments come last, one round each, and so have the last word.
+Pairs are solved in rounds of disjoint pairs (tournament.py), each one vector operation without conflicts, and the next
+round sees its result: Gauss-Seidel, which is what 'sequential' means. Joints come first; fixed bodies come last and so
+have the last word.
 
 Restitution. A row that closes within the step bounces: Newton's law is applied to the velocities that the row finds, so
 impacts happen one after the other and never add energy. The impulse P acts at the time of impact tau, not at the
-start, so it moves its body by (h - tau) P / m: `shift` takes -tau P / m off what the new velocity would give. The
+start, so it moves its body by (h - tau) P / m: the drift takes -tau P / m off what the new velocity would give. The
 path is exact, and so is its derivative, which a step without tau gets wrong (even its sign).
 
 Sources: E. Catto, 'Iterative dynamics with temporal coherence' (GDC 2005) for accumulated impulses and warm starting;
@@ -23,336 +22,200 @@ Sources: E. Catto, 'Iterative dynamics with temporal coherence' (GDC 2005) for a
 for the time of impact in gradients.
 """
 
-import dataclasses
 import math
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-from gen2d.contacts import Segments, dot, inverse_length, segment_disc, turned
-from gen2d.impacts import NONE, PASSES, disc_impact, wall_impact
-from gen2d.tournament import settled, tournament
+from gen2d import joints
+from gen2d.events import Event, noted
+from gen2d.forms import Form, placed
+from gen2d.ledger import Ledger, booked, tallied
+from gen2d.rows import Inertia, Motion, Rules
+from gen2d.sweeps import HELD, Drift, Setup, Solved, kept_in, relax, solve, warm
+from gen2d.tournament import settled
 from gen2d.types import Array
 
 
-@dataclasses.dataclass(frozen=True)
-class Rules:
-    """The numbers of a step; `simulate.rules` makes them from the config."""
+class Body(NamedTuple):
+    """Some moving bodies as they are now."""
 
-    step: float  # s
-    bounce_threshold: float  # m/s: slower impacts do not bounce, nor do those that gravity makes in two steps
-    hertz: float  # stiffness of an overlapping contact; twice that against a fixed object
-    damping_ratio: float
-    push_speed: float  # m/s: an overlap is undone no faster
-    damping: float  # 1/s, of velocity and spin
-    mixing: str
-
-    def softness(self, hertz: float) -> tuple[float, float, float]:
-        """Of an implicit damped spring at this step: bias rate (1/s), mass scale and impulse scale."""
-        omega = 2 * math.pi * hertz
-        a1 = 2 * self.damping_ratio + self.step * omega
-        a2 = self.step * omega * a1
-        return omega / a1, a2 / (1 + a2), 1 / (1 + a2)
+    position: Array  # [2, N, ...] m
+    angle: Array  # [N, ...] rad
+    motion: Motion
+    rest: Motion | None = None  # m, rad: what rounding has kept back of the ways so far
 
 
-class Row(NamedTuple):
-    """Pairs that are solved at once, each [pairs, ...]; the same for a whole video. A pair of which one is absent has
-    no mass to push with. `turn` is the spin that a unit of tangential impulse gives: arm / moment."""
+class Group(NamedTuple):
+    """What stays the same of the moving bodies of one run; an empty slot has no mass, and no inverse of it."""
 
-    arm_a: Array
-    arm_b: Array
-    inverse_mass_a: Array
-    inverse_mass_b: Array
-    turn_a: Array
-    turn_b: Array
-    normal_mass: Array
-    tangent_mass: Array
-    elasticity: Array
-    friction: Array
+    form: Form
+    inverse: Inertia
+    mass: Array  # [N, ...] kg
+    moment: Array  # [N, ...] kg m^2
+    jointed: Array  # [N, ...] 1 where a rigid joint holds it
 
 
-class Motion(NamedTuple):
-    """How the bodies move while they are solved."""
+class Fixed(NamedTuple):
+    """A body that nothing can push, at the start. `motion` is None where it stands still."""
 
-    velocity: Array  # [2, N, ...] m/s
-    spin: Array  # [N, ...] rad/s
+    form: Form
+    position: Array  # [2, 1, ...] m
+    angle: Array  # [1, ...] rad
+    motion: Motion | None
 
+    @property
+    def still(self) -> Motion:
+        """Its motion, zero where it stands still."""
+        return self.motion or Motion(jnp.zeros_like(self.position), jnp.zeros_like(self.angle))
 
-class Drift(NamedTuple):
-    """What impacts change in where a body goes, beyond its new velocity."""
-
-    shift: Array  # [2, N, ...] m: they act at their time, not at the start of the step
-    turn: Array  # [N, ...] rad: likewise
-    held: Array  # [N, ...] 1 where a contact other than an impact held the body
-
-
-class Touch(NamedTuple):
-    """A row as it stands in this step; tau < 0 where it does not bounce (impacts.py)."""
-
-    normal: Array
-    gap: Array
-    tau: Array
+    def at(self, time: Array) -> tuple[Array, Array]:
+        """Where it is by then."""
+        if self.motion is None:
+            return self.position, self.angle
+        return self.position + time * self.motion.velocity, self.angle + time * self.motion.spin
 
 
-class Impulse(NamedTuple):
-    """Accumulated impulses of a row, N s; what is left of them at the end of a step warm-starts the next."""
-
-    normal: Array
-    tangent: Array
-
-
-class Setup(NamedTuple):
+class Scenery(NamedTuple):
     """What stays the same for a whole video."""
 
-    gravity: Array  # [2, ...] m/s^2
-    fall: Array  # [2, N, ...] m/s^2: gravity where there is a body, else 0
-    threshold: Array  # [...] m/s: slower impacts do not bounce
-    pairs: list[Row]
-    walls: list[Row]
-    segments: list[Segments]
-    radius: Array  # [N, ...]
-    one: Array  # see settled()
+    groups: list[Group]
+    fixed: list[Fixed]
+    setup: Setup
+    ties: list[joints.Tied]
+    forces: Callable | None  # (bodies, time) -> for each group force [2, N, ...] N and torque [N, ...] N m
 
 
-class Memory(NamedTuple):
-    """What one step leaves to the next, and what it has seen."""
+class Seen(NamedTuple):
+    """What has been seen so far in rows of one size."""
 
-    pairs: list[Impulse]
-    walls: list[Impulse]
-    pair_depth: Array  # [N / 2, ...] m: deepest overlap so far
-    pair_begins: Array  # [N / 2, ...] contacts that began so far
-    wall_depth: Array  # [N, ...]
-    wall_begins: Array  # [N, ...]
+    depth: Array  # m: deepest overlap
+    begins: Array  # contacts that began
 
 
-def _mixed(a: Array, b: Array, mixing: str) -> Array:
-    return {"mean": (a + b) / 2, "product": a * b, "max": jnp.maximum(a, b), "geometric": jnp.sqrt(a * b)}[mixing]
+class World(NamedTuple):
+    """All that changes from one step to the next."""
+
+    bodies: list[Body]
+    time: Array  # s
+    memory: list[tuple]  # of each row: the impulses at its points, and that against rolling
+    ties: list[Any]  # of each joint: its impulses
+    seen: dict[int, Seen]  # by size of row
+    ledger: Ledger | None
+    events: list[Event] | None
 
 
-class Discs(NamedTuple):
-    """Constants of the dynamic discs, each [N, ...]."""
-
-    radius: Array
-    inverse_mass: Array
-    inverse_moment: Array
-    elasticity: Array
-    friction: Array
-
-
-def row(a: Discs, b: Discs, present: Array, mixing: str) -> Row:
-    """The row of pairs (a, b); where not both are `present` it has no mass."""
-    k_normal = a.inverse_mass + b.inverse_mass
-    turn_a, turn_b = a.radius * a.inverse_moment, b.radius * b.inverse_moment
-    k_tangent = k_normal + a.radius * turn_a + b.radius * turn_b
-    return Row(
-        arm_a=a.radius,
-        arm_b=b.radius,
-        inverse_mass_a=a.inverse_mass,
-        inverse_mass_b=b.inverse_mass,
-        turn_a=turn_a,
-        turn_b=turn_b,
-        normal_mass=jnp.where(present, 1 / jnp.where(present, k_normal, 1.0), 0.0),
-        tangent_mass=jnp.where(present, 1 / jnp.where(present, k_tangent, 1.0), 0.0),
-        elasticity=_mixed(a.elasticity, b.elasticity, mixing),
-        friction=_mixed(a.friction, b.friction, mixing),
-    )
+def _seen(rows: list[Solved], seen: dict[int, Seen], memory: list[tuple], setup: Setup) -> dict[int, Seen]:
+    """The deepest overlap so far and the contacts that began so far; a bounce begins a contact."""
+    seen = dict(seen)
+    for row, solved, (olds, _) in zip(setup.rows, rows, memory, strict=True):
+        depth, begins = seen[size := row.present.shape[0]]
+        for touch in solved.touches:
+            depth = jnp.maximum(depth, jnp.where(touch.grip.normal_mass > 0, -touch.gap, 0.0))
+        now, before = (sum(i.normal for i in x[1:]) + x[0].normal for x in (solved.impulses, olds))
+        seen[size] = Seen(depth, begins + ((now > 0) & (before == 0)))
+    return seen
 
 
-# A row --------------------------------------------------------------------------------------------------------------
+def _accelerations(world: World, scenery: Scenery) -> tuple[list[Array], list[Array] | None]:
+    """Of each group: that of its centres [2, N, ...], and that of its angles [N, ...]; None where there is none."""
+    groups, gravity = scenery.groups, scenery.setup.gravity
+    falls = [gravity[:, None] * (g.inverse.mass > 0) for g in groups]
+    if scenery.forces is None:
+        return falls, None
+    forces = scenery.forces(world.bodies, world.time)
+    falls = [fall + g.inverse.mass * force for fall, g, (force, _) in zip(falls, groups, forces, strict=True)]
+    return falls, [g.inverse.moment * torque for g, (_, torque) in zip(groups, forces, strict=True)]
 
 
-def biased(row: Row, touch: Touch, speed: Array, target: Array, old: Impulse, hertz: float, rules: Rules) -> Array:
-    """The accumulated normal impulse after the biased solve of a row.
+def _free(body: Body, fall: Array, spin_up: Array | float, rules: Rules) -> tuple[Motion, Motion]:
+    """How a body moves after a step in which nothing touches it, and by how much more than h times that it goes.
 
-    Apart: the gap may be closed, no more. Overlapping: a soft push. Bouncing: `target` exactly. Passing: nothing, as
-    the straight line of a soft contact would stop a body that only grazes the other, or that comes a step later.
+    Both are exact for a constant acceleration a and a damping rate c: with s = exp(-c h), p = (1 - s) / c and
+    q = (h - p) / c, v becomes s v + p a and the way is p v + q a.
     """
-    rate, mass_scale, impulse_scale = rules.softness(hertz)
-    apart = touch.gap > 0
-    bias = jnp.where(apart, touch.gap / rules.step, jnp.maximum(rate * touch.gap, -rules.push_speed))
-    soft = old.normal - jnp.where(apart, 1.0, mass_scale) * row.normal_mass * (speed + bias)
-    soft = jnp.maximum(soft - jnp.where(apart, 0.0, impulse_scale) * old.normal, 0.0)
-    soft = jnp.where(touch.tau == PASSES, 0.0, soft)
-    hard = old.normal + row.normal_mass * (target - speed)
-    return jnp.where(row.normal_mass > 0, jnp.where(touch.tau >= 0, hard, soft), 0.0)
+    h, c = rules.step, rules.damping
+    s = math.exp(-c * h)
+    p = -math.expm1(-c * h) / c if c else h
+    q = (h - p) / c if c * h > 1e-4 else 0.5 * h**2 * (1 - c * h / 3)
+    old = body.motion
+    motion = Motion(s * old.velocity + p * fall, s * old.spin + p * spin_up)
+    velocity, spin = (q - h * p) * fall, (q - h * p) * spin_up + jnp.zeros_like(old.spin)
+    if c:
+        velocity, spin = velocity + (p - h * s) * old.velocity, spin + (p - h * s) * old.spin
+    return motion, Motion(velocity, spin)
 
 
-def struck(row: Row, touch: Touch, speed: Array, threshold: Array) -> Array:
-    """Where a neighbour's bounce has closed a row that is in contact: it bounces, too."""
-    return (speed < -threshold) & (touch.gap <= 0) & (row.normal_mass > 0)
+def _moved(motion: Motion, drift: Drift, more: Motion, h: float) -> Motion:
+    """By how much a body goes; free flight is exact for what no contact but an impact held."""
+    free = jnp.where(drift.push > 0, 0.0, 1.0)
+    way = h * motion.velocity + drift.way.velocity + free * more.velocity
+    return Motion(way, h * motion.spin + drift.way.spin + free * more.spin)
 
 
-def relaxed(row: Row, touch: Touch, speed: Array, old: Impulse, threshold: Array) -> Array:
-    """The accumulated normal impulse after the relaxing solve, without bias.
-
-    No say has a row that bounced and parts, one that is apart and carried nothing (it would brake a body one step
-    before its impact), and one that a neighbour closes across a gap (it bounces in a later step).
-    """
-    pushes = (touch.tau < 0) & ((old.normal > 0) | (touch.gap <= 0)) & (speed >= -threshold) & (row.normal_mass > 0)
-    soft = jnp.where(pushes, jnp.maximum(old.normal - row.normal_mass * speed, 0.0), old.normal)
-    hard = old.normal - (1 + row.elasticity) * row.normal_mass * speed
-    return jnp.where(struck(row, touch, speed, threshold), hard, soft)
+def _warmth(warmed: Motion, flying: Motion, group: Group) -> Array:
+    """What the last step's impulses may have added to a speed, m/s; not zero where a joint holds the body."""
+    x, y = jnp.abs(warmed.velocity - flying.velocity)
+    return x + y + HELD * group.jointed
 
 
-def rubbed(row: Row, normal_impulse: Array, slip: Array, old: Impulse) -> Array:
-    """The accumulated tangential impulse: what stops the slip, within Coulomb's bound of the normal impulse now."""
-    bound = row.friction * normal_impulse
-    return jnp.clip(old.tangent - row.tangent_mass * slip, -bound, bound)
+def _arrived(body: Body, way: Motion, one: Array) -> tuple[tuple[Array, Array], Motion]:
+    """Position and angle after a way, and what rounding keeps back of it for the next one (W. Kahan, 1965)."""
+    assert body.rest is not None
+    old, add = Motion(body.position, body.angle), jax.tree.map(jnp.add, way, body.rest)
+    new = settled(jax.tree.map(jnp.add, old, add), one)
+    gone = jax.tree.map(lambda n, o, d: jax.lax.stop_gradient(d - (n - o)), new, old, add)
+    return (new.velocity, new.spin), gone
 
 
-def difference(new: Impulse, old: Impulse) -> Impulse:
-    """What a solve added."""
-    return Impulse(new.normal - old.normal, new.tangent - old.tangent)
+def step(world: World, scenery: Scenery, rules: Rules) -> World:
+    """The world one step later."""
+    h, groups, setup = rules.step, scenery.groups, scenery.setup
+    falls, spin_ups = _accelerations(world, scenery)
+    turns = spin_ups or [0.0] * len(groups)
+    free = [_free(*of, rules) for of in zip(world.bodies, falls, turns, strict=True)]
+    flying, more = settled([motion for motion, _ in free], setup.one), [way for _, way in free]
+    fixed = [Body(*body.at(world.time), body.still) for body in scenery.fixed]
+    known = dict(enumerate(fixed))
 
+    held, motions, tied = joints.warm(scenery.ties, world.bodies, known, flying, world.ties)
+    shapes = [placed(g.form, b.position, b.angle) for g, b in zip(groups, world.bodies, strict=True)]
+    pushing = [f.motion for f in scenery.fixed]
+    solid = [placed(f.form, b.position, b.angle) for f, b in zip(scenery.fixed, fixed, strict=True)]
+    walls = [(shape, motion, None, None) for shape, motion in zip(solid, pushing, strict=True)]
+    unlike = falls if spin_ups else [None] * len(groups)
+    book, events = world.ledger, world.events
+    works = [None] * len(groups) if book is None else book.groups
+    motions, works, found = warm(shapes, motions, unlike, works, walls, world.memory, setup)
+    pushes = [_warmth(*of) for of in zip(motions, flying, groups, strict=True)]
 
-def remembered(touch: Touch, again: Array, impulse: Impulse) -> Impulse:
-    """What may warm-start the next step: a bounce may not, be it in the biased pass or now."""
-    return jax.tree.map(lambda x: jnp.where((touch.tau >= 0) | again, 0.0, x), impulse)
+    ways = [Motion(*(jnp.zeros_like(x) for x in m)) for m in motions]
+    held, motions, ways, tied_more = joints.solve(held, motions, ways, falls, known, rules, biased=True)
+    drifts = [Drift(way, push) for way, push in zip(ways, pushes, strict=True)]
+    still = [(motion, None, None) for motion in pushing]
+    motions, drifts, works, rows = solve(motions, drifts, works, still, found, world.memory, setup, rules)
 
+    ways = [_moved(*of, h) for of in zip(motions, drifts, more, strict=True)]
+    ways = kept_in(ways, shapes, walls, found, setup)
+    places = [_arrived(b, way, setup.one) for b, way in zip(world.bodies, ways, strict=True)]
 
-def slip_of(row: Row, normal: Array, velocity: Array, spin_a: Array | float, spin_b: Array) -> Array:
-    """Tangential speed in m/s of b's rim over a's at the point of contact."""
-    return normal[0] * velocity[1] - normal[1] * velocity[0] - row.arm_a * spin_a - row.arm_b * spin_b
-
-
-def along(normal: Array, impulse: Impulse) -> Array:
-    """The impulse as a vector [2, ...], N s."""
-    return impulse.normal * normal + impulse.tangent * turned(normal)
-
-
-def pushed(motion: Motion, push: Array, twist: Array, inverse_mass: Array, turn: Array) -> Motion:
-    """The motion after the impulse `push` [2, ...] with the tangential part `twist`."""
-    return Motion(motion.velocity + inverse_mass * push, motion.spin - turn * twist)
-
-
-def drifted(drift: Drift, old: Motion, new: Motion, touch: Touch, impulse: Impulse) -> Drift:
-    """The drift with what the time of an impact takes off the way, and whether anything but an impact held the body."""
-    tau = jnp.maximum(touch.tau, 0.0)
-    held = jnp.where((touch.tau < 0) & (impulse.normal > 0), 1.0, 0.0)
-    return Drift(
-        shift=drift.shift - tau * (new.velocity - old.velocity),
-        turn=drift.turn - tau * (new.spin - old.spin),
-        held=jnp.maximum(drift.held, held),
+    held, motions, _, tied_last = joints.solve(held, motions, ways, falls, known, rules, biased=False)
+    motions, works, relaxed, memory = relax(motions, drifts, works, still, rows, setup)
+    if book is not None:
+        olds = [body.motion for body in world.bodies]
+        done = zip(works, groups, olds, flying, more, ways, falls, turns, strict=True)
+        tally = tallied(book.joints, [*tied, *tied_more, *tied_last])
+        book = Ledger([booked(*of, gravity=setup.gravity, h=h) for of in done], tally)
+    if events is not None:
+        events = [noted(e, *of, world.time, setup.one) for e, *of in zip(events, rows, relaxed, strict=True)]
+    return World(
+        bodies=[Body(*place, motion, rest) for (place, rest), motion in zip(places, motions, strict=True)],
+        time=world.time + h,
+        memory=memory,
+        ties=[joint.impulses for joint in held],
+        seen=_seen(rows, world.seen, world.memory, setup),
+        ledger=book,
+        events=events,
     )
-
-
-# A step -------------------------------------------------------------------------------------------------------------
-
-
-def warm(position: Array, motion: Motion, memory: Memory, setup: Setup) -> tuple[Motion, list, list[Touch]]:
-    """The motion with the last step's impulses, and where every pair stands: (offset, 1 / distance), and touches."""
-
-    def play(k: int, a: tuple, b: tuple) -> tuple:
-        row, old = setup.pairs[k], memory.pairs[k]
-        apart = b[0] - a[0]
-        apart, inverse = settled((apart, inverse_length(apart)), setup.one)
-        push = settled(along(apart * inverse, old), setup.one)
-        a = a[0], pushed(a[1], -push, old.tangent, row.inverse_mass_a, row.turn_a)
-        b = b[0], pushed(b[1], push, old.tangent, row.inverse_mass_b, row.turn_b)
-        return a, b, (apart, inverse)
-
-    (_, motion), offsets = tournament((position, motion), len(setup.pairs), play)
-    touches = []
-    for row, old, segment in zip(setup.walls, memory.walls, setup.segments, strict=True):
-        normal, gap = settled(segment_disc(segment, position, setup.radius), setup.one)
-        push = along(normal, old)
-        motion = settled(pushed(motion, push, old.tangent, row.inverse_mass_b, row.turn_b), setup.one)
-        touches.append(Touch(normal, gap, jnp.full_like(gap, NONE)))
-    return motion, offsets, touches
-
-
-def solve(motion: Motion, offsets: list, touches: list[Touch], memory: Memory, setup: Setup, rules: Rules) -> tuple:
-    """Motion and drift after the biased pass, and (touch, impulse) of every row of pairs and of walls."""
-    h, threshold = rules.step, setup.threshold
-
-    def play(k: int, a: tuple, b: tuple) -> tuple:
-        row, old, (apart, inverse) = setup.pairs[k], memory.pairs[k], offsets[k]
-        (motion_a, drift_a), (motion_b, drift_b) = a, b
-        velocity, reach = motion_b.velocity - motion_a.velocity, row.arm_a + row.arm_b
-        impact = disc_impact(apart, inverse, reach, velocity, h, threshold)
-        tau, scale = settled(impact, setup.one)
-        normal = settled((apart + jnp.maximum(tau, 0.0) * velocity) * scale, setup.one)
-        touch, speed = Touch(normal, 1 / inverse - reach, tau), dot(normal, velocity)
-        pressed = settled(biased(row, touch, speed, -row.elasticity * speed, old, rules.hertz, rules), setup.one)
-        slip = slip_of(row, normal, velocity, motion_a.spin, motion_b.spin)
-        impulse = Impulse(pressed, settled(rubbed(row, pressed, slip, old), setup.one))
-        added = difference(impulse, old)
-        push = along(normal, added)
-        new_a = pushed(motion_a, -push, added.tangent, row.inverse_mass_a, row.turn_a)
-        new_b = pushed(motion_b, push, added.tangent, row.inverse_mass_b, row.turn_b)
-        a = new_a, drifted(drift_a, motion_a, new_a, touch, impulse)
-        b = new_b, drifted(drift_b, motion_b, new_b, touch, impulse)
-        return a, b, (touch, impulse)
-
-    drift = Drift(*(jnp.zeros_like(x) for x in (motion.velocity, motion.spin, motion.spin)))
-    (motion, drift), pairs = tournament((motion, drift), len(setup.pairs), play)
-    walls = []
-    for row, old, touch in zip(setup.walls, memory.walls, touches, strict=True):
-        speed, pull = dot(touch.normal, motion.velocity), -dot(touch.normal, setup.gravity[:, None])
-        tau, target = settled(wall_impact(touch.gap, speed, pull, row.elasticity, h, threshold), setup.one)
-        touch = touch._replace(tau=tau)
-        pressed = settled(biased(row, touch, speed, target, old, 2 * rules.hertz, rules), setup.one)
-        slip = slip_of(row, touch.normal, motion.velocity, 0.0, motion.spin)
-        impulse = Impulse(pressed, settled(rubbed(row, pressed, slip, old), setup.one))
-        added = difference(impulse, old)
-        new = pushed(motion, along(touch.normal, added), added.tangent, row.inverse_mass_b, row.turn_b)
-        motion, drift = settled((new, drifted(drift, motion, new, touch, impulse)), setup.one)
-        walls.append((touch, impulse))
-    return motion, drift, pairs, walls
-
-
-def relax(motion: Motion, pairs: list, walls: list, setup: Setup) -> tuple[Motion, list[Impulse], list[Impulse]]:
-    """The motion after the relaxing pass, and what each row leaves to the next step."""
-
-    def again(row: Row, touch: Touch, old: Impulse, velocity: Array, slip: Array) -> tuple[Impulse, Impulse]:
-        speed = dot(touch.normal, velocity)
-        pressed = settled(relaxed(row, touch, speed, old, setup.threshold), setup.one)
-        impulse = Impulse(pressed, settled(rubbed(row, pressed, slip, old), setup.one))
-        left = settled(remembered(touch, struck(row, touch, speed, setup.threshold), impulse), setup.one)
-        return left, difference(impulse, old)
-
-    def play(k: int, a: Motion, b: Motion) -> tuple:
-        row, (touch, old) = setup.pairs[k], pairs[k]
-        velocity = b.velocity - a.velocity
-        left, added = again(row, touch, old, velocity, slip_of(row, touch.normal, velocity, a.spin, b.spin))
-        push = along(touch.normal, added)
-        a = pushed(a, -push, added.tangent, row.inverse_mass_a, row.turn_a)
-        b = pushed(b, push, added.tangent, row.inverse_mass_b, row.turn_b)
-        return a, b, left
-
-    motion, pair_memory = tournament(motion, len(setup.pairs), play)
-    wall_memory = []
-    for row, (touch, old) in zip(setup.walls, walls, strict=True):
-        slip = slip_of(row, touch.normal, motion.velocity, 0.0, motion.spin)
-        left, added = again(row, touch, old, motion.velocity, slip)
-        push = along(touch.normal, added)
-        motion = settled(pushed(motion, push, added.tangent, row.inverse_mass_b, row.turn_b), setup.one)
-        wall_memory.append(left)
-    return motion, pair_memory, wall_memory
-
-
-def seen(depth: Array, begins: Array, rows: list[Row], touched: list, memory: list[Impulse]) -> tuple[Array, Array]:
-    """The deepest overlap so far and the contacts that began so far, [pairs, ...]; a bounce begins a contact."""
-    for row, (touch, impulse), old in zip(rows, touched, memory, strict=True):
-        depth = jnp.maximum(depth, jnp.where(row.normal_mass > 0, -touch.gap, 0.0))
-        begins = begins + ((impulse.normal > 0) & (old.normal <= 0))
-    return depth, begins
-
-
-def step(position: Array, angle: Array, motion: Motion, memory: Memory, setup: Setup, rules: Rules) -> tuple:
-    """Position [2, N, ...], angle [N, ...], motion and memory one step later."""
-    h = rules.step
-    slowed = math.exp(-rules.damping * h)
-    falling = Motion((motion.velocity + h * setup.fall) * slowed, motion.spin * slowed)
-    warmed, offsets, touches = warm(position, settled(falling, setup.one), memory, setup)
-    moving, drift, pairs, walls = solve(warmed, offsets, touches, memory, setup, rules)
-    # Free fall is an exact parabola: x += h v + h^2 g / 2 with v from before, that is, h v_new - h^2 g / 2.
-    free = 0.5 * h**2 * (1 - drift.held)
-    position = position + h * moving.velocity + drift.shift - free * setup.fall
-    angle = angle + h * moving.spin + drift.turn
-    position, angle = settled((position, angle), setup.one)
-    motion, pair_memory, wall_memory = relax(moving, pairs, walls, setup)
-    pair_seen = seen(memory.pair_depth, memory.pair_begins, setup.pairs, pairs, memory.pairs)
-    wall_seen = seen(memory.wall_depth, memory.wall_begins, setup.walls, walls, memory.walls)
-    return position, angle, motion, Memory(pair_memory, wall_memory, *pair_seen, *wall_seen)

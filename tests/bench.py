@@ -1,7 +1,8 @@
 """How fast gen2d is, part by part, beside peer.py, and whether it keeps what it promises.
 
-    python tests/bench.py                 # all, about 5 minutes
+    python tests/bench.py                 # all, about 10 minutes
     python tests/bench.py --quick         # only what a change to the code should be tried on
+    python tests/bench.py --only physics  # what it costs against the number of objects: bench_physics.py
 
 Machines are noisy, so whatever is compared is measured in turns, and a ratio is the median of the ratios of the turns.
 Every measurement runs in a process of its own, on the cores that it is given, and in folders that vanish.
@@ -23,7 +24,9 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import bench_physics
 import numpy as np
+from bench_physics import CASES, Cost
 
 HERE = Path(__file__).resolve()
 CONFIG = "benchmark.yaml"
@@ -188,7 +191,13 @@ def bounds(folder: Path) -> dict[str, float]:
     return {"videos": len(dataset), "bad": bad, "walls": walls, "overlap": overlap}
 
 
-MEASUREMENTS = {work.__name__: work for work in (stages, steady, bounds)}
+def physics(folder: Path, scene: str, turns: int) -> Turns:
+    """CPU seconds a video of gen2d, pymunk and phyjax2d (where it is installed), and of compiling gen2d."""
+    works, compiled = bench_physics.works(CASES[scene])
+    return in_turns(works, turns) | {name: [seconds] for name, seconds in compiled.items()}
+
+
+MEASUREMENTS = {work.__name__: work for work in (stages, steady, bounds, physics)}
 
 
 # ---- Processes
@@ -273,7 +282,7 @@ class Promise(NamedTuple):
         return f"{'at most' if self.most else 'at least'} {self.target:g}: {'kept' if kept else 'NOT KEPT'}"
 
 
-Found = Iterator[Row | Promise]
+Found = Iterator[Row | Promise | Cost]
 BETA = "an interface that pymunk calls highly experimental"
 
 
@@ -353,9 +362,25 @@ def start_section(folder: Path, quick: bool) -> Found:
     yield Promise("  first shard, cold cache", seconds[0], "s", 40, most=True)
 
 
+def physics_section(folder: Path, quick: bool) -> Found:
+    """Scenes of 4 to 64 discs and of 8 boxes, one core, beside pymunk and phyjax2d."""
+    if not bench_physics.has_phyjax2d():
+        print(bench_physics.INSTALL)
+    for case in CASES.values():
+        turns = measured(physics, folder, CORES[:1], scene=case.name, turns=1 if quick else case.turns)
+        cost = bench_physics.cost_of(case, {name: statistics.median(values) for name, values in turns.items()})
+        least, note = (5 if case.objects <= 32 and case.shape == "discs" else 1), "contacts and energy written"
+        yield cost
+        for other in ("pymunk", "phyjax2d") if least > 1 else ("pymunk",):
+            if other in turns:
+                ratio = _ratio(turns[other], turns["all"])
+                yield Promise(f"physics, {case.name}, against {other}", ratio, target=least, note=note)
+        yield Promise("  compiled", cost.compile["all"], "s", 30, most=True)
+
+
 SECTIONS = {
     "parts": parts_section, "steady": steady_section, "command": command_section, "memory": memory_section,
-    "scaling": scaling_section, "start": start_section,
+    "scaling": scaling_section, "start": start_section, "physics": physics_section,
 }  # fmt: skip
 QUICK = ("parts", "steady")
 
@@ -372,17 +397,19 @@ def machine() -> dict[str, Any]:
     return {"cpu": model, "cores": len(CORES), "load": os.getloadavg()[0], **versions}
 
 
-def text_of(facts: Mapping[str, Any], found: Sequence[Row | Promise]) -> str:
+def text_of(facts: Mapping[str, Any], found: Sequence[Row | Promise | Cost]) -> str:
     """The tables."""
     lines = [", ".join(f"{key} {value}" for key, value in facts.items())]
     rows, promises = [f for f in found if isinstance(f, Row)], [f for f in found if isinstance(f, Promise)]
-    lines += ["", f"{'':21} {'videos/s':>9} {'MB/s':>8} {'share':>6} {'peer':>7} {'ratio':>6}"]
+    costs = [f for f in found if isinstance(f, Cost)]
+    if rows:
+        lines += ["", f"{'':21} {'videos/s':>9} {'MB/s':>8} {'share':>6} {'peer':>7} {'ratio':>6}"]
     for row in rows:
         share = f"{row.share:.0%}" if row.share else ""
         peer, ratio = (f"{row.peer:,.0f}", f"{row.rate / row.peer:.2f}") if row.peer else ("", "")
         speed = f"{row.rate:9,.0f} {row.rate * FRAMES_BYTES / 1e6:8,.0f}"
         lines += [f"{row.name:21} {speed} {share:>6} {peer:>7} {ratio:>6}  {row.note}".rstrip()]
-    lines += [""]
+    lines += ["", *bench_physics.table(costs), ""] if costs else [""]
     for p in promises:
         lines += [f"{p.name:38} {p.value:7.2f} {p.unit:7} {p.verdict:22} {p.note}".rstrip()]
     return "\n".join(lines)
@@ -394,23 +421,29 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help=f"only {' and '.join(QUICK)}, with fewer turns")
     parser.add_argument("--only", nargs="+", choices=tuple(SECTIONS), help="only these sections")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures there, too")
+    parser.add_argument("--plot", type=Path, metavar="FILE", help="draw the figures of the section physics there, too")
     parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu", help="where gen2d computes (cpu)")
     parser.add_argument("--measure", nargs=3, help=argparse.SUPPRESS)
     options = parser.parse_args()
+    names = options.only or (QUICK if options.quick else SECTIONS)
+    if options.plot and "physics" not in names:
+        parser.error("--plot draws the section physics, which is not measured: add --only physics")
     if options.measure:
         name, folder, more = options.measure
         print(json.dumps(MEASUREMENTS[name](Path(folder), **json.loads(more))))
         return
     os.environ["JAX_PLATFORMS"] = options.device
     facts, found = machine(), []
-    for name in options.only or (QUICK if options.quick else SECTIONS):
+    for name in names:
         with tempfile.TemporaryDirectory(prefix="gen2d-bench-") as folder:
             found += SECTIONS[name](Path(folder), options.quick)
     print(text_of(facts, found))
     if options.json:
-        kinds = {"rows": Row, "promises": Promise}
+        kinds = {"rows": Row, "promises": Promise, "costs": Cost}
         tables = {key: [f._asdict() for f in found if isinstance(f, kind)] for key, kind in kinds.items()}
         options.json.write_text(json.dumps({"machine": facts} | tables, indent=1))
+    if options.plot:
+        bench_physics.chart([f for f in found if isinstance(f, Cost)], options.plot)
 
 
 if __name__ == "__main__":

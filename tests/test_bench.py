@@ -3,8 +3,12 @@
 from pathlib import Path
 
 import bench
+import bench_physics
+import cv2
 import h5py
+import numpy as np
 import peer
+import pytest
 
 from gen2d.config import load_config
 
@@ -57,3 +61,34 @@ def test_both_ways_of_reading_pymunk_agree() -> None:
     start = peer.sampled(0)
     by_body, by_batch = (peer.stepped(peer.space_of(start), read) for read in peer.READERS)
     assert (by_body == by_batch).all()
+
+
+@pytest.mark.parametrize("shape", ["discs", "boxes"])
+def test_the_engines_of_the_physics_section_start_from_the_same_scene(shape: str) -> None:
+    start = bench_physics.sampled(bench_physics.Case(shape, 5, 1, (1, 0), 1), 0)
+    (scene, state, layout), space = bench_physics.gen2d_scene(start), bench_physics.chipmunk_space(start)
+    assert [run.count for run in layout.runs] == [5, 4]
+    own = np.array([(*b.position, b.angle, *b.velocity, b.mass, b.moment) for b in space.bodies])
+    columns = state.position, state.angle, state.velocity, scene.objects.mass, scene.objects.moment
+    np.testing.assert_allclose(np.column_stack([x[:5] for x in columns]), own, rtol=1e-6)
+
+
+def test_every_engine_of_the_physics_section_is_timed(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    case = bench_physics.Case("discs", 2, 2, (1, 0), 1)
+    monkeypatch.setitem(bench_physics.CASES, case.name, case)
+    turns = bench.physics(tmp_path, case.name, turns=1)
+    assert {"states", "all", "pymunk", "compile states", "compile all"} == turns.keys()
+    assert all(seconds > 0 for (seconds,) in turns.values())
+    cost = bench_physics.cost_of(case, {name: seconds for name, (seconds,) in turns.items()})
+    assert cost.pairs == 9
+    assert "2 discs" in bench.text_of({}, [cost])
+
+
+def test_the_chart_of_the_physics_section_draws_what_was_measured(tmp_path: Path) -> None:
+    costs = [bench_physics.Cost(f"{n} discs", n, n * n, {"all": n / 2, "pymunk": n}, {}) for n in (4, 8)]
+    bench_physics.chart(costs, tmp_path / "chart.png")
+    image = cv2.imread(str(tmp_path / "chart.png"))
+    assert image is not None
+    assert image.shape == (bench_physics.HEIGHT, bench_physics.WIDTH, 3)
+    drawn = {name: (image == color).all(-1).any() for name, color in bench_physics.COLORS.items()}
+    assert drawn == {"states": False, "all": True, "pymunk": True, "phyjax2d": False}

@@ -16,7 +16,8 @@ PACKAGE = ROOT / "gen2d"
 # Each module may import those before it; a family or look may import all of a Python file's neighbours but the last.
 ORDER = [
     *("errors", "fields", "files", "codecs", "formats", "plan", "manifest", "cards", "shards", "loader"),
-    *("verification", "dataloader", "report", "types", "shapes", "contacts", "impacts", "tournament", "solver"),
+    *("verification", "dataloader", "report", "types", "shapes", "tournament", "contacts", "impacts", "rows"),
+    *("ledger", "joints", "forms", "sweeps", "events", "solver", "scenery"),
     *(
         "simulate",
         "factors",
@@ -30,7 +31,7 @@ ORDER = [
         "rollout",
         "pipeline",
     ),
-    *("generation", "preview"),
+    *("generation", "preview", "space", "pictures"),
 ]
 WITHOUT_JAX = ORDER[: ORDER.index("report") + 1]
 PLUGINS = ("scenes", "renderers", "formats")

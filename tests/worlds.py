@@ -12,9 +12,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from gen2d import types
-from gen2d.simulate import simulate
-from gen2d.solver import Rules
-from gen2d.types import Layout, Objects, Scene, State, Trajectory
+from gen2d.rows import Rules
+from gen2d.simulate import Forces, Keep, simulate
+from gen2d.types import STATIC, Layout, Objects, Run, Scene, State, Trajectory
 
 STEP = 1 / 240
 
@@ -22,9 +22,13 @@ STEP = 1 / 240
 def rules(step: float = STEP, **changes: Any) -> Rules:
     """The solver's default numbers at a step, but for the changes."""
     numbers: dict[str, Any] = {
-        "bounce_threshold": 0.01, "hertz": min(30.0, 0.125 / step), "damping_ratio": 10.0, "push_speed": 3.0,
-        "damping": 0.0, "mixing": "product",
-    }  # fmt: skip
+        "bounce_threshold": 0.01,
+        "hertz": min(30.0, 0.125 / step),
+        "damping_ratio": 10.0,
+        "push_speed": 3.0,
+        "damping": 0.0,
+        "mixing": "product",
+    }
     return Rules(step=step, **(numbers | changes))
 
 
@@ -34,8 +38,11 @@ def world(
     gravity: Sequence[float] = (0.0, 0.0),
     slots: int | None = None,
 ) -> tuple[Scene, State, Layout]:
-    """One scene in the sampler's layout. A disc: x, v, radius, spin, elasticity, friction, mass; a segment: a, b (its
-    ends), elasticity, friction. Slots that are left over stay empty."""
+    """One scene in the sampler's layout, in the precision that jax has now.
+
+    A disc: x, v, radius, spin, elasticity, friction, mass, moment, rolling, force, torque; a segment: a, b (its ends),
+    elasticity, friction. Slots that are left over stay empty.
+    """
     count = max(slots or len(discs), 1)
     rows = [{"x": (0, 0), "v": (0, 0), "radius": 0.5, "spin": 0, "elasticity": 1, "friction": 0, **d} for d in discs]
     rows += [{"x": (0, 0), "v": (0, 0), "radius": 0, "spin": 0, "elasticity": 0, "friction": 0}] * (count - len(discs))
@@ -43,12 +50,20 @@ def world(
     ends = np.array([[s["a"], s["b"]] for s in walls], float).reshape(-1, 2, 2)
     radius = np.array([r["radius"] for r in rows], float)
     mass = np.array([r.get("mass", np.pi * r["radius"] ** 2) for r in rows], float)
+    moment = [r.get("moment", m * r["radius"] ** 2 / 2) for r, m in zip(rows, mass, strict=True)]
     there = [*(k < len(discs) for k in range(count)), *(True for _ in walls)]
 
-    def both(of_discs: Any, of_walls: Any, dtype: Any = np.float32) -> jax.Array:
+    real = np.dtype(jnp.result_type(float))
+
+    def both(of_discs: Any, of_walls: Any, dtype: Any = real) -> jax.Array:
         parts = np.asarray(of_discs, float), np.asarray(of_walls, float)
         parts = [p.reshape(len(p), *np.shape(of_discs)[1:]) for p in parts]
         return jnp.asarray(np.concatenate(parts).astype(dtype))
+
+    def some(key: str, of_walls: np.ndarray) -> jax.Array | None:
+        if not any(key in r for r in rows):
+            return None
+        return both([r.get(key, np.zeros(of_walls.shape[1:])) for r in rows], of_walls)
 
     nothing, ones = np.zeros(len(walls)), np.ones(len(walls))
     span = ends[:, 1] - ends[:, 0]
@@ -60,10 +75,13 @@ def world(
         half_length=both(np.zeros(count), np.hypot(*span.T) / 2),
         depth=both(np.arange(count), nothing, np.int16),
         mass=both(mass, np.inf * ones),
-        moment=both(mass * radius**2 / 2, np.inf * ones),
+        moment=both(moment, np.inf * ones),
         elasticity=both([r["elasticity"] for r in rows], [s["elasticity"] for s in walls]),
         friction=both([r["friction"] for r in rows], [s["friction"] for s in walls]),
         color=jnp.zeros((count + len(walls), 3), jnp.uint8),
+        rolling_resistance=some("rolling", nothing),
+        force=some("force", np.zeros((len(walls), 2))),
+        torque=some("torque", nothing),
     )
     state = State(
         position=both([r["x"] for r in rows], ends.mean(axis=1)),
@@ -71,25 +89,32 @@ def world(
         velocity=both([r["v"] for r in rows], np.zeros((len(walls), 2))),
         angular_velocity=both([r["spin"] for r in rows], nothing),
     )
-    layout = Layout(count, len(walls), (0.0, 0.0, 1.0, 1.0), float(radius.max()))
-    return Scene(objects, jnp.asarray(gravity, jnp.float32)), state, layout
+    layout = Layout((Run("circle", count), Run("segment", len(walls), STATIC)))
+    return Scene(objects, jnp.asarray(gravity, real)), state, layout
 
 
 @functools.lru_cache(maxsize=64)
-def _program(layout: Layout, numbers: Rules, frames: int, steps: int):
+def _program(layout: Layout, numbers: Rules, frames: int, steps: int, keep: Keep, forces: Forces | None, wide: bool):
     def run(scene: Scene, state: State) -> Trajectory:
-        made = simulate(types.to_device(scene), types.to_device(state), layout, numbers, frames, steps)
-        return types.to_stored(made)
+        device = types.to_device(scene), types.to_device(state)
+        return types.to_stored(simulate(*device, layout, numbers, frames, steps, keep, forces))
 
     return jax.jit(run)
 
 
-def run(worlds: Sequence[tuple[Scene, State, Layout]], frames: int, steps: int, numbers: Rules | None = None) -> Any:
-    """The trajectories of worlds of one layout, videos first, as NumPy arrays in float64 where they are numbers."""
+def run(
+    worlds: Sequence[tuple[Scene, State, Layout]],
+    frames: int,
+    steps: int,
+    numbers: Rules | None = None,
+    keep: Keep | None = None,
+    forces: Forces | None = None,
+) -> Any:
+    """The trajectories of worlds of one layout, videos first, as NumPy arrays."""
     layout = worlds[0][2]
-    layout = Layout(layout.discs, layout.segments, (0.0, 0.0, 1.0, 1.0), 1.0)
-    scene, state = (jax.tree.map(lambda *x: jnp.stack(x), *(w[i] for w in worlds)) for i in (0, 1))
-    made = _program(layout, numbers or rules(), frames, steps)(scene, state)
+    scene, state = (jax.tree.map(lambda *x: jnp.asarray(np.stack(x)), *(w[i] for w in worlds)) for i in (0, 1))
+    wide = state.position.dtype == np.float64
+    made = _program(layout, numbers or rules(), frames, steps, keep or Keep(), forces, wide)(scene, state)
     return jax.tree.map(np.asarray, made)
 
 
@@ -114,13 +139,19 @@ def turned(vector: Sequence[float], degrees: float) -> tuple[float, float]:
     return float(c * vector[0] - s * vector[1]), float(s * vector[0] + c * vector[1])
 
 
+def _of_discs(scene: Scene, made: Trajectory, i: int, count: int) -> tuple[np.ndarray, ...]:
+    """Mass and moment [K], position, velocity [T, K, 2] and spin [T, K] of video i's discs."""
+    mass, moment = (np.asarray(x, float)[:count] for x in (scene.objects.mass, scene.objects.moment))
+    states = made.states.position, made.states.velocity, made.states.angular_velocity
+    x, v, w = (np.asarray(a[i], float)[:, :count] for a in states)
+    return mass, moment, x, v, w
+
+
 def energies(worlds: Sequence[tuple[Scene, State, Layout]], made: Trajectory) -> np.ndarray:
     """Kinetic and potential energy of each video and frame, J [n, T]."""
     total = []
     for i, (scene, _, layout) in enumerate(worlds):
-        mass, moment = (np.asarray(x, float)[: layout.discs] for x in (scene.objects.mass, scene.objects.moment))
-        x, v, w = (np.asarray(a[i], float)[:, : layout.discs] for a in
-                   (made.states.position, made.states.velocity, made.states.angular_velocity))  # fmt: skip
+        mass, moment, x, v, w = _of_discs(scene, made, i, layout.runs[0].count)
         fall = -np.einsum("tkd,d->tk", x, np.asarray(scene.gravity, float)) * mass
         total.append((0.5 * mass * (v**2).sum(-1) + 0.5 * moment * w**2 + fall).sum(-1))
     return np.array(total)
@@ -130,9 +161,7 @@ def momenta(worlds: Sequence[tuple[Scene, State, Layout]], made: Trajectory) -> 
     """Linear [n, T, 2] and angular [n, T] momentum about the origin."""
     linear, angular = [], []
     for i, (scene, _, layout) in enumerate(worlds):
-        mass, moment = (np.asarray(x, float)[: layout.discs] for x in (scene.objects.mass, scene.objects.moment))
-        x, v, w = (np.asarray(a[i], float)[:, : layout.discs] for a in
-                   (made.states.position, made.states.velocity, made.states.angular_velocity))  # fmt: skip
+        mass, moment, x, v, w = _of_discs(scene, made, i, layout.runs[0].count)
         linear.append((mass[:, None] * v).sum(1))
         cross = x[..., 0] * v[..., 1] - x[..., 1] * v[..., 0]
         angular.append((mass * cross + moment * w).sum(-1))

@@ -9,7 +9,7 @@ from gen2d.config import option
 from gen2d.factors import Distribution
 from gen2d.placement import place
 from gen2d.shapes import disc_mass, disc_moment
-from gen2d.types import DYNAMIC, SHAPES, STATIC, Array, Layout, Objects, Scene, State
+from gen2d.types import DYNAMIC, SHAPES, STATIC, Array, Layout, Objects, Run, Scene, State
 
 
 @dataclasses.dataclass(frozen=True)
@@ -70,7 +70,8 @@ def sizes(options: Options) -> dict[str, int]:
 def layout(options: Options) -> Layout:
     """N balls, then floor, right wall, ceiling, left wall."""
     bounds = (0.0, 0.0, options.width, options.height)
-    return Layout(sizes(options)["N"], 4, bounds, options.radius.support[1])
+    runs = Run("circle", sizes(options)["N"]), Run("segment", 4, STATIC)
+    return Layout(runs, bounds, options.radius.support[1])
 
 
 def sample(key: Array, factors: dict[str, Array], options: Options) -> tuple[Scene, State, Array, Array]:

@@ -1,0 +1,259 @@
+"""From a scene to what the solver needs of it: groups of moving bodies, fixed bodies, joints, and a row for every pair.
+
+The layout says which slots hold what, so all of this is known when a program is compiled, but for the numbers.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from gen2d import joints
+from gen2d.contacts import Stadium, dot
+from gen2d.forms import DiscForm, Form, StadiumForm, form_of, placed
+from gen2d.rows import Impulse, Inertia, Motion, Row, Rules, grip_of, mixed
+from gen2d.solver import Fixed, Group, Scenery
+from gen2d.sweeps import Setup
+from gen2d.tournament import Match, matches, sweep
+from gen2d.types import DYNAMIC, KINEMATIC, Array, Layout, Objects, Record, Run, Scene, State
+
+
+class Side(NamedTuple):
+    """What a row needs to know of one of its sides."""
+
+    inverse: Inertia | None
+    present: Array
+    radius: Array
+    elasticity: Array
+    friction: Array
+    rolling: Array | None  # m
+    slot: Array
+
+
+def cleaned(scene: Scene, state: State) -> tuple[Scene, State]:
+    """Both with nothing in their empty slots, so that whatever stood there (NaN, too) cannot matter."""
+    present = scene.objects.present
+
+    def clean(values: Record) -> Record:
+        return jax.tree.map(lambda x: jnp.where(present, x, jnp.zeros_like(x)), values)
+
+    return Scene(clean(scene.objects), scene.gravity, scene.joints), clean(state)
+
+
+def padded(count: int) -> int:
+    """How many bodies a group of so many has: a tournament needs an even number."""
+    return count + count % 2 if count > 1 else count
+
+
+def slots_of(value: Any, first: int, count: int, room: int | None = None) -> Any:
+    """Some slots of arrays [..., K, n], with zeros up to `room`."""
+
+    def some(x: Array) -> Array:
+        part = x[..., first : first + count, :]
+        return jnp.pad(part, [(0, 0)] * (x.ndim - 2) + [(0, (room or count) - count), (0, 0)])
+
+    return jax.tree.map(some, value)
+
+
+def moving(layout: Layout) -> list[tuple[Run, int]]:
+    """The runs of dynamic bodies, each a group, and their first slots."""
+    return [(run, first) for run, first in layout.spans if run.kind == DYNAMIC]
+
+
+def standing(layout: Layout) -> list[tuple[Run, int]]:
+    """Every static and kinematic slot, and the run that it is in."""
+    runs = [(run, first) for run, first in layout.spans if run.kind != DYNAMIC]
+    return [(run, first + i) for run, first in runs for i in range(run.count)]
+
+
+def _inverse(value: Array, present: Array) -> Array:
+    usable = present & jnp.isfinite(value) & (value > 0)
+    return jnp.where(usable, 1 / jnp.where(usable, value, 1.0), 0.0)
+
+
+def _group(objects: Objects, layout: Layout, run: Run, first: int) -> Group:
+    some = slots_of(objects, first, run.count, padded(run.count))
+    inverse = Inertia(_inverse(some.mass, some.present), _inverse(some.moment, some.present))
+    mass, moment = (_inverse(x, x > 0) for x in inverse)
+    rigid = {slot for tie in layout.joints for slot in (tie.a, tie.b)}
+    jointed = jnp.asarray([float(first + i in rigid) for i in range(padded(run.count))], mass.dtype)[:, None]
+    return Group(form_of(some, run, slice(None)), inverse, mass, moment, jnp.broadcast_to(jointed, mass.shape))
+
+
+def _fixed(objects: Objects, state: State, run: Run, slot: int) -> Fixed:
+    some, place = slots_of(objects, slot, 1), slots_of(state, slot, 1)
+    motion = Motion(place.velocity, place.angular_velocity) if run.kind == KINEMATIC else None
+    return Fixed(form_of(some, run, slice(None)), place.position, place.angle, motion)
+
+
+def _side(objects: Objects, first: int, count: int, inverse: Inertia | None) -> Side:
+    some = slots_of(objects, first, count, padded(count))
+    slots = jnp.broadcast_to(jnp.arange(first, first + padded(count))[:, None], some.radius.shape)
+    resistance = some.rolling_resistance
+    rolling = None if resistance is None else resistance * some.radius
+    return Side(inverse, some.present, some.radius, some.elasticity, some.friction, rolling, slots)
+
+
+def _sides(objects: Objects, layout: Layout, groups: list[Group]) -> tuple[list[Side], list[Side]]:
+    """Of the groups and of the fixed bodies; a kinematic one has an inertia, which is infinite."""
+    ours = [_side(objects, s, run.count, g.inverse) for (run, s), g in zip(moving(layout), groups, strict=True)]
+    nothing = jnp.zeros_like(objects.radius[:1])
+    unmoved = Inertia(nothing, nothing)
+    theirs = [_side(objects, s, 1, unmoved if run.kind == KINEMATIC else None) for run, s in standing(layout)]
+    return ours, theirs
+
+
+def _apart(a: Side, b: Side, layout: Layout) -> Array:
+    """Where two are not tied together by a joint, so that they collide."""
+    tied = [tie for tie in layout.joints if not tie.collide]
+    together = jnp.zeros(b.slot.shape, bool)
+    for i, j in ((tie.a, tie.b) for tie in tied):
+        together = together | ((a.slot == i) & (b.slot == j)) | ((a.slot == j) & (b.slot == i))
+    return ~together
+
+
+def _round(a: Form, b: Form, fixed: bool, still: bool) -> bool:
+    """Whether a pair's levers are known beforehand: two discs, or a disc on something that stands still."""
+    if not isinstance(b, DiscForm):
+        return False
+    return (isinstance(a, DiscForm) and (not fixed or still)) or (isinstance(a, StadiumForm) and fixed and still)
+
+
+def _row(a: Side, b: Side, forms: tuple[Form, Form], fixed: bool, layout: Layout, mixing: str) -> Row:
+    rolling = None
+    if a.rolling is not None and b.rolling is not None:
+        rolling = jnp.maximum(a.rolling, b.rolling) + jnp.zeros_like(b.radius)
+    assert b.inverse is not None, "a fixed body is never second"
+    values = jax.tree.map(lambda x: jnp.broadcast_to(x, b.radius.shape), a._replace(inverse=None))
+    a = values._replace(inverse=a.inverse)
+    here = a.present & b.present & (b.inverse.mass > 0) & _apart(a, b, layout)
+    if a.inverse is not None and not fixed:
+        here = here & (a.inverse.mass > 0)
+    elasticity, friction = mixed(a.elasticity, b.elasticity, mixing), mixed(a.friction, b.friction, mixing)
+    row = Row(a.inverse, b.inverse, here, elasticity, friction, rolling, None, fixed)
+    if not _round(*forms, fixed, a.inverse is None):
+        return row
+    levers = None, None, None if a.inverse is None else a.radius, -b.radius
+    return row._replace(grip=grip_of(row, levers, here))
+
+
+TOGETHER = 1e-4  # m: ends that are so near to another segment lie on it
+
+
+def _onward(end: Array, others: list[Stadium]) -> tuple[Array, Array]:
+    """For an end [2, 1, ...] of a segment, the two directions in which others go on from there, zero if none do."""
+    found = [jnp.zeros_like(end)] * 2
+    for shape in others:
+        offset = end - shape.centre
+        along = dot(offset, shape.direction)
+        aside = offset - jnp.clip(along, -shape.half_length, shape.half_length) * shape.direction
+        there = (dot(aside, aside) < TOGETHER**2) & (shape.half_length > TOGETHER)
+        for way, goes in ((1, along < shape.half_length - TOGETHER), (-1, along > TOGETHER - shape.half_length)):
+            new, empty = there & goes, dot(found[0], found[0]) == 0
+            found = [
+                jnp.where(new & empty, way * shape.direction, found[0]),
+                jnp.where(new & ~empty, way * shape.direction, found[1]),
+            ]
+    return found[0], found[1]
+
+
+def _joined(rows: list[Row], order: list[Match], fixed: list[Fixed]) -> list[Row]:
+    """The rows of discs on fixed segments with what goes on from the segments' ends."""
+    lines = {
+        i: placed(f.form, f.position, f.angle)
+        for i, f in enumerate(fixed)
+        if isinstance(f.form, StadiumForm) and f.motion is None
+    }
+    if len(lines) < 2:
+        return rows
+    ways = {}
+    for i, shape in lines.items():
+        others = [other for j, other in lines.items() if j != i]
+        reach = shape.half_length * shape.direction
+        ways[i] = [_onward(shape.centre + s * reach, others) for s in (-1, 1)]
+    matched = [m for m in order for _ in range(m.rounds)]
+    joined = []
+    for row, m in zip(rows, matched, strict=True):
+        left, right = ways[m.first] if row.grip is not None and m.fixed and m.first in ways else (None, None)
+        joined.append(row._replace(left=left, right=right))
+    return joined
+
+
+def _rows(
+    objects: Objects, layout: Layout, groups: list[Group], fixed: list[Fixed], order: list[Match], mixing: str
+) -> tuple:
+    """For each row what stays the same of it and the slots of its a and b; and how many points it has."""
+    forms = [g.form for g in groups]
+    pairs = [
+        (fixed[m.first].form if m.fixed else forms[m.first], forms[m.second]) for m in order for _ in range(m.rounds)
+    ]
+    firm = [m.fixed for m in order for _ in range(m.rounds)]
+
+    def play(k: int, a: Side, b: Side) -> tuple[Side, Side, tuple[Row, Array, Array]]:
+        slots = jnp.broadcast_to(a.slot, b.slot.shape), b.slot
+        return a, b, (_row(a, b, pairs[k], firm[k], layout, mixing), *slots)
+
+    _, made = sweep(*_sides(objects, layout, groups), order, play)
+    return made, [1 if DiscForm in map(type, forms) else 2 for forms in pairs]
+
+
+def _end(slot: int, anchor: Array, layout: Layout, groups: list[Group]) -> joints.End:
+    for g, (run, first) in enumerate(moving(layout)):
+        if first <= slot < first + run.count:
+            inverse = slots_of(groups[g].inverse, slot - first, 1)
+            return joints.End(g, slot - first, inverse, anchor)
+    return joints.End(None, [s for _, s in standing(layout)].index(slot), None, anchor)
+
+
+def _ties(scene: Scene, layout: Layout, groups: list[Group]) -> list[joints.Tied]:
+    found, values = [], scene.joints
+    for j, tie in enumerate(layout.joints):
+        assert values is not None, "a layout with joints needs scene.joints"
+        of = slots_of(values, j, 1)
+        there = scene.objects.present[tie.a : tie.a + 1] & scene.objects.present[tie.b : tie.b + 1]
+        a, b = (_end(slot, x, layout, groups) for slot, x in ((tie.a, of.anchor_a), (tie.b, of.anchor_b)))
+        found.append(
+            joints.Tied(
+                tie.kind,
+                a,
+                b,
+                there,
+                of.rest,
+                of.stiffness,
+                of.damping,
+                of.lower,
+                of.upper,
+                of.motor_speed,
+                of.motor_torque,
+            )
+        )
+    return found
+
+
+def scenery_of(scene: Scene, state: State, layout: Layout, rules: Rules, forces: Any, contacts: bool) -> tuple:
+    """What stays the same for a whole video, how many points each row has, and the slots (a, b) of its objects.
+
+    `contacts` says whether touches shall say where they are.
+    """
+    objects = scene.objects
+    groups = [_group(objects, layout, run, first) for run, first in moving(layout)]
+    fixed = [_fixed(objects, state, run, slot) for run, slot in standing(layout)]
+    order = matches([padded(run.count) for run, _ in moving(layout)], len(fixed))
+    made, points = _rows(objects, layout, groups, fixed, order, rules.mixing)
+    one = 1.0 + jax.lax.stop_gradient(jnp.maximum(-jnp.max(objects.radius), 0.0))  # 1, but the compiler cannot know
+    # In a pile at rest, what has to be stopped anew each step is what gravity gave: that must not count as a bounce.
+    at_rest = 2 * rules.step * jnp.sqrt(jnp.sum(scene.gravity**2, axis=0))
+    threshold = jnp.maximum(rules.bounce_threshold, at_rest)
+    setup = Setup(_joined([row for row, *_ in made], order, fixed), order, scene.gravity, threshold, one, contacts)
+    scenery = Scenery(groups, fixed, setup, _ties(scene, layout, groups), forces)
+    return scenery, points, [slots for _, *slots in made]
+
+
+def nothing_yet(scenery: Scenery, points: list[int]) -> list[tuple]:
+    """The memory of rows that have not been solved yet."""
+
+    def zero(row: Row) -> Array:
+        return jnp.zeros(row.present.shape, row.friction.dtype)
+
+    rows = zip(scenery.setup.rows, points, strict=True)
+    return [([Impulse(zero(r), zero(r))] * n, None if r.rolling is None else zero(r)) for r, n in rows]

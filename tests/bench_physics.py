@@ -1,0 +1,366 @@
+"""What physics costs against the number of objects: gen2d, Chipmunk (pymunk) and phyjax2d on the same scenes.
+
+    python tests/bench.py --only physics --plot gen2d/physics_cost.png     # about 5 minutes
+
+A scene is a box of constant density: N discs of random radii, or 8 rectangles, that fall and bounce for 64 frames at
+60 Hz, of 4 steps each. Every engine has its own default number of iterations and makes the same states of every
+frame; pymunk is stepped, and read by each body's attributes, as its manual shows. phyjax2d steps its scenes under
+`jax.vmap`. Times are of this process's CPU, which is on one core, so other work on the machine disturbs little.
+"""
+
+import copy
+import importlib
+import importlib.util
+import itertools
+import math
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+import peer
+import pymunk
+
+FRAMES, STEPS, STEP = 64, 4, 1 / 240  # s
+GRAVITY, ELASTICITY, FRICTION = -9.81, 0.9, 0.2  # m/s^2; each body's, of which gen2d and Chipmunk make products
+AREA = 12.5  # m^2 of the box for each object, as 8 of them have in configs/benchmark.yaml
+RADIUS, SIDES, SPEED = (0.5, 1.0), (0.6, 1.4), 3.0  # m, m/s: uniform, uniform, and the deviation of each component
+STEPPED = (FRAMES - 1) * STEPS
+INSTALL = "phyjax2d is not measured, as it is not installed here: pip install --no-deps phyjax2d==0.5.0"
+
+
+class Case(NamedTuple):
+    """A kind of scene, and how much of it is measured."""
+
+    shape: str  # "discs" or "boxes"
+    objects: int
+    lanes: int  # videos that gen2d simulates at once
+    peers: tuple[int, int]  # videos that pymunk and phyjax2d simulate in a turn; more cost phyjax2d more, each
+    turns: int
+
+    @property
+    def name(self) -> str:
+        """As it stands in the tables."""
+        return f"{self.objects} {self.shape}"
+
+    @property
+    def pairs(self) -> int:
+        """How many pairs of things can meet: two objects, or an object and a wall."""
+        return self.objects * (self.objects - 1) // 2 + 4 * self.objects
+
+
+CASES = {
+    case.name: case
+    for case in (
+        Case("discs", 4, 128, (64, 16), 5),
+        Case("discs", 8, 128, (32, 16), 5),
+        Case("discs", 16, 128, (24, 16), 5),
+        Case("discs", 32, 128, (16, 16), 3),
+        Case("discs", 64, 128, (12, 16), 3),
+        Case("boxes", 8, 128, (32, 0), 5),
+    )
+}
+
+
+class Start(NamedTuple):
+    """What a video is made of; discs have a radius, boxes two sides."""
+
+    box: float  # m, its side
+    places: np.ndarray  # [N, 2] m
+    angles: np.ndarray  # [N] rad
+    velocities: np.ndarray  # [N, 2] m/s
+    sizes: np.ndarray  # [N] or [N, 2] m
+
+    @property
+    def masses(self) -> np.ndarray:
+        """kg [N], at a density of 1 kg/m^2."""
+        return np.pi * self.sizes**2 if self.sizes.ndim == 1 else self.sizes.prod(axis=1)
+
+    @property
+    def walls(self) -> list[tuple[tuple[float, float], tuple[float, float]]]:
+        """The ends of the box's four sides."""
+        corners = [(0.0, 0.0), (self.box, 0.0), (self.box, self.box), (0.0, self.box), (0.0, 0.0)]
+        return list(itertools.pairwise(corners))
+
+
+def sampled(case: Case, number: int) -> Start:
+    """The start of video `number`: objects in a square grid, so that none overlap."""
+    rng, box, columns = (
+        np.random.default_rng([1, number]),
+        math.sqrt(AREA * case.objects),
+        math.isqrt(case.objects - 1) + 1,
+    )
+    cells = [((i + 0.5) * box / columns, (j + 0.5) * box / columns) for j in range(columns) for i in range(columns)]
+    discs = case.shape == "discs"
+    return Start(
+        box=box,
+        places=np.array(cells[: case.objects]),
+        angles=np.zeros(case.objects) if discs else rng.uniform(0, np.pi, case.objects),
+        velocities=rng.normal(0, SPEED, (case.objects, 2)),
+        sizes=rng.uniform(*RADIUS, case.objects) if discs else rng.uniform(*SIDES, (case.objects, 2)),
+    )
+
+
+# ---- The engines
+
+
+def works(case: Case) -> tuple[dict[str, Callable[[], float]], dict[str, float]]:
+    """By engine what simulates some videos and returns the CPU seconds of one, and gen2d's seconds to compile."""
+    ours, seconds = {}, {}
+    for name, everything in (("states", False), ("all", True)):
+        program, inputs, seconds[f"compile {name}"] = gen2d_program(case, everything)
+        ours[name] = _ready(program, inputs, case.lanes)
+    by_engine = ours | {"pymunk": lambda: chipmunk_seconds(case)}
+    if case.peers[1] and has_phyjax2d():
+        program, inputs = phyjax2d_program(case)
+        by_engine["phyjax2d"] = _ready(program, inputs, case.peers[1])
+    return by_engine, seconds
+
+
+def has_phyjax2d() -> bool:
+    """Whether it can be imported."""
+    return importlib.util.find_spec("phyjax2d") is not None
+
+
+def _ready(program: Callable, inputs: Any, videos: int) -> Callable[[], float]:
+    import jax
+
+    def seconds() -> float:
+        began = time.process_time()
+        jax.block_until_ready(program(*inputs))
+        return (time.process_time() - began) / videos
+
+    return seconds
+
+
+def gen2d_program(case: Case, everything: bool) -> tuple[Callable, Any, float]:
+    """The compiled program, what it takes, and the CPU seconds that compiling took; with `everything` it also writes
+    contacts, in as many rows as configs/README.md calls a good number, and the books of energy."""
+    import jax
+    from worlds import rules
+
+    from gen2d import devices, types
+    from gen2d.simulate import Keep, simulate
+
+    devices.keep_freed_memory()  # as the product does
+    jax.config.update("jax_enable_compilation_cache", False)
+    made = [gen2d_scene(sampled(case, number)) for number in range(case.lanes)]
+    layout = made[0][2]
+    inputs = jax.tree.map(lambda *x: np.stack(x), *(scene[:2] for scene in made))
+    keep = Keep(4 * layout.slots * math.ceil(FRAMES / 16), energy=True) if everything else Keep()
+
+    def run(scene: types.Scene, state: types.State) -> types.Trajectory:
+        device = types.to_device(scene), types.to_device(state)
+        return types.to_stored(simulate(*device, layout, rules(STEP), FRAMES, STEPS, keep))
+
+    began = time.process_time()
+    program = jax.jit(run).lower(*inputs).compile()
+    return program, jax.device_put(inputs), time.process_time() - began
+
+
+def gen2d_scene(start: Start) -> Any:
+    """Scene, state and layout."""
+    from gen2d.space import Space
+
+    space = Space((0, GRAVITY))
+    for place, angle, velocity, size in zip(*start[1:], strict=True):
+        if start.sizes.ndim == 1:
+            space.add_circle(place, size, velocity=velocity, elasticity=ELASTICITY, friction=FRICTION)
+        else:
+            space.add_box(place, *size, angle=angle, velocity=velocity, elasticity=ELASTICITY, friction=FRICTION)
+    for a, b in start.walls:
+        space.add_segment(a, b, elasticity=ELASTICITY, friction=FRICTION)
+    return space.scene()
+
+
+def chipmunk_seconds(case: Case) -> float:
+    """CPU seconds of one video, without building the scenes."""
+    spaces = [chipmunk_space(sampled(case, number)) for number in range(case.peers[0])]
+    began = time.process_time()
+    for space in spaces:
+        stepped(space)
+    return (time.process_time() - began) / len(spaces)
+
+
+def chipmunk_space(start: Start) -> pymunk.Space:
+    """The scene, of Chipmunk's usual 10 iterations."""
+    space = pymunk.Space()
+    space.gravity = 0, GRAVITY
+    shapes: list[pymunk.Shape] = [pymunk.Segment(space.static_body, a, b, 0) for a, b in start.walls]
+    rows = zip(start.places, start.angles, start.velocities, start.sizes, start.masses, strict=True)
+    for place, angle, velocity, size, mass in rows:
+        disc = start.sizes.ndim == 1
+        moment = pymunk.moment_for_circle(mass, 0, size) if disc else pymunk.moment_for_box(mass, tuple(size))
+        body = pymunk.Body(mass, moment)
+        body.position, body.angle, body.velocity = tuple(place.tolist()), float(angle), tuple(velocity.tolist())
+        shapes.append(pymunk.Circle(body, size) if disc else pymunk.Poly.create_box(body, tuple(size)))
+        space.add(body)
+    for shape in shapes:
+        shape.elasticity, shape.friction = ELASTICITY, FRICTION
+    space.add(*shapes)
+    return space
+
+
+def stepped(space: pymunk.Space) -> np.ndarray:
+    """The states [T, N, 6], float32: x, y, angle, their velocities and the spin."""
+    states, take = [], peer.READERS["body"](space)
+    for t in range(FRAMES):
+        for _ in range(STEPS if t else 0):
+            space.step(STEP)
+        states.append(take())
+    return np.array(states, np.float32)
+
+
+def phyjax2d_program(case: Case) -> tuple[Callable, Any]:
+    """The compiled program for discs, with phyjax2d's usual 6 and 2 iterations, and what it takes."""
+    import jax
+
+    starts = [sampled(case, number) for number in range(case.peers[1])]
+    spaces = [phyjax2d_space(start) for start in starts]
+    step, first = importlib.import_module("phyjax2d").step, spaces[0]
+    parts = [(space.shaped, space._ci, space._ci_total) for space in spaces]
+    tree, leaves = jax.tree.structure(parts[0]), zip(*map(jax.tree.leaves, parts), strict=True)
+    arrays = {i: np.stack(values) for i, values in enumerate(leaves)}
+    own = {i: array for i, array in arrays.items() if (array != array[:1]).any()}  # of each scene: radii and masses
+
+    def video(own: Any, place: Any, velocity: Any) -> Any:
+        space = copy.copy(first)  # a Space cannot be made under jit, so one of each scene has been
+        space.shaped, space._ci, space._ci_total = tree.unflatten([own.get(i, all_[0]) for i, all_ in arrays.items()])
+        state = first.zeros_state().nested_replace("circle.p.xy", place).nested_replace("circle.v.xy", velocity)
+
+        def frame(world: Any, _: None) -> Any:
+            world = jax.lax.fori_loop(0, STEPS, lambda _, now: step(space, *now)[:2], world)
+            return world, (world[0].circle.p, world[0].circle.v)
+
+        return jax.lax.scan(frame, (state, first.init_solver()), None, length=FRAMES - 1)[1]
+
+    columns = [np.array([start[i] for start in starts], np.float32) for i in (1, 3)]
+    inputs = jax.device_put((own, *columns))
+    return jax.jit(jax.vmap(video)).lower(*inputs).compile(), inputs
+
+
+def phyjax2d_space(start: Start) -> Any:
+    """The scene."""
+    physics = importlib.import_module("phyjax2d")
+    builder = physics.SpaceBuilder(
+        gravity=(0, GRAVITY), dt=STEP, linear_damping=0.0, angular_damping=0.0, bounce_threshold=0.01
+    )
+    material = {"elasticity": ELASTICITY**2, "friction": FRICTION**2}  # of which it takes the mean: others' products
+    for radius in start.sizes:
+        builder.add_circle(radius=float(radius), **material)
+    for a, b in start.walls:
+        builder.add_segment(p1=physics.Vec2d(*a), p2=physics.Vec2d(*b), **material)
+    return builder.build()
+
+
+# ---- What is told
+
+
+class Cost(NamedTuple):
+    """A line of the table of physics."""
+
+    name: str
+    objects: int
+    pairs: int
+    micros: Mapping[str, float]  # CPU time of a video and step, by engine
+    compile: Mapping[str, float]  # s
+
+
+LINES = {
+    "states": "gen2d, states only",
+    "all": "gen2d, contacts and energy too",
+    "pymunk": "pymunk",
+    "phyjax2d": "phyjax2d, vmap",
+}
+
+
+def cost_of(case: Case, seconds: Mapping[str, float]) -> Cost:
+    """The line, from the seconds of a video by engine, and gen2d's seconds to compile."""
+    micros = {name: seconds[name] / STEPPED * 1e6 for name in LINES if name in seconds}
+    compiled = {name: seconds[f"compile {name}"] for name in ("states", "all")}
+    return Cost(case.name, case.objects, case.pairs, micros, compiled)
+
+
+def table(costs: Sequence[Cost]) -> list[str]:
+    """Lines of text."""
+    lines = [
+        "one core, microseconds of CPU time a video and step; gen2d with states only, and with contacts and energy"
+    ]
+    lines += [f"{'':12} {'pairs':>6} {'states':>8} {'all':>8} {'pymunk':>8} {'phyjax2d':>9}   compile, s: states, all"]
+    for c in costs:
+        states, all_, pymunk_, phyjax2d = (f"{c.micros[name]:.2f}" if name in c.micros else "-" for name in LINES)
+        compiled = f"{c.compile['states']:.1f}, {c.compile['all']:.1f}"
+        lines += [f"{c.name:12} {c.pairs:6} {states:>8} {all_:>8} {pymunk_:>8} {phyjax2d:>9}   {compiled}"]
+    return lines
+
+
+# Of the chart, in pixels. It is drawn four times as large and then made smaller, which smooths text and lines.
+WIDTH, HEIGHT, ZOOM = 640, 420, 4
+LEFT, RIGHT, TOP, BOTTOM = 74, 18, 40, 52
+INK, FAINT, GRID = (51, 51, 51), (153, 153, 153), (221, 221, 221)  # blue, green, red, as cv2 has it
+COLORS = {"states": (221, 170, 68), "all": (153, 68, 17), "pymunk": (34, 102, 221), "phyjax2d": (119, 153, 34)}
+
+
+def chart(costs: Sequence[Cost], path: Path) -> None:
+    """Returns nothing; draws the cost of discs against their number, both in logarithms, into a PNG file."""
+    costs = [cost for cost in costs if cost.name.endswith("discs")]
+    values = [micros for cost in costs for micros in cost.micros.values()]
+    low, high = min(values) / 1.5, max(values) * 2
+    first, last = min(cost.objects for cost in costs) / 1.15, max(cost.objects for cost in costs) * 1.15
+    image = np.full((HEIGHT * ZOOM, WIDTH * ZOOM, 3), 255, np.uint8)
+
+    def pixel(count: float, micros: float) -> tuple[float, float]:
+        x, y = math.log(count / first) / math.log(last / first), math.log(micros / low) / math.log(high / low)
+        return LEFT + x * (WIDTH - LEFT - RIGHT), HEIGHT - BOTTOM - y * (HEIGHT - TOP - BOTTOM)
+
+    for power in range(math.floor(math.log10(low)), math.ceil(math.log10(high))):
+        for micros in (k * 10.0**power for k in range(1, 10)):
+            if low < micros < high:
+                ends, whole = (pixel(first, micros), pixel(last, micros)), micros == 10.0**power
+                _line(image, ends, GRID, 1 if whole else 0.5)
+                _text(image, f"{micros:g}" if whole else "", (LEFT - 8, ends[0][1] + 4), align=1)
+    for cost in costs:
+        _line(image, (pixel(cost.objects, low), pixel(cost.objects, high)), GRID, 1)
+        _text(image, str(cost.objects), (pixel(cost.objects, low)[0], HEIGHT - BOTTOM + 18), align=0.5)
+    guide = [pixel(cost.objects, cost.pairs * min(costs[0].micros.values()) / costs[0].pairs) for cost in costs]
+    _line(image, guide, FAINT, 1)
+    for name, color in COLORS.items():
+        points = [pixel(cost.objects, cost.micros[name]) for cost in costs if name in cost.micros]
+        _line(image, points, color, 2)
+        for x, y in points:
+            cv2.circle(image, (round(x * ZOOM), round(y * ZOOM)), 4 * ZOOM, color, -1, cv2.LINE_AA)
+    _line(image, [(LEFT, TOP), (LEFT, HEIGHT - BOTTOM), (WIDTH - RIGHT, HEIGHT - BOTTOM)], INK, 1)
+    _legend(image, [name for name in COLORS if any(name in cost.micros for cost in costs)])
+    _text(image, "Physics on one core", (LEFT, 24), size=0.52)
+    _text(image, "discs in a box, N", (LEFT + (WIDTH - LEFT - RIGHT) / 2, HEIGHT - 12), align=0.5)
+    side = np.ascontiguousarray(cv2.rotate(image, cv2.ROTATE_90_CLOCKWISE))  # so that the text runs upwards
+    _text(side, "microseconds a video and step", (TOP + (HEIGHT - TOP - BOTTOM) / 2 + BOTTOM - TOP, 20), align=0.5)
+    image = cv2.rotate(side, cv2.ROTATE_90_COUNTERCLOCKWISE)
+    small = cv2.resize(image, (WIDTH, HEIGHT), interpolation=cv2.INTER_AREA)
+    small = small & 0xF0 | small >> 4  # fewer shades make a smaller file
+    cv2.imwrite(str(path), small, [cv2.IMWRITE_PNG_COMPRESSION, 9])
+
+
+def _legend(image: np.ndarray, names: Sequence[str]) -> None:
+    rows = [(LINES[name], COLORS[name], 2) for name in names] + [("pairs that can meet, slope only", FAINT, 1)]
+    for i, (text, color, width) in enumerate(rows):
+        y = TOP + 16 + 18 * i
+        _line(image, [(LEFT + 14, y), (LEFT + 42, y)], color, width)
+        if width > 1:
+            cv2.circle(image, ((LEFT + 28) * ZOOM, y * ZOOM), 4 * ZOOM, color, -1, cv2.LINE_AA)
+        _text(image, text, (LEFT + 50, y + 4))
+
+
+def _line(image: np.ndarray, points: Sequence[tuple[float, float]], color: Sequence[int], width: float) -> None:
+    at = np.rint(np.array(points) * ZOOM).astype(np.int32)
+    cv2.polylines(image, [at], False, color, round(width * ZOOM), cv2.LINE_AA)
+
+
+def _text(image: np.ndarray, text: str, at: tuple[float, float], align: float = 0, size: float = 0.42) -> None:
+    """Writes with its baseline there, to the right (align 0), around (0.5) or to the left (1)."""
+    font, scale, thick = cv2.FONT_HERSHEY_SIMPLEX, size * ZOOM, ZOOM
+    (width, _), _ = cv2.getTextSize(text, font, scale, thick)
+    place = round(at[0] * ZOOM - align * width), round(at[1] * ZOOM)
+    cv2.putText(image, text, place, font, scale, INK, thick, cv2.LINE_AA)

@@ -1,0 +1,268 @@
+"""What comes to rest stays at rest, nothing passes through anything, and joints of segments are not felt.
+
+Stacks, a full bin, mass on mass, a groove, collinear segments (C17 to C19) and shots at up to 500 m/s.
+"""
+
+import functools
+import itertools
+from typing import Any
+
+import numpy as np
+import pytest
+from laws import DOWN, FAR, FLOOR, GRAVITY, POSES, QUARTERS, Case, holds, overlaps, posed, watch
+from worlds import STEP, run, turned
+
+RADIUS = 0.5  # m
+SLOP = 0.005  # m
+
+
+def wall(x: float, height: float = 60.0) -> dict:
+    """A smooth upright wall."""
+    return {"a": (x, -1.0), "b": (x, height), "elasticity": 1.0, "friction": 0.0}
+
+
+def rested(case: Case, slots: int, settle: int, walls: int = 4) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Overlap in m, way in m and speed in m/s over the 10 s after `settle` s, at most, by pose; the bodies upright and
+    mirrored, at 60 frames per s."""
+    worlds = [posed(case, pose, slots, walls) for pose in (QUARTERS[0], POSES[4])]
+    made = run(worlds, 60 * (settle + 10) + 1, 4)
+    position, velocity = (np.asarray(a, float)[:, 60 * settle :] for a in (made.states.position, made.states.velocity))
+    count = len(case.discs)
+    way = np.linalg.norm(position[:, :, :count] - position[:, :1, :count], axis=-1)
+    speed = np.linalg.norm(velocity[:, :, :count], axis=-1)
+    depth = [overlaps(one, x) for one, x in zip(worlds, position, strict=True)]
+    return np.max(depth, axis=1), way.max((1, 2)), speed.max((1, 2))
+
+
+# Rest ---------------------------------------------------------------------------------------------------------------
+
+
+def test_one_disc_rests():
+    made = watch([Case([{"x": (0, RADIUS), "elasticity": e, "friction": 0.5}], [FLOOR], DOWN) for e in (0, 0.5)], 2401)
+    holds("Rest: one disc, way in 10 s, m", made.x[..., 0, :] - [0, RADIUS], 1e-3)
+    holds("Rest: one disc, speed, m/s", made.v[..., 0, :], 1e-3)
+
+
+def test_column_of_ten_in_a_channel_rests():
+    discs = [{"x": (0, RADIUS * (1 + 2 * k)), "elasticity": 0.5, "friction": 0.5} for k in range(10)]
+    case = Case(discs, [FLOOR, wall(-RADIUS), wall(RADIUS)], DOWN)
+    depth, way, speed = rested(case, 16, settle=5)
+    holds("Rest: column of 10, overlap, m", np.maximum(depth, 0), 0.005)
+    holds("Rest: column of 10, way in 10 s, m", way, 1e-3)
+    holds("Rest: column of 10, speed, m/s", speed, 1e-3)
+
+
+def test_zigzag_channel_of_sixteen_rests():
+    """Smooth discs in a channel 1.6 diameters wide press against both walls: the hardest to carry."""
+    width = 1.6 * 2 * RADIUS
+    side, rise = width / 2 - RADIUS, np.sqrt((2 * RADIUS) ** 2 - (width - 2 * RADIUS) ** 2)
+    discs = [{"x": ((-1) ** k * side, RADIUS + k * rise), "elasticity": 0} for k in range(16)]
+    case = Case(discs, [FLOOR, wall(-width / 2), wall(width / 2)], DOWN)
+    depth, way, speed = rested(case, 16, settle=5)
+    holds("Rest: zigzag channel of 16, overlap, m", np.maximum(depth, 0), 0.011)
+    holds("Rest: zigzag channel of 16, way in 10 s, m", way, 1e-3)
+    holds("Rest: zigzag channel of 16, speed, m/s", speed, 1e-3)
+
+
+def test_walled_pyramid_of_six_rows_rests():
+    rows = 6
+    places = [(k - (n - 1) / 2, 0.5 + (rows - n) * np.sqrt(0.75)) for n in range(rows, 0, -1) for k in range(n)]
+    discs = [{"x": x, "elasticity": 0, "friction": np.sqrt(0.5)} for x in places]
+    case = Case(discs, [{**FLOOR, "friction": np.sqrt(0.5)}, wall(-rows / 2), wall(rows / 2)], DOWN)
+    depth, way, speed = rested(case, 22, settle=5)
+    holds("Rest: pyramid of 6 rows, overlap, m", np.maximum(depth, 0), 0.005)
+    holds("Rest: pyramid of 6 rows, way in 10 s, m", way, 1e-3)
+    holds("Rest: pyramid of 6 rows, speed, m/s", speed, 1e-3)
+
+
+def bin_of(count: int, width: float) -> Case:
+    """Discs of four sizes that fall into a bin."""
+    rng, across = np.random.default_rng(1), int(width)
+    discs = [
+        {
+            "x": (k % across - (across - 1) / 2 + rng.uniform(-0.05, 0.05), 1 + 1.1 * (k // across)),
+            "radius": (0.3, 0.35, 0.4, 0.45)[rng.integers(4)],
+            "elasticity": 0.2,
+            "friction": np.sqrt(0.5),
+        }
+        for k in range(count)
+    ]
+    sides = [{**wall(s * width / 2), "friction": np.sqrt(0.5)} for s in (-1, 1)]
+    return Case(discs, [{**FLOOR, "friction": np.sqrt(0.5)}, *sides], DOWN)
+
+
+@pytest.mark.parametrize(("count", "width"), [(32, 6.0), pytest.param(64, 8.0, marks=pytest.mark.slow)])
+def test_full_bin_rests(count, width):
+    depth, way, speed = rested(bin_of(count, width), count, settle=15)
+    holds(f"Rest: bin of {count}, overlap, m", np.maximum(depth, 0), 0.01)
+    holds(f"Rest: bin of {count}, speed, m/s", speed, 2e-2)
+    holds(f"Rest: bin of {count}, way in 10 s, m", way, 1e-3)
+
+
+def test_bowl_of_the_article_rests():
+    """Demonstration D4: three segments, five discs of 1 m that fall into the bowl."""
+    segments = [{"a": (-4, 4), "b": (0, 0)}, {"a": (0, 0), "b": (4, 0)}, {"a": (4, 0), "b": (8, 4)}]
+    bowl = [
+        {"a": np.add(s["a"], (0, 2)), "b": np.add(s["b"], (0, 2)), "elasticity": 0.5, "friction": 1} for s in segments
+    ]
+    places = [(2, 2 + 2), (4, 3 + 2), (3, 6 + 2), (6, 5 + 2), (5, 7 + 2)]
+    discs = [{"x": x, "radius": 1, "mass": 1, "moment": 0.5, "elasticity": 0.5, "friction": 0.2} for x in places]
+    depth, way, speed = rested(Case(discs, bowl, DOWN), 8, settle=30)
+    holds("Rest: bowl of the article, overlap, m", np.maximum(depth, 0), 0.005)
+    holds("Rest: bowl of the article, way in 10 s, m", way, 1e-3)
+    holds("Rest: bowl of the article, speed, m/s", speed, 1e-3)
+
+
+@pytest.mark.parametrize(("ratio", "bound"), [(10, 0.02), (100, 0.1)])
+def test_heavy_disc_rests_on_a_light_one(ratio, bound):
+    discs = [{"x": (0, RADIUS), "mass": 1}, {"x": (0, 3 * RADIUS), "mass": ratio}]
+    for name, first, second in (("heavy on light", *discs), ("light on heavy", *discs[::-1])):
+        pair = [{**first, "x": discs[0]["x"]}, {**second, "x": discs[1]["x"]}]
+        pair = [{**d, "elasticity": 0, "friction": 0.5} for d in pair]
+        depth, way, speed = rested(Case(pair, [FLOOR, wall(-RADIUS), wall(RADIUS)], DOWN), 8, settle=5)
+        holds(f"Mass ratio {ratio}, {name}: overlap, m", np.maximum(depth, 0), bound)
+        holds(f"Mass ratio {ratio}, {name}: way in 10 s, m", way, 1e-3)
+        holds(f"Mass ratio {ratio}, {name}: speed, m/s", speed, 1e-3)
+
+
+# Grooves and joints -------------------------------------------------------------------------------------------------
+
+
+def test_c17_disc_rests_in_a_v_groove_without_swinging():
+    groove = [{"a": (0, 0), "b": turned((50, 0), d), "elasticity": 1, "friction": 1} for d in (45, 135)]
+    disc = {"x": (0, RADIUS * np.sqrt(2))}
+    cases = [Case([{**disc, "elasticity": e, "friction": mu}], groove, DOWN) for e in (0, 0.5, 1) for mu in (0, 0.5)]
+    made = watch(cases)
+    holds("C17 V-groove: way in 3 s, m", made.x[..., 0, :] - disc["x"], 1e-3)
+    holds("C17 V-groove: speed, m/s", made.v[..., 0, :], 1e-3)
+    holds("C17 V-groove: rim speed, m/s", made.spin[..., 0] * RADIUS, 1e-3)
+    holds("C17 V-groove: speed after 0.5 s, m/s", made.v[..., 120:, 0, :], 1e-4)
+
+
+def joined(pieces: int, length: float) -> list[dict]:
+    """A floor from -length / 2 to length / 2 in collinear pieces; an even number has a joint at 0."""
+    ends = np.linspace(-length / 2, length / 2, pieces + 1)
+    return [{**FLOOR, "a": (a, 0), "b": (b, 0)} for a, b in itertools.pairwise(ends)]
+
+
+OFFSETS = np.array([0, 0.01, -0.01, 0.1, -0.1, 0.25, -0.25]) * RADIUS
+ELASTICITIES, PIECES = (0.0, 0.5, 1.0), (1, 2, 8)
+DROP = 1.0  # m
+
+
+@functools.cache
+def dropped_on_joints() -> tuple[np.ndarray, np.ndarray]:
+    """Places and velocities, [elasticity, pieces, offset, pose, frame, 2], of a disc that falls 1 m on a floor."""
+    cases = [
+        Case([{"x": (x, RADIUS + DROP), "elasticity": e, "friction": 0.5}], joined(pieces, 8.0), DOWN)
+        for e in ELASTICITIES
+        for pieces in PIECES
+        for x in OFFSETS
+    ]
+    made = watch(cases, 241, walls=16)
+    shape = (len(ELASTICITIES), len(PIECES), len(OFFSETS), *made.x.shape[1:3], 2)
+    return made.x[..., 0, :].reshape(shape), made.v[..., 0, :].reshape(shape)
+
+
+@pytest.mark.parametrize("pieces", PIECES)
+@pytest.mark.parametrize("elasticity", ELASTICITIES)
+def test_c18_disc_dropped_on_a_joint_moves_as_on_one_segment(elasticity, pieces):
+    """The article's disc fell through, or rebounded at 2.1 times the speed."""
+    x, v = (a[ELASTICITIES.index(elasticity)] for a in dropped_on_joints())
+    case = f"C18 {pieces} pieces, e = {elasticity:g}"
+    arrival = np.sqrt(2 * DROP * GRAVITY)
+    frame = round(arrival / GRAVITY / STEP) + 2
+    since = frame * STEP - arrival / GRAVITY
+    left = v[PIECES.index(pieces), :, :, frame, 1] + GRAVITY * since * (elasticity > 0)
+    holds(f"{case}: ratio of speeds", left / arrival - elasticity, 1e-3)
+    holds(f"{case}: against one segment, 1 s, m", x[PIECES.index(pieces)] - x[0], 1e-4)
+
+
+def test_c19_disc_rolls_over_joints_without_feeling_them():
+    u = 3.0
+    disc = {"x": (-4.5, RADIUS), "v": (u, 0), "spin": -u / RADIUS, "elasticity": 0, "friction": 0.5}
+    made = watch([Case([{**disc, "elasticity": e}], joined(16, 11.2), DOWN) for e in (0, 0.5)], walls=16)
+    holds("C19 rolling over joints: height, m", made.x[..., 0, 1] - RADIUS, SLOP)
+    holds("C19 rolling over joints: speed along, m/s", made.v[..., 0, 0] - u, 1e-4)
+    holds("C19 rolling over joints: speed up, m/s", made.v[..., 0, 1], 1e-4)
+    holds("C19 rolling over joints: rim speed, m/s", made.spin[..., 0] * RADIUS + u, 1e-4)
+
+
+# No tunnelling ------------------------------------------------------------------------------------------------------
+
+SPEEDS, SIZES, PHASES = (5.0, 50.0, 500.0), (0.05, 0.25, 1.0), range(16)
+SHOTS = [(r, v, STEP * phase / 16, e) for r in SIZES for v in SPEEDS for phase in PHASES for e in (0, 1)]
+
+
+def beyond(shots: list[Case]) -> np.ndarray:
+    """Places of the discs, [shot, turn, frame, slot, 2], in the frame of the shots; every step of 0.5 s, 4 turns."""
+    found = []
+    for k in range(0, len(shots), len(SHOTS)):  # one size of batch, one program
+        worlds = [posed(case, turn, 2, 2) for turn in QUARTERS for case in shots[k : k + len(SHOTS)]]
+        made = np.asarray(run(worlds, 121, 1).states.position, float)[:, :, :2].reshape(4, len(SHOTS), 121, 2, 2)
+        found.append(np.stack([x @ turn for x, turn in zip(made, QUARTERS, strict=True)], axis=1))
+    return np.concatenate(found)
+
+
+def shots_at(segments: list[dict], aims: list[float]) -> list[Case]:
+    """Discs that fly along +x at the origin, or as many radii beside it, and get there at all phases of a step."""
+    return [
+        Case([{"x": (-2 * r - v * (STEP + late), y * r), "v": (v, 0), "radius": r, "elasticity": e}], segments)
+        for y in aims
+        for r, v, late, e in SHOTS
+    ]
+
+
+def none(crossed: Any) -> None:
+    """Asserts that no shot, [shot, turn], has crossed; the message tells sizes and speeds of those that have."""
+    bad = np.resize(np.array(SHOTS), (len(crossed), 4))[crossed.any(1)]
+    kinds = sorted({(float(r), float(v)) for r, v, *_ in bad})
+    assert not len(bad), f"{len(bad)} of {len(crossed)} shots crossed; (radius, speed) in {kinds}"
+
+
+def test_no_disc_passes_a_segment():
+    x = beyond(shots_at([{"a": (0, -5), "b": (0, 5)}], [0.01]))
+    none((x[..., 0, 0] >= 0).any(2))
+
+
+def test_no_disc_passes_a_segment_near_its_end():
+    x = beyond(shots_at([{"a": (0, -5), "b": (0, 0)}], [-0.01, -0.5]))[..., 0, :]
+    none(((x[:, :, 1:, 0] >= 0) & (x[:, :, :-1, 0] < 0) & (x[:, :, 1:, 1] <= 0)).any(2))
+
+
+def test_no_disc_passes_an_end_cap():
+    """Along the segment, head on: it is thrown back or stopped."""
+    x = beyond(shots_at([{"a": (0, 0), "b": (20, 0)}], [0]))
+    none((x[..., 0, 0] >= 0).any(2))
+
+
+@pytest.mark.parametrize("half", [15, 45, 80])
+def test_no_disc_leaves_a_wedge_through_its_corner(half):
+    """Two segments that meet at 0 and open towards -x, at `half` degrees each to the axis."""
+    walls = [{"a": (0, 0), "b": turned((-400, 0), side * half)} for side in (-1, 1)]
+    away = 1.5 / np.sin(np.radians(half))
+    shots = [
+        Case([{"x": (-away * r - v * late, y * r), "v": (v, 0), "radius": r, "elasticity": e}], walls)
+        for y in (0, 0.3)
+        for r, v, late, e in SHOTS
+    ]
+    x = beyond(shots)[..., 0, :]
+    sin, cos = np.sin(np.radians(half)), np.cos(np.radians(half))
+    none((-sin * x[..., 0] <= cos * np.abs(x[..., 1])).any(2))
+
+
+@pytest.mark.parametrize("mass", [1, 100])
+def test_no_disc_passes_a_disc(mass):
+    """Head on: the order along x is kept."""
+    shots = [
+        Case([{"x": (-2 * r - v * (STEP + late), 0), "v": (v, 0), "radius": r, "elasticity": e, "mass": mass},
+              {"x": (2 * r, 0), "v": (-v / 2, 0), "radius": r, "elasticity": e, "mass": 1}])
+        for r, v, late, e in SHOTS
+    ]  # fmt: skip
+    x = beyond(shots)
+    none((x[..., 1, 0] <= x[..., 0, 0]).any(2))
+
+
+def test_far_things_are_far():
+    """The segments that fill up a case are out of reach of every fall here."""
+    assert GRAVITY * 10**2 / 2 < FAR
