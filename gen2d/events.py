@@ -54,14 +54,14 @@ def noted(event: Event, solved: Solved, relaxed: Solved, start: Array, one: Arra
         approach,
         event.normal_impulse + sum(last.normal for *_, last in points),
         event.tangent_impulse + sum(last.tangent for *_, last in points),
-        (event.flags & (BOUNCED | BEFORE)) | jnp.where(bounced, BOUNCED, jnp.where(on, ON, 0)),
+        (event.flags & (BOUNCED | BEFORE)) | jnp.where(bounced, BOUNCED, jnp.where(on, ON, 0)).astype(jnp.int32),
     )
 
 
 def begun(event: Event) -> Event:
     """The event as the next frame begins."""
     fresh = unseen(event.time.shape, event.time.dtype)
-    return fresh._replace(flags=jnp.where((event.flags & ON) > 0, ON | BEFORE, 0))
+    return fresh._replace(flags=jnp.where((event.flags & ON) > 0, ON | BEFORE, 0).astype(jnp.int32))
 
 
 class Happening(NamedTuple):
