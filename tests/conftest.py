@@ -1,9 +1,22 @@
 """Every test shares one cache of compiled programs, also the processes that tests start."""
 
+import gc
 import os
+import sys
 import tempfile
+
+import pytest
 
 _CACHE = tempfile.TemporaryDirectory(prefix="gen2d-test-cache-")
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", _CACHE.name)
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.2")
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _compiled_programs_end_with_their_file():
+    """Hundreds of compiled programs at once are more memory maps than a process may have, and XLA crashes."""
+    yield
+    if "jax" in sys.modules:
+        sys.modules["jax"].clear_caches()
+        gc.collect()
