@@ -85,6 +85,15 @@ def direction(a: Array, otherwise: Array) -> Array:
     return jnp.where(dot(a, a) > NEAREST, a * inverse_length(a), otherwise)
 
 
+def from_core(stadium: Stadium, point: Array) -> tuple[Array, Array, Array]:
+    """A point's offset [2, ...] from the nearest one of a core line; where that line is beside it, as if it had no ends
+    [...], and with them [...], in metres from its middle."""
+    offset = point - stadium.centre
+    along = dot(offset, stadium.direction)
+    inside = jnp.clip(along, -stadium.half_length, stadium.half_length)
+    return offset - inside * stadium.direction, along, inside
+
+
 # Hulls --------------------------------------------------------------------------------------------------------------
 
 

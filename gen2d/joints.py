@@ -13,7 +13,7 @@ import jax.numpy as jnp
 
 from gen2d.contacts import dot, turned
 from gen2d.ledger import Work
-from gen2d.rows import Inertia, Motion, Rules
+from gen2d.rows import Inertia, Motion, Rules, reciprocal
 from gen2d.types import Array
 
 HERTZ, DAMPING_RATIO = 60.0, 5.0  # of rigid joints; at 120 Hz a light chain with a heavy end explodes
@@ -144,8 +144,7 @@ def _k_turn(held: Held) -> Array:
 
 
 def _over(x: Array, usable: Array) -> Array:
-    usable = usable & (x > 0)
-    return jnp.where(usable, 1 / jnp.where(usable, x, 1.0), 0.0)
+    return reciprocal(x, usable & (x > 0))
 
 
 def _along(apart: Array) -> tuple[Array, Array]:

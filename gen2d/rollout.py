@@ -18,7 +18,7 @@ import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from gen2d import factors, raster, types
-from gen2d.config import Config
+from gen2d.config import Config, PhysicsOptions
 from gen2d.fields import Field
 from gen2d.rows import Rules
 from gen2d.simulate import Keep, simulate, substeps
@@ -127,7 +127,7 @@ class Rollout:
         config, layout = self.config, self.layout
         keys = factors.video_keys(root, numbers)
         drawn, scene, state, rejected, placed = jax.vmap(self._sampled)(keys)
-        rules = rules_of(config, self.steps)
+        rules = rules_of(config.physics, config.video.fps, self.steps)
         device = types.to_device(scene), types.to_device(state)
         made = types.to_stored(simulate(*device, layout, rules, config.video.frames, self.steps, self.keep))
         paint = jax.vmap(lambda s: config.look.module.paint(s, layout, config.look.options))(scene)
@@ -187,9 +187,9 @@ def parts(array: Array) -> list[np.ndarray]:
     return [np.asarray(piece.data) for piece in _pieces(array)]
 
 
-def rules_of(config: Config, steps: int) -> Rules:
-    """The solver's numbers, from the config."""
-    physics, step = config.physics, 1 / (config.video.fps * steps)
+def rules_of(physics: PhysicsOptions, fps: float, steps: int) -> Rules:
+    """The solver's numbers, from the options of physics and the steps of a frame."""
+    step = 1 / (fps * steps)
     return Rules(
         step=step,
         bounce_threshold=physics.bounce_threshold,

@@ -28,10 +28,10 @@ class Rules:
     damping: float  # 1/s, of velocity and spin
     mixing: str
 
-    def softness(self, hertz: float, damping_ratio: float | None = None) -> tuple[float, float, float]:
+    def softness(self, hertz: float, damping_ratio: float) -> tuple[float, float, float]:
         """Of an implicit damped spring at this step: bias rate (1/s), mass scale and impulse scale."""
         omega = 2 * math.pi * hertz
-        a1 = 2 * (self.damping_ratio if damping_ratio is None else damping_ratio) + self.step * omega
+        a1 = 2 * damping_ratio + self.step * omega
         a2 = self.step * omega * a1
         return omega / a1, a2 / (1 + a2), 1 / (1 + a2)
 
@@ -118,6 +118,11 @@ class Touch(NamedTuple):
     place: Array | None  # [2, ...] m: of the point; None where nobody asks
 
 
+def reciprocal(x: Array, usable: Array) -> Array:
+    """1 / x where it is usable, else 0; finite in its gradient, too."""
+    return jnp.where(usable, 1 / jnp.where(usable, x, 1.0), 0.0)
+
+
 def mixed(a: Array, b: Array, mixing: str) -> Array:
     """The coefficient of a pair."""
     return {"mean": (a + b) / 2, "product": a * b, "max": jnp.maximum(a, b), "geometric": jnp.sqrt(a * b)}[mixing]
@@ -135,8 +140,7 @@ def grip_of(row: Row, levers: tuple[Array | None, Array | None, Array | None, Ar
         return k_mass + of_a + (0.0 if b is None else row.b.moment * b**2)
 
     ks = k(normal_a, normal_b), k(tangent_a, tangent_b)
-    masses = [jnp.where(near, 1 / jnp.where(near, x, 1.0), 0.0) for x in ks]
-    return Grip(*levers, *ks, *masses)
+    return Grip(*levers, *ks, *(reciprocal(k, near) for k in ks))
 
 
 def grip_at(row: Row, point: Point) -> Grip:
@@ -190,13 +194,18 @@ def added(new: Impulse, old: Impulse) -> Impulse:
     return Impulse(new.normal - old.normal, new.tangent - old.tangent)
 
 
+def softness(row: Row, rules: Rules) -> tuple[float, float, float]:
+    """`Rules.softness` of a row's overlaps."""
+    return rules.softness(2 * rules.hertz if row.firm else rules.hertz, rules.damping_ratio)
+
+
 def biased(row: Row, touch: Touch, speed: Array, old: Impulse, rules: Rules) -> Array:
     """The accumulated normal impulse after the biased solve of a row.
 
     Apart: the gap may be closed, no more. Overlapping: a soft push. Bouncing: its target exactly. Passing: nothing, as
     the straight line of a soft contact would stop a body that only grazes the other, or that comes a step later.
     """
-    rate, mass_scale, impulse_scale = rules.softness(2 * rules.hertz if row.firm else rules.hertz)
+    rate, mass_scale, impulse_scale = softness(row, rules)
     apart, mass = touch.gap > 0, touch.grip.normal_mass
     bias = jnp.where(apart, touch.gap / rules.step, jnp.maximum(rate * touch.gap, -rules.push_speed))
     soft = old.normal - jnp.where(apart, 1.0, mass_scale) * mass * (speed + bias)
@@ -251,7 +260,6 @@ def resisted(row: Row, normal_impulse: Array, a: Motion | None, b: Motion, old: 
     """The accumulated angular impulse that stops rolling, within its bound of the normal impulse now."""
     assert row.rolling is not None, "only rows with rolling resistance have such an impulse"
     k = row.b.moment if row.a is None else row.a.moment + row.b.moment
-    usable = row.present & (k > 0)
-    mass = jnp.where(usable, 1 / jnp.where(usable, k, 1.0), 0.0)
+    mass = reciprocal(k, row.present & (k > 0))
     bound = row.rolling * normal_impulse
     return jnp.clip(old - mass * turning(a, b), -bound, bound)

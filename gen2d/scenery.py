@@ -9,12 +9,12 @@ import jax
 import jax.numpy as jnp
 
 from gen2d import joints
-from gen2d.contacts import Stadium, dot
+from gen2d.contacts import Stadium, dot, from_core
 from gen2d.forms import DiscForm, Form, StadiumForm, form_of, placed
-from gen2d.rows import Impulse, Inertia, Motion, Row, Rules, grip_of, mixed
+from gen2d.rows import Impulse, Inertia, Motion, Row, Rules, grip_of, mixed, reciprocal
 from gen2d.solver import Fixed, Group, Scenery
 from gen2d.sweeps import Setup
-from gen2d.tournament import Match, matches, sweep
+from gen2d.tournament import Match, matches, of_rows, sweep
 from gen2d.types import DYNAMIC, KINEMATIC, Array, Layout, Objects, Record, Run, Scene, State
 
 
@@ -67,8 +67,7 @@ def standing(layout: Layout) -> list[tuple[Run, int]]:
 
 
 def _inverse(value: Array, present: Array) -> Array:
-    usable = present & jnp.isfinite(value) & (value > 0)
-    return jnp.where(usable, 1 / jnp.where(usable, value, 1.0), 0.0)
+    return reciprocal(value, present & jnp.isfinite(value) & (value > 0))
 
 
 def _group(objects: Objects, layout: Layout, run: Run, first: int) -> Group:
@@ -83,7 +82,8 @@ def _group(objects: Objects, layout: Layout, run: Run, first: int) -> Group:
 def _fixed(objects: Objects, state: State, run: Run, slot: int) -> Fixed:
     some, place = slots_of(objects, slot, 1), slots_of(state, slot, 1)
     motion = Motion(place.velocity, place.angular_velocity) if run.kind == KINEMATIC else None
-    return Fixed(form_of(some, run, slice(None)), place.position, place.angle, motion)
+    form = form_of(some, run, slice(None))
+    return Fixed(form, place.position, place.angle, motion, placed(form, place.position, place.angle))
 
 
 def _side(objects: Objects, first: int, count: int, inverse: Inertia | None) -> Side:
@@ -144,9 +144,7 @@ def _onward(end: Array, others: list[Stadium]) -> tuple[Array, Array]:
     """For an end [2, 1, ...] of a segment, the two directions in which others go on from there, zero if none do."""
     found = [jnp.zeros_like(end)] * 2
     for shape in others:
-        offset = end - shape.centre
-        along = dot(offset, shape.direction)
-        aside = offset - jnp.clip(along, -shape.half_length, shape.half_length) * shape.direction
+        aside, along, _ = from_core(shape, end)
         there = (dot(aside, aside) < TOGETHER**2) & (shape.half_length > TOGETHER)
         for way, goes in ((1, along < shape.half_length - TOGETHER), (-1, along > TOGETHER - shape.half_length)):
             new, empty = there & goes, dot(found[0], found[0]) == 0
@@ -159,11 +157,7 @@ def _onward(end: Array, others: list[Stadium]) -> tuple[Array, Array]:
 
 def _joined(rows: list[Row], order: list[Match], fixed: list[Fixed]) -> list[Row]:
     """The rows of discs on fixed segments with what goes on from the segments' ends."""
-    lines = {
-        i: placed(f.form, f.position, f.angle)
-        for i, f in enumerate(fixed)
-        if isinstance(f.form, StadiumForm) and f.motion is None
-    }
+    lines = {i: f.shape for i, f in enumerate(fixed) if isinstance(f.shape, Stadium) and f.motion is None}
     if len(lines) < 2:
         return rows
     ways = {}
@@ -171,9 +165,8 @@ def _joined(rows: list[Row], order: list[Match], fixed: list[Fixed]) -> list[Row
         others = [other for j, other in lines.items() if j != i]
         reach = shape.half_length * shape.direction
         ways[i] = [_onward(shape.centre + s * reach, others) for s in (-1, 1)]
-    matched = [m for m in order for _ in range(m.rounds)]
     joined = []
-    for row, m in zip(rows, matched, strict=True):
+    for row, m in zip(rows, of_rows(order), strict=True):
         left, right = ways[m.first] if row.grip is not None and m.fixed and m.first in ways else (None, None)
         joined.append(row._replace(left=left, right=right))
     return joined
@@ -183,15 +176,12 @@ def _rows(
     objects: Objects, layout: Layout, groups: list[Group], fixed: list[Fixed], order: list[Match], mixing: str
 ) -> tuple:
     """For each row what stays the same of it and the slots of its a and b; and how many points it has."""
-    forms = [g.form for g in groups]
-    pairs = [
-        (fixed[m.first].form if m.fixed else forms[m.first], forms[m.second]) for m in order for _ in range(m.rounds)
-    ]
-    firm = [m.fixed for m in order for _ in range(m.rounds)]
+    forms, matched = [g.form for g in groups], of_rows(order)
+    pairs = [(fixed[m.first].form if m.fixed else forms[m.first], forms[m.second]) for m in matched]
 
     def play(k: int, a: Side, b: Side) -> tuple[Side, Side, tuple[Row, Array, Array]]:
         slots = jnp.broadcast_to(a.slot, b.slot.shape), b.slot
-        return a, b, (_row(a, b, pairs[k], firm[k], layout, mixing), *slots)
+        return a, b, (_row(a, b, pairs[k], matched[k].fixed, layout, mixing), *slots)
 
     _, made = sweep(*_sides(objects, layout, groups), order, play)
     return made, [1 if DiscForm in map(type, forms) else 2 for forms in pairs]

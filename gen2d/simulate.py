@@ -155,9 +155,8 @@ def _states(start: State, bodies: list[Body], layout: Layout, times: Array) -> S
             if run.kind == STATIC:
                 moves = jax.tree.map(jnp.zeros_like, moves)
             way = times[:, None] * moves[0], times * moves[1]
-            later = State(
-                of.position + way[0], of.angle + way[1], *(x + 0 * w for x, w in zip(moves, way, strict=True))
-            )
+            moves = (jnp.broadcast_to(x, w.shape) for x, w in zip(moves, way, strict=True))
+            later = State(of.position + way[0], of.angle + way[1], *moves)
         parts.append(jax.tree.map(lambda x, y: jnp.concatenate([x[None], y]), of, later))
     return jax.tree.map(lambda *x: jnp.concatenate(x, axis=-2), *parts)
 

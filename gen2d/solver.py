@@ -30,6 +30,7 @@ import jax
 import jax.numpy as jnp
 
 from gen2d import joints
+from gen2d.contacts import Shape
 from gen2d.events import Event, noted
 from gen2d.forms import Form, placed
 from gen2d.ledger import Ledger, booked, tallied
@@ -65,6 +66,7 @@ class Fixed(NamedTuple):
     position: Array  # [2, 1, ...] m
     angle: Array  # [1, ...] rad
     motion: Motion | None
+    shape: Shape  # as it lies at the start
 
     @property
     def still(self) -> Motion:
@@ -76,6 +78,10 @@ class Fixed(NamedTuple):
         if self.motion is None:
             return self.position, self.angle
         return self.position + time * self.motion.velocity, self.angle + time * self.motion.spin
+
+    def shape_at(self, now: Body) -> Shape:
+        """Its shape where it is now."""
+        return self.shape if self.motion is None else placed(self.form, now.position, now.angle)
 
 
 class Scenery(NamedTuple):
@@ -183,8 +189,7 @@ def step(world: World, scenery: Scenery, rules: Rules) -> World:
     held, motions, tied = joints.warm(scenery.ties, world.bodies, known, flying, world.ties)
     shapes = [placed(g.form, b.position, b.angle) for g, b in zip(groups, world.bodies, strict=True)]
     pushing = [f.motion for f in scenery.fixed]
-    solid = [placed(f.form, b.position, b.angle) for f, b in zip(scenery.fixed, fixed, strict=True)]
-    walls = [(shape, motion, None, None) for shape, motion in zip(solid, pushing, strict=True)]
+    walls = [(f.shape_at(b), f.motion, None, None) for f, b in zip(scenery.fixed, fixed, strict=True)]
     unlike = falls if spin_ups else [None] * len(groups)
     book, events = world.ledger, world.events
     works = [None] * len(groups) if book is None else book.groups

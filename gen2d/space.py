@@ -30,6 +30,7 @@ from gen2d.config import PhysicsOptions, build
 from gen2d.contacts import touches
 from gen2d.errors import ConfigError
 from gen2d.forms import form_of, placed
+from gen2d.rollout import rules_of
 from gen2d.rows import Rules
 from gen2d.simulate import Forces, Keep, simulate, substeps
 from gen2d.types import (  # fmt: skip
@@ -197,11 +198,16 @@ def _number(
     return number
 
 
-def _pair(name: str, value: Any) -> np.ndarray:
+def _floats(value: Any) -> np.ndarray:
+    """The value as an array of numbers; an empty one if it is none."""
     try:
-        pair = np.asarray(value, float)
+        return np.asarray(value, float)
     except (TypeError, ValueError):
-        pair = np.empty(0)
+        return np.empty(0)
+
+
+def _pair(name: str, value: Any) -> np.ndarray:
+    pair = _floats(value)
     if pair.shape != (2,) or not np.isfinite(pair).all():
         raise ConfigError(f"{name} is {value!r}, but must be two numbers, x and y")
     return pair
@@ -209,10 +215,7 @@ def _pair(name: str, value: Any) -> np.ndarray:
 
 def _corners(name: str, value: Any) -> np.ndarray:
     """Counter-clockwise corners of a convex polygon."""
-    try:
-        corners = np.asarray(value, float)
-    except (TypeError, ValueError):
-        corners = np.empty(0)
+    corners = _floats(value)
     if corners.ndim != 2 or corners.shape[-1] != 2 or not 3 <= len(corners) <= MOST_CORNERS:
         raise ConfigError(f"{name} has shape {list(corners.shape)}, but must be 3 to {MOST_CORNERS} corners (x, y)")
     if not np.isfinite(corners).all():
@@ -505,10 +508,11 @@ class Space:
             4 * layout.slots * (frames - 1) if contacts is None else int(_number("simulate: contacts", contacts, low=0))
         )
         rules, steps = self._rules(fps, substeps)
-        own = None if forces is None else (forces, tuple(int(s) for s in self.slots))
+        slots = self.slots
+        own = None if forces is None else (forces, tuple(int(s) for s in slots))
         program = _program(layout, rules, frames, steps, Keep(rows, energy), own)
         made = jax.tree.map(lambda x: np.asarray(x[0]), program(*jax.tree.map(lambda x: x[None], (scene, state))))
-        slots, states = self.slots, made.states
+        states = made.states
         return Video(
             bodies=tuple(self.bodies),
             joints=tuple(self.joints),
@@ -527,13 +531,7 @@ class Space:
         if asked is not None:
             asked = int(_number("simulate: substeps", asked, low=1))
         steps = substeps(fps, asked or physics.substeps, physics.max_step)
-        step = 1 / (fps * steps)
-        hertz = min(physics.contact_hertz, 0.125 / step)
-        rules = Rules(
-            step, physics.bounce_threshold, hertz, physics.contact_damping_ratio, physics.push_speed, physics.damping,
-            physics.mixing,
-        )  # fmt: skip
-        return rules, steps
+        return rules_of(physics, fps, steps), steps
 
     def poses(self, position: np.ndarray | None = None, angle: np.ndarray | None = None) -> Poses:
         """The bodies at position [T, K, 2] and angle [T, K] (default: as added), and what overlaps there.
@@ -638,7 +636,7 @@ def _inertia(name: str, body: Body, density: float, mass: float | None, moment: 
 @functools.partial(jax.jit, static_argnums=0)
 def _meeting(runs: tuple[Run, Run], objects: Objects, sides: Sequence[jax.Array], places: Sequence) -> list[tuple]:
     """Gap, place and normal of each point of some pairs: slots of two runs, and where they are."""
-    forms = (form_of(objects, run, side) for run, side in zip(runs, sides, strict=True))  # type: ignore[arg-type]
+    forms = (form_of(objects, run, side) for run, side in zip(runs, sides, strict=True))
     a, b = (placed(form, *place) for form, place in zip(forms, places, strict=True))
     return [(point.gap, a.centre + point.arm_a, point.normal) for point in touches(a, b)]
 

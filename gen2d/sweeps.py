@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from gen2d.contacts import FAR, NEAREST, Disc, Stadium, dot, inverse_length, touches, turned
+from gen2d.contacts import FAR, NEAREST, Disc, Stadium, dot, from_core, inverse_length, touches, turned
 from gen2d.impacts import (
     SLOWEST,
     Path,
@@ -40,10 +40,11 @@ from gen2d.rows import (
     relaxed,
     resisted,
     rubbed,
+    softness,
     spun,
     struck,
 )
-from gen2d.tournament import Match, settled, sweep
+from gen2d.tournament import Match, of_rows, settled, sweep
 from gen2d.types import Array
 
 
@@ -89,12 +90,10 @@ def _offset(row: Row, a: Any, b: Disc) -> tuple[Array, Array | None]:
 
     At an end from which another segment goes on, a disc over that one is not this one's: else it would stumble on it.
     """
-    offset = b.centre - a.centre
     if isinstance(a, Disc):
-        return _apart(offset), None
-    along = dot(offset, a.direction)
-    inside = jnp.clip(along, -a.half_length, a.half_length)
-    offset, where = _apart(offset - inside * a.direction), jnp.where(along == inside, MIDDLE, END)
+        return _apart(b.centre - a.centre), None
+    offset, along, inside = from_core(a, b.centre)
+    offset, where = _apart(offset), jnp.where(along == inside, MIDDLE, END)
     if row.left is None or row.right is None:
         return offset, where
     ways = zip(row.left, row.right, strict=True)
@@ -312,7 +311,7 @@ HELD = 1e-9  # m/s: the push of a contact that does not push
 
 def _pushes(row: Row, points: list[Touch], impulses: list[Impulse], a: Drift | None, b: Drift, rules: Rules) -> Array:
     """What a row's contact may add to its bodies' speeds, or hand on; 0 where there is none but an impact."""
-    rate, *_ = rules.softness(2 * rules.hertz if row.firm else rules.hertz)
+    rate, *_ = softness(row, rules)
     found = b.push if a is None else jnp.maximum(a.push, b.push)
     pushes = jnp.zeros_like(found)
     for at, impulse in zip(points, impulses, strict=True):
@@ -426,8 +425,9 @@ def kept_in(ways: list[Motion], shapes: list, fixed: list, found: list, setup: S
     it has met before. It is left where it is, or at the first wall on its way. Nothing of the kind can happen where no
     way is as long as a quarter of a radius and no overlap as deep as a half.
     """
-    lines = [(row, fixed[i][0], g, at[0].gap) for (row, i, g), at in zip(*_firm_rows(setup, found), strict=True)]
-    lines = [line for line in lines if line[0].grip is not None and isinstance(line[1], Stadium)]
+    rows = zip(setup.rows, of_rows(setup.order), found, strict=True)
+    lines = [(row, fixed[m.first][0], m.second, at[0].gap) for row, m, at in rows if m.fixed and row.grip is not None]
+    lines = [line for line in lines if isinstance(line[1], Stadium)]
     if not lines:
         return ways
     risky = [_risky(ways[g].velocity, gap, shapes[g]) for _, _, g, gap in lines]
@@ -453,10 +453,3 @@ def _kept_in(ways: list[Motion], shapes: list, lines: list[tuple[Row, Stadium, i
         room = jnp.maximum(1 - (a.radius + b.radius) / jnp.maximum(jnp.abs(aside), SLOWEST), 0.0)
         parts[g] = jnp.minimum(parts[g], jnp.where(through, share * room, 1.0))
     return [Motion(part * way.velocity, way.spin) for part, way in zip(parts, ways, strict=True)]
-
-
-def _firm_rows(setup: Setup, found: list) -> tuple[list[tuple[Row, int, int]], list]:
-    """Each row of a fixed body, its number and the group's; and what it found."""
-    matched = [match for match in setup.order for _ in range(match.rounds)]
-    firm = [(row, m.first, m.second) for row, m in zip(setup.rows, matched, strict=True) if m.fixed]
-    return firm, [at for at, m in zip(found, matched, strict=True) if m.fixed]

@@ -96,6 +96,11 @@ def matches(sizes: list[int], fixed: int) -> list[Match]:
     return found + [Match(f, g, 1, fixed=True) for f in range(fixed) for g in range(len(sizes))]
 
 
+def of_rows(order: list[Match]) -> list[Match]:
+    """The match of each row: a match has one row a round."""
+    return [match for match in order for _ in range(match.rounds)]
+
+
 def sweep(groups: list, fixed: list, order: list[Match], play: Callable) -> tuple[list, list]:
     """The groups after all matches, and what `play(row, a, b) -> (a, b, out)` gave for each row, counted from 0."""
     groups, outs = list(groups), []

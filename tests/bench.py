@@ -121,14 +121,16 @@ def _physics(rollout: Any) -> tuple[Callable, Callable, np.ndarray]:
     from gen2d.rollout import rules_of
     from gen2d.simulate import simulate
 
-    root, length = factors.seed_words(0, 0), (rollout.config.video.frames, rollout.steps)
+    config = rollout.config
+    root, length = factors.seed_words(0, 0), (config.video.frames, rollout.steps)
+    rules = rules_of(config.physics, config.video.fps, rollout.steps)
 
     def sampled(numbers: Any) -> Any:
         return jax.vmap(rollout._sampled)(factors.video_keys(jnp.asarray(root), numbers))[1:3]
 
     def simulated(scene: Any, state: Any) -> Any:
         device = types.to_device(scene), types.to_device(state)
-        return types.to_stored(simulate(*device, rollout.layout, rules_of(rollout.config, rollout.steps), *length))
+        return types.to_stored(simulate(*device, rollout.layout, rules, *length))
 
     return jax.jit(sampled), jax.jit(simulated), np.arange(rollout.lanes, dtype=np.uint32)
 
