@@ -5,7 +5,6 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from gen2d.rows import Row
 from gen2d.sweeps import Solved
 from gen2d.tournament import settled
 from gen2d.types import Array, Contacts
@@ -77,11 +76,11 @@ class Happening(NamedTuple):
     tangent_impulse: Array
 
 
-def happening(event: Event, row: Row) -> Happening:
+def happening(event: Event, elasticity: Array) -> Happening:
     """What happened, as the frame ends. What bounces leaves with e times the speed that it came with."""
     on, bounced, before = ((event.flags & flag) > 0 for flag in (ON, BOUNCED, BEFORE))
     kind = jnp.where(before, jnp.where(on, PERSIST, END), jnp.where(event.time >= 0, BEGIN, NOTHING))
-    separation = jnp.where(bounced, row.elasticity * event.approach, 0.0)
+    separation = jnp.where(bounced, elasticity * event.approach, 0.0)
     return Happening(jnp.where(bounced, IMPACT, kind).astype(jnp.uint8), *event[:4], separation, *event[4:6])
 
 

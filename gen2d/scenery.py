@@ -9,9 +9,10 @@ import jax
 import jax.numpy as jnp
 
 from gen2d import joints
-from gen2d.contacts import Stadium, dot, from_core
+from gen2d.contacts import FAR, Stadium, dot, from_core
+from gen2d.dense import Dense
 from gen2d.forms import DiscForm, Form, StadiumForm, form_of, placed
-from gen2d.rows import Impulse, Inertia, Motion, Row, Rules, grip_of, mixed, reciprocal
+from gen2d.rows import Inertia, Motion, Row, Rules, grip_of, mixed, reciprocal
 from gen2d.solver import Fixed, Group, Scenery
 from gen2d.sweeps import Setup
 from gen2d.tournament import Match, matches, of_rows, sweep
@@ -172,10 +173,9 @@ def _joined(rows: list[Row], order: list[Match], fixed: list[Fixed]) -> list[Row
     return joined
 
 
-def _rows(
-    objects: Objects, layout: Layout, groups: list[Group], fixed: list[Fixed], order: list[Match], mixing: str
-) -> tuple:
-    """For each row what stays the same of it and the slots of its a and b; and how many points it has."""
+def _rows(objects: Objects, layout: Layout, groups: list[Group], fixed: list[Fixed], mixing: str) -> tuple:
+    """What stays the same of each row, how many points it has, the slots of its a and b; and the rows' order."""
+    order = matches([padded(run.count) for run, _ in moving(layout)], len(fixed))
     forms, matched = [g.form for g in groups], of_rows(order)
     pairs = [(fixed[m.first].form if m.fixed else forms[m.first], forms[m.second]) for m in matched]
 
@@ -184,7 +184,9 @@ def _rows(
         return a, b, (_row(a, b, pairs[k], matched[k].fixed, layout, mixing), *slots)
 
     _, made = sweep(*_sides(objects, layout, groups), order, play)
-    return made, [1 if DiscForm in map(type, forms) else 2 for forms in pairs]
+    rows = _joined([row for row, *_ in made], order, fixed)
+    points = [1 if DiscForm in map(type, forms) else 2 for forms in pairs]
+    return rows, points, [slots for _, *slots in made], order
 
 
 def _end(slot: int, anchor: Array, layout: Layout, groups: list[Group]) -> joints.End:
@@ -220,30 +222,25 @@ def _ties(scene: Scene, layout: Layout, groups: list[Group]) -> list[joints.Tied
     return found
 
 
-def scenery_of(scene: Scene, state: State, layout: Layout, rules: Rules, forces: Any, contacts: bool) -> tuple:
-    """What stays the same for a whole video, how many points each row has, and the slots (a, b) of its objects.
-
-    `contacts` says whether touches shall say where they are.
-    """
+def scenery_of(scene: Scene, state: State, layout: Layout, rules: Rules, forces: Any, contacts: bool) -> Scenery:
+    """What stays the same for a whole video; `contacts` says whether touches shall say where they are."""
     objects = scene.objects
     groups = [_group(objects, layout, run, first) for run, first in moving(layout)]
     fixed = [_fixed(objects, state, run, slot) for run, slot in standing(layout)]
-    order = matches([padded(run.count) for run, _ in moving(layout)], len(fixed))
-    made, points = _rows(objects, layout, groups, fixed, order, rules.mixing)
     one = 1.0 + jax.lax.stop_gradient(jnp.maximum(-jnp.max(objects.radius), 0.0))  # 1, but the compiler cannot know
     # In a pile at rest, what has to be stopped anew each step is what gravity gave: that must not count as a bounce.
     at_rest = 2 * rules.step * jnp.sqrt(jnp.sum(scene.gravity**2, axis=0))
-    threshold = jnp.maximum(rules.bounce_threshold, at_rest)
-    setup = Setup(_joined([row for row, *_ in made], order, fixed), order, scene.gravity, threshold, one, contacts)
-    scenery = Scenery(groups, fixed, setup, _ties(scene, layout, groups), forces)
-    return scenery, points, [slots for _, *slots in made]
+    setup = Setup(scene.gravity[:, None], jnp.maximum(rules.bounce_threshold, at_rest), one, contacts)
+    rows, points, slots, order = _rows(objects, layout, groups, fixed, rules.mixing)
+    contact = Dense(rows, points, slots, order, setup, rules)
+    rails = [_rail(f, objects.present[s : s + 1]) for f, (_, s) in zip(fixed, standing(layout), strict=True)]
+    return Scenery(
+        groups, fixed, [r for r in rails if r is not None], scene.gravity, contact, _ties(scene, layout, groups), forces
+    )
 
 
-def nothing_yet(scenery: Scenery, points: list[int]) -> list[tuple]:
-    """The memory of rows that have not been solved yet."""
-
-    def zero(row: Row) -> Array:
-        return jnp.zeros(row.present.shape, row.friction.dtype)
-
-    rows = zip(scenery.setup.rows, points, strict=True)
-    return [([Impulse(zero(r), zero(r))] * n, None if r.rolling is None else zero(r)) for r, n in rows]
+def _rail(body: Fixed, present: Array) -> Stadium | None:
+    """A fixed segment that stands still, and None if it is no such thing; of negative length where it is absent."""
+    if body.motion is not None or not isinstance(body.shape, Stadium):
+        return None
+    return body.shape._replace(half_length=jnp.where(present, body.shape.half_length, -FAR))

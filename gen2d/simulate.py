@@ -10,10 +10,9 @@ import jax.numpy as jnp
 
 from gen2d import joints, ledger
 from gen2d.errors import ConfigError
-from gen2d.events import begun, compact, happening, unseen
 from gen2d.rows import Motion, Rules
-from gen2d.scenery import cleaned, moving, nothing_yet, padded, scenery_of, slots_of
-from gen2d.solver import Body, Scenery, Seen, World, step
+from gen2d.scenery import cleaned, moving, padded, scenery_of, slots_of
+from gen2d.solver import Body, Scenery, World, step
 from gen2d.types import DYNAMIC, STATIC, Array, Energy, Layout, Quality, Scene, State, Trajectory
 
 MOST_STEPS = 10_000  # a frame
@@ -57,26 +56,24 @@ def simulate(
     chex.assert_equal_shape([state.angle, state.angular_velocity, scene.objects.present, scene.objects.mass])
     scene, state = cleaned(scene, state)
     hook = _hook(scene, state, layout, forces)
-    scenery, points, slots = scenery_of(scene, state, layout, rules, hook, keep.contacts > 0)
-    start = _start(state, layout, scenery, points, keep, rules)
+    scenery = scenery_of(scene, state, layout, rules, hook, keep.contacts > 0)
+    start, contacts = _start(state, layout, scenery, keep, rules), scenery.contacts
 
     def frame(world: World, number: Array) -> tuple[World, tuple]:
-        world = world._replace(time=number * (steps * rules.step))
-        if world.events is not None:
-            world = world._replace(events=[begun(event) for event in world.events])
+        world = world._replace(time=number * (steps * rules.step), contacts=contacts.frame_begins(world.contacts))
         world = jax.lax.fori_loop(0, steps, lambda _, now: step(now, scenery, rules), world)
-        return world, _kept(world, scenery)
+        past, happened = contacts.frame_ends(world.contacts)
+        bodies = [body._replace(rest=None) for body in world.bodies]
+        return world._replace(contacts=past), (bodies, _sums(world, scenery), happened)
 
     numbers = jnp.arange(frames - 1, dtype=state.angle.dtype)
     last, (bodies, sums, happened) = jax.lax.scan(frame, start, numbers)
     states = _states(state, bodies, layout, numbers * (steps * rules.step) + steps * rules.step)
     first = _sums(start, scenery)
     energy = None if first is None else _energy(first, sums)
-    contacts = None
-    if keep.contacts:
-        a, b = (jnp.concatenate(side, axis=0) for side in zip(*slots, strict=True))
-        contacts = compact(happened, a, b, 1 / (steps * rules.step), keep.contacts)
-    return Trajectory(states, _quality(last, energy), contacts, energy)
+    residual = None if energy is None else jnp.max(jnp.abs(energy.residual), axis=0)
+    depth, begins, rows = contacts.ended(last.contacts, happened, keep.contacts, 1 / (steps * rules.step))
+    return Trajectory(states, Quality(depth, begins, residual), rows, energy)
 
 
 def _books(bodies: list[Body], scenery: Scenery, rules: Rules) -> ledger.Ledger:
@@ -93,32 +90,19 @@ def _books(bodies: list[Body], scenery: Scenery, rules: Rules) -> ledger.Ledger:
     return ledger.Ledger(groups, ledger.Work(lost, put_in, damped))
 
 
-def _start(state: State, layout: Layout, scenery: Scenery, points: list[int], keep: Keep, rules: Rules) -> World:
+def _start(state: State, layout: Layout, scenery: Scenery, keep: Keep, rules: Rules) -> World:
     bodies = []
     for run, first in moving(layout):
         of = slots_of(state, first, run.count, padded(run.count))
         nothing = Motion(jnp.zeros_like(of.position), jnp.zeros_like(of.angle))
         bodies.append(Body(of.position, of.angle, Motion(of.velocity, of.angular_velocity), nothing))
-    lanes, kind = state.angle.shape[1:], state.angle.dtype
-    sizes = {row.present.shape[0] for row in scenery.setup.rows}
     return World(
         bodies=bodies,
-        time=jnp.zeros((), kind),
-        memory=nothing_yet(scenery, points),
+        time=jnp.zeros((), state.angle.dtype),
+        contacts=scenery.contacts.start(keep.contacts),
         ties=[joints.nothing(tied) for tied in scenery.ties],
-        seen={n: Seen(jnp.zeros((n, *lanes), kind), jnp.zeros((n, *lanes), jnp.int32)) for n in sizes},
         ledger=_books(bodies, scenery, rules) if keep.energy else None,
-        events=[unseen(row.present.shape, kind) for row in scenery.setup.rows] if keep.contacts else None,
     )
-
-
-def _kept(world: World, scenery: Scenery) -> tuple:
-    """What a frame leaves: the bodies, the sums of energy and momentum, and what happened."""
-    happened = None
-    if world.events is not None:
-        rows = [happening(*of) for of in zip(world.events, scenery.setup.rows, strict=True)]
-        happened = jax.tree.map(lambda *x: jnp.concatenate(x, axis=-2), *rows)
-    return [body._replace(rest=None) for body in world.bodies], _sums(world, scenery), happened
 
 
 def _sums(world: World, scenery: Scenery) -> tuple | None:
@@ -126,8 +110,8 @@ def _sums(world: World, scenery: Scenery) -> tuple | None:
         return None
     fixed = {i: Body(*f.at(world.time), f.still) for i, f in enumerate(scenery.fixed)}
     springs = joints.springs_energy(scenery.ties, world.bodies, fixed)
-    springs = springs + jnp.zeros_like(scenery.setup.gravity[0])
-    now = ledger.balance(scenery.groups, world.bodies, scenery.setup.gravity, springs)
+    springs = springs + jnp.zeros_like(scenery.gravity[0])
+    now = ledger.balance(scenery.groups, world.bodies, scenery.gravity, springs)
     return now, ledger.closed(world.ledger, springs)
 
 
@@ -178,13 +162,3 @@ def _hook(scene: Scene, start: State, layout: Layout, forces: Forces | None) -> 
         return [slots_of(pushes, first, run.count, padded(run.count)) for run, first in mine]
 
     return on_groups
-
-
-def _quality(world: World, energy: Energy | None) -> Quality:
-    lanes = world.bodies[0].angle.shape[1:]
-    depth, begins = jnp.zeros(lanes, world.time.dtype), jnp.zeros(lanes, jnp.int32)
-    for seen in world.seen.values():
-        depth = jnp.maximum(depth, jnp.max(seen.depth, axis=0))
-        begins = begins + jnp.sum(seen.begins, axis=0)
-    residual = None if energy is None else jnp.max(jnp.abs(energy.residual), axis=0)
-    return Quality(depth, begins, residual)

@@ -30,12 +30,11 @@ import jax
 import jax.numpy as jnp
 
 from gen2d import joints
-from gen2d.contacts import Shape
-from gen2d.events import Event, noted
+from gen2d.contacts import Shape, Stadium
 from gen2d.forms import Form, placed
 from gen2d.ledger import Ledger, booked, tallied
 from gen2d.rows import Inertia, Motion, Rules
-from gen2d.sweeps import HELD, Drift, Setup, Solved, kept_in, relax, solve, warm
+from gen2d.sweeps import HELD, Drift, kept_in
 from gen2d.tournament import settled
 from gen2d.types import Array
 
@@ -89,16 +88,11 @@ class Scenery(NamedTuple):
 
     groups: list[Group]
     fixed: list[Fixed]
-    setup: Setup
+    rails: list[Stadium]  # fixed segments that stand still; where there is none, of negative length
+    gravity: Array  # [2, ...] m/s^2
+    contacts: Any  # how pairs are solved: Dense or Sparse
     ties: list[joints.Tied]
     forces: Callable | None  # (bodies, time) -> for each group force [2, N, ...] N and torque [N, ...] N m
-
-
-class Seen(NamedTuple):
-    """What has been seen so far in rows of one size."""
-
-    depth: Array  # m: deepest overlap
-    begins: Array  # contacts that began
 
 
 class World(NamedTuple):
@@ -106,28 +100,14 @@ class World(NamedTuple):
 
     bodies: list[Body]
     time: Array  # s
-    memory: list[tuple]  # of each row: the impulses at its points, and that against rolling
+    contacts: Any  # what the contacts hand on from step to step
     ties: list[Any]  # of each joint: its impulses
-    seen: dict[int, Seen]  # by size of row
     ledger: Ledger | None
-    events: list[Event] | None
-
-
-def _seen(rows: list[Solved], seen: dict[int, Seen], memory: list[tuple], setup: Setup) -> dict[int, Seen]:
-    """The deepest overlap so far and the contacts that began so far; a bounce begins a contact."""
-    seen = dict(seen)
-    for row, solved, (olds, _) in zip(setup.rows, rows, memory, strict=True):
-        depth, begins = seen[size := row.present.shape[0]]
-        for touch in solved.touches:
-            depth = jnp.maximum(depth, jnp.where(touch.grip.normal_mass > 0, -touch.gap, 0.0))
-        now, before = (sum(i.normal for i in x[1:]) + x[0].normal for x in (solved.impulses, olds))
-        seen[size] = Seen(depth, begins + ((now > 0) & (before == 0)))
-    return seen
 
 
 def _accelerations(world: World, scenery: Scenery) -> tuple[list[Array], list[Array] | None]:
     """Of each group: that of its centres [2, N, ...], and that of its angles [N, ...]; None where there is none."""
-    groups, gravity = scenery.groups, scenery.setup.gravity
+    groups, gravity = scenery.groups, scenery.gravity
     falls = [gravity[:, None] * (g.inverse.mass > 0) for g in groups]
     if scenery.forces is None:
         return falls, None
@@ -178,49 +158,45 @@ def _arrived(body: Body, way: Motion, one: Array) -> tuple[tuple[Array, Array], 
 
 def step(world: World, scenery: Scenery, rules: Rules) -> World:
     """The world one step later."""
-    h, groups, setup = rules.step, scenery.groups, scenery.setup
+    h, groups, contacts, past = rules.step, scenery.groups, scenery.contacts, world.contacts
+    one = contacts.setup.one
     falls, spin_ups = _accelerations(world, scenery)
     turns = spin_ups or [0.0] * len(groups)
     free = [_free(*of, rules) for of in zip(world.bodies, falls, turns, strict=True)]
-    flying, more = settled([motion for motion, _ in free], setup.one), [way for _, way in free]
+    flying, more = settled([motion for motion, _ in free], one), [way for _, way in free]
     fixed = [Body(*body.at(world.time), body.still) for body in scenery.fixed]
     known = dict(enumerate(fixed))
 
     held, motions, tied = joints.warm(scenery.ties, world.bodies, known, flying, world.ties)
     shapes = [placed(g.form, b.position, b.angle) for g, b in zip(groups, world.bodies, strict=True)]
-    pushing = [f.motion for f in scenery.fixed]
-    walls = [(f.shape_at(b), f.motion, None, None) for f, b in zip(scenery.fixed, fixed, strict=True)]
+    walls = [(f.shape_at(b), f.motion) for f, b in zip(scenery.fixed, fixed, strict=True)]
     unlike = falls if spin_ups else [None] * len(groups)
-    book, events = world.ledger, world.events
+    book = world.ledger
     works = [None] * len(groups) if book is None else book.groups
-    motions, works, found = warm(shapes, motions, unlike, works, walls, world.memory, setup)
+    bodies = list(zip(shapes, unlike, strict=True))
+    motions, works, found = contacts.warm(past, bodies, walls, motions, works)
     pushes = [_warmth(*of) for of in zip(motions, flying, groups, strict=True)]
 
     ways = [Motion(*(jnp.zeros_like(x) for x in m)) for m in motions]
     held, motions, ways, tied_more = joints.solve(held, motions, ways, falls, known, rules, biased=True)
     drifts = [Drift(way, push) for way, push in zip(ways, pushes, strict=True)]
-    still = [(motion, None, None) for motion in pushing]
-    motions, drifts, works, rows = solve(motions, drifts, works, still, found, world.memory, setup, rules)
+    motions, drifts, works, rows = contacts.solve(past, found, walls, motions, drifts, works)
 
     ways = [_moved(*of, h) for of in zip(motions, drifts, more, strict=True)]
-    ways = kept_in(ways, shapes, walls, found, setup)
-    places = [_arrived(b, way, setup.one) for b, way in zip(world.bodies, ways, strict=True)]
+    ways = kept_in(ways, shapes, scenery.rails)
+    places = [_arrived(b, way, one) for b, way in zip(world.bodies, ways, strict=True)]
 
     held, motions, _, tied_last = joints.solve(held, motions, ways, falls, known, rules, biased=False)
-    motions, works, relaxed, memory = relax(motions, drifts, works, still, rows, setup)
+    motions, works, past = contacts.relax(past, rows, walls, motions, drifts, works, world.time)
     if book is not None:
         olds = [body.motion for body in world.bodies]
         done = zip(works, groups, olds, flying, more, ways, falls, turns, strict=True)
         tally = tallied(book.joints, [*tied, *tied_more, *tied_last])
-        book = Ledger([booked(*of, gravity=setup.gravity, h=h) for of in done], tally)
-    if events is not None:
-        events = [noted(e, *of, world.time, setup.one) for e, *of in zip(events, rows, relaxed, strict=True)]
+        book = Ledger([booked(*of, gravity=scenery.gravity, h=h) for of in done], tally)
     return World(
         bodies=[Body(*place, motion, rest) for (place, rest), motion in zip(places, motions, strict=True)],
         time=world.time + h,
-        memory=memory,
+        contacts=past,
         ties=[joint.impulses for joint in held],
-        seen=_seen(rows, world.seen, world.memory, setup),
         ledger=book,
-        events=events,
     )

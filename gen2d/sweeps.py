@@ -1,6 +1,6 @@
-"""The three passes over every row that a step makes: warm starting, the biased solve, the relaxing solve.
+"""What the three passes of a step do to a row: warm starting, the biased solve, the relaxing solve.
 
-Each pass plays every match once (tournament.py) and hands the motions from row to row.
+A row is any number of pairs; dense.py hands it all pairs of a round, sparse.py those that are near each other.
 """
 
 from collections.abc import Callable
@@ -44,16 +44,14 @@ from gen2d.rows import (
     spun,
     struck,
 )
-from gen2d.tournament import Match, of_rows, settled, sweep
+from gen2d.tournament import settled
 from gen2d.types import Array
 
 
 class Setup(NamedTuple):
-    """What the passes need to know of a video: rows in the order in which they are played, and what to keep."""
+    """What the passes need to know of a video."""
 
-    rows: list[Row]
-    order: list[Match]
-    gravity: Array  # [2, ...] m/s^2
+    gravity: Array  # [2, 1, ...] m/s^2
     threshold: Array  # [...] m/s: slower impacts do not bounce
     one: Array  # see settled()
     contacts: bool  # whether touches shall say where they are
@@ -64,6 +62,13 @@ class Drift(NamedTuple):
 
     way: Motion  # m, rad: impacts act at their time, not at the start of the step
     push: Array  # [N, ...] m/s: what pushing overlaps apart may have added to its speed; 0: no contact holds it
+
+
+class Memory(NamedTuple):
+    """What a row leaves to the next step."""
+
+    impulses: list[Impulse]  # at its points; `kept` says what of them counts
+    roll: Array | None  # N m s, against rolling
 
 
 class Solved(NamedTuple):
@@ -272,38 +277,30 @@ def _exchange(
     return a, b, Solved(was.touches, impulses, roll), spent(work, row, was.touches, more, twist, before, (a, b))
 
 
-def warm(
-    shapes: list, motions: list, falls: list, works: list, fixed: list, memory: list[tuple], setup: Setup
-) -> tuple[list[Motion], list[Work | None], list[list[Found]]]:
-    """The motions with the last step's impulses, the work by then, and the points of every row.
+def warm(row: Row, memory: Memory, a: tuple, b: tuple, setup: Setup) -> tuple[tuple, tuple, list[Found]]:
+    """Both sides with the last step's impulses, and the row's points.
 
-    `falls` are the bodies' accelerations, or None where all fall alike; `fixed` holds (shape, motion, None, None),
-    motion None where it stands still.
+    A side is its shape, motion, acceleration (None where all fall alike) and work; a fixed one has no motion where it
+    stands still.
     """
-
-    def play(k: int, a: tuple, b: tuple) -> tuple:
-        row, (olds, roll) = setup.rows[k], memory[k]
-        (shape_a, motion_a, fall_a, _), (shape_b, motion_b, fall_b, work) = a, b
-        fall = setup.gravity[:, None] if row.firm else None
-        if fall_b is not None:
-            fall = fall_b if row.firm else fall_b - fall_a
-        points = _found(row, shape_a, shape_b, [jnp.abs(old.normal) for old in olds], fall, setup)
-        olds = kept(olds)
-        new_a, new_b = motion_a, motion_b
-        for at, old in zip(points, olds, strict=True):
-            new_a, new_b = pushed(row, at, old, new_a, new_b)
-        if roll is not None:
-            new_a, new_b = spun(row, roll, new_a, new_b)
-        if row.grip is not None and roll is None:
-            speeds = relative(row.grip, points[0].normal, motion_a, motion_b)
-            work = spent_by_discs(work, row.grip, olds[0], *speeds)
-        else:
-            work = spent(work, row, points, olds, roll, (motion_a, motion_b), (new_a, new_b))
-        new_b = settled(new_b, setup.one) if row.firm else new_b
-        return (shape_a, new_a, fall_a, a[3]), (shape_b, new_b, fall_b, work), points
-
-    groups, points = sweep(list(zip(shapes, motions, falls, works, strict=True)), fixed, setup.order, play)
-    return [motion for _, motion, *_ in groups], [work for *_, work in groups], points
+    (shape_a, motion_a, fall_a, _), (shape_b, motion_b, fall_b, work) = a, b
+    olds, roll = kept(memory.impulses), memory.roll
+    fall = setup.gravity if row.firm else None
+    if fall_b is not None:
+        fall = fall_b if row.firm else fall_b - fall_a
+    points = _found(row, shape_a, shape_b, [jnp.abs(old.normal) for old in memory.impulses], fall, setup)
+    new_a, new_b = motion_a, motion_b
+    for at, old in zip(points, olds, strict=True):
+        new_a, new_b = pushed(row, at, old, new_a, new_b)
+    if roll is not None:
+        new_a, new_b = spun(row, roll, new_a, new_b)
+    if row.grip is not None and roll is None:
+        speeds = relative(row.grip, points[0].normal, motion_a, motion_b)
+        work = spent_by_discs(work, row.grip, olds[0], *speeds)
+    else:
+        work = spent(work, row, points, olds, roll, (motion_a, motion_b), (new_a, new_b))
+    new_b = settled(new_b, setup.one) if row.firm else new_b
+    return (shape_a, new_a, fall_a, a[3]), (shape_b, new_b, fall_b, work), points
 
 
 HELD = 1e-9  # m/s: the push of a contact that does not push
@@ -335,40 +332,26 @@ def _drifted(drift: Drift, points: list[Touch], pushes: Array, old: Motion, new:
 
 
 def solve(
-    motions: list[Motion],
-    drifts: list[Drift],
-    works: list,
-    fixed: list,
-    found: list[list[Found]],
-    memory: list[tuple],
-    setup: Setup,
-    rules: Rules,
-) -> tuple[list[Motion], list[Drift], list[Work | None], list[Solved]]:
-    """Motions, drifts and the work after the biased pass, and every row. `fixed` holds (motion, None, None)."""
+    row: Row, memory: Memory, found: list[Found], a: tuple, b: tuple, setup: Setup, rules: Rules
+) -> tuple[tuple, tuple, Solved]:
+    """Both sides after the biased solve, and the row. A side is its motion, drift and work."""
+    (motion_a, drift_a, _), (motion_b, drift_b, work) = a, b
+    points = [_met(row, at, a[:2], b[:2], setup, rules.step) for at in found]
+    both = _both(row, points, [relative(p.grip, p.normal, motion_a, motion_b)[0] for p in points])
 
-    def play(k: int, a: tuple, b: tuple) -> tuple:
-        row, (olds, roll), (motion_a, drift_a, _), (motion_b, drift_b, work) = setup.rows[k], memory[k], a, b
-        olds = kept(olds)
-        points = [_met(row, at, a[:2], b[:2], setup, rules.step) for at in found[k]]
-        both = _both(row, points, [relative(p.grip, p.normal, motion_a, motion_b)[0] for p in points])
+    def press(i: int, touch: Touch, speed: Array, old: Impulse) -> Array:
+        alone = biased(row, touch, speed, old, rules)
+        together = both[i]
+        return alone if together is None else jnp.where(together >= 0, old.normal + together, alone)
 
-        def press(i: int, touch: Touch, speed: Array, old: Impulse) -> Array:
-            alone = biased(row, touch, speed, old, rules)
-            together = both[i]
-            return alone if together is None else jnp.where(together >= 0, old.normal + together, alone)
-
-        was = Solved(points, olds, roll)
-        new_a, new_b, solved, work = _exchange(row, was, press, motion_a, motion_b, work, setup.one)
-        pushes = _pushes(row, points, solved.impulses, drift_a, drift_b, rules)
-        drift_b = _drifted(drift_b, points, pushes, motion_b, new_b)
-        if row.a is not None and drift_a is not None and new_a is not None:
-            drift_a = _drifted(drift_a, points, pushes, motion_a, new_a)
-        new_b, drift_b = settled((new_b, drift_b), setup.one) if row.firm else (new_b, drift_b)
-        return (new_a, drift_a, a[2]), (new_b, drift_b, work), solved
-
-    groups, rows = sweep(list(zip(motions, drifts, works, strict=True)), fixed, setup.order, play)
-    motions, drifts, works = (list(values) for values in zip(*groups, strict=True))
-    return motions, drifts, works, rows
+    was = Solved(points, kept(memory.impulses), memory.roll)
+    new_a, new_b, solved, work = _exchange(row, was, press, motion_a, motion_b, work, setup.one)
+    pushes = _pushes(row, points, solved.impulses, drift_a, drift_b, rules)
+    drift_b = _drifted(drift_b, points, pushes, motion_b, new_b)
+    if row.a is not None and drift_a is not None and new_a is not None:
+        drift_a = _drifted(drift_a, points, pushes, motion_a, new_a)
+    new_b, drift_b = settled((new_b, drift_b), setup.one) if row.firm else (new_b, drift_b)
+    return (new_a, drift_a, a[2]), (new_b, drift_b, work), solved
 
 
 JOLT = 1.0  # m/s: what is faster than this is an impact, also in a pile
@@ -390,66 +373,69 @@ def kept(impulses: list[Impulse]) -> list[Impulse]:
     return [Impulse(jnp.maximum(i.normal, 0.0), i.tangent) for i in impulses]
 
 
-def relax(motions: list, drifts: list[Drift], works: list, fixed: list, rows: list[Solved], setup: Setup) -> tuple:
-    """Motions and the work after the relaxing pass, every row, and what it leaves to the next step.
+def relax(row: Row, solved: Solved, a: tuple, b: tuple, setup: Setup) -> tuple[tuple, tuple, tuple[Solved, Memory]]:
+    """Both sides after the relaxing solve, the row, and what it leaves to the next step.
 
-    `fixed` holds (motion, None, None).
+    A side is its motion, the push of its drift, and its work.
     """
+    (motion_a, push_a, _), (motion_b, push_b, work), again = a, b, []
 
-    def play(k: int, a: tuple, b: tuple) -> tuple:
-        row, solved, again = setup.rows[k], rows[k], []
-        (motion_a, push_a, _), (motion_b, push_b, work) = a, b
+    def press(_: int, touch: Touch, speed: Array, old: Impulse) -> Array:
+        threshold = _threshold(touch, jnp.where(touch.tau < 0, old.normal, 0.0), push_a, push_b, setup)
+        again.append(struck(touch, speed, threshold))
+        return relaxed(row, touch, speed, old, threshold)
 
-        def press(_: int, touch: Touch, speed: Array, old: Impulse) -> Array:
-            threshold = _threshold(touch, jnp.where(touch.tau < 0, old.normal, 0.0), push_a, push_b, setup)
-            again.append(struck(touch, speed, threshold))
-            return relaxed(row, touch, speed, old, threshold)
-
-        new_a, new_b, now, work = _exchange(row, solved, press, motion_a, motion_b, work, setup.one)
-        left = []
-        for at, hit, impulse in zip(now.touches, again, now.impulses, strict=True):
-            left.append(_left(at, (at.tau >= 0) | hit, impulse))
-        left = settled(left, setup.one)
-        new_b = settled(new_b, setup.one) if row.firm else new_b
-        return (new_a, *a[1:]), (new_b, push_b, work), (now, (left, now.roll))
-
-    values = zip(motions, [drift.push for drift in drifts], works, strict=True)
-    groups, outs = sweep(list(values), fixed, setup.order, play)
-    return [motion for motion, *_ in groups], [work for *_, work in groups], *map(list, zip(*outs, strict=True))
+    new_a, new_b, now, work = _exchange(row, solved, press, motion_a, motion_b, work, setup.one)
+    left = []
+    for at, hit, impulse in zip(now.touches, again, now.impulses, strict=True):
+        left.append(_left(at, (at.tau >= 0) | hit, impulse))
+    left = settled(left, setup.one)
+    new_b = settled(new_b, setup.one) if row.firm else new_b
+    return (new_a, *a[1:]), (new_b, push_b, work), (now, Memory(left, now.roll))
 
 
-def kept_in(ways: list[Motion], shapes: list, fixed: list, found: list, setup: Setup) -> list[Motion]:
+def seen(solved: Solved, memory: Memory) -> tuple[Array, Array]:
+    """A row's deepest overlap, m, and whether a contact began; a bounce begins one."""
+    depth = jnp.zeros_like(solved.touches[0].gap)
+    for touch in solved.touches:
+        depth = jnp.maximum(depth, jnp.where(touch.grip.normal_mass > 0, -touch.gap, 0.0))
+    now, before = (sum(i.normal for i in x[1:]) + x[0].normal for x in (solved.impulses, memory.impulses))
+    return depth, (now > 0) & (before == 0)
+
+
+def kept_in(ways: list[Motion], shapes: list, walls: list[Stadium]) -> list[Motion]:
     """The ways, none of which takes a disc deeper than half of its radius into a segment that stands still.
 
     A body meets each row once in a step, so one that is very fast, or wedged in, may be thrown back through a wall that
     it has met before. It is left where it is, or at the first wall on its way. Nothing of the kind can happen where no
     way is as long as a quarter of a radius and no overlap as deep as a half.
     """
-    rows = zip(setup.rows, of_rows(setup.order), found, strict=True)
-    lines = [(row, fixed[m.first][0], m.second, at[0].gap) for row, m, at in rows if m.fixed and row.grip is not None]
-    lines = [line for line in lines if isinstance(line[1], Stadium)]
+    lines = [(wall, g) for wall in walls for g, shape in enumerate(shapes) if isinstance(shape, Disc)]
     if not lines:
         return ways
-    risky = [_risky(ways[g].velocity, gap, shapes[g]) for _, _, g, gap in lines]
+    risky = [_risky(ways[g].velocity, wall, shapes[g]) for wall, g in lines]
     some = jnp.any(jnp.stack([jnp.any(x) for x in risky]))
     return jax.lax.cond(some, lambda: _kept_in(ways, shapes, lines), lambda: ways)
 
 
-def _risky(way: Array, gap: Array, disc: Disc) -> Array:
-    return (16 * dot(way, way) > disc.radius**2) | (gap < -0.5 * disc.radius)
+def _risky(way: Array, a: Stadium, b: Disc) -> Array:
+    offset = b.centre - a.centre
+    deep = jnp.abs(dot(turned(a.direction), offset)) < a.radius + 0.5 * b.radius
+    deep = deep & (jnp.abs(dot(a.direction, offset)) <= a.half_length + 0.9 * b.radius)
+    return (16 * dot(way, way) > b.radius**2) | deep
 
 
-def _kept_in(ways: list[Motion], shapes: list, lines: list[tuple[Row, Stadium, int, Array]]) -> list[Motion]:
+def _kept_in(ways: list[Motion], shapes: list, lines: list[tuple[Stadium, int]]) -> list[Motion]:
     parts = [jnp.ones_like(way.spin) for way in ways]  # of its way that a body goes
-    for row, a, g, gap in lines:
+    for a, g in lines:
         b, way = shapes[g], ways[g].velocity
         normal, offset = turned(a.direction), b.centre - a.centre
         aside, across = dot(normal, offset), dot(normal, way)
         left = jnp.sign(aside) * (aside + across) - a.radius - b.radius
-        through = row.present & (aside * across < 0) & (left < -0.5 * b.radius)
+        through = (aside * across < 0) & (left < -0.5 * b.radius)
         share = aside / jnp.where(through, -across, 1.0)  # where its centre is on the line
         through = through & (jnp.abs(dot(a.direction, offset + share * way)) <= a.half_length + 0.9 * b.radius)
-        through = through & _risky(way, gap, b)  # so that what other scenes do does not count
+        through = through & _risky(way, a, b)  # so that what other scenes do does not count
         room = jnp.maximum(1 - (a.radius + b.radius) / jnp.maximum(jnp.abs(aside), SLOWEST), 0.0)
         parts[g] = jnp.minimum(parts[g], jnp.where(through, share * room, 1.0))
     return [Motion(part * way.velocity, way.spin) for part, way in zip(parts, ways, strict=True)]
