@@ -3,10 +3,12 @@
 The layout says which slots hold what, so all of this is known when a program is compiled, but for the numbers.
 """
 
+import itertools
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from gen2d import joints
 from gen2d.contacts import FAR, Stadium, dot, from_core
@@ -14,8 +16,9 @@ from gen2d.dense import Dense
 from gen2d.forms import DiscForm, Form, StadiumForm, form_of, placed
 from gen2d.rows import Inertia, Motion, Row, Rules, grip_of, mixed, reciprocal
 from gen2d.solver import Fixed, Group, Scenery
+from gen2d.sparse import Kind, Post, Seat, Sparse, chunk_of
 from gen2d.sweeps import Setup
-from gen2d.tournament import Match, matches, of_rows, sweep
+from gen2d.tournament import Match, league, matches, of_rows, sweep, tournament
 from gen2d.types import DYNAMIC, KINEMATIC, Array, Layout, Objects, Record, Run, Scene, State
 
 
@@ -156,37 +159,96 @@ def _onward(end: Array, others: list[Stadium]) -> tuple[Array, Array]:
     return found[0], found[1]
 
 
-def _joined(rows: list[Row], order: list[Match], fixed: list[Fixed]) -> list[Row]:
-    """The rows of discs on fixed segments with what goes on from the segments' ends."""
+def _ways(fixed: list[Fixed]) -> dict[int, list]:
+    """Of each fixed segment that stands still what goes on from its two ends; nothing where there is one at most."""
     lines = {i: f.shape for i, f in enumerate(fixed) if isinstance(f.shape, Stadium) and f.motion is None}
     if len(lines) < 2:
-        return rows
+        return {}
     ways = {}
     for i, shape in lines.items():
         others = [other for j, other in lines.items() if j != i]
         reach = shape.half_length * shape.direction
         ways[i] = [_onward(shape.centre + s * reach, others) for s in (-1, 1)]
-    joined = []
-    for row, m in zip(rows, of_rows(order), strict=True):
-        left, right = ways[m.first] if row.grip is not None and m.fixed and m.first in ways else (None, None)
-        joined.append(row._replace(left=left, right=right))
-    return joined
+    return ways
 
 
-def _rows(objects: Objects, layout: Layout, groups: list[Group], fixed: list[Fixed], mixing: str) -> tuple:
-    """What stays the same of each row, how many points it has, the slots of its a and b; and the rows' order."""
+def _dense(
+    objects: Objects, layout: Layout, groups: list[Group], fixed: list[Fixed], setup: Setup, rules: Rules
+) -> Dense:
     order = matches([padded(run.count) for run, _ in moving(layout)], len(fixed))
-    forms, matched = [g.form for g in groups], of_rows(order)
+    forms, matched, ways = [g.form for g in groups], of_rows(order), _ways(fixed)
     pairs = [(fixed[m.first].form if m.fixed else forms[m.first], forms[m.second]) for m in matched]
 
     def play(k: int, a: Side, b: Side) -> tuple[Side, Side, tuple[Row, Array, Array]]:
-        slots = jnp.broadcast_to(a.slot, b.slot.shape), b.slot
-        return a, b, (_row(a, b, pairs[k], matched[k].fixed, layout, mixing), *slots)
+        row, m = _row(a, b, pairs[k], matched[k].fixed, layout, rules.mixing), matched[k]
+        if row.grip is not None and m.fixed and m.first in ways:
+            row = row._replace(left=ways[m.first][0], right=ways[m.first][1])
+        return a, b, (row, jnp.broadcast_to(a.slot, b.slot.shape), b.slot)
 
     _, made = sweep(*_sides(objects, layout, groups), order, play)
-    rows = _joined([row for row, *_ in made], order, fixed)
-    points = [1 if DiscForm in map(type, forms) else 2 for forms in pairs]
-    return rows, points, [slots for _, *slots in made], order
+    points = [_points(*of) for of in pairs]
+    return Dense([row for row, *_ in made], points, [slots for _, *slots in made], order, setup, rules)
+
+
+def _points(a: Form, b: Form) -> int:
+    """How many points of contact two shapes have."""
+    return 1 if DiscForm in (type(a), type(b)) else 2
+
+
+def _sparse(
+    objects: Objects, layout: Layout, groups: list[Group], fixed: list[Fixed], setup: Setup, rules: Rules
+) -> Sparse:
+    ours, theirs = _sides(objects, layout, groups)
+    ways, firsts = _ways(fixed), [first for _, first in moving(layout)]
+    standing_slots = [slot for _, slot in standing(layout)]
+    kinds, posts = [], []
+
+    def kind(forms: tuple[Form, Form], still: bool, **more: Any) -> Kind:
+        def row(a: Side, b: Side) -> Row:
+            return _row(a, b, forms, still, layout, rules.mixing)
+
+        return Kind(row=row, points=_points(*forms), **more)
+
+    for m in matches([side.slot.shape[0] for side in ours], 0):
+        a, b = _meetings(ours[m.first].slot.shape[0], ours[m.second].slot.shape[0], m)
+        slots = a + firsts[m.first], b + firsts[m.second]
+        forms = groups[m.first].form, groups[m.second].form
+        kinds.append(kind(forms, False, first=m.first, walls=(), second=m.second, a=a, b=b, slots=slots))
+        posts.append([])
+    for g, group in enumerate(groups):
+        own = [(f.form, f.motion is None, i in ways and isinstance(group.form, DiscForm)) for i, f in enumerate(fixed)]
+        alike = [(type(form), len(jax.tree.leaves(form)), *rest) for form, *rest in own]
+        for _, some in itertools.groupby(range(len(fixed)), key=lambda i: alike[i]):
+            walls = tuple(some)
+            a, b = np.indices((len(walls), ours[g].slot.shape[0]))
+            slots = np.array([standing_slots[i] for i in walls])[a], b + firsts[g]
+            forms = fixed[walls[0]].form, group.form
+            kinds.append(kind(forms, True, first=None, walls=walls, second=g, a=a, b=b, slots=slots))
+            onward = [ways[i] if alike[i][-1] else (None, None) for i in walls]
+            posts.append([Post(theirs[i], *way, theirs[i].present) for i, way in zip(walls, onward, strict=True)])
+    lanes = setup.threshold.shape[-1]
+    seats = [
+        Seat(
+            side,
+            jnp.broadcast_to(setup.gravity, (2, *side.slot.shape)),
+            jnp.broadcast_to(setup.threshold, side.slot.shape),
+        )
+        for side in ours
+    ]
+    return Sparse(kinds, seats, posts, objects.rolling_resistance is not None, setup, rules, chunk_of(lanes))
+
+
+def _meetings(first: int, second: int, match: Match) -> tuple[np.ndarray, np.ndarray]:
+    """Who meets in each round of a match, [R, P], by their numbers in their groups."""
+
+    def play(_: int, a: Array, b: Array) -> tuple[Array, Array, tuple[Array, Array]]:
+        return a, b, (a[:, 0], b[:, 0])
+
+    with jax.ensure_compile_time_eval():
+        a, b = (jnp.arange(size)[:, None] for size in (first, second))
+        *_, rounds = tournament(a, match.rounds, play) if match.first == match.second else league(a, b, play)
+        a, b = (np.array([np.asarray(side) for side in sides]) for sides in zip(*rounds, strict=True))
+    return a, b
 
 
 def _end(slot: int, anchor: Array, layout: Layout, groups: list[Group]) -> joints.End:
@@ -222,8 +284,11 @@ def _ties(scene: Scene, layout: Layout, groups: list[Group]) -> list[joints.Tied
     return found
 
 
-def scenery_of(scene: Scene, state: State, layout: Layout, rules: Rules, forces: Any, contacts: bool) -> Scenery:
-    """What stays the same for a whole video; `contacts` says whether touches shall say where they are."""
+def scenery_of(
+    scene: Scene, state: State, layout: Layout, rules: Rules, forces: Any, contacts: bool, sparse: bool
+) -> Scenery:
+    """What stays the same for a whole video; `contacts` says whether touches shall say where they are, `sparse` which
+    form of the solver it is for."""
     objects = scene.objects
     groups = [_group(objects, layout, run, first) for run, first in moving(layout)]
     fixed = [_fixed(objects, state, run, slot) for run, slot in standing(layout)]
@@ -231,11 +296,10 @@ def scenery_of(scene: Scene, state: State, layout: Layout, rules: Rules, forces:
     # In a pile at rest, what has to be stopped anew each step is what gravity gave: that must not count as a bounce.
     at_rest = 2 * rules.step * jnp.sqrt(jnp.sum(scene.gravity**2, axis=0))
     setup = Setup(scene.gravity[:, None], jnp.maximum(rules.bounce_threshold, at_rest), one, contacts)
-    rows, points, slots, order = _rows(objects, layout, groups, fixed, rules.mixing)
-    contact = Dense(rows, points, slots, order, setup, rules)
+    made = (_sparse if sparse else _dense)(objects, layout, groups, fixed, setup, rules)
     rails = [_rail(f, objects.present[s : s + 1]) for f, (_, s) in zip(fixed, standing(layout), strict=True)]
     return Scenery(
-        groups, fixed, [r for r in rails if r is not None], scene.gravity, contact, _ties(scene, layout, groups), forces
+        groups, fixed, [r for r in rails if r is not None], scene.gravity, made, _ties(scene, layout, groups), forces
     )
 
 

@@ -13,6 +13,7 @@ from gen2d.errors import ConfigError
 from gen2d.rows import Motion, Rules
 from gen2d.scenery import cleaned, moving, padded, scenery_of, slots_of
 from gen2d.solver import Body, Scenery, World, step
+from gen2d.sparse import Sparse
 from gen2d.types import DYNAMIC, STATIC, Array, Energy, Layout, Quality, Scene, State, Trajectory
 
 MOST_STEPS = 10_000  # a frame
@@ -44,20 +45,26 @@ def simulate(
     steps: int,
     keep: Keep = Keep(),
     forces: Forces | None = None,
+    sparse: bool = False,
 ) -> Trajectory:
     """The trajectory of `frames` frames, `steps` steps apart; device layout, any number of scenes at once.
 
     Scene and state have bodies before scenes: position [2, K, n] in m, angle [K, n] in rad, and so on (types.py); the
     result has frames first: position [T, 2, K, n]. What stands in empty slots is ignored; they come back as zeros.
     `forces(state, time)` gives force [2, K, n] in N and torque [K, n] in N m on every slot, in every step.
-    Raises AssertionError for records of another layout.
+    With `sparse` only what is near is solved (sparse.py): as exact, on a CPU much faster, but without a reverse-mode
+    gradient. Raises AssertionError for records of another layout.
     """
     chex.assert_shape(state.position, (2, layout.slots, ...))
     chex.assert_equal_shape([state.angle, state.angular_velocity, scene.objects.present, scene.objects.mass])
     scene, state = cleaned(scene, state)
     hook = _hook(scene, state, layout, forces)
-    scenery = scenery_of(scene, state, layout, rules, hook, keep.contacts > 0)
+    scenery = scenery_of(scene, state, layout, rules, hook, keep.contacts > 0, sparse)
     start, contacts = _start(state, layout, scenery, keep, rules), scenery.contacts
+
+    if isinstance(contacts, Sparse):
+        after = jax.eval_shape(lambda world: step(world, scenery, rules).contacts, start)
+        start = start._replace(contacts=contacts.with_room(start.contacts, after))
 
     def frame(world: World, number: Array) -> tuple[World, tuple]:
         world = world._replace(time=number * (steps * rules.step), contacts=contacts.frame_begins(world.contacts))

@@ -3,6 +3,7 @@
 A row is any number of pairs; dense.py hands it all pairs of a round, sparse.py those that are near each other.
 """
 
+import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -392,6 +393,12 @@ def relax(row: Row, solved: Solved, a: tuple, b: tuple, setup: Setup) -> tuple[t
     left = settled(left, setup.one)
     new_b = settled(new_b, setup.one) if row.firm else new_b
     return (new_a, *a[1:]), (new_b, push_b, work), (now, Memory(left, now.roll))
+
+
+def touching(solved: Solved, last: Solved) -> Array:
+    """Whether anything pressed the two of a row together in a step, in its biased solve or in its last one."""
+    pressed = [i.normal > 0 for row in (solved, last) for i in row.impulses]
+    return functools.reduce(jnp.logical_or, pressed)
 
 
 def seen(solved: Solved, memory: Memory) -> tuple[Array, Array]:
