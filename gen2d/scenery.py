@@ -16,7 +16,7 @@ from gen2d.dense import Dense
 from gen2d.forms import DiscForm, Form, StadiumForm, form_of, placed
 from gen2d.rows import Inertia, Motion, Row, Rules, grip_of, mixed, reciprocal
 from gen2d.solver import Fixed, Group, Scenery
-from gen2d.sparse import Kind, Post, Seat, Sparse, chunk_of
+from gen2d.sparse import Kind, Post, Seat, Sparse, chunk_of, ring_of
 from gen2d.sweeps import Setup
 from gen2d.tournament import Match, league, matches, of_rows, sweep, tournament
 from gen2d.types import DYNAMIC, KINEMATIC, Array, Layout, Objects, Record, Run, Scene, State
@@ -212,8 +212,12 @@ def _sparse(
     for m in matches([side.slot.shape[0] for side in ours], 0):
         a, b = _meetings(ours[m.first].slot.shape[0], ours[m.second].slot.shape[0], m)
         slots = a + firsts[m.first], b + firsts[m.second]
+        each = np.broadcast_to(np.arange(a.shape[1]), a.shape)
+        ring, pair = ring_of(a, b) if m.first == m.second else (np.empty(0, int), each)
         forms = groups[m.first].form, groups[m.second].form
-        kinds.append(kind(forms, False, first=m.first, walls=(), second=m.second, a=a, b=b, slots=slots))
+        kinds.append(
+            kind(forms, False, first=m.first, walls=(), second=m.second, a=a, b=b, slots=slots, ring=ring, pair=pair)
+        )
         posts.append([])
     for g, group in enumerate(groups):
         own = [(f.form, f.motion is None, i in ways and isinstance(group.form, DiscForm)) for i, f in enumerate(fixed)]
@@ -223,7 +227,11 @@ def _sparse(
             a, b = np.indices((len(walls), ours[g].slot.shape[0]))
             slots = np.array([standing_slots[i] for i in walls])[a], b + firsts[g]
             forms = fixed[walls[0]].form, group.form
-            kinds.append(kind(forms, True, first=None, walls=walls, second=g, a=a, b=b, slots=slots))
+            kinds.append(
+                kind(
+                    forms, True, first=None, walls=walls, second=g, a=a, b=b, slots=slots, ring=np.empty(0, int), pair=b
+                )
+            )
             onward = [ways[i] if alike[i][-1] else (None, None) for i in walls]
             posts.append([Post(theirs[i], *way, theirs[i].present) for i, way in zip(walls, onward, strict=True)])
     lanes = setup.threshold.shape[-1]

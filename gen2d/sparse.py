@@ -22,10 +22,11 @@ from gen2d.events import BEFORE, ON, Event, Happening, happening, noted, unseen
 from gen2d.rows import Impulse, Motion, Row, Rules
 from gen2d.sweeps import Drift, Memory, Setup
 from gen2d.tables import Spec, gathered, numbers, rebuilt, scattered, table, untabled
-from gen2d.tournament import league, settled, tournament
+from gen2d.tournament import league, settled
 from gen2d.types import Array, Contacts
 
-BITS = 32  # of a word
+BITS = 16  # of a word: so few that a float32 holds it exactly
+BLOCK = 32  # words that are searched at once
 NEVER = -2  # the step of what has not happened
 AHEAD = (
     3.0  # how far a step looks, in ways of the fastest body: two of that speed meet, and one may be hit by a heavier
@@ -60,13 +61,10 @@ class Kind:
     a: np.ndarray  # [R, P] who meets in each of R rounds, by their numbers in their group, or among the walls
     b: np.ndarray
     slots: tuple[np.ndarray, np.ndarray]  # [R, P] theirs
+    ring: np.ndarray  # [N - 1] of one group: see `ring_of`; else empty
+    pair: np.ndarray  # [R, bits] which pair of a round a bit stands for
     row: Callable[[Any, Any], Row]  # from both sides
     points: int
-
-    @property
-    def words(self) -> int:
-        """How many words hold a bit for each pair of a round."""
-        return -(-self.a.shape[1] // BITS)
 
 
 class Listed(NamedTuple):
@@ -160,15 +158,67 @@ def clearance(wall: Shape, centre: Array) -> Array:
     return jnp.sqrt(dot(offset, offset)) - wall.radius
 
 
-def _words(near: Array, words: int) -> Array:
-    """Booleans [P, n] as bits [W n]."""
-    near = jnp.pad(near, ((0, words * BITS - near.shape[0]), (0, 0))).reshape(words, BITS, -1)
-    bit = jnp.left_shift(jnp.uint32(1), jnp.arange(BITS, dtype=jnp.uint32))[:, None]
-    return jnp.sum(jnp.where(near, bit, jnp.uint32(0)), axis=1, dtype=jnp.uint32).reshape(-1)
+def ring_of(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Of the rounds of a tournament [R, P]: an order of all but number 0, and the pair of each round and bit.
+
+    In this order the one at t meets, in round k, the one at k - t modulo R, or number 0 if that is itself (the circle
+    method). So all who meet one of them lie side by side. Bit t stands for the pair in which the one at t is the
+    first, the last bit for number 0's.
+    """
+    rounds, _ = a.shape
+    ring = np.empty(rounds, int)
+    of_0 = np.where(a == 0, b, 0).sum(1) + np.where(b == 0, a, 0).sum(1)
+    ring[np.arange(rounds) * (rounds + 1) // 2 % rounds] = of_0
+    at = np.argsort(np.concatenate([[0], ring]))[1:] - 1 if rounds > 0 else ring
+    at = np.concatenate([[rounds], at])  # where each number stands; number 0 comes last
+    pair = np.zeros((rounds, rounds + 1), int)
+    for k, p in np.ndindex(a.shape):
+        i, j = at[a[k, p]], at[b[k, p]]
+        zero = rounds in (i, j)
+        assert zero or (i + j) % rounds == k, "a tournament is played by the circle method"
+        pair[k, rounds if zero else min(i, j)] = p
+    return ring, pair
+
+
+def words_of(near: Array, one: Array) -> Array:
+    """Booleans [R, P, n] as bits of words [R, W n]."""
+    bits = 2.0 ** (np.arange(near.shape[1]) % BITS)[:, None]
+    marked = jnp.where(near, bits.astype(np.float32), 0.0)
+    parts = [jnp.sum(marked[:, i : i + BITS], axis=1) for i in range(0, near.shape[1], BITS)]
+    return jnp.concatenate(settled(parts, one), axis=1).astype(jnp.uint32)
+
+
+def _near_in_ring(centre: Array, reach: Array, ring: np.ndarray, one: Array) -> Array:
+    """The bits of a tournament [R, W n], whose bodies have centres [2, N, n] and reaches [N, n]."""
+    rounds = len(ring)
+    own = jnp.concatenate([centre, reach[None]])
+    others = own[:, ring]
+    twice = jnp.concatenate([others, others], axis=1)
+    parts = [jnp.zeros((rounds, reach.shape[-1]), jnp.float32) for _ in range(-(-(rounds + 1) // BITS))]
+    turns = np.arange(rounds)
+    for t in range(rounds + 1):
+        if t < rounds:
+            a, b = others[:, t : t + 1], twice[:, -t % rounds : -t % rounds + rounds]
+            first = (turns - t) % rounds > t
+        else:
+            a, b = own[:, :1], own[:, ring[turns * (rounds + 1) // 2 % rounds]]
+            first = turns >= 0
+        apart, reach = b[:2] - a[:2], a[2] + b[2]
+        near = (dot(apart, apart) < reach * reach) & first[:, None]
+        parts[t // BITS] = parts[t // BITS] + jnp.where(near, np.float32(2.0 ** (t % BITS)), 0.0)
+    return jnp.concatenate(settled(parts, one), axis=1).astype(jnp.uint32)
+
+
+def _largest(values: Array) -> Array:
+    """Along the first axis; XLA's own reduction of a maximum is ten times slower on a CPU."""
+    while (count := values.shape[0]) > 1:
+        values = jnp.maximum(values[: (count + 1) // 2], values[count // 2 :])
+    return values[0]
 
 
 def listed(words: Array, chunk: int) -> Listed:
     """The rows with a bit in words [R, W n]."""
+    words = jnp.pad(words, ((0, 0), (0, -words.shape[1] % BLOCK)))
     counts = jax.lax.population_count(words).astype(jnp.int32)
     upto = _summed(counts)
     total = upto[:, -1]
@@ -178,12 +228,9 @@ def listed(words: Array, chunk: int) -> Listed:
 
 def _summed(counts: Array) -> Array:
     """Cumulative sums [R, n] along the last axis, by blocks: jnp.cumsum takes time n^2 on a CPU."""
-    rows, count = counts.shape
-    blocks = -(-count // 32)
-    parts = jnp.pad(counts, ((0, 0), (0, 32 * blocks - count))).reshape(rows, blocks, 32)
-    inside = jnp.cumsum(parts, axis=-1)
+    inside = jnp.cumsum(counts.reshape(len(counts), -1, BLOCK), axis=-1)
     whole = jnp.cumsum(inside[..., -1], axis=-1)
-    return (inside + (whole - inside[..., -1])[..., None]).reshape(rows, -1)[:, :count]
+    return (inside + (whole - inside[..., -1])[..., None]).reshape(counts.shape)
 
 
 class Spot(NamedTuple):
@@ -201,15 +248,15 @@ def _spot(rows: Listed, k: Array, chunk: int) -> Spot:
     turn = jnp.sum(rows.starts[1:] <= k)
     rank = (k - rows.starts[turn]) * chunk + jnp.arange(chunk)
     there = rank < rows.total[turn]
-    before, size = rows.before[turn], rows.before.shape[1]
-    word = jnp.zeros(chunk, jnp.int32)
-    for power in reversed(range((size - 1).bit_length())):  # the last word that as many come before
-        ahead = word + (1 << power)
-        after = before.at[jnp.minimum(ahead, size - 1)].get(mode="promise_in_bounds")
-        word = jnp.where((ahead < size) & (after <= rank), ahead, word)
+    # The last word that as many come before: by blocks of words, then in its block.
+    blocks = rows.before[turn].reshape(-1, BLOCK)
+    block = jnp.sum(blocks[:, 0] <= rank[:, None], axis=1) - 1
+    inside = blocks.at[block].get(mode=PAST)
+    which = jnp.sum(inside <= rank[:, None], axis=1) - 1
+    word, before = block * BLOCK + which, blocks.reshape(-1)
     rank = rank - before.at[word].get(mode="promise_in_bounds")
     bits, bit, rest = rows.words[turn].at[word].get(mode="promise_in_bounds"), jnp.zeros(chunk, jnp.int32), rank
-    for half in (16, 8, 4, 2, 1):
+    for half in (8, 4, 2, 1):
         low = jax.lax.population_count(bits & jnp.uint32((1 << half) - 1)).astype(jnp.int32)
         up = rest >= low
         rest, bit = jnp.where(up, rest - low, rest), jnp.where(up, bit + half, bit)
@@ -275,7 +322,7 @@ class Sparse:
         """The rows of each kind that may meet in this step."""
         fastest = jnp.zeros(self._lanes, self._dtype)
         for motion in motions:
-            fastest = jnp.maximum(fastest, jnp.max(dot(motion.velocity, motion.velocity), axis=0))
+            fastest = jnp.maximum(fastest, _largest(dot(motion.velocity, motion.velocity)))
         fastest = jnp.sqrt(fastest)
         for shape, motion in walls:
             if motion is not None:
@@ -295,26 +342,26 @@ class Sparse:
 
     def _bits(self, kind: Kind, posts: list[Post], bodies: list[tuple], walls: list[tuple], half: Array) -> Array:
         """A bit for each row that is near, in words [R, W n]."""
-        b, words = bodies[kind.second], kind.words
+        (centre, reach), one = bodies[kind.second], self.setup.one
         if kind.first is None:
-            near = [
-                (clearance(walls[i][0], b[0]) < b[1] + half) & post.present
-                for i, post in zip(kind.walls, posts, strict=True)
-            ]
-            return jnp.stack([_words(x, words) for x in near])
+            here = [jnp.where(post.present, 0.0, jnp.nan) for post in posts]
+            gaps = [clearance(walls[i][0], centre) - reach - half + x for i, x in zip(kind.walls, here, strict=True)]
+            return words_of(jnp.stack(settled(gaps, one)) < 0, one)
+        if kind.first == kind.second:
+            return _near_in_ring(centre, reach, kind.ring, one)
 
         def play(_: int, a: tuple, b: tuple) -> tuple[tuple, tuple, Array]:
             apart, reach = b[0] - a[0], a[1] + b[1]
-            return a, b, _words(dot(apart, apart) < reach * reach, words)
+            return a, b, settled(dot(apart, apart) - reach * reach, one)
 
-        if kind.first == kind.second:
-            return jnp.stack(tournament(b, len(kind.a), play)[1])
-        return jnp.stack(league(bodies[kind.first], b, play)[2])
+        return words_of(jnp.stack(league(bodies[kind.first], (centre, reach), play)[2]) < 0, one)
 
     def _place(self, kind: Kind, rows: Listed, k: Array) -> tuple[Place, Spot]:
-        spot, n, pairs = _spot(rows, k, self.chunk), self._lanes, kind.a.shape[1]
-        lane, pair = spot.word % n, jnp.minimum(spot.word // n * BITS + spot.bit, pairs - 1)
-        row = spot.round * pairs + pair
+        spot, n, (_, pairs), bits = _spot(rows, k, self.chunk), self._lanes, kind.a.shape, kind.pair.shape[1]
+        lane, bit = spot.word % n, jnp.minimum(spot.word // n * BITS + spot.bit, bits - 1)
+        row = spot.round * pairs + jnp.asarray(kind.pair.reshape(-1), jnp.int32).at[spot.round * bits + bit].get(
+            mode=PAST
+        )
         a, b = (jnp.asarray(x.reshape(-1), jnp.int32).at[row].get(mode=PAST) for x in (kind.a, kind.b))
         last = self._size(kind.second)
         ends = len(kind.walls) if kind.first is None else self._size(kind.first), last, kind.a.size
@@ -536,8 +583,10 @@ class Sparse:
         for kind, lines, marks in zip(self.kinds, past.lines, past.marks, strict=True):
             rounds, pairs = kind.a.shape
             recent = marks[:-1].reshape(rounds, pairs, n) >= 2 * past.first - 1
-            rows = listed(jax.vmap(lambda x, w=kind.words: _words(x, w))(recent), self.chunk)
-            counts = jax.lax.population_count(rows.words).astype(jnp.int32).reshape(-1, n)
+            words = words_of(recent, self.setup.one)
+            kind = dataclasses.replace(kind, pair=np.broadcast_to(np.arange(pairs), kind.a.shape))  # a bit each
+            rows = listed(words, self.chunk)
+            counts = jax.lax.population_count(words).astype(jnp.int32).reshape(-1, n)
             before = (jnp.cumsum(counts, axis=0) - counts).reshape(-1)
             spec = numbers(self._nothing(kind), (1,), self._dtype)[1]
             slots = [jnp.asarray(x.reshape(-1), jnp.int32) for x in kind.slots]
@@ -553,7 +602,8 @@ class Sparse:
                 told = told._replace(time=jnp.where(told.time >= 0, told.time, began))
                 pair = jnp.minimum(place.row // n, kind.a.size - 1)
                 a, b = (x.at[pair].get(mode=PAST) for x in slots)
-                rank = count[place.lane] + before.at[spot.round * kind.words * n + spot.word].get(mode=PAST) + spot.rank
+                word = jnp.minimum(spot.round * (before.size // len(kind.a)) + spot.word, before.size - 1)
+                rank = count[place.lane] + before.at[word].get(mode=PAST) + spot.rank
                 room = (written.shape[0] - 1) // n
                 where = jnp.where(spot.there & (rank < room), rank * n + place.lane, room * n)
                 frames = jnp.full(self.chunk, frame, jnp.int32)
