@@ -9,6 +9,7 @@ The loops end when the rows do, so there is no reverse-mode gradient here: dense
 """
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -184,7 +185,8 @@ def words_of(near: Array, one: Array) -> Array:
     """Booleans [R, P, n] as bits of words [R, W n]."""
     bits = 2.0 ** (np.arange(near.shape[1]) % BITS)[:, None]
     marked = jnp.where(near, bits.astype(np.float32), 0.0)
-    parts = [jnp.sum(marked[:, i : i + BITS], axis=1) for i in range(0, near.shape[1], BITS)]
+    columns = [marked[:, p] for p in range(near.shape[1])]
+    parts = [functools.reduce(jnp.add, columns[i : i + BITS]) for i in range(0, len(columns), BITS)]
     return jnp.concatenate(settled(parts, one), axis=1).astype(jnp.uint32)
 
 
