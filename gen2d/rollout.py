@@ -26,7 +26,8 @@ from gen2d.types import Array
 
 SLICE_BYTES = 16 * 2**20  # of raw frames drawn at once; larger buffers cost page faults
 SHARD_BYTES = 2**30  # of raw frames in a shard
-LANES, SHARD_VIDEOS = 128, 1024  # at most, unless the config says otherwise
+SHARD_VIDEOS = 1024  # at most, unless the config says otherwise
+LANES, BODIES = (128, 1024), 8192  # videos at once, and moving bodies: enough that a step is not all overhead
 VIDEOS = PartitionSpec("videos")
 
 
@@ -62,7 +63,10 @@ class Rollout:
         frame_bytes = video.frames * video.height * video.width * 3
         auto = min(SHARD_VIDEOS, _power_of_two(SHARD_BYTES // frame_bytes))
         self.videos_per_shard = config.storage.videos_per_shard or auto
-        self.lanes = config.storage.lanes or min(LANES, auto)  # not the shard size: that must not change a video
+        few, many = LANES
+        moving = sum(run.count for run in self.layout.runs if run.kind == types.DYNAMIC)
+        together = min(max(few, _power_of_two(BODIES // max(moving, 1))), many)
+        self.lanes = config.storage.lanes or min(together, auto)  # not the shard size: that must not change a video
         self.slice = divisor(self.lanes, max(1, SLICE_BYTES // frame_bytes))
         self.mesh = Mesh(np.array(self.devices), ("videos",))
         self._simulate = jax.jit(self._shared(self._made, (PartitionSpec(), VIDEOS)))
@@ -129,7 +133,9 @@ class Rollout:
         drawn, scene, state, rejected, placed = jax.vmap(self._sampled)(keys)
         rules = rules_of(config.physics, config.video.fps, self.steps)
         device = types.to_device(scene), types.to_device(state)
-        made = types.to_stored(simulate(*device, layout, rules, config.video.frames, self.steps, self.keep))
+        sparse = self.devices[0].platform == "cpu"
+        made = simulate(*device, layout, rules, config.video.frames, self.steps, self.keep, sparse=sparse)
+        made = types.to_stored(made)
         paint = jax.vmap(lambda s: config.look.module.paint(s, layout, config.look.options))(scene)
         backdrops = jax.vmap(lambda s, t, p: raster.backdrop(s, t, p, layout, self.view))(scene, state, paint)
         discs = raster.moving(scene, made.states, paint.color, layout, self.view)

@@ -98,7 +98,8 @@ class Found(NamedTuple):
     """What the first pass tells the others: how many chunks each kind has, what they keep, and how to read it."""
 
     chunks: list[Array]
-    stores: list[Any]
+    places: list[Array]
+    kept: list[Array]
     specs: list[Spec]
 
 
@@ -395,15 +396,15 @@ class Sparse:
         groups: list[Any],
         walls: list[Any],
         counts: list[Array],
-        places: Callable[[int, Array, Any], Place],
+        places: list[Array],
         carries: list[Any],
         play: Callable,
         dry: bool,
     ) -> tuple[list[Any], list[Any]]:
         """The groups, and what is carried for each kind, after all rows that are near.
 
-        `places(i, k, carried)` says where the rows of chunk k of kind i are, `play(i, k, place, a, b, carried)` gives
-        both sides and what is carried on.
+        `places` are the `Store.place` of each kind, `play(i, k, place, a, b, carried)` gives both sides of the rows of
+        its chunk k and what is carried on.
         """
         one, shapes, carries = self.setup.one, [seat.threshold.shape for seat in self.seats], list(carries)
         made = [table(group, shape, self._dtype) for group, shape in zip(groups, shapes, strict=True)]
@@ -418,7 +419,7 @@ class Sparse:
                 k: Array, state: tuple, i: int = i, kind: Kind = kind, mine: list = mine, fixed: Any = fixed
             ) -> tuple:
                 now, carried = dict(zip(mine, state[0], strict=True)), state[1]
-                place = places(i, k, carried)
+                place = Place(*places[i][k])
                 if fixed is not None:
                     a = gathered(fixed[0], place.a, fixed[1])
                 else:
@@ -455,10 +456,7 @@ class Sparse:
         lines = [numbers(self._nothing(kind), (1,), self._dtype)[1] for kind in self.kinds]
         specs: dict[int, Spec] = {}
 
-        def places(i: int, k: Array, _: Any) -> Place:
-            return self._place(self.kinds[i], near[i], k)[0]
-
-        def play(i: int, k: Array, place: Place, a: Any, b: Any, room: tuple) -> tuple:
+        def play(i: int, k: Array, place: Place, a: Any, b: Any, room: Array | None) -> tuple:
             kind = self.kinds[i]
             first, seat = gathered(posts[i][0], place.a, posts[i][1]), gathered(*_of(seats[kind.second], place.b))
             line = gathered(past.lines[i], place.row, lines[i])
@@ -471,20 +469,35 @@ class Sparse:
             a, b, points = sweeps.warm(row, memory, a, b, setup)
             kept, specs[i] = numbers((row, memory, points, seat.threshold), (self.chunk,), self._dtype)
             kept = settled(jnp.stack(kept), self.setup.one)
-            return a, b, (self._written(kind, room[0], k, jnp.stack(place)), self._written(kind, room[1], k, kept))
+            return a, b, self._written(kind, room, k, kept)
 
         dry = past.stores is None
-        rooms = [(None, None)] * len(self.kinds) if past.stores is None else [s[:2] for s in past.stores]
+        rooms = [None] * len(self.kinds) if past.stores is None else [store.found for store in past.stores]
         groups = [(shape, m, fall, w) for (shape, fall), m, w in zip(bodies, motions, works, strict=True)]
         fixed = [(*wall, None, None) for wall in walls]
         counts = [rows.starts[-1] for rows in near]
-        groups, stores = self._pass(groups, fixed, counts, places, rooms, play, dry)
-        found = Found(counts, stores, [specs[i] for i in range(len(self.kinds))])
+        places = self._places(near, past.stores)
+        groups, kept = self._pass(groups, fixed, counts, places, rooms, play, dry)
+        found = Found(counts, places, kept, [specs[i] for i in range(len(self.kinds))])
         return [motion for _, motion, *_ in groups], [work for *_, work in groups], found
+
+    def _places(self, near: list[Listed], stores: list[Store] | None) -> list[Array]:
+        """Where the rows of all chunks are: for themselves, or they would be computed again for every gather."""
+        if stores is None:
+            return [jnp.zeros((self._room(kind), len(Place._fields), self.chunk), jnp.int32) for kind in self.kinds]
+
+        def placed(i: int) -> Array:
+            def chunk(k: Array, room: Array) -> Array:
+                place, _ = self._place(self.kinds[i], near[i], k)
+                return room.at[k].set(jnp.stack(place), mode=PAST)
+
+            return jax.lax.fori_loop(0, near[i].starts[-1], chunk, stores[i].place)
+
+        return [placed(i) for i in range(len(self.kinds))]
 
     def _again(self, found: Found, i: int, k: Array) -> tuple[Row, Memory, list, Setup]:
         """What the first pass has kept of a chunk of rows."""
-        row, memory, points, threshold = rebuilt(list(found.stores[i][1][k]), found.specs[i])
+        row, memory, points, threshold = rebuilt(list(found.kept[i][k]), found.specs[i])
         return row, memory, points, self.setup._replace(threshold=threshold)
 
     def solve(
@@ -492,9 +505,6 @@ class Sparse:
     ) -> tuple[list[Motion], list[Drift], list, Any]:
         """Motions, drifts and works after the biased pass, and what it has to say of the rows."""
         specs: dict[int, Spec] = {}
-
-        def places(i: int, k: Array, _: Any) -> Place:
-            return Place(*found.stores[i][0][k])
 
         def play(i: int, k: Array, place: Place, a: Any, b: Any, carried: tuple) -> tuple:
             room, depth, begins = carried
@@ -511,7 +521,7 @@ class Sparse:
         rooms = [(None if past.stores is None else past.stores[i].solved, *nothing) for i in range(len(self.kinds))]
         groups = list(zip(motions, drifts, works, strict=True))
         fixed = [(motion, None, None) for _, motion in walls]
-        groups, carries = self._pass(groups, fixed, found.chunks, places, rooms, play, dry)
+        groups, carries = self._pass(groups, fixed, found.chunks, found.places, rooms, play, dry)
         motions, drifts, works = (list(values) for values in zip(*groups, strict=True))
         return motions, drifts, works, (found, carries, specs)
 
@@ -521,9 +531,6 @@ class Sparse:
         """Motions and works after the relaxing pass, and what all rows hand on; the step began at `time`."""
         found, before, specs = rows
         lines = [numbers(self._nothing(kind), (1,), self._dtype)[1] for kind in self.kinds]
-
-        def places(i: int, k: Array, _: Any) -> Place:
-            return Place(*found.stores[i][0][k])
 
         def play(i: int, k: Array, place: Place, a: Any, b: Any, carried: tuple) -> tuple:
             table_, marks = carried
@@ -546,14 +553,14 @@ class Sparse:
         fixed = [(motion, None, None) for _, motion in walls]
         marks = past.marks or [jnp.zeros(0)] * len(self.kinds)
         carries = list(zip(past.lines, marks, strict=True))
-        groups, carries = self._pass(groups, fixed, found.chunks, places, carries, play, past.stores is None)
+        groups, carries = self._pass(groups, fixed, found.chunks, found.places, carries, play, past.stores is None)
         depth, begins = past.depth, past.begins
         for _, deep, began in before:
             depth, begins = jnp.maximum(depth, deep), begins + began
         now = past._replace(
             lines=[table_ for table_, _ in carries],
             marks=[marks for _, marks in carries] if self.setup.contacts else [],
-            stores=[Store(*s, solved) for s, (solved, *_) in zip(found.stores, before, strict=True)],
+            stores=[Store(*of, solved) for *of, (solved, *_) in zip(found.places, found.kept, before, strict=True)],
             depth=depth,
             begins=begins,
             step=past.step + 1,

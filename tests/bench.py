@@ -130,7 +130,7 @@ def _physics(rollout: Any) -> tuple[Callable, Callable, np.ndarray]:
 
     def simulated(scene: Any, state: Any) -> Any:
         device = types.to_device(scene), types.to_device(state)
-        return types.to_stored(simulate(*device, rollout.layout, rules, *length))
+        return types.to_stored(simulate(*device, rollout.layout, rules, *length, sparse=True))
 
     return jax.jit(sampled), jax.jit(simulated), np.arange(rollout.lanes, dtype=np.uint32)
 
