@@ -29,9 +29,6 @@ from gen2d.types import Array, Contacts
 BITS = 16  # of a word: so few that a float32 holds it exactly
 BLOCK = 32  # words that are searched at once
 NEVER = -2  # the step of what has not happened
-AHEAD = (
-    3.0  # how far a step looks, in ways of the fastest body: two of that speed meet, and one may be hit by a heavier
-)
 PAST = "promise_in_bounds"
 
 
@@ -323,19 +320,22 @@ class Sparse:
 
     def _near(self, shapes: list[Shape], walls: list[tuple], motions: list[Motion]) -> list[Listed]:
         """The rows of each kind that may meet in this step."""
+        squares = [dot(motion.velocity, motion.velocity) for motion in motions]
         fastest = jnp.zeros(self._lanes, self._dtype)
-        for motion in motions:
-            fastest = jnp.maximum(fastest, _largest(dot(motion.velocity, motion.velocity)))
+        for square in squares:
+            fastest = jnp.maximum(fastest, _largest(square))
         fastest = jnp.sqrt(fastest)
         for shape, motion in walls:
             if motion is not None:
                 speed = jnp.sqrt(dot(motion.velocity, motion.velocity)) + jnp.abs(motion.spin) * around(shape)
                 fastest = jnp.maximum(fastest, speed[0])
-        half = 0.5 * AHEAD * self.rules.step * fastest
+        # Two that meet come no faster than both do now, or than the fastest of all has made one of them.
+        half = 0.5 * self.rules.step * fastest
+        ways = [self.rules.step * jnp.sqrt(square) + half for square in squares]
         # What is not there reaches not a number, which is more than nothing.
         reaches = [
-            jnp.where(seat.side.present, around(shape) + half, jnp.nan)
-            for shape, seat in zip(shapes, self.seats, strict=True)
+            jnp.where(seat.side.present, around(shape) + way, jnp.nan)
+            for shape, seat, way in zip(shapes, self.seats, ways, strict=True)
         ]
         bodies = [(shape.centre, reach) for shape, reach in zip(shapes, reaches, strict=True)]
         return [
