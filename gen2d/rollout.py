@@ -27,7 +27,7 @@ from gen2d.types import Array
 SLICE_BYTES = 16 * 2**20  # of raw frames drawn at once; larger buffers cost page faults
 SHARD_BYTES = 2**30  # of raw frames in a shard
 SHARD_VIDEOS = 1024  # at most, unless the config says otherwise
-LANES, BODIES = (128, 1024), 8192  # videos at once, and moving bodies: enough that a step is not all overhead
+LANES, ROWS = 1024, 2**20  # videos simulated at once, and pairs that can meet in all of them; 300 bytes for each
 VIDEOS = PartitionSpec("videos")
 
 
@@ -63,9 +63,9 @@ class Rollout:
         frame_bytes = video.frames * video.height * video.width * 3
         auto = min(SHARD_VIDEOS, _power_of_two(SHARD_BYTES // frame_bytes))
         self.videos_per_shard = config.storage.videos_per_shard or auto
-        few, many = LANES
         moving = sum(run.count for run in self.layout.runs if run.kind == types.DYNAMIC)
-        together = min(max(few, _power_of_two(BODIES // max(moving, 1))), many)
+        rows = moving * (self.layout.slots - moving) + moving * (moving - 1) // 2
+        together = min(LANES, _power_of_two(ROWS // max(rows, 1)))
         self.lanes = config.storage.lanes or min(together, auto)  # not the shard size: that must not change a video
         self.slice = divisor(self.lanes, max(1, SLICE_BYTES // frame_bytes))
         self.mesh = Mesh(np.array(self.devices), ("videos",))

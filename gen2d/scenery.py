@@ -14,9 +14,10 @@ from gen2d import joints
 from gen2d.contacts import FAR, Stadium, dot, from_core
 from gen2d.dense import Dense
 from gen2d.forms import DiscForm, Form, StadiumForm, form_of, placed
+from gen2d.near import ring_of
 from gen2d.rows import Inertia, Motion, Row, Rules, grip_of, mixed, reciprocal
 from gen2d.solver import Fixed, Group, Scenery
-from gen2d.sparse import Kind, Post, Seat, Sparse, chunk_of, ring_of
+from gen2d.sparse import Kind, Post, Seat, Sparse, chunk_of
 from gen2d.sweeps import Setup
 from gen2d.tournament import Match, league, matches, of_rows, sweep, tournament
 from gen2d.types import DYNAMIC, KINEMATIC, Array, Layout, Objects, Record, Run, Scene, State
@@ -187,54 +188,47 @@ def _dense(
 
     _, made = sweep(*_sides(objects, layout, groups), order, play)
     points = [_points(*of) for of in pairs]
-    return Dense([row for row, *_ in made], points, [slots for _, *slots in made], order, setup, rules)
+    return Dense([row for row, *_ in made], points, [(a, b) for _, a, b in made], order, setup, rules)
 
 
 def _points(a: Form, b: Form) -> int:
     """How many points of contact two shapes have."""
-    return 1 if DiscForm in (type(a), type(b)) else 2
+    return 1 if _is_disc(a) or _is_disc(b) else 2
 
 
 def _sparse(
     objects: Objects, layout: Layout, groups: list[Group], fixed: list[Fixed], setup: Setup, rules: Rules
 ) -> Sparse:
     ours, theirs = _sides(objects, layout, groups)
-    ways, firsts = _ways(fixed), [first for _, first in moving(layout)]
-    standing_slots = [slot for _, slot in standing(layout)]
-    kinds, posts = [], []
+    sizes, firsts = [side.slot.shape[0] for side in ours], [first for _, first in moving(layout)]
+    fixed_slots, ways, kinds = [slot for _, slot in standing(layout)], _ways(fixed), []
 
-    def kind(forms: tuple[Form, Form], still: bool, **more: Any) -> Kind:
+    def add(forms: tuple[Form, Form], of_a: np.ndarray, b: np.ndarray, **more: Any) -> None:
         def row(a: Side, b: Side) -> Row:
-            return _row(a, b, forms, still, layout, rules.mixing)
+            return _row(a, b, forms, more["first"] is None, layout, rules.mixing)
 
-        return Kind(row=row, points=_points(*forms), **more)
+        slots = of_a, b + firsts[more["second"]]
+        kinds.append(Kind(b=b, slots=slots, row=row, points=_points(*forms), **more))
 
-    for m in matches([side.slot.shape[0] for side in ours], 0):
-        a, b = _meetings(ours[m.first].slot.shape[0], ours[m.second].slot.shape[0], m)
-        slots = a + firsts[m.first], b + firsts[m.second]
-        each = np.broadcast_to(np.arange(a.shape[1]), a.shape)
-        ring, pair = ring_of(a, b) if m.first == m.second else (np.empty(0, int), each)
+    for m in matches(sizes, 0):
+        a, b = _meetings(sizes[m.first], sizes[m.second], m)
+        ring = ring_of(a, b) if m.first == m.second else None
         forms = groups[m.first].form, groups[m.second].form
-        kinds.append(
-            kind(forms, False, first=m.first, walls=(), second=m.second, a=a, b=b, slots=slots, ring=ring, pair=pair)
-        )
-        posts.append([])
+        add(forms, a + firsts[m.first], b, first=m.first, second=m.second, a=a, posts={}, ring=ring)
     for g, group in enumerate(groups):
-        own = [(f.form, f.motion is None, i in ways and isinstance(group.form, DiscForm)) for i, f in enumerate(fixed)]
-        alike = [(type(form), len(jax.tree.leaves(form)), *rest) for form, *rest in own]
-        for _, some in itertools.groupby(range(len(fixed)), key=lambda i: alike[i]):
-            walls = tuple(some)
-            a, b = np.indices((len(walls), ours[g].slot.shape[0]))
-            slots = np.array([standing_slots[i] for i in walls])[a], b + firsts[g]
-            forms = fixed[walls[0]].form, group.form
-            kinds.append(
-                kind(
-                    forms, True, first=None, walls=walls, second=g, a=a, b=b, slots=slots, ring=np.empty(0, int), pair=b
-                )
-            )
-            onward = [ways[i] if alike[i][-1] else (None, None) for i in walls]
-            posts.append([Post(theirs[i], *way, theirs[i].present) for i, way in zip(walls, onward, strict=True)])
-    lanes = setup.threshold.shape[-1]
+
+        def like(i: int, form: Form = group.form) -> tuple:
+            """What fixed bodies have in common whose rows with the group are of one kind."""
+            of = fixed[i]
+            return type(of.form), len(jax.tree.leaves(of.form)), of.motion is None, i in ways and _is_disc(form)
+
+        for alike, numbers in itertools.groupby(range(len(fixed)), key=like):
+            some = list(numbers)
+            onward = {i: ways[i] if alike[-1] else (None, None) for i in some}
+            posts = {i: Post(theirs[i], left, right, theirs[i].present) for i, (left, right) in onward.items()}
+            a, b = np.indices((len(some), sizes[g]))
+            slots = np.array([fixed_slots[i] for i in some])[a]
+            add((fixed[some[0]].form, group.form), slots, b, first=None, second=g, a=a, posts=posts, ring=None)
     seats = [
         Seat(
             side,
@@ -243,7 +237,12 @@ def _sparse(
         )
         for side in ours
     ]
-    return Sparse(kinds, seats, posts, objects.rolling_resistance is not None, setup, rules, chunk_of(lanes))
+    rolling = objects.rolling_resistance is not None
+    return Sparse(kinds, seats, rolling, setup, rules, chunk_of(setup.threshold.shape[-1]))
+
+
+def _is_disc(form: Form) -> bool:
+    return isinstance(form, DiscForm)
 
 
 def _meetings(first: int, second: int, match: Match) -> tuple[np.ndarray, np.ndarray]:

@@ -645,9 +645,11 @@ def _meeting(runs: tuple[Run, Run], objects: Objects, sides: Sequence[jax.Array]
 def _program(layout: Layout, rules: Rules, frames: int, steps: int, keep: Keep, forces: Any) -> Callable:
     """The compiled program of a layout; scenes, states and trajectories have videos first."""
     hook = None if forces is None else _by_slot(*forces)
+    sparse = jax.default_backend() == "cpu"
 
     def run(scene: Scene, state: State) -> Any:
-        return to_stored(simulate(to_device(scene), to_device(state), layout, rules, frames, steps, keep, hook))
+        device = to_device(scene), to_device(state)
+        return to_stored(simulate(*device, layout, rules, frames, steps, keep, hook, sparse))
 
     return jax.jit(run)
 

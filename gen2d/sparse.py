@@ -1,15 +1,14 @@
-"""Only the rows that are near: found anew in every step, gathered, solved a chunk at a time; what a CPU likes.
+"""Only the rows that are near each other, found anew in every step: what a CPU likes.
 
-A step looks at all pairs once, for a bit each: whether they may meet in it. The bits are counted, and the three passes
-run over chunks of rows of one round (tournament.py), of all scenes at once: such rows share no body, so the order in a
-chunk does not matter, and the rounds come in dense.py's order. What is not near would have been solved for nothing.
-Bodies, and what a row remembers, lie in tables with one line each, so that a gather copies whole lines.
+A step looks at all pairs once, for a bit each: whether they may meet in it (near.py). The three passes then run over
+those rows in chunks, of all scenes at once, round after round in the order of dense.py. Bodies, and what is remembered
+of a row, lie in tables with a line each (tables.py): a chunk's lines are gathered, solved and put back. A row that is
+not near would have changed nothing, so the result is that of dense.py, but for the rounding of other machine code.
 
 The loops end when the rows do, so there is no reverse-mode gradient here: dense.py has it.
 """
 
 import dataclasses
-import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -18,18 +17,29 @@ import jax.numpy as jnp
 import numpy as np
 
 from gen2d import sweeps
-from gen2d.contacts import Disc, Hull, Shape, Stadium, dot, from_core
+from gen2d.contacts import Shape, dot
 from gen2d.events import BEFORE, ON, Event, Happening, happening, noted, unseen
+from gen2d.near import (
+    BITS,
+    Listed,
+    Ring,
+    Spots,
+    around,
+    bits_in_ring,
+    bits_of,
+    clearance,
+    counted,
+    largest,
+    listed,
+    spots,
+)
 from gen2d.rows import Impulse, Motion, Row, Rules
 from gen2d.sweeps import Drift, Memory, Setup
-from gen2d.tables import Spec, gathered, numbers, rebuilt, scattered, table, untabled
+from gen2d.tables import SAFE, Spec, Table, numbers, rebuilt, repeated, table
 from gen2d.tournament import league, settled
 from gen2d.types import Array, Contacts
 
-BITS = 16  # of a word: so few that a float32 holds it exactly
-BLOCK = 32  # words that are searched at once
 NEVER = -2  # the step of what has not happened
-PAST = "promise_in_bounds"
 
 
 class Post(NamedTuple):
@@ -54,28 +64,23 @@ class Kind:
     """Rows that are solved by the same operations: a match of two groups, or of some fixed bodies with a group."""
 
     first: int | None  # a group; None: fixed bodies
-    walls: tuple[int, ...]  # which
+    posts: dict[int, Post]  # which
     second: int
-    a: np.ndarray  # [R, P] who meets in each of R rounds, by their numbers in their group, or among the walls
+    a: np.ndarray  # [R, P] who meets in each of R rounds, by their numbers in their group, or among the posts
     b: np.ndarray
     slots: tuple[np.ndarray, np.ndarray]  # [R, P] theirs
-    ring: np.ndarray  # [N - 1] of one group: see `ring_of`; else empty
-    pair: np.ndarray  # [R, bits] which pair of a round a bit stands for
+    ring: Ring | None  # of a group with itself
     row: Callable[[Any, Any], Row]  # from both sides
     points: int
 
-
-class Listed(NamedTuple):
-    """The rows of a kind that are near, by round, then word and scene, then bit."""
-
-    words: Array  # [R, W n] uint32
-    before: Array  # [R, W n] how many of the round come before this word's
-    total: Array  # [R]
-    starts: Array  # [R + 1] the first chunk of each round
+    @property
+    def groups(self) -> list[int]:
+        """The groups whose bodies it moves."""
+        return [self.second] if self.first in (None, self.second) else [self.first, self.second]
 
 
 class Place(NamedTuple):
-    """Where the rows of a chunk are, each [C]; all of these are past the end where there is no row."""
+    """Where the rows of a chunk are, each [C]; where there is no row, the last line of all."""
 
     a: Array  # lines of the tables of their bodies
     b: Array
@@ -86,16 +91,24 @@ class Place(NamedTuple):
 class Store(NamedTuple):
     """What a step's passes tell each other of the rows of a kind, by chunk."""
 
-    place: Array  # [K, 4, C]
+    places: Array  # [K, 4, C]
     found: Array  # [K, F, C]
     solved: Array
 
 
 class Found(NamedTuple):
-    """What the first pass tells the others: how many chunks each kind has, what they keep, and how to read it."""
+    """What the first pass tells the others, of each kind: how many chunks there are, and what it keeps of them."""
 
     chunks: list[Array]
     places: list[Array]
+    kept: list[Array]
+    specs: list[Spec]
+
+
+class Solved(NamedTuple):
+    """What the second pass tells the third."""
+
+    found: Found
     kept: list[Array]
     specs: list[Spec]
 
@@ -132,145 +145,12 @@ class Told(NamedTuple):
     b: Array
 
 
-def around(shape: Shape) -> Array:
-    """The radius of a circle around a shape's centre that holds it, m."""
-    if isinstance(shape, Disc):
-        return shape.radius
-    if isinstance(shape, Stadium):
-        return shape.half_length + shape.radius
-    offsets = [v - shape.centre for v in shape.vertices]
-    furthest = dot(offsets[0], offsets[0])
-    for offset in offsets[1:]:
-        furthest = jnp.maximum(furthest, dot(offset, offset))
-    return jnp.sqrt(furthest) + shape.radius
-
-
-def clearance(wall: Shape, centre: Array) -> Array:
-    """How far a point is from a wall, m; never more than it is."""
-    if isinstance(wall, Hull):
-        sides = [dot(n, centre - v) for n, v in zip(wall.normals, wall.vertices, strict=True)]
-        furthest = sides[0]
-        for side in sides[1:]:
-            furthest = jnp.maximum(furthest, side)
-        return furthest - wall.radius
-    offset = centre - wall.centre if isinstance(wall, Disc) else from_core(wall, centre)[0]
-    return jnp.sqrt(dot(offset, offset)) - wall.radius
-
-
-def ring_of(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Of the rounds of a tournament [R, P]: an order of all but number 0, and the pair of each round and bit.
-
-    In this order the one at t meets, in round k, the one at k - t modulo R, or number 0 if that is itself (the circle
-    method). So all who meet one of them lie side by side. Bit t stands for the pair in which the one at t is the
-    first, the last bit for number 0's.
-    """
-    rounds, _ = a.shape
-    ring = np.empty(rounds, int)
-    of_0 = np.where(a == 0, b, 0).sum(1) + np.where(b == 0, a, 0).sum(1)
-    ring[np.arange(rounds) * (rounds + 1) // 2 % rounds] = of_0
-    at = np.argsort(np.concatenate([[0], ring]))[1:] - 1 if rounds > 0 else ring
-    at = np.concatenate([[rounds], at])  # where each number stands; number 0 comes last
-    pair = np.zeros((rounds, rounds + 1), int)
-    for k, p in np.ndindex(a.shape):
-        i, j = at[a[k, p]], at[b[k, p]]
-        zero = rounds in (i, j)
-        assert zero or (i + j) % rounds == k, "a tournament is played by the circle method"
-        pair[k, rounds if zero else min(i, j)] = p
-    return ring, pair
-
-
-def words_of(near: Array, one: Array) -> Array:
-    """Booleans [R, P, n] as bits of words [R, W n]."""
-    bits = 2.0 ** (np.arange(near.shape[1]) % BITS)[:, None]
-    marked = jnp.where(near, bits.astype(np.float32), 0.0)
-    columns = [marked[:, p] for p in range(near.shape[1])]
-    parts = [functools.reduce(jnp.add, columns[i : i + BITS]) for i in range(0, len(columns), BITS)]
-    return jnp.concatenate(settled(parts, one), axis=1).astype(jnp.uint32)
-
-
-def _near_in_ring(centre: Array, reach: Array, ring: np.ndarray, one: Array) -> Array:
-    """The bits of a tournament [R, W n], whose bodies have centres [2, N, n] and reaches [N, n]."""
-    rounds = len(ring)
-    own = jnp.concatenate([centre, reach[None]])
-    others = own[:, ring]
-    twice = jnp.concatenate([others, others], axis=1)
-    parts = [jnp.zeros((rounds, reach.shape[-1]), jnp.float32) for _ in range(-(-(rounds + 1) // BITS))]
-    turns = np.arange(rounds)
-    for t in range(rounds + 1):
-        if t < rounds:
-            a, b = others[:, t : t + 1], twice[:, -t % rounds : -t % rounds + rounds]
-            first = (turns - t) % rounds > t
-        else:
-            a, b = own[:, :1], own[:, ring[turns * (rounds + 1) // 2 % rounds]]
-            first = turns >= 0
-        apart, reach = b[:2] - a[:2], a[2] + b[2]
-        near = (dot(apart, apart) < reach * reach) & first[:, None]
-        parts[t // BITS] = parts[t // BITS] + jnp.where(near, np.float32(2.0 ** (t % BITS)), 0.0)
-    return jnp.concatenate(settled(parts, one), axis=1).astype(jnp.uint32)
-
-
-def _largest(values: Array) -> Array:
-    """Along the first axis; XLA's own reduction of a maximum is ten times slower on a CPU."""
-    while (count := values.shape[0]) > 1:
-        values = jnp.maximum(values[: (count + 1) // 2], values[count // 2 :])
-    return values[0]
-
-
-def listed(words: Array, chunk: int) -> Listed:
-    """The rows with a bit in words [R, W n]."""
-    words = jnp.pad(words, ((0, 0), (0, -words.shape[1] % BLOCK)))
-    counts = jax.lax.population_count(words).astype(jnp.int32)
-    upto = _summed(counts)
-    total = upto[:, -1]
-    starts = jnp.cumsum(-(-total // chunk))
-    return Listed(words, upto - counts, total, jnp.pad(starts, (1, 0)))
-
-
-def _summed(counts: Array) -> Array:
-    """Cumulative sums [R, n] along the last axis, by blocks: jnp.cumsum takes time n^2 on a CPU."""
-    inside = jnp.cumsum(counts.reshape(len(counts), -1, BLOCK), axis=-1)
-    whole = jnp.cumsum(inside[..., -1], axis=-1)
-    return (inside + (whole - inside[..., -1])[..., None]).reshape(counts.shape)
-
-
-class Spot(NamedTuple):
-    """Rows of a chunk, each [C], as `Listed` counts them."""
-
-    round: Array  # one for all
-    word: Array
-    bit: Array
-    rank: Array  # among the word's
-    there: Array
-
-
-def _spot(rows: Listed, k: Array, chunk: int) -> Spot:
-    """The rows of chunk k."""
-    turn = jnp.sum(rows.starts[1:] <= k)
-    rank = (k - rows.starts[turn]) * chunk + jnp.arange(chunk)
-    there = rank < rows.total[turn]
-    # The last word that as many come before: by blocks of words, then in its block.
-    blocks = rows.before[turn].reshape(-1, BLOCK)
-    block = jnp.sum(blocks[:, 0] <= rank[:, None], axis=1) - 1
-    inside = blocks.at[block].get(mode=PAST)
-    which = jnp.sum(inside <= rank[:, None], axis=1) - 1
-    word, before = block * BLOCK + which, blocks.reshape(-1)
-    rank = rank - before.at[word].get(mode="promise_in_bounds")
-    bits, bit, rest = rows.words[turn].at[word].get(mode="promise_in_bounds"), jnp.zeros(chunk, jnp.int32), rank
-    for half in (8, 4, 2, 1):
-        low = jax.lax.population_count(bits & jnp.uint32((1 << half) - 1)).astype(jnp.int32)
-        up = rest >= low
-        rest, bit = jnp.where(up, rest - low, rest), jnp.where(up, bit + half, bit)
-        bits = jnp.where(up, bits >> half, bits)
-    return Spot(turn, word, bit, rank, there)
-
-
 @dataclasses.dataclass(frozen=True)
 class Sparse:
     """All rows of a video, of which only those are solved whose bodies are near each other."""
 
     kinds: list[Kind]
     seats: list[Seat]  # by group
-    posts: list[list[Post]]  # by kind: of its fixed bodies
     rolling: bool  # whether anything resists rolling
     setup: Setup
     rules: Rules
@@ -287,20 +167,15 @@ class Sparse:
     def start(self, contacts: int) -> Past:
         """What the first step begins with."""
         n, count = self._lanes, jnp.zeros(self._lanes + 1, jnp.int32)
-        first = [numbers(self._nothing(kind), (1,), self._dtype)[0] for kind in self.kinds]
-        told = numbers(_told_nothing(self._dtype), (1,), self._dtype)[0]
         return Past(
-            lines=[
-                jnp.broadcast_to(jnp.concatenate(line), (kind.a.size * n + 1, len(line)))
-                for kind, line in zip(self.kinds, first, strict=True)
-            ],
+            lines=[repeated(self._nothing(kind), kind.a.size * n, self._dtype).lines for kind in self.kinds],
             marks=[jnp.full(kind.a.size * n + 1, NEVER, jnp.int32) for kind in self.kinds] if contacts else [],
             stores=None,
             depth=count.astype(self._dtype),
             begins=count,
             step=jnp.zeros((), jnp.int32),
             first=jnp.zeros((), jnp.int32),
-            written=jnp.zeros((contacts * n + 1, len(told)), self._dtype) if contacts else None,
+            written=repeated(_nothing_told(self._dtype), contacts * n, self._dtype).lines if contacts else None,
             told=count if contacts else None,
         )
 
@@ -313,8 +188,12 @@ class Sparse:
             return jnp.zeros(1, self._dtype)
 
         memory = Memory([Impulse(zero(), zero()) for _ in range(kind.points)], zero() if self.rolling else None)
-        event = jax.tree.map(jnp.copy, unseen((1,), self._dtype)) if self.setup.contacts else None
-        return Line(memory, zero() + NEVER, event, zero() if self.setup.contacts else None)
+        if not self.setup.contacts:
+            return Line(memory, zero() + NEVER, None, None)
+        return Line(memory, zero() + NEVER, jax.tree.map(jnp.copy, unseen((1,), self._dtype)), zero())
+
+    def _spec(self, kind: Kind) -> Spec:
+        return numbers(self._nothing(kind), (1,), self._dtype)[1]
 
     # ---- Which rows are near
 
@@ -323,8 +202,7 @@ class Sparse:
         squares = [dot(motion.velocity, motion.velocity) for motion in motions]
         fastest = jnp.zeros(self._lanes, self._dtype)
         for square in squares:
-            fastest = jnp.maximum(fastest, _largest(square))
-        fastest = jnp.sqrt(fastest)
+            fastest = jnp.maximum(fastest, jnp.sqrt(largest(square)))
         for shape, motion in walls:
             if motion is not None:
                 speed = jnp.sqrt(dot(motion.velocity, motion.velocity)) + jnp.abs(motion.spin) * around(shape)
@@ -332,112 +210,113 @@ class Sparse:
         # Two that meet come no faster than both do now, or than the fastest of all has made one of them.
         half = 0.5 * self.rules.step * fastest
         ways = [self.rules.step * jnp.sqrt(square) + half for square in squares]
-        # What is not there reaches not a number, which is more than nothing.
         reaches = [
-            jnp.where(seat.side.present, around(shape) + way, jnp.nan)
+            jnp.where(seat.side.present, around(shape) + way, jnp.nan)  # what is not there is near nothing
             for shape, seat, way in zip(shapes, self.seats, ways, strict=True)
         ]
         bodies = [(shape.centre, reach) for shape, reach in zip(shapes, reaches, strict=True)]
-        return [
-            listed(self._bits(kind, posts, bodies, walls, half), self.chunk)
-            for kind, posts in zip(self.kinds, self.posts, strict=True)
-        ]
+        return [listed(self._bits(kind, bodies, walls, half), self.chunk) for kind in self.kinds]
 
-    def _bits(self, kind: Kind, posts: list[Post], bodies: list[tuple], walls: list[tuple], half: Array) -> Array:
+    def _bits(self, kind: Kind, bodies: list[tuple], walls: list[tuple], half: Array) -> Array:
         """A bit for each row that is near, in words [R, W n]."""
         (centre, reach), one = bodies[kind.second], self.setup.one
         if kind.first is None:
-            here = [jnp.where(post.present, 0.0, jnp.nan) for post in posts]
-            gaps = [clearance(walls[i][0], centre) - reach - half + x for i, x in zip(kind.walls, here, strict=True)]
-            return words_of(jnp.stack(settled(gaps, one)) < 0, one)
-        if kind.first == kind.second:
-            return _near_in_ring(centre, reach, kind.ring, one)
+            here = [jnp.where(post.present, 0.0, jnp.nan) for post in kind.posts.values()]
+            gaps = [clearance(walls[i][0], centre) - reach - half + x for i, x in zip(kind.posts, here, strict=True)]
+            return bits_of(jnp.stack(settled(gaps, one)) < 0, one)
+        if kind.ring is not None:
+            return bits_in_ring(centre, reach, kind.ring, one)
 
         def play(_: int, a: tuple, b: tuple) -> tuple[tuple, tuple, Array]:
-            apart, reach = b[0] - a[0], a[1] + b[1]
-            return a, b, settled(dot(apart, apart) - reach * reach, one)
+            apart, both = b[0] - a[0], a[1] + b[1]
+            return a, b, settled(dot(apart, apart) - both * both, one)
 
-        return words_of(jnp.stack(league(bodies[kind.first], (centre, reach), play)[2]) < 0, one)
+        *_, gaps = league(bodies[kind.first], (centre, reach), play)
+        return bits_of(jnp.stack(gaps) < 0, one)
 
-    def _place(self, kind: Kind, rows: Listed, k: Array) -> tuple[Place, Spot]:
-        spot, n, (_, pairs), bits = _spot(rows, k, self.chunk), self._lanes, kind.a.shape, kind.pair.shape[1]
+    def _place(self, kind: Kind, spot: Spots, pair: np.ndarray) -> Place:
+        """Where rows are; `pair` [R, bits] says which pair of a round a bit stands for."""
+        n, (_, pairs), bits = self._lanes, kind.a.shape, pair.shape[1]
         lane, bit = spot.word % n, jnp.minimum(spot.word // n * BITS + spot.bit, bits - 1)
-        row = spot.round * pairs + jnp.asarray(kind.pair.reshape(-1), jnp.int32).at[spot.round * bits + bit].get(
-            mode=PAST
-        )
-        a, b = (jnp.asarray(x.reshape(-1), jnp.int32).at[row].get(mode=PAST) for x in (kind.a, kind.b))
-        last = self._size(kind.second)
-        ends = len(kind.walls) if kind.first is None else self._size(kind.first), last, kind.a.size
+
+        def looked_up(values: np.ndarray, where: Array) -> Array:
+            return jnp.asarray(values.reshape(-1), jnp.int32).at[where].get(mode=SAFE)
+
+        row = spot.round * pairs + looked_up(pair, spot.round * bits + bit)
+        a, b = looked_up(kind.a, row), looked_up(kind.b, row)
+        ends = len(kind.posts) if kind.first is None else self._size(kind.first), self._size(kind.second), kind.a.size
         lines = (jnp.where(spot.there, x * n + lane, end * n) for x, end in zip((a, b, row), ends, strict=True))
-        return Place(*lines, jnp.where(spot.there, lane, n)), spot
+        return Place(*lines, lane=jnp.where(spot.there, lane, n))
 
     def _size(self, group: int) -> int:
         return self.seats[group].threshold.shape[0]
 
-    # ---- The passes
+    def _places(self, near: list[Listed], stores: list[Store] | None) -> list[Array]:
+        """Where the rows of all chunks are: in a loop of its own, or each gather would compute it again."""
+        if stores is None:
+            return [jnp.zeros((self._room(kind), len(Place._fields), self.chunk), jnp.int32) for kind in self.kinds]
+
+        def placed(kind: Kind, rows: Listed, room: Array) -> Array:
+            pair = _pairs(kind) if kind.ring is None else kind.ring.pair
+
+            def chunk(k: Array, room: Array) -> Array:
+                place = self._place(kind, spots(rows, k, self.chunk), pair)
+                return room.at[k].set(jnp.stack(place), mode=SAFE)
+
+            return jax.lax.fori_loop(0, rows.starts[-1], chunk, room)
+
+        return [placed(*of) for of in zip(self.kinds, near, [store.places for store in stores], strict=True)]
 
     def _room(self, kind: Kind) -> int:
         """How many chunks there may be."""
         rounds, pairs = kind.a.shape
         return rounds * -(-pairs * self._lanes // self.chunk)
 
-    def _of_fixed(self, trees: list[Any]) -> tuple[Array, Spec]:
+    # ---- The passes
+
+    def _table(self, tree: Any, count: int) -> Table:
+        return table(tree, (count, self._lanes), self._dtype)
+
+    def _fixed(self, trees: list[Any]) -> Table:
         """A table of fixed bodies, whose trees have leaves [..., 1, n]."""
-        whole = jax.tree.map(lambda *x: jnp.concatenate(x, axis=-2), *trees)
-        return table(whole, (len(trees), self._lanes), self._dtype)
+        return self._table(jax.tree.map(lambda *x: jnp.concatenate(x, axis=-2), *trees), len(trees))
 
-    def _written(self, kind: Kind, room: Array | None, k: Array, values: Array) -> Array:
-        if room is None:
-            return jnp.zeros((self._room(kind), *values.shape), values.dtype)
-        return room.at[k].set(values, mode=PAST)
-
-    def _pass(
-        self,
-        groups: list[Any],
-        walls: list[Any],
-        counts: list[Array],
-        places: list[Array],
-        carries: list[Any],
-        play: Callable,
-        dry: bool,
-    ) -> tuple[list[Any], list[Any]]:
+    def _pass(self, groups: list[Any], walls: list[Any], found: Found, carries: list[Any], play: Callable) -> tuple:
         """The groups, and what is carried for each kind, after all rows that are near.
 
-        `places` are the `Store.place` of each kind, `play(i, k, place, a, b, carried)` gives both sides of the rows of
-        its chunk k and what is carried on.
+        `play(i, k, place, a, b, carried)` gives both sides of the rows of chunk k of kind i, and what is carried on.
+        What carries None is not known yet: its first chunk is played once, to see what it looks like.
         """
-        one, shapes, carries = self.setup.one, [seat.threshold.shape for seat in self.seats], list(carries)
-        made = [table(group, shape, self._dtype) for group, shape in zip(groups, shapes, strict=True)]
-        tables, specs = [lines for lines, _ in made], [spec for _, spec in made]
+        one, carries = self.setup.one, list(carries)
+        tables = [self._table(group, self._size(g)) for g, group in enumerate(groups)]
         for i, kind in enumerate(self.kinds):
-            mine = [kind.second] if kind.first is None or kind.first == kind.second else [kind.first, kind.second]
-            fixed = None
-            if kind.first is None:
-                fixed = self._of_fixed([walls[j] for j in kind.walls])
+            fixed = self._fixed([walls[j] for j in kind.posts]) if kind.first is None else None
 
-            def chunk(
-                k: Array, state: tuple, i: int = i, kind: Kind = kind, mine: list = mine, fixed: Any = fixed
-            ) -> tuple:
-                now, carried = dict(zip(mine, state[0], strict=True)), state[1]
-                place = Place(*places[i][k])
-                if fixed is not None:
-                    a = gathered(fixed[0], place.a, fixed[1])
-                else:
-                    a = gathered(now[kind.first], place.a, specs[kind.first])
-                b = gathered(now[kind.second], place.b, specs[kind.second])
-                a, b, carried = play(i, k, place, a, b, carried)
-                if kind.first is not None:
-                    now[kind.first] = scattered(now[kind.first], place.a, a, one)
-                now[kind.second] = scattered(now[kind.second], place.b, b, one)
-                return [now[g] for g in mine], carried
+            def chunk(k: Array, state: tuple, i: int = i, kind: Kind = kind, fixed: Table | None = fixed) -> tuple:
+                lines, carried = state
+                now = {g: tables[g]._replace(lines=x) for g, x in lines.items()}
+                place = Place(*found.places[i][k])
+                a = now[kind.first].at(place.a) if fixed is None else fixed.at(place.a)
+                a, b, carried = play(i, k, place, a, now[kind.second].at(place.b), carried)
+                if fixed is None:
+                    now[kind.first] = now[kind.first].put(place.a, a, one)
+                now[kind.second] = now[kind.second].put(place.b, b, one)
+                return {g: x.lines for g, x in now.items()}, carried
 
-            start = [tables[g] for g in mine], carries[i]
-            after, carries[i] = (
-                chunk(jnp.zeros((), jnp.int32), start) if dry else jax.lax.fori_loop(0, counts[i], chunk, start)
-            )
-            for g, lines in zip(mine, after, strict=True):
-                tables[g] = lines
-        return [untabled(*of) for of in zip(tables, specs, shapes, strict=True)], carries
+            start = {g: tables[g].lines for g in kind.groups}, carries[i]
+            if None in jax.tree.leaves(carries[i], is_leaf=lambda x: x is None):
+                lines, carries[i] = chunk(jnp.zeros((), jnp.int32), start)
+            else:
+                lines, carries[i] = jax.lax.fori_loop(0, found.chunks[i], chunk, start)
+            for g, x in lines.items():
+                tables[g] = tables[g]._replace(lines=x)
+        return [t.whole((self._size(g), self._lanes)) for g, t in enumerate(tables)], carries
+
+    def _kept(self, kind: Kind, room: Array | None, k: Array, values: list[Array]) -> Array:
+        """The room with a chunk's values; new room if there is none."""
+        if room is None:
+            return jnp.zeros((self._room(kind), len(values), self.chunk), self._dtype)
+        return room.at[k].set(settled(jnp.stack(values), self.setup.one), mode=SAFE)
 
     def warm(
         self, past: Past, bodies: list[tuple], walls: list[tuple], motions: list[Motion], works: list
@@ -448,18 +327,15 @@ class Sparse:
         the latter None where they stand still.
         """
         near = self._near([shape for shape, _ in bodies], walls, motions)
-        seats = [table(s, s.threshold.shape, self._dtype) for s in self.seats]
-        posts = [
-            seats[kind.first] if kind.first is not None else self._of_fixed(some)
-            for kind, some in zip(self.kinds, self.posts, strict=True)
-        ]
-        lines = [numbers(self._nothing(kind), (1,), self._dtype)[1] for kind in self.kinds]
+        found = Found([rows.starts[-1] for rows in near], self._places(near, past.stores), [], [])
+        seats = [self._table(seat, self._size(g)) for g, seat in enumerate(self.seats)]
+        firsts = [self._fixed(list(k.posts.values())) if k.first is None else seats[k.first] for k in self.kinds]
+        memories = [Table(x, self._spec(kind)) for x, kind in zip(past.lines, self.kinds, strict=True)]
         specs: dict[int, Spec] = {}
 
         def play(i: int, k: Array, place: Place, a: Any, b: Any, room: Array | None) -> tuple:
-            kind = self.kinds[i]
-            first, seat = gathered(posts[i][0], place.a, posts[i][1]), gathered(*_of(seats[kind.second], place.b))
-            line = gathered(past.lines[i], place.row, lines[i])
+            kind, first, seat = self.kinds[i], firsts[i].at(place.a), seats[self.kinds[i].second].at(place.b)
+            line = memories[i].at(place.row)
             fresh = line.stamp == (past.step - 1).astype(self._dtype)
             memory = jax.tree.map(lambda x: jnp.where(fresh, x, 0.0), line.memory)
             row = kind.row(first.side, seat.side)
@@ -467,33 +343,14 @@ class Sparse:
                 row = row._replace(left=first.left, right=first.right)
             setup = self.setup._replace(gravity=seat.gravity, threshold=seat.threshold)
             a, b, points = sweeps.warm(row, memory, a, b, setup)
-            kept, specs[i] = numbers((row, memory, points, seat.threshold), (self.chunk,), self._dtype)
-            kept = settled(jnp.stack(kept), self.setup.one)
-            return a, b, self._written(kind, room, k, kept)
+            values, specs[i] = numbers((row, memory, points, seat.threshold), (self.chunk,), self._dtype)
+            return a, b, self._kept(kind, room, k, values)
 
-        dry = past.stores is None
         rooms = [None] * len(self.kinds) if past.stores is None else [store.found for store in past.stores]
         groups = [(shape, m, fall, w) for (shape, fall), m, w in zip(bodies, motions, works, strict=True)]
-        fixed = [(*wall, None, None) for wall in walls]
-        counts = [rows.starts[-1] for rows in near]
-        places = self._places(near, past.stores)
-        groups, kept = self._pass(groups, fixed, counts, places, rooms, play, dry)
-        found = Found(counts, places, kept, [specs[i] for i in range(len(self.kinds))])
+        groups, kept = self._pass(groups, [(*wall, None, None) for wall in walls], found, rooms, play)
+        found = found._replace(kept=kept, specs=[specs[i] for i in range(len(self.kinds))])
         return [motion for _, motion, *_ in groups], [work for *_, work in groups], found
-
-    def _places(self, near: list[Listed], stores: list[Store] | None) -> list[Array]:
-        """Where the rows of all chunks are: for themselves, or they would be computed again for every gather."""
-        if stores is None:
-            return [jnp.zeros((self._room(kind), len(Place._fields), self.chunk), jnp.int32) for kind in self.kinds]
-
-        def placed(i: int) -> Array:
-            def chunk(k: Array, room: Array) -> Array:
-                place, _ = self._place(self.kinds[i], near[i], k)
-                return room.at[k].set(jnp.stack(place), mode=PAST)
-
-            return jax.lax.fori_loop(0, near[i].starts[-1], chunk, stores[i].place)
-
-        return [placed(i) for i in range(len(self.kinds))]
 
     def _again(self, found: Found, i: int, k: Array) -> tuple[Row, Memory, list, Setup]:
         """What the first pass has kept of a chunk of rows."""
@@ -502,70 +359,66 @@ class Sparse:
 
     def solve(
         self, past: Past, found: Found, walls: list[tuple], motions: list[Motion], drifts: list, works: list
-    ) -> tuple[list[Motion], list[Drift], list, Any]:
-        """Motions, drifts and works after the biased pass, and what it has to say of the rows."""
+    ) -> tuple[list[Motion], list[Drift], list, tuple]:
+        """Motions, drifts and works after the biased pass, and what it has seen of the rows."""
         specs: dict[int, Spec] = {}
 
         def play(i: int, k: Array, place: Place, a: Any, b: Any, carried: tuple) -> tuple:
             room, depth, begins = carried
             row, memory, points, setup = self._again(found, i, k)
             a, b, solved = sweeps.solve(row, memory, points, a, b, setup, self.rules)
-            kept, specs[i] = numbers(solved, (self.chunk,), self._dtype)
+            values, specs[i] = numbers(solved, (self.chunk,), self._dtype)
             deep, began = sweeps.seen(solved, memory)
             depth, begins = depth.at[place.lane].max(deep), begins.at[place.lane].add(began.astype(jnp.int32))
-            kept = settled(jnp.stack(kept), self.setup.one)
-            return a, b, (self._written(self.kinds[i], room, k, kept), depth, begins)
+            return a, b, (self._kept(self.kinds[i], room, k, values), depth, begins)
 
-        dry = past.stores is None
+        rooms = [None] * len(self.kinds) if past.stores is None else [store.solved for store in past.stores]
         nothing = jnp.zeros_like(past.depth), jnp.zeros_like(past.begins)
-        rooms = [(None if past.stores is None else past.stores[i].solved, *nothing) for i in range(len(self.kinds))]
         groups = list(zip(motions, drifts, works, strict=True))
         fixed = [(motion, None, None) for _, motion in walls]
-        groups, carries = self._pass(groups, fixed, found.chunks, found.places, rooms, play, dry)
+        groups, carries = self._pass(groups, fixed, found, [(room, *nothing) for room in rooms], play)
         motions, drifts, works = (list(values) for values in zip(*groups, strict=True))
-        return motions, drifts, works, (found, carries, specs)
+        solved = Solved(found, [kept for kept, *_ in carries], [specs[i] for i in range(len(self.kinds))])
+        return motions, drifts, works, (solved, [seen for _, *seen in carries])
 
     def relax(
-        self, past: Past, rows: Any, walls: list[tuple], motions: list[Motion], drifts: list, works: list, time: Array
+        self, past: Past, rows: tuple, walls: list[tuple], motions: list[Motion], drifts: list, works: list, time: Array
     ) -> tuple[list[Motion], list, Past]:
         """Motions and works after the relaxing pass, and what all rows hand on; the step began at `time`."""
-        found, before, specs = rows
-        lines = [numbers(self._nothing(kind), (1,), self._dtype)[1] for kind in self.kinds]
+        before, seen = rows
+        found, one = before.found, self.setup.one
+        specs = [self._spec(kind) for kind in self.kinds]
 
         def play(i: int, k: Array, place: Place, a: Any, b: Any, carried: tuple) -> tuple:
-            table_, marks = carried
+            lines, marks = Table(carried[0], specs[i]), carried[1]
             row, _, _, setup = self._again(found, i, k)
-            solved = rebuilt(list(before[i][0][k]), specs[i])
+            solved = rebuilt(list(before.kept[i][k]), before.specs[i])
             a, b, (last, memory) = sweeps.relax(row, solved, a, b, setup)
-            stamp = jnp.full(self.chunk, past.step, self._dtype)
-            new = Line(memory, stamp, None, None)
+            new = Line(memory, jnp.full(self.chunk, past.step, self._dtype), None, None)
             if self.setup.contacts:
-                event = self._event(past, gathered(table_, place.row, lines[i]))
-                event = noted(event, solved, last, time, self.setup.one)
-                new = Line(memory, stamp, event, row.elasticity)
-                touching = sweeps.touching(solved, last)
+                event = noted(self._event(past, lines.at(place.row)), solved, last, time, one)
+                new = new._replace(event=event, elasticity=row.elasticity)
                 mark = 2 * past.step + jnp.where((event.flags & ON) > 0, 1, 0)
-                old = marks.at[place.row].get(mode=PAST)
-                marks = marks.at[place.row].set(jnp.where(touching, mark, old), mode=PAST)
-            return a, b, (scattered(table_, place.row, new, self.setup.one), marks)
+                old = marks.at[place.row].get(mode=SAFE)
+                marks = marks.at[place.row].set(jnp.where(sweeps.touching(solved, last), mark, old), mode=SAFE)
+            return a, b, (lines.put(place.row, new, one).lines, marks)
 
         groups = [(motion, drift.push, work) for motion, drift, work in zip(motions, drifts, works, strict=True)]
-        fixed = [(motion, None, None) for _, motion in walls]
-        marks = past.marks or [jnp.zeros(0)] * len(self.kinds)
+        marks = past.marks or [jnp.zeros(0, jnp.int32)] * len(self.kinds)
         carries = list(zip(past.lines, marks, strict=True))
-        groups, carries = self._pass(groups, fixed, found.chunks, found.places, carries, play, past.stores is None)
+        groups, carries = self._pass(groups, [(motion, None, None) for _, motion in walls], found, carries, play)
         depth, begins = past.depth, past.begins
-        for _, deep, began in before:
+        for deep, began in seen:
             depth, begins = jnp.maximum(depth, deep), begins + began
-        now = past._replace(
-            lines=[table_ for table_, _ in carries],
+        past = past._replace(
+            lines=[lines for lines, _ in carries],
             marks=[marks for _, marks in carries] if self.setup.contacts else [],
-            stores=[Store(*of, solved) for *of, (solved, *_) in zip(found.places, found.kept, before, strict=True)],
+            stores=[Store(*of) for of in zip(found.places, found.kept, before.kept, strict=True)],
             depth=depth,
             begins=begins,
             step=past.step + 1,
         )
-        return [motion for motion, *_ in groups], [work for *_, work in groups], now
+        return [motion for motion, *_ in groups], [work for *_, work in groups], past
 
     # ---- What happened
 
@@ -586,84 +439,85 @@ class Sparse:
         """The same, with the rows of contacts of the frame."""
         if past.written is None or past.told is None:
             return past, None
-        written, count, n = past.written, past.told, self._lanes
-        began = past.first.astype(self._dtype) * self.rules.step
-        frame = past.step // jnp.maximum(past.step - past.first, 1)
+        written, told = past.written, past.told
         for kind, lines, marks in zip(self.kinds, past.lines, past.marks, strict=True):
-            rounds, pairs = kind.a.shape
-            recent = marks[:-1].reshape(rounds, pairs, n) >= 2 * past.first - 1
-            words = words_of(recent, self.setup.one)
-            kind = dataclasses.replace(kind, pair=np.broadcast_to(np.arange(pairs), kind.a.shape))  # a bit each
-            rows = listed(words, self.chunk)
-            counts = jax.lax.population_count(words).astype(jnp.int32).reshape(-1, n)
-            before = (jnp.cumsum(counts, axis=0) - counts).reshape(-1)
-            spec = numbers(self._nothing(kind), (1,), self._dtype)[1]
-            slots = [jnp.asarray(x.reshape(-1), jnp.int32) for x in kind.slots]
+            recent = marks[:-1].reshape(*kind.a.shape, self._lanes) >= 2 * past.first - 1
+            words = bits_of(recent, self.setup.one)
+            written = self._tell(past, kind, Table(lines, self._spec(kind)), words, written, told)
+            told = told.at[:-1].add(jnp.sum(counted(words).reshape(-1, self._lanes), axis=0, dtype=jnp.int32))
+        return past._replace(written=written, told=told), None
 
-            def chunk(k: Array, written: Array, kind: Kind = kind, rows: Listed = rows, lines: Array = lines,
-                      before: Array = before, spec: Spec = spec, slots: list = slots, count: Array = count) -> Array:  # fmt: skip
-                place, spot = self._place(kind, rows, k)
-                line = gathered(lines, place.row, spec)
-                event = self._event(past, line)
-                last = line.stamp == (past.step - 1).astype(self._dtype)
-                event = event._replace(flags=jnp.where(last, event.flags, event.flags & ~ON))
-                told = happening(event, line.elasticity)
-                told = told._replace(time=jnp.where(told.time >= 0, told.time, began))
-                pair = jnp.minimum(place.row // n, kind.a.size - 1)
-                a, b = (x.at[pair].get(mode=PAST) for x in slots)
-                word = jnp.minimum(spot.round * (before.size // len(kind.a)) + spot.word, before.size - 1)
-                rank = count[place.lane] + before.at[word].get(mode=PAST) + spot.rank
-                room = (written.shape[0] - 1) // n
-                where = jnp.where(spot.there & (rank < room), rank * n + place.lane, room * n)
-                frames = jnp.full(self.chunk, frame, jnp.int32)
-                return scattered(written, where, Told(told, frames, a, b), self.setup.one)
+    def _tell(self, past: Past, kind: Kind, lines: Table, words: Array, written: Array, told: Array) -> Array:
+        """What is written, and the rows of a kind with a bit in words [R, W n]; `told` have been before."""
+        n, one, rows = self._lanes, self.setup.one, listed(words, self.chunk)
+        counts = counted(words).reshape(-1, n)
+        before = told[:-1] + jnp.cumsum(counts, axis=0, dtype=jnp.int32) - counts  # by round and word
+        spec = numbers(_nothing_told(self._dtype), (1,), self._dtype)[1]
+        slots = [jnp.asarray(x.reshape(-1), jnp.int32) for x in kind.slots]
+        room, width = (len(written) - 1) // n, words.shape[1]
+        number = past.step // jnp.maximum(past.step - past.first, 1)
 
-            written = jax.lax.fori_loop(0, rows.starts[-1], chunk, written)
-            count = count.at[:-1].add(jnp.sum(counts, axis=0))
-        return past._replace(written=written, told=count), None
+        def chunk(k: Array, written: Array) -> Array:
+            spot = spots(rows, k, self.chunk)
+            place = self._place(kind, spot, _pairs(kind))
+            line = lines.at(place.row)
+            event, last = self._event(past, line), line.stamp == (past.step - 1).astype(self._dtype)
+            event = event._replace(flags=jnp.where(last, event.flags, event.flags & ~ON))
+            new = happening(event, line.elasticity)
+            began = past.first.astype(self._dtype) * self.rules.step  # when an end without a touch is told
+            new = new._replace(time=jnp.where(new.time >= 0, new.time, began))
+            word = jnp.minimum(spot.round * width + spot.word, before.size - 1)
+            rank = before.reshape(-1).at[word].get(mode=SAFE) + spot.rank
+            where = jnp.where(spot.there & (rank < room), rank * n + place.lane, room * n)
+            row = jnp.minimum(place.row // n, kind.a.size - 1)
+            a, b = (x.at[row].get(mode=SAFE) for x in slots)
+            return Table(written, spec).put(where, Told(new, jnp.full_like(a, number), a, b), one).lines
+
+        return jax.lax.fori_loop(0, rows.starts[-1], chunk, written)
 
     def ended(self, past: Past, _: None, slots: int, fps: float) -> tuple[Array, Array, Contacts | None]:
         """Of the whole video: the deepest overlap, m, how many contacts began, and up to `slots` rows of contacts."""
         depth, begins = past.depth[:-1], past.begins[:-1]
         if past.written is None or past.told is None:
             return depth, begins, None
-        count = past.told[:-1]
-        told = untabled(past.written, numbers(_told_nothing(self._dtype), (1,), self._dtype)[1], (slots, self._lanes))
+        spec = numbers(_nothing_told(self._dtype), (1,), self._dtype)[1]
+        told, count = Table(past.written, spec).whole((slots, self._lanes)), past.told[:-1]
         filled = jnp.arange(slots)[:, None] < count
         order = jnp.argsort(jnp.where(filled, told.happening.time, jnp.inf), axis=0, stable=True)
 
-        def taken(x: Array) -> Array:
+        def in_order(x: Array) -> Array:
             x = jnp.where(filled, x, jnp.zeros_like(x))
             return jnp.take_along_axis(x, jnp.broadcast_to(order, x.shape), axis=-2)
 
-        told = jax.tree.map(taken, told)
-        kind, time, place, normal, approach, separation, normal_impulse, tangent_impulse = told.happening
-        return depth, begins, Contacts(
-            time=time,
+        told = jax.tree.map(in_order, told)
+        what = told.happening
+        contacts = Contacts(
+            time=what.time,
             frame=told.frame,
             a=told.a.astype(jnp.int16),
             b=told.b.astype(jnp.int16),
-            point=place,
-            normal=normal,
-            normal_impulse=normal_impulse,
-            tangent_impulse=tangent_impulse,
-            approach_speed=approach,
-            separation_speed=separation,
-            kind=kind,
+            point=what.place,
+            normal=what.normal,
+            normal_impulse=what.normal_impulse,
+            tangent_impulse=what.tangent_impulse,
+            approach_speed=what.approach,
+            separation_speed=what.separation,
+            kind=what.kind,
             count=count,
-        )  # fmt: skip
+        )
+        return depth, begins, contacts
 
 
-def _told_nothing(dtype: Any) -> Told:
-    zero, vector = (lambda: jnp.zeros(1, dtype)), (lambda: jnp.zeros((2, 1), dtype))
-    happened = Happening(jnp.zeros(1, jnp.uint8), zero(), vector(), vector(), *(zero() for _ in range(4)))
-    return Told(happened, *(jnp.zeros(1, jnp.int32) for _ in range(3)))
+def _pairs(kind: Kind) -> np.ndarray:
+    """The pairs of each round, one for each bit."""
+    return np.broadcast_to(np.arange(kind.a.shape[1]), kind.a.shape)
 
 
-def _of(made: tuple[Array, Spec], where: Array) -> tuple[Array, Array, Spec]:
-    return made[0], where, made[1]
+def _nothing_told(dtype: Any) -> Told:
+    zeros = [jnp.zeros((2, 1) if name in ("place", "normal") else 1, dtype) for name in Happening._fields[1:]]
+    return Told(Happening(jnp.zeros(1, jnp.uint8), *zeros), *(jnp.zeros(1, jnp.int32) for _ in range(3)))
 
 
 def chunk_of(lanes: int) -> int:
-    """How many rows to solve at once, with so many scenes."""
-    return max(16, min(256, 1 << max(lanes // 16, 1).bit_length()))
+    """How many rows to solve at once with so many scenes: a few times fewer than are near in a round."""
+    return min(max(16, 1 << (lanes // 16).bit_length()), 256)

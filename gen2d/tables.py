@@ -7,7 +7,10 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from gen2d.tournament import settled
 from gen2d.types import Array
+
+SAFE = "promise_in_bounds"  # of indices; JAX's own check would cost a pass over them
 
 
 class Leaf(NamedTuple):
@@ -52,36 +55,43 @@ def rebuilt(found: Sequence[Array], spec: Spec) -> Any:
     def leaf(part: Any) -> Any:
         if not isinstance(part, Leaf):
             return part
-        if not part.lead:
-            return found[part.first].astype(part.dtype)
-        count = 1
-        for size in part.lead:
-            count *= size
-        stacked = jnp.stack(list(found[part.first : part.first + count]))
-        return stacked.reshape(*part.lead, *stacked.shape[1:]).astype(part.dtype)
+        own = found[part.first : part.first + math.prod(part.lead)]
+        whole = jnp.stack(list(own)).reshape(*part.lead, *own[0].shape) if part.lead else own[0]
+        return whole.astype(part.dtype)
 
     return jax.tree.unflatten(spec.tree, [leaf(part) for part in spec.leaves])
 
 
-def table(tree: Any, shape: tuple[int, ...], dtype: Any) -> tuple[Array, Spec]:
-    """Leaves [..., N, n] as a table of N n lines and one of zeros, and how to get them back."""
+class Table(NamedTuple):
+    """The numbers of things, a line each, and a last line that is nobody's."""
+
+    lines: Array  # [N n + 1, F]
+    spec: Spec
+
+    def at(self, where: Array) -> Any:
+        """The tree with leaves [..., C] of some lines."""
+        return rebuilt(list(self.lines.at[where].get(mode=SAFE).T), self.spec)
+
+    def put(self, where: Array, tree: Any, one: Array) -> "Table":
+        """The table with other lines there; two may be the same only if they are the last."""
+        found, _ = numbers(tree, where.shape, self.lines.dtype)
+        if not found:
+            return self
+        return self._replace(lines=self.lines.at[where].set(settled(jnp.stack(found), one).T, mode=SAFE))
+
+    def whole(self, shape: tuple[int, ...]) -> Any:
+        """The tree with leaves [..., *shape] of all lines but the last."""
+        return rebuilt([column.reshape(shape) for column in self.lines[:-1].T], self.spec)
+
+
+def table(tree: Any, shape: tuple[int, ...], dtype: Any) -> Table:
+    """Leaves [..., *shape] as a table of as many lines, and one of zeros."""
     found, spec = numbers(tree, shape, dtype)
     columns = [x.reshape(-1) for x in found] or [jnp.zeros(math.prod(shape), dtype)]
-    lines = jnp.stack(columns, axis=-1)
-    return jnp.pad(lines, ((0, 1), (0, 0))), spec
+    return Table(jnp.pad(jnp.stack(columns, axis=-1), ((0, 1), (0, 0))), spec)
 
 
-def untabled(lines: Array, spec: Spec, shape: tuple[int, ...]) -> Any:
-    """The tree of a table."""
-    return rebuilt([column.reshape(shape) for column in lines[:-1].T], spec)
-
-
-def gathered(lines: Array, where: Array, spec: Spec) -> Any:
-    """The tree with leaves [..., C] of some lines of a table."""
-    return rebuilt(list(lines.at[where].get(mode="promise_in_bounds").T), spec)
-
-
-def scattered(lines: Array, where: Array, tree: Any, one: Array) -> Array:
-    """The table with other lines there, which may be the same only where they do not matter."""
-    found, _ = numbers(tree, where.shape, lines.dtype)
-    return lines.at[where].set((jnp.stack(found) / one).T, mode="promise_in_bounds")
+def repeated(tree: Any, count: int, dtype: Any) -> Table:
+    """A table of `count` lines, each of them this tree of leaves [..., 1], and one more."""
+    found, spec = numbers(tree, (1,), dtype)
+    return Table(jnp.broadcast_to(jnp.concatenate(found), (count + 1, len(found))), spec)

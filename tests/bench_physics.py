@@ -155,7 +155,7 @@ def gen2d_program(case: Case, everything: bool) -> tuple[Callable, Any, float]:
 
     def run(scene: types.Scene, state: types.State) -> types.Trajectory:
         device = types.to_device(scene), types.to_device(state)
-        return types.to_stored(simulate(*device, layout, rules(STEP), FRAMES, STEPS, keep))
+        return types.to_stored(simulate(*device, layout, rules(STEP), FRAMES, STEPS, keep, sparse=True))
 
     began = time.process_time()
     program = jax.jit(run).lower(*inputs).compile()

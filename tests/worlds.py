@@ -94,10 +94,19 @@ def world(
 
 
 @functools.lru_cache(maxsize=64)
-def _program(layout: Layout, numbers: Rules, frames: int, steps: int, keep: Keep, forces: Forces | None, wide: bool):
+def _program(
+    layout: Layout,
+    numbers: Rules,
+    frames: int,
+    steps: int,
+    keep: Keep,
+    forces: Forces | None,
+    sparse: bool,
+    wide: bool,
+):
     def run(scene: Scene, state: State) -> Trajectory:
         device = types.to_device(scene), types.to_device(state)
-        return types.to_stored(simulate(*device, layout, numbers, frames, steps, keep, forces))
+        return types.to_stored(simulate(*device, layout, numbers, frames, steps, keep, forces, sparse))
 
     return jax.jit(run)
 
@@ -109,12 +118,13 @@ def run(
     numbers: Rules | None = None,
     keep: Keep | None = None,
     forces: Forces | None = None,
+    sparse: bool = True,
 ) -> Any:
-    """The trajectories of worlds of one layout, videos first, as NumPy arrays."""
+    """The trajectories of worlds of one layout, videos first, as NumPy arrays; in the solver's form for CPUs."""
     layout = worlds[0][2]
     scene, state = (jax.tree.map(lambda *x: jnp.asarray(np.stack(x)), *(w[i] for w in worlds)) for i in (0, 1))
     wide = state.position.dtype == np.float64
-    made = _program(layout, numbers or rules(), frames, steps, keep or Keep(), forces, wide)(scene, state)
+    made = _program(layout, numbers or rules(), frames, steps, keep or Keep(), forces, sparse, wide)(scene, state)
     return jax.tree.map(np.asarray, made)
 
 
