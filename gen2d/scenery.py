@@ -211,7 +211,7 @@ def _sparse(
         kinds.append(Kind(b=b, slots=slots, row=row, points=_points(*forms), **more))
 
     for m in matches(sizes, 0):
-        a, b = _meetings(sizes[m.first], sizes[m.second], m)
+        a, b = meetings(sizes[m.first], sizes[m.second], m)
         ring = ring_of(a, b) if m.first == m.second else None
         forms = groups[m.first].form, groups[m.second].form
         add(forms, a + firsts[m.first], b, first=m.first, second=m.second, a=a, posts={}, ring=ring)
@@ -245,7 +245,7 @@ def _is_disc(form: Form) -> bool:
     return isinstance(form, DiscForm)
 
 
-def _meetings(first: int, second: int, match: Match) -> tuple[np.ndarray, np.ndarray]:
+def meetings(first: int, second: int, match: Match) -> tuple[np.ndarray, np.ndarray]:
     """Who meets in each round of a match, [R, P], by their numbers in their groups."""
 
     def play(_: int, a: Array, b: Array) -> tuple[Array, Array, tuple[Array, Array]]:

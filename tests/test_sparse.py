@@ -1,0 +1,153 @@
+"""The solver's two forms: what is near is found, each pair once, and solving only that changes nothing."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from worlds import box, rules, run, world
+
+from gen2d import types
+from gen2d.contacts import Disc, Hull, Stadium, edge_normals, hull
+from gen2d.near import around, bits_in_ring, bits_of, clearance, listed, ring_of, spots
+from gen2d.scenery import meetings
+from gen2d.simulate import Keep, simulate
+from gen2d.space import Space
+from gen2d.tournament import Match
+
+EVERYTHING = Keep(contacts=300, energy=True)
+
+
+def gas(seed: int, discs: int, **more: float) -> tuple:
+    """Discs that fly, fall and bounce in a box."""
+    rng, columns = np.random.default_rng(seed), int(np.ceil(np.sqrt(discs)))
+    side = 2.2 * columns
+    cells = [((i + 0.5) * side / columns, (j + 0.5) * side / columns) for i in range(columns) for j in range(columns)]
+    rows = [
+        {"x": x, "v": rng.normal(0, 3, 2), "radius": rng.uniform(0.5, 1), "elasticity": 0.7, "friction": 0.3, **more}
+        for x in cells[:discs]
+    ]
+    return world(rows, box(side, 0.9, 0.2, (side / 2, side / 2)), (0, -9.81))
+
+
+def assert_alike(ours: types.Trajectory, theirs: types.Trajectory, within: float) -> None:
+    """Both trajectories are the same but for what grows out of rounding."""
+    for (path, a), b in zip(jax.tree_util.tree_leaves_with_path(ours), jax.tree.leaves(theirs), strict=True):
+        name = jax.tree_util.keystr(path)
+        if np.issubdtype(a.dtype, np.integer):
+            np.testing.assert_array_equal(a, b, name)
+        else:
+            np.testing.assert_allclose(a, b, rtol=within, atol=within, err_msg=name)
+
+
+def test_both_forms_give_the_same_discs():
+    worlds = [gas(seed, 5, rolling=0.05, torque=0.1) for seed in range(3)]
+    made = [run(worlds, 41, 4, keep=EVERYTHING, sparse=sparse) for sparse in (True, False)]
+    assert made[0].contacts.count.min() > 0
+    assert_alike(*made, within=2e-3)
+
+
+def test_both_forms_give_the_same_of_more_discs_than_a_word_has_bits():
+    worlds = [gas(seed, 19) for seed in range(3)]
+    made = [run(worlds, 31, 4, sparse=sparse) for sparse in (True, False)]
+    assert made[0].quality.contacts.min() > 0
+    assert_alike(*made, within=2e-3)
+
+
+def test_both_forms_give_the_same_mixture():
+    """Pairs of several shapes, bodies that move as they like, a joint, and forces that depend on the state."""
+    space = Space((0, -9.81))
+    space.add_segment((-4, 0), (0, 0.5))
+    space.add_segment((0, 0.5), (4, 0))
+    space.add_box((1.5, 1), 0.8, 0.8, kind="kinematic", velocity=(-1.0, 0.0), spin=0.5)
+    space.add_circle((-2, 0.6), 0.3, kind="static")
+    space.add_capsule((-0.5, 1), (0.2, 1.2), 0.1)
+    space.add_capsule((0.3, 1.2), (1, 1.5), 0.1)
+    space.add_joint("distance", 4, 5)
+    space.add_circle((-2.1, 1.5), 0.3)
+    space.add_circle((0.1, 1.9), 0.3)
+    scene, state, layout = space.scene()
+    many = [types.to_device(jax.tree.map(lambda x: jnp.asarray(x)[None], record)) for record in (scene, state)]
+
+    def wind(state: types.State, time: jax.Array) -> tuple:
+        return jnp.stack([jnp.cos(time) - 0.1 * state.velocity[0], 0 * state.angle]), -0.1 * state.angular_velocity
+
+    def made(sparse: bool) -> types.Trajectory:
+        program = jax.jit(lambda a, b: simulate(a, b, layout, rules(), 31, 4, EVERYTHING, wind, sparse))
+        return jax.tree.map(np.asarray, types.to_stored(program(many[0], many[1])))
+
+    ours, theirs = made(True), made(False)
+    assert ours.contacts is not None
+    assert ours.contacts.count.min() > 0
+    assert_alike(ours, theirs, within=2e-3)
+
+
+def _visited(words: np.ndarray, chunk: int) -> list[tuple[int, int, int]]:
+    """Round, word and bit of all rows, in the order in which they are solved."""
+    rows, found = listed(jnp.asarray(words), chunk), []
+    for k in range(int(rows.starts[-1])):
+        spot = jax.tree.map(np.asarray, spots(rows, jnp.asarray(k), chunk))
+        found += [
+            (int(spot.round), int(w), int(b)) for w, b in zip(spot.word[spot.there], spot.bit[spot.there], strict=True)
+        ]
+    return found
+
+
+@pytest.mark.parametrize("density", [0.0, 0.01, 0.3, 1.0])
+def test_every_bit_is_visited_once_and_in_order(density):
+    rng = np.random.default_rng(1)
+    bits = rng.random((5, 75, 16)) < density
+    words = (bits * 2 ** np.arange(16)).sum(-1).astype(np.uint32)
+    assert _visited(words, 16) == list(map(tuple, np.argwhere(bits).tolist()))
+
+
+@pytest.mark.parametrize("count", [2, 4, 16, 18, 40])
+def test_a_ring_finds_each_near_pair_once(count):
+    rng, lanes = np.random.default_rng(count), 3
+    centre, reach = rng.uniform(0, 5, (2, count, lanes)), rng.uniform(0.2, 0.8, (count, lanes))
+    reach[0, 0] = np.nan  # is not there
+    a, b = meetings(count, count, Match(0, 0, count - 1))
+    ring = ring_of(a, b)
+    words = np.asarray(bits_in_ring(jnp.asarray(centre), jnp.asarray(reach), ring, jnp.ones(())))
+    found = []
+    for turn, word, bit in _visited(words, 16):
+        pair = ring.pair[turn, word // lanes * 16 + bit]
+        found.append((*sorted((a[turn, pair], b[turn, pair])), word % lanes))
+    distance = np.hypot(*(centre[:, :, None] - centre[:, None]))
+    near = np.argwhere(np.triu((distance < reach[:, None] + reach[None]).T, 1))
+    assert sorted(found) == sorted((i, j, lane) for lane, i, j in near.tolist())
+
+
+def test_bits_of_more_pairs_than_a_word_has():
+    near = np.random.default_rng(2).random((3, 21, 4)) < 0.5
+    words = np.asarray(bits_of(jnp.asarray(near), jnp.ones(()))).reshape(3, 2, 4)
+    back = [(words[:, p // 16] >> (p % 16)) & 1 for p in range(21)]
+    np.testing.assert_array_equal(np.stack(back, axis=1), near)
+
+
+def test_a_shape_is_nowhere_nearer_than_its_clearance_nor_beyond_its_circle():
+    rng = np.random.default_rng(3)
+    points = rng.uniform(-3, 3, (2, 400))
+    square = [jnp.array([[x], [y]]) for x, y in ((-1, -0.5), (1, -0.5), (1, 0.5), (-1, 0.5))]
+    zero, at = jnp.zeros(1), jnp.array([[0.3], [-0.2]])
+    tilt = jnp.full(1, 0.4)
+    shapes = [
+        (Disc(at, jnp.full(1, 0.7)), [at[:, 0]], 0.7),
+        (Stadium(at, jnp.array([[0.8], [0.6]]), jnp.ones(1), jnp.full(1, 0.2)), _along(at, 1.0), 0.2),
+        (hull(square, edge_normals(square), at, tilt, zero), None, 0.0),
+    ]
+    for shape, core, radius in shapes:
+        outline = _outline(shape) if core is None else np.array(core).T
+        apart = np.sqrt(((points[:, :, None] - outline[:, None]) ** 2).sum(0)).min(1) - radius
+        assert (np.asarray(clearance(shape, jnp.asarray(points))) <= apart + 1e-5).all()
+        furthest = np.hypot(*(outline - np.asarray(at))).max() + radius
+        assert float(around(shape)[0]) >= furthest - 1e-5
+
+
+def _along(at: jax.Array, half_length: float) -> list[np.ndarray]:
+    return [np.asarray(at[:, 0]) + s * np.array([0.8, 0.6]) for s in np.linspace(-half_length, half_length, 201)]
+
+
+def _outline(shape: Hull) -> np.ndarray:
+    corners = [np.asarray(v)[:, 0] for v in shape.vertices]
+    sides = zip(corners, [*corners[1:], corners[0]], strict=True)
+    return np.array([p + t * (q - p) for p, q in sides for t in np.linspace(0, 1, 101)]).T
