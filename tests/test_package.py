@@ -16,8 +16,8 @@ PACKAGE = ROOT / "gen2d"
 # Each module may import those before it; a family or look may import all of a Python file's neighbours but the last.
 ORDER = [
     *("errors", "fields", "files", "codecs", "formats", "plan", "manifest", "cards", "shards", "loader"),
-    *("verification", "dataloader", "report", "types", "shapes", "tournament", "contacts", "impacts", "rows"),
-    *("ledger", "joints", "forms", "sweeps", "events", "solver", "scenery"),
+    *("verification", "dataloader", "report", "types", "shapes", "tournament", "tables", "contacts", "impacts", "rows"),
+    *("ledger", "joints", "forms", "sweeps", "events", "near", "dense", "sparse", "solver", "scenery"),
     *(
         "simulate",
         "factors",
