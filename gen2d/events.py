@@ -97,7 +97,7 @@ def compact(frames: Happening, a: Array, b: Array, fps: float, slots: int) -> Co
     filled, place = wanted[:, None] <= count, jnp.minimum(place, steps * rows - 1)
     time = jnp.take_along_axis(frames.time.reshape(-1, lanes), place, axis=0)
     time = jnp.where(time >= 0, time, (place // rows) / fps)  # an end without a touch: as the frame began
-    order = jnp.argsort(jnp.where(filled, time, jnp.inf), axis=0, stable=True)
+    order = order_of(jnp.where(filled, time, jnp.inf))
     time, place = (jnp.take_along_axis(x, order, axis=0) for x in (time, place))
     frame, row = place // rows, place % rows
 
@@ -126,6 +126,29 @@ def compact(frames: Happening, a: Array, b: Array, fps: float, slots: int) -> Co
         kind=taken(frames.kind),
         count=count,
     )
+
+
+def order_of(time: Array) -> Array:
+    """The places [C, n] of times in ascending order, of equal ones as they come.
+
+    An odd-even transposition sort: as many passes as a row is out of its place, which is few, as frames come in order;
+    a sort of all takes twenty times as long on a CPU.
+    """
+    rows = jnp.arange(len(time), dtype=jnp.int32)[:, None]
+
+    def beside(values: Array, by: int) -> Array:
+        return jnp.roll(values, by, axis=0)
+
+    def exchange(state: tuple) -> tuple:
+        time, order, turn, idle = state
+        first, last = rows % 2 == turn % 2, len(rows) - 1
+        later = first & (rows < last) & (time > beside(time, -1))
+        earlier = ~first & (rows > 0) & (beside(time, 1) > time)
+        time, order = (jnp.where(later, beside(x, -1), jnp.where(earlier, beside(x, 1), x)) for x in (time, order))
+        return time, order, turn + 1, jnp.where(jnp.any(later), 0, idle + 1)
+
+    start = time, jnp.broadcast_to(rows, time.shape), jnp.int32(0), jnp.int32(0)
+    return jax.lax.while_loop(lambda state: state[3] < 2, exchange, start)[1]
 
 
 def _counted(there: Array) -> Array:

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple, TypeAlias
 import jax.numpy as jnp
 
 from gen2d.contacts import dot
+from gen2d.folds import total
 from gen2d.rows import Found, Grip, Impulse, Motion, Row, Touch, relative, turning
 from gen2d.types import Array
 
@@ -131,7 +132,7 @@ def closed(book: Ledger, springs: Array) -> tuple[Array, ...]:
     """Lost in contact, put in, lost to damping, by now; what springs hold now is not lost."""
     works = book.groups if book.joints is None else [*book.groups, book.joints]
     lost, driven, damped = (
-        sum((jnp.sum(part, axis=0) for part in parts if part is not None), jnp.zeros_like(springs))
+        sum((total(part) for part in parts if part is not None), jnp.zeros_like(springs))
         for parts in zip(*works, strict=True)
     )
     return lost, driven, damped - springs
@@ -143,9 +144,9 @@ def balance(groups: list[Any], bodies: list[Any], gravity: Array, springs: Array
     linear = jnp.zeros_like(gravity)
     for g, body in zip(groups, bodies, strict=True):
         (x, y), v, spin = body.position, body.motion.velocity, body.motion.spin
-        kinetic = kinetic + jnp.sum(0.5 * g.mass * dot(v, v), axis=0)
-        rotational = rotational + jnp.sum(0.5 * g.moment * spin**2, axis=0)
-        potential = potential - jnp.sum(g.mass * dot(gravity[:, None], body.position), axis=0)
-        linear = linear + jnp.sum(g.mass * v, axis=1)
-        angular = angular + jnp.sum(g.mass * (x * v[1] - y * v[0]) + g.moment * spin, axis=0)
+        kinetic = kinetic + total(0.5 * g.mass * dot(v, v))
+        rotational = rotational + total(0.5 * g.moment * spin**2)
+        potential = potential - total(g.mass * dot(gravity[:, None], body.position))
+        linear = linear + total(g.mass * v)
+        angular = angular + total(g.mass * (x * v[1] - y * v[0]) + g.moment * spin)
     return kinetic, rotational, potential + springs, linear, angular

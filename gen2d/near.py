@@ -39,13 +39,6 @@ def clearance(wall: Shape, centre: Array) -> Array:
     return jnp.sqrt(dot(offset, offset)) - wall.radius
 
 
-def largest(values: Array) -> Array:
-    """Along the first axis. (XLA's own reduction to a maximum is ten times slower on a CPU.)"""
-    while (count := values.shape[0]) > 1:
-        values = jnp.maximum(values[: (count + 1) // 2], values[count // 2 :])
-    return values[0]
-
-
 class Ring(NamedTuple):
     """A tournament of N numbers in R = N - 1 rounds, by the circle method.
 

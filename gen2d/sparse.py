@@ -18,7 +18,8 @@ import numpy as np
 
 from gen2d import sweeps
 from gen2d.contacts import Shape, dot
-from gen2d.events import BEFORE, ON, Event, Happening, happening, noted, unseen
+from gen2d.events import BEFORE, ON, Event, Happening, happening, noted, order_of, unseen
+from gen2d.folds import largest
 from gen2d.near import (
     BITS,
     Listed,
@@ -29,7 +30,6 @@ from gen2d.near import (
     bits_of,
     clearance,
     counted,
-    largest,
     listed,
     spots,
 )
@@ -483,7 +483,7 @@ class Sparse:
         spec = numbers(_nothing_told(self._dtype), (1,), self._dtype)[1]
         told, count = Table(past.written, spec).whole((slots, self._lanes)), past.told[:-1]
         filled = jnp.arange(slots)[:, None] < count
-        order = jnp.argsort(jnp.where(filled, told.happening.time, jnp.inf), axis=0, stable=True)
+        order = order_of(jnp.where(filled, told.happening.time, jnp.inf))
 
         def in_order(x: Array) -> Array:
             x = jnp.where(filled, x, jnp.zeros_like(x))

@@ -16,7 +16,19 @@ PACKAGE = ROOT / "gen2d"
 # Each module may import those before it; a family or look may import all of a Python file's neighbours but the last.
 ORDER = [
     *("errors", "fields", "files", "codecs", "formats", "plan", "manifest", "cards", "shards", "loader"),
-    *("verification", "dataloader", "report", "types", "shapes", "tournament", "tables", "contacts", "impacts", "rows"),
+    *(
+        "verification",
+        "dataloader",
+        "report",
+        "types",
+        "shapes",
+        "tournament",
+        "tables",
+        "folds",
+        "contacts",
+        "impacts",
+        "rows",
+    ),
     *("ledger", "joints", "forms", "sweeps", "events", "near", "dense", "sparse", "solver", "scenery"),
     *(
         "simulate",
