@@ -140,7 +140,7 @@ class StorageOptions:
         None,
         int,
         "videos",
-        "simulated at once by a device; null: 1024, or fewer with many objects. Changes the last bits of a simulation",
+        "simulated at once by a device; null: 512, or fewer with many objects. Changes the last bits of a simulation",
         low=1,
         high=65536,
         optional=True,

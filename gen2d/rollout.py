@@ -27,7 +27,7 @@ from gen2d.types import Array
 SLICE_BYTES = 16 * 2**20  # of raw frames drawn at once; larger buffers cost page faults
 SHARD_BYTES = 2**30  # of raw frames in a shard
 SHARD_VIDEOS = 1024  # at most, unless the config says otherwise
-LANES, ROWS = 1024, 2**20  # videos simulated at once, and pairs that can meet in all of them; 300 bytes for each
+LANES, ROWS = 512, 2**20  # videos simulated at once, and pairs that can meet in all of them; 300 bytes for each
 VIDEOS = PartitionSpec("videos")
 
 

@@ -56,12 +56,12 @@ class Case(NamedTuple):
 CASES = {
     case.name: case
     for case in (
-        Case("discs", 4, 1024, (64, 16), 5),
-        Case("discs", 8, 1024, (32, 16), 5),
-        Case("discs", 16, 1024, (24, 16), 3),
-        Case("discs", 32, 1024, (16, 16), 3),
+        Case("discs", 4, 512, (64, 16), 5),
+        Case("discs", 8, 512, (32, 16), 5),
+        Case("discs", 16, 512, (24, 16), 3),
+        Case("discs", 32, 512, (16, 16), 3),
         Case("discs", 64, 256, (12, 16), 2),
-        Case("boxes", 8, 1024, (32, 0), 5),
+        Case("boxes", 8, 512, (32, 0), 5),
     )
 }
 
