@@ -304,7 +304,7 @@ class Sparse:
                 return {g: x.lines for g, x in now.items()}, carried
 
             start = {g: tables[g].lines for g in kind.groups}, carries[i]
-            if None in jax.tree.leaves(carries[i], is_leaf=lambda x: x is None):
+            if any(x is None for x in jax.tree.leaves(carries[i], is_leaf=lambda x: x is None)):
                 lines, carries[i] = chunk(jnp.zeros((), jnp.int32), start)
             else:
                 lines, carries[i] = jax.lax.fori_loop(0, found.chunks[i], chunk, start)

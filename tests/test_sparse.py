@@ -46,6 +46,7 @@ def test_both_forms_give_the_same_discs():
     assert_alike(*made, within=2e-3)
 
 
+@pytest.mark.slow
 def test_both_forms_give_the_same_of_more_discs_than_a_word_has_bits():
     worlds = [gas(seed, 19) for seed in range(3)]
     made = [run(worlds, 31, 4, sparse=sparse) for sparse in (True, False)]
@@ -53,6 +54,7 @@ def test_both_forms_give_the_same_of_more_discs_than_a_word_has_bits():
     assert_alike(*made, within=2e-3)
 
 
+@pytest.mark.slow
 def test_both_forms_give_the_same_mixture():
     """Pairs of several shapes, bodies that move as they like, a joint, and forces that depend on the state."""
     space = Space((0, -9.81))
