@@ -19,7 +19,7 @@ from gen2d.rows import Inertia, Motion, Row, Rules, grip_of, mixed, reciprocal
 from gen2d.solver import Fixed, Group, Scenery
 from gen2d.sparse import Kind, Post, Seat, Sparse, chunk_of
 from gen2d.sweeps import Setup
-from gen2d.tournament import Match, league, matches, of_rows, sweep, tournament
+from gen2d.tournament import matches, meetings, of_rows, sweep
 from gen2d.types import DYNAMIC, KINEMATIC, Array, Layout, Objects, Record, Run, Scene, State
 
 
@@ -243,19 +243,6 @@ def _sparse(
 
 def _is_disc(form: Form) -> bool:
     return isinstance(form, DiscForm)
-
-
-def meetings(first: int, second: int, match: Match) -> tuple[np.ndarray, np.ndarray]:
-    """Who meets in each round of a match, [R, P], by their numbers in their groups."""
-
-    def play(_: int, a: Array, b: Array) -> tuple[Array, Array, tuple[Array, Array]]:
-        return a, b, (a[:, 0], b[:, 0])
-
-    with jax.ensure_compile_time_eval():
-        a, b = (jnp.arange(size)[:, None] for size in (first, second))
-        *_, rounds = tournament(a, match.rounds, play) if match.first == match.second else league(a, b, play)
-        a, b = (np.array([np.asarray(side) for side in sides]) for sides in zip(*rounds, strict=True))
-    return a, b
 
 
 def _end(slot: int, anchor: Array, layout: Layout, groups: list[Group]) -> joints.End:

@@ -8,9 +8,9 @@ A step of h seconds reads as the sentences of `step`:
 4. the bodies move;
 5. every joint and pair is solved once more without the bias, so that pushing apart leaves no speed behind.
 
-Pairs are solved in rounds of disjoint pairs (tournament.py), each one vector operation without conflicts, and the next
-round sees its result: Gauss-Seidel, which is what 'sequential' means. Joints come first; fixed bodies come last and so
-have the last word.
+Pairs are solved in rounds of disjoint pairs (tournament.py), all of them (dense.py) or those that are near (sparse.py),
+and each round sees the last one's result: Gauss-Seidel, which is what 'sequential' means. Joints come first; fixed
+bodies come last and so have the last word.
 
 Restitution. A row that closes within the step bounces: Newton's law is applied to the velocities that the row finds, so
 impacts happen one after the other and never add energy. The impulse P acts at the time of impact tau, not at the

@@ -18,7 +18,7 @@ import numpy as np
 
 from gen2d import sweeps
 from gen2d.contacts import Shape, dot
-from gen2d.events import BEFORE, ON, Event, Happening, happening, noted, order_of, unseen
+from gen2d.events import ON, Event, Happening, begun, contacts_of, happening, noted, order_of, unseen
 from gen2d.folds import largest
 from gen2d.near import (
     BITS,
@@ -102,15 +102,16 @@ class Found(NamedTuple):
     chunks: list[Array]
     places: list[Array]
     kept: list[Array]
-    specs: list[Spec]
+    specs: dict[int, Spec]  # how to read it
 
 
 class Solved(NamedTuple):
-    """What the second pass tells the third."""
+    """What the second pass tells the third, of each kind."""
 
     found: Found
     kept: list[Array]
-    specs: list[Spec]
+    specs: dict[int, Spec]
+    seen: list[tuple[Array, Array]]  # by scene, and nobody's: the deepest overlap, m, and how many contacts began
 
 
 class Line(NamedTuple):
@@ -184,13 +185,11 @@ class Sparse:
         return past._replace(stores=jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), after.stores))
 
     def _nothing(self, kind: Kind) -> Line:
-        def zero() -> Array:
-            return jnp.zeros(1, self._dtype)
-
-        memory = Memory([Impulse(zero(), zero()) for _ in range(kind.points)], zero() if self.rolling else None)
+        zero = jnp.zeros(1, self._dtype)
+        memory = Memory([Impulse(zero, zero)] * kind.points, zero if self.rolling else None)
         if not self.setup.contacts:
-            return Line(memory, zero() + NEVER, None, None)
-        return Line(memory, zero() + NEVER, jax.tree.map(jnp.copy, unseen((1,), self._dtype)), zero())
+            return Line(memory, zero + NEVER, None, None)
+        return Line(memory, zero + NEVER, unseen((1,), self._dtype), zero)
 
     def _spec(self, kind: Kind) -> Spec:
         return numbers(self._nothing(kind), (1,), self._dtype)[1]
@@ -327,7 +326,7 @@ class Sparse:
         the latter None where they stand still.
         """
         near = self._near([shape for shape, _ in bodies], walls, motions)
-        found = Found([rows.starts[-1] for rows in near], self._places(near, past.stores), [], [])
+        found = Found([rows.starts[-1] for rows in near], self._places(near, past.stores), [], {})
         seats = [self._table(seat, self._size(g)) for g, seat in enumerate(self.seats)]
         firsts = [self._fixed(list(k.posts.values())) if k.first is None else seats[k.first] for k in self.kinds]
         memories = [Table(x, self._spec(kind)) for x, kind in zip(past.lines, self.kinds, strict=True)]
@@ -343,13 +342,13 @@ class Sparse:
                 row = row._replace(left=first.left, right=first.right)
             setup = self.setup._replace(gravity=seat.gravity, threshold=seat.threshold)
             a, b, points = sweeps.warm(row, memory, a, b, setup)
-            values, specs[i] = numbers((row, memory, points, seat.threshold), (self.chunk,), self._dtype)
+            values, specs[i] = numbers((row, memory, points, seat.threshold), (self.chunk,), self._dtype, once=True)
             return a, b, self._kept(kind, room, k, values)
 
         rooms = [None] * len(self.kinds) if past.stores is None else [store.found for store in past.stores]
         groups = [(shape, m, fall, w) for (shape, fall), m, w in zip(bodies, motions, works, strict=True)]
         groups, kept = self._pass(groups, [(*wall, None, None) for wall in walls], found, rooms, play)
-        found = found._replace(kept=kept, specs=[specs[i] for i in range(len(self.kinds))])
+        found = found._replace(kept=kept, specs=specs)
         return [motion for _, motion, *_ in groups], [work for *_, work in groups], found
 
     def _again(self, found: Found, i: int, k: Array) -> tuple[Row, Memory, list, Setup]:
@@ -359,7 +358,7 @@ class Sparse:
 
     def solve(
         self, past: Past, found: Found, walls: list[tuple], motions: list[Motion], drifts: list, works: list
-    ) -> tuple[list[Motion], list[Drift], list, tuple]:
+    ) -> tuple[list[Motion], list[Drift], list, Solved]:
         """Motions, drifts and works after the biased pass, and what it has seen of the rows."""
         specs: dict[int, Spec] = {}
 
@@ -367,7 +366,7 @@ class Sparse:
             room, depth, begins = carried
             row, memory, points, setup = self._again(found, i, k)
             a, b, solved = sweeps.solve(row, memory, points, a, b, setup, self.rules)
-            values, specs[i] = numbers(solved, (self.chunk,), self._dtype)
+            values, specs[i] = numbers(solved, (self.chunk,), self._dtype, once=True)
             deep, began = sweeps.seen(solved, memory)
             depth, begins = depth.at[place.lane].max(deep), begins.at[place.lane].add(began.astype(jnp.int32))
             return a, b, (self._kept(self.kinds[i], room, k, values), depth, begins)
@@ -378,21 +377,27 @@ class Sparse:
         fixed = [(motion, None, None) for _, motion in walls]
         groups, carries = self._pass(groups, fixed, found, [(room, *nothing) for room in rooms], play)
         motions, drifts, works = (list(values) for values in zip(*groups, strict=True))
-        solved = Solved(found, [kept for kept, *_ in carries], [specs[i] for i in range(len(self.kinds))])
-        return motions, drifts, works, (solved, [seen for _, *seen in carries])
+        seen = [(depth, begins) for _, depth, begins in carries]
+        return motions, drifts, works, Solved(found, [kept for kept, *_ in carries], specs, seen)
 
     def relax(
-        self, past: Past, rows: tuple, walls: list[tuple], motions: list[Motion], drifts: list, works: list, time: Array
+        self,
+        past: Past,
+        rows: Solved,
+        walls: list[tuple],
+        motions: list[Motion],
+        drifts: list,
+        works: list,
+        time: Array,
     ) -> tuple[list[Motion], list, Past]:
         """Motions and works after the relaxing pass, and what all rows hand on; the step began at `time`."""
-        before, seen = rows
-        found, one = before.found, self.setup.one
+        found, one = rows.found, self.setup.one
         specs = [self._spec(kind) for kind in self.kinds]
 
         def play(i: int, k: Array, place: Place, a: Any, b: Any, carried: tuple) -> tuple:
             lines, marks = Table(carried[0], specs[i]), carried[1]
             row, _, _, setup = self._again(found, i, k)
-            solved = rebuilt(list(before.kept[i][k]), before.specs[i])
+            solved = rebuilt(list(rows.kept[i][k]), rows.specs[i])
             a, b, (last, memory) = sweeps.relax(row, solved, a, b, setup)
             new = Line(memory, jnp.full(self.chunk, past.step, self._dtype), None, None)
             if self.setup.contacts:
@@ -408,12 +413,12 @@ class Sparse:
         carries = list(zip(past.lines, marks, strict=True))
         groups, carries = self._pass(groups, [(motion, None, None) for _, motion in walls], found, carries, play)
         depth, begins = past.depth, past.begins
-        for deep, began in seen:
+        for deep, began in rows.seen:
             depth, begins = jnp.maximum(depth, deep), begins + began
         past = past._replace(
             lines=[lines for lines, _ in carries],
             marks=[marks for _, marks in carries] if self.setup.contacts else [],
-            stores=[Store(*of) for of in zip(found.places, found.kept, before.kept, strict=True)],
+            stores=[Store(*of) for of in zip(found.places, found.kept, rows.kept, strict=True)],
             depth=depth,
             begins=begins,
             step=past.step + 1,
@@ -425,10 +430,8 @@ class Sparse:
     def _event(self, past: Past, line: Line) -> Event:
         """A row's event in this frame so far: what an older one says counts only for whether it touched before."""
         assert line.event is not None, "lines hold events where contacts are kept"
-        current = line.stamp >= past.first
-        touched = ((line.event.flags & ON) > 0) & (line.stamp == past.first - 1)
-        fresh = unseen(line.stamp.shape, self._dtype)
-        fresh = fresh._replace(flags=jnp.where(touched, ON | BEFORE, 0))
+        current, ended = line.stamp >= past.first, line.stamp == past.first - 1  # it is of the last frame's last step
+        fresh = begun(line.event._replace(flags=jnp.where(ended, line.event.flags, 0)))
         return jax.tree.map(lambda x, y: jnp.where(current, x, y), line.event, fresh)
 
     def frame_begins(self, past: Past) -> Past:
@@ -489,23 +492,7 @@ class Sparse:
             x = jnp.where(filled, x, jnp.zeros_like(x))
             return jnp.take_along_axis(x, jnp.broadcast_to(order, x.shape), axis=-2)
 
-        told = jax.tree.map(in_order, told)
-        what = told.happening
-        contacts = Contacts(
-            time=what.time,
-            frame=told.frame,
-            a=told.a.astype(jnp.int16),
-            b=told.b.astype(jnp.int16),
-            point=what.place,
-            normal=what.normal,
-            normal_impulse=what.normal_impulse,
-            tangent_impulse=what.tangent_impulse,
-            approach_speed=what.approach,
-            separation_speed=what.separation,
-            kind=what.kind,
-            count=count,
-        )
-        return depth, begins, contacts
+        return depth, begins, contacts_of(*jax.tree.map(in_order, told), count=count)
 
 
 def _pairs(kind: Kind) -> np.ndarray:
@@ -514,8 +501,8 @@ def _pairs(kind: Kind) -> np.ndarray:
 
 
 def _nothing_told(dtype: Any) -> Told:
-    zeros = [jnp.zeros((2, 1) if name in ("place", "normal") else 1, dtype) for name in Happening._fields[1:]]
-    return Told(Happening(jnp.zeros(1, jnp.uint8), *zeros), *(jnp.zeros(1, jnp.int32) for _ in range(3)))
+    nothing = happening(unseen((1,), dtype), jnp.zeros(1, dtype))
+    return Told(nothing, *[jnp.zeros(1, jnp.int32)] * 3)
 
 
 def chunk_of(lanes: int) -> int:

@@ -422,7 +422,7 @@ def kept_in(ways: list[Motion], shapes: list, walls: list[Stadium]) -> list[Moti
         return ways
     risky = [_risky(ways[g].velocity, wall, shapes[g]) for wall, g in lines]
     some = jnp.any(jnp.stack([jnp.any(x) for x in risky]))
-    return jax.lax.cond(some, lambda: _kept_in(ways, shapes, lines), lambda: ways)
+    return jax.lax.cond(some, lambda: _kept_in(ways, shapes, lines, risky), lambda: ways)
 
 
 def _risky(way: Array, a: Stadium, b: Disc) -> Array:
@@ -432,9 +432,9 @@ def _risky(way: Array, a: Stadium, b: Disc) -> Array:
     return (16 * dot(way, way) > b.radius**2) | deep
 
 
-def _kept_in(ways: list[Motion], shapes: list, lines: list[tuple[Stadium, int]]) -> list[Motion]:
+def _kept_in(ways: list[Motion], shapes: list, lines: list[tuple[Stadium, int]], risky: list[Array]) -> list[Motion]:
     parts = [jnp.ones_like(way.spin) for way in ways]  # of its way that a body goes
-    for a, g in lines:
+    for (a, g), may in zip(lines, risky, strict=True):
         b, way = shapes[g], ways[g].velocity
         normal, offset = turned(a.direction), b.centre - a.centre
         aside, across = dot(normal, offset), dot(normal, way)
@@ -442,7 +442,7 @@ def _kept_in(ways: list[Motion], shapes: list, lines: list[tuple[Stadium, int]])
         through = (aside * across < 0) & (left < -0.5 * b.radius)
         share = aside / jnp.where(through, -across, 1.0)  # where its centre is on the line
         through = through & (jnp.abs(dot(a.direction, offset + share * way)) <= a.half_length + 0.9 * b.radius)
-        through = through & _risky(way, a, b)  # so that what other scenes do does not count
+        through = through & may  # so that what other scenes do does not count
         room = jnp.maximum(1 - (a.radius + b.radius) / jnp.maximum(jnp.abs(aside), SLOWEST), 0.0)
         parts[g] = jnp.minimum(parts[g], jnp.where(through, share * room, 1.0))
     return [Motion(part * way.velocity, way.spin) for part, way in zip(parts, ways, strict=True)]

@@ -28,10 +28,11 @@ class Spec(NamedTuple):
     leaves: list[Any]
 
 
-def numbers(tree: Any, shape: tuple[int, ...], dtype: Any) -> tuple[list[Array], Spec]:
+def numbers(tree: Any, shape: tuple[int, ...], dtype: Any, once: bool = False) -> tuple[list[Array], Spec]:
     """Every number of the tree, each an array of `shape`, and how to get the tree back.
 
-    Leaves are arrays [..., *shape], or broadcast to that; one that stands in the tree twice is taken once.
+    Leaves are arrays [..., *shape], or broadcast to that; with `once` the same array is taken only once, wherever it
+    stands.
     """
     leaves, treedef = jax.tree.flatten(tree)
     found: list[Array] = []
@@ -41,7 +42,7 @@ def numbers(tree: Any, shape: tuple[int, ...], dtype: Any) -> tuple[list[Array],
         if isinstance(leaf, bool):
             parts.append(leaf)
             continue
-        if id(leaf) not in known:
+        if not once or id(leaf) not in known:
             lead = leaf.shape[: max(leaf.ndim - len(shape), 0)]
             known[id(leaf)] = Leaf(len(found), lead, leaf.dtype)
             found += list(jnp.broadcast_to(leaf, (*lead, *shape)).reshape(-1, *shape).astype(dtype))

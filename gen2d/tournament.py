@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from gen2d.types import Array
 
@@ -99,6 +100,19 @@ def matches(sizes: list[int], fixed: int) -> list[Match]:
 def of_rows(order: list[Match]) -> list[Match]:
     """The match of each row: a match has one row a round."""
     return [match for match in order for _ in range(match.rounds)]
+
+
+def meetings(first: int, second: int, match: Match) -> tuple[np.ndarray, np.ndarray]:
+    """Who meets in each round of a match, [R, P], by their numbers in their groups."""
+
+    def play(_: int, a: Array, b: Array) -> tuple[Array, Array, tuple[Array, Array]]:
+        return a, b, (a[:, 0], b[:, 0])
+
+    with jax.ensure_compile_time_eval():
+        a, b = (jnp.arange(size)[:, None] for size in (first, second))
+        *_, rounds = tournament(a, match.rounds, play) if match.first == match.second else league(a, b, play)
+        a, b = (np.array([np.asarray(side) for side in sides]) for sides in zip(*rounds, strict=True))
+    return a, b
 
 
 def sweep(groups: list, fixed: list, order: list[Match], play: Callable) -> tuple[list, list]:

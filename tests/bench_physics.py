@@ -1,13 +1,13 @@
 """What physics costs against the number of objects: gen2d, Chipmunk (pymunk) and phyjax2d on the same scenes.
 
-    python tests/bench.py --only physics --plot gen2d/physics_cost.png     # about 6 minutes
+    python tests/bench.py --only physics --plot gen2d/physics_cost.png     # about 5 minutes
 
 A scene is a box of constant density: N discs of random radii, or 8 rectangles, that fall and bounce for 64 frames at
 60 Hz, of 4 steps each. Every engine has its own default number of iterations and makes the same states of every
 frame; pymunk is stepped, and read by each body's attributes, as its manual shows. phyjax2d steps its scenes under
 `jax.vmap`, 16 at once, as it is slower with more (8 discs: 13 microseconds a step with 16, 18 with 64). Times are of
 this process's CPU, which is on one core, so other work on the machine disturbs little. Most of what this takes is
-compiling, nearly half of that for 64 discs.
+compiling.
 """
 
 import copy

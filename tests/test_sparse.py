@@ -9,10 +9,9 @@ from worlds import box, rules, run, world
 from gen2d import types
 from gen2d.contacts import Disc, Hull, Stadium, edge_normals, hull
 from gen2d.near import around, bits_in_ring, bits_of, clearance, listed, ring_of, spots
-from gen2d.scenery import meetings
 from gen2d.simulate import Keep, simulate
 from gen2d.space import Space
-from gen2d.tournament import Match
+from gen2d.tournament import Match, meetings
 
 EVERYTHING = Keep(contacts=300, energy=True)
 
