@@ -100,7 +100,8 @@ def _verb_parser(verb: str) -> Parser:
         parser.add_argument(
             "--out", type=Path, metavar="FOLDER", help="where to put the pictures (default: the current folder)"
         )
-        parser.add_argument("--videos", type=int, default=8, help="how many rows of the sheet (8)")
+        parser.add_argument("--videos", type=int, help="how many rows of the sheet (8), or of each look (1)")
+        parser.add_argument("--gallery", action="store_true", help="instead, the same videos in every look, annotated")
         parser.add_argument("--seed", type=int, default=None, help="of a config")
         parser.add_argument(
             "--set", action="append", default=[], dest="sets", metavar="A.B=V", help="override an option of a config"
@@ -190,9 +191,16 @@ def listing(arguments: Sequence[str]) -> int:
 def preview(arguments: Sequence[str]) -> int:
     """0, and the names of the pictures made."""
     options = _verb_parser("preview").parse_args(arguments)
-    from gen2d.preview import preview as draw
+    changes = {"seed": options.seed, "sets": options.sets}
+    changes |= {} if options.videos is None else {"videos": options.videos}
+    if options.gallery:
+        from gen2d.gallery import gallery
 
-    made = draw(options.dataset, options.out or Path(), options.videos, seed=options.seed, sets=options.sets)
+        made = [gallery(options.dataset, options.out or Path(), **changes)]
+    else:
+        from gen2d.preview import preview as draw
+
+        made = draw(options.dataset, options.out or Path(), **changes)
     print("\n".join(map(str, made)))
     return 0
 

@@ -100,19 +100,67 @@ class PhysicsOptions:
 
 @dataclasses.dataclass(frozen=True)
 class CameraOptions:
-    """What part of the world a frame shows; null: all of the scene."""
+    """What part of the world a frame shows, and how the camera moves."""
 
     center: tuple[float, ...] | None = option(
-        None, float, "m", "world point in the middle of the frame", parts=2, optional=True
+        None, float, "m", "world point in the middle of the frame; null: the scene's", parts=2, optional=True
     )
-    scale: float | None = option(None, float, "px/m", "pixels per metre", above=0, high=1e6, optional=True)
+    scale: float | None = option(
+        None, float, "px/m", "pixels per metre; null: all of the scene", above=0, high=1e6, optional=True
+    )
     margin: float = option(0.0, float, "m", "shown around the scene where scale is null", low=0)
+    angle: Distribution = option(0.0, float, "rad", "of the camera, counter-clockwise", draw=True)
+    pan: tuple[Distribution, ...] = option([0, 0], float, "m/s", "speed of the camera", parts=2, draw=True)
+    zoom: Distribution = option(0.0, float, "1/s", "rate at which the scale grows", draw=True, low=-100, high=100)
+    turn: Distribution = option(0.0, float, "rad/s", "at which the camera turns", draw=True)
+    shake: Distribution = option(0.0, float, "m", "root mean square of a hand's tremor", draw=True, low=0)
+    shake_hertz: float = option(4.0, float, "Hz", "lowest frequency of the tremor", above=0)
+    follow: int | None = option(
+        None, int, "slot", "of the object that stays in the middle of the frame; null: none", low=0, optional=True
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class ImageOptions:
+    """How an image forms: how colours mix, how long the shutter is open, what stands before it, and how it is read."""
+
+    blending: str = option(
+        "srgb", str, "", "of a pixel's colours: as most tools do, or in linear light", choices=("srgb", "linear")
+    )
+    exposure: float = option(
+        0.0,
+        float,
+        "frames",
+        "for which the shutter is open, until the frame's instant; 0: no motion blur",
+        low=0,
+        high=1,
+    )
+    exposure_samples: int = option(8, int, "samples", "of an exposure, evenly in time", low=2, high=256)
+    noise: Distribution = option(
+        0.0, float, "sRGB", "standard deviation of a video's sensor noise", draw=True, low=0, high=255
+    )
+    occluders: int = option(0, int, "rectangles", "that stand before objects and do not take part", low=0, high=16)
+    occluder_width: Distribution = option([0.1, 0.3], float, "1", "of an occluder, over the frame's", draw=True, low=0)
+    occluder_height: Distribution = option([0.1, 0.6], float, "1", "of an occluder, over the frame's", draw=True, low=0)
+    occluder_front: Distribution = option(
+        1.0, float, "1", "share of the objects that an occluder stands before, in their drawing order",
+        draw=True, low=0, high=1,
+    )  # fmt: skip
+    occluder_color: tuple[Distribution, ...] = option(
+        [[60, 140]] * 3, int, "sRGB", "of an occluder", parts=3, draw=True, low=0, high=255
+    )
 
 
 @dataclasses.dataclass(frozen=True)
 class AnnotationOptions:
     """What is stored beside frames and states."""
 
+    masks: bool = option(False, bool, "", "which object each pixel shows")
+    amodal: bool = option(False, bool, "", "where each object is, seen or not, a bit a pixel")
+    boxes: bool = option(False, bool, "", "around what is seen of each object, and around all of it")
+    visibility: bool = option(False, bool, "", "how many pixels of each object are seen, and which part of it")
+    flow: bool = option(False, bool, "", "where each pixel goes to in the next frame, and came from")
+    tracks: int = option(0, int, "points", "fixed to each object and followed; 0: none", low=0, high=1024)
     contacts: int = option(
         0, int, "rows", "of contacts, per object and 16 frames; 4 is a good number, 0: none", low=0, high=1000
     )
@@ -124,6 +172,13 @@ class StorageOptions:
     """How videos lie on disk."""
 
     format: str = option("hdf5", str, "", "file format of a shard", choices=("hdf5",))
+    frames: str = option(
+        "video",
+        str,
+        "",
+        "video: stored; none: left out, to be drawn again with gen2d.render",
+        choices=("video", "none"),
+    )
     codec: str = option(
         "gzip", str, "", "of the frames: gzip opens everywhere, zstd is smaller, none can be mapped", choices=CODECS
     )
@@ -172,6 +227,7 @@ class Config:
     scene: Plugin
     physics: PhysicsOptions
     camera: CameraOptions
+    image: ImageOptions
     look: Plugin
     annotations: AnnotationOptions
     storage: StorageOptions
@@ -199,6 +255,7 @@ SECTIONS = {
     "video": VideoOptions,
     "physics": PhysicsOptions,
     "camera": CameraOptions,
+    "image": ImageOptions,
     "annotations": AnnotationOptions,
     "storage": StorageOptions,
 }

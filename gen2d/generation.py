@@ -192,9 +192,9 @@ def _measured(
     marks = [time.perf_counter()]
     jax.block_until_ready(rollout.begin(split, firsts))
     marks.append(time.perf_counter())
-    frames = jax.block_until_ready(rollout.draw(batch, job.start, rollout.slice))
+    drawn = jax.block_until_ready(rollout.draw(batch, job.start, rollout.slice))
     marks.append(time.perf_counter())
-    block = encoder.encode(job, rollout.host_columns(batch)[0], frames)
+    block = encoder.encode(job, rollout.host_columns(batch)[0], drawn[0])
     marks.append(time.perf_counter())
     count, threads = len(rollout.devices), threads_for(devices.cores())
     videos = rollout.lanes * count, rollout.slice * count, len(block) * threads
@@ -203,6 +203,8 @@ def _measured(
 
 def _warn_of_ratio(dataset: Dataset, block: Block, say: Callable[[str], None]) -> None:
     """Says so, once, where gzip does not suit the frames."""
+    if "frames" not in dataset.fields:
+        return
     raw = len(block) * int(np.prod(dataset.fields["frames"].shape(dataset.sizes)))
     ratio = raw / sum(map(len, block.chunks["frames"]))
     if dataset.codec == "gzip" and ratio < 3:

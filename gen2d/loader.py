@@ -32,7 +32,7 @@ LAYOUTS = {"THWC": (0, 1, 2, 3), "TCHW": (0, 3, 1, 2), "CTHW": (3, 0, 1, 2)}
 def open(
     path: str | Path,
     split: str | None = None,
-    fields: Sequence[str] = ("frames", "states/*"),
+    fields: Sequence[str] | None = None,
     window: int | None = None,
     stride: int = 1,
     start: str | int = "random",
@@ -42,9 +42,10 @@ def open(
 ) -> "Dataset":
     """The videos of one split of a complete dataset.
 
-    `split` may be left out if there is only one, or one called train. `fields` are names or patterns. `window` takes so
-    many frames, `stride` apart, beginning at frame `start`: a number, "first", or "random", which DataLoader draws anew
-    for each video and epoch; the Dataset alone then begins at the first. `layout` is of images with channels, `dtype`
+    `split` may be left out if there is only one, or one called train. `fields` are names or patterns: frames and
+    "states/*" unless told otherwise. `window` takes so many frames, `stride` apart, beginning at frame `start`: a
+    number, "first", or "random", which DataLoader draws anew for each video and epoch; the Dataset alone then begins at
+    the first. `layout` is of images with channels, `dtype`
     of frames ("float32" is 0 to 1). With verify="checksum" nothing damaged is ever returned.
 
     Raises FolderError, ConfigError, and DamagedError, then and whenever videos are read.
@@ -52,6 +53,8 @@ def open(
     root = Path(path)
     manifest = read_manifest(root)
     split = _chosen_split(root, manifest, split)
+    if fields is None:
+        fields = [*({"frames"} & manifest["fields"].keys()), "states/*"]
     names = _chosen_fields(root, manifest, [fields] if isinstance(fields, str) else fields)
     options = Options(split, tuple(names), window, stride, start, layout, dtype, verify)
     _check(options, manifest["sizes"].get("T", 0))

@@ -15,7 +15,7 @@ import numpy as np
 
 from gen2d import shards
 from gen2d.errors import UserError
-from gen2d.rollout import Batch, Rollout, part, parts
+from gen2d.rollout import Batch, Rollout, parts
 from gen2d.shards import Block, Dataset, Shard
 from gen2d.types import Array
 
@@ -85,13 +85,13 @@ class Encoder:
         self.limit = 2 * (len(rollout.devices) + threads)  # jobs in flight
         self.running: deque[Future[Block]] = deque()
 
-    def encode(self, job: Job, columns: dict[str, np.ndarray], frames: Array) -> Block:
-        """The block of a job, from its device's columns and the frames of its slice on all devices."""
+    def encode(self, job: Job, columns: dict[str, np.ndarray], drawn: dict[str, Array]) -> Block:
+        """The block of a job, from its device's columns and what was drawn of its slice there."""
         rows, start = job.rows, job.start
         own = {name: column[rows] for name, column in columns.items()}
-        own["frames"] = part(frames, job.device)[rows.start - start : rows.stop - start]
+        for name, array in drawn.items():
+            own[name] = np.asarray(array)[rows.start - start : rows.stop - start]
         own["index"] = np.arange(job.first + rows.start, job.first + rows.stop, dtype=np.int64)
-        own |= self.rollout.camera(rows.stop - rows.start)
         block = shards.encode(own, self.dataset.fields, self.dataset.codec)
         _check_finite(block, job.first + rows.start)
         return block
@@ -119,16 +119,16 @@ class Encoder:
     def _submitted(self, jobs: list[Job], batch: Batch) -> Iterator[int]:
         columns = self.rollout.host_columns(batch)
         for start in sorted({job.start for job in jobs}):
-            frames = self.rollout.draw(batch, start, self.rollout.slice)
+            drawn = self.rollout.draw(batch, start, self.rollout.slice)
             for job in jobs:
                 if job.start == start:
-                    job.future = self._submit(job, columns[job.device], frames)
+                    job.future = self._submit(job, columns[job.device], drawn[job.device])
             yield start
 
-    def _submit(self, job: Job, columns: dict[str, np.ndarray], frames: Array) -> Future[Block]:
+    def _submit(self, job: Job, columns: dict[str, np.ndarray], drawn: dict[str, Array]) -> Future[Block]:
         while len(self.running) >= self.limit:
             self.running.popleft().result()
-        self.running.append(self.pool.submit(self.encode, job, columns, frames))
+        self.running.append(self.pool.submit(self.encode, job, columns, drawn))
         return self.running[-1]
 
     def close(self) -> None:

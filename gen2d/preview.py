@@ -1,6 +1,7 @@
 """Pictures for a person: a contact sheet (videos down, time across) and an animation, of a dataset or of a config."""
 
-from collections.abc import Sequence
+import contextlib
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import cv2
@@ -10,7 +11,7 @@ from gen2d.errors import FolderError, UserError
 from gen2d.loader import open as open_dataset
 
 COLUMNS = 10  # frames across the sheet
-GAP = 2  # px between pictures
+GAP, GREY = 2, 170  # px between pictures, and its sRGB
 SMALLEST = 96  # px: smaller frames are enlarged by whole factors, so that pixels stay pixels
 
 
@@ -18,21 +19,33 @@ def preview(
     source: str, out: Path, videos: int = 8, *, seed: int | None = None, sets: Sequence[str] = ()
 ) -> list[Path]:
     """The files made in the folder `out`: NAME-sheet.png and NAME.gif."""
-    if videos < 1:
-        raise UserError(f"--videos is {videos}, but must be 1 or more")
+    check_videos(videos)
     if Path(source).is_dir():
         ds = open_dataset(source, fields=("frames",))
         name, frames, fps = ds.manifest["name"], ds.batch(range(min(videos, len(ds))))["frames"], ds.manifest["fps"]
     else:
         name, frames, fps = _drawn(source, videos, seed, sets)
+    sheet, animation = out / f"{name}-sheet.png", out / f"{name}.gif"
+    with writing(out):
+        write(sheet, contact_sheet(frames))
+        animate(animation, frames, fps)
+    return [sheet, animation]
+
+
+def check_videos(videos: int) -> None:
+    """Returns nothing; raises UserError where there would be no video."""
+    if videos < 1:
+        raise UserError(f"--videos is {videos}, but must be 1 or more")
+
+
+@contextlib.contextmanager
+def writing(out: Path) -> Iterator[None]:
+    """A block that writes into a folder, which is made first; its OSError becomes a FolderError."""
     try:
         out.mkdir(parents=True, exist_ok=True)
-        sheet, animation = out / f"{name}-sheet.png", out / f"{name}.gif"
-        _write(sheet, contact_sheet(frames))
-        animate(animation, frames, fps)
+        yield
     except OSError as error:
         raise FolderError(f"{out}: pictures cannot be written there ({error.strerror or error})") from None
-    return [sheet, animation]
 
 
 def _drawn(source: str, videos: int, seed: int | None, sets: Sequence[str]) -> tuple[str, np.ndarray, float]:
@@ -44,7 +57,7 @@ def _drawn(source: str, videos: int, seed: int | None, sets: Sequence[str]) -> t
     from gen2d.pipeline import check_placed
     from gen2d.rollout import Rollout, parts
 
-    config = load_config(source, sets)
+    config = load_config(source, [*sets, "storage.frames=video"])
     if seed is not None:
         config = dataclasses.replace(config, seed=checked_seed(seed))
     rollout = Rollout(config, devices.prepare()[:1])
@@ -53,21 +66,29 @@ def _drawn(source: str, videos: int, seed: int | None, sets: Sequence[str]) -> t
         batch = rollout.begin("train", [first])
         check_placed(parts(batch.placed)[0][: videos - first], first)
         for start in range(0, min(rollout.lanes, videos - first), rollout.slice):
-            frames.append(parts(rollout.draw(batch, start, rollout.slice))[0])
+            frames.append(np.asarray(rollout.draw(batch, start, rollout.slice)[0]["frames"]))
     return config.name, np.concatenate(frames)[:videos], config.video.fps
+
+
+def shown(frames: int) -> np.ndarray:
+    """The numbers of the frames that a sheet shows, the first and the last among them."""
+    return np.unique(np.linspace(0, frames - 1, COLUMNS).round().astype(int))
 
 
 def contact_sheet(frames: np.ndarray) -> np.ndarray:
     """One picture [H, W, 3]: a row for each of the videos [n, T, H, W, 3], first to last frame from left to right."""
-    times = np.unique(np.linspace(0, frames.shape[1] - 1, COLUMNS).round().astype(int))
-    rows = [np.concatenate([_framed(video[t]) for t in times], axis=1) for video in frames]
+    rows = [np.concatenate([_framed(video[t]) for t in shown(len(video))], axis=1) for video in frames]
     return np.concatenate(rows)
 
 
+def enlarged(image: np.ndarray) -> np.ndarray:
+    """A small image [H, W] or [H, W, 3] larger by a whole factor."""
+    factor = -(-SMALLEST // min(image.shape[:2]))
+    return np.repeat(np.repeat(image, factor, axis=0), factor, axis=1)
+
+
 def _framed(frame: np.ndarray) -> np.ndarray:
-    factor = -(-SMALLEST // min(frame.shape[:2]))
-    large = np.repeat(np.repeat(frame, factor, axis=0), factor, axis=1)
-    return np.pad(large, [(GAP, GAP), (GAP, GAP), (0, 0)], constant_values=255)
+    return np.pad(enlarged(frame), [(GAP, GAP), (GAP, GAP), (0, 0)], constant_values=GREY)
 
 
 def animate(path: Path, frames: np.ndarray, fps: float) -> None:
@@ -87,6 +108,7 @@ def _tiled(video: np.ndarray) -> np.ndarray:
     return np.stack([_framed(frame) for frame in video])
 
 
-def _write(path: Path, image: np.ndarray) -> None:
+def write(path: Path, image: np.ndarray) -> None:
+    """Writes a picture [H, W, 3]."""
     if not cv2.imwrite(str(path), image[..., ::-1]):
         raise OSError("OpenCV could not write a PNG")

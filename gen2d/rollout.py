@@ -6,6 +6,7 @@ more devices mean more batches, not wider ones, and video i always sits in lane 
 do not depend on how many videos are made, or where.
 """
 
+import dataclasses
 import functools
 import math
 import zlib
@@ -17,12 +18,13 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-from gen2d import factors, raster, types
+from gen2d import annotations, drawing, factors, types
 from gen2d.config import Config, PhysicsOptions
 from gen2d.fields import Field
+from gen2d.raster import Stage
 from gen2d.rows import Rules
 from gen2d.simulate import Keep, simulate, substeps
-from gen2d.types import Array
+from gen2d.types import Array, Scene, State
 
 SLICE_BYTES = 16 * 2**20  # of raw frames drawn at once; larger buffers cost page faults
 SHARD_BYTES = 2**30  # of raw frames in a shard
@@ -34,9 +36,8 @@ VIDEOS = PartitionSpec("videos")
 class Batch(NamedTuple):
     """`lanes` simulated videos on each device, ready to be drawn."""
 
-    columns: dict[str, Array]  # stored fields but for the frames, [n, ...]
-    backdrops: Array
-    discs: raster.Moving
+    columns: dict[str, Array]  # stored fields but for those that are drawn, [n, ...]
+    stages: Stage
     placed: Array  # [n] whether the sampler found a scene
 
 
@@ -56,10 +57,9 @@ class Rollout:
         self.config, self.devices = config, list(devices)
         family, options, video = config.scene.module, config.scene.options, config.video
         self.layout = family.layout(options)
-        self.view = _view(config, self.layout)
+        self.plan = drawing.plan_of(config, self.layout)
         self.steps = substeps(video.fps, config.physics.substeps, config.physics.max_step)
-        spans = math.ceil(video.frames / 16)
-        self.keep = Keep(config.annotations.contacts * spans * self.layout.slots, config.annotations.energy)
+        self.keep = keep_of(config, self.layout)
         frame_bytes = video.frames * video.height * video.width * 3
         auto = min(SHARD_VIDEOS, _power_of_two(SHARD_BYTES // frame_bytes))
         self.videos_per_shard = config.storage.videos_per_shard or auto
@@ -80,6 +80,7 @@ class Rollout:
         video, family = self.config.video, self.config.scene.module
         own = {"T": video.frames, "K": self.layout.slots, "H": video.height, "W": video.width}
         own |= {"C": self.keep.contacts} if self.keep.contacts else {}
+        own |= annotations.sizes(self.config.annotations, self.plan)
         return own | family.sizes(self.config.scene.options)
 
     @property
@@ -92,7 +93,9 @@ class Rollout:
         fields |= types.fields_of(scene)
         if not self.keep.energy:
             del fields["quality/energy_residual"]
-        fields["frames"] = Field("uint8", "n T H W 3", "sRGB", "the video")
+        if self.plan.frames:
+            fields["frames"] = Field("uint8", "n T H W 3", "sRGB", "the video")
+        fields |= annotations.fields(self.config.annotations)
         fields["index"] = Field("int64", "n", "1", "the video's number in its split")
         fields["time"] = Field("float64", "T", "s", "of each frame; frame 0 is the initial state")
         fields["quality/rejected_draws"] = Field("int32", "n", "1", "places drawn again as they did not fit")
@@ -114,17 +117,22 @@ class Rollout:
         root = np.asarray(factors.seed_words(self.config.seed, zlib.crc32(split.encode())))
         return self._simulate(root, jax.device_put(numbers, NamedSharding(self.mesh, VIDEOS)))
 
-    def draw(self, batch: Batch, start: int, count: int) -> Array:
-        """Starts the frames [devices * count, T, H, W, 3] of `count` videos of each device, from lane `start` on."""
-        return self._draw(count)(batch.backdrops, batch.discs, np.int32(start))
+    def draw(self, batch: Batch, start: int, count: int) -> list[dict[str, Array]]:
+        """Starts to draw `count` videos of each device, from lane `start` on: for each device their frames
+        [count, T, H, W, 3] and what is told of their pixels, by their stored names.
+
+        Each device runs a program of its own: compiled for several at once, another rounding would differ.
+        """
+        own = [jax.tree.map(lambda array, d=d: _pieces(array)[d].data, batch.stages) for d in range(len(self.devices))]
+        return [self._draw(count)(stages, np.int32(start)) for stages in own]
 
     @functools.lru_cache(maxsize=8)  # noqa: B019 (a Rollout lives as long as its run)
     def _draw(self, count: int) -> Any:
-        def drawn(backdrops: Array, discs: raster.Moving, start: Array) -> Array:
-            cut = jax.tree.map(lambda x: jax.lax.dynamic_slice_in_dim(x, start, count), (backdrops, discs))
-            return raster.draw(cut[0], cut[1], self.layout.reach * self.view.scale)
+        def drawn(stages: Stage, start: Array) -> dict[str, Array]:
+            cut = jax.tree.map(lambda x: jax.lax.dynamic_slice_in_dim(x, start, count), stages)
+            return drawing.pictures(cut, self.plan, self.config.annotations)
 
-        return jax.jit(self._shared(drawn, (VIDEOS, VIDEOS, PartitionSpec())))
+        return jax.jit(drawn)
 
     def _made(self, root: Array, numbers: Array) -> Batch:
         """One device's share: from numbers to everything but the frames."""
@@ -135,14 +143,22 @@ class Rollout:
         device = types.to_device(scene), types.to_device(state)
         sparse = self.devices[0].platform == "cpu"
         made = simulate(*device, layout, rules, config.video.frames, self.steps, self.keep, sparse=sparse)
-        made = types.to_stored(made)
-        paint = jax.vmap(lambda s: config.look.module.paint(s, layout, config.look.options))(scene)
-        backdrops = jax.vmap(lambda s, t, p: raster.backdrop(s, t, p, layout, self.view))(scene, state, paint)
-        discs = raster.moving(scene, made.states, paint.color, layout, self.view)
+        between = None if made.between is None else _videos_first(made.between)
+        made = types.to_stored(dataclasses.replace(made, between=None))
+
+        def staged(key: Array, scene: Scene, states: State, between: State | None) -> tuple[Stage, Array]:
+            paint = drawing.paint_of(key, config, scene, layout)
+            view = drawing.view_of(key, config, layout, states)
+            stage = drawing.stage_of(key, config, scene, states, view, paint, between)
+            return stage, drawing.painted_colors(paint, scene)
+
+        stages, colors = jax.vmap(staged)(keys, scene, made.states, between)
         columns = types.columns(scene) | types.columns(made)
+        columns["objects/color"] = colors
+        columns |= drawing.camera_columns(stages.instants.view)
         columns |= {f"factors/{name}": values.astype(jnp.float32) for name, values in drawn.items()}
         columns["quality/rejected_draws"] = rejected
-        return Batch(columns, backdrops, discs, placed)
+        return Batch(columns, stages, placed)
 
     def _sampled(self, key: Array) -> tuple:
         family, options = self.config.scene.module, self.config.scene.options
@@ -162,14 +178,10 @@ class Rollout:
             pieces["contacts/time"] = [array.astype(np.float64) for array in pieces["contacts/time"]]
         return [{name: arrays[d] for name, arrays in pieces.items()} for d in range(len(self.devices))]
 
-    def camera(self, count: int) -> dict[str, np.ndarray]:
-        """The camera's fields for `count` videos."""
-        shape = (count, self.config.video.frames)
-        return {
-            "camera/center": np.broadcast_to(np.array(self.view.center, np.float32), (*shape, 2)),
-            "camera/scale": np.full(shape, self.view.scale, np.float32),
-            "camera/angle": np.zeros(shape, np.float32),
-        }
+
+def _videos_first(between: State) -> State:
+    """States [T - 1, steps, (2,) K, n] as [n, T - 1, steps, K(, 2)]."""
+    return jax.tree.map(lambda x: jnp.moveaxis(jnp.moveaxis(x, -1, 0), -1, 3), between)
 
 
 CAMERA = (
@@ -183,14 +195,15 @@ def _pieces(array: Array) -> list[Any]:
     return sorted(array.addressable_shards, key=lambda piece: piece.index[0].start or 0)
 
 
-def part(array: Array, device: int) -> np.ndarray:
-    """One device's part of an array, by its place in the mesh, without a copy where the device is a CPU."""
-    return np.asarray(_pieces(array)[device].data)
-
-
 def parts(array: Array) -> list[np.ndarray]:
     """Each device's part of an array."""
     return [np.asarray(piece.data) for piece in _pieces(array)]
+
+
+def keep_of(config: Config, layout: types.Layout) -> Keep:
+    """What is kept of a simulation beyond its states."""
+    rows = config.annotations.contacts * math.ceil(config.video.frames / 16) * layout.slots
+    return Keep(rows, config.annotations.energy, between=config.image.exposure > 0)
 
 
 def rules_of(physics: PhysicsOptions, fps: float, steps: int) -> Rules:
@@ -205,13 +218,6 @@ def rules_of(physics: PhysicsOptions, fps: float, steps: int) -> Rules:
         damping=physics.damping,
         mixing=physics.mixing,
     )
-
-
-def _view(config: Config, layout: types.Layout) -> raster.View:
-    video, camera = config.video, config.camera
-    fitted = raster.fitted(layout.bounds, video.height, video.width, camera.margin)
-    center = camera.center or fitted.center
-    return raster.View(video.height, video.width, (center[0], center[1]), camera.scale or fitted.scale)
 
 
 def _factor_options(config: Config) -> dict[str, Any]:

@@ -34,6 +34,7 @@ class Keep:
 
     contacts: int = 0  # slots for rows of contacts; 0: none
     energy: bool = False
+    between: bool = False  # whether the states at every step, too
 
 
 def simulate(
@@ -68,19 +69,35 @@ def simulate(
 
     def frame(world: World, number: Array) -> tuple[World, tuple]:
         world = world._replace(time=number * (steps * rules.step), contacts=contacts.frame_begins(world.contacts))
-        world = jax.lax.fori_loop(0, steps, lambda _, now: step(now, scenery, rules), world)
+        if keep.between:
+            world, way = jax.lax.scan(lambda now, _: _shown(step(now, scenery, rules)), world, length=steps)
+        else:
+            world, way = jax.lax.fori_loop(0, steps, lambda _, now: step(now, scenery, rules), world), None
         past, happened = contacts.frame_ends(world.contacts)
-        bodies = [body._replace(rest=None) for body in world.bodies]
-        return world._replace(contacts=past), (bodies, _sums(world, scenery), happened)
+        return world._replace(contacts=past), (_shown(world)[1], way, _sums(world, scenery), happened)
 
     numbers = jnp.arange(frames - 1, dtype=state.angle.dtype)
-    last, (bodies, sums, happened) = jax.lax.scan(frame, start, numbers)
+    last, (bodies, way, sums, happened) = jax.lax.scan(frame, start, numbers)
+    between = None if way is None else _between(state, way, layout, rules.step)
     states = _states(state, bodies, layout, numbers * (steps * rules.step) + steps * rules.step)
     first = _sums(start, scenery)
     energy = None if first is None else _energy(first, sums)
     residual = None if energy is None else jnp.max(jnp.abs(energy.residual), axis=0)
     depth, begins, rows = contacts.ended(last.contacts, happened, keep.contacts, 1 / (steps * rules.step))
-    return Trajectory(states, Quality(depth, begins, residual), rows, energy)
+    return Trajectory(states, Quality(depth, begins, residual), rows, energy, between)
+
+
+def _shown(world: World) -> tuple[World, list[Body]]:
+    """The world, and of its bodies what is kept of an instant."""
+    return world, [body._replace(rest=None) for body in world.bodies]
+
+
+def _between(start: State, way: list[Body], layout: Layout, step: float) -> State:
+    """The states [T - 1, steps, ...] at the ends of steps, of bodies likewise."""
+    frames, steps = way[0].angle.shape[:2]
+    bodies = jax.tree.map(lambda x: x.reshape(frames * steps, *x.shape[2:]), way)
+    states = _states(start, bodies, layout, (jnp.arange(frames * steps, dtype=start.angle.dtype) + 1) * step)
+    return jax.tree.map(lambda x: x[1:].reshape(frames, steps, *x.shape[1:]), states)
 
 
 def _books(bodies: list[Body], scenery: Scenery, rules: Rules) -> ledger.Ledger:

@@ -11,6 +11,7 @@ from typing import Any, TypeVar, dataclass_transform
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from gen2d.fields import Field
 
@@ -149,6 +150,7 @@ class Trajectory:
     quality: Quality
     contacts: Contacts | None = None
     energy: Energy | None = None
+    between: State | None = None  # at every step, [T, steps, ...]; not stored
 
 
 @dataclasses.dataclass(frozen=True)
@@ -159,6 +161,13 @@ class Run:
     count: int
     kind: int = DYNAMIC
     vertices: int = 0  # of each polygon, at most
+    rounded: bool = False  # whether polygons have a radius
+    layer: int | None = None  # lower layers are drawn first; None: 0 for static objects, 1 for those that move
+
+    @property
+    def painted(self) -> int:
+        """The layer that it is drawn in."""
+        return (0 if self.kind == STATIC else 1) if self.layer is None else self.layer
 
 
 @dataclasses.dataclass(frozen=True)
@@ -190,15 +199,21 @@ class Layout:
         return sum(run.count for run in self.runs)
 
     @property
-    def discs(self) -> int:
-        """How many moving discs there are, which the rasterizer expects in the first slots."""
-        return self.runs[0].count
-
-    @property
     def spans(self) -> tuple[tuple[Run, int], ...]:
         """Each run and its first slot."""
         starts = itertools.accumulate((run.count for run in self.runs), initial=0)
         return tuple(zip(self.runs, starts, strict=False))
+
+    @property
+    def painted(self) -> tuple[tuple[Run, int], ...]:
+        """The same from back to front: lower layers first, slots of one layer in their order."""
+        return tuple(sorted(self.spans, key=lambda span: (span[0].painted, span[1])))
+
+    @property
+    def depths(self) -> np.ndarray:
+        """Each slot's place in the drawing order, [K] int16, 0 is farthest back: what `objects/depth` holds."""
+        order = [slot for run, first in self.painted for slot in range(first, first + run.count)]
+        return np.argsort(order).astype(np.int16)
 
 
 def described(cls: type) -> dict[str, tuple[str, Field]]:

@@ -1,12 +1,12 @@
-"""Plain discs on a plain background, walls as lines: each object in its own colour."""
+"""Plain shapes on a plain background, each object in one colour."""
 
 import dataclasses
 
 import jax.numpy as jnp
 
 from gen2d.config import option
-from gen2d.raster import Paint
-from gen2d.types import Layout, Scene
+from gen2d.paint import Background, Paint, colors_of, lines_of
+from gen2d.types import Array, Layout, Scene
 
 
 @dataclasses.dataclass(frozen=True)
@@ -15,15 +15,19 @@ class Options:
 
     background: tuple = option([20, 20, 20], int, "sRGB", "behind everything", parts=3, low=0, high=255)
     wall_width: float = option(1.5, float, "px", "of a segment's line, beyond its own radius; 0: not drawn", low=0)
-
-
-def paint(scene: Scene, layout: Layout, options: Options) -> Paint:
-    """What one video's slots are drawn as."""
-    objects = scene.objects
-    walls = slice(layout.discs, layout.slots)
-    drawn = objects.present[walls] & ((options.wall_width > 0) | (objects.radius[walls] > 0))
-    return Paint(
-        background=jnp.asarray(options.background, jnp.float32),
-        color=objects.color.astype(jnp.float32),
-        line=jnp.where(drawn, options.wall_width / 2, -jnp.inf),
+    palette: str = option("scene", str, "", "whose colours objects have", choices=("scene", "random"))
+    contrast: float = option(
+        120.0, float, "1", "least difference of random colours and of the background, 0 to 765", low=0, high=765
     )
+
+
+def margin(options: Options) -> float:
+    """How far an object may be drawn beyond its rim, px."""
+    return options.wall_width / 2
+
+
+def paint(scene: Scene, layout: Layout, options: Options, key: Array) -> Paint:
+    """What one video's slots are painted with."""
+    background = jnp.asarray(options.background, jnp.float32)
+    drawn, grow = lines_of(scene, options.wall_width)
+    return Paint(Background(background), colors_of(scene, layout, options, key, background), drawn, grow)

@@ -85,7 +85,7 @@ def _parts(folder: Path, sets: Sequence[str]) -> dict[str, tuple[Callable[[], An
     frames = [jax.block_until_ready(rollout.draw(batch, job.start, rollout.slice)) for job in jobs]
 
     def encode() -> list[Any]:
-        return [encoder.encode(job, columns, f) for job, f in zip(jobs, frames, strict=True)]
+        return [encoder.encode(job, columns, f[0]) for job, f in zip(jobs, frames, strict=True)]
 
     blocks = encode() * (whole // rollout.lanes)
 
@@ -97,7 +97,7 @@ def _parts(folder: Path, sets: Sequence[str]) -> dict[str, tuple[Callable[[], An
         "sampler": (lambda: jax.block_until_ready(sample(numbers)), rollout.lanes),
         "simulate": (lambda: jax.block_until_ready(simulate(*drawn)), rollout.lanes),
         "render": (draw, rollout.lanes),
-        "transfer": (lambda: [rollout.host_columns(batch), *map(parts, frames)], rollout.lanes),
+        "transfer": (lambda: [rollout.host_columns(batch), *(np.asarray(a) for drawn in frames for a in drawn[0].values())], rollout.lanes),
         "compress": (encode, rollout.lanes),
         "write": (lambda: shards.write(dataset, shard, blocks), whole),
     }

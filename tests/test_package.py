@@ -35,18 +35,13 @@ ORDER = [
         "factors",
         "plugins",
         "config",
-        "raster",
-        "placement",
-        "scenes",
-        "renderers",
-        "devices",
-        "rollout",
-        "pipeline",
     ),
-    *("generation", "preview", "space", "pictures"),
+    *("coverage", "paint", "camera", "figures", "raster", "extents", "annotations"),
+    *("placement", "scenes", "renderers", "drawing", "devices", "rollout", "redraw", "pipeline"),
+    *("generation", "preview", "gallery", "space", "pictures"),
 ]
 WITHOUT_JAX = ORDER[: ORDER.index("report") + 1]
-PLUGINS = ("scenes", "renderers", "formats")
+PLUGINS = ("scenes", "renderers", "annotations", "formats")
 
 
 def imports(path: Path) -> set[str]:

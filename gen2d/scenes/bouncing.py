@@ -4,6 +4,7 @@ import dataclasses
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from gen2d.config import option
 from gen2d.factors import Distribution
@@ -107,7 +108,7 @@ def _objects(factors: dict[str, Array], present: Array, options: Options) -> Obj
         shape=both(jnp.zeros(balls), SHAPES.index("segment") * walls, jnp.uint8),
         radius=both(factors["radius"], 0 * walls),
         half_length=both(jnp.zeros(balls), length / 2),
-        depth=both(4 + jnp.arange(balls), jnp.arange(4), jnp.int16),
+        depth=both(*np.split(layout(options).depths, [balls]), jnp.int16),
         mass=both(mass, jnp.inf * walls),
         moment=both(disc_moment(factors["radius"], mass), jnp.inf * walls),
         elasticity=both(factors["elasticity"], factors["wall_elasticity"] * walls),

@@ -1,0 +1,54 @@
+"""What is true of a video's pixels: one file for each annotation, named like the option that asks for it.
+
+A file has `FIELDS`, what it stores, by name; `OWNERS`, whether it needs to know which object each pixel shows; and
+`annotate(stage, owners, plan, options)`, written for one video, which gives an array for each field.
+"""
+
+import functools
+import importlib
+import pkgutil
+from types import ModuleType
+from typing import Any
+
+import jax
+
+from gen2d.fields import Field
+from gen2d.raster import Plan, Stage
+from gen2d.types import Array
+
+
+def wanted(options: Any) -> list[ModuleType]:
+    """The annotations that the options ask for."""
+    names = sorted(module.name for module in pkgutil.iter_modules(__path__))
+    return [importlib.import_module(f"{__name__}.{name}") for name in names if getattr(options, name)]
+
+
+def need_owners(options: Any) -> bool:
+    """Whether it must be known which object each pixel shows."""
+    return any(module.OWNERS for module in wanted(options))
+
+
+def fields(options: Any) -> dict[str, Field]:
+    """Everything that is stored for these options."""
+    return {name: field for module in wanted(options) for name, field in module.FIELDS.items()}
+
+
+def sizes(options: Any, plan: Plan) -> dict[str, int]:
+    """The sizes of the axes that annotations bring with them."""
+    found: dict[str, int] = {}
+    for module in wanted(options):
+        if hasattr(module, "sizes"):
+            found |= module.sizes(plan, options)
+    return found
+
+
+def annotated(stages: Stage, owners: Array | None, plan: Plan, options: Any) -> dict[str, Array]:
+    """The annotations of some videos, by their stored names; owners [n, T, H, W] uint8 as raster.draw gives them."""
+    found: dict[str, Array] = {}
+    for module in wanted(options):
+        annotate = functools.partial(module.annotate, plan=plan, options=options)
+        if owners is None:
+            found |= jax.vmap(lambda stage, annotate=annotate: annotate(stage, None))(stages)
+        else:
+            found |= jax.vmap(annotate)(stages, owners)
+    return found

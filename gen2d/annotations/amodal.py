@@ -1,0 +1,32 @@
+"""Where each object is in the picture, seen or not: pixels at least half of which it covers, a bit each."""
+
+import jax.numpy as jnp
+
+from gen2d.fields import Field
+from gen2d.raster import Plan, Stage, alone
+from gen2d.types import Array
+
+OWNERS = False
+FIELDS = {
+    "masks/amodal": Field(
+        "uint8", "n T K B", "1", "pixels half covered or more, seen or not; bits in rows, first pixel highest"
+    )
+}
+
+
+def sizes(plan: Plan, options: object) -> dict[str, int]:
+    """B, the bytes of a mask: numpy.unpackbits(mask)[: H * W].reshape(H, W) is the mask."""
+    return {"B": -(-plan.height * plan.width // 8)}
+
+
+def annotate(stage: Stage, owners: Array | None, plan: Plan, options: object) -> dict[str, Array]:
+    """The packed masks of every slot."""
+    pixels = plan.height * plan.width
+    weights = jnp.asarray([128, 64, 32, 16, 8, 4, 2, 1], jnp.uint8)
+
+    def packed(cover: Array) -> Array:
+        bits = (cover >= 0.5).reshape(-1, pixels)
+        bits = jnp.pad(bits, [(0, 0), (0, -pixels % 8)]).reshape(len(bits), -1, 8)
+        return jnp.where(bits, weights, 0).astype(jnp.uint8).sum(-1, dtype=jnp.uint8)
+
+    return {"masks/amodal": alone(stage, plan, packed)}

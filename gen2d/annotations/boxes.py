@@ -1,0 +1,55 @@
+"""Boxes: around what is seen of each object, and around all of it."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+
+from gen2d import extents
+from gen2d.fields import Field
+from gen2d.folds import folded
+from gen2d.raster import Plan, Stage
+from gen2d.types import Array
+
+OWNERS = True
+FIELDS = {
+    "boxes/visible": Field(
+        "float32", "n T K 4", "px", "x0 y0 x1 y1 around the pixels of the instance mask; 0 where nothing is seen"
+    ),
+    "boxes/amodal": Field(
+        "float32", "n T K 4", "px", "x0 y0 x1 y1 around the whole object, also beyond the frame, to a part of a pixel"
+    ),
+}
+WORD = 32  # slots that are looked at together, a bit each
+
+
+def annotate(stage: Stage, owners: Array, plan: Plan, options: object) -> dict[str, Array]:
+    """Both kinds of boxes."""
+    return {"boxes/visible": seen_boxes(owners, plan.layout.slots), "boxes/amodal": extents.boxes(stage, plan)}
+
+
+def seen_boxes(owners: Array, slots: int) -> Array:
+    """The boxes [T, K, 4] around the pixels of each slot in masks [T, H, W]."""
+    found = []
+    for first in range(0, slots, WORD):
+        columns, rows = _words(owners, first)
+        # In a loop of its own: fused with what is before it, all pixels would be looked at again for each number.
+        bits = jnp.arange(min(WORD, slots - first), dtype=jnp.uint32)
+        ends = [jax.lax.map(functools.partial(_ends, words=words.T), bits) for words in (columns, rows)]
+        found.append(jnp.stack([ends[0][0], ends[1][0], ends[0][1], ends[1][1]], -1))
+    return jnp.moveaxis(jnp.concatenate(found), 0, 1)
+
+
+def _words(owners: Array, first: int) -> tuple[Array, Array]:
+    """For each column and row of masks [T, H, W] which of WORD slots are seen there, a bit each."""
+    number = owners.astype(jnp.uint32) - (first + 1)  # wraps around below
+    bits = jnp.where(number < WORD, jnp.uint32(1) << (number & (WORD - 1)), jnp.uint32(0))
+    return folded(bits, 1, jnp.bitwise_or), folded(bits, 2, jnp.bitwise_or)
+
+
+def _ends(bit: Array, words: Array) -> tuple[Array, Array]:
+    """Of words [L, T], the first place that has a bit and the one after the last, [T], float32."""
+    there, place = (words >> bit) & 1 > 0, jnp.arange(len(words), dtype=jnp.float32)[:, None]
+    last = folded(jnp.where(there, place + 1, 0.0), 0, jnp.maximum)
+    first = len(words) - folded(jnp.where(there, len(words) - place, 0.0), 0, jnp.maximum)
+    return jnp.minimum(first, last), last

@@ -1,0 +1,17 @@
+"""Which object each pixel shows: the one of which most is seen in it."""
+
+from gen2d.fields import Field
+from gen2d.raster import Plan, Stage
+from gen2d.types import Array
+
+OWNERS = True
+FIELDS = {
+    "masks/instance": Field(
+        "uint8", "n T H W", "id", "slot + 1 of the object seen most of, 0 background, 255 an occluder"
+    )
+}
+
+
+def annotate(stage: Stage, owners: Array, plan: Plan, options: object) -> dict[str, Array]:
+    """The mask itself."""
+    return {"masks/instance": owners}

@@ -1,0 +1,83 @@
+"""Points that are fixed to objects, followed through the video."""
+
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from gen2d.camera import to_pixels
+from gen2d.fields import Field
+from gen2d.paint import hashed
+from gen2d.raster import Plan, Stage
+from gen2d.types import Array, Run
+
+OWNERS = True
+FIELDS = {
+    "tracks/points": Field(
+        "float32", "n T P 2", "px", "x right, y down, of points fixed to objects, even in their area"
+    ),
+    "tracks/visible": Field("bool", "n T P", "1", "whether the point lies in a pixel that shows its object"),
+    "tracks/object": Field("int16", "n P", "object", "slot that the point is fixed to, -1 where there is none"),
+}
+
+
+def sizes(plan: Plan, options: Any) -> dict[str, int]:
+    """P, so many points for every slot."""
+    return {"P": plan.layout.slots * options.tracks}
+
+
+def annotate(stage: Stage, owners: Array, plan: Plan, options: Any) -> dict[str, Array]:
+    """The points, where they are seen, and whose they are."""
+    count = options.tracks
+    own = jnp.concatenate([_inside(stage, run, first, count) for run, first in plan.layout.spans])  # [K, P, 2] m
+    at = stage.instants
+    cos, sin = jnp.cos(at.angle)[..., None], jnp.sin(at.angle)[..., None]
+    x, y = own[..., 0], own[..., 1]
+    world = at.position[:, :, None] + jnp.stack([x * cos - y * sin, x * sin + y * cos], -1)
+    points = to_pixels(at.view, world.reshape(len(world), -1, 2), plan.height, plan.width)
+    slots = np.repeat(np.arange(plan.layout.slots), count)
+    there = stage.paint.drawn[slots]
+    points = jnp.where(there[:, None], points, 0.0)
+    column, row = (jnp.floor(points[..., i]).astype(jnp.int32) for i in range(2))
+    inside = (column >= 0) & (column < plan.width) & (row >= 0) & (row < plan.height)
+    place = jnp.clip(row, 0, plan.height - 1) * plan.width + jnp.clip(column, 0, plan.width - 1)
+    shown = jnp.take_along_axis(owners.reshape(len(owners), -1), place, axis=1)
+    return {
+        "tracks/points": points,
+        "tracks/visible": there & inside & (shown == slots + 1),
+        "tracks/object": jnp.where(there, slots, -1).astype(jnp.int16),
+    }
+
+
+def _inside(stage: Stage, run: Run, first: int, count: int) -> Array:
+    """Random points [k, P, 2] m in the shapes of a run, in their own frames, even in their area."""
+    slots = jnp.arange(first, first + run.count)[:, None]
+    words = (hashed(stage.seed, slots, jnp.arange(count), n) for n in range(1, 4))
+    u, v, w = ((word >> 8).astype(jnp.float32) / 2**24 for word in words)
+    radius = stage.bodies.radius[slots]
+    reach, turn = radius * jnp.sqrt(u), 2 * jnp.pi * v
+    round_part = jnp.stack([reach * jnp.cos(turn), reach * jnp.sin(turn)], -1)
+    if run.shape == "circle":
+        return round_part
+    if run.shape == "polygon":
+        assert stage.bodies.vertices is not None
+        return _in_polygon(stage.bodies.vertices[first : first + run.count], u, v, w)
+    half = stage.bodies.half_length[slots]
+    # A capsule: the rectangle by its share of the area, else the disc cut in two at its ends.
+    flat = w * (4 * half + jnp.pi * radius) < 4 * half
+    block = jnp.stack([half * (2 * u - 1), radius * (2 * v - 1)], -1)
+    ends = round_part + jnp.stack([jnp.where(round_part[..., 0] > 0, half, -half), jnp.zeros_like(reach)], -1)
+    return jnp.where(flat[..., None], block, ends)
+
+
+def _in_polygon(vertices: Array, u: Array, v: Array, w: Array) -> Array:
+    """Points [k, P, 2] in triangles between the first vertex and the sides, each by its share of the area."""
+    corner = vertices - vertices[:, :1]
+    following = jnp.roll(corner, -1, axis=1)
+    area = corner[..., 0] * following[..., 1] - corner[..., 1] * following[..., 0]
+    share = jnp.cumsum(area, axis=1)
+    side = (w[..., None] * share[:, None, -1:] > share[:, None]).sum(-1)
+    side = jnp.minimum(side, vertices.shape[1] - 1)
+    one, other = (jnp.take_along_axis(a, side[..., None], axis=1) for a in (corner, following))
+    far = jnp.sqrt(u)[..., None]
+    return vertices[:, :1] + far * (one + v[..., None] * (other - one))

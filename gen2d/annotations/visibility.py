@@ -1,0 +1,39 @@
+"""How much of each object is seen."""
+
+import jax
+import jax.numpy as jnp
+
+from gen2d import extents
+from gen2d.fields import Field
+from gen2d.folds import folded
+from gen2d.raster import Plan, Stage
+from gen2d.types import Array
+
+OWNERS = True
+FIELDS = {
+    "visibility/pixels": Field("int32", "n T K", "px", "pixels of the instance mask"),
+    "visibility/fraction": Field("float32", "n T K", "1", "those over the area of the whole object, 1 at most"),
+}
+
+
+def annotate(stage: Stage, owners: Array, plan: Plan, options: object) -> dict[str, Array]:
+    """The number of pixels and the part seen."""
+    pixels = counts(owners, plan.layout.slots)
+    area = extents.areas(stage, plan)
+    return {
+        "visibility/pixels": pixels,
+        "visibility/fraction": jnp.where(area > 0, jnp.minimum(pixels / jnp.where(area > 0, area, 1.0), 1.0), 0.0),
+    }
+
+
+def counts(owners: Array, slots: int) -> Array:
+    """How many pixels of masks [T, H, W] show each slot, [T, K] int32."""
+    frames, height, width = owners.shape
+    rows = next(n for n in range(min(height, 255), 0, -1) if height % n == 0)  # whose sum fits a byte
+    strips = owners.reshape(frames, height // rows, rows, width)
+
+    def of(name: Array) -> Array:
+        columns = folded((strips == name).astype(jnp.uint8), 2, jnp.add).astype(jnp.int32)
+        return folded(columns, 2, jnp.add).sum(1)
+
+    return jax.lax.map(of, jnp.arange(1, slots + 1, dtype=jnp.uint8)).T

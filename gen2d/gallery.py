@@ -1,0 +1,162 @@
+"""A gallery for a person: the same videos in every look, then in the flat one with what is told of their pixels.
+
+The videos of a config are made in a temporary folder, as states alone; from there on it is one way for all.
+"""
+
+import tempfile
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from gen2d import plugins
+from gen2d.config import load_config
+from gen2d.loader import Dataset
+from gen2d.loader import open as open_dataset
+from gen2d.preview import GAP, check_videos, contact_sheet, enlarged, shown, write, writing
+
+LABEL = 110  # px, of the strip with a row's name
+TRACKS = 6  # points of an object
+SEEN, WHOLE = (255, 255, 255), (255, 140, 0)  # boxes around what is seen, and around all of an object
+Columns = Mapping[str, np.ndarray]
+
+
+def gallery(source: str, out: Path, videos: int = 1, *, seed: int | None = None, sets: Sequence[str] = ()) -> Path:
+    """The file made in the folder `out`, NAME-gallery.png: a row for each look and annotation, or for each of the first
+    `videos` of it. The config's own look has its options, the others their defaults."""
+    check_videos(videos)
+    if Path(source).is_dir():
+        ds = open_dataset(source)
+        picture, name = _sheet(ds, videos, _looks(ds.manifest["config"]["look"]), sets), ds.manifest["name"]
+    else:
+        picture, name = _made(source, videos, seed, sets)
+    path = out / f"{name}-gallery.png"
+    with writing(out):
+        write(path, picture)
+    return path
+
+
+def _made(source: str, videos: int, seed: int | None, sets: Sequence[str]) -> tuple[np.ndarray, str]:
+    """The gallery of a config, and its name."""
+    from gen2d.generation import generate
+
+    plain = load_config(source, sets).plain()
+    bare = plain | {"look": "flat", "annotations": {}, "storage": plain["storage"] | {"frames": "none"}}
+    with tempfile.TemporaryDirectory() as folder:
+        generate(bare, videos, Path(folder) / "states", seed=seed)
+        return _sheet(open_dataset(Path(folder) / "states"), videos, _looks(plain["look"])), plain["name"]
+
+
+def _looks(own: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
+    """All looks by what they are called in the gallery; `own` has its options."""
+    return {name: {"name": name} for name in plugins.names("look")} | {Path(own["name"]).stem: own}
+
+
+def _sheet(ds: Dataset, videos: int, looks: Mapping[str, Mapping[str, Any]], sets: Sequence[str] = ()) -> np.ndarray:
+    """All rows as one picture [H, W, 3]."""
+    numbers = range(min(videos, len(ds)))
+    rows = [*_look_rows(ds, numbers, looks, sets), *_annotation_rows(ds, numbers, sets)]
+    return np.concatenate([_labelled(name, contact_sheet(frames)) for name, frames in rows])
+
+
+def _labelled(name: str, picture: np.ndarray) -> np.ndarray:
+    strip = np.full((len(picture), LABEL, 3), 255, np.uint8)
+    cv2.putText(strip, name, (2 * GAP, 20), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (0, 0, 0), 1, cv2.LINE_AA)
+    return np.concatenate([strip, picture], axis=1)
+
+
+Rows = Iterator[tuple[str, np.ndarray]]
+
+
+def _look_rows(
+    ds: Dataset, numbers: Sequence[int], looks: Mapping[str, Mapping[str, Any]], sets: Sequence[str]
+) -> Rows:
+    """Each look's name and frames [n, T, H, W, 3]."""
+    from gen2d.redraw import render
+
+    for name, look in looks.items():
+        yield name, np.asarray(render(ds, numbers, look=look, sets=sets))
+
+
+def _annotation_rows(ds: Dataset, numbers: Sequence[int], sets: Sequence[str]) -> Rows:
+    """Each annotation's name and frames [n, T, H, W, 3] that show it."""
+    from gen2d.redraw import render
+
+    sets = [*sets, f"annotations.tracks={TRACKS}"]
+    fields = ["masks/instance", "masks/amodal", "boxes/visible", "boxes/amodal", "flow/forward", "tracks/points"]
+    fields += ["tracks/visible", "frames"]
+    found = render(ds, numbers, look="flat", sets=sets, fields=fields)
+    times = shown(found["frames"].shape[1])
+    columns = {name: np.asarray(array[:, times]) for name, array in found.items()}
+    fastest = np.abs(columns["flow/forward"].astype(np.float32)).max()
+    columns["flow/forward"] = columns["flow/forward"] / max(fastest, 1e-3)
+    for name, draw in DRAWN.items():
+        yield name, np.stack([_film(columns, video, draw) for video in range(len(numbers))])
+
+
+def _film(columns: Columns, video: int, draw: Callable[[Columns], np.ndarray]) -> np.ndarray:
+    """One video's pictures."""
+    times = range(columns["frames"].shape[1])
+    return np.stack([draw({name: array[video, t] for name, array in columns.items()}) for t in times])
+
+
+# ---- One frame, from its columns
+
+
+def colors(count: int) -> np.ndarray:
+    """Colours [count, 3] uint8 that differ, for ids: 0 is black, 255 grey."""
+    hue = np.arange(count) * 0.618034 % 1 * 180  # the golden section: neighbours differ, and none comes twice
+    full = np.stack([hue, np.full(count, 170), np.full(count, 255)], -1).astype(np.uint8)
+    made = cv2.cvtColor(full[None], cv2.COLOR_HSV2RGB)[0]
+    made[0], made[255:] = 0, 128
+    return made
+
+
+def _masks(frame: Columns) -> np.ndarray:
+    """The instance mask in false colours."""
+    return colors(256)[frame["masks/instance"]]
+
+
+def _amodal(frame: Columns) -> np.ndarray:
+    """The outline of all of each object."""
+    image = enlarged(frame["frames"])
+    height, width = frame["frames"].shape[:2]
+    for slot, packed in enumerate(frame["masks/amodal"]):
+        mask = enlarged(np.unpackbits(packed)[: height * width].reshape(height, width))
+        image[(mask > 0) & (cv2.erode(mask, np.ones((3, 3), np.uint8)) == 0)] = colors(256)[slot + 1]
+    return image
+
+
+def _boxes(frame: Columns) -> np.ndarray:
+    """What is seen of each object in a white box, all of it in an orange one."""
+    image = enlarged(frame["frames"])
+    factor = len(image) // len(frame["frames"])
+    for name, color in (("boxes/amodal", WHOLE), ("boxes/visible", SEEN)):
+        for left, top, right, bottom in np.round(frame[name] * factor).astype(int).tolist():
+            if right > left:
+                cv2.rectangle(image, (left, top), (right - 1, bottom - 1), color)
+    return image
+
+
+def _flow(frame: Columns) -> np.ndarray:
+    """The flow to the next frame: its direction as a hue, its speed as saturation."""
+    x, y = np.moveaxis(frame["flow/forward"], -1, 0)
+    hue = np.degrees(np.arctan2(y, x)) % 360 / 2
+    hsv = np.stack([hue, 255 * np.clip(np.hypot(x, y), 0, 1), np.full_like(x, 255)], -1)
+    return cv2.cvtColor(hsv.astype(np.uint8), cv2.COLOR_HSV2RGB)
+
+
+def _tracks(frame: Columns) -> np.ndarray:
+    """Points that are fixed to objects, where they are seen."""
+    image = enlarged(frame["frames"])
+    factor = len(image) // len(frame["frames"])
+    for number, (point, seen) in enumerate(zip(frame["tracks/points"], frame["tracks/visible"], strict=True)):
+        if seen:
+            place = (np.floor(point * factor)).astype(int).tolist()
+            cv2.circle(image, place, 1, colors(256)[number % 254 + 1].tolist(), -1)
+    return image
+
+
+DRAWN = {"masks": _masks, "amodal": _amodal, "boxes": _boxes, "flow": _flow, "tracks": _tracks}

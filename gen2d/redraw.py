@@ -1,0 +1,254 @@
+"""Videos of a dataset drawn again, at any size and in any look, and simulated again from their stored scenes.
+
+A dataset holds all that a frame depends on: what was drawn at random comes back from its key, the rest from its fields.
+So a dataset of states alone (`storage: {frames: none}`) is drawn inside the training loop, on its device.
+"""
+
+import dataclasses
+import functools
+import zlib
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from gen2d import drawing, factors, loader, types
+from gen2d.camera import View
+from gen2d.config import Config, load_config
+from gen2d.errors import ConfigError
+from gen2d.loader import Dataset, Numbers
+from gen2d.raster import Stage
+from gen2d.rollout import Rollout, keep_of, rules_of
+from gen2d.simulate import simulate, substeps
+from gen2d.types import Array, Joints, Layout, Objects, Scene, State
+
+Columns = Mapping[str, Any]
+
+
+def config_of(ds: Dataset, sets: Sequence[str] = ()) -> Config:
+    """The config that a dataset was made from, with `sets` changed ('video.height=128')."""
+    recipe = ds.manifest["config"] | {"seed": ds.manifest["seed"]}
+    try:
+        return load_config(recipe, sets)
+    except ConfigError as error:
+        raise ConfigError(f"{ds.root}: its config cannot be used ({error})") from None
+
+
+def render(
+    ds: Dataset,
+    indices: Numbers,
+    *,
+    height: int | None = None,
+    width: int | None = None,
+    look: str | Mapping[str, Any] | None = None,
+    sets: Sequence[str] = (),
+    states: Columns | None = None,
+    fields: Sequence[str] | None = None,
+) -> Any:
+    """The frames [n, T, H, W, 3] uint8 of these videos, a jax array on jax's default device.
+
+    Drawn from what is stored; at the stored settings and fingerprint, the stored frames. `height`, `width` (px), `look`
+    (a name, or a mapping with a name and options) and `sets` ('annotations.masks=true', 'image.noise=4') draw them
+    otherwise. `states` are those of `simulate_again` instead of the stored ones. With `fields` ("frames",
+    "masks/instance") a dictionary of these, the annotations that they belong to switched on.
+    Raises ConfigError (a UserError) and DamagedError.
+    """
+    changes = [*sets, *_changed(height, width), *_asked(fields)]
+    base = config_of(ds)
+    config = config_of(ds, [*changes, "storage.frames=video"])
+    if look is not None:
+        plain = {"name": look} if isinstance(look, str) else dict(look)
+        config = load_config(config.plain() | {"look": plain})
+    numbers = _checked(ds, indices)
+    if config.image.exposure and states is not None:
+        raise ConfigError("states have no motion between frames: image.exposure must be 0 where they are given")
+    if config.image.exposure:
+        found = _again(ds, config, numbers)
+    else:
+        columns = dict(_stored(ds, numbers)) | dict(states or {})
+        _check_frames(columns, states)
+        settings = _Settings(base, config)
+        stages = _staged(columns, _key_words(ds), jnp.asarray(numbers, jnp.uint32), settings)
+        found = _pictures(stages, settings)
+    if fields is None:
+        return found["frames"]
+    missing = [name for name in fields if name not in found]
+    if missing:
+        raise ConfigError(f"fields holds {missing[0]!r}, but must be of {', '.join(sorted(found))}")
+    return {name: found[name] for name in fields}
+
+
+def simulate_again(
+    ds: Dataset,
+    indices: Numbers,
+    *,
+    fps: float | None = None,
+    frames: int | None = None,
+    sets: Sequence[str] = (),
+) -> dict[str, Array]:
+    """The states of these videos at another frame rate or for another number of frames, from their stored scenes.
+
+    Jax arrays by their stored names: "states/position" [n, T, K, 2] in m and so on, "time" [T] in s, and the camera's
+    fields; with contacts or energy if the config asks for them. `sets` may change the physics ('physics.damping=0.1').
+    At the stored settings the states agree with the stored ones to rounding.
+    """
+    changes = [
+        *sets,
+        *([] if fps is None else [f"video.fps={fps}"]),
+        *([] if frames is None else [f"video.frames={frames}"]),
+    ]
+    config, numbers = config_of(ds, changes), _checked(ds, indices)
+    columns = _stored(ds, numbers)
+    made = _simulated(columns, _key_words(ds), jnp.asarray(numbers, jnp.uint32), _Settings(config_of(ds), config))
+    return made | {"time": jnp.arange(config.video.frames) / config.video.fps}
+
+
+# ---- What is asked, checked
+
+
+def _changed(height: int | None, width: int | None) -> list[str]:
+    return [f"video.{name}={value}" for name, value in (("height", height), ("width", width)) if value is not None]
+
+
+_OPTIONS = {
+    "masks/instance": "masks",
+    "masks/amodal": "amodal",
+    "boxes": "boxes",
+    "visibility": "visibility",
+    "flow": "flow",
+}
+
+
+def _asked(fields: Sequence[str] | None) -> list[str]:
+    names = {_OPTIONS.get(name, _OPTIONS.get(name.split("/")[0])) for name in fields or ()}
+    return [f"annotations.{name}=true" for name in sorted(filter(None, names))]
+
+
+def _checked(ds: Dataset, indices: Numbers) -> np.ndarray:
+    numbers = np.atleast_1d(np.asarray(indices))
+    if numbers.ndim != 1 or not np.issubdtype(numbers.dtype, np.integer):
+        raise ConfigError(f"indices must be whole numbers in a list, but are {indices!r}")
+    wrong = numbers[(numbers < -len(ds)) | (numbers >= len(ds))]
+    if len(wrong):
+        raise ConfigError(f"indices holds {wrong[0]}, but {ds.options.split} has {len(ds)} videos")
+    return np.where(numbers < 0, numbers + len(ds), numbers)
+
+
+def _check_frames(columns: Columns, states: Columns | None) -> None:
+    frames = {
+        len(np.shape(columns[name])) and np.shape(columns[name])[1] for name in ("states/position", "camera/scale")
+    }
+    if len(frames) > 1:
+        raise ConfigError("states and camera have other numbers of frames: give all that simulate_again returned")
+
+
+# ---- From fields to records
+
+
+@functools.lru_cache(maxsize=16)
+def _whole(ds: Dataset) -> Dataset:
+    """The same dataset with every field but the images."""
+    manifest = ds.manifest["fields"]
+    names = [
+        name for name, about in manifest.items() if about["axes"].startswith("n") and "H" not in about["axes"].split()
+    ]
+    return loader.open(ds.root, ds.options.split, fields=tuple(names), verify=ds.options.verify)
+
+
+def _stored(ds: Dataset, numbers: np.ndarray) -> dict[str, np.ndarray]:
+    return _whole(ds).batch(numbers)
+
+
+def _record(cls: type, columns: Columns) -> Any:
+    """The record of these columns."""
+    known = types.described(cls).items()
+    return cls(**{attribute: jnp.asarray(columns[name]) for name, (attribute, _) in known if name in columns})
+
+
+def _scene(columns: Columns) -> Scene:
+    joints = _record(Joints, columns) if "joints/rest" in columns else None
+    return Scene(_record(Objects, columns), jnp.asarray(columns["world/gravity"]), joints)
+
+
+def _key_words(ds: Dataset) -> np.ndarray:
+    return factors.seed_words(ds.manifest["seed"], zlib.crc32(ds.options.split.encode()))
+
+
+@dataclasses.dataclass(frozen=True)
+class _Settings:
+    """What decides a compiled program: a dataset's config, and that of what is made again."""
+
+    base: Config
+    config: Config
+
+    def __hash__(self) -> int:
+        return hash(self._key)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Settings) and self._key == other._key
+
+    @property
+    def _key(self) -> tuple[str, str]:
+        return self.base.text(), self.config.text()
+
+    @property
+    def layout(self) -> Layout:
+        return self.config.scene.module.layout(self.config.scene.options)
+
+    def resized(self, view: View) -> View:
+        """A stored view for frames of another size: all that was seen is."""
+        old, new = self.base.video, self.config.video
+        return view._replace(scale=view.scale * min(new.height / old.height, new.width / old.width))
+
+
+@functools.partial(jax.jit, static_argnames="settings")
+def _staged(columns: Columns, words: Array, numbers: Array, settings: _Settings) -> Stage:
+    config, layout = settings.config, settings.layout
+    scene, states = _scene(columns), _record(State, columns)
+    view = settings.resized(View(*(jnp.asarray(columns[f"camera/{name}"]) for name in View._fields)))
+
+    def staged(key: Array, scene: Scene, states: State, view: View) -> Stage:
+        paint = drawing.paint_of(key, config, scene, layout)
+        return drawing.stage_of(key, config, scene, states, view, paint)
+
+    return jax.vmap(staged)(factors.video_keys(words, numbers), scene, states, view)
+
+
+@functools.partial(jax.jit, static_argnames="settings")
+def _pictures(stages: Stage, settings: _Settings) -> dict[str, Array]:
+    """What a run draws, in a program of its own, as there: so that its rounding is the same."""
+    return drawing.pictures(stages, drawing.plan_of(settings.config, settings.layout), settings.config.annotations)
+
+
+@functools.partial(jax.jit, static_argnames="settings")
+def _simulated(columns: Columns, words: Array, numbers: Array, settings: _Settings) -> dict[str, Array]:
+    config, layout = settings.config, settings.layout
+    scene = _scene(columns)
+    first = jax.tree.map(lambda a: a[:, 0], _record(State, columns))
+    steps = substeps(config.video.fps, config.physics.substeps, config.physics.max_step)
+    rules = rules_of(config.physics, config.video.fps, steps)
+    keep = dataclasses.replace(keep_of(config, layout), between=False)
+    device = types.to_device(scene), types.to_device(first)
+    sparse = jax.default_backend() == "cpu"
+    made = types.to_stored(simulate(*device, layout, rules, config.video.frames, steps, keep, sparse=sparse))
+    keys = factors.video_keys(words, numbers)
+    view = jax.vmap(lambda key, states: drawing.view_of(key, config, layout, states))(keys, made.states)
+    return types.columns(made) | drawing.camera_columns(view)
+
+
+def _again(ds: Dataset, config: Config, numbers: np.ndarray) -> dict[str, Array]:
+    """Videos made from their keys again, as they were made: what blurs them is not stored."""
+    lanes = ds.manifest["fingerprint"]["lanes"]
+    rollout = Rollout(load_config(config, [f"storage.lanes={lanes}"]), jax.devices()[:1])
+    found: dict[str, list[Array]] = {}
+    order = np.argsort(numbers, kind="stable")
+    for first in sorted({int(number) // lanes * lanes for number in numbers}):
+        batch = rollout.begin(ds.options.split, [first])
+        own = numbers[order][(numbers[order] >= first) & (numbers[order] < first + lanes)] - first
+        stages = jax.tree.map(lambda a, own=own: a[own], batch.stages)
+        for name, array in _pictures(stages, _Settings(config, config)).items():
+            found.setdefault(name, []).append(array)
+    return {name: jnp.concatenate(parts)[np.argsort(order)] for name, parts in found.items()}
+

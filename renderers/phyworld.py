@@ -1,0 +1,27 @@
+"""Red and blue shapes in turn on white, without walls: the look of PhyWorld's videos (Kang et al., arXiv 2411.02385).
+
+Theirs have a rim that is soft over 1.5 % of the radius; here it is sharp.
+"""
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+
+from gen2d.paint import Background, Paint, are_moving, lines_of
+from gen2d.types import Array, Layout, Scene
+
+WHITE, RED, BLUE = (255.0, 255.0, 255.0), (255.0, 0.0, 0.0), (0.0, 0.0, 255.0)
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """None: the look is as it was published."""
+
+
+def paint(scene: Scene, layout: Layout, options: Options, key: Array) -> Paint:
+    """What one video's slots are painted with; what is static and not a wall keeps the scene's colour."""
+    moving = are_moving(layout)
+    turn = np.asarray([RED, BLUE])[(np.cumsum(moving) - 1) % 2]
+    colors = jnp.where(moving[:, None], turn, scene.objects.color.astype(jnp.float32))
+    return Paint(Background(jnp.asarray(WHITE)), colors, lines_of(scene, 0.0)[0])

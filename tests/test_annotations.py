@@ -1,0 +1,150 @@
+"""Annotations: each obeys its law on random scenes, in several looks, with cameras that stand and that move."""
+
+import jax
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+
+from gen2d.config import load_config
+from gen2d.rollout import Rollout, parts
+
+ALL = [f"annotations.{name}=true" for name in ("masks", "amodal", "boxes", "visibility", "flow")]
+SMALL = ["storage.lanes=4", "video.frames=12", "video.height=40", "video.width=56", "annotations.tracks=5", "seed=3"]
+CASES = {
+    "still": ["look.palette=random", "camera.margin=-0"],
+    "moving": ["camera.pan=[[-2,2],1]", "camera.turn=0.4", "camera.zoom=0.2", "look=textured"],
+    "marked": ["look=marked", "image.occluders=2", "image.occluder_front=[0,1]"],
+}
+
+
+class Made:
+    """Some videos' fields, and what they were drawn from."""
+
+    def __init__(self, sets: list[str]) -> None:
+        self.rollout = Rollout(load_config("bouncing.yaml", [*SMALL, *ALL, *sets]), jax.devices()[:1])
+        batch = self.rollout.begin("train", [0])
+        assert parts(batch.placed)[0].all()
+        self.of = {name: np.asarray(a) for name, a in self.rollout.draw(batch, 0, 4)[0].items()}
+        self.of |= self.rollout.host_columns(batch)[0]
+        self.mask = self.of["masks/instance"]
+        self.slots = self.rollout.layout.slots
+
+
+@pytest.fixture(scope="module", params=CASES.values(), ids=CASES.keys())
+def made(request):
+    return Made(request.param)
+
+
+def test_fields_are_as_described(made):
+    for name, array in made.of.items():
+        field = made.rollout.fields[name]
+        assert array.shape[1:] == field.shape(made.rollout.sizes), name
+        assert array.dtype == field.dtype or name == "contacts/time", name
+
+
+def test_visible_boxes_and_counts_are_those_of_the_mask(made):
+    for v, t, k in np.ndindex(*made.mask.shape[:2], made.slots):
+        rows, columns = np.nonzero(made.mask[v, t] == k + 1)
+        assert made.of["visibility/pixels"][v, t, k] == len(rows)
+        box = [0] * 4 if not len(rows) else [columns.min(), rows.min(), columns.max() + 1, rows.max() + 1]
+        assert_array_equal(made.of["boxes/visible"][v, t, k], box)
+
+
+def test_what_is_seen_lies_in_what_is_there(made):
+    boxes, amodal = (made.of[f"boxes/{kind}"] for kind in ("visible", "amodal"))
+    seen = made.of["visibility/pixels"] > 0
+    grown = amodal + [-1, -1, 1, 1]  # a pixel may be seen most of, of which little is covered
+    assert (boxes[seen][:, :2] >= grown[seen][:, :2]).all()
+    assert (boxes[seen][:, 2:] <= grown[seen][:, 2:]).all()
+    fraction = made.of["visibility/fraction"]
+    assert ((fraction >= 0) & (fraction <= 1)).all()
+    assert (fraction[~seen] == 0).all()
+
+
+def test_amodal_masks_hold_the_instance_mask_where_one_object_alone_fills_a_pixel(made):
+    height, width = made.mask.shape[2:]
+    bits = np.unpackbits(made.of["masks/amodal"], axis=-1)[..., : height * width].astype(bool)
+    bits = bits.reshape(*bits.shape[:3], height, width)
+    for k in range(made.slots):
+        mine = made.mask == k + 1
+        inside = bits[:, :, k]
+        assert not (bits.sum(2) == 1)[mine & ~inside].any()  # another fills half of it and this one shows
+    balls = made.of["objects/shape"][0] == 0
+    discs = bits[:, :, balls].sum((3, 4))
+    areas = np.pi * (made.of["objects/radius"][:, None, balls] * made.of["camera/scale"][..., None]) ** 2
+    box = made.of["boxes/amodal"][:, :, balls]
+    whole = (box[..., :2] >= 0).all(-1) & (box[..., 2] <= width) & (box[..., 3] <= height) & (areas > 0)
+    assert_allclose(discs[whole], areas[whole], atol=6)
+
+
+def test_flow_carries_each_object_and_the_background_to_the_next_frame(made):
+    height, width = made.mask.shape[2:]
+    y, x = np.mgrid[:height, :width] + 0.5
+    for name, step in (("forward", 1), ("backward", -1)):
+        flow, valid = made.of[f"flow/{name}"].astype(float), made.of[f"flow/{name}_valid"].astype(bool)
+        assert not valid[:, -1 if step > 0 else 0].any()
+        checked = 0
+        for v, t in np.ndindex(*made.mask.shape[:2]):
+            there = np.nonzero(valid[v, t])
+            to_x, to_y = x[there] + flow[v, t][there][:, 0], y[there] + flow[v, t][there][:, 1]
+            own = made.mask[v, t][there]
+            assert_array_equal(made.mask[v, t + step][to_y.astype(int), to_x.astype(int)][own < 255], own[own < 255])
+            checked += len(own)
+        assert checked > 0.7 * valid[:, 1:-1].size
+
+
+def test_flow_at_a_discs_centre_is_the_way_of_its_centre(made):
+    boxes = made.of["boxes/amodal"]
+    centers = (boxes[..., :2] + boxes[..., 2:]) / 2
+    checked = 0
+    for v, t, k in np.ndindex(4, 11, made.slots):
+        if made.of["objects/shape"][v, k] or not made.of["objects/present"][v, k]:
+            continue
+        column, row = np.floor(centers[v, t, k]).astype(int)
+        if not (0 <= row < made.mask.shape[2] and 0 <= column < made.mask.shape[3]):
+            continue
+        if made.mask[v, t, row, column] != k + 1:
+            continue
+        turn = made.of["states/angle"][v, t + 1, k] - made.of["states/angle"][v, t, k]
+        way = centers[v, t + 1, k] - centers[v, t, k]
+        assert_allclose(made.of["flow/forward"][v, t, row, column], way, atol=0.72 * abs(turn) + 0.05)
+        checked += 1
+    assert checked > 50
+
+
+def test_a_frame_carried_by_its_flow_is_the_next_frame():
+    plain = Made(["look.palette=random", "scene.spin=0", "scene.friction=0", "video.height=64", "video.width=64"])
+    frames, flow, valid = (plain.of[name] for name in ("frames", "flow/backward", "flow/backward_valid"))
+    y, x = np.mgrid[: frames.shape[2], : frames.shape[3]]
+    for v, t in ((0, 3), (1, 7), (2, 5)):
+        # Where the pixel and its neighbours show the same object in both frames: no rim is near.
+        mask = plain.mask[v, t]
+        same = np.ones_like(mask, bool)
+        for dy, dx in np.ndindex(5, 5):
+            same &= np.roll(mask, (dy - 2, dx - 2), (0, 1)) == mask
+        same &= valid[v, t].astype(bool)
+        from_x = np.rint(x + flow[v, t, ..., 0].astype(float)).astype(int).clip(0, frames.shape[3] - 1)
+        from_y = np.rint(y + flow[v, t, ..., 1].astype(float)).astype(int).clip(0, frames.shape[2] - 1)
+        carried = frames[v, t - 1][from_y, from_x]
+        assert_array_equal(carried[same], frames[v, t][same])
+
+
+def test_tracks_follow_their_objects_and_know_when_they_are_seen(made):
+    points, seen, owner = (made.of[f"tracks/{name}"] for name in ("points", "visible", "object"))
+    height, width = made.mask.shape[2:]
+    boxes = made.of["boxes/amodal"]
+    for v, p in np.ndindex(owner.shape):
+        k = owner[v, p]
+        if k < 0:
+            assert not points[v, :, p].any()
+            continue
+        assert (points[v, :, p] >= boxes[v, :, k, :2] - 1e-2).all()
+        assert (points[v, :, p] <= boxes[v, :, k, 2:] + 1e-2).all()
+        column, row = np.floor(points[v, :, p]).astype(int).T
+        inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+        shown = made.mask[v, np.arange(len(row)), row.clip(0, height - 1), column.clip(0, width - 1)] == k + 1
+        assert_array_equal(seen[v, :, p], inside & shown)
+    # Points of one body stay as far from each other, in metres.
+    one = points[:, :, :5] / made.of["camera/scale"][:, :, None, None]
+    apart = np.linalg.norm(one[:, :, 1:] - one[:, :, :1], axis=-1)
+    assert_allclose(apart, np.broadcast_to(apart[:, :1], apart.shape), atol=2e-4)

@@ -1,0 +1,271 @@
+"""Coverage: the exact area of each shape in each pixel, beside closed forms and polygon areas in float64.
+
+Errors are in grey levels of 255 before rounding; `pytest -rP` prints those reached. Shapes with straight sides
+are not compiled as a whole, which would take longer than it saves.
+"""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from worlds import disc_areas, outline, polygon_areas
+
+from gen2d import coverage
+
+SIZE, COUNT, CORNERS = 72, 64, 6  # px, shapes at once, corners of each
+EDGES = np.arange(SIZE + 1)
+
+
+@functools.partial(jax.jit, static_argnames="size")
+def discs(centre, radius, size=SIZE):
+    """The coverage [n, size, size] of discs about centres [n, 2]."""
+    edges = jnp.arange(size, dtype=centre.dtype)
+    return coverage.disc_area(coverage.disc_cuts(edges - centre[:, :1], edges - centre[:, 1:], radius), 1e9)
+
+
+def rounded(corners, radius):
+    """The coverage [n, SIZE, SIZE] of rounded polygons [n, V, 2]; no radius: sharp ones."""
+    edges = jnp.broadcast_to(jnp.arange(SIZE, dtype=corners.dtype), (len(corners), SIZE))
+    return coverage.rounded_area(coverage.rounded_cuts(edges, edges, corners, radius))
+
+
+def compared(name, found, exact, mean, most):
+    """Fails where coverages are not the exact areas: on the mean over pixels on an edge, and anywhere."""
+    error = 255 * np.abs(np.asarray(found, float) - exact)
+    edge = (exact > 1e-9) & (exact < 1 - 1e-9)
+    print(f"{name}: mean {error[edge].mean():.4f}, most {error.max():.4f} of 255, {edge.sum()} pixels")
+    assert error[edge].mean() <= mean
+    assert error.max() <= most
+
+
+def rims(rng, radii):
+    """Centres [n, 2] that put a random point of each rim in the middle of the window, some where the disc touches a
+    pixel's edge."""
+    angle = rng.uniform(0, 2 * np.pi, len(radii))
+    angle[:16] = np.arange(16) * (np.pi / 2)
+    middle = SIZE / 2 + rng.uniform(-0.5, 0.5, (len(radii), 2))
+    middle[:8], radii[:8] = SIZE / 2, np.ceil(radii[:8])
+    return np.float32(middle - radii[:, None] * np.stack([np.cos(angle), np.sin(angle)], -1)), np.float32(radii)
+
+
+# ---- Discs
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "mean", "most"),
+    [(0.05, 2, 0.005, 0.02), (2, 4, 0.005, 0.02), (4, 32, 0.02, 0.2), (32, 63, 0.06, 0.5), (64, 128, 0.1, 2.0),
+     (128, 1000, 0.05, 1.0)],
+)  # fmt: skip
+def test_a_disc_covers_its_area_of_every_pixel(low, high, mean, most):
+    rng = np.random.default_rng(int(high))
+    centre, radius = rims(rng, np.exp(rng.uniform(np.log(low), np.log(high), COUNT)))
+    exact = [disc_areas(EDGES - c[0], EDGES - c[1], r) for c, r in zip(np.float64(centre), radius, strict=True)]
+    compared(f"discs of {low} to {high} px", discs(centre, radius), np.array(exact), mean, most)
+
+
+@pytest.mark.parametrize(("low", "high", "size"), [(0.2, 30, SIZE), (30, 300, 608)])
+def test_the_pixels_of_a_disc_add_up_to_its_area(low, high, size):
+    rng = np.random.default_rng(1)
+    radius = np.float32(np.geomspace(low, high, COUNT if size == SIZE else 12))
+    centre = np.float32(size / 2 + rng.uniform(-0.5, 0.5, (len(radius), 2)))
+    share = np.asarray(discs(centre, radius, size), float).sum((1, 2)) / (np.pi * np.float64(radius) ** 2)
+    print(f"discs of {low} to {high} px: {np.abs(share - 1).max():.1e} of the area")
+    assert_allclose(share, 1, atol=1e-3)
+    assert_allclose(share, 1, atol=3e-5)
+
+
+def centroids(cover):
+    middles = np.arange(SIZE) + 0.5
+    cover = np.asarray(cover, float)
+    return np.stack([cover.sum(1) @ middles, cover.sum(2) @ middles], -1) / cover.sum((1, 2))[:, None]
+
+
+@pytest.mark.parametrize("radius", [0.4, 1.0, 3.0, 5.5, 12.0, 30.0])
+def test_the_centroid_follows_a_disc_between_pixels(radius):
+    centre = np.float32(SIZE / 2 + np.random.default_rng(2).uniform(-0.5, 0.5, (COUNT, 2)))
+    found = centroids(discs(centre, np.full(COUNT, radius, np.float32)))
+    exact = [disc_areas(EDGES - c[0], EDGES - c[1], radius) for c in np.float64(centre)]
+    assert_allclose(found, centroids(exact), atol=1e-4)
+    off = np.abs(found - centre).max()
+    print(f"radius {radius} px: centroid off by {off:.4f} px at most")
+    # Of exact areas too: pixels alias what is finer than they are, J1(2 pi r) / (pi r) of it.
+    assert off < (0.01 if radius >= 3 else 0.2)
+
+
+# ---- Shapes with straight sides
+
+
+def capsules(rng):
+    """Some [n, 2, 2] with their radii: at every eighth of a turn, at any angle, and without length."""
+    angle = np.concatenate([np.arange(16) * (np.pi / 4), rng.uniform(0, 2 * np.pi, COUNT - 16)])
+    half = rng.uniform(0, 16, COUNT) * (np.arange(COUNT) % 10 > 0)
+    along = half[:, None] * np.stack([np.cos(angle), np.sin(angle)], -1)
+    along[:16] = np.round(along[:16], 6)  # level and upright to the last bit
+    centre = SIZE / 2 + rng.uniform(-0.5, 0.5, (COUNT, 2)) * (np.arange(COUNT) % 4 > 0)[:, None]
+    radius = np.exp(rng.uniform(np.log(0.3), np.log(16), COUNT))
+    radius[::4] = np.ceil(radius[::4])
+    return np.float32(np.stack([centre - along, centre + along], 1)), np.float32(radius)
+
+
+def polygons(rng):
+    """Some [n, 6, 2] of 3 to 6 corners, the last given more than once: of any shape, boxes at right angles, and boxes
+    along the edges of pixels."""
+    found = []
+    for i in range(COUNT):
+        count = 3 + i % 4
+        angle = np.sort((np.arange(count) + rng.uniform(0, 0.8, count)) * (2 * np.pi / count))
+        corners = np.stack([np.cos(angle), np.sin(angle)], -1) * rng.uniform(1.5, 16, 2)
+        if i % 4 == 0:
+            corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * rng.uniform(1.5, 16, 2)
+            corners = np.ceil(corners) if i % 8 else corners
+        else:
+            turn = rng.uniform(0, 2 * np.pi)
+            corners = corners @ np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
+        centre = SIZE / 2 + (rng.uniform(-0.5, 0.5, 2) if i % 8 != 4 else 0)
+        found.append(np.concatenate([corners, np.repeat(corners[-1:], CORNERS - len(corners), 0)]) + centre)
+    return np.float32(found)
+
+
+def exact_areas(corners, radius=None):
+    radius = np.zeros(len(corners)) if radius is None else np.asarray(radius, float)
+    return np.array(
+        [polygon_areas(outline(np.float64(c), r), SIZE, SIZE) for c, r in zip(corners, radius, strict=True)]
+    )
+
+
+def test_a_capsule_covers_its_area_of_every_pixel():
+    corners, radius = capsules(np.random.default_rng(3))
+    compared("capsules", rounded(corners, radius), exact_areas(corners, radius), 0.005, 0.05)
+
+
+def test_a_polygon_covers_its_area_of_every_pixel():
+    corners = polygons(np.random.default_rng(4))
+    compared("polygons", rounded(corners, None), exact_areas(corners), 0.005, 0.05)
+
+
+def test_a_rounded_polygon_covers_its_area_of_every_pixel():
+    rng = np.random.default_rng(5)
+    corners, radius = polygons(rng), np.float32(np.exp(rng.uniform(np.log(0.3), np.log(12), COUNT)))
+    compared("rounded polygons", rounded(corners, radius), exact_areas(corners, radius), 0.005, 0.05)
+
+
+def test_what_has_no_area_covers_nothing():
+    rng = np.random.default_rng(6)
+    points = np.float32(np.repeat(rng.uniform(0, SIZE, (COUNT, 1, 2)), CORNERS, 1))
+    lines = np.float32(rng.uniform(0, SIZE, (COUNT, 2, 2)))
+    for cover in (
+        discs(points[:, 0], np.zeros(COUNT, np.float32)),
+        rounded(points, None),
+        rounded(points, np.zeros(COUNT, np.float32)),
+        rounded(lines, np.zeros(COUNT, np.float32)),
+    ):
+        assert_allclose(cover, 0, atol=1e-4)
+
+
+def test_two_parts_make_a_whole():
+    corners = polygons(np.random.default_rng(7))
+    one, other = corners.copy(), corners.copy()
+    one[:, 3:] = one[:, 2:3]  # the triangle of the first three corners
+    other[:, 1] = other[:, 0]  # the rest
+    assert_allclose(rounded(one, None) + rounded(other, None), rounded(corners, None), atol=2e-4)
+
+
+def test_a_capsule_without_length_and_a_rounded_point_are_discs():
+    rng = np.random.default_rng(8)
+    centre, radius = np.float32(rng.uniform(30, 42, (COUNT, 2))), np.float32(rng.uniform(0.3, 20, COUNT))
+    disc = discs(centre, radius)
+    assert_allclose(rounded(np.repeat(centre[:, None], 2, 1), radius), disc, atol=3e-4)
+    assert_allclose(rounded(np.repeat(centre[:, None], CORNERS, 1), radius), disc, atol=3e-4)
+
+
+# ---- Derivatives
+
+
+def weights():
+    """A picture that each coverage is weighted with: derivatives of each pixel's share count."""
+    return np.float32(np.random.default_rng(9).uniform(-1, 1, (SIZE, SIZE)))
+
+
+def differences(value, shape, step):
+    """The derivatives of value(parameters) [n] with respect to parameters [n, ...], by central differences."""
+    found = np.zeros(shape.shape)
+    for place in np.ndindex(shape.shape[1:]):
+        move = np.zeros(shape.shape)
+        move[(slice(None), *place)] = step
+        found[(slice(None), *place)] = (value(shape + move) - value(shape - move)) / (2 * step)
+    return found
+
+
+def disc_slopes(centre, radius):
+    return jax.grad(lambda *of: (weights() * discs(*of)).sum(), argnums=(0, 1))(centre, radius)
+
+
+def rounded_slopes(corners, radius):
+    if radius is None:
+        return jax.grad(lambda of: (weights() * rounded(of, None)).sum())(corners), None
+    return jax.grad(lambda *of: (weights() * rounded(*of)).sum(), argnums=(0, 1))(corners, radius)
+
+
+def alike(name, found, exact, mean, most):
+    """Fails where slopes are not these, but for shares of their root mean square."""
+    error = np.abs(np.asarray(found, float) - exact) / np.sqrt(np.square(exact).mean())
+    print(f"{name}: mean {error.mean():.1e}, most {error.max():.1e} of a usual slope")
+    assert error.mean() <= mean
+    assert error.max() <= most
+
+
+@pytest.mark.parametrize(("low", "high", "mean", "most"), [(0.3, 32, 1e-4, 5e-3), (70, 500, 5e-3, 5e-2)])
+def test_a_disc_moves_and_grows_as_its_slopes_say(low, high, mean, most):
+    rng = np.random.default_rng(10)
+    centre, radius = rims(rng, np.exp(rng.uniform(np.log(low), np.log(high), COUNT)))
+    some, weight = np.arange(COUNT) >= 16, weights()  # not where discs touch edges
+
+    def total(of):
+        areas = [disc_areas(EDGES - c[0], EDGES - c[1], c[2]) for c in of]
+        return (weight * np.array(areas)).sum((1, 2))
+
+    exact = differences(total, np.concatenate([np.float64(centre), radius[:, None]], 1)[some], 1e-4)
+    slope = [np.asarray(slope)[some] for slope in disc_slopes(centre, radius)]
+    alike(f"discs of {low} to {high} px, centre", slope[0], exact[:, :2], mean, most)
+    alike(f"discs of {low} to {high} px, radius", slope[1], exact[:, 2], mean, most)
+
+
+@pytest.mark.parametrize("kind", ["capsule", "polygon", "rounded polygon"])
+def test_a_shape_changes_as_its_slopes_say(kind):
+    rng, weight = np.random.default_rng(11), weights()
+    corners, radius = capsules(rng)
+    if kind != "capsule":
+        corners, radius = polygons(rng)[:, :4], None if kind == "polygon" else np.float32(rng.uniform(1, 9, COUNT))
+    number = np.arange(COUNT)
+    some = (number % 4 > 0) & (number % 10 > 0) & (number >= 16)  # none whose sides lie on edges or have no length
+    of_corners, of_radius = (None if x is None else np.asarray(x)[some] for x in rounded_slopes(corners, radius))
+
+    def total(of):
+        return (weight * exact_areas(of, None if radius is None else radius[some])).sum((1, 2))
+
+    def grown(by):
+        return (weight * exact_areas(corners[some], radius[some] + by)).sum((1, 2))
+
+    alike(f"{kind}, corners", of_corners, differences(total, np.float64(corners[some]), 2e-3), 1e-3, 1e-2)
+    if radius is not None:
+        alike(f"{kind}, radius", of_radius, differences(grown, np.zeros(some.sum()), 2e-3), 1e-3, 1e-2)
+
+
+def test_slopes_are_finite_where_shapes_touch_edges_or_have_no_area():
+    rng = np.random.default_rng(12)
+    centre, radius = rims(rng, np.exp(rng.uniform(np.log(0.3), np.log(300), COUNT)))
+    centre[16:32], radius[16:32] = np.round(centre[16:32]), np.arange(16) / 2
+    on_edges = np.round(polygons(rng)[:, :4])
+    on_edges[::5] = on_edges[::5, :1]  # a point
+    on_edges[1::5, 2:] = on_edges[1::5, 1:2]  # a line
+    slopes = [*disc_slopes(centre, radius)]
+    for corners in (on_edges, np.round(capsules(rng)[0])):
+        for grown in (np.zeros(COUNT, np.float32), np.float32(np.arange(COUNT) % 9)):
+            slopes += rounded_slopes(corners, grown)
+    slopes.append(rounded_slopes(on_edges, None)[0])
+    for slope in slopes:
+        assert np.isfinite(slope).all()
+        assert np.abs(slope).max() < 2 * np.pi * 300  # what a whole rim can sweep

@@ -1,0 +1,85 @@
+"""Videos drawn and simulated again from a dataset: the same frames, other sizes, looks and frame rates."""
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+
+import gen2d
+from gen2d.errors import ConfigError
+
+SMALL = ["storage.lanes=4", "video.frames=8", "video.height=32", "video.width=48", "annotations.masks=true"]
+CASES = {
+    "plain": [],
+    "moving": ["camera.pan=[[-1,1],0.5]", "camera.shake=0.1", "look.palette=random", "image.blending=linear"],
+    "occluded": ["image.occluders=2", "image.noise=[1,4]", "look=textured"],
+    "blurred": ["image.exposure=0.5", "image.exposure_samples=4"],
+}
+
+
+def dataset(folder, sets, n=6):
+    gen2d.generate("bouncing.yaml", n, folder, sets=[*SMALL, *sets], device="cpu")
+    return gen2d.open(folder)
+
+
+@pytest.fixture(scope="module")
+def plain(tmp_path_factory):
+    return dataset(tmp_path_factory.mktemp("plain") / "ds", [])
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_drawn_again_the_frames_are_those_stored(case, tmp_path, plain):
+    ds = plain if case == "plain" else dataset(tmp_path / "ds", CASES[case])
+    assert_array_equal(gen2d.render(ds, range(6)), ds[:]["frames"])
+    some = gen2d.render(ds, [5, 2, -1], fields=("frames", "masks/instance"))
+    whole = gen2d.open(ds.root, fields=("masks/instance",))
+    assert_array_equal(some["frames"], ds[[5, 2, 5]]["frames"])
+    assert_array_equal(some["masks/instance"], whole[[5, 2, 5]]["masks/instance"])
+
+
+def test_a_larger_picture_shows_the_same(plain):
+    small = ds_frames = plain[[0, 1]]["frames"].astype(float)
+    large = np.asarray(gen2d.render(plain, [0, 1], height=128, width=192, sets=["look.wall_width=6"])).astype(float)
+    shrunk = large.reshape(2, 8, 32, 4, 48, 4, 3).mean((3, 5))
+    assert np.abs(shrunk - small).max() < 2  # area averages of area averages, but for rounding
+    assert ds_frames.shape == shrunk.shape
+
+
+def test_another_look_and_other_annotations(plain):
+    made = gen2d.render(plain, [1], look={"name": "marked"}, fields=("frames", "boxes/visible", "flow/forward"))
+    assert (np.asarray(made["frames"]) != plain[[1]]["frames"]).any()
+    assert made["flow/forward"].shape == (1, 8, 32, 48, 2)
+
+
+def test_states_alone_are_drawn_when_loaded(tmp_path, plain):
+    ds = dataset(tmp_path / "ds", ["storage.frames=none", "annotations.masks=false"])
+    assert "frames" not in ds.manifest["fields"]
+    assert list(ds[0]) == [name for name in sorted(ds[0]) if name.startswith("states/")]
+    assert_array_equal(gen2d.render(ds, range(6)), plain[:]["frames"])
+    assert gen2d.verify(ds.root, "full") == []
+
+
+def test_simulated_again_the_states_are_those_stored(plain):
+    again = gen2d.simulate_again(plain, [0, 3])
+    assert_allclose(again["states/position"], plain[[0, 3]]["states/position"], atol=1e-5)
+    twice = gen2d.simulate_again(plain, [0, 3], fps=60, frames=15)
+    assert_allclose(twice["time"], np.arange(15) / 60, atol=1e-6)
+    # The same motion, but for where in a step impacts fall.
+    assert_allclose(twice["states/position"][:, ::2][:, :3], plain[[0, 3]]["states/position"][:, :3], atol=2e-2)
+    assert gen2d.render(plain, [0, 3], states=twice).shape == (2, 15, 32, 48, 3)
+
+
+@pytest.mark.parametrize(
+    ("call", "said"),
+    [
+        (lambda ds: gen2d.render(ds, [6]), "indices holds 6"),
+        (lambda ds: gen2d.render(ds, [0.5]), "whole numbers"),
+        (lambda ds: gen2d.render(ds, [0], height=2), "video.height is 2"),
+        (lambda ds: gen2d.render(ds, [0], look="flatt"), "flat"),
+        (lambda ds: gen2d.render(ds, [0], fields=("frame",)), "fields holds 'frame'"),
+        (lambda ds: gen2d.simulate_again(ds, [0], fps=-1), "video.fps is -1"),
+    ],
+)
+def test_bad_input_gets_one_sentence(plain, call, said):
+    with pytest.raises(ConfigError, match=said) as caught:
+        call(plain)
+    assert "\n" not in str(caught.value)
