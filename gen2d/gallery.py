@@ -13,9 +13,11 @@ import numpy as np
 
 from gen2d import plugins
 from gen2d.config import load_config
+from gen2d.generation import generate
 from gen2d.loader import Dataset
 from gen2d.loader import open as open_dataset
 from gen2d.preview import GAP, check_videos, contact_sheet, enlarged, shown, write, writing
+from gen2d.redraw import config_of, render
 
 LABEL = 110  # px, of the strip with a row's name
 TRACKS = 6  # points of an object
@@ -29,7 +31,8 @@ def gallery(source: str, out: Path, videos: int = 1, *, seed: int | None = None,
     check_videos(videos)
     if Path(source).is_dir():
         ds = open_dataset(source)
-        picture, name = _sheet(ds, videos, _looks(ds.manifest["config"]["look"]), sets), ds.manifest["name"]
+        looks = _looks(config_of(ds, sets).plain()["look"])
+        picture, name = _sheet(ds, videos, looks, sets), ds.manifest["name"]
     else:
         picture, name = _made(source, videos, seed, sets)
     path = out / f"{name}-gallery.png"
@@ -40,8 +43,6 @@ def gallery(source: str, out: Path, videos: int = 1, *, seed: int | None = None,
 
 def _made(source: str, videos: int, seed: int | None, sets: Sequence[str]) -> tuple[np.ndarray, str]:
     """The gallery of a config, and its name."""
-    from gen2d.generation import generate
-
     plain = load_config(source, sets).plain()
     bare = plain | {"look": "flat", "annotations": {}, "storage": plain["storage"] | {"frames": "none"}}
     with tempfile.TemporaryDirectory() as folder:
@@ -74,16 +75,12 @@ def _look_rows(
     ds: Dataset, numbers: Sequence[int], looks: Mapping[str, Mapping[str, Any]], sets: Sequence[str]
 ) -> Rows:
     """Each look's name and frames [n, T, H, W, 3]."""
-    from gen2d.redraw import render
-
     for name, look in looks.items():
         yield name, np.asarray(render(ds, numbers, look=look, sets=sets))
 
 
 def _annotation_rows(ds: Dataset, numbers: Sequence[int], sets: Sequence[str]) -> Rows:
     """Each annotation's name and frames [n, T, H, W, 3] that show it."""
-    from gen2d.redraw import render
-
     sets = [*sets, f"annotations.tracks={TRACKS}"]
     fields = ["masks/instance", "masks/amodal", "boxes/visible", "boxes/amodal", "flow/forward", "tracks/points"]
     fields += ["tracks/visible", "frames"]

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 
 from gen2d.errors import FolderError, UserError
+from gen2d.loader import Dataset
 from gen2d.loader import open as open_dataset
 
 COLUMNS = 10  # frames across the sheet
@@ -21,8 +22,8 @@ def preview(
     """The files made in the folder `out`: NAME-sheet.png and NAME.gif."""
     check_videos(videos)
     if Path(source).is_dir():
-        ds = open_dataset(source, fields=("frames",))
-        name, frames, fps = ds.manifest["name"], ds.batch(range(min(videos, len(ds))))["frames"], ds.manifest["fps"]
+        ds = open_dataset(source)
+        name, frames, fps = ds.manifest["name"], _stored(ds, range(min(videos, len(ds)))), ds.manifest["fps"]
     else:
         name, frames, fps = _drawn(source, videos, seed, sets)
     sheet, animation = out / f"{name}-sheet.png", out / f"{name}.gif"
@@ -46,6 +47,15 @@ def writing(out: Path) -> Iterator[None]:
         yield
     except OSError as error:
         raise FolderError(f"{out}: pictures cannot be written there ({error.strerror or error})") from None
+
+
+def _stored(ds: Dataset, numbers: Sequence[int]) -> np.ndarray:
+    """The frames of a dataset's videos, drawn again where they are not stored."""
+    if "frames" in ds.manifest["fields"]:
+        return ds.batch(numbers)["frames"]
+    from gen2d.redraw import render
+
+    return np.asarray(render(ds, numbers))
 
 
 def _drawn(source: str, videos: int, seed: int | None, sets: Sequence[str]) -> tuple[str, np.ndarray, float]:

@@ -161,15 +161,16 @@ def _stored(ds: Dataset, numbers: np.ndarray) -> dict[str, np.ndarray]:
     return _whole(ds).batch(numbers)
 
 
-def _record(cls: type, columns: Columns) -> Any:
-    """The record of these columns."""
+def record_of(cls: type, columns: Columns) -> Any:
+    """The record that holds these fields, arrays by stored name."""
     known = types.described(cls).items()
     return cls(**{attribute: jnp.asarray(columns[name]) for name, (attribute, _) in known if name in columns})
 
 
-def _scene(columns: Columns) -> Scene:
-    joints = _record(Joints, columns) if "joints/rest" in columns else None
-    return Scene(_record(Objects, columns), jnp.asarray(columns["world/gravity"]), joints)
+def scene_of(columns: Columns) -> Scene:
+    """The scenes that these fields are of."""
+    joints = record_of(Joints, columns) if "joints/rest" in columns else None
+    return Scene(record_of(Objects, columns), jnp.asarray(columns["world/gravity"]), joints)
 
 
 def _key_words(ds: Dataset) -> np.ndarray:
@@ -206,7 +207,7 @@ class _Settings:
 @functools.partial(jax.jit, static_argnames="settings")
 def _staged(columns: Columns, words: Array, numbers: Array, settings: _Settings) -> Stage:
     config, layout = settings.config, settings.layout
-    scene, states = _scene(columns), _record(State, columns)
+    scene, states = scene_of(columns), record_of(State, columns)
     view = settings.resized(View(*(jnp.asarray(columns[f"camera/{name}"]) for name in View._fields)))
 
     def staged(key: Array, scene: Scene, states: State, view: View) -> Stage:
@@ -225,8 +226,8 @@ def _pictures(stages: Stage, settings: _Settings) -> dict[str, Array]:
 @functools.partial(jax.jit, static_argnames="settings")
 def _simulated(columns: Columns, words: Array, numbers: Array, settings: _Settings) -> dict[str, Array]:
     config, layout = settings.config, settings.layout
-    scene = _scene(columns)
-    first = jax.tree.map(lambda a: a[:, 0], _record(State, columns))
+    scene = scene_of(columns)
+    first = jax.tree.map(lambda a: a[:, 0], record_of(State, columns))
     steps = substeps(config.video.fps, config.physics.substeps, config.physics.max_step)
     rules = rules_of(config.physics, config.video.fps, steps)
     keep = dataclasses.replace(keep_of(config, layout), between=False)
@@ -251,4 +252,3 @@ def _again(ds: Dataset, config: Config, numbers: np.ndarray) -> dict[str, Array]
         for name, array in _pictures(stages, _Settings(config, config)).items():
             found.setdefault(name, []).append(array)
     return {name: jnp.concatenate(parts)[np.argsort(order)] for name, parts in found.items()}
-

@@ -8,6 +8,7 @@ import dataclasses
 import jax.numpy as jnp
 import numpy as np
 
+from gen2d.config import option
 from gen2d.paint import Background, Paint, are_moving, lines_of
 from gen2d.types import Array, Layout, Scene
 
@@ -16,12 +17,19 @@ WHITE, RED, BLUE = (255.0, 255.0, 255.0), (255.0, 0.0, 0.0), (0.0, 0.0, 255.0)
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """None: the look is as it was published."""
+    """Line widths."""
+
+    wall_width: float = option(0.0, float, "px", "of a segment's line, beyond its own radius; 0: not drawn", low=0)
+
+
+def margin(options: Options) -> float:
+    """How far an object may be drawn beyond its rim, px."""
+    return options.wall_width / 2
 
 
 def paint(scene: Scene, layout: Layout, options: Options, key: Array) -> Paint:
-    """What one video's slots are painted with; what is static and not a wall keeps the scene's colour."""
+    """What one video's slots are painted with; what is static has the scene's colours."""
     moving = are_moving(layout)
-    turn = np.asarray([RED, BLUE])[(np.cumsum(moving) - 1) % 2]
+    turn = jnp.asarray([RED, BLUE])[(np.cumsum(moving) - 1) % 2]
     colors = jnp.where(moving[:, None], turn, scene.objects.color.astype(jnp.float32))
-    return Paint(Background(jnp.asarray(WHITE)), colors, lines_of(scene, 0.0)[0])
+    return Paint(Background(jnp.asarray(WHITE)), colors, *lines_of(scene, options.wall_width))

@@ -15,14 +15,9 @@ class Options:
     """Spots, colours and line widths."""
 
     spots: float = option(
-        0.8,
-        float,
-        "1",
-        "how far spots go from an object's colour to black or white, whichever is farther",
-        low=0,
-        high=1,
+        0.8, float, "1", "how far spots go to black or white, whichever differs more from the background", low=0, high=1
     )
-    cell: float = option(0.7, float, "1", "size of a spot, over the largest object's reach", above=0)
+    cell: float = option(0.6, float, "1", "size of a spot, over the largest object's reach", above=0)
     background_kind: str = option("noise", str, "", "what is behind everything", choices=("plain", "gradient", "noise"))
     background: tuple = option(
         [20, 20, 20], int, "sRGB", "of the background, where a gradient or noise begins", parts=3, low=0, high=255
@@ -48,10 +43,11 @@ def paint(scene: Scene, layout: Layout, options: Options, key: Array) -> Paint:
     k_background, k_spots = (jax.random.fold_in(key, i) for i in (1, 2))
     background = background_of(options, layout, k_background)
     drawn, grow = lines_of(scene, options.wall_width)
-    colors = colors_of(scene, layout, options, key, mean_color(background))
+    mean = mean_color(background)
+    colors = colors_of(scene, layout, options, key, mean)
     texture = Texture(
         seed=jax.random.bits(k_spots, (layout.slots,), jnp.uint32),
         cell=jnp.full(layout.slots, options.cell * layout.reach),
-        color=colors + options.spots * (contrasting(colors) - colors),
+        color=colors + options.spots * (contrasting(mean) - colors),
     )
     return Paint(background, colors, drawn, grow, texture=texture)

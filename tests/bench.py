@@ -3,6 +3,7 @@
     python tests/bench.py                 # all, about 10 minutes
     python tests/bench.py --quick         # only what a change to the code should be tried on
     python tests/bench.py --only physics  # what it costs against the number of objects: bench_physics.py
+    python tests/bench.py --only render   # what drawing costs, and annotations: bench_render.py
 
 Machines are noisy, so whatever is compared is measured in turns, and a ratio is the median of the ratios of the turns.
 Every measurement runs in a process of its own, on the cores that it is given, and in folders that vanish.
@@ -25,8 +26,10 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import bench_physics
+import bench_render
 import numpy as np
 from bench_physics import CASES, Cost
+from bench_render import Annotated, Drawing
 
 HERE = Path(__file__).resolve()
 CONFIG = "benchmark.yaml"
@@ -72,20 +75,19 @@ def _parts(folder: Path, sets: Sequence[str]) -> dict[str, tuple[Callable[[], An
 
     from gen2d import devices, pipeline, shards
     from gen2d.generation import dataset_of
-    from gen2d.rollout import parts
 
     rollout = rollout_of(sets)
     sample, simulate, numbers = _physics(rollout)
-    drawn, batch = sample(numbers), rollout.begin("train", [0] * len(rollout.devices))
+    start, batch = sample(numbers), rollout.begin("train", [0] * len(rollout.devices))
     whole = rollout.videos_per_shard // rollout.lanes * rollout.lanes
     dataset = dataset_of(rollout, folder / "data", {"train": whole})
     (shard, *_), columns = shards.open_folder(dataset), rollout.host_columns(batch)[0]
     encoder = pipeline.Encoder(rollout, dataset, pipeline.threads_for(devices.cores()))
     jobs = pipeline.jobs_of([0], [[(shard, 0, rollout.lanes)]], rollout.lanes, rollout.slice)
-    frames = [jax.block_until_ready(rollout.draw(batch, job.start, rollout.slice)) for job in jobs]
+    pictures = [jax.block_until_ready(rollout.draw(batch, job.start, rollout.slice))[0] for job in jobs]
 
     def encode() -> list[Any]:
-        return [encoder.encode(job, columns, f[0]) for job, f in zip(jobs, frames, strict=True)]
+        return [encoder.encode(job, columns, drawn) for job, drawn in zip(jobs, pictures, strict=True)]
 
     blocks = encode() * (whole // rollout.lanes)
 
@@ -93,11 +95,14 @@ def _parts(folder: Path, sets: Sequence[str]) -> dict[str, tuple[Callable[[], An
         for job in jobs:
             jax.block_until_ready(rollout.draw(batch, job.start, rollout.slice))
 
+    def transfer() -> list[Any]:
+        return [rollout.host_columns(batch), *(np.asarray(array) for drawn in pictures for array in drawn.values())]
+
     return {
         "sampler": (lambda: jax.block_until_ready(sample(numbers)), rollout.lanes),
-        "simulate": (lambda: jax.block_until_ready(simulate(*drawn)), rollout.lanes),
+        "simulate": (lambda: jax.block_until_ready(simulate(*start)), rollout.lanes),
         "render": (draw, rollout.lanes),
-        "transfer": (lambda: [rollout.host_columns(batch), *(np.asarray(a) for drawn in frames for a in drawn[0].values())], rollout.lanes),
+        "transfer": (transfer, rollout.lanes),
         "compress": (encode, rollout.lanes),
         "write": (lambda: shards.write(dataset, shard, blocks), whole),
     }
@@ -199,7 +204,21 @@ def physics(folder: Path, scene: str, turns: int) -> Turns:
     return in_turns(works, turns) | {name: [seconds] for name, seconds in compiled.items()}
 
 
-MEASUREMENTS = {work.__name__: work for work in (stages, steady, bounds, physics)}
+def render(folder: Path, case: str, turns: int) -> Turns:
+    """CPU seconds a frame of gen2d, of OpenCV and of a copy."""
+    of = bench_render.CASES[case]
+    return in_turns(bench_render.works(of, rollout_of(of.sets)), turns)
+
+
+def annotated(folder: Path, turns: int) -> Turns:
+    """CPU seconds a frame of drawing with each of the annotations, and the bytes of it."""
+    asked = {name: [f"annotations.{part}" for part in parts] for name, parts in bench_render.ANNOTATIONS.items()}
+    rollouts = {name: rollout_of((*bench_render.ANNOTATED.sets, *parts)) for name, parts in asked.items()}
+    works, sizes = bench_render.annotating(rollouts)
+    return in_turns(works, turns) | {f"bytes {name}": [size] for name, size in sizes.items()}
+
+
+MEASUREMENTS = {work.__name__: work for work in (stages, steady, bounds, physics, render, annotated)}
 
 
 # ---- Processes
@@ -284,8 +303,10 @@ class Promise(NamedTuple):
         return f"{'at most' if self.most else 'at least'} {self.target:g}: {'kept' if kept else 'NOT KEPT'}"
 
 
-Found = Iterator[Row | Promise | Cost]
+Told = Row | Promise | Cost | Drawing | Annotated
+Found = Iterator[Told]
 BETA = "an interface that pymunk calls highly experimental"
+ALONE = f"against the frames alone, {bench_render.ANNOTATED.name}"
 
 
 def _ratio(of: Sequence[float], to: Sequence[float]) -> float:
@@ -380,9 +401,39 @@ def physics_section(folder: Path, quick: bool) -> Found:
         yield Promise("  compiled", cost.compile["all"], "s", 30, most=True)
 
 
+def render_section(folder: Path, quick: bool) -> Found:
+    """Frames of 64 to 256 px with 2 to 32 discs, one core, beside OpenCV and a copy; then what annotations add."""
+    repeats = 5 if quick else 15
+    for case in bench_render.CASES.values():
+        turns = measured(render, folder, CORES[:1], case=case.name, turns=repeats)
+        yield bench_render.drawing_of(case, {name: statistics.median(values) for name, values in turns.items()})
+        least, name = 5 if case.pixels == 64 else None, f"render {case.name} against"
+        yield Promise(f"{name} OpenCV", _ratio(turns["opencv"], turns["gen2d"]), target=least)
+        if case.name == bench_render.COPIED:
+            yield Promise(f"{name} a copy", _ratio(turns["gen2d"], turns["copy"]), target=4, most=True)
+    yield from annotations_told(measured(annotated, folder, CORES[:1], turns=repeats))
+
+
+def annotations_told(turns: Turns) -> Found:
+    """What drawing with annotations costs beside drawing alone."""
+    frames, most = turns["frames"], {"masks, boxes, visibility": 1.5}
+    for name in bench_render.ANNOTATIONS:
+        added = [a - b for a, b in zip(turns[name], frames, strict=True)]
+        (size,) = turns[f"bytes {name}"]
+        yield Annotated(name, statistics.median(turns[name]) * 1e6, statistics.median(added) * 1e6, int(size))
+        if name != "frames":
+            yield Promise(
+                f"render with {name}", _ratio(turns[name], frames), target=most.get(name), most=True, note=ALONE
+            )
+        if name == "flow":
+            each = _ratio(added, frames) * bench_render.ANNOTATED.frame_bytes / size
+            yield Promise("  a byte of it, against one of frames", each, target=2, most=True)
+
+
 SECTIONS = {
     "parts": parts_section, "steady": steady_section, "command": command_section, "memory": memory_section,
     "scaling": scaling_section, "start": start_section, "physics": physics_section,
+    "render": render_section,
 }  # fmt: skip
 QUICK = ("parts", "steady")
 
@@ -399,11 +450,23 @@ def machine() -> dict[str, Any]:
     return {"cpu": model, "cores": len(CORES), "load": os.getloadavg()[0], **versions}
 
 
-def text_of(facts: Mapping[str, Any], found: Sequence[Row | Promise | Cost]) -> str:
+# What JSON calls each kind of line, which of them have a table of their own, and which sections a chart.
+KINDS = {"rows": Row, "promises": Promise, "costs": Cost, "drawings": Drawing, "annotations": Annotated}
+TABLES: Mapping[type, Callable[[Any], list[str]]] = {
+    Cost: bench_physics.table,
+    Drawing: bench_render.table,
+    Annotated: bench_render.table_of_annotations,
+}
+CHARTS: Mapping[str, tuple[type, Callable[[Any, Path], None]]] = {
+    "physics": (Cost, bench_physics.chart),
+    "render": (Drawing, bench_render.chart),
+}
+
+
+def text_of(facts: Mapping[str, Any], found: Sequence[Told]) -> str:
     """The tables."""
     lines = [", ".join(f"{key} {value}" for key, value in facts.items())]
     rows, promises = [f for f in found if isinstance(f, Row)], [f for f in found if isinstance(f, Promise)]
-    costs = [f for f in found if isinstance(f, Cost)]
     if rows:
         lines += ["", f"{'':21} {'videos/s':>9} {'MB/s':>8} {'share':>6} {'peer':>7} {'ratio':>6}"]
     for row in rows:
@@ -411,7 +474,10 @@ def text_of(facts: Mapping[str, Any], found: Sequence[Row | Promise | Cost]) -> 
         peer, ratio = (f"{row.peer:,.0f}", f"{row.rate / row.peer:.2f}") if row.peer else ("", "")
         speed = f"{row.rate:9,.0f} {row.rate * FRAMES_BYTES / 1e6:8,.0f}"
         lines += [f"{row.name:21} {speed} {share:>6} {peer:>7} {ratio:>6}  {row.note}".rstrip()]
-    lines += ["", *bench_physics.table(costs), ""] if costs else [""]
+    for kind, table in TABLES.items():
+        told = [f for f in found if isinstance(f, kind)]
+        lines += ["", *table(told)] if told else []
+    lines += [""]
     for p in promises:
         lines += [f"{p.name:38} {p.value:7.2f} {p.unit:7} {p.verdict:22} {p.note}".rstrip()]
     return "\n".join(lines)
@@ -423,13 +489,14 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help=f"only {' and '.join(QUICK)}, with fewer turns")
     parser.add_argument("--only", nargs="+", choices=tuple(SECTIONS), help="only these sections")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures there, too")
-    parser.add_argument("--plot", type=Path, metavar="FILE", help="draw the figures of the section physics there, too")
+    parser.add_argument("--plot", type=Path, metavar="FILE", help="draw the section physics there, else render")
     parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu", help="where gen2d computes (cpu)")
     parser.add_argument("--measure", nargs=3, help=argparse.SUPPRESS)
     options = parser.parse_args()
     names = options.only or (QUICK if options.quick else SECTIONS)
-    if options.plot and "physics" not in names:
-        parser.error("--plot draws the section physics, which is not measured: add --only physics")
+    plotted = next((name for name in CHARTS if name in names), None)
+    if options.plot and not plotted:
+        parser.error("--plot draws the section physics or render, of which none is measured: add --only physics")
     if options.measure:
         name, folder, more = options.measure
         print(json.dumps(MEASUREMENTS[name](Path(folder), **json.loads(more))))
@@ -441,11 +508,11 @@ def main() -> None:
             found += SECTIONS[name](Path(folder), options.quick)
     print(text_of(facts, found))
     if options.json:
-        kinds = {"rows": Row, "promises": Promise, "costs": Cost}
-        tables = {key: [f._asdict() for f in found if isinstance(f, kind)] for key, kind in kinds.items()}
+        tables = {key: [f._asdict() for f in found if isinstance(f, kind)] for key, kind in KINDS.items()}
         options.json.write_text(json.dumps({"machine": facts} | tables, indent=1))
-    if options.plot:
-        bench_physics.chart([f for f in found if isinstance(f, Cost)], options.plot)
+    if options.plot and plotted:
+        kind, chart = CHARTS[plotted]
+        chart([f for f in found if isinstance(f, kind)], options.plot)
 
 
 if __name__ == "__main__":

@@ -1,38 +1,65 @@
 """Annotations: each obeys its law on random scenes, in several looks, with cameras that stand and that move."""
 
+import functools
+import zlib
+
 import jax
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
+from gen2d import drawing, factors, redraw, types
 from gen2d.config import load_config
 from gen2d.rollout import Rollout, parts
 
 ALL = [f"annotations.{name}=true" for name in ("masks", "amodal", "boxes", "visibility", "flow")]
 SMALL = ["storage.lanes=4", "video.frames=12", "video.height=40", "video.width=56", "annotations.tracks=5", "seed=3"]
 CASES = {
-    "still": ["look.palette=random", "camera.margin=-0"],
+    "still": ["look.palette=random"],
     "moving": ["camera.pan=[[-2,2],1]", "camera.turn=0.4", "camera.zoom=0.2", "look=textured"],
     "marked": ["look=marked", "image.occluders=2", "image.occluder_front=[0,1]"],
 }
 
 
+@functools.cache
+def simulated():
+    """Some videos' fields, and the keys of the videos; their pictures are drawn in several ways."""
+    rollout = Rollout(load_config("bouncing.yaml", SMALL), jax.devices()[:1])
+    batch = rollout.begin("train", [0])
+    assert parts(batch.placed)[0].all()
+    keys = factors.video_keys(factors.seed_words(3, zlib.crc32(b"train")), np.arange(4, dtype=np.uint32))
+    return rollout.host_columns(batch)[0], keys
+
+
 class Made:
-    """Some videos' fields, and what they were drawn from."""
+    """The videos, drawn and annotated as a config says."""
 
     def __init__(self, sets: list[str]) -> None:
-        self.rollout = Rollout(load_config("bouncing.yaml", [*SMALL, *ALL, *sets]), jax.devices()[:1])
-        batch = self.rollout.begin("train", [0])
-        assert parts(batch.placed)[0].all()
-        self.of = {name: np.asarray(a) for name, a in self.rollout.draw(batch, 0, 4)[0].items()}
-        self.of |= self.rollout.host_columns(batch)[0]
-        self.mask = self.of["masks/instance"]
-        self.slots = self.rollout.layout.slots
+        config = load_config("bouncing.yaml", [*SMALL, *ALL, *sets])
+        self.rollout = Rollout(config, jax.devices()[:1])
+        columns, keys = simulated()
+        layout = self.rollout.layout
+
+        def staged(key, scene, states):
+            paint, view = drawing.paint_of(key, config, scene, layout), drawing.view_of(key, config, layout, states)
+            return drawing.stage_of(key, config, scene, states, view, paint)
+
+        scenes, states = redraw.scene_of(columns), redraw.record_of(types.State, columns)
+        stages = jax.jit(jax.vmap(staged))(keys, scenes, states)
+        drawn = jax.jit(lambda stages: drawing.pictures(stages, self.rollout.plan, config.annotations))(stages)
+        seen = drawing.camera_columns(stages.instants.view)
+        self.of = columns | {name: np.asarray(a) for name, a in (drawn | seen).items()}
+        self.mask, self.slots = self.of["masks/instance"], layout.slots
 
 
-@pytest.fixture(scope="module", params=CASES.values(), ids=CASES.keys())
+@pytest.fixture(scope="module", params=CASES, ids=CASES.keys())
 def made(request):
-    return Made(request.param)
+    return drawn_as(request.param)
+
+
+@functools.cache
+def drawn_as(case: str) -> Made:
+    return Made(CASES[case])
 
 
 def test_fields_are_as_described(made):
@@ -61,14 +88,17 @@ def test_what_is_seen_lies_in_what_is_there(made):
     assert (fraction[~seen] == 0).all()
 
 
-def test_amodal_masks_hold_the_instance_mask_where_one_object_alone_fills_a_pixel(made):
+def test_amodal_masks_are_instance_masks_where_one_object_is_alone_and_have_its_area(made):
     height, width = made.mask.shape[2:]
     bits = np.unpackbits(made.of["masks/amodal"], axis=-1)[..., : height * width].astype(bool)
     bits = bits.reshape(*bits.shape[:3], height, width)
+    y, x = np.mgrid[:height, :width][:, None, None, None] + 0.5
+    x0, y0, x1, y1 = np.moveaxis(made.of["boxes/amodal"], -1, 0)[..., None, None]
+    near = (x > x0 - 1) & (x < x1 + 1) & (y > y0 - 1) & (y < y1 + 1) & (x1 > x0)
+    alone = (near.sum(2) == 1) & (made.mask != 255)
     for k in range(made.slots):
-        mine = made.mask == k + 1
-        inside = bits[:, :, k]
-        assert not (bits.sum(2) == 1)[mine & ~inside].any()  # another fills half of it and this one shows
+        mine = alone & near[:, :, k]
+        assert_array_equal((made.mask == k + 1)[mine], bits[:, :, k][mine])
     balls = made.of["objects/shape"][0] == 0
     discs = bits[:, :, balls].sum((3, 4))
     areas = np.pi * (made.of["objects/radius"][:, None, balls] * made.of["camera/scale"][..., None]) ** 2
@@ -84,12 +114,15 @@ def test_flow_carries_each_object_and_the_background_to_the_next_frame(made):
         flow, valid = made.of[f"flow/{name}"].astype(float), made.of[f"flow/{name}_valid"].astype(bool)
         assert not valid[:, -1 if step > 0 else 0].any()
         checked = 0
+        missed = 0
         for v, t in np.ndindex(*made.mask.shape[:2]):
+            if not valid[v, t].any():
+                continue
             there = np.nonzero(valid[v, t])
             to_x, to_y = x[there] + flow[v, t][there][:, 0], y[there] + flow[v, t][there][:, 1]
-            own = made.mask[v, t][there]
-            assert_array_equal(made.mask[v, t + step][to_y.astype(int), to_x.astype(int)][own < 255], own[own < 255])
-            checked += len(own)
+            missed += (made.mask[v, t + step][to_y.astype(int), to_x.astype(int)] != made.mask[v, t][there]).sum()
+            checked += len(to_x)
+        assert missed <= 1e-3 * checked  # stored with 11 bits, a flow may end just beyond a pixel's edge
         assert checked > 0.7 * valid[:, 1:-1].size
 
 
@@ -113,7 +146,7 @@ def test_flow_at_a_discs_centre_is_the_way_of_its_centre(made):
 
 
 def test_a_frame_carried_by_its_flow_is_the_next_frame():
-    plain = Made(["look.palette=random", "scene.spin=0", "scene.friction=0", "video.height=64", "video.width=64"])
+    plain = drawn_as("still")
     frames, flow, valid = (plain.of[name] for name in ("frames", "flow/backward", "flow/backward_valid"))
     y, x = np.mgrid[: frames.shape[2], : frames.shape[3]]
     for v, t in ((0, 3), (1, 7), (2, 5)):

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import bench
 import bench_physics
+import bench_render
 import cv2
 import h5py
 import numpy as np
@@ -92,3 +93,50 @@ def test_the_chart_of_the_physics_section_draws_what_was_measured(tmp_path: Path
     assert image.shape == (bench_physics.HEIGHT, bench_physics.WIDTH, 3)
     drawn = {name: (image == color).all(-1).any() for name, color in bench_physics.COLORS.items()}
     assert drawn == {"states": False, "all": True, "pymunk": True, "phyjax2d": False}
+
+
+SMALL = bench_render.Case(32, 2, 4)
+
+
+def test_opencv_draws_the_pictures_of_gen2d() -> None:
+    rollout = bench.rollout_of(SMALL.sets)
+    batch = rollout.begin("train", [0] * len(rollout.devices))
+    ours, columns = np.asarray(rollout.draw(batch, 0, 4)[0]["frames"])[0], rollout.host_columns(batch)[0]
+    theirs = np.empty_like(ours)
+    bench_render.drawn(columns, 0, theirs)
+    scale, middle = SMALL.pixels / peer.SIDE, np.arange(SMALL.pixels) + 0.5
+    place, radius = columns["states/position"][0, :, :2] * scale, columns["objects/radius"][0, :2] * scale
+    x, y = (place[..., i, None, None] for i in (0, 1))
+    to_rim = np.hypot(middle - x, SMALL.pixels - middle[:, None] - y) - radius[:, None, None]
+    inside = (np.abs(to_rim) > 2).all(1)  # OpenCV's discs are a pixel too large
+    assert 0.5 < inside.mean() < 1
+    assert (ours[inside] == theirs[inside]).all()
+    assert (ours != peer.BACKGROUND).any()
+
+
+def test_every_way_of_drawing_is_timed(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setitem(bench_render.CASES, SMALL.name, SMALL)
+    turns = bench.render(tmp_path, SMALL.name, turns=1)
+    assert turns.keys() == bench_render.LINES.keys()
+    assert all(seconds > 0 for (seconds,) in turns.values())
+    drawing = bench_render.drawing_of(SMALL, {name: seconds for name, (seconds,) in turns.items()})
+    assert "32 px, 2 discs" in bench.text_of({}, [drawing])
+
+
+def test_what_annotations_add_is_timed_and_weighed(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(bench_render, "ANNOTATED", SMALL)
+    monkeypatch.setattr(bench_render, "ANNOTATIONS", {"frames": (), "flow": ("flow=true",)})
+    turns = bench.annotated(tmp_path, turns=1)
+    assert all(seconds > 0 for name in ("frames", "flow") for seconds in turns[name])
+    assert (turns["bytes frames"], turns["bytes flow"]) == ([0], [32 * 32 * 2 * (2 * 2 + 1)])
+    assert "flow" in bench.text_of({}, list(bench.annotations_told(turns)))
+
+
+def test_the_chart_of_the_render_section_draws_what_was_measured(tmp_path: Path) -> None:
+    both = [({"gen2d": n / 9, "opencv": n / 3}, n) for n in (64, 128)]
+    drawings = [bench_render.Drawing(f"{n} px", n, 8, micros, {}) for micros, n in both]
+    bench_render.chart(drawings, tmp_path / "chart.png")
+    image = cv2.imread(str(tmp_path / "chart.png"))
+    assert image is not None
+    assert image.shape == (bench_physics.HEIGHT, bench_physics.WIDTH, 3)
+    assert all((image == color).all(-1).any() for color in bench_render.COLORS.values())

@@ -10,10 +10,15 @@ from gen2d.errors import ConfigError
 SMALL = ["storage.lanes=4", "video.frames=8", "video.height=32", "video.width=48", "annotations.masks=true"]
 CASES = {
     "plain": [],
-    "moving": ["camera.pan=[[-1,1],0.5]", "camera.shake=0.1", "look.palette=random", "image.blending=linear"],
-    "occluded": ["image.occluders=2", "image.noise=[1,4]", "look=textured"],
-    "blurred": ["image.exposure=0.5", "image.exposure_samples=4"],
+    "moving": [
+        "camera.pan=[[-1,1],0.5]",
+        "camera.shake=0.1",
+        "image.occluders=2",
+        "image.noise=[1,4]",
+        "look=textured",
+    ],
 }
+BLURRED = ["image.exposure=0.5", "image.exposure_samples=4", "look.palette=random", "image.blending=linear"]
 
 
 def dataset(folder, sets, n=6):
@@ -26,9 +31,9 @@ def plain(tmp_path_factory):
     return dataset(tmp_path_factory.mktemp("plain") / "ds", [])
 
 
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("case", [*CASES, pytest.param("blurred", marks=pytest.mark.slow)])
 def test_drawn_again_the_frames_are_those_stored(case, tmp_path, plain):
-    ds = plain if case == "plain" else dataset(tmp_path / "ds", CASES[case])
+    ds = plain if case == "plain" else dataset(tmp_path / "ds", {**CASES, "blurred": BLURRED}[case])
     assert_array_equal(gen2d.render(ds, range(6)), ds[:]["frames"])
     some = gen2d.render(ds, [5, 2, -1], fields=("frames", "masks/instance"))
     whole = gen2d.open(ds.root, fields=("masks/instance",))
@@ -37,11 +42,11 @@ def test_drawn_again_the_frames_are_those_stored(case, tmp_path, plain):
 
 
 def test_a_larger_picture_shows_the_same(plain):
-    small = ds_frames = plain[[0, 1]]["frames"].astype(float)
+    small = plain[[0, 1]]["frames"].astype(float)
     large = np.asarray(gen2d.render(plain, [0, 1], height=128, width=192, sets=["look.wall_width=6"])).astype(float)
     shrunk = large.reshape(2, 8, 32, 4, 48, 4, 3).mean((3, 5))
-    assert np.abs(shrunk - small).max() < 2  # area averages of area averages, but for rounding
-    assert ds_frames.shape == shrunk.shape
+    # Averages over areas, whatever their size: but for rounding, and for pixels in which several rims meet.
+    assert np.quantile(np.abs(shrunk - small), 0.995) < 1.5
 
 
 def test_another_look_and_other_annotations(plain):
@@ -58,9 +63,13 @@ def test_states_alone_are_drawn_when_loaded(tmp_path, plain):
     assert gen2d.verify(ds.root, "full") == []
 
 
+@pytest.mark.slow
 def test_simulated_again_the_states_are_those_stored(plain):
     again = gen2d.simulate_again(plain, [0, 3])
     assert_allclose(again["states/position"], plain[[0, 3]]["states/position"], atol=1e-5)
+
+
+def test_simulated_again_at_twice_the_frame_rate_the_motion_is_the_same(plain):
     twice = gen2d.simulate_again(plain, [0, 3], fps=60, frames=15)
     assert_allclose(twice["time"], np.arange(15) / 60, atol=1e-6)
     # The same motion, but for where in a step impacts fall.

@@ -1,17 +1,20 @@
-"""Small worlds for the law tests: discs and segments by hand, simulated with the product's own programs.
+"""Small worlds for the law tests: discs and segments by hand, simulated with the product's own programs; videos to be
+drawn, and the exact areas of shapes in their pixels.
 
 All tests share a few shapes (how many discs, segments, frames, steps), so that each is compiled once.
 """
 
 import functools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gen2d import types
+from gen2d import drawing, factors, types
+from gen2d.config import Config, load_config
+from gen2d.raster import Plan, Stage
 from gen2d.rows import Rules
 from gen2d.simulate import Forces, Keep, simulate
 from gen2d.types import STATIC, Layout, Objects, Run, Scene, State, Trajectory
@@ -176,6 +179,46 @@ def momenta(worlds: Sequence[tuple[Scene, State, Layout]], made: Trajectory) -> 
         cross = x[..., 0] * v[..., 1] - x[..., 1] * v[..., 0]
         angular.append((mass * cross + moment * w).sum(-1))
     return np.array(linear), np.array(angular)
+
+
+# ---- Videos that no solver makes, to be drawn
+
+
+def flown(config: Config | Mapping, count: int) -> tuple[Stage, Plan, Scene, State]:
+    """What `count` videos of a config are drawn from, their plan, scenes and states [n, T, ...]; from where the sampler
+    puts it everything flies straight on, through walls too."""
+    config = load_config(config)
+    layout = config.scene.module.layout(config.scene.options)
+    keys = factors.video_keys(jnp.asarray(factors.seed_words(config.seed, 0)), jnp.arange(count, dtype=jnp.uint32))
+    stages, scenes, states = jax.jit(jax.vmap(functools.partial(_flown, config, layout)))(keys)
+    return stages, drawing.plan_of(config, layout), scenes, states
+
+
+def _flown(config: Config, layout: Layout, key: jax.Array) -> tuple[Stage, Scene, State]:
+    family, options, video, steps = config.scene.module, config.scene.options, config.video, 4
+    sizes = family.sizes(options)
+    wanted = {
+        name: (getattr(options, name), tuple(sizes[axis] for axis in axes.split()[1:]))
+        for name, axes in family.FACTORS.items()
+    }
+    scene, begin, *_ = family.sample(key, factors.draw(key, wanted), options)
+
+    def at(time: jax.Array) -> State:
+        def moved(start: jax.Array, rate: jax.Array) -> jax.Array:
+            return start + time.reshape(*time.shape, *[1] * start.ndim) * rate
+
+        return State(
+            moved(begin.position, begin.velocity),
+            moved(begin.angle, begin.angular_velocity),
+            moved(begin.velocity, 0 * begin.velocity),
+            moved(begin.angular_velocity, 0 * begin.angular_velocity),
+        )
+
+    frame, step = jnp.arange(video.frames), jnp.arange(1, steps + 1)
+    states, between = at(frame / video.fps), at((frame[:-1, None] + step / steps) / video.fps)
+    paint = drawing.paint_of(key, config, scene, layout)
+    view = drawing.view_of(key, config, layout, states)
+    return drawing.stage_of(key, config, scene, states, view, paint, between), scene, states
 
 
 # ---- Exact areas of shapes in pixels, in float64; px, x to the right and y down

@@ -1,0 +1,233 @@
+"""What drawing costs against the size of the picture and the number of objects: gen2d, OpenCV and a plain copy.
+
+    python tests/bench.py --only render --plot gen2d/render_cost.png     # about 4 minutes
+
+The scene is that of configs/benchmark.yaml: N discs in a box of 10 m, 64 frames a video. It is simulated before any
+time is taken. gen2d draws in slices as a run does; OpenCV is called from Python for every disc, as in peer.py, on the
+same states and into a buffer of the size of a slice. A turn makes 100 MB of frames, whatever their size. Times are of
+this process's CPU, which is on one core, so other work on the machine disturbs little.
+"""
+
+import math
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+import peer
+from bench_physics import BOTTOM, FAINT, GRID, HEIGHT, INK, LEFT, RIGHT, TOP, WIDTH, ZOOM, _line, _text
+
+FRAMES = 64  # of a video
+SIZES = {64: 128, 128: 32, 256: 8}  # px, and how many videos are 100 MB
+
+
+class Case(NamedTuple):
+    """A size of picture, a number of discs, and how many videos are drawn in a turn."""
+
+    pixels: int
+    objects: int
+    videos: int
+
+    @property
+    def name(self) -> str:
+        """As it stands in the tables."""
+        return f"{self.pixels} px, {self.objects} discs"
+
+    @property
+    def sets(self) -> tuple[str, ...]:
+        """What differs from configs/benchmark.yaml; many discs are smaller, so that they fit the box."""
+        video = [f"video.{name}={value}" for name, value in self.video.items()]
+        radius = ["scene.radius=[0.25,0.5]"] if self.objects > 16 else []
+        return *video, *radius, f"scene.balls={self.objects}", f"storage.lanes={self.videos}"
+
+    @property
+    def video(self) -> dict[str, int]:
+        """The section `video` of its config."""
+        return {"frames": FRAMES, "height": self.pixels, "width": self.pixels}
+
+    @property
+    def frame_bytes(self) -> int:
+        """Of one frame."""
+        return self.pixels**2 * 3
+
+
+CASES = {case.name: case for case in (Case(px, n, videos) for px, videos in SIZES.items() for n in (2, 8, 32))}
+COPIED = "256 px, 8 discs"  # what is held against a copy
+ANNOTATED = Case(64, 8, 64)  # what annotations are added to
+ANNOTATIONS = {
+    "frames": (),
+    "masks": ("masks=true",),
+    "masks, boxes, visibility": ("masks=true", "boxes=true", "visibility=true"),
+    "flow": ("flow=true",),
+    "amodal": ("amodal=true",),
+    "tracks, 8 points a slot": ("tracks=8",),
+}
+
+
+# ---- What draws
+
+
+def works(case: Case, rollout: Any) -> dict[str, Callable[[], float]]:
+    """By name what draws, or copies, all frames of a case and returns the CPU seconds of one."""
+    cv2.setNumThreads(1)
+    batch = rollout.begin("train", [0] * len(rollout.devices))
+    columns = rollout.host_columns(batch)[0]
+    buffer = np.zeros((rollout.slice, FRAMES, case.pixels, case.pixels, 3), np.uint8)
+    source, target = (np.full(case.videos * FRAMES * case.frame_bytes, i, np.uint8) for i in range(2))
+
+    def opencv() -> None:
+        for video in range(case.videos):
+            drawn(columns, video, buffer[video % len(buffer)])
+
+    by_name = {"gen2d": _drawing(rollout, batch), "opencv": opencv, "copy": lambda: np.copyto(target, source)}
+    return {name: _timed(work, case.videos * FRAMES) for name, work in by_name.items()}
+
+
+def annotating(rollouts: Mapping[str, Any]) -> tuple[dict[str, Callable[[], float]], dict[str, int]]:
+    """By annotation what draws videos with it and returns the CPU seconds of a frame, and the bytes of it a frame."""
+    first = next(iter(rollouts.values()))
+    batch = first.begin("train", [0] * len(first.devices))  # annotations change nothing of what is drawn from
+    frames = first.config.video.frames
+    each = {name: _timed(_drawing(rollout, batch), first.lanes * frames) for name, rollout in rollouts.items()}
+    made = {name: rollout.draw(batch, 0, rollout.slice)[0] for name, rollout in rollouts.items()}
+    told = {name: {of: array for of, array in arrays.items() if of != "frames"} for name, arrays in made.items()}
+    return each, {
+        name: sum(a.nbytes for a in arrays.values()) // (first.slice * frames) for name, arrays in told.items()
+    }
+
+
+def _drawing(rollout: Any, batch: Any) -> Callable[[], None]:
+    import jax
+
+    def draw() -> None:
+        for start in range(0, rollout.lanes, rollout.slice):
+            jax.block_until_ready(rollout.draw(batch, start, rollout.slice))
+
+    return draw
+
+
+def _timed(work: Callable[[], None], frames: int) -> Callable[[], float]:
+    def seconds() -> float:
+        began = time.process_time()
+        work()
+        return (time.process_time() - began) / frames
+
+    return seconds
+
+
+def drawn(columns: Mapping[str, np.ndarray], video: int, frames: np.ndarray) -> None:
+    """Returns nothing; fills frames [T, H, W, 3] uint8 with a video's discs by OpenCV, as peer.drawn does."""
+    height, discs = frames.shape[1], columns["objects/radius"][video] > 0  # walls have none
+    scale, places = height / peer.SIDE, columns["states/position"][video][:, discs]
+    pixels = np.stack([places[..., 0] * scale - 0.5, (peer.SIDE - places[..., 1]) * scale - 0.5], axis=-1)
+    centers = np.rint(pixels * 2**peer.BITS).astype(int).tolist()
+    radii = np.rint(columns["objects/radius"][video][discs] * scale * 2**peer.BITS).astype(int).tolist()
+    colors = columns["objects/color"][video][discs].tolist()
+    frames[:] = peer.BACKGROUND
+    for frame, row in zip(frames, centers, strict=True):
+        for center, radius, color in zip(row, radii, colors, strict=True):
+            cv2.circle(frame, center, radius, color, -1, cv2.LINE_AA, peer.BITS)
+
+
+# ---- What is told
+
+
+class Drawing(NamedTuple):
+    """A line of the table of drawing."""
+
+    name: str
+    pixels: int
+    objects: int
+    micros: Mapping[str, float]  # CPU time of a frame, by what draws it
+    rates: Mapping[str, float]  # MB/s of frames
+
+
+class Annotated(NamedTuple):
+    """A line of the table of annotations."""
+
+    name: str
+    micros: float  # CPU time of a frame with it
+    added: float  # of that, beyond the frame alone
+    bytes: int  # of it a frame, beside the frame's own
+
+
+LINES = {"gen2d": "gen2d", "opencv": "OpenCV, called from Python", "copy": "a copy of the frames"}
+
+
+def drawing_of(case: Case, seconds: Mapping[str, float]) -> Drawing:
+    """The line, from the seconds of a frame."""
+    rates = {name: case.frame_bytes / value / 1e6 for name, value in seconds.items()}
+    return Drawing(case.name, case.pixels, case.objects, {name: s * 1e6 for name, s in seconds.items()}, rates)
+
+
+def table(drawings: Sequence[Drawing]) -> list[str]:
+    """Lines of text."""
+    lines = ["one core, microseconds of CPU time a frame, and MB of frames a second"]
+    lines += [f"{'':18} {'gen2d':>8} {'OpenCV':>8} {'a copy':>8} {'MB/s:':>7} {'gen2d':>7} {'OpenCV':>7} {'a copy':>7}"]
+    for d in drawings:
+        micros = " ".join(f"{d.micros[name]:8.2f}" for name in LINES)
+        lines += [f"{d.name:18} {micros} {'':7} {' '.join(f'{d.rates[name]:7,.0f}' for name in LINES)}"]
+    return lines
+
+
+def table_of_annotations(found: Sequence[Annotated]) -> list[str]:
+    """Lines of text."""
+    lines = [f"one core, {ANNOTATED.name}, microseconds of CPU time a frame with an annotation, and its bytes"]
+    lines += [f"{'':26} {'micros':>8} {'added':>8} {'bytes':>8}"]
+    return lines + [f"{a.name:26} {a.micros:8.2f} {a.added:8.2f} {a.bytes:8,}" for a in found]
+
+
+COLORS = {"gen2d": (153, 68, 17), "opencv": (34, 102, 221)}  # blue, green, red, as cv2 has it
+ENDS = {"gen2d": (-1, 16), "opencv": (0, -16)}  # where a line's number stands: by which point, and how far beside it
+
+
+def chart(drawings: Sequence[Drawing], path: Path) -> None:
+    """Returns nothing; draws the cost of a frame against its side, both in logarithms, into a PNG file: a line for each
+    number of discs, with the number at its end."""
+    values, sizes = [d.micros[name] for d in drawings for name in COLORS], sorted({d.pixels for d in drawings})
+    low, high, first, last = min(values) / 1.5, max(values) * 3, sizes[0] / 1.2, sizes[-1] * 1.2
+    image = np.full((HEIGHT * ZOOM, WIDTH * ZOOM, 3), 255, np.uint8)
+
+    def place(pixels: float, micros: float) -> tuple[float, float]:
+        x, y = math.log(pixels / first) / math.log(last / first), math.log(micros / low) / math.log(high / low)
+        return LEFT + x * (WIDTH - LEFT - RIGHT), HEIGHT - BOTTOM - y * (HEIGHT - TOP - BOTTOM)
+
+    for power in range(math.floor(math.log10(low)), math.ceil(math.log10(high))):
+        for micros in (k * 10.0**power for k in range(1, 10)):
+            if low < micros < high:
+                ends, whole = (place(first, micros), place(last, micros)), micros == 10.0**power
+                _line(image, ends, GRID, 1 if whole else 0.5)
+                _text(image, f"{micros:g}" if whole else "", (LEFT - 8, ends[0][1] + 4), align=1)
+    for size in sizes:
+        _line(image, (place(size, low), place(size, high)), GRID, 1)
+        _text(image, str(size), (place(size, low)[0], HEIGHT - BOTTOM + 18), align=0.5)
+    _line(image, [place(size, min(values) * (size / sizes[0]) ** 2) for size in sizes], FAINT, 1)
+    for name, color in COLORS.items():
+        end, aside = ENDS[name]
+        for count in sorted({d.objects for d in drawings}):
+            points = [place(d.pixels, d.micros[name]) for d in drawings if d.objects == count]
+            _line(image, points, color, 2)
+            for x, y in points:
+                cv2.circle(image, (round(x * ZOOM), round(y * ZOOM)), 4 * ZOOM, color, -1, cv2.LINE_AA)
+            _text(image, str(count), (points[end][0] + aside, points[end][1] + 4), align=0.5)
+    _line(image, [(LEFT, TOP), (LEFT, HEIGHT - BOTTOM), (WIDTH - RIGHT, HEIGHT - BOTTOM)], INK, 1)
+    _legend(image)
+    _text(image, "Drawing on one core", (LEFT, 24), size=0.52)
+    _text(image, "side of the frame, pixels", (LEFT + (WIDTH - LEFT - RIGHT) / 2, HEIGHT - 12), align=0.5)
+    side = np.ascontiguousarray(cv2.rotate(image, cv2.ROTATE_90_CLOCKWISE))  # so that the text runs upwards
+    _text(side, "microseconds a frame", (TOP + (HEIGHT - TOP - BOTTOM) / 2 + BOTTOM - TOP, 20), align=0.5)
+    image = cv2.rotate(side, cv2.ROTATE_90_COUNTERCLOCKWISE)
+    small = np.asarray(cv2.resize(image, (WIDTH, HEIGHT), interpolation=cv2.INTER_AREA), np.uint8)
+    cv2.imwrite(str(path), small // 17 * 17, [cv2.IMWRITE_PNG_COMPRESSION, 9])  # fewer shades make a smaller file
+
+
+def _legend(image: np.ndarray) -> None:
+    rows = [(f"{LINES[name]}, N discs", color, 2) for name, color in COLORS.items()]
+    rows += [("pixels, slope only", FAINT, 1)]
+    image[(TOP + 4) * ZOOM : (TOP + 10 + 18 * len(rows)) * ZOOM, (LEFT + 8) * ZOOM : (LEFT + 264) * ZOOM] = 255
+    for i, (text, color, width) in enumerate(rows):
+        y = TOP + 16 + 18 * i
+        _line(image, [(LEFT + 14, y), (LEFT + 42, y)], color, width)
+        _text(image, text, (LEFT + 50, y + 4))
