@@ -176,7 +176,8 @@ class Inks(NamedTuple):
 
 def inks_of(paint: Paint, slots: slice) -> Inks:
     """What some slots are painted with; arrays [k, ...]."""
-    inks = Inks(paint.color, paint.rim_color, paint.mark_color, paint.shade, paint.texture)
+    color = paint.color if paint.fill is None else paint.fill
+    inks = Inks(color, paint.rim_color, paint.mark_color, paint.shade, paint.texture)
     return jax.tree.map(lambda a: a[slots], inks)
 
 

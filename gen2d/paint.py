@@ -37,17 +37,13 @@ class Paint(NamedTuple):
     color: Array  # [K, 3]
     drawn: Array  # [K] bool
     grow: Array | None = None  # [K] px, beyond the object's own rim: the width of a line without one
+    fill: Array | None = None  # [K, 3] of the inside, where that is not of the object's colour
     rim: Array | None = None  # [K] px, width of a line along the inside of the rim
     rim_color: Array | None = None  # [K, 3]
-    mark: Array | None = None  # [K] half the width of a bar from the centre to the rim, over the object's radius
+    mark: Array | None = None  # [K] half the width of a bar from the centre to the rim, over the way to the nearest rim
     mark_color: Array | None = None  # [K, 3]
     shade: Array | None = None  # [K] how much darker the rim is than the middle, 0 to 1
     texture: Texture | None = None  # of [K]
-
-    @property
-    def plain(self) -> bool:
-        """Whether every object is of one colour."""
-        return self.rim is None and self.mark is None and self.shade is None and self.texture is None
 
 
 def _hashed(x: Array) -> Array:

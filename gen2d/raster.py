@@ -135,7 +135,7 @@ def over(under: Array, layer: Layer, linear: bool) -> Array:
         share = cover.astype(jnp.float32) * (1 / FULL)
         mixed = light + share * (to_linear(color.astype(jnp.float32)) - light)
         return (to_srgb(mixed) + 0.5).astype(jnp.uint8)
-    # Fixed point, so that both forms round alike: 5 bits below one, and products of 16 bits, of which a vector has many.
+    # Fixed point, so that both forms round alike: 5 bits below one, products of 16 bits, of which a vector has many.
     under = under.astype(jnp.int16)
     apart = (color - under) << 6
     product = ((apart.astype(jnp.int32) * cover.astype(jnp.int32)) >> 16).astype(jnp.int16)
@@ -357,8 +357,8 @@ def _averaged(total: Array, count: int) -> Array:
 
 
 def noisy(frames: Array, deviation: Array, seed: Array, numbers: Array) -> Array:
-    """The frames [T, H, W, 3] with Gaussian noise of a sensor: for each value four random bytes, whose sum has a variance
-    of (256^2 - 1) / 3."""
+    """The frames [T, H, W, 3] with Gaussian noise of a sensor: for each value four random bytes, whose sum has a
+    variance of (256^2 - 1) / 3."""
     places = jnp.arange(math.prod(frames.shape[1:]), dtype=jnp.uint32).reshape(frames.shape[1:])
     word = hashed(seed, numbers[:, None, None, None], places)
     total = functools.reduce(jnp.add, [((word >> shift) & 255).astype(jnp.int32) for shift in (0, 8, 16, 24)])
@@ -501,24 +501,12 @@ class _Patches:
         """What of each group depends on rows or columns alone, for all instants."""
         found = []
         for group in self.plan.groups:
-            windows = [self._window(group, at, run, first) for run, first in group.runs]
+            windows = [patch_of(self.plan, group, at, run, first) for run, first in group.runs]
             spans = zip(group.runs, windows, strict=True)
             cuts = [_cut(self.stage, self.plan, at, run, first, window) for (run, first), window in spans]
             top, left = (_joined([getattr(w, edge) for w in windows]) for edge in ("top", "left"))
             found.append(Patches(group, Window(top, left, windows[0].rows, windows[0].columns), cuts))
         return found
-
-    def _window(self, group: Group, at: Instants, run: Run, first: int) -> Window:
-        height, width = self.plan.height, self.plan.width
-        rows, columns = group.size(height, width)
-        places = to_pixels(at.view, at.position[:, first : first + run.count], height, width)
-
-        def begin(center: Array, size: int, whole: int) -> Array:
-            if size == whole:
-                return jnp.zeros(center.T.shape, jnp.int32)
-            return jnp.clip(jnp.floor(center.T - group.reach).astype(jnp.int32), 0, whole - size)
-
-        return Window(begin(places[..., 1], rows, height), begin(places[..., 0], columns, width), rows, columns)
 
     def _painted(self, canvas: Canvas, frame: Array, cuts: "list[Patches]", i: Array) -> Canvas:
         """The canvas with instant i of all that moves painted into its frame; owners have but one frame."""
@@ -588,10 +576,29 @@ def _flat(a: Array) -> Array:
     return a.reshape(-1, *a.shape[2:])
 
 
+def patch_of(plan: Plan, group: Group, at: Instants, run: Run, first: int) -> Window:
+    """The patches of a run's slots at some instants, top and left [k, I]."""
+    height, width = plan.height, plan.width
+    rows, columns = group.size(height, width)
+    places = to_pixels(at.view, at.position[:, first : first + run.count], height, width)
+
+    def begin(center: Array, size: int, whole: int) -> Array:
+        if size == whole:
+            return jnp.zeros(center.T.shape, jnp.int32)
+        return jnp.clip(jnp.floor(center.T - group.reach).astype(jnp.int32), 0, whole - size)
+
+    return Window(begin(places[..., 1], rows, height), begin(places[..., 0], columns, width), rows, columns)
+
+
 def _joined(arrays: list[Array]) -> Array:
     return arrays[0] if len(arrays) == 1 else jnp.concatenate(arrays)
 
 
 def draw(stages: Stage, plan: Plan) -> tuple[Array | None, Array | None]:
     """Frames [n, T, H, W, 3] uint8 and owners [n, T, H, W] uint8, each if it is wanted, in the form for this device."""
-    return (draw_patches if jax.default_backend() == "cpu" else draw_dense)(stages, plan)
+    return (draw_patches if on_cpu() else draw_dense)(stages, plan)
+
+
+def on_cpu() -> bool:
+    """Whether programs run on a CPU, for which small loops are best, rather than on a GPU."""
+    return jax.default_backend() == "cpu"

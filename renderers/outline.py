@@ -36,4 +36,5 @@ def paint(scene: Scene, layout: Layout, options: Options, key: Array) -> Paint:
     drawn, grow = lines_of(scene, options.wall_width)
     colors, line = colors_of(scene, layout, options, key, background), are_lines(scene)
     within = jnp.where(line[:, None], colors, background + options.fill * (colors - background))
-    return Paint(Background(background), within, drawn, grow, rim=jnp.where(line, 0.0, options.width), rim_color=colors)
+    rim = jnp.where(line, 0.0, options.width)
+    return Paint(Background(background), colors, drawn, grow, fill=within, rim=rim, rim_color=colors)

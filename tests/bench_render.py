@@ -1,6 +1,6 @@
 """What drawing costs against the size of the picture and the number of objects: gen2d, OpenCV and a plain copy.
 
-    python tests/bench.py --only render --plot gen2d/render_cost.png     # about 4 minutes
+    python tests/bench.py --only render --plot gen2d/render_cost.png     # about 2 minutes, 5 if nothing is compiled
 
 The scene is that of configs/benchmark.yaml: N discs in a box of 10 m, 64 frames a video. It is simulated before any
 time is taken. gen2d draws in slices as a run does; OpenCV is called from Python for every disc, as in peer.py, on the
@@ -180,7 +180,7 @@ def table_of_annotations(found: Sequence[Annotated]) -> list[str]:
 
 
 COLORS = {"gen2d": (153, 68, 17), "opencv": (34, 102, 221)}  # blue, green, red, as cv2 has it
-ENDS = {"gen2d": (-1, 16), "opencv": (0, -16)}  # where a line's number stands: by which point, and how far beside it
+ENDS = {"gen2d": (0, -16), "opencv": (-1, 16)}  # where a line's number stands: by which point, and how far beside it
 
 
 def chart(drawings: Sequence[Drawing], path: Path) -> None:

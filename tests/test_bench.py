@@ -108,7 +108,7 @@ def test_opencv_draws_the_pictures_of_gen2d() -> None:
     place, radius = columns["states/position"][0, :, :2] * scale, columns["objects/radius"][0, :2] * scale
     x, y = (place[..., i, None, None] for i in (0, 1))
     to_rim = np.hypot(middle - x, SMALL.pixels - middle[:, None] - y) - radius[:, None, None]
-    inside = (np.abs(to_rim) > 2).all(1)  # OpenCV's discs are a pixel too large
+    inside = (np.abs(to_rim) > 3).all(1)  # pixels; OpenCV's discs are about one too large
     assert 0.5 < inside.mean() < 1
     assert (ours[inside] == theirs[inside]).all()
     assert (ours != peer.BACKGROUND).any()

@@ -290,23 +290,24 @@ def test_a_pixel_is_owned_by_what_is_seen_most_of(case):
 
 
 def inset(corners, width):
-    """The points of a convex polygon that are so far from its sides, as corners [V, 2]; without an area, one point."""
-    kept = corners
-    for begin, end in zip(corners, np.roll(corners, -1, axis=0), strict=True):
-        if (begin == end).all():
-            continue
-        side = end - begin
-        depth = (kept - begin) @ np.array([side[1], -side[0]]) / np.hypot(*side) - width
-        found = []
+    """The points of a convex polygon that are so far from its sides, as corners [V, 2], without an area one point; and
+    whether the rim leaves out the centre, or a side."""
+    kept = corners = np.unique(corners, axis=0)
+    kept = corners = corners[np.argsort(np.arctan2(*(corners - corners.mean(0)).T[::-1]))]
+    sides = np.roll(corners, -1, axis=0) - corners
+    normals = np.stack([-sides[:, 1], sides[:, 0]], -1) / np.hypot(*sides.T)[:, None]
+    middle = ((corners.mean(0) - corners) * normals).sum(-1).min()
+    for begin, normal in zip(corners, normals, strict=True):
+        depth, found = (kept - begin) @ normal - width, []
         for i in range(len(kept)):
             if depth[i - 1] * depth[i] < 0:
                 found.append(kept[i - 1] + (kept[i] - kept[i - 1]) * depth[i - 1] / (depth[i - 1] - depth[i]))
             if depth[i] >= 0:
                 found.append(kept[i])
         if len(found) < 3:
-            return corners[:1]
+            return corners[:1], True
         kept = np.array(found)
-    return kept
+    return kept, width > 0.99 * middle or len(kept) < len(corners)
 
 
 RIMMED = {"circle": Run("circle", 1), "polygon": Run("polygon", 1, vertices=4)}
@@ -334,16 +335,14 @@ def test_a_rim_is_what_lies_within_a_width_of_the_edge(shape):
         ((_, whole, _),) = layers(one, plan, 0)
         core, radius = placed(one, plan, 0, run, 0)
         rim = float(one.paint.rim[0])
-        inner = outline(core, radius - rim) if radius > rim else core[:1]
+        inner, wide = (outline(core, radius - rim) if radius > rim else core[:1]), False
         if run.shape == "polygon" and radius <= rim:
-            inner = inset(core, rim - radius)
+            inner, wide = inset(core, rim - radius)
         error = np.abs(found[v] - (whole - polygon_areas(inner, size, size))).max()
-        # Where a rim is so wide that it leaves a polygon no place for a side, it is less exact.
-        narrow = run.shape != "polygon" or radius > rim or len(inner) == len(np.unique(core, axis=0))
-        worst[narrow] = max(worst[narrow], error)
-    print(f"{shape}: a rim is off by {255 * worst[1]:.3f} of 255 at most, by {255 * worst[0]:.0f} where it is wide")
-    assert worst[True] < 1e-3
-    assert worst[False] < 0.3
+        worst[wide] = max(worst[wide], error)
+    print(f"{shape}: a rim is off by {255 * worst[0]:.3f} of 255 at most, by {255 * worst[1]:.0f} where it is wide")
+    assert worst[False] < 1e-3
+    assert worst[True] < 0.3  # a polygon's centre, or a short side, lies in its rim: less exact
 
 
 # ---- How colours mix, noise, motion blur
@@ -420,12 +419,12 @@ def centroids(frames):
 def test_a_moving_ball_is_blurred_along_its_path():
     blurred, plan, _, _ = flown({**BALL, "image": {"exposure": 1, "exposure_samples": 8}}, 16)
     frames = np.asarray(PATCHES(blurred, plan)[0])
-    at = blurred.instants
+    at = jax.tree.map(np.asarray, blurred.instants)
     inside = (np.abs(at.position[:, :, 0] - 5) < 5 - 0.8).all((1, 2))  # all of it in all frames, and before
     before = 2 * at.position[:, 0, 0] - at.position[:, 1, 0]
     inside &= (np.abs(before - 5) < 5 - 0.8).all(1)
     assert inside.sum() >= 5
-    scale = np.asarray(at.view.scale)[..., None]
+    scale = at.view.scale[..., None]
     middle = (at.position[:, :, 0] + np.concatenate([before[:, None], at.position[:, :-1, 0]], 1)) / 2
     expected = np.array([32, 24]) + (middle - 5) * scale * [1, -1]
     off = np.abs(centroids(frames) - expected)[inside].max()

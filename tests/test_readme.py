@@ -32,7 +32,13 @@ def test_every_block_runs(tmp_path: Path):
         elif kind == "sh":
             for line in block.splitlines():
                 _run(line, tmp_path)
-    assert {path.name for path in (tmp_path / "datasets").iterdir()} == {"bouncing", "mine", "touched", "seen", "annotated"}
+    assert {path.name for path in (tmp_path / "datasets").iterdir()} == {
+        "bouncing",
+        "mine",
+        "touched",
+        "seen",
+        "annotated",
+    }
 
 
 def _run(line: str, folder: Path) -> None:

@@ -190,8 +190,13 @@ def flown(config: Config | Mapping, count: int) -> tuple[Stage, Plan, Scene, Sta
     config = load_config(config)
     layout = config.scene.module.layout(config.scene.options)
     keys = factors.video_keys(jnp.asarray(factors.seed_words(config.seed, 0)), jnp.arange(count, dtype=jnp.uint32))
-    stages, scenes, states = jax.jit(jax.vmap(functools.partial(_flown, config, layout)))(keys)
+    stages, scenes, states = _all_flown(config, layout, keys)
     return stages, drawing.plan_of(config, layout), scenes, states
+
+
+@functools.partial(jax.jit, static_argnums=(0, 1))
+def _all_flown(config: Config, layout: Layout, keys: jax.Array) -> tuple[Stage, Scene, State]:
+    return jax.vmap(functools.partial(_flown, config, layout))(keys)
 
 
 def _flown(config: Config, layout: Layout, key: jax.Array) -> tuple[Stage, Scene, State]:

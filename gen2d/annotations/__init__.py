@@ -1,7 +1,8 @@
 """What is true of a video's pixels: one file for each annotation, named like the option that asks for it.
 
 A file has `FIELDS`, what it stores, by name; `OWNERS`, whether it needs to know which object each pixel shows; and
-`annotate(stage, owners, plan, options)`, written for one video, which gives an array for each field.
+`annotate(stage, owners, plan, options)`, written for one video, which gives an array for each field. With `IN_TURN` it
+is called for one video after the other on a CPU. Axes that others do not have are in `sizes(plan, options)`.
 """
 
 import functools
@@ -13,7 +14,7 @@ from typing import Any
 import jax
 
 from gen2d.fields import Field
-from gen2d.raster import Plan, Stage
+from gen2d.raster import Plan, Stage, on_cpu
 from gen2d.types import Array
 
 
@@ -47,8 +48,8 @@ def annotated(stages: Stage, owners: Array | None, plan: Plan, options: Any) -> 
     found: dict[str, Array] = {}
     for module in wanted(options):
         annotate = functools.partial(module.annotate, plan=plan, options=options)
-        if owners is None:
-            found |= jax.vmap(lambda stage, annotate=annotate: annotate(stage, None))(stages)
+        if on_cpu() and getattr(module, "IN_TURN", False):
+            found |= jax.lax.map(lambda both, annotate=annotate: annotate(*both), (stages, owners))
         else:
-            found |= jax.vmap(annotate)(stages, owners)
+            found |= jax.vmap(annotate, in_axes=(0, None if owners is None else 0))(stages, owners)
     return found

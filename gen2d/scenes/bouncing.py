@@ -4,7 +4,6 @@ import dataclasses
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from gen2d.config import option
 from gen2d.factors import Distribution
@@ -100,6 +99,7 @@ def _objects(factors: dict[str, Array], present: Array, options: Options) -> Obj
         mask = present if of_balls.ndim == 1 else present[:, None]
         return jnp.concatenate([jnp.where(mask, of_balls, 0), of_walls]).astype(dtype)
 
+    depths = jnp.asarray(layout(options).depths)
     mass = disc_mass(factors["radius"], factors["density"])
     length = jnp.asarray([options.width, options.height, options.width, options.height])
     return Objects(
@@ -108,7 +108,7 @@ def _objects(factors: dict[str, Array], present: Array, options: Options) -> Obj
         shape=both(jnp.zeros(balls), SHAPES.index("segment") * walls, jnp.uint8),
         radius=both(factors["radius"], 0 * walls),
         half_length=both(jnp.zeros(balls), length / 2),
-        depth=both(*np.split(layout(options).depths, [balls]), jnp.int16),
+        depth=both(depths[:balls], depths[balls:], jnp.int16),
         mass=both(mass, jnp.inf * walls),
         moment=both(disc_moment(factors["radius"], mass), jnp.inf * walls),
         elasticity=both(factors["elasticity"], factors["wall_elasticity"] * walls),
