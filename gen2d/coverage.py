@@ -195,7 +195,8 @@ def _normals(corner: list[Array]) -> list[Array]:
         found.append((square > 1e-12, jnp.stack([side[..., 1], -side[..., 0]], -1) / length))
     normal = []
     for i in range(count):
-        best = jnp.concatenate([jnp.ones_like(corner[0][..., :1]), jnp.zeros_like(corner[0][..., :1])], -1)
+        turn = 2 * math.pi * i / count  # a point is a disc: all around it
+        best = jnp.zeros_like(corner[0]) + jnp.asarray([math.cos(turn), math.sin(turn)], corner[0].dtype)
         for back in range(count - 1, -1, -1):
             there, value = found[i - back]
             best = jnp.where(there, value, best)
@@ -210,7 +211,8 @@ def _line(y: Array, begin: Array, end: Array) -> Line:
 
     def part(edge: Array) -> Array:
         """Which part of the side lies above an edge between rows."""
-        return jnp.where(flat, 0.0, jnp.clip((edge - begin[..., 1:]) / jnp.where(flat, 1.0, rise), 0.0, 1.0))
+        along = jnp.clip((edge - begin[..., 1:]) / jnp.where(flat, 1.0, rise), 0.0, 1.0)
+        return jnp.where(flat, (edge > begin[..., 1:]).astype(along.dtype), along)
 
     (first, second), across = map(part, _shift(y)), side[..., :1]
     one, other = begin[..., :1] + first * across, begin[..., :1] + second * across

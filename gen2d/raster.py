@@ -20,7 +20,7 @@ import jax.numpy as jnp
 
 from gen2d.camera import to_pixels, to_world
 from gen2d.figures import Bodies, Cut, Instants, Window, cut, inks_of, painted, parts_of
-from gen2d.paint import LINEAR, Background, Paint, hashed, textured, to_linear, to_srgb
+from gen2d.paint import LINEAR, Paint, hashed, textured, to_linear, to_srgb
 from gen2d.types import STATIC, Array, Layout, Run
 
 LANES = 8  # pixels: a patch's rows are whole SIMD vectors
@@ -167,8 +167,9 @@ def _occluder(occluders: Occluders, i: int, height: int, width: int) -> tuple[Ar
     return part(height, top, bottom)[:, None] * part(width, left, right), occluders.color[i]
 
 
-def _ground(background: Background, at: Instants, height: int, width: int) -> Array:
+def _ground(stage: Stage, at: Instants, height: int, width: int) -> Array:
     """The background [I, H, W, 3] at some instants, as floats; [1, H, W, 3] where it is the same at all."""
+    background, first = stage.paint.background, stage.instants.view
     color = background.color
     if background.to_color is None and background.texture is None:
         return jnp.broadcast_to(color, (1, height, width, 3))
@@ -178,7 +179,7 @@ def _ground(background: Background, at: Instants, height: int, width: int) -> Ar
     if background.to_color is not None and background.direction is not None:
         # From one end of what the first frame shows to the other.
         cos, sin = jnp.cos(background.direction), jnp.sin(background.direction)
-        center, scale = at.view.center[0], at.view.scale[0]
+        center, scale = first.center[0], first.scale[0]
         reach = (jnp.abs(cos) * width + jnp.abs(sin) * height) / (2 * scale)
         along = ((x - center[0]) * cos + (y - center[1]) * sin) / reach
         color = color + jnp.clip((along[..., None] + 1) / 2, 0, 1) * (background.to_color - color)
@@ -199,10 +200,11 @@ def _stills(stage: Stage, plan: Plan) -> "Canvas":
     """What never moves, drawn once, without the instants' axis."""
     at = _some(stage.instants, slice(0, 1))
     height, width = plan.height, plan.width
-    image = (_ground(stage.paint.background, at, height, width) + 0.5).astype(jnp.uint8)
+    image = (_ground(stage, at, height, width) + 0.5).astype(jnp.uint8)
     nobody = jnp.full((1, height, width), NOBODY, jnp.int32)
     canvas = Canvas(image if plan.frames else None, nobody if plan.owners else None)
-    return jax.tree.map(lambda a: a[0], _all_over(canvas, stage, plan, at, plan.behind))
+    bare = stage._replace(occluders=None)  # they stand before what moves
+    return jax.tree.map(lambda a: a[0], _all_over(canvas, bare, plan, at, plan.behind))
 
 
 class Canvas(NamedTuple):
@@ -315,7 +317,7 @@ def _dense_frames(stage: Stage, plan: Plan, at: Instants) -> Array:
         image = _stills(stage, plan).image
         assert image is not None
     else:
-        image = (_ground(stage.paint.background, at, plan.height, plan.width) + 0.5).astype(jnp.uint8)
+        image = (_ground(stage, at, plan.height, plan.width) + 0.5).astype(jnp.uint8)
     image = jnp.broadcast_to(image, (at.angle.shape[0], plan.height, plan.width, 3))
     canvas = _moving(Canvas(image, None), stage, plan, at)
     assert canvas.image is not None
@@ -369,11 +371,11 @@ def noisy(frames: Array, deviation: Array, seed: Array, numbers: Array) -> Array
 def draw_soft(stage: Stage, plan: Plan) -> Array:
     """One video's frames [T, H, W, 3] as floats, 0 to 255, without rounding, noise or motion blur: what the others give
     but for rounding, and differentiable in places, angles, sizes, colours and the camera."""
-    image = _ground(stage.paint.background, stage.instants, plan.height, plan.width)
+    image = _ground(stage, stage.instants, plan.height, plan.width)
     image = jnp.broadcast_to(to_linear(image) if plan.linear else image, (len(stage.instants.angle), *image.shape[1:]))
-    image = _moving(
-        image, stage, dataclasses.replace(plan, still=False), stage.instants, _brightly if plan.linear else _softly
-    )
+    paint = _brightly if plan.linear else _softly
+    image = _all_over(image, stage._replace(occluders=None), plan, stage.instants, plan.behind, paint)
+    image = _moving(image, stage, plan, stage.instants, paint)
     return to_srgb(image) if plan.linear else image
 
 
@@ -478,7 +480,7 @@ class _Patches:
                 start = self.back.image[None]
             else:
                 at = jax.tree.map(lambda a: jax.lax.dynamic_slice_in_dim(a, i, 1), shown)
-                start = (_ground(stage.paint.background, at, plan.height, plan.width) + 0.5).astype(jnp.uint8)
+                start = (_ground(stage, at, plan.height, plan.width) + 0.5).astype(jnp.uint8)
             image = self._painted(Canvas(start, None), jnp.int32(0), cuts, i).image
             assert image is not None
             return image

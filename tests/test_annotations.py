@@ -4,6 +4,7 @@ import functools
 import zlib
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
@@ -27,7 +28,8 @@ def simulated():
     rollout = Rollout(load_config("bouncing.yaml", SMALL), jax.devices()[:1])
     batch = rollout.begin("train", [0])
     assert parts(batch.placed)[0].all()
-    keys = factors.video_keys(factors.seed_words(3, zlib.crc32(b"train")), np.arange(4, dtype=np.uint32))
+    words = jnp.asarray(factors.seed_words(3, zlib.crc32(b"train")))
+    keys = factors.video_keys(words, jnp.arange(4, dtype=jnp.uint32))
     return rollout.host_columns(batch)[0], keys
 
 
@@ -52,7 +54,7 @@ class Made:
         self.mask, self.slots = self.of["masks/instance"], layout.slots
 
 
-@pytest.fixture(scope="module", params=CASES, ids=CASES.keys())
+@pytest.fixture(scope="module", params=CASES, ids=list(CASES))
 def made(request):
     return drawn_as(request.param)
 
@@ -80,7 +82,7 @@ def test_visible_boxes_and_counts_are_those_of_the_mask(made):
 def test_what_is_seen_lies_in_what_is_there(made):
     boxes, amodal = (made.of[f"boxes/{kind}"] for kind in ("visible", "amodal"))
     seen = made.of["visibility/pixels"] > 0
-    grown = amodal + [-1, -1, 1, 1]  # a pixel may be seen most of, of which little is covered
+    grown = amodal + np.array([-1, -1, 1, 1])  # a pixel may be seen most of, of which little is covered
     assert (boxes[seen][:, :2] >= grown[seen][:, :2]).all()
     assert (boxes[seen][:, 2:] <= grown[seen][:, 2:]).all()
     fraction = made.of["visibility/fraction"]

@@ -1,5 +1,9 @@
 """Cameras: where points of the world are in the picture, and that each moves as its options say."""
 
+# Records of jax arrays are filled with NumPy's here.
+# pyright: reportArgumentType=false, reportIndexIssue=false, reportOptionalMemberAccess=false, reportOptionalSubscript=false, reportCallIssue=false
+# pyright: reportOperatorIssue=false, reportOptionalOperand=false, reportGeneralTypeIssues=false, reportAttributeAccessIssue=false
+
 import jax
 import numpy as np
 import pytest
@@ -7,7 +11,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from worlds import flown
 
 from gen2d import raster
-from gen2d.camera import View, filmed, fitted, to_pixels, to_world
+from gen2d.camera import View, filmed, fitted, largest_scale, to_pixels, to_world
 from gen2d.config import load_config
 from gen2d.types import Layout, Run, State
 
@@ -120,12 +124,19 @@ def test_a_followed_object_stays_in_the_middle():
     assert_allclose(away.center - places[:, 1], np.arange(FRAMES)[:, None] / FPS * [1, 0], atol=1e-5)
 
 
+@pytest.mark.parametrize("zoom", [0.8, [-1, 1], -0.5])
+def test_no_frame_has_more_pixels_per_metre_than_is_said(zoom):
+    options = load_config({"camera": {"zoom": zoom}}).camera
+    most = largest_scale(options, LAYOUT, HEIGHT, WIDTH, FRAMES / FPS)
+    assert max(watched(seed, zoom=zoom).scale.max() for seed in range(20)) <= most * (1 + 1e-6)
+
+
 # ---- In the picture
 
 
 def shown(drawn=None, **camera):
-    """Three videos with a camera at 7 px/m, their plan, and their frames [n, T, H, W] in grey levels; if it is told which
-    slots are drawn, of these alone."""
+    """Three videos with a camera at 7 px/m, their plan, and their frames [n, T, H, W] in grey levels; all slots are
+    drawn, or those that are named."""
     stages, plan, *_ = flown({**BALLS, "camera": {"scale": 7, **camera}}, 3)
     if drawn is not None:
         stages = stages._replace(paint=stages.paint._replace(drawn=np.tile(drawn, (3, 1))))

@@ -81,7 +81,7 @@ def test_simulated_again_at_twice_the_frame_rate_the_motion_is_the_same(plain):
     ("call", "said"),
     [
         (lambda ds: gen2d.render(ds, [6]), "indices holds 6"),
-        (lambda ds: gen2d.render(ds, [0.5]), "whole numbers"),
+        (lambda ds: gen2d.render(ds, np.array([0.5])), "whole numbers"),
         (lambda ds: gen2d.render(ds, [0], height=2), "video.height is 2"),
         (lambda ds: gen2d.render(ds, [0], look="flatt"), "flat"),
         (lambda ds: gen2d.render(ds, [0], fields=("frame",)), "fields holds 'frame'"),

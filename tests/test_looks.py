@@ -1,0 +1,206 @@
+"""Looks: each in the folder paints, in both forms alike, what it says that it paints; and colours can be told apart."""
+
+# Records of jax arrays are filled with NumPy's here.
+# pyright: reportArgumentType=false, reportIndexIssue=false, reportOptionalMemberAccess=false, reportOptionalSubscript=false, reportCallIssue=false
+# pyright: reportOperatorIssue=false, reportOptionalOperand=false, reportGeneralTypeIssues=false, reportAttributeAccessIssue=false
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from numpy.testing import assert_array_equal
+from worlds import world
+
+from gen2d import drawing, paint, plugins, raster
+from gen2d.config import load_config
+from gen2d.types import SHAPES, STATIC, Layout, Run
+
+LOOKS = plugins.names("look")
+RANDOM = [name for name in LOOKS if hasattr(plugins.load("look", name).Options, "palette")]
+FREE = {"palette": "random", "contrast": 150.0}
+HEIGHT, WIDTH = 40, 44
+PATCHES, DENSE = (jax.jit(form, static_argnums=1) for form in (raster.draw_patches, raster.draw_dense))
+DISCS = Layout((Run("circle", 4),), (0.0, 0.0, 10.0, 10.0), 1.6)
+SHAPES_ALL = Layout(
+    (*DISCS.runs, *(Run(shape, 2) for shape in SHAPES[2:]), Run("segment", 4, STATIC)), DISCS.bounds, 1.6
+)
+
+
+def config_of(name, **options):
+    video = {"frames": 1, "height": HEIGHT, "width": WIDTH}
+    return load_config({"video": video, "look": {"name": name, **options}})
+
+
+def scene_of(layout):
+    """A scene of a layout in which slot 3 is empty, and its state at one frame."""
+    rng = np.random.default_rng(5)
+    places = [(2.5, 3), (7, 7.1), (7.3, 2), (0, 0)]
+    discs = [{"x": place, "radius": radius} for place, radius in zip(places, (1.6, 1.2, 1.3, 0), strict=True)]
+    scene, state, _ = world(discs + [{"radius": 0}] * (layout.slots - 4))
+    shape = np.repeat([SHAPES.index(run.shape) for run in layout.runs], [run.count for run in layout.runs])
+    present = np.arange(layout.slots) != 3
+    colors = rng.integers(0, 256, (layout.slots, 3)) * present[:, None]
+    objects = dataclasses.replace(
+        scene.objects, present=jnp.asarray(present), shape=jnp.uint8(shape), color=jnp.uint8(colors)
+    )
+    return dataclasses.replace(scene, objects=objects), jax.tree.map(lambda a: a[None], state)
+
+
+def keys(count):
+    return jax.random.split(jax.random.key(0), count)
+
+
+@functools.cache
+def painter(name, layout, **options):
+    """The compiled paints of one scene."""
+    config = config_of(name, **options)
+    return jax.jit(jax.vmap(lambda key: drawing.paint_of(key, config, scene_of(layout)[0], layout)))
+
+
+def painted(name, count, layout=DISCS, **options):
+    """The paints of one scene with some keys."""
+    return painter(name, layout, **options)(keys(count))
+
+
+@functools.cache
+def drawn(name):
+    """Two videos in a look as it is without options: stages, plan, and the frames [n, H, W, 3] in the form for CPUs."""
+    config, (scene, states) = config_of(name), scene_of(DISCS)
+
+    def staged(key):
+        view = drawing.view_of(key, config, DISCS, states)
+        return drawing.stage_of(key, config, scene, states, view, drawing.paint_of(key, config, scene, DISCS))
+
+    stages, plan = jax.vmap(staged)(keys(2)), drawing.plan_of(config, DISCS)
+    return stages, plan, np.asarray(PATCHES(stages, plan)[0])[:, 0]
+
+
+@pytest.mark.parametrize("name", LOOKS)
+def test_a_look_paints_in_both_forms_alike(name):
+    stages, plan, frames = drawn(name)
+    assert frames.std((1, 2)).min() > 5
+    apart = np.abs(frames.astype(int) - np.asarray(DENSE(stages, plan)[0])[:, 0])
+    print(f"{name}: forms differ by {apart.max()} at most")
+    assert apart.max() <= 1
+
+
+@pytest.mark.parametrize("name", LOOKS)
+def test_a_look_paints_all_that_is_there_and_no_more(name):
+    slots, made = SHAPES_ALL.slots, painted(name, 3, SHAPES_ALL)
+    per_slot = [
+        made.color,
+        made.drawn,
+        made.fill,
+        made.grow,
+        made.rim,
+        made.rim_color,
+        made.mark,
+        made.mark_color,
+        made.shade,
+    ]
+    assert all(part is None or part.shape[:2] == (3, slots) for part in per_slot)
+    there = np.arange(slots) != 3
+    if name == "phyworld":  # without walls
+        there[-4:] = False
+    assert_array_equal(made.drawn, np.tile(there, (3, 1)))
+    for color in (made.color, made.fill, made.rim_color, made.mark_color, made.background.color):
+        assert color is None or ((color >= 0) & (color <= 255)).all()
+    margin = drawing.plan_of(config_of(name), SHAPES_ALL).grow
+    assert made.grow is None or made.grow.max() <= margin
+
+
+@pytest.mark.parametrize("name", LOOKS)
+def test_the_colour_that_is_stored_is_painted(name):
+    stages, plan, frames = drawn(name)
+    scene, states = scene_of(DISCS)
+    stored = np.asarray(jax.vmap(lambda made: drawing.painted_colors(made, scene))(stages.paint))
+    assert stored.dtype == np.uint8
+    assert not stored[:, 3].any()
+    rows, columns = np.mgrid[:HEIGHT, :WIDTH] + 0.5
+    for v, k in np.ndindex(2, 3):
+        column, row = np.array([WIDTH, HEIGHT]) / 2 + (np.asarray(states.position)[0, k] - 5) * plan.scale * [1, -1]
+        mine = np.hypot(columns - column, rows - row) < plan.scale * scene.objects.radius[k] - 0.7
+        apart = frames[v][mine].astype(float) - stored[v, k]
+        if stages.paint.texture is not None:  # spots of which go from it to another colour
+            way = np.asarray(stages.paint.texture.color)[v, k] - stored[v, k]
+            share = apart @ way / (way @ way)
+            assert share.min() < 0.45
+            assert share.max() > 0.55
+            apart = apart - np.clip(share, 0, 1)[:, None] * way
+        assert np.abs(apart).max(-1).min() <= 2
+
+
+@pytest.mark.parametrize("name", LOOKS)
+def test_one_key_paints_the_same_and_another_key_what_is_random(name):
+    options = FREE if name in RANDOM else {}
+    one, again = painted(name, 4, **options), painted(name, 4, **options)
+    jax.tree.map(assert_array_equal, one, again)
+    if name in RANDOM:
+        colors = np.asarray(one.color)
+        assert len(np.unique(colors[:, 0], axis=0)) == 4
+    if one.texture is not None:
+        assert len(np.unique(one.texture.seed)) == one.texture.seed.size
+
+
+@pytest.mark.parametrize("name", RANDOM)
+def test_random_colours_can_be_told_apart(name):
+    made = painted(name, 4, **FREE)
+    colors = np.asarray(made.color)[:, :3]
+    behind = np.asarray(jax.vmap(paint.mean_color)(made.background))[:, None]
+    assert least(np.concatenate([behind, colors], 1)).min() >= 150
+
+
+def test_random_colours_are_the_same_in_all_looks_on_one_background():
+    one, other = (painted(name, 4, **FREE) for name in ("flat", "marked"))
+    assert_array_equal(one.color, other.color)
+
+
+# ---- Palettes
+
+
+def least(colors):
+    """The least contrast [n] of two of some colours [n, count, 3]."""
+    apart = np.asarray(paint.contrast(jnp.asarray(colors)[:, :, None], jnp.asarray(colors)[:, None]))
+    return np.where(np.eye(colors.shape[1], dtype=bool), np.inf, apart).min((1, 2))
+
+
+@functools.partial(jax.jit, static_argnums=1)
+@functools.partial(jax.vmap, in_axes=(0, None, None, 0))
+def chosen(key, count, distance, behind):
+    return paint.palette(key, count, distance, behind)
+
+
+def palettes(count, distance, videos=200):
+    """Random backgrounds and the first of 8 colours chosen for them, [videos, 1 + count, 3]."""
+    behind = np.random.default_rng(2).integers(0, 256, (videos, 3)).astype(np.float32)
+    colors = chosen(jax.random.split(jax.random.key(1), videos), 8, distance, behind)
+    return np.concatenate([behind[:, None], np.asarray(colors)[:, :count]], 1)
+
+
+@pytest.mark.parametrize(("count", "distance"), [(1, 200.0), (4, 150.0), (8, 100.0)])
+def test_a_palette_keeps_its_colours_apart_where_it_can(count, distance):
+    colors = palettes(count, distance)
+    found = least(colors)
+    print(f"{count} colours: {found.min():.0f} apart at least, {distance} asked for")
+    assert found.min() >= distance
+    assert (colors == np.round(colors)).all()
+    assert ((colors >= 0) & (colors <= 255)).all()
+
+
+def test_a_palette_that_is_asked_for_too_much_gives_colours_far_apart():
+    found = least(palettes(4, 765.0))
+    print(f"4 colours: {found.min():.0f} apart at least, {np.median(found):.0f} on the median, 765 asked for")
+    assert found.min() > 150
+
+
+def test_contrast_is_a_distance_of_765_at_most():
+    rng = np.random.default_rng(3)
+    a, b = np.float32(rng.uniform(0, 255, (2, 1000, 3)))
+    one, other = paint.contrast(a, b), paint.contrast(b, a)
+    assert_array_equal(one, other)
+    assert_array_equal(paint.contrast(a, a), 0)
+    assert np.max(one) < 765
+    assert 764 < paint.contrast(np.zeros(3, np.float32), np.full(3, 255, np.float32)) < 765
