@@ -26,6 +26,7 @@ from gen2d.types import Array
 
 LARGE = 64.0  # px: from this radius on a disc's rim counts as straight within a pixel, but for its curvature
 QUARTER = math.pi / 4
+FAR = 1e12  # px, px^2: beyond every arc
 THIN = 1e-6  # px: a line's width in a row, where it is vertical
 
 # Integral of sqrt(1 - s^2) from u to 1, over (1 - u)^1.5: a least-squares fit, off by 4e-8 in the integral.
@@ -242,9 +243,12 @@ def _arc(x: Array, y: Array, radius: Array, begin: Array, end: Array, side: int)
     low, high = (radius * sine[..., None] for sine in ((begin, end) if side > 0 else (end, begin)))
     (top, bottom) = (jnp.clip(edge, low, high) for edge in _shift(y))
     columns = _shift(x)
-    leave = [jnp.sqrt(jnp.maximum(radius**2 - jnp.maximum(side * at, 0.0) ** 2, 0.0)) for at in columns]
-    leave = [jax.lax.stop_gradient(value) for value in leave]  # the area does not change with it, to first order
-    areas = [under_arc(value, radius) for value in leave]
+    # Where a column leaves the arc does not matter to first order. One on the other side of the centre never does: a
+    # bound that is never met, as halves of slopes would be lost where it is just met.
+    away = [jnp.maximum(side * at, 0.0) for at in columns]
+    leave = [jax.lax.stop_gradient(jnp.sqrt(jnp.maximum(radius**2 - at**2, 0.0))) for at in away]
+    areas = [jnp.where(at > 0, under_arc(value, radius), FAR) for at, value in zip(away, leave, strict=True)]
+    leave = [jnp.where(at > 0, value, FAR) for at, value in zip(away, leave, strict=True)]
     begin, end = (top, bottom) if side > 0 else (bottom, top)
     ends = begin, under_arc(begin, radius), end, under_arc(end, radius)
     return Arc(*ends, (columns[0], columns[1]), (leave[0], leave[1]), (areas[0], areas[1]))

@@ -473,7 +473,7 @@ def test_batches_share_one_program():
     for first in range(0, 3 * lanes, lanes):
         batch = Batch({}, jax.tree.map(lambda a, first=first: a[first : first + lanes], every), jnp.ones(lanes, bool))
         for start in (0, 2):
-            made = rollout.draw(batch, start, 2)
+            (made,) = rollout.draw(batch, start, 2)
             assert made["frames"].shape[0] == 2
     assert rollout._draw(2)._cache_size() == 1
 
