@@ -112,7 +112,7 @@ def overlaps(one: tuple, position: np.ndarray) -> np.ndarray:
     """The deepest overlap in m at each frame, [T], of a world whose discs stood at `position` [T, K, 2]."""
     scene, state, layout = one
     n, there = layout.runs[0].count, np.asarray(scene.objects.present)
-    radius, x = np.asarray(scene.objects.radius, float), np.asarray(position, float)[:, : layout.discs]
+    radius, x = np.asarray(scene.objects.radius, float), np.asarray(position, float)[:, : layout.runs[0].count]
     apart = np.linalg.norm(x[:, :, None] - x[:, None], axis=-1)
     pairs = there[:n, None] & there[None, :n] & ~np.eye(n, dtype=bool)
     deepest = np.where(pairs, radius[:n, None] + radius[None, :n] - apart, -np.inf).max((1, 2))
