@@ -277,13 +277,26 @@ def _below(past: Array, width: Array) -> Array:
     return inner * inner / (2 * width) + (past - inner)
 
 
+@jax.custom_jvp
+def _within(value: Array, end: Array) -> Array:
+    """The value, or the nearer end."""
+    return jnp.clip(value, -end, end)
+
+
+@_within.defjvp
+def _within_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
+    (value, end), (moved, stretched) = primals, tangents
+    # On an end, where rounding may put it, it moves as the end does.
+    return _within(value, end), jnp.where(jnp.abs(value) < end, moved, jnp.sign(value) * stretched)
+
+
 def _beyond_right(arc: Arc, edge: int) -> Array:
     """The integral of max(x - sqrt(r^2 - y^2), 0) dy along an arc."""
     at, leave, area = (a[edge][..., None, :] for a in (arc.at, arc.leave, arc.leave_area))
 
     def to(y: Array, under: Array) -> Array:
         y, under = _grid(y), _grid(under)
-        return at * (y - jnp.clip(y, -leave, leave)) - (under - jnp.clip(under, -area, area))
+        return at * (y - _within(y, leave)) - (under - _within(under, area))
 
     return to(arc.end, arc.end_area) - to(arc.begin, arc.begin_area)
 
@@ -294,6 +307,6 @@ def _beyond_left(arc: Arc, edge: int) -> Array:
 
     def to(y: Array, under: Array) -> Array:
         y, under = _grid(y), _grid(under)
-        return at * jnp.clip(y, -leave, leave) + jnp.clip(under, -area, area)
+        return at * _within(y, leave) + _within(under, area)
 
     return to(arc.end, arc.end_area) - to(arc.begin, arc.begin_area)

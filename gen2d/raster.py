@@ -84,13 +84,12 @@ class Plan:
 
     def _reach(self, run: Run) -> float:
         """Of an object from its centre, px; as large as the picture where that is not known to be less."""
-        reach = math.inf if run.kind == STATIC else self.layout.reach * self.scale + self.grow
+        reach = self.largest(run)
         return reach if 2 * reach + 2 < max(self.height, self.width) else math.inf
 
-    @property
-    def largest(self) -> float:
-        """No disc is larger, px."""
-        return self.layout.reach * self.scale + self.grow
+    def largest(self, run: Run) -> float:
+        """No disc of a run is larger, px."""
+        return math.inf if run.kind == STATIC else self.layout.reach * self.scale + self.grow
 
 
 class Group(NamedTuple):
@@ -240,7 +239,7 @@ def _all_over(
             def one(canvas: Any, entry: tuple) -> tuple[Any, None]:
                 cuts, inks, slot, rank = entry
                 canvas = _standing(canvas, stage, plan, lambda of: of == rank, paint)
-                layer = Layer(*painted(cuts, inks, window, plan.largest))
+                layer = Layer(*painted(cuts, inks, window, plan.largest(run)))
                 return paint(canvas, _fixed(layer, paint), slot + 1), None
 
             numbers = jnp.arange(run.count)
@@ -349,7 +348,8 @@ def alone(stage: Stage, plan: Plan, measure: Any) -> Array:
         stands = plan.still and run.kind == STATIC
         cuts = _cut(stage, plan, _some(stage.instants, slice(0, 1 if stands else None)), run, first, window)
         inks = inks_of(stage.paint, slice(first, first + run.count))
-        made = jax.lax.map(lambda one: measure(painted(one[0], one[1], window, plan.largest)[0]), (cuts, inks))
+        largest = plan.largest(run)
+        made = jax.lax.map(lambda one, most=largest: measure(painted(*one, window, most)[0]), (cuts, inks))
         found.append(jnp.broadcast_to(made, (run.count, len(stage.instants.angle), *made.shape[2:])))
     return jnp.moveaxis(jnp.concatenate(found), 0, 1)
 
@@ -534,7 +534,7 @@ class _Patches:
         covers, colors = [], []
         for (run, first), cuts in zip(patches.group.runs, patches.cuts, strict=True):
             inks = inks_of(self.stage.paint, slice(first, first + run.count))
-            cover, color = painted(jax.tree.map(pick, cuts), inks, patches.window, self.plan.largest)
+            cover, color = painted(jax.tree.map(pick, cuts), inks, patches.window, self.plan.largest(run))
             covers.append(whole(cover))
             colors.append(_ink(color))
         shape = jnp.broadcast_shapes(*(color.shape[1:] for color in colors))
