@@ -349,7 +349,7 @@ def alone(stage: Stage, plan: Plan, measure: Any) -> Array:
         cuts = _cut(stage, plan, _some(stage.instants, slice(0, 1 if stands else None)), run, first, window)
         inks = inks_of(stage.paint, slice(first, first + run.count))
         largest = plan.largest(run)
-        made = jax.lax.map(lambda one, most=largest: measure(painted(*one, window, most)[0]), (cuts, inks))
+        made = jax.lax.map(lambda one, most=largest: measure(painted(one[0], one[1], window, most)[0]), (cuts, inks))
         found.append(jnp.broadcast_to(made, (run.count, len(stage.instants.angle), *made.shape[2:])))
     return jnp.moveaxis(jnp.concatenate(found), 0, 1)
 
