@@ -5,12 +5,12 @@ is counter-clockwise, so that the picture turns clockwise.
 """
 
 import math
-import zlib
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
+from gen2d.factors import key_for
 from gen2d.types import Array, Layout, State
 
 TREMOR = (1.0, 1.37, 2.11)  # frequencies of a shaking hand, over the lowest
@@ -40,6 +40,14 @@ def to_world(view: View, columns: Array, rows: Array, height: int, width: int) -
         view.center[..., None, 0] + across * cos - up * sin,
         view.center[..., None, 1] + across * sin + up * cos,
     )
+
+
+def pixel_at(column: Array, row: Array, height: int, width: int) -> tuple[Array, Array]:
+    """The number of the pixel, counted along rows, that holds each point, the nearest where it lies outside, and
+    whether it lies inside."""
+    j, i = (jnp.floor(a).astype(jnp.int32) for a in (column, row))
+    inside = (j >= 0) & (j < width) & (i >= 0) & (i < height)
+    return jnp.clip(i, 0, height - 1) * width + jnp.clip(j, 0, width - 1), inside
 
 
 def fitted(bounds: tuple[float, ...], height: int, width: int, margin: float) -> tuple[tuple[float, float], float]:
@@ -76,7 +84,7 @@ def filmed(key: Array, options: Any, layout: Layout, states: State, fps: float, 
     time = jnp.arange(frames, dtype=jnp.float32) / fps
 
     def drawn(name: str, source: Any) -> Array:
-        return source.sample(jax.random.fold_in(key, zlib.crc32(name.encode())), ())
+        return source.sample(key_for(key, name), ())
 
     middle, scale = base(options, layout, height, width)
     pan = jnp.stack([drawn(f"pan {axis}", part) for axis, part in zip("xy", options.pan, strict=True)])

@@ -3,7 +3,6 @@
 Each has a key of its own, so that another look or another camera changes nothing else.
 """
 
-import zlib
 from typing import Any
 
 import jax
@@ -12,15 +11,12 @@ import jax.numpy as jnp
 from gen2d import annotations, camera
 from gen2d.camera import View
 from gen2d.config import Config, ImageOptions
+from gen2d.factors import key_for
 from gen2d.figures import Bodies, Instants
 from gen2d.paint import Paint
-from gen2d.raster import Occluders, Plan, Stage, draw
+from gen2d.picture import Occluders, Plan, Stage
+from gen2d.raster import draw
 from gen2d.types import Array, Layout, Scene, State
-
-
-def key_for(key: Array, what: str) -> Array:
-    """The key of one of the things that a video needs drawn numbers for."""
-    return jax.random.fold_in(key, zlib.crc32(what.encode()))
 
 
 def plan_of(config: Config, layout: Layout) -> Plan:
@@ -32,7 +28,7 @@ def plan_of(config: Config, layout: Layout) -> Plan:
         height=video.height,
         width=video.width,
         scale=camera.largest_scale(config.camera, layout, video.height, video.width, seconds),
-        grow=look.module.margin(look.options) if hasattr(look.module, "margin") else 0.0,
+        grow=getattr(look.options, "margin", 0.0),
         still=not camera.moves(config.camera),
         linear=image.blending == "linear",
         frames=config.storage.frames != "none",
@@ -53,9 +49,18 @@ def view_of(key: Array, config: Config, layout: Layout, states: State) -> View:
 
 
 def stage_of(
-    key: Array, config: Config, scene: Scene, states: State, view: View, paint: Paint, between: State | None = None
+    key: Array,
+    config: Config,
+    plan: Plan,
+    scene: Scene,
+    states: State,
+    view: View | None = None,
+    between: State | None = None,
 ) -> Stage:
-    """All that one video is drawn from; `between` holds its states [T - 1, steps, K ...] at every step."""
+    """All that one video is drawn from; `between` holds its states [T - 1, steps, K ...] at every step. Its view is
+    that of its key, if none is given."""
+    paint = paint_of(key, config, scene, plan.layout)
+    view = view_of(key, config, plan.layout, states) if view is None else view
     objects, image = scene.objects, config.image
     bodies = Bodies(objects.radius, objects.half_length, objects.vertices)
     exposed = None
@@ -64,7 +69,7 @@ def stage_of(
         exposed = _exposed(image, config.video.fps, states, between, view)
     seed = jax.random.bits(key_for(key, "pixels"), (), jnp.uint32)
     deviation = image.noise.sample(key_for(key, "noise"), ()) if image.noise.support != (0.0, 0.0) else None
-    occluders = _occluders(key_for(key, "occluders"), config) if image.occluders else None
+    occluders = _occluders(key_for(key, "occluders"), config, plan) if image.occluders else None
     return Stage(bodies, Instants(states.position, states.angle, view), exposed, paint, occluders, deviation, seed)
 
 
@@ -98,7 +103,7 @@ def _exposed(image: ImageOptions, fps: float, states: State, between: State, vie
     return Instants(position, angle, View(*map(even, view)))
 
 
-def _occluders(key: Array, config: Config) -> Occluders:
+def _occluders(key: Array, config: Config, plan: Plan) -> Occluders:
     image, video = config.image, config.video
     count = image.occluders
     keys = dict(zip(("place", "width", "height", "front", "color"), jax.random.split(key, 5), strict=True))
@@ -110,10 +115,8 @@ def _occluders(key: Array, config: Config) -> Occluders:
         -1,
     )
     center = jax.random.uniform(keys["place"], (count, 2)) * jnp.asarray([video.width, video.height])
-    layout = config.scene.module.layout(config.scene.options)
-    plan = plan_of(config, layout)
-    moving = sum(len(group.slots) for group in plan.groups)
-    rank = jnp.sort(jnp.round(image.occluder_front.sample(keys["front"], (count,)) * moving).astype(jnp.int32))
+    front = image.occluder_front.sample(keys["front"], (count,))
+    rank = jnp.sort(jnp.round(front * plan.moving).astype(jnp.int32))
     parts = [
         part.sample(k, (count,)).astype(jnp.float32)
         for part, k in zip(image.occluder_color, jax.random.split(keys["color"], 3), strict=True)

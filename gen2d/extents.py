@@ -1,9 +1,11 @@
 """How large figures are in the picture, in closed form: the boxes around them and their areas."""
 
+from collections.abc import Callable
+
 import jax.numpy as jnp
 
 from gen2d.figures import Figure, parts_of
-from gen2d.raster import Plan, Stage
+from gen2d.picture import Plan, Stage
 from gen2d.types import Array
 
 
@@ -35,9 +37,9 @@ def area_of(figure: Figure, disc: bool) -> Array:
     return core + radius * jnp.sqrt(((following - corners) ** 2).sum(-1)).sum(-1) + round_part
 
 
-def _of_slots(stage: Stage, plan: Plan, measure: object) -> Array:
+def _of_slots(stage: Stage, plan: Plan, measure: Callable[[Figure, bool], Array]) -> Array:
     found = []
     for run, first in plan.layout.spans:
         parts = parts_of(run, first, stage.bodies, stage.instants, stage.paint, plan.height, plan.width)
-        found.append(measure(parts.whole, run.shape == "circle"))  # type: ignore[operator]
+        found.append(measure(parts.whole, run.shape == "circle"))
     return jnp.moveaxis(jnp.concatenate(found), 0, 1)

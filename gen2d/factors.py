@@ -104,6 +104,11 @@ def parse(value: Any, whole: bool = False) -> Distribution:
     return Distribution(kind, tuple(int(x) if isinstance(x, Integral) else float(x) for x in numbers))
 
 
+def key_for(key: Array, what: str) -> Array:
+    """The key of one of the things that numbers are drawn for."""
+    return jax.random.fold_in(key, zlib.crc32(what.encode()))
+
+
 Drawn = Distribution | tuple[Distribution, ...]
 
 
@@ -114,7 +119,7 @@ def draw(key: Array, wanted: Mapping[str, tuple[Drawn, tuple[int, ...]]]) -> dic
     """
     drawn = {}
     for name, (source, shape) in wanted.items():
-        own = jax.random.fold_in(key, zlib.crc32(name.encode()))
+        own = key_for(key, name)
         if isinstance(source, Distribution):
             drawn[name] = source.sample(own, shape)
         else:

@@ -130,7 +130,7 @@ class Dataset:
 
     def batch(self, indices: Numbers, starts: Numbers | None = None, out: Batch | None = None) -> Batch:
         """The videos with these numbers, stacked; windows begin at `starts`; `out` is filled if given."""
-        numbers = self._numbers(indices)
+        numbers = self.numbers(indices)
         out = self.empty(len(numbers)) if out is None else self._fitting(out, len(numbers))
         self.fill(out, 0, numbers, starts)
         return out
@@ -141,7 +141,7 @@ class Dataset:
 
     def fill(self, out: Batch, row: int, indices: Numbers, starts: Numbers | None = None) -> None:
         """Returns nothing; puts the videos into `out` from `row` on. Threads may fill one batch together."""
-        numbers = self._numbers(indices)
+        numbers = self.numbers(indices)
         first = np.full(len(numbers), self.options.first) if starts is None else np.asarray(starts)
         last = self.manifest["sizes"].get("T", 0) - self.options.span
         if first.shape != numbers.shape or ((first < 0) | (first > last)).any():
@@ -176,7 +176,8 @@ class Dataset:
             where = f"{path}: {column.name} of {self.options.split} video {video}"
             raise DamagedError(f"{where} cannot be read ({error}): gen2d verify finds all such damage") from error
 
-    def _numbers(self, indices: Numbers) -> np.ndarray:
+    def numbers(self, indices: Numbers) -> np.ndarray:
+        """Indices as the numbers of videos, int64: negative ones count from the end."""
         numbers = np.asarray(indices)
         if not np.issubdtype(numbers.dtype, np.integer) and len(numbers):
             raise TypeError(f"a video's number must be an integer, not {numbers.dtype}")

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gen2d.types import SHAPES, STATIC, Array, Layout, Scene
+from gen2d.types import Array
 
 TRIES = 64  # colours from which a palette chooses
 
@@ -61,6 +61,11 @@ def hashed(*words: Any) -> Array:
     return total
 
 
+def fraction(word: Array) -> Array:
+    """A word as a number from 0 to below 1: its first 24 bits."""
+    return (word >> 8).astype(jnp.float32) * (1 / 2**24)
+
+
 def noise(x: Array, y: Array, seed: Array) -> Array:
     """Smooth noise between 0 and 1, with a cell of 1: random values at whole numbers, between them a cubic blend; two
     octaves."""
@@ -74,8 +79,7 @@ def _octave(x: Array, y: Array, seed: Array) -> Array:
     i, j = left.astype(jnp.int32), top.astype(jnp.int32)
 
     def at(di: int, dj: int) -> Array:
-        word = _hashed(_hashed((i + di).astype(jnp.uint32) ^ seed) ^ (j + dj).astype(jnp.uint32))
-        return (word >> 8).astype(jnp.float32) * (1 / 2**24)
+        return fraction(_hashed(_hashed((i + di).astype(jnp.uint32) ^ seed) ^ (j + dj).astype(jnp.uint32)))
 
     upper, lower = at(0, 0) * (1 - u) + at(1, 0) * u, at(0, 1) * (1 - u) + at(1, 1) * u
     return upper * (1 - v) + lower * v
@@ -140,59 +144,3 @@ def to_srgb(light: Array) -> Array:
 LINEAR = np.asarray(
     [v / 12.92 if v <= 0.04045 else ((v + 0.055) / 1.055) ** 2.4 for v in np.arange(256) / 255], np.float32
 )  # of each sRGB value
-
-
-# ---- What looks have in common
-
-
-def are_lines(scene: Scene) -> Array:
-    """Which slots are segments [K], in whatever runs they are."""
-    return scene.objects.shape == SHAPES.index("segment")
-
-
-def are_moving(layout: Layout) -> np.ndarray:
-    """Which slots are not static [K]."""
-    return np.repeat([run.kind != STATIC for run in layout.runs], [run.count for run in layout.runs])
-
-
-def lines_of(scene: Scene, width: float) -> tuple[Array, Array]:
-    """Which slots are drawn [K], and what is added to their rims [K] px, where segments are lines of a width in px
-    beyond their own radius; those that have neither are not drawn."""
-    line, objects = are_lines(scene), scene.objects
-    drawn = objects.present & ~(line & (objects.radius + width <= 0))
-    return drawn, jnp.where(line, width / 2, 0.0)
-
-
-def colors_of(scene: Scene, layout: Layout, options: Any, key: Array, background: Array) -> Array:
-    """The colours [K, 3] of the slots: the scene's, or random ones (`options.palette`) for all that moves, which differ
-    by `options.contrast` from one another and from the background [3]. One key gives the same in all looks."""
-    colors, moving = scene.objects.color.astype(jnp.float32), np.flatnonzero(are_moving(layout))
-    if options.palette == "scene" or not len(moving):
-        return colors
-    return colors.at[moving].set(palette(key, len(moving), options.contrast, background))
-
-
-def background_of(options: Any, layout: Layout, key: Array) -> Background:
-    """The background that `options.background_kind` asks for: plain, a gradient in a random direction, or noise; these
-    two go from `options.background` to `options.background_to`."""
-    color, to_color = (jnp.asarray(c, jnp.float32) for c in (options.background, options.background_to))
-    if options.background_kind == "plain":
-        return Background(color)
-    if options.background_kind == "gradient":
-        return Background(color, to_color, jax.random.uniform(key, maxval=2 * np.pi))
-    left, bottom, right, top = layout.bounds
-    cell = jnp.float32(options.background_cell * min(right - left, top - bottom))
-    return Background(color, texture=Texture(jax.random.bits(key, (), jnp.uint32), cell, to_color))
-
-
-def mean_color(background: Background) -> Array:
-    """The colour [3] halfway between the two of a background."""
-    other = background.to_color if background.texture is None else background.texture.color
-    return background.color if other is None else (background.color + other) / 2
-
-
-def contrasting(colors: Array) -> Array:
-    """Nearly black or nearly white [..., 3], whichever differs more in lightness from the colours [..., 3]."""
-    luminance = to_linear(colors) @ jnp.asarray([0.2126, 0.7152, 0.0722])
-    # At 0.175 the ratios of luminances, both with 0.05 added, are equal (WCAG 2.2, 'contrast ratio').
-    return jnp.where((luminance > 0.175)[..., None], 16.0, 240.0) + jnp.zeros_like(colors)

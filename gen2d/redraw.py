@@ -14,17 +14,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gen2d import drawing, factors, loader, types
+from gen2d import annotations, drawing, factors, loader, types
 from gen2d.camera import View
-from gen2d.config import Config, load_config
+from gen2d.config import AnnotationOptions, Config, load_config
 from gen2d.errors import ConfigError
 from gen2d.loader import Dataset, Numbers
-from gen2d.raster import Stage
+from gen2d.manifest import field_of
+from gen2d.picture import Plan, Stage, on_cpu
 from gen2d.rollout import Rollout, keep_of, rules_of
 from gen2d.simulate import simulate, substeps
 from gen2d.types import Array, Joints, Layout, Objects, Scene, State
 
 Columns = Mapping[str, Any]
+POINTS = 8  # of each object, where tracks are asked for that the config does not have
 
 
 def config_of(ds: Dataset, sets: Sequence[str] = ()) -> Config:
@@ -53,15 +55,14 @@ def render(
     (a name, or a mapping with a name and options) and `sets` ('annotations.masks=true', 'image.noise=4') draw them
     otherwise. `states` are those of `simulate_again` instead of the stored ones. With `fields` ("frames",
     "masks/instance") a dictionary of these, the annotations that they belong to switched on.
-    Raises ConfigError (a UserError) and DamagedError.
+    Raises ConfigError (a UserError), DamagedError, and IndexError where there is no such video.
     """
-    changes = [*sets, *_changed(height, width), *_asked(fields)]
-    base = config_of(ds)
-    config = config_of(ds, [*changes, "storage.frames=video"])
+    base, numbers = config_of(ds), ds.numbers(np.atleast_1d(indices))
+    config = config_of(ds, [*sets, *_changed(height, width), "storage.frames=video"])
+    config = load_config(config, _asked(fields, config.annotations))
     if look is not None:
         plain = {"name": look} if isinstance(look, str) else dict(look)
         config = load_config(config.plain() | {"look": plain})
-    numbers = _checked(ds, indices)
     if config.image.exposure and states is not None:
         raise ConfigError("states have no motion between frames: image.exposure must be 0 where they are given")
     if config.image.exposure:
@@ -99,7 +100,7 @@ def simulate_again(
         *([] if fps is None else [f"video.fps={fps}"]),
         *([] if frames is None else [f"video.frames={frames}"]),
     ]
-    config, numbers = config_of(ds, changes), _checked(ds, indices)
+    config, numbers = config_of(ds, changes), ds.numbers(np.atleast_1d(indices))
     columns = _stored(ds, numbers)
     made = _simulated(columns, _key_words(ds), jnp.asarray(numbers, jnp.uint32), _Settings(config_of(ds), config))
     return made | {"time": jnp.arange(config.video.frames) / config.video.fps}
@@ -112,28 +113,14 @@ def _changed(height: int | None, width: int | None) -> list[str]:
     return [f"video.{name}={value}" for name, value in (("height", height), ("width", width)) if value is not None]
 
 
-_OPTIONS = {
-    "masks/instance": "masks",
-    "masks/amodal": "amodal",
-    "boxes": "boxes",
-    "visibility": "visibility",
-    "flow": "flow",
-}
-
-
-def _asked(fields: Sequence[str] | None) -> list[str]:
-    names = {_OPTIONS.get(name, _OPTIONS.get(name.split("/")[0])) for name in fields or ()}
-    return [f"annotations.{name}=true" for name in sorted(filter(None, names))]
-
-
-def _checked(ds: Dataset, indices: Numbers) -> np.ndarray:
-    numbers = np.atleast_1d(np.asarray(indices))
-    if numbers.ndim != 1 or not np.issubdtype(numbers.dtype, np.integer):
-        raise ConfigError(f"indices must be whole numbers in a list, but are {indices!r}")
-    wrong = numbers[(numbers < -len(ds)) | (numbers >= len(ds))]
-    if len(wrong):
-        raise ConfigError(f"indices holds {wrong[0]}, but {ds.options.split} has {len(ds)} videos")
-    return np.where(numbers < 0, numbers + len(ds), numbers)
+def _asked(fields: Sequence[str] | None, options: AnnotationOptions) -> list[str]:
+    """What switches those annotations on that these fields belong to."""
+    off = [
+        name
+        for name, module in annotations.modules().items()
+        if not getattr(options, name) and set(fields or ()) & set(module.FIELDS)
+    ]
+    return [f"annotations.{name}={'true' if getattr(options, name) is False else POINTS}" for name in off]
 
 
 def _check_frames(columns: Columns, states: Columns | None) -> None:
@@ -150,11 +137,9 @@ def _check_frames(columns: Columns, states: Columns | None) -> None:
 @functools.lru_cache(maxsize=16)
 def _whole(ds: Dataset) -> Dataset:
     """The same dataset with every field but the images."""
-    manifest = ds.manifest["fields"]
-    names = [
-        name for name, about in manifest.items() if about["axes"].startswith("n") and "H" not in about["axes"].split()
-    ]
-    return loader.open(ds.root, ds.options.split, fields=tuple(names), verify=ds.options.verify)
+    fields = {name: field_of(about) for name, about in ds.manifest["fields"].items()}
+    names = tuple(name for name, field in fields.items() if field.per_video and not field.is_image)
+    return loader.open(ds.root, ds.options.split, fields=names, verify=ds.options.verify)
 
 
 def _stored(ds: Dataset, numbers: np.ndarray) -> dict[str, np.ndarray]:
@@ -198,6 +183,10 @@ class _Settings:
     def layout(self) -> Layout:
         return self.config.scene.module.layout(self.config.scene.options)
 
+    @property
+    def plan(self) -> Plan:
+        return drawing.plan_of(self.config, self.layout)
+
     def resized(self, view: View) -> View:
         """A stored view for frames of another size: all that was seen is."""
         old, new = self.base.video, self.config.video
@@ -206,13 +195,12 @@ class _Settings:
 
 @functools.partial(jax.jit, static_argnames="settings")
 def _staged(columns: Columns, words: Array, numbers: Array, settings: _Settings) -> Stage:
-    config, layout = settings.config, settings.layout
+    config, plan = settings.config, settings.plan
     scene, states = scene_of(columns), record_of(State, columns)
     view = settings.resized(View(*(jnp.asarray(columns[f"camera/{name}"]) for name in View._fields)))
 
     def staged(key: Array, scene: Scene, states: State, view: View) -> Stage:
-        paint = drawing.paint_of(key, config, scene, layout)
-        return drawing.stage_of(key, config, scene, states, view, paint)
+        return drawing.stage_of(key, config, plan, scene, states, view)
 
     return jax.vmap(staged)(factors.video_keys(words, numbers), scene, states, view)
 
@@ -220,7 +208,7 @@ def _staged(columns: Columns, words: Array, numbers: Array, settings: _Settings)
 @functools.partial(jax.jit, static_argnames="settings")
 def _pictures(stages: Stage, settings: _Settings) -> dict[str, Array]:
     """What a run draws, in a program of its own, as there: so that its rounding is the same."""
-    return drawing.pictures(stages, drawing.plan_of(settings.config, settings.layout), settings.config.annotations)
+    return drawing.pictures(stages, settings.plan, settings.config.annotations)
 
 
 @functools.partial(jax.jit, static_argnames="settings")
@@ -232,8 +220,7 @@ def _simulated(columns: Columns, words: Array, numbers: Array, settings: _Settin
     rules = rules_of(config.physics, config.video.fps, steps)
     keep = dataclasses.replace(keep_of(config, layout), between=False)
     device = types.to_device(scene), types.to_device(first)
-    sparse = jax.default_backend() == "cpu"
-    made = types.to_stored(simulate(*device, layout, rules, config.video.frames, steps, keep, sparse=sparse))
+    made = types.to_stored(simulate(*device, layout, rules, config.video.frames, steps, keep, sparse=on_cpu()))
     keys = factors.video_keys(words, numbers)
     view = jax.vmap(lambda key, states: drawing.view_of(key, config, layout, states))(keys, made.states)
     return types.columns(made) | drawing.camera_columns(view)

@@ -21,7 +21,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from gen2d import annotations, drawing, factors, types
 from gen2d.config import Config, PhysicsOptions
 from gen2d.fields import Field
-from gen2d.raster import Stage
+from gen2d.picture import Stage
 from gen2d.rows import Rules
 from gen2d.simulate import Keep, simulate, substeps
 from gen2d.types import Array, Scene, State
@@ -147,10 +147,8 @@ class Rollout:
         made = types.to_stored(dataclasses.replace(made, between=None))
 
         def staged(key: Array, scene: Scene, states: State, between: State | None) -> tuple[Stage, Array]:
-            paint = drawing.paint_of(key, config, scene, layout)
-            view = drawing.view_of(key, config, layout, states)
-            stage = drawing.stage_of(key, config, scene, states, view, paint, between)
-            return stage, drawing.painted_colors(paint, scene)
+            stage = drawing.stage_of(key, config, self.plan, scene, states, between=between)
+            return stage, drawing.painted_colors(stage.paint, scene)
 
         stages, colors = jax.vmap(staged)(keys, scene, made.states, between)
         columns = types.columns(scene) | types.columns(made)

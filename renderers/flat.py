@@ -1,33 +1,17 @@
-"""Plain shapes on a plain background, each object in one colour."""
+"""Plain shapes, each in one colour."""
 
 import dataclasses
 
-import jax.numpy as jnp
-
-from gen2d.config import option
-from gen2d.paint import Background, Paint, colors_of, lines_of
+from gen2d.looks import Plain, plain
+from gen2d.paint import Paint
 from gen2d.types import Array, Layout, Scene
 
 
 @dataclasses.dataclass(frozen=True)
-class Options:
-    """Colours and line widths."""
-
-    background: tuple = option([20, 20, 20], int, "sRGB", "behind everything", parts=3, low=0, high=255)
-    wall_width: float = option(1.5, float, "px", "of a segment's line, beyond its own radius; 0: not drawn", low=0)
-    palette: str = option("scene", str, "", "whose colours objects have", choices=("scene", "random"))
-    contrast: float = option(
-        120.0, float, "1", "least difference of random colours and of the background, 0 to 765", low=0, high=765
-    )
-
-
-def margin(options: Options) -> float:
-    """How far an object may be drawn beyond its rim, px."""
-    return options.wall_width / 2
+class Options(Plain):
+    """What plain shapes have."""
 
 
 def paint(scene: Scene, layout: Layout, options: Options, key: Array) -> Paint:
     """What one video's slots are painted with."""
-    background = jnp.asarray(options.background, jnp.float32)
-    drawn, grow = lines_of(scene, options.wall_width)
-    return Paint(Background(background), colors_of(scene, layout, options, key, background), drawn, grow)
+    return plain(scene, layout, options, key)

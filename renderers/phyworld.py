@@ -9,22 +9,18 @@ import jax.numpy as jnp
 import numpy as np
 
 from gen2d.config import option
-from gen2d.paint import Background, Paint, are_moving, lines_of
+from gen2d.looks import Lines, are_moving, lines_of
+from gen2d.paint import Background, Paint
 from gen2d.types import Array, Layout, Scene
 
 WHITE, RED, BLUE = (255.0, 255.0, 255.0), (255.0, 0.0, 0.0), (0.0, 0.0, 255.0)
 
 
 @dataclasses.dataclass(frozen=True)
-class Options:
+class Options(Lines):
     """Line widths."""
 
     wall_width: float = option(0.0, float, "px", "of a segment's line, beyond its own radius; 0: not drawn", low=0)
-
-
-def margin(options: Options) -> float:
-    """How far an object may be drawn beyond its rim, px."""
-    return options.wall_width / 2
 
 
 def paint(scene: Scene, layout: Layout, options: Options, key: Array) -> Paint:
@@ -32,4 +28,4 @@ def paint(scene: Scene, layout: Layout, options: Options, key: Array) -> Paint:
     moving = are_moving(layout)
     turn = jnp.asarray([RED, BLUE])[(np.cumsum(moving) - 1) % 2]
     colors = jnp.where(moving[:, None], turn, scene.objects.color.astype(jnp.float32))
-    return Paint(Background(jnp.asarray(WHITE)), colors, *lines_of(scene, options.wall_width))
+    return Paint(Background(jnp.asarray(WHITE)), colors, *lines_of(scene, options))

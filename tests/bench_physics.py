@@ -321,24 +321,24 @@ def chart(costs: Sequence[Cost], path: Path) -> None:
         for micros in (k * 10.0**power for k in range(1, 10)):
             if low < micros < high:
                 ends, whole = (pixel(first, micros), pixel(last, micros)), micros == 10.0**power
-                _line(image, ends, GRID, 1 if whole else 0.5)
-                _text(image, f"{micros:g}" if whole else "", (LEFT - 8, ends[0][1] + 4), align=1)
+                line(image, ends, GRID, 1 if whole else 0.5)
+                text(image, f"{micros:g}" if whole else "", (LEFT - 8, ends[0][1] + 4), align=1)
     for cost in costs:
-        _line(image, (pixel(cost.objects, low), pixel(cost.objects, high)), GRID, 1)
-        _text(image, str(cost.objects), (pixel(cost.objects, low)[0], HEIGHT - BOTTOM + 18), align=0.5)
+        line(image, (pixel(cost.objects, low), pixel(cost.objects, high)), GRID, 1)
+        text(image, str(cost.objects), (pixel(cost.objects, low)[0], HEIGHT - BOTTOM + 18), align=0.5)
     guide = [pixel(cost.objects, cost.pairs * min(costs[0].micros.values()) / costs[0].pairs) for cost in costs]
-    _line(image, guide, FAINT, 1)
+    line(image, guide, FAINT, 1)
     for name, color in COLORS.items():
         points = [pixel(cost.objects, cost.micros[name]) for cost in costs if name in cost.micros]
-        _line(image, points, color, 2)
+        line(image, points, color, 2)
         for x, y in points:
             cv2.circle(image, (round(x * ZOOM), round(y * ZOOM)), 4 * ZOOM, color, -1, cv2.LINE_AA)
-    _line(image, [(LEFT, TOP), (LEFT, HEIGHT - BOTTOM), (WIDTH - RIGHT, HEIGHT - BOTTOM)], INK, 1)
+    line(image, [(LEFT, TOP), (LEFT, HEIGHT - BOTTOM), (WIDTH - RIGHT, HEIGHT - BOTTOM)], INK, 1)
     _legend(image, [name for name in COLORS if any(name in cost.micros for cost in costs)])
-    _text(image, "Physics on one core", (LEFT, 24), size=0.52)
-    _text(image, "discs in a box, N", (LEFT + (WIDTH - LEFT - RIGHT) / 2, HEIGHT - 12), align=0.5)
+    text(image, "Physics on one core", (LEFT, 24), size=0.52)
+    text(image, "discs in a box, N", (LEFT + (WIDTH - LEFT - RIGHT) / 2, HEIGHT - 12), align=0.5)
     side = np.ascontiguousarray(cv2.rotate(image, cv2.ROTATE_90_CLOCKWISE))  # so that the text runs upwards
-    _text(side, "microseconds a video and step", (TOP + (HEIGHT - TOP - BOTTOM) / 2 + BOTTOM - TOP, 20), align=0.5)
+    text(side, "microseconds a video and step", (TOP + (HEIGHT - TOP - BOTTOM) / 2 + BOTTOM - TOP, 20), align=0.5)
     image = cv2.rotate(side, cv2.ROTATE_90_COUNTERCLOCKWISE)
     small = np.asarray(cv2.resize(image, (WIDTH, HEIGHT), interpolation=cv2.INTER_AREA), np.uint8)
     cv2.imwrite(str(path), small // 17 * 17, [cv2.IMWRITE_PNG_COMPRESSION, 9])  # fewer shades make a smaller file
@@ -347,20 +347,20 @@ def chart(costs: Sequence[Cost], path: Path) -> None:
 def _legend(image: np.ndarray, names: Sequence[str]) -> None:
     rows = [(LINES[name], COLORS[name], 2) for name in names] + [("pairs that can meet, slope only", FAINT, 1)]
     image[(TOP + 4) * ZOOM : (TOP + 10 + 18 * len(rows)) * ZOOM, (LEFT + 8) * ZOOM : (LEFT + 244) * ZOOM] = 255
-    for i, (text, color, width) in enumerate(rows):
+    for i, (name, color, width) in enumerate(rows):
         y = TOP + 16 + 18 * i
-        _line(image, [(LEFT + 14, y), (LEFT + 42, y)], color, width)
+        line(image, [(LEFT + 14, y), (LEFT + 42, y)], color, width)
         if width > 1:
             cv2.circle(image, ((LEFT + 28) * ZOOM, y * ZOOM), 4 * ZOOM, color, -1, cv2.LINE_AA)
-        _text(image, text, (LEFT + 50, y + 4))
+        text(image, name, (LEFT + 50, y + 4))
 
 
-def _line(image: np.ndarray, points: Sequence[tuple[float, float]], color: Sequence[int], width: float) -> None:
+def line(image: np.ndarray, points: Sequence[tuple[float, float]], color: Sequence[int], width: float) -> None:
     at = np.rint(np.array(points) * ZOOM).astype(np.int32)
     cv2.polylines(image, [at], False, color, round(width * ZOOM), cv2.LINE_AA)
 
 
-def _text(image: np.ndarray, text: str, at: tuple[float, float], align: float = 0, size: float = 0.42) -> None:
+def text(image: np.ndarray, text: str, at: tuple[float, float], align: float = 0, size: float = 0.42) -> None:
     """Writes with its baseline there, to the right (align 0), around (0.5) or to the left (1)."""
     font, scale, thick = cv2.FONT_HERSHEY_SIMPLEX, size * ZOOM, ZOOM
     (width, _), _ = cv2.getTextSize(text, font, scale, thick)

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 import peer
-from bench_physics import BOTTOM, FAINT, GRID, HEIGHT, INK, LEFT, RIGHT, TOP, WIDTH, ZOOM, _line, _text
+from bench_physics import BOTTOM, FAINT, GRID, HEIGHT, INK, LEFT, RIGHT, TOP, WIDTH, ZOOM, line, text
 
 FRAMES = 64  # of a video
 SIZES = {64: 128, 128: 32, 256: 8}  # px, and how many videos are 100 MB
@@ -198,26 +198,26 @@ def chart(drawings: Sequence[Drawing], path: Path) -> None:
         for micros in (k * 10.0**power for k in range(1, 10)):
             if low < micros < high:
                 ends, whole = (place(first, micros), place(last, micros)), micros == 10.0**power
-                _line(image, ends, GRID, 1 if whole else 0.5)
-                _text(image, f"{micros:g}" if whole else "", (LEFT - 8, ends[0][1] + 4), align=1)
+                line(image, ends, GRID, 1 if whole else 0.5)
+                text(image, f"{micros:g}" if whole else "", (LEFT - 8, ends[0][1] + 4), align=1)
     for size in sizes:
-        _line(image, (place(size, low), place(size, high)), GRID, 1)
-        _text(image, str(size), (place(size, low)[0], HEIGHT - BOTTOM + 18), align=0.5)
-    _line(image, [place(size, min(values) * (size / sizes[0]) ** 2) for size in sizes], FAINT, 1)
+        line(image, (place(size, low), place(size, high)), GRID, 1)
+        text(image, str(size), (place(size, low)[0], HEIGHT - BOTTOM + 18), align=0.5)
+    line(image, [place(size, min(values) * (size / sizes[0]) ** 2) for size in sizes], FAINT, 1)
     for name, color in COLORS.items():
         end, aside = ENDS[name]
         for count in sorted({d.objects for d in drawings}):
             points = [place(d.pixels, d.micros[name]) for d in drawings if d.objects == count]
-            _line(image, points, color, 2)
+            line(image, points, color, 2)
             for x, y in points:
                 cv2.circle(image, (round(x * ZOOM), round(y * ZOOM)), 4 * ZOOM, color, -1, cv2.LINE_AA)
-            _text(image, str(count), (points[end][0] + aside, points[end][1] + 4), align=0.5)
-    _line(image, [(LEFT, TOP), (LEFT, HEIGHT - BOTTOM), (WIDTH - RIGHT, HEIGHT - BOTTOM)], INK, 1)
+            text(image, str(count), (points[end][0] + aside, points[end][1] + 4), align=0.5)
+    line(image, [(LEFT, TOP), (LEFT, HEIGHT - BOTTOM), (WIDTH - RIGHT, HEIGHT - BOTTOM)], INK, 1)
     _legend(image)
-    _text(image, "Drawing on one core", (LEFT, 24), size=0.52)
-    _text(image, "side of the frame, pixels", (LEFT + (WIDTH - LEFT - RIGHT) / 2, HEIGHT - 12), align=0.5)
+    text(image, "Drawing on one core", (LEFT, 24), size=0.52)
+    text(image, "side of the frame, pixels", (LEFT + (WIDTH - LEFT - RIGHT) / 2, HEIGHT - 12), align=0.5)
     side = np.ascontiguousarray(cv2.rotate(image, cv2.ROTATE_90_CLOCKWISE))  # so that the text runs upwards
-    _text(side, "microseconds a frame", (TOP + (HEIGHT - TOP - BOTTOM) / 2 + BOTTOM - TOP, 20), align=0.5)
+    text(side, "microseconds a frame", (TOP + (HEIGHT - TOP - BOTTOM) / 2 + BOTTOM - TOP, 20), align=0.5)
     image = cv2.rotate(side, cv2.ROTATE_90_COUNTERCLOCKWISE)
     small = np.asarray(cv2.resize(image, (WIDTH, HEIGHT), interpolation=cv2.INTER_AREA), np.uint8)
     cv2.imwrite(str(path), small // 17 * 17, [cv2.IMWRITE_PNG_COMPRESSION, 9])  # fewer shades make a smaller file
@@ -227,7 +227,7 @@ def _legend(image: np.ndarray) -> None:
     rows = [(f"{LINES[name]}, N discs", color, 2) for name, color in COLORS.items()]
     rows += [("pixels, slope only", FAINT, 1)]
     image[(TOP + 4) * ZOOM : (TOP + 10 + 18 * len(rows)) * ZOOM, (LEFT + 8) * ZOOM : (LEFT + 264) * ZOOM] = 255
-    for i, (text, color, width) in enumerate(rows):
+    for i, (name, color, width) in enumerate(rows):
         y = TOP + 16 + 18 * i
-        _line(image, [(LEFT + 14, y), (LEFT + 42, y)], color, width)
-        _text(image, text, (LEFT + 50, y + 4))
+        line(image, [(LEFT + 14, y), (LEFT + 42, y)], color, width)
+        text(image, name, (LEFT + 50, y + 4))

@@ -43,8 +43,7 @@ class Made:
         layout = self.rollout.layout
 
         def staged(key, scene, states):
-            paint, view = drawing.paint_of(key, config, scene, layout), drawing.view_of(key, config, layout, states)
-            return drawing.stage_of(key, config, scene, states, view, paint)
+            return drawing.stage_of(key, config, self.rollout.plan, scene, states)
 
         scenes, states = redraw.scene_of(columns), redraw.record_of(types.State, columns)
         stages = jax.jit(jax.vmap(staged))(keys, scenes, states)

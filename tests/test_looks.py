@@ -14,7 +14,7 @@ import pytest
 from numpy.testing import assert_array_equal
 from worlds import world
 
-from gen2d import drawing, paint, plugins, raster
+from gen2d import drawing, looks, paint, plugins, raster
 from gen2d.config import load_config
 from gen2d.types import SHAPES, STATIC, Layout, Run
 
@@ -70,11 +70,8 @@ def drawn(name):
     """Two videos in a look as it is without options: stages, plan, and the frames [n, H, W, 3] in the form for CPUs."""
     config, (scene, states) = config_of(name), scene_of(DISCS)
 
-    def staged(key):
-        view = drawing.view_of(key, config, DISCS, states)
-        return drawing.stage_of(key, config, scene, states, view, drawing.paint_of(key, config, scene, DISCS))
-
-    stages, plan = jax.vmap(staged)(keys(2)), drawing.plan_of(config, DISCS)
+    plan = drawing.plan_of(config, DISCS)
+    stages = jax.vmap(lambda key: drawing.stage_of(key, config, plan, scene, states))(keys(2))
     return stages, plan, np.asarray(PATCHES(stages, plan)[0])[:, 0]
 
 
@@ -149,7 +146,7 @@ def test_one_key_paints_the_same_and_another_key_what_is_random(name):
 def test_random_colours_can_be_told_apart(name):
     made = painted(name, 4, **FREE)
     colors = np.asarray(made.color)[:, :3]
-    behind = np.asarray(jax.vmap(paint.mean_color)(made.background))[:, None]
+    behind = np.asarray(jax.vmap(looks.mean_color)(made.background))[:, None]
     assert least(np.concatenate([behind, colors], 1)).min() >= 150
 
 

@@ -19,8 +19,9 @@ from gen2d import raster
 from gen2d.camera import View
 from gen2d.config import load_config
 from gen2d.figures import Bodies, Instants
+from gen2d.layers import OCCLUDER
 from gen2d.paint import Background, Paint, Texture
-from gen2d.raster import OCCLUDER, Occluders, Plan, Stage
+from gen2d.picture import Occluders, Plan, Stage
 from gen2d.rollout import Batch, Rollout
 from gen2d.types import STATIC, Layout, Run
 
@@ -104,7 +105,7 @@ def stages(plan, videos, frames, features=(), occluders=0, noise=None, seed=0):
         rng = np.random.default_rng([seed, video])
         low = rng.uniform(0, 0.8, (occluders, 2)) * [plan.width, plan.height]
         box = np.concatenate([low, low + rng.uniform(1, 9, (occluders, 2))], -1)
-        moving = sum(len(group.slots) for group in plan.groups)
+        moving = plan.moving
         some = Occluders(
             box, rng.integers(0, 256, (occluders, 3)) * 1.0, np.sort(rng.integers(0, moving + 1, occluders))
         )

@@ -14,7 +14,7 @@ import numpy as np
 
 from gen2d import drawing, factors, types
 from gen2d.config import Config, load_config
-from gen2d.raster import Plan, Stage
+from gen2d.picture import Plan, Stage
 from gen2d.rows import Rules
 from gen2d.simulate import Forces, Keep, simulate
 from gen2d.types import STATIC, Layout, Objects, Run, Scene, State, Trajectory
@@ -221,9 +221,8 @@ def _flown(config: Config, layout: Layout, key: jax.Array) -> tuple[Stage, Scene
 
     frame, step = jnp.arange(video.frames), jnp.arange(1, steps + 1)
     states, between = at(frame / video.fps), at((frame[:-1, None] + step / steps) / video.fps)
-    paint = drawing.paint_of(key, config, scene, layout)
-    view = drawing.view_of(key, config, layout, states)
-    return drawing.stage_of(key, config, scene, states, view, paint, between), scene, states
+    stage = drawing.stage_of(key, config, drawing.plan_of(config, layout), scene, states, between=between)
+    return stage, scene, states
 
 
 # ---- Exact areas of shapes in pixels, in float64; px, x to the right and y down

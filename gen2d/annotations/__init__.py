@@ -14,14 +14,19 @@ from typing import Any
 import jax
 
 from gen2d.fields import Field
-from gen2d.raster import Plan, Stage, on_cpu
+from gen2d.picture import Plan, Stage, on_cpu
 from gen2d.types import Array
+
+
+def modules() -> dict[str, ModuleType]:
+    """All annotations, by the option that asks for each."""
+    names = sorted(module.name for module in pkgutil.iter_modules(__path__))
+    return {name: importlib.import_module(f"{__name__}.{name}") for name in names}
 
 
 def wanted(options: Any) -> list[ModuleType]:
     """The annotations that the options ask for."""
-    names = sorted(module.name for module in pkgutil.iter_modules(__path__))
-    return [importlib.import_module(f"{__name__}.{name}") for name in names if getattr(options, name)]
+    return [module for name, module in modules().items() if getattr(options, name)]
 
 
 def need_owners(options: Any) -> bool:

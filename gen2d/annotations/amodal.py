@@ -3,7 +3,8 @@
 import jax.numpy as jnp
 
 from gen2d.fields import Field
-from gen2d.raster import Plan, Stage, alone
+from gen2d.picture import Plan, Stage
+from gen2d.raster import alone
 from gen2d.types import Array
 
 OWNERS = False

@@ -11,10 +11,11 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from gen2d.camera import to_pixels
+from gen2d.camera import pixel_at, to_pixels
 from gen2d.fields import Field
 from gen2d.figures import Instants, Window
-from gen2d.raster import OCCLUDER, Plan, Stage, on_cpu, patch_of
+from gen2d.layers import OCCLUDER
+from gen2d.picture import Plan, Stage, on_cpu, patch_of
 from gen2d.types import STATIC, Array
 
 OWNERS = True
@@ -80,12 +81,9 @@ def _motion(here: Array, there: Array, turned: Array, grown: Array) -> Array:
 
 def _ends(number: Array, x: Array, y: Array, then: Array) -> tuple[Array, Array, Array]:
     """The flow [..., 2] of pixels at x and y, whom the frame there shows where it ends, and whether it ends inside."""
-    height, width = then.shape
     dx = number[..., 0] * x + number[..., 1] * y + number[..., 2]
     dy = number[..., 3] * x + number[..., 4] * y + number[..., 5]
-    column, row = (jnp.floor(a).astype(jnp.int32) for a in (x + dx, y + dy))
-    inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
-    place = jnp.clip(row, 0, height - 1) * width + jnp.clip(column, 0, width - 1)
+    place, inside = pixel_at(x + dx, y + dy, *then.shape)
     return jnp.stack([dx, dy], -1).astype(jnp.float16), then.reshape(-1)[place], inside
 
 

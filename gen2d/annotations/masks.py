@@ -1,7 +1,7 @@
 """Which object each pixel shows: the one of which most is seen in it."""
 
 from gen2d.fields import Field
-from gen2d.raster import Plan, Stage
+from gen2d.picture import Plan, Stage
 from gen2d.types import Array
 
 OWNERS = True

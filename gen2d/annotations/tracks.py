@@ -5,10 +5,10 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from gen2d.camera import to_pixels
+from gen2d.camera import pixel_at, to_pixels
 from gen2d.fields import Field
-from gen2d.paint import hashed
-from gen2d.raster import Plan, Stage
+from gen2d.paint import fraction, hashed
+from gen2d.picture import Plan, Stage
 from gen2d.types import Array, Run
 
 OWNERS = True
@@ -38,9 +38,7 @@ def annotate(stage: Stage, owners: Array, plan: Plan, options: Any) -> dict[str,
     slots = np.repeat(np.arange(plan.layout.slots), count)
     there = stage.paint.drawn[slots]
     points = jnp.where(there[:, None], points, 0.0)
-    column, row = (jnp.floor(points[..., i]).astype(jnp.int32) for i in range(2))
-    inside = (column >= 0) & (column < plan.width) & (row >= 0) & (row < plan.height)
-    place = jnp.clip(row, 0, plan.height - 1) * plan.width + jnp.clip(column, 0, plan.width - 1)
+    place, inside = pixel_at(points[..., 0], points[..., 1], plan.height, plan.width)
     shown = jnp.take_along_axis(owners.reshape(len(owners), -1), place, axis=1)
     return {
         "tracks/points": points,
@@ -53,7 +51,7 @@ def _inside(stage: Stage, run: Run, first: int, count: int) -> Array:
     """Random points [k, P, 2] m in the shapes of a run, in their own frames, even in their area."""
     slots = jnp.arange(first, first + run.count)[:, None]
     words = (hashed(stage.seed, slots, jnp.arange(count), n) for n in range(1, 4))
-    u, v, w = ((word >> 8).astype(jnp.float32) / 2**24 for word in words)
+    u, v, w = map(fraction, words)
     radius = stage.bodies.radius[slots]
     reach, turn = radius * jnp.sqrt(u), 2 * jnp.pi * v
     round_part = jnp.stack([reach * jnp.cos(turn), reach * jnp.sin(turn)], -1)
