@@ -2,7 +2,8 @@
 
 import dataclasses
 import math
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -115,6 +116,14 @@ def patch_of(plan: Plan, group: Group, at: Instants, run: Run, first: int) -> Wi
         return jnp.clip(jnp.floor(center.T - group.reach).astype(jnp.int32), 0, whole - size)
 
     return Window(begin(places[..., 1], rows, height), begin(places[..., 0], columns, width), rows, columns)
+
+
+def each_video(function: Callable[..., Any], *arrays: Any) -> Any:
+    """What a function makes of each video of arrays [n, ...]: on a CPU of one after the other, whose intermediate
+    results then stay in its caches, elsewhere of all at once."""
+    if on_cpu():
+        return jax.lax.map(lambda video: function(*video), arrays)
+    return jax.vmap(function)(*arrays)
 
 
 def on_cpu() -> bool:

@@ -40,7 +40,6 @@ class Made:
         config = load_config("bouncing.yaml", [*SMALL, *ALL, *sets])
         self.rollout = Rollout(config, jax.devices()[:1])
         columns, keys = simulated()
-        layout = self.rollout.layout
 
         def staged(key, scene, states):
             return drawing.stage_of(key, config, self.rollout.plan, scene, states)
@@ -50,7 +49,8 @@ class Made:
         drawn = jax.jit(lambda stages: drawing.pictures(stages, self.rollout.plan, config.annotations))(stages)
         seen = drawing.camera_columns(stages.instants.view)
         self.of = columns | {name: np.asarray(a) for name, a in (drawn | seen).items()}
-        self.mask, self.slots = self.of["masks/instance"], layout.slots
+        self.mask, self.slots = self.of["masks/instance"], self.rollout.layout.slots
+        self.stages, self.options = stages, config.annotations
 
 
 @pytest.fixture(scope="module", params=CASES, ids=list(CASES))
@@ -68,6 +68,18 @@ def test_fields_are_as_described(made):
         field = made.rollout.fields[name]
         assert array.shape[1:] == field.shape(made.rollout.sizes), name
         assert array.dtype == field.dtype or name == "contacts/time", name
+
+
+def test_the_form_for_gpus_tells_the_same(made, monkeypatch):
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    told = jax.jit(lambda stages: drawing.pictures(stages, made.rollout.plan, made.options))(made.stages)
+    assert_array_equal(told.pop("masks/instance"), made.mask)
+    for name, array in told.items():
+        here, there = np.asarray(array), made.of[name]
+        if here.dtype in (bool, np.uint8):  # an end of a flow on a pixel's edge, half a pixel covered, a level of grey
+            assert (np.abs(here.astype(int) - there) > (name == "frames")).mean() < 2e-3, name
+        else:
+            assert_allclose(here.astype(float), there.astype(float), rtol=2e-3, atol=2e-3, err_msg=name)
 
 
 def test_visible_boxes_and_counts_are_those_of_the_mask(made):

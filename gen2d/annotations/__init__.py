@@ -1,20 +1,17 @@
 """What is true of a video's pixels: one file for each annotation, named like the option that asks for it.
 
 A file has `FIELDS`, what it stores, by name; `OWNERS`, whether it needs to know which object each pixel shows; and
-`annotate(stage, owners, plan, options)`, written for one video, which gives an array for each field. With `IN_TURN` it
-is called for one video after the other on a CPU. Axes that others do not have are in `sizes(plan, options)`.
+`annotate(stages, owners, plan, options)`, which gives an array for each field of some videos. Axes that others do not
+have are in `sizes(plan, options)`.
 """
 
-import functools
 import importlib
 import pkgutil
 from types import ModuleType
 from typing import Any
 
-import jax
-
 from gen2d.fields import Field
-from gen2d.picture import Plan, Stage, on_cpu
+from gen2d.picture import Plan, Stage
 from gen2d.types import Array
 
 
@@ -52,9 +49,5 @@ def annotated(stages: Stage, owners: Array | None, plan: Plan, options: Any) -> 
     """The annotations of some videos, by their stored names; owners [n, T, H, W] uint8 as raster.draw gives them."""
     found: dict[str, Array] = {}
     for module in wanted(options):
-        annotate = functools.partial(module.annotate, plan=plan, options=options)
-        if on_cpu() and getattr(module, "IN_TURN", False):
-            found |= jax.lax.map(lambda both, annotate=annotate: annotate(*both), (stages, owners))
-        else:
-            found |= jax.vmap(annotate, in_axes=(0, None if owners is None else 0))(stages, owners)
+        found |= module.annotate(stages, owners, plan, options)
     return found

@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 
 from gen2d.fields import Field
-from gen2d.picture import Plan, Stage
+from gen2d.picture import Plan, Stage, each_video
 from gen2d.raster import alone
 from gen2d.types import Array
 
@@ -20,7 +20,7 @@ def sizes(plan: Plan, options: object) -> dict[str, int]:
     return {"B": -(-plan.height * plan.width // 8)}
 
 
-def annotate(stage: Stage, owners: Array | None, plan: Plan, options: object) -> dict[str, Array]:
+def annotate(stages: Stage, owners: Array | None, plan: Plan, options: object) -> dict[str, Array]:
     """The packed masks of every slot."""
     pixels = plan.height * plan.width
     weights = jnp.asarray([128, 64, 32, 16, 8, 4, 2, 1], jnp.uint8)
@@ -30,4 +30,4 @@ def annotate(stage: Stage, owners: Array | None, plan: Plan, options: object) ->
         bits = jnp.pad(bits, [(0, 0), (0, -pixels % 8)]).reshape(len(bits), -1, 8)
         return jnp.where(bits, weights, 0).astype(jnp.uint8).sum(-1, dtype=jnp.uint8)
 
-    return {"masks/amodal": alone(stage, plan, packed)}
+    return {"masks/amodal": each_video(lambda stage: alone(stage, plan, packed), stages)}

@@ -4,6 +4,7 @@ import functools
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from gen2d import extents
 from gen2d.fields import Field
@@ -23,9 +24,13 @@ FIELDS = {
 WORD = 32  # slots that are looked at together, a bit each
 
 
-def annotate(stage: Stage, owners: Array, plan: Plan, options: object) -> dict[str, Array]:
+def annotate(stages: Stage, owners: Array, plan: Plan, options: object) -> dict[str, Array]:
     """Both kinds of boxes."""
-    return {"boxes/visible": seen_boxes(owners, plan.layout.slots), "boxes/amodal": extents.boxes(stage, plan)}
+    seen = seen_boxes(owners.reshape(-1, *owners.shape[2:]), plan.layout.slots)
+    return {
+        "boxes/visible": seen.reshape(*owners.shape[:2], *seen.shape[1:]),
+        "boxes/amodal": jax.vmap(functools.partial(extents.boxes, plan=plan))(stages),
+    }
 
 
 def seen_boxes(owners: Array, slots: int) -> Array:
@@ -33,8 +38,9 @@ def seen_boxes(owners: Array, slots: int) -> Array:
     found = []
     for first in range(0, slots, WORD):
         columns, rows = _words(owners, first)
-        # In a loop of its own: fused with what is before it, all pixels would be looked at again for each number.
-        bits = jnp.arange(min(WORD, slots - first), dtype=jnp.uint32)
+        # In a loop of its own: fused with what is before it, all pixels would be looked at again for each number. Over
+        # constants: over an iota XLA's CPU compiler makes another loop, which takes seven times as long.
+        bits = np.arange(min(WORD, slots - first), dtype=np.uint32)
         ends = [jax.lax.map(functools.partial(_ends, words=words.T), bits) for words in (columns, rows)]
         found.append(jnp.stack([ends[0][0], ends[1][0], ends[0][1], ends[1][1]], -1))
     return jnp.moveaxis(jnp.concatenate(found), 0, 1)

@@ -4,10 +4,6 @@ A pixel moves with the object that owns it, as a rigid body; the background with
 flow is valid where its end lies in the picture and in a pixel that shows the same object.
 """
 
-import functools
-from collections.abc import Callable
-from typing import NamedTuple
-
 import jax
 import jax.numpy as jnp
 
@@ -16,10 +12,9 @@ from gen2d.fields import Field
 from gen2d.figures import Instants, Window
 from gen2d.layers import OCCLUDER
 from gen2d.picture import Plan, Stage, on_cpu, patch_of
-from gen2d.types import STATIC, Array
+from gen2d.types import STATIC, Array, Run
 
 OWNERS = True
-IN_TURN = True  # video by video on a CPU
 _VALID = "1 where the flow ends in the frame, at a pixel of the same object"
 FIELDS = {
     "flow/forward": Field("float16", "n T H W 2", "px/frame", "dx right, dy down, to frame t + 1; 0 in the last"),
@@ -29,37 +24,18 @@ FIELDS = {
 }
 
 
-def annotate(stage: Stage, owners: Array, plan: Plan, options: object) -> dict[str, Array]:
+def annotate(stages: Stage, owners: Array, plan: Plan, options: object) -> dict[str, Array]:
     """Both flows and where they are valid."""
-    count = len(owners)
-    others = jnp.stack([jnp.arange(count) + 1, jnp.arange(count) - 1], axis=1)  # [T, 2]
-    moves, others = (others >= 0) & (others < count), jnp.clip(others, 0, count - 1)
-    tables = jnp.stack([_tables(stage.instants, others[:, i], plan) for i in range(2)], axis=1)  # [T, 2, K + 1, 6]
-    tables = jnp.where(moves[..., None, None], tables, 0.0)
-    flow_of = _by_patches(stage, plan) if on_cpu() else _by_pixels
-    now = Now(owners, owners[others], tables, moves, jnp.arange(count))
-    flow, valid = jax.lax.map(lambda now: flow_of(now, plan), now)
-    return {
-        "flow/forward": flow[:, 0],
-        "flow/backward": flow[:, 1],
-        "flow/forward_valid": valid[:, 0],
-        "flow/backward_valid": valid[:, 1],
-    }
+    found, flow_of = {}, _by_patches if on_cpu() else _by_pixels
+    for name, step in (("forward", 1), ("backward", -1)):
+        found[f"flow/{name}"], found[f"flow/{name}_valid"] = flow_of(stages, owners, plan, step)
+    return found
 
 
-class Now(NamedTuple):
-    """What the flow of a frame depends on; then comes next, then before."""
-
-    owner: Array  # [H, W]
-    then: Array  # [2, H, W]
-    table: Array  # [2, K + 1, 6]
-    moves: Array  # [2] whether there is such a frame
-    number: Array
-
-
-def _tables(at: Instants, other: Array, plan: Plan) -> Array:
-    """For each frame and id, 0 the background's, the motion of a pixel at (x, y): dx = a x + b y + c,
-    dy = d x + e y + f, as [T, K + 1, 6]."""
+def _tables(at: Instants, step: int, plan: Plan) -> Array:
+    """For each frame and id, 0 the background's, the motion of a pixel at (x, y) in so many frames: dx = a x + b y + c,
+    dy = d x + e y + f, as [T, K + 1, 6]; beyond the ends nothing moves."""
+    other = jnp.clip(jnp.arange(len(at.angle)) + step, 0, len(at.angle) - 1)
     then = jax.tree.map(lambda a: a[other], at)
     here, there = (to_pixels(i.view, i.position, plan.height, plan.width) for i in (at, then))
     grown = then.view.scale / at.view.scale
@@ -79,64 +55,104 @@ def _motion(here: Array, there: Array, turned: Array, grown: Array) -> Array:
     return jnp.stack([a, -b, shift[..., 0] - a * x + b * y, b, a, shift[..., 1] - b * x - a * y], -1)
 
 
-def _ends(number: Array, x: Array, y: Array, then: Array) -> tuple[Array, Array, Array]:
-    """The flow [..., 2] of pixels at x and y, whom the frame there shows where it ends, and whether it ends inside."""
+def _ends(number: Array, x: Array, y: Array, height: int, width: int) -> tuple[Array, Array, Array]:
+    """The flow [..., 2] of pixels at x and y, the number of the pixel where it ends, and whether it ends inside."""
     dx = number[..., 0] * x + number[..., 1] * y + number[..., 2]
     dy = number[..., 3] * x + number[..., 4] * y + number[..., 5]
-    place, inside = pixel_at(x + dx, y + dy, *then.shape)
-    return jnp.stack([dx, dy], -1).astype(jnp.float16), then.reshape(-1)[place], inside
+    return jnp.stack([dx, dy], -1).astype(jnp.float16), *pixel_at(x + dx, y + dy, height, width)
 
 
-def _by_pixels(now: Now, plan: Plan) -> tuple[Array, Array]:
-    """The flows [2, H, W, 2] of a frame and where they are valid [2, H, W]: every pixel looks its motion up."""
+def _ends_of(frames: int, step: int) -> tuple[int, int]:
+    """The first frame from which such a step stays in the video, and the one after the last."""
+    return max(0, -step), frames - max(0, step)
+
+
+# ---- Every pixel looks its motion up
+
+
+def _by_pixels(stages: Stage, owners: Array, plan: Plan, step: int, ground: bool = False) -> tuple[Array, Array]:
+    """The flows [n, T, H, W, 2] and where they are valid [n, T, H, W]; with `ground` as if only the camera moved. The
+    form for GPUs."""
     x, y = jnp.arange(plan.width) + 0.5, (jnp.arange(plan.height) + 0.5)[:, None]
-    known = now.owner < OCCLUDER
-    place = jnp.where(known, now.owner, 0).astype(jnp.int32)
+    begin, end = _ends_of(owners.shape[1], step)
 
-    def one(table: Array, then: Array, moves: Array) -> tuple[Array, Array]:
-        flow, shown, inside = _ends(jnp.where(known[..., None], table[place], 0.0), x, y, then)
-        return flow, (moves & inside & (shown == now.owner)).astype(jnp.uint8)
+    def video(stage: Stage, owners: Array) -> tuple[Array, Array]:
+        table = _tables(stage.instants, step, plan)
+        table = jnp.broadcast_to(table[:, :1], table.shape) if ground else table
 
-    return jax.vmap(one)(now.table, now.then, now.moves)
+        def frame(t: Array) -> tuple[Array, Array]:
+            owner, then = owners[t], owners[t + step].reshape(-1)
+            known = owner < OCCLUDER
+            number = table[t, jnp.where(known, owner, 0).astype(jnp.int32)]
+            flow, place, inside = _ends(jnp.where(known[..., None], number, 0.0), x, y, *owner.shape)
+            return flow, (inside & (then[place] == owner)).astype(jnp.uint8)
+
+        rest = (begin, owners.shape[0] - end)
+        return jax.tree.map(
+            lambda a: jnp.pad(a, [rest, *[(0, 0)] * (a.ndim - 1)]), jax.lax.map(frame, jnp.arange(begin, end))
+        )
+
+    return jax.vmap(video)(stages, owners)
 
 
-def _by_patches(stage: Stage, plan: Plan) -> Callable[[Now, Plan], tuple[Array, Array]]:
-    """The same for a CPU: the background's motion everywhere, then each object's in its patch."""
-    moving = [(group, run, first) for group in plan.groups for run, first in group.runs if run.kind != STATIC]
-    patches = [(patch_of(plan, group, stage.instants, run, first), run, first) for group, run, first in moving]
+# ---- Each object's motion goes into a patch of its own
 
-    def frame(now: Now, plan: Plan) -> tuple[Array, Array]:
-        flows = _background(now, plan)
-        for window, run, first in patches:
-            top, left = (jax.lax.dynamic_index_in_dim(a, now.number, 1, keepdims=False) for a in window[:2])
-            stroke = functools.partial(_stroke, now=now, window=window._replace(top=top, left=left), first=first)
-            flows = jax.lax.fori_loop(0, run.count, stroke, flows)
+
+def _by_patches(stages: Stage, owners: Array, plan: Plan, step: int) -> tuple[Array, Array]:
+    """The same for a CPU: the background's motion everywhere, then each object's where it is seen in its patch."""
+    count, frames = owners.shape[:2]
+    begin, end = _ends_of(frames, step)
+    spans = [(group, *span) for group in plan.groups for span in group.runs if span[0].kind != STATIC]
+    everyone = owners.reshape(-1, *owners.shape[2:])
+    flow, valid = _behind(stages, owners, plan, step)
+    # Both numbers of a pixel beside one another: rows of pairs are not written as vectors.
+    start = flow.reshape(-1, plan.height, 2 * plan.width), valid.reshape(everyone.shape)
+
+    def video(v: Array, flows: tuple[Array, Array]) -> tuple[Array, Array]:
+        at = jax.tree.map(lambda a: jax.lax.dynamic_index_in_dim(a, v, keepdims=False), stages.instants)
+        table = _tables(at, step, plan)
+        for group, run, first in spans:
+            window = patch_of(plan, group, at, run, first)
+
+            def frame(t: Array, flows: tuple, window: Window = window, run: Run = run, first: int = first) -> tuple:
+                def stroke(k: Array, flows: tuple) -> tuple:
+                    here = window._replace(top=window.top[k, t], left=window.left[k, t])
+                    return _stroke(flows, everyone, v * frames + t, step, first + k + 1, table[t, first + k + 1], here)
+
+                return jax.lax.fori_loop(0, run.count, stroke, flows)
+
+            flows = jax.lax.fori_loop(begin, end, frame, flows)
         return flows
 
-    return frame
+    flow, valid = jax.lax.fori_loop(0, count, video, start)
+    return flow.reshape(*owners.shape, 2), valid.reshape(owners.shape)
 
 
-def _background(now: Now, plan: Plan) -> tuple[Array, Array]:
-    """The flows of a frame as if only the camera moved."""
-    if plan.still:
-        same = (now.then == now.owner) & now.moves[:, None, None]
-        return jnp.zeros((2, plan.height, plan.width, 2), jnp.float16), same.astype(jnp.uint8)
-    ground = jnp.broadcast_to(now.table[:, :1], now.table.shape)
-    return _by_pixels(now._replace(table=ground), plan)
+def _behind(stages: Stage, owners: Array, plan: Plan, step: int) -> tuple[Array, Array]:
+    """The flows and where they are valid as if only the camera moved."""
+    if not plan.still:
+        return _by_pixels(stages, owners, plan, step, ground=True)
+    same = (owners[:, 1:] == owners[:, :-1]).astype(jnp.uint8)
+    valid = jax.lax.dynamic_update_slice(jnp.zeros_like(owners), same, (0, max(0, -step), 0, 0))
+    return jnp.zeros((*owners.shape, 2), jnp.float16), valid
 
 
-def _stroke(k: Array, flows: tuple[Array, Array], now: Now, window: Window, first: int) -> tuple[Array, Array]:
-    """The flows after those of one object were put where it is seen."""
-    size, top, left = (window.rows, window.columns), window.top[k], window.left[k]
-    name = (first + k + 1).astype(jnp.uint8)
-    mine = jax.lax.dynamic_slice(now.owner, (top, left), size) == name
-    x, y = jnp.arange(size[1]) + (left + 0.5), (jnp.arange(size[0]) + (top + 0.5))[:, None]
-    ends = [_ends(now.table[i, first + k + 1], x, y, now.then[i]) for i in range(2)]
-    new = jnp.stack([flow for flow, *_ in ends])
-    seen = [now.moves[i] & inside & (shown == name) for i, (_, shown, inside) in enumerate(ends)]
-    flow, valid = flows
-    old = jax.lax.dynamic_slice(flow, (0, top, left, 0), new.shape)
-    was = jax.lax.dynamic_slice(valid, (0, top, left), new.shape[:-1])
-    flow = jax.lax.dynamic_update_slice(flow, jnp.where(mine[..., None], new, old), (0, top, left, 0))
-    valid = jax.lax.dynamic_update_slice(valid, jnp.where(mine, jnp.stack(seen).astype(jnp.uint8), was), (0, top, left))
-    return flow, valid
+def _stroke(
+    flows: tuple[Array, Array], owners: Array, frame: Array, step: int, name: Array, number: Array, window: Window
+) -> tuple[Array, Array]:
+    """The flows after those of one object were put where a frame shows it."""
+    (flow, valid), (_, height, width) = flows, owners.shape
+    place, size = (frame, window.top, window.left), (1, window.rows, window.columns)
+    beside, twice = (frame, window.top, 2 * window.left), (1, window.rows, 2 * window.columns)
+    x, y = jnp.arange(window.columns) + (window.left + 0.5), (jnp.arange(window.rows) + (window.top + 0.5))[:, None]
+    mine = jax.lax.dynamic_slice(owners, place, size) == name.astype(jnp.uint8)
+    _, end, inside = _ends(number, x, y, height, width)
+    shown = owners.reshape(-1)[(frame + step) * height * width + end]
+    seen = (inside & (shown == name.astype(jnp.uint8))).astype(jnp.uint8)
+    entry = jnp.arange(twice[-1])
+    a, b, c = (jnp.where(entry % 2 == 0, number[i], number[i + 3]) for i in range(3))
+    new = (a * (entry // 2 + (window.left + 0.5)) + b * y + c).astype(jnp.float16)[None]
+    old, was = jax.lax.dynamic_slice(flow, beside, twice), jax.lax.dynamic_slice(valid, place, size)
+    both = jnp.where(jnp.broadcast_to(mine[..., None], (*size, 2)).reshape(twice), new, old)
+    flow = jax.lax.dynamic_update_slice(flow, both, beside)
+    return flow, jax.lax.dynamic_update_slice(valid, jnp.where(mine, seen, was), place)

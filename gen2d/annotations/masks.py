@@ -12,6 +12,6 @@ FIELDS = {
 }
 
 
-def annotate(stage: Stage, owners: Array, plan: Plan, options: object) -> dict[str, Array]:
+def annotate(stages: Stage, owners: Array, plan: Plan, options: object) -> dict[str, Array]:
     """The mask itself."""
     return {"masks/instance": owners}

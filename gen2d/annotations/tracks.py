@@ -1,7 +1,9 @@
 """Points that are fixed to objects, followed through the video."""
 
+import functools
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -26,9 +28,13 @@ def sizes(plan: Plan, options: Any) -> dict[str, int]:
     return {"P": plan.layout.slots * options.tracks}
 
 
-def annotate(stage: Stage, owners: Array, plan: Plan, options: Any) -> dict[str, Array]:
+def annotate(stages: Stage, owners: Array, plan: Plan, options: Any) -> dict[str, Array]:
     """The points, where they are seen, and whose they are."""
-    count = options.tracks
+    return jax.vmap(functools.partial(_followed, plan=plan, count=options.tracks))(stages, owners)
+
+
+def _followed(stage: Stage, owners: Array, plan: Plan, count: int) -> dict[str, Array]:
+    """So many points of each object of a video."""
     own = jnp.concatenate([_inside(stage, run, first, count) for run, first in plan.layout.spans])  # [K, P, 2] m
     at = stage.instants
     cos, sin = jnp.cos(at.angle)[..., None], jnp.sin(at.angle)[..., None]

@@ -1,12 +1,15 @@
 """How much of each object is seen."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from gen2d import extents
 from gen2d.fields import Field
 from gen2d.folds import folded
-from gen2d.picture import Plan, Stage
+from gen2d.picture import Plan, Stage, each_video
 from gen2d.types import Array
 
 OWNERS = True
@@ -16,10 +19,10 @@ FIELDS = {
 }
 
 
-def annotate(stage: Stage, owners: Array, plan: Plan, options: object) -> dict[str, Array]:
+def annotate(stages: Stage, owners: Array, plan: Plan, options: object) -> dict[str, Array]:
     """The number of pixels and the part seen."""
-    pixels = counts(owners, plan.layout.slots)
-    area = extents.areas(stage, plan)
+    pixels = each_video(functools.partial(counts, slots=plan.layout.slots), owners)
+    area = jax.vmap(functools.partial(extents.areas, plan=plan))(stages)
     return {
         "visibility/pixels": pixels,
         "visibility/fraction": jnp.where(area > 0, jnp.minimum(pixels / jnp.where(area > 0, area, 1.0), 1.0), 0.0),
@@ -36,4 +39,4 @@ def counts(owners: Array, slots: int) -> Array:
         columns = folded((strips == name).astype(jnp.uint8), 2, jnp.add).astype(jnp.int32)
         return folded(columns, 2, jnp.add).sum(1)
 
-    return jax.lax.map(of, jnp.arange(1, slots + 1, dtype=jnp.uint8)).T
+    return jax.lax.map(of, np.arange(1, slots + 1, dtype=np.uint8)).T
