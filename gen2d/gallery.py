@@ -16,7 +16,7 @@ from gen2d.config import load_config
 from gen2d.generation import generate
 from gen2d.loader import Dataset
 from gen2d.loader import open as open_dataset
-from gen2d.preview import GAP, check_videos, contact_sheet, enlarged, shown, write, writing
+from gen2d.preview import GAP, check_folder, check_videos, contact_sheet, enlarged, shown, write, writing
 from gen2d.redraw import config_of, render
 
 LABEL = 110  # px, of the strip with a row's name
@@ -29,6 +29,7 @@ def gallery(source: str, out: Path, videos: int = 1, *, seed: int | None = None,
     """The file made in the folder `out`, NAME-gallery.png: a row for each look and annotation, or for each of the first
     `videos` of it. The config's own look has its options, the others their defaults."""
     check_videos(videos)
+    check_folder(out)
     if Path(source).is_dir():
         ds = open_dataset(source)
         looks = _looks(config_of(ds, sets).plain()["look"])

@@ -1,6 +1,7 @@
 """Pictures for a person: a contact sheet (videos down, time across) and an animation, of a dataset or of a config."""
 
 import contextlib
+import tempfile
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -21,6 +22,7 @@ def preview(
 ) -> list[Path]:
     """The files made in the folder `out`: NAME-sheet.png and NAME.gif."""
     check_videos(videos)
+    check_folder(out)
     if Path(source).is_dir():
         ds = open_dataset(source)
         name, frames, fps = ds.manifest["name"], _stored(ds, range(min(videos, len(ds)))), ds.manifest["fps"]
@@ -37,6 +39,12 @@ def check_videos(videos: int) -> None:
     """Returns nothing; raises UserError where there would be no video."""
     if videos < 1:
         raise UserError(f"--videos is {videos}, but must be 1 or more")
+
+
+def check_folder(out: Path) -> None:
+    """Returns nothing; makes the folder for pictures, or raises FolderError, before any is drawn."""
+    with writing(out), tempfile.TemporaryFile(dir=out):
+        pass
 
 
 @contextlib.contextmanager
