@@ -113,7 +113,7 @@ class CameraOptions:
     pan: tuple[Distribution, ...] = option([0, 0], float, "m/s", "speed of the camera", parts=2, draw=True)
     zoom: Distribution = option(0.0, float, "1/s", "rate at which the scale grows", draw=True, low=-100, high=100)
     turn: Distribution = option(0.0, float, "rad/s", "at which the camera turns", draw=True)
-    shake: Distribution = option(0.0, float, "m", "root mean square, in each direction, of a hand's tremor", draw=True, low=0)
+    shake: Distribution = option(0.0, float, "m", "of a hand's tremor, rms in each direction", draw=True, low=0)
     shake_hertz: float = option(4.0, float, "Hz", "lowest frequency of the tremor", above=0)
     follow: int | None = option(
         None, int, "slot", "of the object that stays in the middle of the frame; null: none", low=0, optional=True
