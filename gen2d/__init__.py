@@ -21,10 +21,11 @@ if TYPE_CHECKING:
     from gen2d.loader import open
     from gen2d.redraw import render, simulate_again
     from gen2d.space import Space
+    from gen2d.streaming import stream
     from gen2d.verification import verify
 
 __version__ = "0.1.0"
-__all__ = ["DataLoader", "Space", "generate", "load_config", "open", "render", "simulate_again", "verify"]
+__all__ = ["DataLoader", "Space", "generate", "load_config", "open", "render", "simulate_again", "stream", "verify"]
 
 _HOME = {
     "DataLoader": "gen2d.dataloader",
@@ -34,6 +35,7 @@ _HOME = {
     "open": "gen2d.loader",
     "render": "gen2d.redraw",
     "simulate_again": "gen2d.redraw",
+    "stream": "gen2d.streaming",
     "verify": "gen2d.verification",
 }
 

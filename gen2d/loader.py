@@ -53,11 +53,10 @@ def open(
     root = Path(path)
     manifest = read_manifest(root)
     split = _chosen_split(root, manifest, split)
-    if fields is None:
-        fields = [*({"frames"} & manifest["fields"].keys()), "states/*"]
-    names = _chosen_fields(root, manifest, [fields] if isinstance(fields, str) else fields)
-    options = Options(split, tuple(names), window, stride, start, layout, dtype, verify)
-    _check(options, manifest["sizes"].get("T", 0))
+    described = {name: field_of(about) for name, about in manifest["fields"].items()}
+    names = chosen_fields(f"{root}", described, fields)
+    options = Options(split, names, window, stride, start, layout, dtype, verify)
+    options.check(manifest["sizes"].get("T", 0))
     return Dataset(root, manifest, options)
 
 
@@ -80,9 +79,30 @@ class Options:
         return self.start if isinstance(self.start, int) else 0
 
     @property
+    def is_random(self) -> bool:
+        """Whether windows begin at random frames."""
+        return self.window is not None and self.start == "random"
+
+    @property
     def span(self) -> int:
         """How many frames a window reaches over."""
         return 0 if self.window is None else (self.window - 1) * self.stride + 1
+
+    def check(self, frames: int) -> None:
+        """Returns nothing; raises ConfigError for what cannot be of videos with so many frames."""
+        allowed = {"layout": tuple(LAYOUTS), "dtype": ("uint8", "float32"), "verify": ("checksum", "none")}
+        for name, values in allowed.items():
+            if getattr(self, name) not in values:
+                raise ConfigError(f"{name} is {getattr(self, name)!r}, but must be one of {', '.join(values)}")
+        if isinstance(self.start, str) and self.start not in ("random", "first"):
+            raise ConfigError(f"start is {self.start!r}, but must be 'random', 'first' or a frame's number")
+        if isinstance(self.start, int) and self.window is None:
+            raise ConfigError(f"start is {self.start}, but without a window all frames are given: say window=")
+        if self.window is not None and (self.window < 1 or self.stride < 1 or self.first < 0):
+            raise ConfigError("window and stride must be 1 or more, and start 0 or more")
+        if self.window is not None and self.first + self.span > frames:
+            need = f"window {self.window}, stride {self.stride} and start {self.start} need"
+            raise ConfigError(f"{need} {self.first + self.span} frames, but the videos have {frames}")
 
 
 class Dataset:
@@ -283,33 +303,20 @@ def _chosen_split(root: Path, manifest: Mapping[str, Any], split: str | None) ->
     return chosen
 
 
-def _chosen_fields(root: Path, manifest: Mapping[str, Any], patterns: Sequence[str]) -> list[str]:
-    names = [name for name, about in manifest["fields"].items() if field_of(about).per_video]
+def chosen_fields(source: str, fields: Mapping[str, Field], patterns: Sequence[str] | str | None) -> tuple[str, ...]:
+    """The names of the fields of each video that patterns ask for; without any, frames and states."""
+    names = [name for name, field in fields.items() if field.per_video]
+    if patterns is None:
+        patterns = [*({"frames"} & fields.keys()), "states/*"]
     chosen: dict[str, None] = {}
-    for pattern in patterns:
+    for pattern in [patterns] if isinstance(patterns, str) else patterns:
         found = fnmatch.filter(names, pattern)
         if not found:
-            raise ConfigError(f"{root} has no field {pattern!r}{_nearest(pattern, names)}")
+            raise ConfigError(f"{source} has no field {pattern!r}{_nearest(pattern, names)}")
         chosen |= dict.fromkeys(found)
-    return list(chosen)
+    return tuple(chosen)
 
 
 def _nearest(name: str, names: Sequence[str] | Mapping[str, Any]) -> str:
     near = difflib.get_close_matches(name, names, n=1, cutoff=0.4)
     return f": did you mean {near[0]!r}?" if near else f": it has {', '.join(names)}"
-
-
-def _check(options: Options, frames: int) -> None:
-    allowed = {"layout": tuple(LAYOUTS), "dtype": ("uint8", "float32"), "verify": ("checksum", "none")}
-    for name, values in allowed.items():
-        if getattr(options, name) not in values:
-            raise ConfigError(f"{name} is {getattr(options, name)!r}, but must be one of {', '.join(values)}")
-    if isinstance(options.start, str) and options.start not in ("random", "first"):
-        raise ConfigError(f"start is {options.start!r}, but must be 'random', 'first' or a frame's number")
-    if isinstance(options.start, int) and options.window is None:
-        raise ConfigError(f"start is {options.start}, but without a window all frames are given: say window=")
-    if options.window is not None and (options.window < 1 or options.stride < 1 or options.first < 0):
-        raise ConfigError("window and stride must be 1 or more, and start 0 or more")
-    if options.window is not None and options.first + options.span > frames:
-        need = f"window {options.window}, stride {options.stride} and start {options.start} need"
-        raise ConfigError(f"{need} {options.first + options.span} frames, but the videos have {frames}")

@@ -114,6 +114,10 @@ class Rollout:
     def begin(self, split: str, firsts: Sequence[int]) -> Batch:
         """Starts `lanes` videos on each device, from these numbers on; one number per device."""
         numbers = np.concatenate([np.arange(first, first + self.lanes, dtype=np.uint32) for first in firsts])
+        return self.begin_with(split, numbers)
+
+    def begin_with(self, split: str, numbers: np.ndarray) -> Batch:
+        """Starts the videos with these numbers, uint32, `lanes` for each device."""
         root = np.asarray(factors.seed_words(self.config.seed, zlib.crc32(split.encode())))
         return self._simulate(root, jax.device_put(numbers, NamedSharding(self.mesh, VIDEOS)))
 

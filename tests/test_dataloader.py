@@ -13,8 +13,9 @@ import synthetic
 from numpy.testing import assert_array_equal
 
 from gen2d import loader
-from gen2d.dataloader import DataLoader, order
+from gen2d.dataloader import DataLoader
 from gen2d.errors import ConfigError
+from gen2d.order import order
 
 TRAIN = 20
 

@@ -1,0 +1,146 @@
+"""Which videos come when: the order of an epoch, each rank's share of it, and where a reader stands.
+
+Nothing is drawn from a generator that has a state: video and window at each position are computed from seed, epoch and
+position, so going on anywhere takes no replay.
+"""
+
+from collections.abc import Iterator, Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from gen2d.errors import ConfigError
+
+
+class Step(NamedTuple):
+    """A global batch: positions from one on in an epoch."""
+
+    epoch: int
+    position: int
+    size: int
+
+
+class Walk:
+    """The way through a number of videos, and the place on it: each rank has its slice of every global batch.
+
+    The way ends when `epochs` epochs are through, and begins again with those that follow. The last videos of an epoch
+    that fill no global batch are left out (`remainder="drop"`) or make a smaller one ("keep").
+    """
+
+    def __init__(
+        self,
+        videos: int,
+        batch_size: int,
+        seed: int,
+        shuffle: bool | str,
+        epochs: int | None,
+        rank: int,
+        world_size: int,
+        remainder: str,
+    ) -> None:
+        one_of("shuffle", shuffle, ("global", True, False))
+        one_of("remainder", remainder, ("drop", "keep"))
+        if min(batch_size, world_size) < 1 or not 0 <= rank < world_size:
+            raise ConfigError("batch_size and world_size must be 1 or more, and rank from 0 to world_size - 1")
+        self.videos, self.seed, self.shuffle, self.epochs = videos, seed, bool(shuffle), epochs
+        self.rank, self.world_size, self.global_size = rank, world_size, batch_size * world_size
+        self.least = 1 if remainder == "keep" else self.global_size  # how many videos still make a global batch
+        self.epoch = self.position = 0
+        if videos < self.least:
+            raise ConfigError(f"{self.global_size} videos make a global batch, but there are only {videos}")
+
+    def __len__(self) -> int:
+        """The number of global batches in one epoch."""
+        whole, rest = divmod(self.videos, self.global_size)
+        return whole + (rest >= self.least)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Where it stands, and what decides the order."""
+        fixed = {"seed": self.seed, "shuffle": self.shuffle, "videos": self.videos}
+        return fixed | {"epoch": self.epoch, "position": self.position}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Returns nothing; goes to where `state` was taken, on whatever number of ranks."""
+        for name, here in self.state_dict().items():
+            if name not in ("epoch", "position") and state[name] != here:
+                raise ConfigError(
+                    f"the state has {name} {state[name]}, but this loader has {here}: orders would differ"
+                )
+        self.epoch, self.position = self._settled(state["epoch"], state["position"])
+
+    def steps(self) -> Iterator[Step]:
+        """The global batches to come."""
+        epoch, position = self.epoch, self.position
+        end = None if self.epochs is None else (epoch // self.epochs + 1) * self.epochs
+        while end is None or epoch < end:
+            size = min(self.global_size, self.videos - position)
+            yield Step(epoch, position, size)
+            epoch, position = self._settled(epoch, position + size)
+
+    def passed(self, step: Step) -> None:
+        """Returns nothing; the place is then after that global batch."""
+        self.epoch, self.position = self._settled(step.epoch, step.position + step.size)
+
+    def _settled(self, epoch: int, position: int) -> tuple[int, int]:
+        """Where the next global batch begins."""
+        return (epoch, position) if self.videos - position >= self.least else (epoch + 1, 0)
+
+    def share(self, step: Step) -> tuple[np.ndarray, np.ndarray]:
+        """The positions of this rank's slice of a global batch, and the numbers of the videos there."""
+        begin, end = (step.size * rank // self.world_size for rank in (self.rank, self.rank + 1))
+        positions = step.position + np.arange(begin, end)
+        return positions, order(self.seed, step.epoch, positions, self.videos) if self.shuffle else positions
+
+    def starts(self, step: Step, positions: np.ndarray, choices: int) -> np.ndarray:
+        """At which of so many frames the window at each position begins."""
+        return (_hashed(_WINDOWS, self.seed, step.epoch, positions) % np.uint64(choices)).astype(np.int64)
+
+
+def one_of(name: str, value: Any, allowed: tuple) -> None:
+    """Returns nothing; raises ConfigError for a value that is none of those allowed."""
+    if value not in allowed:
+        raise ConfigError(f"{name} is {value!r}, but must be one of {', '.join(map(str, allowed))}")
+
+
+# What a random number is for, so that no two uses share one.
+_ORDER, _WINDOWS = 0, 1
+
+
+def order(seed: int, epoch: int, positions: np.ndarray, count: int) -> np.ndarray:
+    """The numbers of the videos at these positions of an epoch: a permutation of 0 to count - 1, nowhere stored.
+
+    A Feistel network permutes the smallest square power of two that holds `count`; what falls outside goes through
+    again until it falls inside (Black and Rogaway, CT-RSA 2002).
+    """
+    half = np.uint64(max(1, ((count - 1).bit_length() + 1) // 2))
+    keys = [_hashed(_ORDER, seed, epoch, step) for step in range(8)]
+    values = positions.astype(np.uint64)
+    outside = np.ones(values.shape, bool)
+    while outside.any():
+        values[outside] = _feistel(values[outside], keys, half)
+        outside = values >= count
+    return values.astype(np.int64)
+
+
+def _feistel(values: np.ndarray, keys: list[np.ndarray], half: np.uint64) -> np.ndarray:
+    mask = (np.uint64(1) << half) - np.uint64(1)
+    left, right = values >> half, values & mask
+    for key in keys:
+        left, right = right, left ^ (_mixed(right ^ key) & mask)
+    return (left << half) | right
+
+
+def _hashed(*parts: int | np.ndarray) -> np.ndarray:
+    """64 random bits that the parts decide, uint64, for each element of the parts."""
+    bits = np.zeros(1, np.uint64)
+    for part in parts:
+        bits = _mixed(bits ^ np.asarray(part).astype(np.uint64))
+    return bits
+
+
+def _mixed(bits: np.ndarray) -> np.ndarray:
+    """The next output of SplitMix64 (Steele, Lea and Flood, OOPSLA 2014), for each element."""
+    bits = bits + np.uint64(0x9E3779B97F4A7C15)
+    bits = (bits ^ (bits >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    bits = (bits ^ (bits >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    return bits ^ (bits >> np.uint64(31))

@@ -1,0 +1,127 @@
+"""Streams: the batches of a dataset, without the dataset."""
+
+import itertools
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.testing import assert_array_equal
+from tiny import CONFIG, changed
+
+import gen2d
+from gen2d.errors import ConfigError
+from gen2d.pipeline import NoPlaceError
+from gen2d.streaming import Stream, cell_size
+
+VIDEOS = 22
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("made") / "tiny"
+    gen2d.generate(CONFIG, VIDEOS, out, seed=5)
+    return out
+
+
+def streamed(batch_size: int = 4, **options: Any) -> Stream:
+    return gen2d.stream(CONFIG, 5, batch_size, n=VIDEOS, **options)
+
+
+def same(stream, loader, count: int | None = None) -> None:
+    """Fails unless both give the same batches, the first `count` of them."""
+    for here, there in itertools.islice(zip(stream, loader, strict=count is None), count):
+        assert here.keys() == there.keys()
+        for name, array in here.items():
+            assert_array_equal(np.asarray(array), there[name], err_msg=name)
+
+
+@pytest.mark.parametrize("shuffle", [False, "global"])
+@pytest.mark.parametrize("batch_size", [1, 3, 4, 9])
+def test_a_stream_gives_the_batches_of_the_dataset(made: Path, batch_size: int, shuffle: bool | str):
+    options: dict[str, Any] = {"shuffle": shuffle, "epochs": 1, "remainder": "keep"}
+    loader = gen2d.DataLoader(gen2d.open(made, fields="*"), batch_size, seed=7, **options)
+    same(streamed(batch_size, fields="*", order_seed=7, **options), loader)
+
+
+@pytest.mark.parametrize(
+    "view",
+    [
+        {"window": 3, "stride": 2, "layout": "TCHW"},
+        {"window": 2, "start": 1, "dtype": "float32"},
+        {"fields": ["states/position", "factors/*", "index"]},
+        {"fields": "frames", "layout": "CTHW", "dtype": "float32"},
+    ],
+)
+def test_windows_layouts_and_types_are_those_of_the_loader(made: Path, view: dict):
+    options: dict[str, Any] = {"shuffle": True, "epochs": 2}
+    same(streamed(**view, **options), gen2d.DataLoader(gen2d.open(made, **view), 4, **options))
+
+
+@pytest.mark.parametrize("remainder", ["drop", "keep"])
+def test_a_state_goes_on_in_a_stream_or_in_a_loader_on_any_number_of_ranks(made: Path, remainder: str):
+    options: dict[str, Any] = {"shuffle": True, "remainder": remainder, "epochs": 2}
+    ds = gen2d.open(made)
+    stream = streamed(6, **options)
+    assert len(list(itertools.islice(stream, 2))) == 2
+    state = stream.state_dict()
+    for rank in range(3):
+        ranks: dict[str, Any] = {"rank": rank, "world_size": 3}
+        here, there = streamed(2, **options, **ranks), gen2d.DataLoader(ds, 2, **options, **ranks)
+        here.load_state_dict(state)
+        there.load_state_dict(state)
+        assert here.state_dict() == there.state_dict() == state
+        same(here, there)
+        assert here.state_dict() == there.state_dict()
+
+
+def test_without_an_end_it_begins_like_the_dataset_and_goes_on(made: Path):
+    stream = gen2d.stream(CONFIG, 5, 4, fields=["states/*", "index"])
+    batches = list(itertools.islice(stream, 8))
+    assert_array_equal(np.concatenate([b["index"] for b in batches]), np.arange(32))
+    stored = gen2d.open(made).batch(range(20))
+    assert_array_equal(np.concatenate([b["states/position"] for b in batches[:5]]), stored["states/position"])
+
+
+def test_arrays_are_on_the_device_and_torch_takes_them(made: Path):
+    assert isinstance(next(iter(streamed()))["frames"], jax.Array)
+    torch = pytest.importorskip("torch")
+    batch = next(iter(streamed(to="torch")))
+    assert batch["frames"].dtype == torch.uint8
+    assert_array_equal(batch["frames"].numpy(), gen2d.open(made).batch(range(4))["frames"])
+
+
+@given(st.integers(1, 600), st.sampled_from([1, 4, 6, 64, 100, 512]))
+def test_cells_waste_little(batch_size: int, lanes: int):
+    cell = cell_size(batch_size, lanes)
+    assert lanes % cell == 0
+    assert -(-batch_size // cell) * cell <= batch_size * 9 / 8
+
+
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        ({"fields": "framess"}, "frames"),
+        ({"window": 7}, "7 frames"),
+        ({"to": "numpy"}, "to is 'numpy'"),
+        ({"layout": "HWC"}, "layout is 'HWC'"),
+        ({"shuffle": "some"}, "shuffle is 'some'"),
+        ({"n": 0}, "n is 0"),
+        ({"rank": 2}, "rank"),
+        ({"batch_size": 0}, "batch_size"),
+        ({"n": 3}, "only 3"),
+    ],
+)
+def test_a_wrong_option_is_told(options: dict, told: str):
+    with pytest.raises(ConfigError, match=told) as caught:
+        gen2d.stream(CONFIG, **{"batch_size": 4, **options})
+    assert "\n" not in str(caught.value)
+
+
+def test_a_scene_that_does_not_fit_is_told():
+    crowded = changed(scene={"balls": 12, "radius": 1.2})
+    with pytest.raises(NoPlaceError, match="could not be placed"):
+        next(iter(gen2d.stream(crowded, batch_size=4)))
