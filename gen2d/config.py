@@ -182,6 +182,14 @@ class StorageOptions:
     codec: str = option(
         "gzip", str, "", "of the frames: gzip opens everywhere, zstd is smaller, none can be mapped", choices=CODECS
     )
+    chunk_frames: int | None = option(
+        None,
+        int,
+        "frames",
+        "compressed together; null: a whole video. Fewer make short windows faster to read and files larger",
+        low=1,
+        optional=True,
+    )
     videos_per_shard: int | None = option(
         None,
         int,
@@ -425,6 +433,9 @@ def from_mapping(values: Any, source: str, name: str = "dataset") -> Config:
         s: build(cls, {} if values.get(s) is None else values[s], s, source) for s, cls in SECTIONS.items()
     }
     plugs: dict[str, Any] = {p: _plugin(p, values.get(p), default, source) for p, default in PLUGINS.items()}
+    frames, chunk = sections["video"].frames, sections["storage"].chunk_frames
+    if chunk is not None and frames % chunk:
+        raise ConfigError(f"{source}: storage.chunk_frames is {chunk}, but must divide video.frames, which is {frames}")
     return Config(name=name, seed=seed, **sections, **plugs)
 
 

@@ -120,6 +120,7 @@ def dataset_of(rollout: Rollout, out: Path, counts: Mapping[str, int]) -> Datase
         splits=counts,
         videos_per_shard=rollout.videos_per_shard,
         codec=config.storage.codec,
+        chunk_frames=config.storage.chunk_frames,
         fps=config.video.fps,
         constants={"time": rollout.time},
         conventions=CONVENTIONS,

@@ -118,7 +118,11 @@ class Dataset:
         self._base = sum(sizes.values())  # the index holds one split after the other
         self._videos = self._table("videos")
         self._rows = self._table("shards")
-        self._chunks = {column.name: self._table(column.name) for column in self._columns if column.is_image}
+        self._chunks = {
+            column.name: self._table(column.name).reshape(-1, column.pieces)
+            for column in self._columns
+            if column.is_image
+        }
 
     def __reduce__(self) -> tuple[Any, ...]:
         values = vars(self.options)
@@ -169,19 +173,21 @@ class Dataset:
         videos = self._videos[self._base + numbers]
         for column in self._columns:
             whole = None if column.is_direct else np.empty((1, *column.stored), column.field.dtype)
-            for step, place in enumerate(self._places(column, numbers, videos)):
+            for step, places in enumerate(self._places(column, numbers, videos)):
                 target = out[column.name][row + step : row + step + 1]
-                self._read(column, place, int(numbers[step]), target if whole is None else whole)
+                into, begin = target if whole is None else whole, int(first[step])
+                for piece in column.needed(begin):
+                    self._read(column, _Place._make(places[piece]), int(numbers[step]), column.part(into, piece))
                 if whole is not None:
-                    column.convert(whole, int(first[step]), target)
+                    column.convert(whole, begin, target)
 
-    def _places(self, column: "_Column", numbers: np.ndarray, videos: np.ndarray) -> "Iterable[_Place]":
-        """Where the videos' pieces lie."""
+    def _places(self, column: "_Column", numbers: np.ndarray, videos: np.ndarray) -> "Iterable[Sequence[tuple]]":
+        """Where the pieces of each video lie."""
         if column.is_image:
-            return map(_Place._make, self._chunks[column.name][self._base + numbers].tolist())
+            return self._chunks[column.name][self._base + numbers].tolist()
         offset = self._rows[column.name][videos["shard"]] + videos["row"].astype(np.uint64) * np.uint64(column.size)
         parts = videos["shard"], offset, np.full(len(numbers), column.size), videos[column.name]
-        return map(_Place, *(part.tolist() for part in parts))
+        return ([place] for place in zip(*(part.tolist() for part in parts), strict=True))
 
     def _read(self, column: "_Column", place: "_Place", video: int, target: np.ndarray) -> None:
         shard = self.manifest["shards"][place.shard]
@@ -231,6 +237,8 @@ class _Column:
         self.codec = manifest["fields"][name]["codec"]
         self.stored = field.shape(manifest["sizes"])
         self.size = stored_bytes(field, manifest["sizes"])
+        self.frames = manifest["chunk_frames"] if field.is_image else None  # of a piece
+        self.pieces = manifest["sizes"]["T"] // self.frames if self.frames else 1
         axes = field.axes.split()[1:]
         self.order = LAYOUTS[options.layout] if self.is_image and len(axes) == 4 else tuple(range(len(axes)))
         self.window, self.stride = (options.window if axes[:1] == ["T"] else None), options.stride
@@ -240,6 +248,16 @@ class _Column:
         self.shape = tuple(shape[axis] for axis in self.order)
         # Then a piece is read or decoded right where it is wanted.
         self.is_direct = not self.to_float and self.window is None and self.order == tuple(range(len(axes)))
+
+    def needed(self, first: int) -> range:
+        """The pieces that the window which begins at frame `first` lies in."""
+        if self.window is None or self.frames is None:
+            return range(self.pieces)
+        return range(first // self.frames, (first + (self.window - 1) * self.stride) // self.frames + 1)
+
+    def part(self, whole: np.ndarray, piece: int) -> np.ndarray:
+        """Where in a whole video a piece belongs, both with a leading 1."""
+        return whole if self.frames is None else whole[:, piece * self.frames : (piece + 1) * self.frames]
 
     def convert(self, whole: np.ndarray, first: int, target: np.ndarray) -> None:
         """Returns nothing; puts the window that begins at frame `first` into `target`, both with a leading 1."""

@@ -113,11 +113,12 @@ def write_index(dataset: Dataset, shards: list[Shard], records: list[Record]) ->
 
 
 def _index(dataset: Dataset, shards: list[Shard], records: list[Record]) -> Tables:
-    """Where every piece lies and its checksum: a row per video in the order of the shards, and one per shard."""
+    """Where every piece lies and its checksum: a row per chunk or video in the order of the shards, one per shard."""
     images, rows = image_names(dataset.fields), row_names(dataset.fields)
-    total = sum(shard.count for shard in shards)
+    total, frames = sum(shard.count for shard in shards), dataset.chunk_frames
+    pieces = dataset.sizes["T"] // frames if frames else 1
     chunk = np.dtype([("shard", "<u4"), ("offset", "<u8"), ("size", "<u8"), ("crc32", "<u4")])
-    index = {name: np.zeros(total, chunk) for name in images}
+    index: Tables = {name: np.zeros((total, pieces), chunk) for name in images}
     index["videos"] = np.zeros(total, [("shard", "<u4"), ("row", "<u4"), *((name, "<u4") for name in rows)])
     start = 0
     for shard in shards:
@@ -125,6 +126,7 @@ def _index(dataset: Dataset, shards: list[Shard], records: list[Record]) -> Tabl
         _fill(own, shard, images, rows, table_path(dataset.root, shard.name))
         start += shard.count
     places = [tuple(record["rows"][name] for name in rows) for record in records]
+    index |= {name: index[name].reshape(-1) for name in images}
     return index | {"shards": np.array(places, [(name, "<u8") for name in rows])}
 
 
@@ -136,5 +138,6 @@ def _fill(own: Tables, shard: Shard, images: list[str], rows: list[str], path: P
         for name in rows:
             videos[name] = tables[f"crc/{name}"]
         for name in images:
-            own[name]["shard"], own[name]["crc32"] = shard.number, tables[f"crc/{name}"]
-            own[name]["offset"], own[name]["size"] = tables[f"chunks/{name}"].T
+            shape = own[name].shape
+            own[name]["shard"], own[name]["crc32"] = shard.number, tables[f"crc/{name}"].reshape(shape)
+            own[name]["offset"], own[name]["size"] = (part.reshape(shape) for part in tables[f"chunks/{name}"].T)

@@ -15,7 +15,7 @@ SCHEMA = "gen2d.dataset/1"
 MARK = Path(".gen2d")  # the folder, inside a dataset's, of what only the program needs
 
 # What must agree before shards of two runs may stand in one folder; the manifest has the same keys.
-IDENTITY = ("config", "seed", "fingerprint", "codec", "videos_per_shard", "sizes")
+IDENTITY = ("config", "seed", "fingerprint", "codec", "chunk_frames", "videos_per_shard", "sizes")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,6 +35,7 @@ class Dataset:
     codec: str
     fps: float
     constants: Mapping[str, np.ndarray]  # the fields that are one for all videos
+    chunk_frames: int | None = None  # of an image's chunk, a divisor of T; None: a chunk holds a whole video
     conventions: str = ""
     rng: str = "threefry2x32"
     command: str = ""

@@ -172,7 +172,7 @@ def _write(dataset: Dataset, shard: Shard, blocks: Iterable[Block], seen: _Seen)
     about |= {"fps": dataset.fps, "seed": dataset.seed, "conventions": dataset.conventions}
     layout = dataset.fields, dataset.sizes, shard.count
     with publishing(shard_path(dataset.root, shard.name)) as temporary:
-        places = hdf5.write(temporary, *layout, blocks, dataset.codec, about, dataset.constants)
+        places = hdf5.write(temporary, *layout, blocks, dataset.codec, dataset.chunk_frames, about, dataset.constants)
         file = {"bytes": temporary.stat().st_size, "sha256": file_sha256(temporary)}
     tables = _packed(seen, places)
     publish(table_path(dataset.root, shard.name), tables)

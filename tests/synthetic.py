@@ -81,7 +81,7 @@ def blocks(made: Dataset, shard: Shard, size: int = 3) -> Iterator[shards.Block]
     """The shard in blocks of `size` videos, made one at a time."""
     for first in range(0, shard.count, size):
         rows = range(first, min(first + size, shard.count))
-        yield shards.encode(columns(made, shard, rows), made.fields, made.codec)
+        yield shards.encode(columns(made, shard, rows), made.fields, made.codec, made.chunk_frames)
 
 
 def make(made: Dataset, size: int = 3, **options: bool) -> Dataset:

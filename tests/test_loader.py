@@ -20,15 +20,18 @@ TRAIN = 20
 AXES = {"THWC": (0, 1, 2, 3, 4), "TCHW": (0, 1, 4, 2, 3), "CTHW": (0, 4, 1, 2, 3)}
 
 
-@pytest.fixture(scope="module", params=["gzip", "zstd", "none"])
+# Frames of a chunk by codec: whole videos, or parts of them.
+@pytest.fixture(scope="module", params=[("gzip", None), ("zstd", None), ("none", None), ("zstd", 1), ("none", 5)])
 def root(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("data") / request.param
-    return synthetic.make(synthetic.dataset(folder, codec=request.param)).root
+    codec, frames = request.param
+    folder = tmp_path_factory.mktemp("data") / codec
+    return synthetic.make(synthetic.dataset(folder, codec=codec, chunk_frames=frames)).root
 
 
-@pytest.fixture(scope="module")
-def toy(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return synthetic.make(synthetic.dataset(tmp_path_factory.mktemp("data") / "toy")).root
+@pytest.fixture(scope="module", params=[None, 1])
+def toy(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    made = synthetic.dataset(tmp_path_factory.mktemp("data") / "toy", chunk_frames=request.param)
+    return synthetic.make(made).root
 
 
 def same(found: dict[str, np.ndarray], expected: dict[str, np.ndarray]) -> None:

@@ -22,12 +22,12 @@ class Block:
     """m consecutive videos, ready to store."""
 
     arrays: Mapping[str, np.ndarray]  # fields stored as they are, [m, ...]
-    chunks: Mapping[str, list[bytes]]  # images, compressed, m of each
-    crc: Mapping[str, np.ndarray]  # uint32 [m] of every field: over the chunk, or over the bytes of the row
+    chunks: Mapping[str, list[bytes]]  # images, compressed, the same number for every video
+    crc: Mapping[str, np.ndarray]  # uint32 of every field: over each chunk, or [m] over the bytes of each row
     moments: Mapping[str, np.ndarray]  # float64 [m, 5, components]: count, sum, sum of squares, least, largest
 
     def __len__(self) -> int:
-        return len(next(iter(self.crc.values())))
+        return len(next(iter(self.arrays.values())))
 
     @property
     def nbytes(self) -> int:
@@ -40,7 +40,7 @@ class Block:
 class Places:
     """Where in the file each field's bytes lie."""
 
-    chunks: Mapping[str, np.ndarray]  # images: uint64 [count, 2], offset and size of each video's chunk
+    chunks: Mapping[str, np.ndarray]  # images: uint64 [chunks, 2], offset and size of each
     rows: Mapping[str, int]  # the others: offset of the first video, the rest follow without gaps
 
 
@@ -59,11 +59,14 @@ def stored_bytes(field: Field, sizes: Mapping[str, int]) -> int:
     return int(np.prod(field.shape(sizes))) * np.dtype(field.dtype).itemsize
 
 
-def encode(columns: Mapping[str, np.ndarray], fields: Mapping[str, Field], codec: str) -> Block:
-    """A Block of m videos from columns `[m, ...]` as stored; spends its time in code that releases the GIL."""
+def encode(
+    columns: Mapping[str, np.ndarray], fields: Mapping[str, Field], codec: str, chunk_frames: int | None = None
+) -> Block:
+    """A Block of m videos from columns `[m, ...]` as stored, images in chunks of so many frames, or of all; spends its
+    time in code that releases the GIL."""
     columns = {name: _checked(name, columns[name], field) for name, field in fields.items() if field.per_video}
     chunks = {
-        name: [codecs.encode(codec, video) for video in column]
+        name: [codecs.encode(codec, piece) for video in column for piece in _pieces(video, chunk_frames)]
         for name, column in columns.items()
         if fields[name].is_image
     }
@@ -77,7 +80,14 @@ def encode(columns: Mapping[str, np.ndarray], fields: Mapping[str, Field], codec
 
 def head(block: Block, count: int) -> Block:
     """The block's first `count` videos."""
-    return Block(*({name: values[:count] for name, values in part.items()} for part in vars(block).values()))
+    videos = len(block)
+    parts = vars(block).values()
+    return Block(*({name: part[name][: len(part[name]) // videos * count] for name in part} for part in parts))
+
+
+def _pieces(video: np.ndarray, frames: int | None) -> Iterable[np.ndarray]:
+    """The video, cut into pieces of so many frames, if any number is given."""
+    return (video,) if frames is None else video.reshape(-1, frames, *video.shape[1:])
 
 
 def _checked(name: str, column: np.ndarray, field: Field) -> np.ndarray:

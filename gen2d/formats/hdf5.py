@@ -1,4 +1,6 @@
-"""HDF5 shards: images in one compressed chunk a video, everything else contiguous, readable by any HDF5 program.
+"""HDF5 shards: images in compressed chunks, one a video unless told otherwise, everything else contiguous.
+
+Any HDF5 program reads them.
 
 The bytes depend on the compressed chunks and values and on nothing else: no times, hosts or users, and not on how the
 videos were grouped into blocks. h5py serves one thread at a time, so compression happens elsewhere and chunks pass
@@ -28,6 +30,7 @@ def write(
     count: int,
     blocks: Iterable[Block],
     codec: str,
+    chunk_frames: int | None,
     attributes: Mapping[str, str | int | float],
     constants: Mapping[str, np.ndarray],
 ) -> Places:
@@ -40,7 +43,7 @@ def write(
     with _new(path) as file:
         file.attrs.update(attributes)
         shapes = {name: (count, *fields[name].shape(sizes)) for name in images + rows}
-        chunked = {name: _chunked(file, name, fields[name].dtype, shapes[name], codec) for name in images}
+        chunked = {name: _chunked(file, name, fields[name].dtype, shapes[name], codec, chunk_frames) for name in images}
         table = {name: np.zeros(shapes[name], fields[name].dtype) for name in rows}
         for first, block in _numbered(blocks, count, path):
             _write_chunks(chunked, block, first)
@@ -51,7 +54,7 @@ def write(
         for name, field in sorted(fields.items()):
             file[name].attrs.update(axes=field.axes, unit=field.unit, meaning=field.meaning)
         return Places(
-            chunks={name: _chunk_places(dataset, count) for name, dataset in chunked.items()},
+            chunks={name: _chunk_places(dataset) for name, dataset in chunked.items()},
             # A dataset without a single byte has no place.
             rows={name: file[name].id.get_offset() or 0 for name in rows},  # pyright: ignore[reportAttributeAccessIssue]
         )
@@ -87,13 +90,17 @@ def _new(path: Path) -> Iterator[h5py.File]:
         raise OSError(int(number[1]) if number else errno.EIO, str(error)) from error
 
 
-def _chunked(file: h5py.File, name: str, dtype: str, shape: tuple[int, ...], codec: str) -> h5py.Dataset:
-    """A new dataset with a chunk per video; made by hand, as h5py refuses a filter that it has no plugin for.
+def _chunked(
+    file: h5py.File, name: str, dtype: str, shape: tuple[int, ...], codec: str, chunk_frames: int | None
+) -> h5py.Dataset:
+    """A new dataset with a chunk per video, or per so many frames.
+
+    Made by hand, as h5py refuses a filter without its plugin.
 
     A process that has imported hdf5plugin writes zstd files with the filter's name in them: other bytes, same content.
     """
     settings = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
-    settings.set_chunk((1, *shape[1:]))
+    settings.set_chunk((1, chunk_frames or shape[1], *shape[2:]))
     settings.set_obj_track_times(False)
     if codec in codecs.HDF5_FILTERS:
         number, options = codecs.HDF5_FILTERS[codec]
@@ -121,8 +128,10 @@ def _write_chunks(chunked: Mapping[str, h5py.Dataset], block: Block, first: int)
     # Video by video, so that the file does not depend on the size of a block.
     for row in range(len(block)):
         for name, dataset in chunked.items():
-            corner = (first + row,) + (0,) * (dataset.ndim - 1)
-            dataset.id.write_direct_chunk(corner, block.chunks[name][row])
+            pieces, frames = len(block.chunks[name]) // len(block), _frames(dataset)
+            for piece, data in enumerate(block.chunks[name][row * pieces : (row + 1) * pieces]):
+                corner = (first + row, piece * frames, *[0] * (dataset.ndim - 2))
+                dataset.id.write_direct_chunk(corner, data)
 
 
 def _fill(table: np.ndarray, first: int, values: np.ndarray, name: str) -> None:
@@ -132,11 +141,20 @@ def _fill(table: np.ndarray, first: int, values: np.ndarray, name: str) -> None:
     table[first : first + len(values)] = values
 
 
-def _chunk_places(dataset: h5py.Dataset, count: int) -> np.ndarray:
-    places = np.zeros((count, 2), np.uint64)
+def _frames(dataset: h5py.Dataset) -> int:
+    """Of a chunk."""
+    assert dataset.chunks is not None
+    return dataset.chunks[1]
+
+
+def _chunk_places(dataset: h5py.Dataset) -> np.ndarray:
+    frames = _frames(dataset)
+    pieces = dataset.shape[1] // frames
+    places = np.zeros((len(dataset) * pieces, 2), np.uint64)
 
     def note(chunk: h5py.h5d.StoreInfo) -> None:
-        places[chunk.chunk_offset[0]] = chunk.byte_offset, chunk.size
+        video, frame = chunk.chunk_offset[:2]
+        places[video * pieces + frame // frames] = chunk.byte_offset, chunk.size
 
     dataset.id.chunk_iter(note)
     return places
@@ -148,7 +166,9 @@ def _has_zstd(dataset: h5py.Dataset) -> bool:
 
 def _read_zstd(dataset: h5py.Dataset) -> np.ndarray:
     out = np.empty(dataset.shape, dataset.dtype)
+    frames = _frames(dataset)
     for row in range(len(out)):
-        _, data = dataset.id.read_direct_chunk((row,) + (0,) * (out.ndim - 1))
-        codecs.decode_into("zstd", data, out[row])
+        for begin in range(0, dataset.shape[1], frames):
+            _, data = dataset.id.read_direct_chunk((row, begin, *[0] * (out.ndim - 2)))
+            codecs.decode_into("zstd", data, out[row, begin : begin + frames])
     return out
