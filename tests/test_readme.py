@@ -22,6 +22,7 @@ def test_the_set_up_is_one_line_each():
 
 
 def test_every_block_runs(tmp_path: Path):
+    compared = 0  # models with what they must beat
     for kind, block in BLOCKS:
         if kind == "yaml":
             (tmp_path / "mine.yaml").write_text(block)
@@ -29,9 +30,13 @@ def test_every_block_runs(tmp_path: Path):
             words = [sys.executable, "-c", block]
             done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, check=False)
             assert done.returncode == 0, block + done.stderr
+            told = re.search(r"error ([\d.]+), of .* ([\d.]+)", done.stdout)
+            assert told is None or float(told[1]) < 0.9 * float(told[2]), done.stdout
+            compared += told is not None
         elif kind == "sh":
             for line in block.splitlines():
                 _run(line, tmp_path)
+    assert compared == 2
     assert {path.name for path in (tmp_path / "datasets").iterdir()} == {
         "bouncing",
         "mine",
