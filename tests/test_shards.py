@@ -347,6 +347,45 @@ def test_a_killed_writer_publishes_nothing_and_is_resumed(tmp_path: Path, codec:
     assert synthetic.tree(tmp_path / "a") == synthetic.tree(tmp_path / "b")
 
 
+# Three workers on a dataset that grows, killed together or one of them alone, at random moments, until 40 have been.
+KILLING = """
+import os, random, signal, sys, time
+from pathlib import Path
+sys.path.insert(0, {tests!r})
+import synthetic
+from gen2d import shards
+def work(made, number):
+    for shard in shards.mine(shards.open_folder(made), number, 3):
+        shards.write(made, shard, synthetic.blocks(made, shard))
+    shards.finish(made)
+chance, killed, count = random.Random(5), 0, 24
+while killed < 40:
+    made = synthetic.dataset(Path({root!r}), train=count)
+    workers = []
+    for number in range(3):
+        workers.append(os.fork())
+        if not workers[-1]:
+            work(made, number)
+            os._exit(0)
+    time.sleep(chance.random() * 0.2)
+    for worker in workers if chance.random() < 0.5 else [chance.choice(workers)]:
+        os.kill(worker, signal.SIGKILL)
+    killed += sum(os.WIFSIGNALED(os.waitpid(worker, 0)[1]) for worker in workers)
+    for shard in made.root.glob("shards/*.h5"):
+        synthetic.hdf5.read(shard)  # what has its name is whole
+    count += 8 * chance.randint(0, 3)
+print(count)
+"""
+
+
+def test_forty_kills_leave_no_trace(tmp_path: Path) -> None:
+    script = KILLING.format(tests=str(Path(__file__).parent), root=str(tmp_path / "a"))
+    count = int(subprocess.run([sys.executable, "-c", script], capture_output=True, check=True).stdout)
+    synthetic.make(synthetic.dataset(tmp_path / "a", train=count))
+    synthetic.make(synthetic.dataset(tmp_path / "b", train=count))
+    assert synthetic.tree(tmp_path / "a") == synthetic.tree(tmp_path / "b")
+
+
 def test_the_manifest_keeps_to_the_schema_and_to_itself(tmp_path: Path) -> None:
     made = synthetic.make(synthetic.dataset(tmp_path))
     manifest = shards.read_manifest(tmp_path)
