@@ -4,6 +4,7 @@
     python tests/bench.py --quick         # only what a change to the code should be tried on
     python tests/bench.py --only physics  # what it costs against the number of objects: bench_physics.py
     python tests/bench.py --only render   # what drawing costs, and annotations: bench_render.py
+    python tests/bench.py --only storage  # what writing and reading cost: bench_storage.py
 
 Machines are noisy, so whatever is compared is measured in turns, and a ratio is the median of the ratios of the turns.
 Every measurement runs in a process of its own, on the cores that it is given, and in folders that vanish.
@@ -27,9 +28,11 @@ from typing import Any, NamedTuple
 
 import bench_physics
 import bench_render
+import bench_storage
 import numpy as np
 from bench_physics import CASES, Cost
 from bench_render import Annotated, Drawing
+from bench_storage import Stored
 
 HERE = Path(__file__).resolve()
 CONFIG = "benchmark.yaml"
@@ -218,7 +221,12 @@ def annotated(folder: Path, turns: int) -> Turns:
     return in_turns(works, turns) | {f"bytes {name}": [size] for name, size in sizes.items()}
 
 
-MEASUREMENTS = {work.__name__: work for work in (stages, steady, bounds, physics, render, annotated)}
+def storage(folder: Path, case: str, turns: int) -> Turns:
+    """CPU seconds of writing, reading and copying all videos of a case."""
+    return in_turns(bench_storage.works(bench_storage.CASES[case], folder), turns)
+
+
+MEASUREMENTS = {work.__name__: work for work in (stages, steady, bounds, physics, render, annotated, storage)}
 
 
 # ---- Processes
@@ -303,7 +311,7 @@ class Promise(NamedTuple):
         return f"{'at most' if self.most else 'at least'} {self.target:g}: {'kept' if kept else 'NOT KEPT'}"
 
 
-Told = Row | Promise | Cost | Drawing | Annotated
+Told = Row | Promise | Cost | Drawing | Annotated | Stored
 Found = Iterator[Told]
 BETA = "an interface that pymunk calls highly experimental"
 ALONE = f"against the frames alone, {bench_render.ANNOTATED.name}"
@@ -430,10 +438,35 @@ def annotations_told(turns: Turns) -> Found:
             yield Promise("  a byte of it, against one of frames", each, target=2, most=True)
 
 
+def storage_section(folder: Path, quick: bool) -> Found:
+    """Videos of three sizes, one core: the loader beside a plain h5py loop and a copy, writing beside its codec."""
+    for number, case in enumerate(bench_storage.CASES.values()):
+        own = folder / str(number)
+        own.mkdir()
+        turns = measured(storage, own, CORES[:1], case=case.name, turns=3 if quick else 9)
+        yield bench_storage.stored_of(case, {name: statistics.median(values) for name, values in turns.items()})
+        for codec in ("zstd", "gzip"):
+            least = (case.against_gzip4, case.against_same, case.against_copy) if codec == "zstd" else (None,) * 3
+            of = turns[f"loader {codec}"]
+            yield Promise(
+                f"{case.name}, {codec}: loader against h5py, gzip-4", _ratio(turns["h5py gzip-4"], of), target=least[0]
+            )
+            yield Promise("  against h5py on the same files", _ratio(turns[f"h5py {codec}"], of), target=least[1])
+            yield Promise("  against a copy", _ratio(turns["copy"], of), target=least[2])
+            yield Promise(
+                "  writing against the codec alone",
+                _ratio(turns[f"codec {codec}"], turns[f"write {codec}"]),
+                target=bench_storage.WRITTEN,
+            )
+        yield Promise(
+            f"{case.name}, none: loader against a copy", _ratio(turns["copy"], turns["loader none"]), target=case.mapped
+        )
+
+
 SECTIONS = {
     "parts": parts_section, "steady": steady_section, "command": command_section, "memory": memory_section,
     "scaling": scaling_section, "start": start_section, "physics": physics_section,
-    "render": render_section,
+    "render": render_section, "storage": storage_section,
 }  # fmt: skip
 QUICK = ("parts", "steady")
 
@@ -451,11 +484,19 @@ def machine() -> dict[str, Any]:
 
 
 # What JSON calls each kind of line, which of them have a table of their own, and which sections a chart.
-KINDS = {"rows": Row, "promises": Promise, "costs": Cost, "drawings": Drawing, "annotations": Annotated}
+KINDS = {
+    "rows": Row,
+    "promises": Promise,
+    "costs": Cost,
+    "drawings": Drawing,
+    "annotations": Annotated,
+    "stored": Stored,
+}
 TABLES: Mapping[type, Callable[[Any], list[str]]] = {
     Cost: bench_physics.table,
     Drawing: bench_render.table,
     Annotated: bench_render.table_of_annotations,
+    Stored: bench_storage.table,
 }
 CHARTS: Mapping[str, tuple[type, Callable[[Any, Path], None]]] = {
     "physics": (Cost, bench_physics.chart),

@@ -1,0 +1,134 @@
+"""What it costs to write videos and to read them again: gen2d, a plain h5py loop and a plain copy.
+
+    python tests/bench.py --only storage     # about 2 minutes
+
+The videos are those of synthetic.discs, about 50 MB of frames, with a state beside each. They are read in one thread,
+from files that the system still has in memory, into a batch that is there already. Times are of this process's CPU.
+"""
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import h5py
+import hdf5plugin  # noqa: F401 (h5py reads zstd with it)
+import numpy as np
+import synthetic
+
+from gen2d import codecs, loader, shards
+from gen2d.fields import Field
+
+FIELDS = {
+    "frames": Field("uint8", "n T H W 3", "sRGB", "what is seen"),
+    "states/position": Field("float32", "n T K 2", "m", "of the centre of mass"),
+}
+
+
+class Case(NamedTuple):
+    """A size of video, how many are 50 MB, and the least that is promised."""
+
+    pixels: int
+    frames: int
+    videos: int
+    against_gzip4: float
+    against_same: float
+    against_copy: float
+    mapped: float  # without a codec, against a copy
+
+    @property
+    def name(self) -> str:
+        """As it stands in the tables."""
+        return f"{self.pixels} px, {self.frames} frames"
+
+
+CASES = {
+    case.name: case
+    for case in (
+        Case(64, 64, 64, 3, 1.5, 0.12, 0.35),
+        Case(128, 64, 16, 4.5, 2.3, 0.23, 0.45),
+        Case(256, 32, 8, 5, 2.8, 0.28, 0.45),
+    )
+}
+WRITTEN = 0.8  # of the speed of the codec alone
+
+
+class Stored(NamedTuple):
+    """A line of the table: MB of frames a second of CPU time."""
+
+    name: str
+    rates: Mapping[str, float]
+
+
+def works(case: Case, folder: Path) -> dict[str, Callable[[], float]]:
+    """By name what reads, copies, compresses or writes all videos of a case and returns the CPU seconds."""
+    frames = synthetic.discs(case.videos, case.frames, case.pixels)
+    columns = {"frames": frames, "states/position": np.zeros((case.videos, case.frames, 8, 2), np.float32)}
+    out = {name: np.empty_like(values) for name, values in columns.items()}
+    with h5py.File(folder / "gzip-4.h5", "w") as file:
+        for name, values in columns.items():
+            file.create_dataset(name, data=values, chunks=(1, *values.shape[1:]), compression="gzip")
+    found: dict[str, Callable[[], Any]] = {
+        "copy": lambda: np.copyto(out["frames"], frames),
+        "h5py gzip-4": lambda: _looped(folder / "gzip-4.h5", out),
+    }
+    for codec in codecs.CODECS:
+        made = _dataset(case, folder / codec, codec)
+        _write(made, columns)
+        ds = loader.open(made.root, fields=tuple(columns))
+        shard = made.root / "shards" / "train-00000.h5"
+        found[f"loader {codec}"] = lambda ds=ds: ds.batch(range(case.videos), out=out)
+        found[f"h5py {codec}"] = lambda shard=shard: _looped(shard, out)
+        if codec != "none":
+            again = _dataset(case, folder / f"{codec} again", codec)
+            found[f"codec {codec}"] = lambda codec=codec: [codecs.encode(codec, video) for video in frames]
+            found[f"write {codec}"] = lambda again=again: _write(again, columns)
+    return {name: _timed(work) for name, work in found.items()}
+
+
+def _dataset(case: Case, root: Path, codec: str) -> shards.Dataset:
+    sizes = {"T": case.frames, "H": case.pixels, "W": case.pixels, "K": 8}
+    plan = {"splits": {"train": case.videos}, "videos_per_shard": case.videos, "constants": {}}
+    return synthetic.dataset(root, codec=codec, fields=FIELDS, sizes=sizes, **plan)
+
+
+def _write(made: shards.Dataset, columns: Mapping[str, np.ndarray]) -> None:
+    (shard,) = shards.plan(made.splits, made.videos_per_shard)
+    shards.open_folder(made)
+    blocks = (
+        shards.encode({name: values[i : i + 4] for name, values in columns.items()}, made.fields, made.codec)
+        for i in range(0, shard.count, 4)
+    )
+    shards.write(made, shard, blocks)
+    shards.finish(made)
+
+
+def _looped(path: Path, out: Mapping[str, np.ndarray]) -> None:
+    """Reads every video of a file as people do."""
+    with h5py.File(path) as file:
+        for name, target in out.items():
+            dataset: Any = file[name]
+            for i in range(len(target)):
+                target[i] = dataset[i]
+
+
+def _timed(work: Callable[[], Any]) -> Callable[[], float]:
+    def seconds() -> float:
+        began = time.process_time()
+        work()
+        return time.process_time() - began
+
+    return seconds
+
+
+def stored_of(case: Case, seconds: Mapping[str, float]) -> Stored:
+    """The line, from the seconds of all videos."""
+    size = case.videos * case.frames * case.pixels**2 * 3 / 1e6
+    return Stored(case.name, {name: size / value for name, value in seconds.items()})
+
+
+def table(lines: Sequence[Stored]) -> list[str]:
+    """Lines of text."""
+    names = list(lines[0].rates)
+    head = ["one core, MB of frames a second of CPU time", f"{'':16} " + " ".join(f"{line.name:>17}" for line in lines)]
+    return [*head, *(f"{name:16} " + " ".join(f"{line.rates[name]:17,.0f}" for line in lines) for name in names)]
