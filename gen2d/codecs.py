@@ -49,7 +49,10 @@ def decode_into(codec: str, data: bytes | memoryview, out: np.ndarray) -> None:
     Raises DamagedError unless `data` is whole, ends where it should and fills `out` exactly.
     """
     try:
-        plain = _decode(codec, data, out.nbytes)
+        if codec == "zstd":
+            _unzstd(data, out)
+            return
+        plain = _inflated(data, out.nbytes) if codec == "gzip" else memoryview(data).cast("B")
     except _ERRORS as error:
         raise DamagedError(f"compressed data is damaged ({error})") from error
     if len(plain) != out.nbytes:
@@ -58,20 +61,39 @@ def decode_into(codec: str, data: bytes | memoryview, out: np.ndarray) -> None:
         out.reshape(-1)[...] = np.frombuffer(plain, out.dtype)
 
 
-def _decode(codec: str, data: bytes | memoryview, size: int) -> bytes | memoryview:
-    if codec == "gzip":
-        stream = isal_zlib.decompressobj()
-        # One byte more than expected: a longer stream is noticed, and the buffer need not grow to see the end.
-        plain = stream.decompress(data, size + 1)
-        if not stream.eof or stream.unused_data:
-            raise DamagedError("compressed data does not end where it should")
-        return plain
-    if codec == "zstd":
-        # Asked before decompressing, so that a damaged size cannot ask for all the memory there is.
-        if zstandard.frame_content_size(data) != size:
-            raise DamagedError(f"compressed data does not hold the {size} bytes that it must hold")
-        return _decompressor().decompress(data, allow_extra_data=False)
-    return memoryview(data).cast("B")
+def _inflated(data: bytes | memoryview, size: int) -> bytes:
+    stream = isal_zlib.decompressobj()
+    # One byte more than expected: a longer stream is noticed, and the buffer need not grow to see the end.
+    plain = stream.decompress(data, size + 1)
+    if not stream.eof or stream.unused_data:
+        raise DamagedError("compressed data does not end where it should")
+    return plain
+
+
+def _unzstd(data: bytes | memoryview, out: np.ndarray) -> None:
+    # Asked before decompressing, so that a damaged size cannot ask for all the memory there is.
+    if zstandard.frame_content_size(data) != out.nbytes:
+        raise DamagedError(f"compressed data does not hold the {out.nbytes} bytes that it must hold")
+    if _frame_end(data) != len(data):
+        raise DamagedError("compressed data does not end where it should")
+    # With all data and all room at once, zstd decompresses right into the room.
+    room = out.reshape(-1).view(np.uint8)
+    got = _decompressor().stream_reader(data).readinto(room.data) if out.nbytes else 0
+    if got != out.nbytes:
+        raise DamagedError(f"compressed data holds {got} bytes, but must hold {out.nbytes}")
+
+
+def _frame_end(data: bytes | memoryview) -> int:
+    """Where a zstd frame ends, from the headers of its blocks (RFC 8878, 3.1.1.2), of which it has one in 128 kB."""
+    place = zstandard.frame_header_size(data)
+    last = False
+    while not last:
+        header = int.from_bytes(data[place : place + 3], "little")
+        last, repeats, size = bool(header & 1), header >> 1 & 3 == 1, header >> 3
+        place += 3 + (1 if repeats else size)
+        if place > len(data):
+            break
+    return place + 4  # the checksum
 
 
 def _compressor() -> zstandard.ZstdCompressor:
