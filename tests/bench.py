@@ -446,7 +446,7 @@ def storage_section(folder: Path, quick: bool) -> Found:
         turns = measured(storage, own, CORES[:1], case=case.name, turns=3 if quick else 9)
         yield bench_storage.stored_of(case, {name: statistics.median(values) for name, values in turns.items()})
         for codec in ("zstd", "gzip"):
-            least = (case.against_gzip4, case.against_same, case.against_copy) if codec == "zstd" else (None,) * 3
+            least = case.against_gzip4, case.against_same, case.against_copy
             of = turns[f"loader {codec}"]
             yield Promise(
                 f"{case.name}, {codec}: loader against h5py, gzip-4", _ratio(turns["h5py gzip-4"], of), target=least[0]
