@@ -1,0 +1,27 @@
+"""A film per video in H.264 by PyAV, which browsers play."""
+
+from pathlib import Path
+
+from gen2d import films
+from gen2d.exports import Source
+
+LOSS = "lossy: colours at half the resolution, and rounded"
+FIELDS, FIXED = ("frames",), True
+SUFFIX = ""
+# Flat discs need a better quality than the camera's pictures that the usual 23 is meant for.
+OPTIONS = {"crf": "12", "movflags": "+faststart"}
+
+
+def check(source: Source) -> None:
+    """ConfigError for sizes and rates that it cannot have, UserError without PyAV."""
+    films.check("h264", source.frame_size, source.fps)
+    films.pyav()
+
+
+def write(target: Path, source: Source) -> None:
+    """Fills the folder with KEY.mp4."""
+
+    def one(key: str, video: dict) -> None:
+        films.encode(target / f"{key}.mp4", video["frames"], source.fps, "libx264", "yuv420p", OPTIONS)
+
+    source.each(one)
