@@ -11,7 +11,7 @@ from types import ModuleType
 from typing import Any
 
 from gen2d import exports
-from gen2d.errors import ConfigError, FolderError, UserError
+from gen2d.errors import ConfigError, FolderError
 from gen2d.exports import Source
 from gen2d.files import as_json, publishing, publishing_folder, read_json, sweep_beside
 from gen2d.progress import progress, stopping_on_sigterm
@@ -58,8 +58,8 @@ def export(
     source = exports.source_of(root, split, _patterns(to, module, fields))
     out = Path(out) if out is not None else _beside(root, f"{to}{module.SUFFIX}")
     about = _about(source, to)
-    _check_out(out, module, about, overwrite)
     module.check(source)
+    _check_out(out, module, about, overwrite)
     say = say or (lambda line: None)
     with _explained(out), stopping_on_sigterm(say), progress(len(source), say) as advance:
         size = _written(out, module, dataclasses.replace(source, advance=advance), about)
@@ -93,46 +93,44 @@ def _about(source: Source, to: str) -> dict[str, Any]:
     manifest = source.ds.manifest
     shown = ("name", "seed", "fps", "sizes", "conventions", "licence", "manifest_sha256", "config_sha256")
     about = {key: manifest[key] for key in shown} | {"schema": SCHEMA, "format": to, "split": source.ds.options.split}
-    return about | {"fields": {name: manifest["fields"].get(name) for name in source.fields}, "videos": len(source)}
+    fields = {name: dataclasses.asdict(field) for name, field in source.fields.items()}
+    return about | {"fields": fields, "videos": len(source)}
 
 
 # ---- Where it goes
 
 
 def _check_out(out: Path, module: ModuleType, about: Mapping[str, Any], overwrite: bool) -> None:
-    """FolderError where `out` holds what must stay; what a killed export left there goes."""
+    """Returns nothing; raises FolderError where `out` holds what must stay."""
     with _explained(out):
-        out.parent.mkdir(parents=True, exist_ok=True)
-        sweep_beside(out)
-        if not out.exists() or (out.is_dir() and not module.SUFFIX and not any(out.iterdir())):
+        if not out.exists():
             return
         if out.is_dir() == bool(module.SUFFIX):
-            kind = "folder" if out.is_dir() else "file"
-            raise FolderError(f"{out} is a {kind} already: choose another --out")
-        if module.SUFFIX:
-            _check_file(out, overwrite)
-        else:
+            kinds = ("folder", "file") if out.is_dir() else ("file", "folder")
+            raise FolderError(f"{out} is a {kinds[0]}, but {about['format']} makes a {kinds[1]}: choose another --out")
+        if out.is_dir():
             _check_folder(out, about, overwrite)
-
-
-def _check_file(out: Path, overwrite: bool) -> None:
-    if not overwrite:
-        raise FolderError(f"{out} is there already: choose another --out, or --overwrite to replace it")
+        elif not overwrite:
+            raise FolderError(f"{out} is there already: choose another --out, or --overwrite to replace it")
 
 
 def _check_folder(out: Path, about: Mapping[str, Any], overwrite: bool) -> None:
     there = read_json(out / ABOUT) or {}
-    foreign = [path.name for path in out.iterdir() if path.name not in {ABOUT, *there.get("files", ())}]
-    if there.get("schema") != SCHEMA or foreign:
-        name = f", such as {min(foreign)}" if foreign else ""
-        raise FolderError(f"{out} holds something else than an export{name}: choose another --out")
+    own = {ABOUT, *there.get("files", ())} if there.get("schema") == SCHEMA else set()
+    foreign = {path.name for path in out.iterdir()} - own
+    if foreign:
+        raise FolderError(f"{out} holds {min(foreign)}, which no export made: choose another --out")
+    if not own:
+        return  # an empty folder
     same = all(there.get(key) == about[key] for key in ("format", "split", "name", "seed", "config_sha256"))
     if not same and not overwrite:
         raise FolderError(f"{out} holds another export: choose another --out, or --overwrite to replace it")
 
 
 def _written(out: Path, module: ModuleType, source: Source, about: Mapping[str, Any]) -> int:
-    """The bytes written; afterwards `out` is there, whole."""
+    """The bytes written; afterwards `out` is there, whole, and what a killed export left beside it is not."""
+    out.parent.mkdir(parents=True, exist_ok=True)
+    sweep_beside(out)
     if module.SUFFIX:
         with publishing(out) as temporary:
             module.write(temporary, source)
@@ -149,7 +147,5 @@ def _explained(out: Path) -> Iterator[None]:
     """A block whose OSError becomes one sentence."""
     try:
         yield
-    except (UserError, KeyboardInterrupt):
-        raise
     except OSError as error:
         raise FolderError(f"{out} cannot be written ({error.strerror or error}): choose another --out") from None

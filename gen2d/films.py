@@ -11,7 +11,8 @@ import numpy as np
 
 from gen2d.errors import ConfigError, UserError
 
-LARGEST_RATE = 2**16 - 1  # what MPEG-4 has bits for, in numerator and denominator
+SLOWEST = 0.1  # frames/s; OpenCV rounds rates to a thousandth
+FASTEST = 2**16 - 1  # frames/s; what MPEG-4 has bits for
 
 
 def mp4v(path: Path, frames: np.ndarray, fps: float) -> None:
@@ -34,16 +35,19 @@ def mp4v(path: Path, frames: np.ndarray, fps: float) -> None:
 
 
 def encode(path: Path, frames: np.ndarray, fps: float, codec: str, pixels: str, options: Mapping[str, str]) -> None:
-    """Writes frames [T, H, W, 3] by one of PyAV's encoders; `pixels` and `options` are FFmpeg's."""
+    """Writes frames [T, H, W, 3] by one of PyAV's encoders, or raises OSError; `pixels` and `options` are FFmpeg's."""
     av = pyav()
     # Bit-exact: without versions and random numbers in the file.
-    with av.open(str(path), "w", options={"fflags": "+bitexact"}) as file:
-        stream = file.add_stream(codec, rate=rate_of(fps), options=dict(options))
-        stream.height, stream.width, stream.pix_fmt = *frames.shape[1:3], pixels
-        stream.codec_context.thread_count = 1  # videos are encoded side by side
-        for image in frames:
-            file.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24")))
-        file.mux(stream.encode(None))
+    try:
+        with av.open(str(path), "w", options={"fflags": "+bitexact"}) as file:
+            stream = file.add_stream(codec, rate=rate_of(fps), options=dict(options))
+            stream.height, stream.width, stream.pix_fmt = *frames.shape[1:3], pixels
+            stream.codec_context.thread_count = 1  # videos are encoded side by side
+            for image in frames:
+                file.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24")))
+            file.mux(stream.encode(None))
+    except av.FFmpegError as error:  # of which some are an OSError, and some are not
+        raise OSError(error.errno, error.strerror, str(path)) from error
 
 
 def pyav() -> ModuleType:
@@ -61,18 +65,16 @@ def rate_of(fps: float) -> Fraction:
     return Fraction(fps).limit_denominator(1001)
 
 
-def check(name: str, size: tuple[int, int], fps: float) -> None:
-    """Returns nothing; raises ConfigError where a film with half the colours' resolution cannot be as asked."""
+def check_size(name: str, size: tuple[int, int]) -> None:
+    """Returns nothing; raises ConfigError where colours cannot be stored at half the frame's resolution."""
     for side, pixels in zip(("height", "width"), size, strict=True):
         if pixels % 2:
-            raise ConfigError(
-                f"video.{side} is {pixels} px, but {name} must have an even {side}: choose ffv1, npz or webdataset"
-            )
-    check_rate(name, fps)
+            raise ConfigError(f"video.{side} is {pixels}, but must be even for {name}: choose ffv1, npz or webdataset")
 
 
-def check_rate(name: str, fps: float) -> None:
-    """Returns nothing; raises ConfigError for a frame rate that films cannot store."""
-    rate = rate_of(fps)
-    if not 0 < rate.numerator <= LARGEST_RATE or abs(rate / Fraction(fps) - 1) > 1e-4:
-        raise ConfigError(f"video.fps is {fps:g}, but {name} must have 0.001 to {LARGEST_RATE} frames/s")
+def check_rate(name: str, fps: float, fastest: float) -> None:
+    """Returns nothing; raises ConfigError for a frame rate that a format cannot store."""
+    if not SLOWEST <= fps <= fastest:
+        raise ConfigError(
+            f"video.fps is {fps:g}, but must be from {SLOWEST:g} to {fastest:g} for {name}: choose npz or webdataset"
+        )

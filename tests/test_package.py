@@ -90,7 +90,8 @@ def test_plugins_do_not_import_each_other(path):
 
 def test_reading_data_never_imports_jax():
     names = ", ".join(f"gen2d.{name}" for name in WITHOUT_JAX)
-    code = f"import gen2d, {names}, sys; gen2d.open, gen2d.DataLoader, gen2d.verify, gen2d.export; assert 'jax' not in sys.modules"
+    code = f"import gen2d, {names}, sys; gen2d.open, gen2d.DataLoader, gen2d.export, gen2d.verify; "
+    code += "assert 'jax' not in sys.modules"
     subprocess.run([sys.executable, "-c", code], check=True)
 
 

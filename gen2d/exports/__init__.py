@@ -20,9 +20,11 @@ from pathlib import Path
 import numpy as np
 
 from gen2d import loader
+from gen2d.fields import Field
 from gen2d.formats import stored_bytes
 from gen2d.loader import Batch, Dataset
 
+FRAMES = Field("uint8", "n T H W 3", "sRGB", "the video")  # as they are where they are stored
 DRAWN_BYTES = 2**26  # frames that are not stored are drawn so many at a time
 
 
@@ -38,9 +40,9 @@ class Source:
         return len(self.ds)
 
     @property
-    def fields(self) -> list[str]:
-        """The names of what each video has."""
-        return [*(["frames"] if self.draws else []), *self.ds.fields]
+    def fields(self) -> dict[str, Field]:
+        """What each video has, by name."""
+        return ({"frames": FRAMES} if self.draws else {}) | self.ds.fields
 
     @property
     def fps(self) -> float:
@@ -55,14 +57,7 @@ class Source:
     @property
     def video_bytes(self) -> int:
         """What one video takes before compression."""
-        sizes = self.ds.manifest["sizes"]
-        stored = sum(stored_bytes(field, sizes) for field in self.ds.fields.values())
-        return stored + (self._frame_bytes if self.draws else 0)
-
-    @property
-    def _frame_bytes(self) -> int:
-        """What one video's frames take."""
-        return self.ds.manifest["sizes"]["T"] * int(np.prod(self.frame_size)) * 3
+        return sum(stored_bytes(field, self.ds.manifest["sizes"]) for field in self.fields.values())
 
     def key(self, number: int) -> str:
         """A video's name in files: split and number, so that names sort as numbers do."""
@@ -77,7 +72,7 @@ class Source:
 
     def each(self, write: Callable[[str, Batch], None]) -> None:
         """Returns nothing; calls `write(key, video)` for every video, several at once."""
-        threads = len(os.sched_getaffinity(0))
+        threads = min(os.cpu_count() or 1, 8)
         running: deque[Future[None]] = deque()
         with ThreadPoolExecutor(threads) as pool:
             for number, video in enumerate(self.videos()):
@@ -93,7 +88,7 @@ class Source:
         """Frames of one video after the other, drawn several at a time, always as many: one program is compiled."""
         from gen2d.redraw import render  # imports jax: only now
 
-        count = max(1, min(128, len(self), DRAWN_BYTES // self._frame_bytes))
+        count = max(1, min(128, len(self), DRAWN_BYTES // stored_bytes(FRAMES, self.ds.manifest["sizes"])))
         for first in range(0, len(self), count):
             numbers = np.minimum(np.arange(first, first + count), len(self) - 1)
             yield from np.asarray(render(self.ds, numbers))[: len(self) - first]

@@ -8,12 +8,14 @@ from gen2d.exports import Source
 LOSS = "lossy: colours at half the resolution, and rounded"
 FIELDS, FIXED = ("frames",), True
 SUFFIX = ""
+FASTEST = 240  # frames/s, of this encoder
 OPTIONS = {"crf": "20", "preset": "8", "svtav1-params": "lp=1"}
 
 
 def check(source: Source) -> None:
     """ConfigError for sizes and rates that it cannot have, UserError without PyAV."""
-    films.check("av1", source.frame_size, source.fps)
+    films.check_size("av1", source.frame_size)
+    films.check_rate("av1", source.fps, FASTEST)
     films.pyav()
 
 

@@ -8,13 +8,14 @@ from gen2d.exports import Source
 LOSS = ""
 FIELDS, FIXED = ("frames",), True
 SUFFIX = ""
+FASTEST = 1000  # frames/s: Matroska tells times in milliseconds
 PIXELS = "bgr0"  # the stored bytes in another order; any form of YUV would round them
 OPTIONS = {"level": "3", "coder": "1", "context": "1", "slicecrc": "1"}
 
 
 def check(source: Source) -> None:
     """ConfigError for rates that it cannot have, UserError without PyAV."""
-    films.check_rate("ffv1", source.fps)
+    films.check_rate("ffv1", source.fps, FASTEST)
     films.pyav()
 
 

@@ -14,7 +14,8 @@ OPTIONS = {"crf": "12", "movflags": "+faststart"}
 
 def check(source: Source) -> None:
     """ConfigError for sizes and rates that it cannot have, UserError without PyAV."""
-    films.check("h264", source.frame_size, source.fps)
+    films.check_size("h264", source.frame_size)
+    films.check_rate("h264", source.fps, films.FASTEST)
     films.pyav()
 
 

@@ -12,7 +12,8 @@ SUFFIX = ""
 
 def check(source: Source) -> None:
     """ConfigError for sizes and rates that it cannot have."""
-    films.check("mp4", source.frame_size, source.fps)
+    films.check_size("mp4", source.frame_size)
+    films.check_rate("mp4", source.fps, films.FASTEST)
 
 
 def write(target: Path, source: Source) -> None:

@@ -31,7 +31,8 @@ STATIC, CIRCLE = 1, 0  # in objects/kind and objects/shape; types.py says the sa
 
 def check(source: Source) -> None:
     """ConfigError where a film cannot be, or a video has other than one or two moving balls or a moving camera."""
-    films.check("phyworld", source.frame_size, source.fps)
+    films.check_size("phyworld", source.frame_size)
+    films.check_rate("phyworld", source.fps, films.FASTEST)
     ds = loader.open(source.ds.root, source.ds.options.split, (*OBJECTS, *CAMERA))
     usual = None
     for first in range(0, len(ds), GROUP):

@@ -3,6 +3,7 @@
 A key is followed by a dot and the field's name, whose slashes become dots, as a key's files must lie in one folder.
 """
 
+import dataclasses
 import io
 import tarfile
 from itertools import islice
@@ -47,11 +48,8 @@ def _add_video(tar: tarfile.TarFile, source: Source, number: int, video: Batch) 
 
 def _about(source: Source, number: int) -> dict[str, Any]:
     """What a video's JSON says: where it comes from, and what each field is."""
-    manifest = source.ds.manifest
-    fields = {
-        name: {key: manifest["fields"][name][key] for key in ("axes", "unit", "meaning")} for name in source.ds.fields
-    }
-    about = {key: manifest[key] for key in ("name", "seed", "fps")}
+    about = {key: source.ds.manifest[key] for key in ("name", "seed", "fps")}
+    fields = {name: dataclasses.asdict(field) for name, field in source.fields.items()}
     return about | {"split": source.ds.options.split, "number": number, "fields": fields}
 
 
