@@ -54,9 +54,9 @@ def export(
     is replaced, what another made only with `overwrite`. `say` takes lines for a person.
     Raises ConfigError and FolderError (UserError) with one sentence, and DamagedError.
     """
-    began, root, module = time.perf_counter(), Path(root), _module(to)
+    began, module = time.perf_counter(), _module(to)
     source = exports.source_of(root, split, _patterns(to, module, fields))
-    out = Path(out) if out is not None else _beside(root, f"{to}{module.SUFFIX}")
+    out = Path(out) if out is not None else _beside(Path(root), f"{to}{module.SUFFIX}")
     about = _about(source, to)
     module.check(source)
     _check_out(out, module, about, overwrite)

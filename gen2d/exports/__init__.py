@@ -94,7 +94,7 @@ class Source:
             yield from np.asarray(render(self.ds, numbers))[: len(self) - first]
 
 
-def source_of(root: Path, split: str | None, patterns: Sequence[str]) -> Source:
+def source_of(root: str | Path, split: str | None, patterns: Sequence[str]) -> Source:
     """The videos of a dataset's split with these fields; frames are drawn where they are asked for but not stored."""
     ds = loader.open(root, split, fields=())
     draws = "frames" not in ds.manifest["fields"] and any(fnmatch.fnmatch("frames", p) for p in patterns)

@@ -34,20 +34,11 @@ def check(source: Source) -> None:
     films.check_size("phyworld", source.frame_size)
     films.check_rate("phyworld", source.fps, films.FASTEST)
     ds = loader.open(source.ds.root, source.ds.options.split, (*OBJECTS, *CAMERA))
-    usual = None
-    for first in range(0, len(ds), GROUP):
-        for number, video in enumerate(ds.__getitems__(range(first, min(first + GROUP, len(ds)))), first):
-            where = f"phyworld cannot hold {ds.options.split} video {number} of {ds.root}:"
-            balls = _balls(video)
-            usual = len(balls) if usual is None else usual
-            if len(balls) not in (1, 2) or (video["objects/shape"][balls] != CIRCLE).any():
-                raise ConfigError(f"{where} {_told(video, balls)}, but it must be one or two balls")
-            if len(balls) != usual:
-                raise ConfigError(
-                    f"{where} {_told(video, balls)}, but all videos must have as many as the first, {usual}"
-                )
-            if video["camera/angle"].any() or any(np.ptp(video[name], axis=0).any() for name in CAMERA):
-                raise ConfigError(f"{where} its camera moves or is turned, but must stand still and upright")
+    usual = len(_balls(ds[0]))
+    for number in range(len(ds)):
+        wrong = _wrong(ds[number], usual)
+        if wrong:
+            raise ConfigError(f"phyworld cannot hold {ds.options.split} video {number} of {ds.root}: {wrong}")
 
 
 def write(target: Path, source: Source) -> None:
@@ -73,11 +64,17 @@ def _balls(video: Batch) -> np.ndarray:
     return np.flatnonzero(video["objects/present"] & (video["objects/kind"] != STATIC))
 
 
-def _told(video: Batch, balls: np.ndarray) -> str:
-    """What moves, in words."""
+def _wrong(video: Batch, usual: int) -> str:
+    """Why a video cannot be held, in words; "" if it can. `usual` is how many balls the first one has."""
+    balls = _balls(video)
     if (video["objects/shape"][balls] != CIRCLE).any():
         return "something else than a ball moves in it"
-    return f"{len(balls)} balls move in it"
+    if len(balls) not in (1, 2) or len(balls) != usual:
+        allowed = usual if usual in (1, 2) else "1 or 2"
+        return f"the number of balls that move in it is {len(balls)}, but must be {allowed}"
+    if video["camera/angle"].any() or any(np.ptp(video[name], axis=0).any() for name in CAMERA):
+        return "its camera moves or is turned, but must stand still and upright"
+    return ""
 
 
 def _film(path: Path, video: Batch, fps: float) -> np.ndarray:
