@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from gen2d.config import load_config
     from gen2d.dataloader import DataLoader
+    from gen2d.exporting import export
     from gen2d.generation import generate
     from gen2d.loader import open
     from gen2d.redraw import render, simulate_again
@@ -25,11 +26,14 @@ if TYPE_CHECKING:
     from gen2d.verification import verify
 
 __version__ = "0.1.0"
-__all__ = ["DataLoader", "Space", "generate", "load_config", "open", "render", "simulate_again", "stream", "verify"]
+__all__ = [
+    "DataLoader", "Space", "export", "generate", "load_config", "open", "render", "simulate_again", "stream", "verify",
+]  # fmt: skip
 
 _HOME = {
     "DataLoader": "gen2d.dataloader",
     "Space": "gen2d.space",
+    "export": "gen2d.exporting",
     "generate": "gen2d.generation",
     "load_config": "gen2d.config",
     "open": "gen2d.loader",

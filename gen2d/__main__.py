@@ -16,6 +16,7 @@ VERBS = {
     "info": "tell what a dataset holds",
     "list": "list scene families, looks and configs, with all options",
     "preview": "draw a contact sheet and an animation of a dataset or a config",
+    "export": "write a dataset as films, tar files, NumPy archives or in another program's layout",
 }
 
 GUIDE = """\
@@ -96,6 +97,8 @@ def _verb_parser(verb: str) -> Parser:
             "--level", choices=("quick", "full"), default="full", help="quick: sizes and index; full: every byte"
         )
         parser.add_argument("--json", action="store_true", help="print the problems as JSON")
+    if verb == "export":
+        _add_export(parser)
     if verb == "preview":
         parser.add_argument(
             "--out", type=Path, metavar="FOLDER", help="where to put the pictures (default: the current folder)"
@@ -107,6 +110,23 @@ def _verb_parser(verb: str) -> Parser:
             "--set", action="append", default=[], dest="sets", metavar="A.B=V", help="override an option of a config"
         )
     return parser
+
+
+def _add_export(parser: Parser) -> None:
+    from gen2d.exporting import formats
+
+    parser.add_argument("--to", required=True, metavar="FORMAT", help=f"one of {', '.join(formats())}")
+    parser.add_argument(
+        "--out", type=Path, metavar="PATH", help="what to make (default: DIR-FORMAT, beside the dataset)"
+    )
+    parser.add_argument("--split", metavar="NAME", help="which videos (default: the only split, or train)")
+    parser.add_argument(
+        "--fields",
+        nargs="+",
+        metavar="NAME",
+        help="names or patterns such as 'states/*' (npz, webdataset; default: all)",
+    )
+    parser.add_argument("--overwrite", action="store_true", help="replace an export of another dataset")
 
 
 def _worker(text: str) -> tuple[int, int]:
@@ -205,10 +225,30 @@ def preview(arguments: Sequence[str]) -> int:
     return 0
 
 
+def export(arguments: Sequence[str]) -> int:
+    """0, and what was made."""
+    options = _verb_parser("export").parse_args(arguments)
+    from gen2d.exporting import export as write
+    from gen2d.report import in_bytes, in_time
+
+    made = write(
+        options.dataset,
+        options.to,
+        options.out,
+        split=options.split,
+        fields=options.fields,
+        overwrite=options.overwrite,
+        say=lambda line: print(line, file=sys.stderr, flush=True),
+    )
+    loss = f"\n{options.to} is {made.loss}" if made.loss else ""
+    print(f"{made.videos:,} videos in {in_time(made.seconds)}, {in_bytes(made.bytes)}, in {made.out}{loss}")
+    return 0
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """The exit code: 0, 1 for damaged data or a full disk, 2 for what the user can mend, 130 when interrupted."""
     arguments = sys.argv[1:] if arguments is None else list(arguments)
-    verbs = {"verify": verify, "info": info, "list": listing, "preview": preview}
+    verbs = {"verify": verify, "info": info, "list": listing, "preview": preview, "export": export}
     verb = verbs.get(arguments[0]) if arguments else None
     try:
         if verb:

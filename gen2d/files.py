@@ -1,9 +1,11 @@
 """Files that appear whole or not at all: written under a temporary name, synced, renamed; their hashes and JSON."""
 
 import contextlib
+import glob
 import hashlib
 import json
 import os
+import shutil
 import socket
 from collections.abc import Iterator
 from pathlib import Path
@@ -26,6 +28,27 @@ def publishing(path: Path) -> Iterator[Path]:
     _sync(path.parent)
 
 
+@contextlib.contextmanager
+def publishing_folder(path: Path) -> Iterator[Path]:
+    """A temporary folder to write in; it appears as `path`, instead of what was there, when the block ends well."""
+    temporary = path.with_name(f"{path.name}.tmp.{_HOST}.{os.getpid()}")
+    replaced = path.with_name(f"{path.name}.old.tmp.{_HOST}.{os.getpid()}")
+    try:
+        temporary.mkdir()
+        yield temporary
+        os.sync()  # once: a file at a time, many small ones would take minutes
+        if path.exists():
+            path.rename(replaced)
+        temporary.rename(path)
+    except BaseException:  # also an interrupt
+        if replaced.exists() and not path.exists():
+            replaced.rename(path)
+        shutil.rmtree(temporary, ignore_errors=True)
+        raise
+    _sync(path.parent)
+    shutil.rmtree(replaced, ignore_errors=True)
+
+
 def publish(path: Path, content: bytes) -> None:
     """Returns when the disk has `content` as `path`, whole."""
     with publishing(path) as temporary:
@@ -35,9 +58,19 @@ def publish(path: Path, content: bytes) -> None:
 def sweep(root: Path) -> None:
     """Returns nothing; removes what dead processes of this host left behind. Of other hosts nothing is known."""
     for path in root.rglob(f"*.tmp.{_HOST}.*"):
-        process = path.name.rpartition(".")[2]
-        if process.isdigit() and not _is_alive(int(process)):
+        if _is_abandoned(path):
             path.unlink(missing_ok=True)
+
+
+def sweep_beside(path: Path) -> None:
+    """Returns nothing; removes what dead processes of this host left when they were to publish `path`."""
+    for left in path.parent.glob(f"{glob.escape(path.name)}.*tmp.{_HOST}.*"):
+        if not _is_abandoned(left):
+            continue
+        if left.is_dir():
+            shutil.rmtree(left, ignore_errors=True)
+        else:
+            left.unlink(missing_ok=True)
 
 
 def as_json(value: Any) -> bytes:
@@ -72,6 +105,12 @@ def _sync(path: Path) -> None:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
+
+
+def _is_abandoned(temporary: Path) -> bool:
+    """Whether the process that a temporary name tells of is dead."""
+    process = temporary.name.rpartition(".")[2]
+    return process.isdigit() and not _is_alive(int(process))
 
 
 def _is_alive(process: int) -> bool:

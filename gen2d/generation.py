@@ -5,23 +5,19 @@ import numbers
 import os
 import re
 import shlex
-import signal
-import sys
-import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
-from tqdm import tqdm
 
 from gen2d import devices, shards
 from gen2d.config import Config, checked_seed, load_config
 from gen2d.errors import ConfigError, FolderError, UserError
 from gen2d.pipeline import Encoder, Job, Writers, batches, jobs_of, threads_for
+from gen2d.progress import progress, stopping_on_sigterm
 from gen2d.report import in_bytes, in_time
 from gen2d.rollout import Batch, Rollout, divisor
 from gen2d.shards import Block, Dataset, Shard
@@ -133,11 +129,11 @@ def _make(rollout: Rollout, dataset: Dataset, todo: list[Shard], say: Callable[[
     encoder, writers = Encoder(rollout, dataset, threads_for(devices.cores())), Writers(dataset)
     work = batches(todo, rollout.lanes)
     size = 0
-    with _stopping_on_sigterm(say):  # also while it cleans up: then a second signal ends the process
+    with stopping_on_sigterm(say):  # also while it cleans up: then a second signal ends the process
         try:
             count = sum(shard.count for shard in todo)
             _prepare(rollout, encoder, work, count, say)
-            with _progress(count, say) as advance:
+            with progress(count, say) as advance:
                 for shard, block in encoder.blocks(work):
                     writers.put(shard, block)
                     size += block.nbytes
@@ -225,52 +221,6 @@ def _explained(error: Exception) -> Exception:
             "the device has too little memory for a batch: lower storage.lanes, or use --device cpu"
         )
     return error
-
-
-@contextmanager
-def _progress(count: int, say: Callable[[str], None]) -> Iterator[Callable[[int], None]]:
-    """A bar on a terminal; elsewhere a plain line every ten seconds. Yields what to call with each number of videos."""
-    if sys.stderr.isatty():
-        with tqdm(total=count, unit=" videos", smoothing=0.1, dynamic_ncols=True) as bar:
-
-            def moved(videos: int) -> None:
-                bar.update(videos)
-
-            yield moved
-        return
-    began = told = time.perf_counter()
-    done = 0
-
-    def advance(videos: int) -> None:
-        nonlocal done, told
-        done += videos
-        now = time.perf_counter()
-        if now - told >= 10 and done < count:
-            told, speed = now, done / (now - began)
-            say(f"{done:,} of {count:,} videos, {speed:,.0f} videos/s, {in_time((count - done) / speed)} left")
-
-    yield advance
-
-
-@contextmanager
-def _stopping_on_sigterm(say: Callable[[str], None]) -> Iterator[None]:
-    """Makes SIGTERM stop the run as Ctrl-C does; a second signal of either kind ends the process at once."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-
-    def stop(number: int, _: Any) -> None:
-        signal.signal(signal.SIGINT, signal.SIG_DFL)
-        signal.signal(signal.SIGTERM, signal.SIG_DFL)
-        say("Stopping; what is being compiled or written is finished or dropped first. A second signal does not wait.")
-        raise KeyboardInterrupt(number)
-
-    before = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 def command(arguments: Sequence[str]) -> str:

@@ -10,6 +10,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from gen2d import films
 from gen2d.errors import ConfigError
 from gen2d.preview import animate
 from gen2d.space import Body, Poses, Space, Video
@@ -116,22 +117,13 @@ def save(of: Video, path: str | Path, **options: Any) -> Path:
     if path.suffix == ".gif":
         animate(path, film[None], of.fps)
     else:
-        _film(path, film, of.fps)
+        films.mp4v(path, film, of.fps)
     return path
 
 
 def _write(path: Path, image: np.ndarray) -> None:
     if not cv2.imwrite(str(path), image[..., ::-1]):
         raise OSError(f"{path}: OpenCV could not write a picture")
-
-
-def _film(path: Path, film: np.ndarray, fps: float) -> None:
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), fps, film.shape[2:0:-1])
-    if not writer.isOpened():
-        raise OSError(f"{path}: OpenCV could not write a film")
-    for image in film:
-        writer.write(np.ascontiguousarray(image[..., ::-1]))
-    writer.release()
 
 
 def _placed(points: Any, position: np.ndarray, angle: float) -> np.ndarray:

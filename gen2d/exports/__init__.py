@@ -1,0 +1,102 @@
+"""Datasets in the formats of other programs: one file per format, found by its name.
+
+Each has `LOSS`, what is not kept ("" where all of it is), `FIELDS`, the patterns of the fields that it holds, `FIXED`,
+whether it can hold no others, `SUFFIX`, the ending of the one file that it makes ("" where it fills a folder), and
+
+    check(source)           raises ConfigError where this dataset cannot be held
+    write(target, source)   fills the folder, or the file
+
+A Source gives one video at a time, so that a dataset of any size is exported in little memory.
+"""
+
+import dataclasses
+import fnmatch
+import os
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+
+from gen2d import loader
+from gen2d.fields import Field
+from gen2d.formats import stored_bytes
+from gen2d.loader import Batch, Dataset
+
+FRAMES = Field("uint8", "n T H W 3", "sRGB", "the video")  # as they are where they are stored
+DRAWN_BYTES = 2**26  # frames that are not stored are drawn so many at a time
+
+
+@dataclasses.dataclass(frozen=True)
+class Source:
+    """The videos to export, in their order."""
+
+    ds: Dataset
+    draws: bool  # frames, which are not stored
+    advance: Callable[[int], None]  # told of each video that is done
+
+    def __len__(self) -> int:
+        return len(self.ds)
+
+    @property
+    def fields(self) -> dict[str, Field]:
+        """What each video has, by name."""
+        return ({"frames": FRAMES} if self.draws else {}) | self.ds.fields
+
+    @property
+    def fps(self) -> float:
+        """Frames per second."""
+        return self.ds.manifest["fps"]
+
+    @property
+    def frame_size(self) -> tuple[int, int]:
+        """Height and width, px."""
+        return self.ds.manifest["sizes"]["H"], self.ds.manifest["sizes"]["W"]
+
+    @property
+    def video_bytes(self) -> int:
+        """What one video takes before compression."""
+        return sum(stored_bytes(field, self.ds.manifest["sizes"]) for field in self.fields.values())
+
+    def key(self, number: int) -> str:
+        """A video's name in files: split and number, so that names sort as numbers do."""
+        return f"{self.ds.options.split}-{number:09d}"
+
+    def videos(self) -> Iterator[Batch]:
+        """The videos one by one, arrays by field."""
+        frames = self._drawn() if self.draws else iter(())
+        for number in range(len(self)):
+            drawn = {"frames": next(frames)} if self.draws else {}
+            yield drawn | self.ds[number]
+
+    def each(self, write: Callable[[str, Batch], None]) -> None:
+        """Returns nothing; calls `write(key, video)` for every video, several at once."""
+        threads = min(os.cpu_count() or 1, 8)
+        running: deque[Future[None]] = deque()
+        with ThreadPoolExecutor(threads) as pool:
+            for number, video in enumerate(self.videos()):
+                running.append(pool.submit(write, self.key(number), video))
+                if len(running) > threads:
+                    running.popleft().result()
+                    self.advance(1)
+            for left in running:
+                left.result()
+                self.advance(1)
+
+    def _drawn(self) -> Iterator[np.ndarray]:
+        """Frames of one video after the other, drawn several at a time, always as many: one program is compiled."""
+        from gen2d.redraw import render  # imports jax: only now
+
+        count = max(1, min(128, len(self), DRAWN_BYTES // stored_bytes(FRAMES, self.ds.manifest["sizes"])))
+        for first in range(0, len(self), count):
+            numbers = np.minimum(np.arange(first, first + count), len(self) - 1)
+            yield from np.asarray(render(self.ds, numbers))[: len(self) - first]
+
+
+def source_of(root: str | Path, split: str | None, patterns: Sequence[str]) -> Source:
+    """The videos of a dataset's split with these fields; frames are drawn where they are asked for but not stored."""
+    ds = loader.open(root, split, fields=())
+    draws = "frames" not in ds.manifest["fields"] and any(fnmatch.fnmatch("frames", p) for p in patterns)
+    stored = [pattern for pattern in patterns if pattern != "frames"] if draws else patterns
+    return Source(loader.open(root, ds.options.split, stored), draws, lambda videos: None)

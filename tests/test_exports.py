@@ -1,0 +1,450 @@
+"""What is exported, read back by programs that know nothing of gen2d, is what the dataset holds."""
+
+import io
+import json
+import subprocess
+import sys
+import tarfile
+from collections.abc import Iterator
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import av
+import cv2
+import h5py
+import numpy as np
+import pytest
+import synthetic
+import tiny
+from numpy.testing import assert_allclose, assert_array_equal
+
+import gen2d
+from gen2d import exporting, exports
+from gen2d.errors import ConfigError, FolderError, UserError
+from gen2d.fields import Field
+
+SIZES = {"T": 6, "H": 64, "W": 48, "K": 3}
+TRAIN = 10
+FILMS = {"mp4": ".mp4", "h264": ".mp4", "av1": ".mp4", "ffv1": ".mkv"}
+FOLDERS = [*FILMS, "npz", "webdataset"]
+
+
+@pytest.fixture(scope="module")
+def toy(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Discs with hard rims and random colours: as hard for a lossy codec as a small picture can be."""
+    made = synthetic.dataset(tmp_path_factory.mktemp("data") / "toy", train=TRAIN, sizes=SIZES)
+    return synthetic.make(made).root
+
+
+def decoded(path: Path) -> tuple[np.ndarray, Fraction]:
+    """Frames [T, H, W, 3] and frames/s of a film."""
+    with av.open(str(path)) as file:
+        stream = file.streams.video[0]
+        frames = [frame.to_ndarray(format="rgb24") for frame in file.decode(stream)]
+        assert stream.average_rate is not None
+        return np.stack(frames), stream.average_rate
+
+
+def noise_ratio(found: np.ndarray, expected: np.ndarray) -> float:
+    """How little they differ, PSNR in dB."""
+    return float(10 * np.log10(255**2 / max(np.mean((found.astype(float) - expected) ** 2), 1e-9)))
+
+
+def tree(root: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in root.iterdir()}
+
+
+# ---- Films
+
+
+@pytest.mark.parametrize("to", FILMS)
+def test_a_film_per_video_has_its_frames_at_its_rate(toy: Path, tmp_path: Path, to: str) -> None:
+    made = gen2d.export(toy, to, tmp_path / to)
+    films = sorted(path for path in made.out.iterdir() if path.name != "export.json")
+    assert [path.name for path in films] == [f"train-{number:09d}{FILMS[to]}" for number in range(TRAIN)]
+    assert made.videos == TRAIN
+    assert made.bytes == sum(path.stat().st_size for path in films)
+    for path, frames in zip(films, synthetic.stored(toy)["frames"], strict=True):
+        found, rate = decoded(path)
+        assert rate == 10
+        assert found.shape == frames.shape
+        if made.loss:
+            assert noise_ratio(found, frames) > 22
+        else:
+            assert_array_equal(found, frames)
+
+
+def test_what_opencv_reads_is_in_the_right_colours(toy: Path, tmp_path: Path) -> None:
+    for to in ("mp4", "h264", "ffv1"):
+        path = next(gen2d.export(toy, to, tmp_path / to).out.glob("train-000000003.*"))
+        film, frames = cv2.VideoCapture(str(path)), []
+        assert film.get(cv2.CAP_PROP_FPS) == 10
+        while (read := film.read())[0]:
+            frames.append(read[1][..., ::-1])
+        assert noise_ratio(np.stack(frames), synthetic.stored(toy)["frames"][3]) > 22
+
+
+@pytest.mark.parametrize("fps", [0.5, 12.5, 24000 / 1001, 29.97, 240.0])
+@pytest.mark.parametrize("to", FILMS)
+def test_the_rate_is_kept(tmp_path: Path, to: str, fps: float) -> None:
+    made = synthetic.make(synthetic.dataset(tmp_path / "toy", train=1, fps=fps, sizes=SIZES))
+    out = gen2d.export(made.root, to, tmp_path / "out").out
+    assert float(decoded(next(out.glob("train-*")))[1]) == pytest.approx(fps, rel=1e-4)
+
+
+# ---- Arrays
+
+
+def same(found: dict[str, np.ndarray], stored: dict[str, np.ndarray], number: int) -> None:
+    """Fails unless one video's fields are those stored, to the bit."""
+    tiny.same({name: value[None] for name, value in found.items()}, {n: v[number][None] for n, v in stored.items()})
+
+
+def test_an_archive_per_video_has_every_field_bit_by_bit(toy: Path, tmp_path: Path) -> None:
+    out, expected = gen2d.export(toy, "npz", tmp_path / "npz").out, synthetic.stored(toy)
+    for number in range(TRAIN):
+        with np.load(out / f"train-{number:09d}.npz") as archive:
+            found = dict(archive)
+        assert_array_equal(found.pop("time"), np.arange(5) / 10)
+        same(found, expected, number)
+
+
+def samples(folder: Path) -> Iterator[dict[str, bytes]]:
+    """The videos as WebDataset finds them: files in a row whose names agree up to the first dot."""
+    for path in sorted(folder.glob("*.tar")):
+        sample: dict[str, bytes] = {}
+        with tarfile.open(path) as tar:
+            for member in tar:
+                assert (member.mtime, member.uid, member.gid, member.uname) == (0, 0, 0, "")
+                key, _, ending = member.name.partition(".")
+                if sample and key != sample["__key__"].decode():
+                    yield sample
+                    sample = {}
+                file = tar.extractfile(member)
+                assert file is not None
+                assert ending not in sample
+                sample |= {"__key__": key.encode(), ending: file.read()}
+        yield sample
+
+
+def test_tar_files_have_every_field_bit_by_bit(toy: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("gen2d.exports.webdataset.TAR_VIDEOS", 4)
+    out, expected = gen2d.export(toy, "webdataset", tmp_path / "tars").out, synthetic.stored(toy)
+    assert sorted(path.name for path in out.glob("*.tar")) == [f"train-{number:06d}.tar" for number in range(3)]
+    found = list(samples(out))
+    assert [sample["__key__"].decode() for sample in found] == [f"train-{number:09d}" for number in range(TRAIN)]
+    for number, sample in enumerate(found):
+        about = json.loads(sample["json"])
+        assert (about["name"], about["split"], about["number"], about["fps"]) == ("toy", "train", number, 10)
+        assert about["fields"]["states/position"]["unit"] == "m"
+        arrays = {name: np.load(io.BytesIO(sample[f"{name.replace('/', '.')}.npy"])) for name in about["fields"]}
+        same(arrays, expected, number)
+        assert len(sample) == len(expected) + 2
+
+
+def test_fields_and_split_can_be_chosen(toy: Path, tmp_path: Path) -> None:
+    out = gen2d.export(toy, "npz", tmp_path / "npz", split="test", fields=("states/*",)).out
+    assert sorted(path.name for path in out.glob("*.npz")) == [f"test-{number:09d}.npz" for number in range(3)]
+    with np.load(out / "test-000000002.npz") as archive:
+        assert set(archive) == {"states/position", "states/angle", "time"}
+
+
+# ---- phyworld
+
+
+def arrays(path: Path) -> dict[str, np.ndarray]:
+    """Every dataset of an HDF5 file."""
+    found: dict[str, np.ndarray] = {}
+    with h5py.File(path) as file:
+        file.visititems(lambda name, of: found.update({name: of[()]}) if isinstance(of, h5py.Dataset) else None)
+    return found
+
+
+def centre(frame: np.ndarray) -> np.ndarray:
+    """The middle (x, y) of all balls' area in a frame, in tenths of its width from its lower left corner."""
+    cover = 255.0 - frame[..., 1]  # all balls have as little green
+    cover[cover < 40] = 0  # what the codec adds to the background
+    height, width = cover.shape
+    x, y = np.arange(width) + 0.5, height - np.arange(height) - 0.5
+    return np.array([(cover.sum(0) * x).sum(), (cover.sum(1) * y).sum()]) / cover.sum() * 10 / width
+
+
+@pytest.fixture(scope="module", params=[1, 2])
+def balls(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """One ball with its frames stored, or two whose frames are yet to be drawn."""
+    colors = {1: [230, 20, 20], 2: [[20, 230], 20, 20]}[request.param]
+    config = tiny.changed(
+        video={"width": 96, "height": 64, "frames": 4},
+        scene={"balls": request.param, "radius": [0.7, 0.8], "color": colors},
+        look={"background": [255, 255, 255], "wall_width": 0},
+        storage={"frames": {1: "video", 2: "none"}[request.param]},
+    )
+    folder = tmp_path_factory.mktemp("balls") / "balls"
+    gen2d.generate(config, 6, folder, device="cpu")
+    return folder
+
+
+def test_phyworld_has_films_positions_and_what_was_drawn(
+    balls: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("gen2d.exports.phyworld.GROUP", 4)
+    found = arrays(gen2d.export(balls, "phyworld", tmp_path / "train.hdf5").out)
+    names = {"init_streams", "position_streams", "video_streams"}
+    assert found.keys() == {f"{name}/{group}" for name in names for group in ("00000", "00001")}
+    ds = gen2d.open(balls, fields="*")
+    count = int(ds[0]["factors/balls"])
+    for number in range(len(ds)):
+        group, row, video = f"{number // 4:05d}", number % 4, ds[number]
+        position, init = (found[f"{name}_streams/{group}"][row] for name in ("position", "init"))
+        assert position.dtype == init.dtype == np.float64
+        assert position.shape == ((4, 2) if count == 1 else (4, 2, 2))
+        metre = video["camera/scale"][0] * 10 / 96
+        radius, speed = video["objects/radius"][:count], np.hypot(*video["states/velocity"][0, :count].T)
+        assert_allclose(init, np.concatenate([radius, speed]) * metre, rtol=1e-6)
+        moved = np.diff(position.reshape(4, count, 2), axis=0)
+        assert_allclose(moved, np.diff(video["states/position"][:, :count], axis=0) * metre, atol=1e-5)
+        (tmp_path / "film.mp4").write_bytes(found[f"video_streams/{group}"][row].tobytes())
+        frames, rate = decoded(tmp_path / "film.mp4")
+        assert (rate, frames.shape) == (20, (4, 64, 96, 3))
+        middle = np.average(position.reshape(4, count, 2), axis=1, weights=radius**2)
+        assert_allclose([centre(frame) for frame in frames], middle, atol=0.1)
+
+
+def two_balls(folder: Path, monkeypatch: pytest.MonkeyPatch, **changes: Any) -> Path:
+    """Three videos of two balls, a wall and an empty slot; in video 1 some fields are changed."""
+    position = np.array([[[3, 2], [1, 0], [9, 9], [0, 0]], [[4, 2.5], [3, 4], [9, 9], [0, 0]]], np.float32)
+    values = {
+        "frames": np.full((2, 64, 48, 3), 200),
+        "states/position": position,
+        "states/velocity": position * 0 + np.array([3, 4]),
+        "objects/present": np.array([True, True, True, False]),
+        "objects/kind": np.array([0, 0, 1, 0]),
+        "objects/shape": np.array([0, 0, 1, 0]),
+        "objects/radius": np.array([0.5, 0.25, 0, 0]),
+        "camera/center": np.full((2, 2), [3, 2]),
+        "camera/scale": np.full(2, 12),
+        "camera/angle": np.zeros(2),
+    }
+    fields = {
+        name: Field(dtype, axes, "", "")
+        for dtype, axes, *names in [
+            ("uint8", "n T H W 3", "frames"),
+            ("float32", "n T K 2", "states/position", "states/velocity"),
+            ("bool", "n K", "objects/present"),
+            ("uint8", "n K", "objects/kind", "objects/shape"),
+            ("float32", "n K", "objects/radius"),
+            ("float32", "n T 2", "camera/center"),
+            ("float32", "n T", "camera/scale", "camera/angle"),
+        ]
+        for name in names
+    }
+    monkeypatch.setattr(synthetic, "video", lambda made, split, number: values | (changes if number == 1 else {}))
+    sizes = {"T": 2, "H": 64, "W": 48, "K": 4}
+    return synthetic.make(synthetic.dataset(folder, 3, fields=fields, sizes=sizes, constants={})).root
+
+
+def test_phyworld_s_frame_is_ten_units_wide(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    root = two_balls(tmp_path / "balls", monkeypatch)
+    found = arrays(gen2d.export(root, "phyworld", tmp_path / "out.hdf5").out)
+    # 48 px are 4 m and 10 units, 64 px above each other are 13.3 units.
+    half = np.array([5, 20 / 3])
+    expected = [[half, half - 5], [half + np.array([2.5, 1.25]), half + np.array([0, 5])]]
+    assert_allclose(found["position_streams/00000"], np.array([expected] * 3), rtol=1e-12)
+    assert_allclose(found["init_streams/00000"], [[1.25, 0.625, 12.5, 12.5]] * 3, rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("changes", "told"),
+    [
+        ({"objects/kind": np.zeros(4)}, "something else than a ball moves in it"),
+        ({"objects/present": np.ones(4)}, "the number of balls that move in it is 3, but must be 2"),
+        ({"objects/present": np.array([1, 0, 1, 0])}, "the number of balls that move in it is 1, but must be 2"),
+        ({"camera/angle": np.full(2, 0.1)}, "its camera moves or is turned, but must stand still and upright"),
+        ({"camera/center": np.eye(2)}, "its camera moves or is turned, but must stand still and upright"),
+    ],
+)
+def test_phyworld_refuses_what_its_layout_cannot_hold(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, changes: dict[str, np.ndarray], told: str
+) -> None:
+    root = two_balls(tmp_path / "balls", monkeypatch, **changes)
+    with pytest.raises(ConfigError) as caught:
+        gen2d.export(root, "phyworld", tmp_path / "out.hdf5")
+    assert str(caught.value) == f"phyworld cannot hold train video 1 of {root}: {told}"
+    assert [path.name for path in tmp_path.iterdir()] == ["balls"]
+
+
+def test_frames_that_are_not_stored_are_drawn(balls: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    ds = gen2d.open(balls)
+    if "frames" in ds.manifest["fields"]:
+        return  # the case of one ball
+    monkeypatch.setattr("gen2d.exports.DRAWN_BYTES", 4 * 4 * 64 * 96 * 3)  # four videos at a time: the last are two
+    out, expected = gen2d.export(balls, "npz", tmp_path / "npz").out, np.asarray(gen2d.render(ds, range(6)))
+    for number in range(6):
+        with np.load(out / f"train-{number:09d}.npz") as archive:
+            assert_array_equal(archive["frames"], expected[number])
+
+
+# ---- Whole or not at all
+
+
+@pytest.mark.parametrize("to", FOLDERS)
+def test_equal_datasets_give_equal_bytes(toy: Path, tmp_path: Path, to: str) -> None:
+    first, again = (tree(gen2d.export(toy, to, tmp_path / name).out) for name in ("first", "again"))
+    assert first == again
+
+
+KILLED = """
+import os, signal, sys
+from gen2d import exporting, exports
+videos = exports.Source.videos
+def few(source):
+    for number, video in enumerate(videos(source)):
+        if number == 7:
+            os.kill(os.getpid(), int(sys.argv[4]))
+        yield video
+exports.Source.videos = few
+exporting.export(*sys.argv[1:4])
+"""
+
+
+@pytest.mark.parametrize("number", [9, 15], ids=["killed", "terminated"])
+@pytest.mark.parametrize("to", ["npz", "webdataset"])
+def test_a_killed_export_leaves_nothing_under_its_name(toy: Path, tmp_path: Path, to: str, number: int) -> None:
+    out = tmp_path / "out"
+    words = [sys.executable, "-c", KILLED, str(toy), to, str(out), str(number)]
+    assert subprocess.run(words, check=False, capture_output=True).returncode
+    assert not out.exists()
+    assert len(list(tmp_path.iterdir())) == (number == 9)  # what nothing could tidy up, the next export does
+    gen2d.export(toy, to, out)
+    assert list(tmp_path.iterdir()) == [out]
+
+
+def test_an_export_that_is_stopped_leaves_what_was_there(
+    toy: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before = tree(gen2d.export(toy, "npz", tmp_path / "out").out)
+
+    def stopped(source: exports.Source) -> Iterator[Any]:
+        yield source.ds[0]
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(exports.Source, "videos", stopped)
+    with pytest.raises(KeyboardInterrupt):
+        gen2d.export(toy, "npz", tmp_path / "out")
+    assert list(tmp_path.iterdir()) == [tmp_path / "out"]
+    assert tree(tmp_path / "out") == before
+
+
+def test_its_own_is_replaced_and_what_others_made_is_not(toy: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    out.mkdir()  # an empty folder is as good as none
+    gen2d.export(toy, "npz", out)
+    gen2d.export(toy, "npz", out, fields="index")
+    with pytest.raises(FolderError, match="another export: choose another --out, or --overwrite"):
+        gen2d.export(toy, "mp4", out)
+    gen2d.export(toy, "mp4", out, overwrite=True)
+    assert not list(out.glob("*.npz"))
+    (out / "mine.txt").write_text("keep me")
+    for overwrite in (False, True):
+        with pytest.raises(FolderError, match=r"holds mine\.txt, which no export made"):
+            gen2d.export(toy, "mp4", out, overwrite=overwrite)
+    assert (out / "mine.txt").read_text() == "keep me"
+    assert list(tmp_path.iterdir()) == [out]
+
+
+def test_a_file_is_replaced_only_when_asked(balls: Path, tmp_path: Path) -> None:
+    out = tmp_path / "train.hdf5"
+    out.write_text("mine")
+    with pytest.raises(FolderError, match="is there already"):
+        gen2d.export(balls, "phyworld", out)
+    assert out.read_text() == "mine"
+    gen2d.export(balls, "phyworld", out, overwrite=True)
+    assert h5py.is_hdf5(out)
+    with pytest.raises(FolderError, match="is a file, but npz makes a folder"):
+        gen2d.export(balls, "npz", out, overwrite=True)
+
+
+# ---- Bad input
+
+
+def test_every_format_keeps_the_contract() -> None:
+    for name in exporting.formats():
+        module = exporting._module(name)
+        assert (module.__doc__ or "").strip()
+        assert isinstance(module.LOSS, str)
+        assert isinstance(module.FIXED, bool)
+        assert all(callable(getattr(module, function)) for function in ("check", "write"))
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (["--to", "mp3"], "--to is 'mp3', but must be one of av1, ffv1, h264, mp4, npz, phyworld, webdataset"),
+        ([], "required: --to"),
+        (["--to", "npz", "--split", "tran"], "has no split 'tran': did you mean 'train'?"),
+        (
+            ["--to", "npz", "--fields", "state/position"],
+            "has no field 'state/position': did you mean 'states/position'",
+        ),
+        (["--to", "mp4", "--fields", "index"], "--fields is index, but mp4 has its own: choose npz or webdataset"),
+        (["--to", "npz", "--out", "file/child"], "cannot be written"),
+        (["--to", "phyworld"], "has no field 'states/velocity'"),
+    ],
+)
+def test_bad_input_gets_one_line_and_code_2(toy: Path, tmp_path: Path, words: list[str], told: str) -> None:
+    (tmp_path / "file").write_text("")
+    done = tiny.ran("export", toy, *words, cwd=tmp_path)
+    assert done.returncode == 2, done
+    assert told in done.stderr
+    assert len(done.stderr.splitlines()) == 1
+    assert not done.stdout
+
+
+def test_a_folder_that_is_no_dataset_is_told(tmp_path: Path) -> None:
+    done = tiny.ran("export", tmp_path, "--to", "npz")
+    assert (done.returncode, len(done.stderr.splitlines())) == (2, 1)
+    assert "is not a gen2d dataset" in done.stderr
+
+
+def test_the_command_says_what_it_made_and_what_was_lost(toy: Path, tmp_path: Path) -> None:
+    done = tiny.ran("export", toy, "--to", "mp4", "--out", tmp_path / "films")
+    assert done.returncode == 0, done.stderr
+    assert f"{TRAIN} videos in" in done.stdout
+    assert "mp4 is lossy" in done.stdout
+    exact = tiny.ran("export", toy, "--to", "npz", "--split", "test", "--fields", "index", "states/*", cwd=tmp_path)
+    assert "lossy" not in exact.stdout
+    assert (toy.parent / "toy-npz" / "test-000000002.npz").is_file()  # beside the dataset
+
+
+@pytest.mark.parametrize(
+    ("to", "changes", "told"),
+    [
+        ("mp4", {"sizes": SIZES | {"W": 47}}, "video.width is 47, but must be even for mp4"),
+        ("h264", {"sizes": SIZES | {"H": 63}}, "video.height is 63, but must be even for h264"),
+        ("av1", {"fps": 1000.0}, "video.fps is 1000, but must be from 0.1 to 240 for av1"),
+        ("ffv1", {"fps": 2000.0}, "video.fps is 2000, but must be from 0.1 to 1000 for ffv1"),
+        ("mp4", {"fps": 0.01}, "video.fps is 0.01, but must be from 0.1 to 65535 for mp4"),
+    ],
+)
+def test_what_a_format_cannot_hold_is_told_first(tmp_path: Path, to: str, changes: dict[str, Any], told: str) -> None:
+    made = synthetic.make(synthetic.dataset(tmp_path / "toy", train=1, **changes))
+    with pytest.raises(ConfigError) as caught:
+        gen2d.export(made.root, to, tmp_path / "out")
+    assert told in str(caught.value)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_missing_extra_is_named(toy: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "av", None)
+    for to in ("h264", "av1", "ffv1"):
+        with pytest.raises(UserError, match=r"pip install gen2d\[video\]"):
+            gen2d.export(toy, to, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_no_jax_is_imported_where_frames_are_stored(toy: Path, tmp_path: Path) -> None:
+    code = (
+        "import sys, gen2d\nfor to in sys.argv[2:]: gen2d.export(sys.argv[1], to, to)\nassert 'jax' not in sys.modules"
+    )
+    subprocess.run([sys.executable, "-c", code, str(toy), *FOLDERS], check=True, cwd=tmp_path)
