@@ -66,9 +66,9 @@ class Cache:
                     continue  # renamed by whoever had the lock before
                 try:
                     yield part
-                except BaseException:
-                    part.unlink(missing_ok=True)
-                    raise
+                finally:
+                    if _is_at(file.fileno(), part):  # not renamed; and nobody else may, as long as it is locked
+                        part.unlink()
                 return
 
     def _make_room(self, size: int) -> None:

@@ -206,8 +206,8 @@ def _asked(spans: list[Range]) -> list[bytes | OSError]:
     return [_checked(data, span) for data, span in zip(read, spans, strict=True)]
 
 
-def _checked(data: bytes | Exception, span: Range) -> bytes | OSError:
-    if isinstance(data, Exception):
+def _checked(data: bytes | BaseException, span: Range) -> bytes | OSError:
+    if isinstance(data, BaseException):
         return _told(data, span.url)
     if len(data) > span.end - span.start:
         return OSError(errno.EOPNOTSUPP, "the server does not give parts of files: say cache_dir=", str(span.url))
@@ -251,8 +251,11 @@ def _tried(url: Url, call: Callable[[Any, str], T]) -> T:
 _FINAL = (FileNotFoundError, PermissionError, IsADirectoryError, NotADirectoryError)
 
 
-def _told(error: Exception, url: Url) -> OSError:
+def _told(error: BaseException, url: Url) -> OSError:
     """The error as one that pathlib could raise."""
+    cause = error.__cause__
+    if isinstance(error, FileNotFoundError) and type(cause).__module__.startswith("aiohttp"):
+        error = cause or error  # fsspec calls a file missing also where no server answers
     if getattr(error, "status", None) in (401, 403) or "Credentials" in type(error).__name__:
         error = PermissionError()
     for kind in _FINAL:
@@ -279,7 +282,8 @@ def _made(start: str, process: int) -> Any:
         # What others write must be seen at once.
         return fsspec.core.url_to_fs(start, use_listings_cache=False)[0]
     except ImportError as error:
-        raise FolderError(f"{start} needs more packages ({error}): pip install 'gen2d[remote]'") from None
+        hint = ": pip install 'gen2d[remote]'" if start.startswith(("s3:", "http")) else ""
+        raise FolderError(f"{start} needs another package ({error}){hint}") from None
     except Exception as error:
         known = ", ".join(sorted(name for name in fsspec.available_protocols() if name in _COMMON))
         told = " ".join(str(error).split())

@@ -168,7 +168,7 @@ def _unreached(root: Url, error: OSError) -> FolderError:
 def write(dataset: Dataset, shard: Shard, blocks: Iterable[Block]) -> dict[str, Any]:
     """The record of the shard that `blocks` became; afterwards it is done, whatever happens to the machine.
 
-    Raises FolderError when the disk is full, or a server keeps failing. Whatever is raised, here or by `blocks`, nothing
+    Raises FolderError when the disk is full or a server keeps failing. Whatever is raised, here or by `blocks`, nothing
     half-written stays.
     """
     seen = _Seen()

@@ -60,19 +60,21 @@ class Server(ThreadingHTTPServer):
 
 
 class _Handler(BaseHTTPRequestHandler):
-    server: Server
     protocol_version = "HTTP/1.1"
 
     def answer(self) -> None:
+        proxy = self.server
+        assert isinstance(proxy, Server)
         asked = Request(self.command, self.path, self.headers.get("Range", ""))
-        self.server.asked.append(asked)
+        proxy.asked.append(asked)
         content = self._content()
-        fault = self.server.fault(asked)
+        fault = proxy.fault(asked)
         if fault in ("fail", "deny"):
             return self._send(503 if fault == "fail" else 403, [], b"", cut=False)
         if asked.path.startswith("/files/"):
-            return self._send_file(self.server.folder / asked.path.removeprefix("/files/"), asked.range)
-        back = http.client.HTTPConnection("127.0.0.1", self.server.behind, timeout=30)
+            path = proxy.folder / asked.path.removeprefix("/files/")
+            return self._send_file(path, asked.range if proxy.gives_parts else "")
+        back = http.client.HTTPConnection("127.0.0.1", proxy.behind, timeout=30)
         headers = {key: value for key, value in self.headers.items() if key.lower() != "transfer-encoding"}
         back.request(self.command, self.path, content, headers)
         reply = back.getresponse()
@@ -95,7 +97,7 @@ class _Handler(BaseHTTPRequestHandler):
         if not path.is_file():
             return self._send(404, [], b"", cut=False)
         content = path.read_bytes()
-        if not part or not self.server.gives_parts:
+        if not part:
             return self._send(200, [("Content-Length", str(len(content)))], content, cut=False)
         first, last = map(int, part.removeprefix("bytes=").split("-"))
         self._send(206, [], content[first : last + 1], cut=False)
@@ -105,14 +107,14 @@ class _Handler(BaseHTTPRequestHandler):
         for key, value in headers:
             if key.lower() not in ("connection", "transfer-encoding", "content-length"):
                 self.send_header(key, value)
-        length = dict((key.lower(), value) for key, value in headers).get("content-length", str(len(content)))
+        length = {key.lower(): value for key, value in headers}.get("content-length", str(len(content)))
         self.send_header("Content-Length", length if self.command == "HEAD" else str(len(content)))
         self.end_headers()
         self.wfile.write(content[: len(content) // 2] if cut else content)
         if cut:
             self.close_connection = True
 
-    def log_message(self, *_: object) -> None:
+    def log_message(self, format: str, *args: object) -> None:
         """Says nothing."""
 
 
@@ -138,6 +140,7 @@ def environment(server: Server) -> dict[str, str]:
     """The variables that lead S3 clients to the server, and nowhere else."""
     names = {"ACCESS_KEY_ID": "some", "SECRET_ACCESS_KEY": "one", "DEFAULT_REGION": "us-east-1"}
     names |= {"ENDPOINT_URL": server.address, "EC2_METADATA_DISABLED": "true"}
+    names |= {"MAX_ATTEMPTS": "1"}  # trying again is for gen2d
     names |= {"CONFIG_FILE": os.devnull, "SHARED_CREDENTIALS_FILE": os.devnull}
     return {f"AWS_{name}": value for name, value in names.items()}
 
@@ -163,7 +166,7 @@ def tree(url: str) -> dict[str, bytes]:
 
     system = s3fs.S3FileSystem(use_listings_cache=False)
     found = {name.removeprefix(url.removeprefix("s3://") + "/"): name for name in system.find(url)}
-    return {name: system.cat_file(path) for name, path in found.items() if not name.startswith(".gen2d")}
+    return {name: bytes(system.cat_file(path)) for name, path in found.items() if not name.startswith(".gen2d")}
 
 
 def copied(root: Path, url: str) -> None:

@@ -23,12 +23,12 @@ AXES = {"THWC": (0, 1, 2, 3, 4), "TCHW": (0, 1, 4, 2, 3), "CTHW": (0, 4, 1, 2, 3
 @pytest.fixture(scope="module", params=["gzip", "zstd", "none"])
 def root(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("data") / request.param
-    return synthetic.make(synthetic.dataset(folder, codec=request.param)).root
+    return synthetic.folder(synthetic.make(synthetic.dataset(folder, codec=request.param)))
 
 
 @pytest.fixture(scope="module")
 def toy(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return synthetic.make(synthetic.dataset(tmp_path_factory.mktemp("data") / "toy")).root
+    return synthetic.folder(synthetic.make(synthetic.dataset(tmp_path_factory.mktemp("data") / "toy")))
 
 
 def same(found: dict[str, np.ndarray], expected: dict[str, np.ndarray]) -> None:
