@@ -13,7 +13,7 @@ from gen2d.fields import Field
 from gen2d.files import as_json, file_sha256, parsed, publishing, sha256
 from gen2d.formats import MOMENTS_OF, image_names, merged, row_names
 from gen2d.plan import MARK, SCHEMA, Dataset, Shard, table_path
-from gen2d.remote import Place
+from gen2d.remote import Place, reading
 
 Record = Mapping[str, Any]  # of a shard that is done, as shards.py writes it
 Tables = dict[str, np.ndarray]
@@ -28,7 +28,9 @@ def read_manifest(root: Place) -> dict[str, Any]:
     try:
         content = path.read_bytes()
     except (FileNotFoundError, NotADirectoryError, IsADirectoryError):
-        if not (root / MARK).is_dir():
+        with reading(root):
+            begun = (root / MARK).is_dir()
+        if not begun:
             raise FolderError(f"{root} is not a gen2d dataset: it has no manifest.json") from None
         told = "run the command that made it again, and it goes on where it stopped"
         raise FolderError(f"{root} is incomplete: {told}") from None

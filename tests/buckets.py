@@ -16,6 +16,8 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import NamedTuple
 
+import s3fs
+
 BUCKET = "bucket"
 
 
@@ -162,15 +164,12 @@ def _make_bucket(port: int) -> None:
 
 def tree(url: str) -> dict[str, bytes]:
     """Every published object below the URL and its bytes."""
-    import s3fs
-
     system = s3fs.S3FileSystem(use_listings_cache=False)
     found = {name.removeprefix(url.removeprefix("s3://") + "/"): name for name in system.find(url)}
-    return {name: bytes(system.cat_file(path)) for name, path in found.items() if not name.startswith(".gen2d")}
+    content = {name: system.cat_file(path) for name, path in found.items() if not name.startswith(".gen2d")}
+    return {name: data for name, data in content.items() if isinstance(data, bytes)}
 
 
 def copied(root: Path, url: str) -> None:
     """Returns when the dataset in the folder is at the URL too."""
-    import s3fs
-
     s3fs.S3FileSystem().put(str(root), url, recursive=True)

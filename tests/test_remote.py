@@ -1,5 +1,6 @@
 """A dataset at a URL is read and written as one in a folder is, also over a network that fails now and then."""
 
+import errno
 import json
 import multiprocessing
 import pickle
@@ -7,6 +8,7 @@ import re
 import signal
 import subprocess
 import sys
+import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -25,6 +27,7 @@ from gen2d import loader, remote, shards
 from gen2d.dataloader import DataLoader
 from gen2d.errors import ConfigError, DamagedError, FolderError, UserError
 from gen2d.files import sweep
+from gen2d.formats import hdf5
 from gen2d.remote import Range, Url, place
 
 TOY = "s3://bucket/toy"
@@ -94,7 +97,8 @@ def test_what_is_read_is_what_is_in_the_folder(
             (tmp_path / "one").write_bytes(content)
             remote.upload(tmp_path / "one", Url(f"{urls[kind]}/{name}"))
     cache = tmp_path / "cache" if cached else None
-    for options in ({"fields": "*"}, {"window": 2, "stride": 2, "start": 1, "layout": "TCHW", "dtype": "float32"}):
+    windows: dict[str, Any] = {"window": 2, "stride": 2, "start": 1, "layout": "TCHW", "dtype": "float32"}
+    for options in ({"fields": "*"}, windows):
         found, expected = gen2d.open(urls[kind], cache_dir=cache, **options), gen2d.open(toy, **options)
         same(found[:], expected[:])
         same(found[[7, 0, 19, 7]], expected[[7, 0, 19, 7]])
@@ -480,6 +484,19 @@ def test_no_permission_is_told(server: Server, toy: Path, method: str) -> None:
             server.fault = always("deny", method, "manifest.json" if call is gen2d.open else "/index/")
             with pytest.raises(FolderError, match=rf"^{TOY}/.* cannot be read \(Permission denied\)$"):
                 call(TOY)
+
+
+def test_a_full_disk_is_that_of_temporary_files(monkeypatch: pytest.MonkeyPatch) -> None:
+    made = at("s3://bucket/full")
+    shard = shards.open_folder(made)[0]
+
+    def write(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(hdf5, "write", write)
+    with pytest.raises(FolderError, match=rf"^no space left for {tempfile.gettempdir()}: ") as caught:
+        shards.write(made, shard, synthetic.blocks(made, shard))
+    assert caught.value.exit_code == 1
 
 
 # ---- The command line
