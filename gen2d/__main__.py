@@ -10,6 +10,7 @@ from typing import Any, NoReturn
 
 from gen2d import __version__
 from gen2d.errors import DamagedError, UserError
+from gen2d.remote import place, reading
 
 VERBS = {
     "verify": "check a dataset against its checksums",
@@ -60,7 +61,7 @@ def generating() -> Parser:
         "--config", required=True, metavar="YAML", help="a file, or the name of one that comes with gen2d"
     )
     parser.add_argument("--n", required=True, type=int, metavar="N", help="how many videos the dataset is to hold")
-    parser.add_argument("--out", type=Path, metavar="DIR", help="where (default: datasets/NAME in the current folder)")
+    parser.add_argument("--out", metavar="DIR", help="a folder or URL (default: datasets/NAME in the current folder)")
     parser.add_argument("--seed", type=int, metavar="S", help="0 to 2**63 - 1 (default: the config's, else 0)")
     parser.add_argument("--split", default="train", metavar="NAME", help="the split that the videos belong to (train)")
     parser.add_argument(
@@ -90,7 +91,7 @@ def _verb_parser(verb: str) -> Parser:
     if verb == "list":
         parser.add_argument("name", nargs="?", help="a family, look or config: only this one")
         return parser
-    help_text = "a dataset's folder" + (", or a config" if verb == "preview" else "")
+    help_text = "a dataset's folder or URL" + (", or a config" if verb == "preview" else "")
     parser.add_argument("dataset", metavar="DIR" + ("|CONFIG" if verb == "preview" else ""), help=help_text)
     if verb == "verify":
         parser.add_argument(
@@ -179,9 +180,10 @@ def verify(arguments: Sequence[str]) -> int:
     options = _verb_parser("verify").parse_args(arguments)
     from gen2d.verification import verify as check
 
-    root = Path(options.dataset)
-    if not (root / "manifest.json").exists() and not (root / ".gen2d").is_dir():
-        raise UserError(f"{root} is not a dataset that gen2d made")
+    root = place(options.dataset)
+    with reading(root):
+        if not (root / "manifest.json").exists() and not (root / ".gen2d").is_dir():
+            raise UserError(f"{root} is not a dataset that gen2d made")
     problems = check(root, options.level)
     if options.json:
         print(json.dumps({"dataset": options.dataset, "level": options.level, "problems": problems}))
@@ -195,7 +197,7 @@ def info(arguments: Sequence[str]) -> int:
     options = _verb_parser("info").parse_args(arguments)
     from gen2d.report import sheet
 
-    print(sheet(Path(options.dataset)))
+    print(sheet(place(options.dataset)))
     return 0
 
 

@@ -1,4 +1,7 @@
-"""Files that appear whole or not at all: written under a temporary name, synced, renamed; their hashes and JSON."""
+"""Files that appear whole or not at all: written under a temporary name, synced, renamed; their hashes and JSON.
+
+Those of a Url are written in the folder for temporary files, and uploaded.
+"""
 
 import contextlib
 import glob
@@ -7,17 +10,27 @@ import json
 import os
 import shutil
 import socket
+import stat
+import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+
+from gen2d.remote import Place, Url, upload
 
 _HOST = socket.gethostname()
 
 
 @contextlib.contextmanager
-def publishing(path: Path) -> Iterator[Path]:
+def publishing(path: Place) -> Iterator[Path]:
     """A temporary name to write under; the file appears as `path` when the block ends well, and never otherwise."""
-    temporary = path.with_name(f"{path.name}.tmp.{_HOST}.{os.getpid()}")
+    with _uploading(path) if isinstance(path, Url) else _renaming(path) as temporary:
+        yield temporary
+
+
+@contextlib.contextmanager
+def _renaming(path: Path) -> Iterator[Path]:
+    temporary = path.with_name(f"{path.name}{_mark()}")
     try:
         yield temporary
         _sync(temporary)
@@ -49,16 +62,39 @@ def publishing_folder(path: Path) -> Iterator[Path]:
     shutil.rmtree(replaced, ignore_errors=True)
 
 
-def publish(path: Path, content: bytes) -> None:
-    """Returns when the disk has `content` as `path`, whole."""
+@contextlib.contextmanager
+def _uploading(url: Url) -> Iterator[Path]:
+    with tempfile.TemporaryDirectory(prefix="gen2d-", suffix=_mark()) as folder:
+        yield Path(folder) / url.name
+        upload(Path(folder) / url.name, url)
+
+
+def _mark() -> str:
+    """The end of the name of what is temporary."""
+    return f".tmp.{_HOST}.{os.getpid()}"
+
+
+def publish(path: Place, content: bytes) -> None:
+    """Returns when the disk, or the server, has `content` as `path`, whole."""
     with publishing(path) as temporary:
         temporary.write_bytes(content)
 
 
-def sweep(root: Path) -> None:
+def work_folder(root: Place) -> Path:
+    """The folder on disk in which what goes to `root` is written first."""
+    return Path(tempfile.gettempdir()) if isinstance(root, Url) else root
+
+
+def sweep(root: Place) -> None:
     """Returns nothing; removes what dead processes of this host left behind. Of other hosts nothing is known."""
-    for path in root.rglob(f"*.tmp.{_HOST}.*"):
-        if _is_abandoned(path):
+    pattern = f"*.tmp.{_HOST}.*"
+    left = work_folder(root).glob(f"gen2d-{pattern}") if isinstance(root, Url) else root.rglob(pattern)
+    for path in left:
+        if not _is_abandoned(path):
+            continue
+        if isinstance(root, Url):
+            shutil.rmtree(path, ignore_errors=True)
+        else:
             path.unlink(missing_ok=True)
 
 
@@ -73,16 +109,46 @@ def sweep_beside(path: Path) -> None:
             left.unlink(missing_ok=True)
 
 
+def remove_tree(folder: Place) -> None:
+    """Returns nothing; the folder and all in it are gone."""
+    if isinstance(folder, Path):
+        shutil.rmtree(folder, ignore_errors=True)
+        return
+    for path in folder.rglob("*"):
+        path.unlink(missing_ok=True)
+
+
+def size_of(path: Place) -> int | None:
+    """The size of the file in bytes; None if there is none."""
+    try:
+        about = path.stat()
+    except (FileNotFoundError, NotADirectoryError):
+        return None
+    return about.st_size if stat.S_ISREG(about.st_mode) else None
+
+
 def as_json(value: Any) -> bytes:
     """The one way JSON is written here, so that equal values have equal bytes."""
     return json.dumps(value, sort_keys=True, indent=1, ensure_ascii=False).encode()
 
 
-def read_json(path: Path) -> dict[str, Any] | None:
-    """The JSON object in the file; None if there is none."""
+def read_json(path: Place) -> dict[str, Any] | None:
+    """The JSON object in the file; None if there is none. Raises OSError if that cannot be known of a Url."""
     try:
-        value = json.loads(path.read_bytes())
-    except (OSError, ValueError):
+        return parsed(path.read_bytes())
+    except FileNotFoundError:
+        return None
+    except OSError:
+        if isinstance(path, Url):
+            raise
+        return None
+
+
+def parsed(content: bytes) -> dict[str, Any] | None:
+    """The JSON object that these bytes are; None if they are none."""
+    try:
+        value = json.loads(content)
+    except ValueError:
         return None
     return value if isinstance(value, dict) else None
 
@@ -92,8 +158,10 @@ def sha256(content: bytes) -> str:
     return hashlib.sha256(content).hexdigest()
 
 
-def file_sha256(path: Path) -> str:
-    """The file's sha256, read piece by piece."""
+def file_sha256(path: Place) -> str:
+    """The file's sha256, read piece by piece from a disk."""
+    if isinstance(path, Url):
+        return sha256(path.read_bytes())
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 

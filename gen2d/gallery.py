@@ -16,7 +16,7 @@ from gen2d.config import load_config
 from gen2d.generation import generate
 from gen2d.loader import Dataset
 from gen2d.loader import open as open_dataset
-from gen2d.preview import GAP, check_folder, check_videos, contact_sheet, enlarged, shown, write, writing
+from gen2d.preview import GAP, check_folder, check_videos, contact_sheet, enlarged, is_dataset, shown, write, writing
 from gen2d.redraw import config_of, render
 
 LABEL = 110  # px, of the strip with a row's name
@@ -30,7 +30,7 @@ def gallery(source: str, out: Path, videos: int = 1, *, seed: int | None = None,
     `videos` of it. The config's own look has its options, the others their defaults."""
     check_videos(videos)
     check_folder(out)
-    if Path(source).is_dir():
+    if is_dataset(source):
         ds = open_dataset(source)
         looks = _looks(config_of(ds, sets).plain()["look"])
         picture, name = _sheet(ds, videos, looks, sets), ds.manifest["name"]

@@ -18,6 +18,7 @@ from gen2d.config import Config, checked_seed, load_config
 from gen2d.errors import ConfigError, FolderError, UserError
 from gen2d.pipeline import Encoder, Job, Writers, batches, jobs_of, threads_for
 from gen2d.progress import progress, stopping_on_sigterm
+from gen2d.remote import Place, place
 from gen2d.report import in_bytes, in_time
 from gen2d.rollout import Batch, Rollout, divisor
 from gen2d.shards import Block, Dataset, Shard
@@ -33,7 +34,7 @@ CONVENTIONS = (
 class Summary:
     """What a run did."""
 
-    out: Path
+    out: Place
     made: int  # videos
     total: int  # videos in the folder's plan
     seconds: float
@@ -52,7 +53,7 @@ class DeviceMemoryError(UserError):
 def generate(
     config: Config | Mapping | str | Path,
     n: int,
-    out: str | Path | None = None,
+    out: str | Place | None = None,
     *,
     seed: int | None = None,
     split: str = "train",
@@ -66,7 +67,8 @@ def generate(
 
     `config` is a file's name or path, a mapping or a Config; `sets` overrides single options ('physics.substeps=8').
     Video i depends on the config, the seed, the split and i alone, so a run may be stopped and repeated, extended to a
-    larger `n`, or shared by workers (`worker=(r, W)`: this one is number r of W). `out` is datasets/NAME by default.
+    larger `n`, or shared by workers (`worker=(r, W)`: this one is number r of W). `out` is datasets/NAME by default,
+    and may be a URL that fsspec can write to.
     `say` takes lines for a person. Raises ConfigError, FolderError or DeviceError (all UserError) with one sentence.
     """
     say = say or (lambda line: None)
@@ -74,7 +76,7 @@ def generate(
     if seed is not None:
         config = dataclasses.replace(config, seed=checked_seed(seed))
     n = _check_run(n, split, worker)
-    out = Path(out) if out is not None else Path("datasets") / config.name
+    out = place(out) if out is not None else Path("datasets") / config.name
     rollout = Rollout(config, devices.prepare(device))
     dataset = dataset_of(rollout, out, {split: n})
     remaining = [shard for shard in shards.open_folder(dataset, overwrite) if shard.split == split]
@@ -101,7 +103,7 @@ def _check_run(n: Any, split: str, worker: tuple[int, int]) -> int:
     return int(n)
 
 
-def dataset_of(rollout: Rollout, out: Path, counts: Mapping[str, int]) -> Dataset:
+def dataset_of(rollout: Rollout, out: Place, counts: Mapping[str, int]) -> Dataset:
     """What the folder `out` is to hold."""
     config = rollout.config
     return Dataset(

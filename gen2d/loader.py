@@ -1,27 +1,32 @@
 """Videos by number: what `open` gives of a complete dataset, one by one or as batches.
 
 Pieces are read by offset straight from the shards, without h5py and its one lock per process, and decoded where they
-are wanted. Neither jax nor h5py is imported, and no open file outlives a fork, so fork and spawn are both safe.
+are wanted. Neither jax nor h5py is imported, and no open file outlives a fork, so fork and spawn are both safe. Of a
+remote dataset the pieces of all videos wanted at once are asked for at once, or whole shards are kept in a cache.
 """
 
+import contextlib
 import dataclasses
 import difflib
 import fnmatch
 import functools
+import io
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from gen2d import codecs
-from gen2d.errors import ConfigError, DamagedError
+from gen2d.cache import Cache
+from gen2d.errors import ConfigError, DamagedError, FolderError
 from gen2d.fields import Field
-from gen2d.files import file_sha256
+from gen2d.files import file_sha256, sha256
 from gen2d.formats import stored_bytes
 from gen2d.manifest import field_of, read_manifest
 from gen2d.plan import shard_path
+from gen2d.remote import Place, Range, Url, place, read_ranges
 
 Batch = dict[str, np.ndarray]
 Numbers = Sequence[int] | np.ndarray
@@ -30,7 +35,7 @@ LAYOUTS = {"THWC": (0, 1, 2, 3), "TCHW": (0, 3, 1, 2), "CTHW": (3, 0, 1, 2)}
 
 
 def open(
-    path: str | Path,
+    path: str | Place,
     split: str | None = None,
     fields: Sequence[str] | None = None,
     window: int | None = None,
@@ -39,6 +44,8 @@ def open(
     layout: str = "THWC",
     dtype: str = "uint8",
     verify: str = "checksum",
+    cache_dir: str | Path | None = None,
+    cache_bytes: int | None = None,
 ) -> "Dataset":
     """The videos of one split of a complete dataset.
 
@@ -48,15 +55,19 @@ def open(
     the first. `layout` is of images with channels, `dtype`
     of frames ("float32" is 0 to 1). With verify="checksum" nothing damaged is ever returned.
 
+    `path` is a folder or a URL that fsspec knows. Of a URL `cache_dir` keeps whole shards in a folder, `cache_bytes` at
+    most besides those on their way, the ones used longest ago going first; several processes and datasets may share it.
+
     Raises FolderError, ConfigError, and DamagedError, then and whenever videos are read.
     """
-    root = Path(path)
+    root = place(path)
     manifest = read_manifest(root)
     split = _chosen_split(root, manifest, split)
     described = {name: field_of(about) for name, about in manifest["fields"].items()}
     names = chosen_fields(f"{root}", described, fields)
-    options = Options(split, names, window, stride, start, layout, dtype, verify)
+    options = Options(split, names, window, stride, start, layout, dtype, verify, cache_dir, cache_bytes)
     options.check(manifest["sizes"].get("T", 0))
+    _check_cache(options, max(shard["bytes"] for shard in manifest["shards"]))
     return Dataset(root, manifest, options)
 
 
@@ -72,6 +83,8 @@ class Options:
     layout: str
     dtype: str
     verify: str
+    cache_dir: str | Path | None = None
+    cache_bytes: int | None = None
 
     @property
     def first(self) -> int:
@@ -108,11 +121,14 @@ class Options:
 class Dataset:
     """Videos by number, as dictionaries of NumPy arrays; also a map-style dataset for torch and grain."""
 
-    def __init__(self, root: Path, manifest: Mapping[str, Any], options: Options) -> None:
+    def __init__(self, root: Place, manifest: Mapping[str, Any], options: Options) -> None:
         self.root, self.manifest, self.options = root, manifest, options
         self.fields = {name: field_of(manifest["fields"][name]) for name in options.fields}
         self.stats = {name: values for name, values in manifest["stats"][options.split].items() if name in self.fields}
         self._columns = [_Column(name, field, manifest, options) for name, field in self.fields.items()]
+        self._cache = None
+        if isinstance(root, Url) and options.cache_dir is not None:
+            self._cache = Cache(Path(options.cache_dir), options.cache_bytes)
         self._count = manifest["splits"][options.split]
         sizes = {split: count for split, count in sorted(manifest["splits"].items()) if split < options.split}
         self._base = sum(sizes.values())  # the index holds one split after the other
@@ -171,36 +187,76 @@ class Dataset:
         if first.shape != numbers.shape or ((first < 0) | (first > last)).any():
             raise ConfigError(f"starts must be a frame from 0 to {last} for each video, but are {first.tolist()}")
         videos = self._videos[self._base + numbers]
-        for column in self._columns:
+        begins = first.tolist()
+        places = [self._places(column, numbers, videos, begins) for column in self._columns]
+        read = self._reader(places)
+        for column, own in zip(self._columns, places, strict=True):
             whole = None if column.is_direct else np.empty((1, *column.stored), column.field.dtype)
-            for step, places in enumerate(self._places(column, numbers, videos)):
+            for step, pieces in enumerate(own):
                 target = out[column.name][row + step : row + step + 1]
-                into, begin = target if whole is None else whole, int(first[step])
-                for piece in column.needed(begin):
-                    self._read(column, _Place._make(places[piece]), int(numbers[step]), column.part(into, piece))
+                into, begin = target if whole is None else whole, begins[step]
+                for number, piece in zip(column.needed(begin), pieces, strict=True):
+                    self._read(read, column, piece, int(numbers[step]), column.part(into, number))
                 if whole is not None:
                     column.convert(whole, begin, target)
 
-    def _places(self, column: "_Column", numbers: np.ndarray, videos: np.ndarray) -> "Iterable[Sequence[tuple]]":
-        """Where the pieces of each video lie."""
+    def _places(
+        self, column: "_Column", numbers: np.ndarray, videos: np.ndarray, begins: list[int]
+    ) -> "list[list[_Place]]":
+        """Where the pieces lie that are needed of each video."""
         if column.is_image:
-            return self._chunks[column.name][self._base + numbers].tolist()
+            known = self._chunks[column.name][self._base + numbers].tolist()
+            pairs = zip(known, begins, strict=True)
+            return [[_Place._make(pieces[i]) for i in column.needed(begin)] for pieces, begin in pairs]
         offset = self._rows[column.name][videos["shard"]] + videos["row"].astype(np.uint64) * np.uint64(column.size)
         parts = videos["shard"], offset, np.full(len(numbers), column.size), videos[column.name]
-        return ([place] for place in zip(*(part.tolist() for part in parts), strict=True))
+        return [[_Place._make(piece)] for piece in zip(*(part.tolist() for part in parts), strict=True)]
 
-    def _read(self, column: "_Column", place: "_Place", video: int, target: np.ndarray) -> None:
-        shard = self.manifest["shards"][place.shard]
-        path = shard_path(self.root, shard["name"])
+    def _read(self, read: "_Reader", column: "_Column", piece: "_Place", video: int, target: np.ndarray) -> None:
         try:
-            data = _piece(_opened(path, shard["sha256"], os.getpid()), column, place, target)
-            if self.options.verify == "checksum" and codecs.crc32(data) != place.crc32:
+            data = read(column, piece, target)
+            if self.options.verify == "checksum" and codecs.crc32(data) != piece.crc32:
                 raise DamagedError("its checksum differs")
-            if column.codec != "none":
+            if isinstance(data, bytes):
                 codecs.decode_into(column.codec, data, target)
         except (DamagedError, OSError) as error:
-            where = f"{path}: {column.name} of {self.options.split} video {video}"
-            raise DamagedError(f"{where} cannot be read ({error}): gen2d verify finds all such damage") from error
+            where = f"{self._shard_path(piece.shard)}: {column.name} of {self.options.split} video {video}"
+            raise DamagedError(f"{where} cannot be read ({_why(error)}): gen2d verify finds all such damage") from error
+
+    def _reader(self, places: "list[list[list[_Place]]]") -> "_Reader":
+        """What gives the bytes of these pieces, by what the shards lie on."""
+        if isinstance(self.root, Path):
+            return lambda column, piece, target: _piece(self._open(piece.shard), column, piece, target)
+        if self._cache:
+            opened = functools.lru_cache(maxsize=16)(self._open_cached)
+            return lambda column, piece, target: _piece(opened(piece.shard), column, piece, target)
+        pieces = {piece for own in places for video in own for piece in video}
+        return functools.partial(_received, dict(zip(pieces, read_ranges(list(map(self._range, pieces))), strict=True)))
+
+    def _shard_path(self, number: int) -> Place:
+        return shard_path(self.root, self.manifest["shards"][number]["name"])
+
+    def _range(self, piece: "_Place") -> Range:
+        url = self._shard_path(piece.shard)
+        assert isinstance(url, Url)
+        return Range(url, piece.offset, piece.offset + piece.size)
+
+    def _open(self, number: int) -> "_File":
+        path = self._shard_path(number)
+        assert isinstance(path, Path)
+        return _opened(path, self.manifest["shards"][number]["sha256"], os.getpid())
+
+    def _open_cached(self, number: int) -> "_File":
+        shard = self.manifest["shards"][number]
+        while True:
+            path = self._cached(self._shard_path(number), shard["sha256"], shard["bytes"])
+            with contextlib.suppress(FileNotFoundError):  # another process made room just now
+                return _File(path)
+
+    def _cached(self, url: Place, sha256: str, size: int | None = None) -> Path:
+        assert self._cache is not None
+        assert isinstance(url, Url)
+        return self._cache.path(url, sha256, size)
 
     def numbers(self, indices: Numbers) -> np.ndarray:
         """Indices as the numbers of videos, int64: negative ones count from the end."""
@@ -220,13 +276,29 @@ class Dataset:
         return out
 
     def _table(self, name: str) -> np.ndarray:
-        """An index file, mapped, not read into memory; checked first, as wrong places would lead anywhere."""
-        path = f"index/{name}.npy"
-        if not (self.root / path).is_file():
-            raise DamagedError(f"{self.root / path} is missing")
-        if self.options.verify == "checksum" and file_sha256(self.root / path) != self.manifest["files"][path]:
-            raise DamagedError(f"{self.root / path} is not what was written")
-        return np.load(self.root / path, mmap_mode="r")
+        """An index file, mapped, not read into memory, unless it is remote and there is no cache.
+
+        Checked first, as wrong places would lead anywhere.
+        """
+        name = f"index/{name}.npy"
+        path, right = self.root / name, self.manifest["files"][name]
+        try:
+            if self._cache:
+                path = self._cached(path, right)
+            if isinstance(path, Path):
+                intact = self.options.verify == "none" or file_sha256(path) == right
+                table = np.load(path, mmap_mode="r") if intact else None
+            else:
+                content = path.read_bytes()
+                intact = self.options.verify == "none" or sha256(content) == right
+                table = np.load(io.BytesIO(content)) if intact else None
+        except FileNotFoundError:
+            raise DamagedError(f"{path} is missing") from None
+        except OSError as error:
+            raise FolderError(f"{path} cannot be read ({_why(error)})") from error
+        if table is None:
+            raise DamagedError(f"{path} is not what was written")
+        return table
 
 
 class _Column:
@@ -279,6 +351,9 @@ class _Place(NamedTuple):
     crc32: int
 
 
+_Reader = Callable[[_Column, _Place, np.ndarray], bytes | memoryview]
+
+
 class _File:
     """A file that is open for reading, closed when nobody uses it any more."""
 
@@ -305,13 +380,28 @@ def _piece(file: _File, column: _Column, place: _Place, target: np.ndarray) -> b
     return data
 
 
+def _received(
+    found: Mapping[_Place, bytes | OSError], column: _Column, piece: _Place, target: np.ndarray
+) -> bytes | memoryview:
+    """The bytes of a piece that has been asked for already."""
+    data = found[piece]
+    if isinstance(data, OSError):
+        raise data
+    return data
+
+
+def _why(error: Exception) -> str:
+    """What is wrong, without the file's name."""
+    return str(getattr(error, "strerror", None) or error)
+
+
 @functools.lru_cache(maxsize=128)
 def _opened(path: Path, sha256: str, process: int) -> _File:
     """The open file; one that was made again since, or opened before a fork, is another."""
     return _File(path)
 
 
-def _chosen_split(root: Path, manifest: Mapping[str, Any], split: str | None) -> str:
+def _chosen_split(root: Place, manifest: Mapping[str, Any], split: str | None) -> str:
     splits = manifest["splits"]
     if split is None and len(splits) != 1 and "train" not in splits:
         raise ConfigError(f"{root} has the splits {', '.join(splits)}: say which, as split=")
@@ -338,3 +428,12 @@ def chosen_fields(source: str, fields: Mapping[str, Field], patterns: Sequence[s
 def _nearest(name: str, names: Sequence[str] | Mapping[str, Any]) -> str:
     near = difflib.get_close_matches(name, names, n=1, cutoff=0.4)
     return f": did you mean {near[0]!r}?" if near else f": it has {', '.join(names)}"
+
+
+def _check_cache(options: Options, largest: int) -> None:
+    if options.cache_bytes is None:
+        return
+    if options.cache_dir is None:
+        raise ConfigError(f"cache_bytes is {options.cache_bytes}, but there is no cache: say cache_dir=")
+    if options.cache_bytes < largest:
+        raise ConfigError(f"cache_bytes is {options.cache_bytes}, but must be {largest} or more, for the largest shard")

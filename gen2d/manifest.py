@@ -1,35 +1,43 @@
 """The manifest: everything about a complete dataset, sealed with a hash, and the index of where each piece lies."""
 
 import dataclasses
+import io
 import json
 from collections.abc import Iterable, Mapping
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from gen2d.errors import DamagedError, FolderError
 from gen2d.fields import Field
-from gen2d.files import as_json, file_sha256, publishing, read_json, sha256
+from gen2d.files import as_json, file_sha256, parsed, publishing, sha256
 from gen2d.formats import MOMENTS_OF, image_names, merged, row_names
 from gen2d.plan import MARK, SCHEMA, Dataset, Shard, table_path
+from gen2d.remote import Place, reading
 
 Record = Mapping[str, Any]  # of a shard that is done, as shards.py writes it
 Tables = dict[str, np.ndarray]
 
 
-def read_manifest(root: Path) -> dict[str, Any]:
+def read_manifest(root: Place) -> dict[str, Any]:
     """The manifest of a complete dataset.
 
     Raises FolderError if the folder is no dataset or not complete, DamagedError if a byte of the manifest changed.
     """
     path = root / "manifest.json"
-    if not path.is_file():
-        if not (root / MARK).is_dir():
-            raise FolderError(f"{root} is not a gen2d dataset: it has no manifest.json")
-        raise FolderError(f"{root} is incomplete: run the command that made it again, and it goes on where it stopped")
-    manifest = read_json(path)
-    if manifest is None or path.read_bytes() != as_json(_sealed(manifest)):
+    try:
+        content = path.read_bytes()
+    except (FileNotFoundError, NotADirectoryError, IsADirectoryError):
+        with reading(root):
+            begun = (root / MARK).is_dir()
+        if not begun:
+            raise FolderError(f"{root} is not a gen2d dataset: it has no manifest.json") from None
+        told = "run the command that made it again, and it goes on where it stopped"
+        raise FolderError(f"{root} is incomplete: {told}") from None
+    except OSError as error:
+        raise FolderError(f"{path} cannot be read ({error.strerror or error})") from error
+    manifest = parsed(content)
+    if manifest is None or content != as_json(_sealed(manifest)):
         raise DamagedError(f"{path} is not what was written")
     if manifest["schema"] != SCHEMA:
         raise FolderError(f"{path} has schema {manifest['schema']}, but this gen2d reads {SCHEMA}")
@@ -102,13 +110,14 @@ def _stats(records: list[Record]) -> dict[str, dict[str, list[float] | None]]:
 def write_index(dataset: Dataset, shards: list[Shard], records: list[Record]) -> dict[str, str]:
     """The sha256 of each file of the index, by its name in the folder; afterwards the files are there."""
     hashes = {}
-    for name, table in _index(dataset, shards, records).items():
-        path = dataset.root / "index" / f"{name}.npy"
+    for field, table in _index(dataset, shards, records).items():
+        name = f"index/{field}.npy"
+        path = dataset.root / name
         path.parent.mkdir(parents=True, exist_ok=True)
         with publishing(path) as temporary:
             with temporary.open("wb") as file:
                 np.save(file, table, allow_pickle=False)
-            hashes[path.relative_to(dataset.root).as_posix()] = file_sha256(temporary)
+            hashes[name] = file_sha256(temporary)
     return hashes
 
 
@@ -130,11 +139,11 @@ def _index(dataset: Dataset, shards: list[Shard], records: list[Record]) -> Tabl
     return index | {"shards": np.array(places, [(name, "<u8") for name in rows])}
 
 
-def _fill(own: Tables, shard: Shard, images: list[str], rows: list[str], path: Path) -> None:
+def _fill(own: Tables, shard: Shard, images: list[str], rows: list[str], path: Place) -> None:
     """Puts a shard's tables into its rows of the index."""
     videos = own["videos"]
     videos["shard"], videos["row"] = shard.number, np.arange(shard.count)
-    with np.load(path) as tables:
+    with np.load(io.BytesIO(path.read_bytes())) as tables:
         for name in rows:
             videos[name] = tables[f"crc/{name}"]
         for name in images:

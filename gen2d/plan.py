@@ -10,6 +10,7 @@ import numpy as np
 
 from gen2d.fields import Field
 from gen2d.files import as_json
+from gen2d.remote import Place
 
 SCHEMA = "gen2d.dataset/1"
 MARK = Path(".gen2d")  # the folder, inside a dataset's, of what only the program needs
@@ -22,7 +23,7 @@ IDENTITY = ("config", "seed", "fingerprint", "codec", "chunk_frames", "videos_pe
 class Dataset:
     """What a folder is to hold."""
 
-    root: Path
+    root: Place
     name: str
     fields: Mapping[str, Field]
     sizes: Mapping[str, int]  # of the axes that are letters
@@ -79,16 +80,16 @@ def mine(shards: Iterable[Shard], worker: int, workers: int) -> list[Shard]:
     return [shard for shard in shards if shard.place % workers == worker]
 
 
-def shard_path(root: Path, name: str) -> Path:
+def shard_path(root: Place, name: str) -> Place:
     """The file of the shard called `name`."""
     return root / "shards" / f"{name}.h5"
 
 
-def record_path(root: Path, name: str) -> Path:
+def record_path(root: Place, name: str) -> Place:
     """What says that the shard is done, and what went into it."""
     return root / MARK / "done" / f"{name}.json"
 
 
-def table_path(root: Path, name: str) -> Path:
+def table_path(root: Place, name: str) -> Place:
     """Where in the shard its pieces lie and their checksums, kept until all go into the index."""
     return root / MARK / "done" / f"{name}.npz"

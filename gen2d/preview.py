@@ -11,6 +11,7 @@ import numpy as np
 from gen2d.errors import FolderError, UserError
 from gen2d.loader import Dataset
 from gen2d.loader import open as open_dataset
+from gen2d.remote import Url, place
 
 COLUMNS = 10  # frames across the sheet
 GAP, GREY = 2, 170  # px between pictures, and its sRGB
@@ -23,7 +24,7 @@ def preview(
     """The files made in the folder `out`: NAME-sheet.png and NAME.gif."""
     check_videos(videos)
     check_folder(out)
-    if Path(source).is_dir():
+    if is_dataset(source):
         ds = open_dataset(source)
         name, frames, fps = ds.manifest["name"], _stored(ds, range(min(videos, len(ds)))), ds.manifest["fps"]
     else:
@@ -33,6 +34,12 @@ def preview(
         write(sheet, contact_sheet(frames))
         animate(animation, frames, fps)
     return [sheet, animation]
+
+
+def is_dataset(source: str) -> bool:
+    """Whether it is a dataset, at a URL or in a folder, that is to be drawn; all else is a config."""
+    found = place(source)
+    return isinstance(found, Url) or found.is_dir()
 
 
 def check_videos(videos: int) -> None:

@@ -139,7 +139,8 @@ def _whole(ds: Dataset) -> Dataset:
     """The same dataset with every field but the images."""
     fields = {name: field_of(about) for name, about in ds.manifest["fields"].items()}
     names = tuple(name for name, field in fields.items() if field.per_video and not field.is_image)
-    return loader.open(ds.root, ds.options.split, fields=names, verify=ds.options.verify)
+    kept = {key: getattr(ds.options, key) for key in ("split", "verify", "cache_dir", "cache_bytes")}
+    return loader.open(ds.root, fields=names, **kept)
 
 
 def _stored(ds: Dataset, numbers: np.ndarray) -> dict[str, np.ndarray]:

@@ -1,10 +1,10 @@
 """What a dataset holds, and what gen2d knows, as text for a terminal."""
 
 import dataclasses
-from pathlib import Path
 from typing import Any
 
 from gen2d.errors import ConfigError
+from gen2d.remote import Place
 from gen2d.shards import read_manifest
 
 
@@ -33,7 +33,7 @@ def _table(rows: list[tuple[str, ...]]) -> list[str]:
     ]
 
 
-def sheet(root: Path) -> str:
+def sheet(root: Place) -> str:
     """The data sheet of a dataset: what it holds, field by field, and what made it."""
     manifest = read_manifest(root)
     splits = ", ".join(f"{name}: {count:,} videos" for name, count in manifest["splits"].items())

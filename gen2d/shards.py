@@ -2,10 +2,10 @@
 
     plan -> open_folder -> (encode -> write) for each shard -> finish
 
-A shard is written under a temporary name, hashed, and renamed; its record under ``.gen2d/done`` follows. A shard is
-done if its record fits and its file has the recorded size, so whatever a crash leaves is made again. Workers share
-nothing: each takes its shards by their number, and whoever finds all records writes the index, the cards and, last, the
-manifest.
+A shard is written under a temporary name, hashed, and renamed, or uploaded where the folder is a Url; its record under
+``.gen2d/done`` follows. A shard is done if its record fits and its file has the recorded size, so whatever a crash
+leaves is made again. Workers share nothing: each takes its shards by their number, and whoever finds all records writes
+the index, the cards and, last, the manifest.
 """
 
 import contextlib
@@ -13,19 +13,33 @@ import dataclasses
 import errno
 import io
 import json
+import math
 import shutil
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
 from gen2d import cards
 from gen2d.errors import FolderError
-from gen2d.files import as_json, file_sha256, publish, publishing, read_json, sha256, sweep
+from gen2d.files import (
+    as_json,
+    file_sha256,
+    publish,
+    publishing,
+    read_json,
+    remove_tree,
+    sha256,
+    size_of,
+    sweep,
+    work_folder,
+)
 from gen2d.formats import Block, Places, encode, hdf5, head, merged, stored_bytes
 from gen2d.manifest import describe, read_manifest, write_index
 from gen2d.plan import IDENTITY, MARK, SCHEMA, Dataset, Shard, mine, plan, record_path, shard_path, table_path
+from gen2d.remote import Place, Url
 
 __all__ = [
     "Block", "Dataset", "Shard", "encode", "finish", "forget", "free_bytes", "head", "log", "mine", "open_folder",
@@ -49,40 +63,49 @@ def open_folder(dataset: Dataset, overwrite: bool = False) -> list[Shard]:
         _claim(dataset)
         sweep(root)
         records = _records(dataset)
-        remaining = [shard for shard in _whole_plan(dataset, records) if not _is_done(dataset, shard, records)]
+        planned = _whole_plan(dataset, records)
+        done = _at_once(lambda shard: _is_done(dataset, shard, records), planned)
+        remaining = [shard for shard, is_done in zip(planned, done, strict=True) if not is_done]
         if remaining:
             (root / "manifest.json").unlink(missing_ok=True)
         return remaining
 
 
-def forget(root: Path, name: str) -> None:
+def forget(root: Place, name: str) -> None:
     """Returns nothing; the shard called `name` counts as not made, so that the next run makes it again."""
     record_path(root, name).unlink(missing_ok=True)
 
 
-def free_bytes(path: Path) -> int:
-    """How much the disk that holds `path`, or will, can take."""
-    path = path.absolute()
+def free_bytes(root: Place) -> float:
+    """How much the disk that holds `root`, or will, can take; of a Url no limit is known."""
+    if isinstance(root, Url):
+        return math.inf
+    path = root.absolute()
     return shutil.disk_usage(next(place for place in (path, *path.parents) if place.exists())).free
 
 
-def log(root: Path, entry: Mapping[str, Any]) -> None:
+def log(root: Place, entry: Mapping[str, Any]) -> None:
     """Returns nothing; adds a line to the folder's run log, which is where times and hosts belong."""
-    with (root / MARK / "run.jsonl").open("a") as file:
-        file.write(json.dumps(dict(entry), sort_keys=True) + "\n")
+    path, line = root / MARK / "run.jsonl", json.dumps(dict(entry), sort_keys=True) + "\n"
+    with _explained(root):
+        if isinstance(path, Path):
+            with path.open("a") as file:
+                file.write(line)
+        else:  # an object is written anew, so of two workers that end at once one may go unnoted
+            publish(path, (path.read_bytes() if path.exists() else b"") + line.encode())
 
 
-def _is_dataset(root: Path) -> bool:
+def _is_dataset(root: Place) -> bool:
     return (root / MARK).is_dir() or (read_json(root / "manifest.json") or {}).get("schema") == SCHEMA
 
 
-def _clear(root: Path) -> None:
+def _clear(root: Place) -> None:
     """Removes what is written here and no more; the mark stays, so that a crash here leaves a dataset's folder."""
     (root / MARK).mkdir(exist_ok=True)
     for name in ("manifest.json", "croissant.json", "README.md", "config.yaml", MARK / "dataset.json"):
         (root / name).unlink(missing_ok=True)
     for name in ("shards", "index", MARK / "done"):
-        shutil.rmtree(root / name, ignore_errors=True)
+        remove_tree(root / name)
 
 
 def _claim(dataset: Dataset) -> None:
@@ -101,7 +124,7 @@ def _claim(dataset: Dataset) -> None:
         publish(mark, as_json(dataset.identity))
 
 
-def _compare(root: Path, there: Mapping[str, Any], here: Mapping[str, Any]) -> None:
+def _compare(root: Place, there: Mapping[str, Any], here: Mapping[str, Any]) -> None:
     differing = list(_differences(there, here))
     if differing:
         told = " and ".join(differing[:3])
@@ -117,7 +140,7 @@ def _differences(there: Any, here: Any, name: str = "") -> Iterator[str]:
 
 
 @contextlib.contextmanager
-def _explained(root: Path) -> Iterator[None]:
+def _explained(root: Place) -> Iterator[None]:
     try:
         yield
     except (FileExistsError, NotADirectoryError) as error:
@@ -125,10 +148,18 @@ def _explained(root: Path) -> Iterator[None]:
     except PermissionError as error:
         raise FolderError(f"you have no permission to write in {error.filename}: choose another --out") from error
     except OSError as error:
+        if isinstance(root, Url):
+            raise _unreached(root, error) from error
         why = (
             "is on a disk that is read-only" if error.errno == errno.EROFS else f"cannot be written ({error.strerror})"
         )
         raise FolderError(f"{root} {why}: choose another --out") from error
+
+
+def _unreached(root: Url, error: OSError) -> FolderError:
+    told = "permission was denied" if isinstance(error, PermissionError) else error.strerror or str(error)
+    again = "run the same command again, and it goes on where it stopped"
+    return FolderError(f"{error.filename or root} cannot be read or written ({told}): once it can, {again}")
 
 
 # ---- One shard
@@ -137,15 +168,18 @@ def _explained(root: Path) -> Iterator[None]:
 def write(dataset: Dataset, shard: Shard, blocks: Iterable[Block]) -> dict[str, Any]:
     """The record of the shard that `blocks` became; afterwards it is done, whatever happens to the machine.
 
-    Raises FolderError when the disk is full. Whatever is raised, here or by `blocks`, nothing half-written stays.
+    Raises FolderError when the disk is full or a server keeps failing. Whatever is raised, here or by `blocks`, nothing
+    half-written stays.
     """
     seen = _Seen()
     try:
         return _write(dataset, shard, seen.passing(blocks), seen)
     except OSError as error:
-        if error.errno not in (errno.ENOSPC, errno.EDQUOT):
-            raise
-        raise _full(dataset, shard, seen) from error
+        if error.errno in (errno.ENOSPC, errno.EDQUOT):
+            raise _full(dataset, shard, seen) from error
+        if isinstance(dataset.root, Url):
+            raise _unreached(dataset.root, error) from error
+        raise
 
 
 class _Seen:
@@ -208,9 +242,10 @@ def _contents(seen: _Seen, places: Places) -> dict[str, Any]:
 def _full(dataset: Dataset, shard: Shard, seen: _Seen) -> FolderError:
     raw = sum(stored_bytes(field, dataset.sizes) for field in dataset.fields.values())
     need = shard.count * (seen.bytes / seen.videos if seen.videos else raw)
-    free = free_bytes(dataset.root)
+    disk = work_folder(dataset.root)
+    free = free_bytes(disk)
     error = FolderError(
-        f"no space left for {dataset.root}: {shard.name} needs about {need / 1e6:.1f} MB and {free / 1e6:.1f} MB are "
+        f"no space left for {disk}: {shard.name} needs about {need / 1e6:.1f} MB and {free / 1e6:.1f} MB are "
         f"free, so at least {max(need - free, 0) / 1e6:.1f} MB are missing: make room and run the same command again"
     )
     error.exit_code = 1
@@ -220,8 +255,18 @@ def _full(dataset: Dataset, shard: Shard, seen: _Seen) -> FolderError:
 def _records(dataset: Dataset) -> dict[str, dict[str, Any]]:
     """The records in the folder that are of this dataset, by shard."""
     identity = sha256(as_json(dataset.identity))
-    parsed = (read_json(path) for path in sorted((dataset.root / MARK / "done").glob("*.json")))
-    return {record["name"]: record for record in parsed if record and record.get("identity") == identity}
+    found = _at_once(read_json, sorted((dataset.root / MARK / "done").glob("*.json")))
+    return {record["name"]: record for record in found if record and record.get("identity") == identity}
+
+
+T = TypeVar("T")
+R = TypeVar("R")
+
+
+def _at_once(function: Callable[[T], R], items: Iterable[T]) -> list[R]:
+    """The function's value for each item; servers take long to answer, but answer many questions at once."""
+    with ThreadPoolExecutor(16) as pool:
+        return list(pool.map(function, items))
 
 
 def _whole_plan(dataset: Dataset, records: Mapping[str, Mapping[str, Any]]) -> list[Shard]:
@@ -237,9 +282,8 @@ def _is_done(dataset: Dataset, shard: Shard, records: Mapping[str, Mapping[str, 
     file, tables = shard_path(dataset.root, shard.name), table_path(dataset.root, shard.name)
     return (
         all(record.get(key) == getattr(shard, key) for key in ("split", "first", "count"))
-        and file.is_file()
-        and file.stat().st_size == record["bytes"]
-        and tables.is_file()
+        and size_of(file) == record["bytes"]
+        and size_of(tables) is not None
         and file_sha256(tables) == record["tables_sha256"]
     )
 
@@ -252,11 +296,11 @@ def finish(dataset: Dataset) -> bool:
 
     False while shards are missing that other workers still make.
     """
-    records = _records(dataset)
-    shards = _whole_plan(dataset, records)
-    if not all(_is_done(dataset, shard, records) for shard in shards):
-        return False
     with _explained(dataset.root):
+        records = _records(dataset)
+        shards = _whole_plan(dataset, records)
+        if not all(_at_once(lambda shard: _is_done(dataset, shard, records), shards)):
+            return False
         _complete(dataset, shards, [records[shard.name] for shard in shards])
     return True
 

@@ -1,7 +1,9 @@
 """Whether a dataset on disk is what was written: `quick` looks at names and sizes, `full` at every byte and value."""
 
+import contextlib
 import dataclasses
 import os
+import tempfile
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -12,9 +14,10 @@ import numpy as np
 
 from gen2d import loader
 from gen2d.errors import ConfigError, DamagedError, FolderError
-from gen2d.files import file_sha256
+from gen2d.files import file_sha256, size_of
 from gen2d.manifest import field_of, read_manifest
 from gen2d.plan import shard_path
+from gen2d.remote import Place, Url, download, place, reading
 
 LEVELS = ("quick", "full")
 
@@ -31,7 +34,7 @@ class Problem:
 
 
 def verify(
-    root: str | Path, level: str = "quick", repair_with: Callable[[list[str]], object] | None = None
+    root: str | Place, level: str = "quick", repair_with: Callable[[list[str]], object] | None = None
 ) -> list[str]:
     """What is wrong with the dataset, a sentence each; empty if nothing is.
 
@@ -45,14 +48,14 @@ def verify(
     return [problem.sentence for problem in found]
 
 
-def damaged_shards(root: str | Path, level: str = "quick") -> list[str]:
+def damaged_shards(root: str | Place, level: str = "quick") -> list[str]:
     """The names of the shards that must be made again."""
     return sorted({problem.shard for problem in problems(root, level) if problem.shard})
 
 
-def problems(root: str | Path, level: str = "quick") -> Iterator[Problem]:
+def problems(root: str | Place, level: str = "quick") -> Iterator[Problem]:
     """Everything that is wrong, the folder first, then shard by shard."""
-    root = Path(root)
+    root = place(root)
     if level not in LEVELS:
         raise ConfigError(f"level is {level!r}, but must be one of {', '.join(LEVELS)}")
     try:
@@ -60,33 +63,34 @@ def problems(root: str | Path, level: str = "quick") -> Iterator[Problem]:
     except (FolderError, DamagedError) as error:
         yield Problem(str(error))
         return
-    whole = list(_hashed_files(root, manifest))
-    yield from whole
-    missized = list(_shard_files(root, manifest))
-    yield from missized
+    with reading(root):
+        whole = list(_hashed_files(root, manifest))
+        missized = list(_shard_files(root, manifest))
+    yield from [*whole, *missized]
     if level == "full":
         absent = {problem.shard for problem in missized}
         present = [shard for shard in manifest["shards"] if shard["name"] not in absent]
-        with ThreadPoolExecutor(min(os.cpu_count() or 1, 8)) as pool:
-            for found in pool.map(lambda shard: list(_contents(root, manifest, shard, not whole)), present):
+        with _nearby(root, manifest) as near, ThreadPoolExecutor(min(os.cpu_count() or 1, 8)) as pool:
+            for found in pool.map(lambda shard: _contents_near(root, near, manifest, shard, not whole), present):
                 yield from found
 
 
-def _hashed_files(root: Path, manifest: Mapping[str, Any]) -> Iterator[Problem]:
+def _hashed_files(root: Place, manifest: Mapping[str, Any]) -> Iterator[Problem]:
     for name, sha256 in manifest["files"].items():
         if not (root / name).is_file():
             yield Problem(f"{root / name} is missing")
         elif file_sha256(root / name) != sha256:
             yield Problem(f"{root / name} is not what was written")
     for path in (root / "index").rglob("*"):
-        if path.is_file() and path.relative_to(root).as_posix() not in manifest["files"]:
+        if path.is_file() and str(path).removeprefix(f"{root}/") not in manifest["files"]:
             yield Problem(f"{path} does not belong to the dataset")
 
 
-def _shard_files(root: Path, manifest: Mapping[str, Any]) -> Iterator[Problem]:
+def _shard_files(root: Place, manifest: Mapping[str, Any]) -> Iterator[Problem]:
     expected = {shard_path(root, shard["name"]): shard for shard in manifest["shards"]}
-    for path, shard in expected.items():
-        size = path.stat().st_size if path.is_file() else None
+    with ThreadPoolExecutor(16) as pool:  # a server answers many questions at once
+        sizes = list(pool.map(size_of, expected))
+    for (path, shard), size in zip(expected.items(), sizes, strict=True):
         if size is None:
             yield Problem(f"{path} is missing", shard["name"])
         elif size != shard["bytes"]:
@@ -94,6 +98,40 @@ def _shard_files(root: Path, manifest: Mapping[str, Any]) -> Iterator[Problem]:
     for path in sorted((root / "shards").glob("*")):
         if path not in expected:
             yield Problem(f"{path} does not belong to the dataset")
+
+
+@contextlib.contextmanager
+def _nearby(root: Place, manifest: Mapping[str, Any]) -> Iterator[Path]:
+    """The dataset's folder; of a Url one on disk with all its files but the shards."""
+    if isinstance(root, Path):
+        yield root
+        return
+    with tempfile.TemporaryDirectory(prefix="gen2d-") as folder:
+        near = Path(folder)
+        (near / "shards").mkdir()
+        for name in ("manifest.json", *manifest["files"]):
+            (near / name).parent.mkdir(parents=True, exist_ok=True)
+            with contextlib.suppress(OSError):  # what is missing has been told of
+                download(root / name, near / name)
+        yield near
+
+
+def _contents_near(
+    root: Place, near: Path, manifest: Mapping[str, Any], shard: Mapping[str, Any], indexed: bool
+) -> list[Problem]:
+    """What is wrong within the shard, which is fetched first where it is not on disk."""
+    if root == near:
+        return list(_contents(near, manifest, shard, indexed))
+    url, path = shard_path(root, shard["name"]), shard_path(near, shard["name"])
+    assert isinstance(url, Url)
+    assert isinstance(path, Path)
+    try:
+        download(url, path, shard["bytes"])
+    except OSError as error:
+        return [Problem(f"{url} cannot be read ({error.strerror})", shard["name"])]
+    found = list(_contents(near, manifest, shard, indexed))
+    os.truncate(path, 0)  # it may still be open
+    return [Problem(problem.sentence.replace(str(near), str(root)), problem.shard) for problem in found]
 
 
 def _contents(root: Path, manifest: Mapping[str, Any], shard: Mapping[str, Any], indexed: bool) -> Iterator[Problem]:

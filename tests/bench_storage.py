@@ -78,7 +78,7 @@ def works(case: Case, folder: Path) -> dict[str, Callable[[], float]]:
         _write(made, columns)
         assert shards.finish(made)
         ds = loader.open(made.root, fields=tuple(columns))
-        shard = made.root / "shards" / "train-00000.h5"
+        shard = folder / codec / "shards" / "train-00000.h5"
         found[f"loader {codec}"] = lambda ds=ds: ds.batch(range(case.videos), out=out)
         found[f"h5py {codec}"] = lambda shard=shard: _looped(shard, out)
         if codec != "none":

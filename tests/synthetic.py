@@ -8,6 +8,7 @@ import numpy as np
 from gen2d import shards
 from gen2d.fields import Field
 from gen2d.formats import hdf5
+from gen2d.remote import Place
 from gen2d.shards import Dataset, Shard
 
 FIELDS = {
@@ -25,7 +26,7 @@ FIELDS = {
 }
 
 
-def dataset(root: Path, train: int = 20, codec: str = "gzip", **changes: object) -> Dataset:
+def dataset(root: Place, train: int = 20, codec: str = "gzip", **changes: object) -> Dataset:
     """A dataset of `train` videos and 3 of a split called test, in shards of 8."""
     values: dict[str, object] = {
         "root": root,
@@ -90,6 +91,12 @@ def make(made: Dataset, size: int = 3, **options: bool) -> Dataset:
         shards.write(made, shard, blocks(made, shard, size))
     assert shards.finish(made)
     return made
+
+
+def folder(made: Dataset) -> Path:
+    """Where on this machine the dataset lies."""
+    assert isinstance(made.root, Path)
+    return made.root
 
 
 def stored(root: Path, split: str = "train") -> dict[str, np.ndarray]:

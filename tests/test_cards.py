@@ -31,7 +31,7 @@ def test_the_cards_name_every_field_and_file(tmp_path: Path) -> None:
 @pytest.mark.parametrize("example", ["gen2d", "torch", "h5py"])
 def test_the_examples_of_the_card_run(tmp_path: Path, example: str, codec: str) -> None:
     made = synthetic.make(synthetic.dataset(tmp_path / "copied elsewhere", codec=codec))
-    blocks = re.findall(r"```python\n(.*?)```", (made.root / "README.md").read_text(), re.S)
+    blocks = re.findall(r"```python\n(.*?)```", (synthetic.folder(made) / "README.md").read_text(), re.S)
     (code,) = (block for block in blocks if example in block and (example == "torch" or "torch" not in block))
     for module in re.findall(r"import (.*)", code)[0].split(", "):
         if not importlib.util.find_spec(module):
@@ -39,8 +39,8 @@ def test_the_examples_of_the_card_run(tmp_path: Path, example: str, codec: str) 
     shown = {"torch": 'batch["frames"].numpy()', "gen2d": 'video["frames"]', "h5py": "video"}[example]
     code += f"\nimport numpy\nnumpy.save('shown.npy', {shown})"
     # In a process of its own: where hdf5plugin is imported, HDF5 writes the filter's name into new zstd files.
-    subprocess.run([sys.executable, "-c", code], cwd=made.root, check=True)
-    found = np.load(made.root / "shown.npy")
+    subprocess.run([sys.executable, "-c", code], cwd=synthetic.folder(made), check=True)
+    found = np.load(synthetic.folder(made) / "shown.npy")
     if example == "torch":
         assert found.shape == (20, 5, 8, 8, 3)
     else:

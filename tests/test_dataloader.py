@@ -22,7 +22,7 @@ TRAIN = 20
 
 @pytest.fixture(scope="module")
 def toy(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return synthetic.make(synthetic.dataset(tmp_path_factory.mktemp("data") / "toy")).root
+    return synthetic.folder(synthetic.make(synthetic.dataset(tmp_path_factory.mktemp("data") / "toy")))
 
 
 def numbers(batches: Sequence[dict[str, Any]]) -> list[list[int]]:

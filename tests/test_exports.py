@@ -34,7 +34,7 @@ FOLDERS = [*FILMS, "npz", "webdataset"]
 def toy(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Discs with hard rims and random colours: as hard for a lossy codec as a small picture can be."""
     made = synthetic.dataset(tmp_path_factory.mktemp("data") / "toy", train=TRAIN, sizes=SIZES)
-    return synthetic.make(made).root
+    return synthetic.folder(synthetic.make(made))
 
 
 def decoded(path: Path) -> tuple[np.ndarray, Fraction]:
@@ -89,7 +89,7 @@ def test_what_opencv_reads_is_in_the_right_colours(toy: Path, tmp_path: Path) ->
 @pytest.mark.parametrize("to", FILMS)
 def test_the_rate_is_kept(tmp_path: Path, to: str, fps: float) -> None:
     made = synthetic.make(synthetic.dataset(tmp_path / "toy", train=1, fps=fps, sizes=SIZES))
-    out = gen2d.export(made.root, to, tmp_path / "out").out
+    out = gen2d.export(synthetic.folder(made), to, tmp_path / "out").out
     assert float(decoded(next(out.glob("train-*")))[1]) == pytest.approx(fps, rel=1e-4)
 
 
@@ -241,7 +241,7 @@ def two_balls(folder: Path, monkeypatch: pytest.MonkeyPatch, **changes: Any) -> 
     }
     monkeypatch.setattr(synthetic, "video", lambda made, split, number: values | (changes if number == 1 else {}))
     sizes = {"T": 2, "H": 64, "W": 48, "K": 4}
-    return synthetic.make(synthetic.dataset(folder, 3, fields=fields, sizes=sizes, constants={})).root
+    return synthetic.folder(synthetic.make(synthetic.dataset(folder, 3, fields=fields, sizes=sizes, constants={})))
 
 
 def test_phyworld_s_frame_is_ten_units_wide(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -430,7 +430,7 @@ def test_the_command_says_what_it_made_and_what_was_lost(toy: Path, tmp_path: Pa
 def test_what_a_format_cannot_hold_is_told_first(tmp_path: Path, to: str, changes: dict[str, Any], told: str) -> None:
     made = synthetic.make(synthetic.dataset(tmp_path / "toy", train=1, **changes))
     with pytest.raises(ConfigError) as caught:
-        gen2d.export(made.root, to, tmp_path / "out")
+        gen2d.export(synthetic.folder(made), to, tmp_path / "out")
     assert told in str(caught.value)
     assert not (tmp_path / "out").exists()
 

@@ -15,7 +15,21 @@ ROOT = Path(gen2d.__file__).parent.parent
 PACKAGE = ROOT / "gen2d"
 # Each module may import those before it; a family or look may import all of a Python file's neighbours but the last.
 ORDER = [
-    *("errors", "fields", "files", "codecs", "formats", "plan", "manifest", "cards", "shards", "loader", "order"),
+    *(
+        "errors",
+        "fields",
+        "remote",
+        "files",
+        "cache",
+        "codecs",
+        "formats",
+        "plan",
+        "manifest",
+        "cards",
+        "shards",
+        "loader",
+    ),
+    "order",
     *(
         "verification",
         "dataloader",

@@ -15,7 +15,9 @@ from gen2d.verification import damaged_shards, verify
 
 @pytest.fixture(scope="module")
 def pristine(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return synthetic.make(synthetic.dataset(tmp_path_factory.mktemp("data") / "toy", train=10, codec="zstd")).root
+    return synthetic.folder(
+        synthetic.make(synthetic.dataset(tmp_path_factory.mktemp("data") / "toy", train=10, codec="zstd"))
+    )
 
 
 @pytest.fixture

@@ -1,0 +1,555 @@
+"""A dataset at a URL is read and written as one in a folder is, also over a network that fails now and then."""
+
+import errno
+import gc
+import json
+import multiprocessing
+import pickle
+import re
+import signal
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import buckets
+import numpy as np
+import pytest
+import s3fs
+import synthetic
+import tiny
+from buckets import Request, Server
+from numpy.testing import assert_array_equal
+
+import gen2d
+from gen2d import loader, remote, shards
+from gen2d.dataloader import DataLoader
+from gen2d.errors import ConfigError, DamagedError, FolderError, UserError
+from gen2d.files import sweep
+from gen2d.formats import hdf5
+from gen2d.remote import Range, Url, place
+
+TOY = "s3://bucket/toy"
+
+
+@pytest.fixture(scope="module")
+def running() -> Iterator[Server]:
+    with buckets.serving() as server, pytest.MonkeyPatch.context() as patch:
+        for name, value in buckets.environment(server).items():
+            patch.setenv(name, value)
+        yield server
+        remote._made.cache_clear()
+        s3fs.S3FileSystem.clear_instance_cache()
+        gc.collect()  # closes connections
+
+
+@pytest.fixture(autouse=True)
+def server(running: Server, monkeypatch: pytest.MonkeyPatch) -> Server:
+    monkeypatch.setattr(remote, "PAUSE", 0.01)
+    monkeypatch.setattr(s3fs.S3FileSystem, "retries", 1)  # trying again is for gen2d
+    running.reset()
+    return running
+
+
+@pytest.fixture(scope="module")
+def toy(running: Server, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A dataset in a folder, and at TOY, and on a web server."""
+    root = tmp_path_factory.mktemp("data") / "toy"
+    synthetic.make(synthetic.dataset(root))
+    buckets.copied(root, TOY)
+    running.folder = root.parent
+    return root
+
+
+def same(found: dict[str, np.ndarray], expected: dict[str, np.ndarray]) -> None:
+    assert found.keys() == expected.keys()
+    for name, values in expected.items():
+        assert found[name].dtype == values.dtype
+        assert_array_equal(found[name], values)
+
+
+def first_time(kind: str) -> Callable[[Request], str]:
+    """A fault that meets everything that is asked, once."""
+    met: set[Request] = set()
+
+    def fault(request: Request) -> str:
+        fresh = request not in met
+        met.add(request)
+        return kind if fresh else ""
+
+    return fault
+
+
+def always(kind: str, method: str, part: str) -> Callable[[Request], str]:
+    """A fault that meets this method and part of a path."""
+    return lambda request: kind if request.method == method and part in request.path else ""
+
+
+# ---- Reading
+
+
+@pytest.mark.parametrize("cached", [False, True])
+@pytest.mark.parametrize("kind", ["s3", "http", "file", "memory"])
+def test_what_is_read_is_what_is_in_the_folder(
+    server: Server, toy: Path, tmp_path: Path, kind: str, cached: bool
+) -> None:
+    urls = {"s3": TOY, "http": f"{server.address}/files/toy", "file": f"file://{toy}", "memory": "memory://some/toy"}
+    if kind == "memory":
+        for name, content in synthetic.tree(toy).items():
+            (tmp_path / "one").write_bytes(content)
+            remote.upload(tmp_path / "one", Url(f"{urls[kind]}/{name}"))
+    cache = tmp_path / "cache" if cached else None
+    cases: list[dict[str, Any]] = [{"fields": "*"}, {"window": 2, "stride": 2, "layout": "TCHW", "dtype": "float32"}]
+    for options in cases:
+        found, expected = gen2d.open(urls[kind], cache_dir=cache, **options), gen2d.open(toy, **options)
+        same(found[:], expected[:])
+        same(found[[7, 0, 19, 7]], expected[[7, 0, 19, 7]])
+        same(found[-1], expected[-1])
+
+
+@pytest.mark.parametrize("codec", ["zstd", "none"])
+def test_every_codec_is_read(tmp_path: Path, codec: str) -> None:
+    root = synthetic.folder(synthetic.make(synthetic.dataset(tmp_path / "toy", train=3, codec=codec)))
+    buckets.copied(root, f"s3://bucket/{codec}")
+    same(gen2d.open(f"s3://bucket/{codec}", "train", "*")[:], synthetic.stored(root))
+
+
+def test_a_video_takes_one_request_a_field_and_near_ones_share(
+    server: Server, toy: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    dataset = gen2d.open(TOY)  # frames and two fields of states
+    for near, one, neighbours in ((0, 3, 3), (remote.NEAR, 1, 1)):
+        monkeypatch.setattr(remote, "NEAR", near)
+        server.reset()
+        dataset[3]
+        assert len(server.asked) == len(server.of("GET", "/shards/train-00000.h5")) == one
+        assert all(request.range for request in server.asked)
+        server.reset()
+        dataset[[4, 3, 3]]
+        assert len(server.asked) <= neighbours + (near == 0)  # between the chunks of frames lie those of masks
+    server.reset()
+    dataset[:]
+    assert len(server.asked) == 3  # one for each shard
+
+
+def test_what_is_asked_covers_each_range_and_wastes_little() -> None:
+    random = np.random.default_rng(0)
+    for _ in range(50):
+        files, starts = random.integers(0, 3, 40), random.integers(0, 10**8, 40)
+        sizes = random.choice([0, 10, 10**5, 10**7], 40)
+        parts = zip(files.tolist(), starts.tolist(), sizes.tolist(), strict=True)
+        ranges = [Range(Url(f"s3://bucket/{file}"), start, start + size) for file, start, size in parts]
+        spans = remote._spans(ranges)
+        assert sorted({one for members in spans.values() for one in members}) == sorted(set(ranges))
+        for span, members in spans.items():
+            assert all(span.url == one.url and span.start <= one.start and one.end <= span.end for one in members)
+            assert span.end - span.start <= remote.LONGEST or span in members
+            used = np.zeros(span.end - span.start, bool)
+            for one in members:
+                used[one.start - span.start : one.end - span.start] = True
+            assert (~used).sum() <= remote.NEAR * (len(members) - 1)
+
+
+def test_the_index_is_fetched_once(server: Server, toy: Path, tmp_path: Path) -> None:
+    dataset = gen2d.open(TOY, cache_dir=tmp_path)
+    assert len(server.of("GET", "/index/")) == 3
+    server.reset()
+    same(pickle.loads(pickle.dumps(dataset))[5], gen2d.open(toy)[5])
+    assert not server.of("GET", "/index/")
+    assert len(server.of("GET", "/shards/")) == 1
+
+
+@pytest.mark.parametrize("kind", ["fail", "cut"])
+def test_what_fails_is_tried_again(server: Server, toy: Path, tmp_path: Path, kind: str) -> None:
+    for cache in (None, tmp_path):
+        server.fault = first_time(kind)
+        same(gen2d.open(TOY, cache_dir=cache)[:], gen2d.open(toy)[:])
+        server.fault = first_time(kind)
+        same(gen2d.open(f"{server.address}/files/toy", cache_dir=cache)[:], gen2d.open(toy)[:])
+
+
+@pytest.mark.parametrize("cached", [False, True])
+@pytest.mark.parametrize("kind", ["fail", "cut"])
+def test_what_keeps_failing_is_told(server: Server, toy: Path, tmp_path: Path, kind: str, cached: bool) -> None:
+    dataset = gen2d.open(TOY, cache_dir=tmp_path if cached else None)
+    server.fault = always(kind, "GET", "/shards/train-00001.h5")
+    with pytest.raises(DamagedError, match=rf"^{TOY}/shards/train-00001.h5: .* of train video 9 cannot be read \(.+\)"):
+        dataset[[1, 9]]
+    same(dataset[1], gen2d.open(toy)[1])
+    for part in ("manifest.json", "videos.npy"):
+        server.fault = always(kind, "GET", part)
+        with pytest.raises(FolderError, match=rf"^{TOY}/.*{part} cannot be read \(.+\)$"):
+            gen2d.open(TOY)
+
+
+def test_a_server_without_parts_is_told_and_a_cache_helps(server: Server, toy: Path, tmp_path: Path) -> None:
+    url = f"{server.address}/files/toy"
+    server.gives_parts = False
+    try:
+        with pytest.raises(DamagedError, match="does not give parts of files: say cache_dir="):
+            gen2d.open(url)[0]
+        same(gen2d.open(url, cache_dir=tmp_path)[0], gen2d.open(toy)[0])
+    finally:
+        server.gives_parts = True
+
+
+def damaged(toy: Path, url: str, name: str, change: Callable[[bytearray], Any]) -> None:
+    """Puts a copy of the dataset at the URL, with one file changed."""
+    buckets.copied(toy, url)
+    content = bytearray((toy / name).read_bytes())
+    change(content)
+    s3fs.S3FileSystem().pipe(f"{url}/{name}", bytes(content))
+
+
+def flip(content: bytearray) -> None:
+    middle = len(content) // 2
+    content[middle : middle + 6000] = bytes(6000)
+
+
+def shorten(content: bytearray) -> None:
+    del content[len(content) // 2 :]
+
+
+@pytest.mark.parametrize("change", [flip, shorten])
+def test_damage_is_never_returned_and_verify_tells_as_of_a_folder(
+    toy: Path, tmp_path: Path, change: Callable[[bytearray], Any]
+) -> None:
+    url, name = f"s3://bucket/{change.__name__}", "shards/train-00001.h5"
+    damaged(toy, url, name, change)
+    for cache in (None, tmp_path / "cache"):
+        with pytest.raises(DamagedError, match=rf"^{url}/{name}: "):
+            gen2d.open(url, fields="*", cache_dir=cache)[8:16]
+    copy = tmp_path / "toy"
+    for file, content in synthetic.tree(toy).items():
+        (copy / file).parent.mkdir(parents=True, exist_ok=True)
+        (copy / file).write_bytes(content)
+    content = bytearray((copy / name).read_bytes())
+    change(content)
+    (copy / name).write_bytes(content)
+    for level in ("quick", "full"):
+        expected = [sentence.replace(str(copy), url) for sentence in gen2d.verify(copy, level)]
+        assert gen2d.verify(url, level) == expected
+    assert gen2d.verify(TOY, "full") == []
+
+
+def test_a_damaged_index_is_told(toy: Path) -> None:
+    damaged(toy, "s3://bucket/index", "index/frames.npy", shorten)
+    with pytest.raises(DamagedError, match=r"^s3://bucket/index/index/frames.npy is not what was written"):
+        gen2d.open("s3://bucket/index")
+
+
+# ---- The cache
+
+
+def sizes(folder: Path) -> dict[str, int]:
+    return {path.name: path.stat().st_size for path in folder.iterdir()}
+
+
+def test_a_cache_keeps_to_its_limit_and_drops_what_was_used_longest_ago(
+    server: Server, toy: Path, tmp_path: Path
+) -> None:
+    made = {shard["name"]: shard for shard in shards.read_manifest(toy)["shards"]}
+    hashes = [made[f"train-{i:05d}"]["sha256"] for i in range(3)]
+    limit = made["train-00000"]["bytes"] + made["train-00001"]["bytes"] + 20000  # the index, and some
+    dataset, expected = gen2d.open(TOY, cache_dir=tmp_path, cache_bytes=limit), gen2d.open(toy)
+    for number in (0, 8, 1, 19):
+        same(dataset[number], expected[number])
+        assert sum(sizes(tmp_path).values()) <= limit
+    assert hashes[1] not in sizes(tmp_path)
+    assert {hashes[0], hashes[2]} <= sizes(tmp_path).keys()
+    server.reset()
+    dataset[[2, 18]]
+    assert not server.asked
+    random = np.random.default_rng(0)
+    for number in random.integers(0, 20, 30):
+        same(dataset[int(number)], expected[int(number)])
+        assert sum(sizes(tmp_path).values()) <= limit
+
+
+def test_what_is_changed_in_a_cache_is_fetched_again(server: Server, toy: Path, tmp_path: Path) -> None:
+    gen2d.open(TOY, cache_dir=tmp_path)[:]
+    for path in tmp_path.iterdir():
+        content = bytearray(path.read_bytes())
+        content[-1] ^= 1
+        path.write_bytes(content if path.stat().st_size % 2 else content[:-9])
+    (tmp_path / f"{'0' * 64}.part").write_bytes(b"of someone dead")
+    same(gen2d.open(TOY, cache_dir=tmp_path)[:], gen2d.open(toy)[:])
+
+
+def read_slowly(folder: Path, numbers: list[int]) -> list[int]:
+    return [int(gen2d.open(TOY, fields="index", cache_dir=folder)[number]["index"]) for number in numbers]
+
+
+def test_processes_share_a_cache_and_fetch_each_shard_once(server: Server, toy: Path, tmp_path: Path) -> None:
+    with multiprocessing.get_context("spawn").Pool(3) as pool:
+        found = pool.starmap(read_slowly, [(tmp_path, [0, 9, 18, 1])] * 3)
+    assert found == [[0, 9, 18, 1]] * 3
+    assert len(server.of("GET", "/shards/")) == 3
+    assert not list(tmp_path.glob("*.part"))
+
+
+def test_a_killed_fetch_leaves_nothing_that_counts(server: Server, toy: Path, tmp_path: Path) -> None:
+    words = "import sys, gen2d, time; ds = gen2d.open(sys.argv[1], cache_dir=sys.argv[2]); print(flush=True); ds[0]"
+    with subprocess.Popen([sys.executable, "-c", words, TOY, tmp_path], stdout=subprocess.PIPE) as process:
+
+        def killing(request: Request) -> str:
+            if "/shards/" in request.path:
+                process.kill()
+            return ""
+
+        server.fault = killing
+        process.wait()
+    server.reset()
+    assert process.returncode == -signal.SIGKILL
+    assert len(list(tmp_path.glob("*.part"))) == 1
+    same(gen2d.open(TOY, cache_dir=tmp_path)[0], gen2d.open(toy)[0])
+    assert not list(tmp_path.glob("*.part"))
+
+
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [({"cache_bytes": 10**9}, "say cache_dir="), ({"cache_dir": "/tmp", "cache_bytes": 1000}, "for the largest shard")],
+)
+def test_a_cache_that_cannot_be_is_told(toy: Path, options: dict[str, Any], told: str) -> None:
+    with pytest.raises(ConfigError, match=told):
+        gen2d.open(TOY, **options)
+
+
+# ---- Processes
+
+
+def first_frames(dataset: loader.Dataset) -> np.ndarray:
+    return dataset[[0, 9]]["frames"]
+
+
+@pytest.mark.parametrize("method", ["fork", "spawn"])
+def test_a_dataset_is_read_after_fork_and_spawn(toy: Path, method: str) -> None:
+    dataset = gen2d.open(TOY)
+    expected = first_frames(dataset)  # so that the parent has connections open
+    with multiprocessing.get_context(method).Pool(2) as pool:
+        for found in pool.map(first_frames, [dataset] * 3):
+            assert_array_equal(found, expected)
+
+
+def test_the_loader_takes_it(toy: Path) -> None:
+    with (
+        DataLoader(gen2d.open(TOY), 6, seed=3, epochs=2, num_threads=3) as found,
+        DataLoader(gen2d.open(toy), 6, seed=3, epochs=2, num_threads=3) as expected,
+    ):
+        for one, other in zip(found, expected, strict=True):
+            same(one, other)
+
+
+def test_reading_a_folder_imports_no_fsspec_and_reading_a_url_no_jax(toy: Path) -> None:
+    code = "import sys, gen2d; gen2d.open(sys.argv[1])[0]; assert not {'jax', sys.argv[2]} & sys.modules.keys()"
+    subprocess.run([sys.executable, "-c", code, toy, "fsspec"], check=True)
+    subprocess.run([sys.executable, "-c", code, TOY, "h5py"], check=True)
+
+
+# ---- Writing
+
+
+def at(url: str, **changes: Any) -> shards.Dataset:
+    return synthetic.dataset(place(url), **changes)
+
+
+def test_what_is_written_is_what_is_in_the_folder_and_in_order(server: Server, toy: Path) -> None:
+    synthetic.make(at("s3://bucket/written"))
+    written = [request.path.removeprefix("/bucket/written/") for request in server.of("PUT")]
+    assert buckets.tree("s3://bucket/written") == synthetic.tree(toy)
+    assert written[-1] == "manifest.json"
+    for name in ("train-00000", "train-00002", "test-00000"):
+        assert written.index(f"shards/{name}.h5") < written.index(f".gen2d/done/{name}.json")
+    assert shards.open_folder(at("s3://bucket/written")) == []
+    shards.log(place("s3://bucket/written"), {"speed": 1})
+    shards.log(place("s3://bucket/written"), {"speed": 2})
+    lines = (place("s3://bucket/written") / ".gen2d/run.jsonl").read_bytes().splitlines()
+    assert [json.loads(line)["speed"] for line in lines] == [1, 2]
+
+
+def test_memory_takes_a_dataset_too(toy: Path) -> None:
+    synthetic.make(at("memory://written"))
+    same(gen2d.open("memory://written")[:], gen2d.open(toy)[:])
+    assert gen2d.verify("memory://written", "full") == []
+
+
+@pytest.mark.parametrize("kind", ["fail", "cut"])
+def test_uploads_are_tried_again(server: Server, toy: Path, kind: str) -> None:
+    server.fault = first_time(kind)
+    synthetic.make(at(f"s3://bucket/again-{kind}"))
+    server.reset()
+    assert buckets.tree(f"s3://bucket/again-{kind}") == synthetic.tree(toy)
+
+
+@pytest.mark.parametrize("part", ["/shards/train-00001.h5", "/done/train-00001.npz", "/done/train-00001.json"])
+def test_an_upload_that_keeps_failing_is_told_and_resumed(server: Server, toy: Path, part: str) -> None:
+    url = f"s3://bucket/failing{part.replace('/', '-')}"
+    server.fault = always("fail", "PUT", part)
+    with pytest.raises(FolderError, match=rf"^{url}/.*train-00001.* cannot be read or written .*same command again"):
+        synthetic.make(at(url))
+    server.reset()
+    with pytest.raises(FolderError, match="is incomplete"):
+        gen2d.open(url)
+    assert "train-00001" in [shard.name for shard in shards.open_folder(at(url))]
+    synthetic.make(at(url))
+    assert buckets.tree(url) == synthetic.tree(toy)
+
+
+# Killed by the test as soon as the server is asked for what it waits for.
+WRITING = """
+import sys
+sys.path.insert(0, sys.argv[1])
+import synthetic
+from gen2d.remote import place
+synthetic.make(synthetic.dataset(place(sys.argv[2])))
+"""
+
+
+@pytest.mark.parametrize("part", ["/shards/train-00001.h5", "/done/train-00001.json", "/index/videos.npy"])
+@pytest.mark.parametrize("arrives", [False, True])
+def test_a_killed_writer_is_resumed(
+    server: Server, toy: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, part: str, arrives: bool
+) -> None:
+    url = f"s3://bucket/killed{part.replace('/', '-')}-{arrives}"
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    monkeypatch.setattr("tempfile.tempdir", None)
+    words = [sys.executable, "-c", WRITING, str(Path(__file__).parent), url]
+    with subprocess.Popen(words, stderr=subprocess.DEVNULL) as process:
+
+        def killing(request: Request) -> str:
+            if request.method != "PUT" or part not in request.path:
+                return ""
+            process.kill()
+            return "" if arrives else "fail"
+
+        server.fault = killing
+        process.wait()
+    server.reset()
+    assert process.returncode == -signal.SIGKILL
+    with pytest.raises(FolderError, match="is incomplete"):
+        gen2d.open(url)
+    assert list(tmp_path.iterdir())
+    sweep(place(url))
+    assert not list(tmp_path.iterdir())
+    synthetic.make(at(url))
+    assert buckets.tree(url) == synthetic.tree(toy)
+
+
+def test_more_videos_extend_and_equal_one_run(tmp_path: Path) -> None:
+    synthetic.make(at("s3://bucket/longer", train=12))
+    assert [shard.name for shard in shards.open_folder(at("s3://bucket/longer", train=30))] == [
+        "train-00001", "train-00002", "train-00003",
+    ]  # fmt: skip
+    synthetic.make(at("s3://bucket/longer", train=30))
+    synthetic.make(synthetic.dataset(tmp_path, train=30))
+    assert buckets.tree("s3://bucket/longer") == synthetic.tree(tmp_path)
+
+
+def test_workers_share_a_url(toy: Path) -> None:
+    made = at("s3://bucket/shared")
+    shares = [shards.mine(shards.open_folder(made), worker, 2) for worker in range(2)]
+    for share, complete in zip(shares, (False, True), strict=True):
+        for shard in share:
+            shards.write(made, shard, synthetic.blocks(made, shard))
+        assert shards.finish(made) == complete
+    assert buckets.tree("s3://bucket/shared") == synthetic.tree(toy)
+
+
+def test_another_dataset_is_refused_or_replaced(tmp_path: Path) -> None:
+    url = "s3://bucket/another"
+    synthetic.make(at(url))
+    before = buckets.tree(url)
+    with pytest.raises(FolderError, match="seed is 7 there and 8 here"):
+        shards.open_folder(at(url, seed=8))
+    assert buckets.tree(url) == before
+    synthetic.make(at(url, train=3, seed=8), overwrite=True)
+    synthetic.make(synthetic.dataset(tmp_path, train=3, seed=8))
+    assert buckets.tree(url) == synthetic.tree(tmp_path)
+
+
+def test_what_is_no_dataset_is_left_alone(tmp_path: Path) -> None:
+    (tmp_path / "thesis.tex").write_text("years of work")
+    remote.upload(tmp_path / "thesis.tex", Url("s3://bucket/thesis/thesis.tex"))
+    for overwrite in (False, True):
+        with pytest.raises(FolderError, match="holds something else"):
+            shards.open_folder(at("s3://bucket/thesis"), overwrite)
+    assert list(buckets.tree("s3://bucket/thesis")) == ["thesis.tex"]
+
+
+@pytest.mark.parametrize("method", ["PUT", "GET"])
+def test_no_permission_is_told(server: Server, toy: Path, method: str) -> None:
+    server.fault = always("deny", method, "/")
+    with pytest.raises(FolderError, match="you have no permission to write in s3://bucket/denied"):
+        synthetic.make(at("s3://bucket/denied"))
+    if method == "GET":
+        for call in (gen2d.open, gen2d.verify):
+            server.fault = always("deny", method, "manifest.json" if call is gen2d.open else "/index/")
+            with pytest.raises(FolderError, match=rf"^{TOY}/.* cannot be read \(Permission denied\)$"):
+                call(TOY)
+
+
+def test_a_full_disk_is_that_of_temporary_files(monkeypatch: pytest.MonkeyPatch) -> None:
+    made = at("s3://bucket/full")
+    shard = shards.open_folder(made)[0]
+
+    def write(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(hdf5, "write", write)
+    with pytest.raises(FolderError, match=rf"^no space left for {tempfile.gettempdir()}: ") as caught:
+        shards.write(made, shard, synthetic.blocks(made, shard))
+    assert caught.value.exit_code == 1
+
+
+# ---- The command line
+
+
+@pytest.mark.parametrize(
+    ("url", "told"),
+    [
+        ("s3://", "must be PROTOCOL://FOLDER"),
+        ("nope://bucket/toy", r"Protocol not known: nope\); common protocols are"),
+        ("s3://bucket/nothing-here", "not a (gen2d )?dataset"),
+        ("s3://no-such-bucket/toy", "not a (gen2d )?dataset"),
+        ("http://127.0.0.1:1/toy", r"http://127.0.0.1:1/toy/.* cannot be read \("),
+    ],
+)
+def test_a_wrong_url_is_one_sentence(url: str, told: str) -> None:
+    with pytest.raises(UserError, match=told):
+        gen2d.open(url)
+    for verb in ("verify", "info"):
+        done = tiny.ran(verb, url)
+        assert done.returncode == 2
+        assert re.fullmatch(rf"gen2d: .*{told}.*\n", done.stderr), done.stderr
+
+
+@pytest.mark.parametrize(
+    ("url", "missing"), [("s3://bucket/toy", "fsspec"), ("s3://bucket/toy", "s3fs"), ("memory://toy", "fsspec")]
+)
+def test_a_missing_package_is_one_sentence(url: str, missing: str) -> None:
+    code = f"import sys; sys.modules[{missing!r}] = None; from gen2d.__main__ import main; main(['info', {url!r}])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert re.fullmatch(r"gen2d: .* needs .*: pip install 'gen2d\[remote\]'\n", done.stderr), done.stderr
+
+
+def test_a_run_leaves_at_a_url_what_it_leaves_in_a_folder(server: Server, tmp_path: Path) -> None:
+    config = tmp_path / "tiny.yaml"
+    config.write_text(json.dumps(tiny.CONFIG))
+    for out in (tmp_path / "tiny", "s3://bucket/tiny"):
+        done = tiny.ran("--config", config, "--n", 12, "--out", out, "--device", "cpu")
+        assert done.returncode == 0, done.stderr
+        assert f"in {out}" in done.stdout
+    assert buckets.tree("s3://bucket/tiny") == synthetic.tree(tmp_path / "tiny")
+    for verb in ("verify", "info"):
+        done = tiny.ran(verb, "s3://bucket/tiny")
+        assert done.returncode == 0, done.stderr
+        assert "s3://bucket/tiny" in done.stdout
+    done = tiny.ran("preview", "s3://bucket/tiny", "--out", tmp_path, "--videos", 2)
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "tiny-sheet.png").is_file()
+    done = tiny.ran("--config", config, "--n", 12, "--out", "s3://bucket/tiny", "--seed", 3, "--device", "cpu")
+    assert done.returncode == 2
+    assert "seed is 0 there and 3 here" in done.stderr
