@@ -5,7 +5,7 @@ import hashlib
 import json
 import os
 import socket
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -52,6 +52,18 @@ def read_json(path: Path) -> dict[str, Any] | None:
     except (OSError, ValueError):
         return None
     return value if isinstance(value, dict) else None
+
+
+def sealed(values: Mapping[str, Any], key: str) -> dict[str, Any]:
+    """The values, and under `key` the sha256 of all the others."""
+    rest = {name: value for name, value in values.items() if name != key}
+    return rest | {key: sha256(as_json(rest))}
+
+
+def read_sealed(path: Path, key: str) -> dict[str, Any] | None:
+    """What `sealed` gave and the file holds; None if the file is missing or any byte of it changed."""
+    values = read_json(path)
+    return values if values is not None and path.read_bytes() == as_json(sealed(values, key)) else None
 
 
 def sha256(content: bytes) -> str:

@@ -10,12 +10,15 @@ import numpy as np
 
 from gen2d.errors import DamagedError, FolderError
 from gen2d.fields import Field
-from gen2d.files import as_json, file_sha256, publishing, read_json, sha256
+from gen2d.files import as_json, file_sha256, publishing, read_sealed, sealed, sha256
 from gen2d.formats import MOMENTS_OF, image_names, merged, row_names
-from gen2d.plan import MARK, SCHEMA, Dataset, Shard, table_path
+from gen2d.plan import IDENTITY, MARK, SCHEMA, Dataset, Shard, mark_path, record_path, table_path
 
 Record = Mapping[str, Any]  # of a shard that is done, as shards.py writes it
 Tables = dict[str, np.ndarray]
+
+# Where each file keeps the hash of all else in it.
+SEAL, MARK_SEAL, RECORD_SEAL = "manifest_sha256", "identity_sha256", "record_sha256"
 
 
 def read_manifest(root: Path) -> dict[str, Any]:
@@ -28,12 +31,23 @@ def read_manifest(root: Path) -> dict[str, Any]:
         if not (root / MARK).is_dir():
             raise FolderError(f"{root} is not a gen2d dataset: it has no manifest.json")
         raise FolderError(f"{root} is incomplete: run the command that made it again, and it goes on where it stopped")
-    manifest = read_json(path)
-    if manifest is None or path.read_bytes() != as_json(_sealed(manifest)):
+    manifest = read_sealed(path, SEAL)
+    if manifest is None:
         raise DamagedError(f"{path} is not what was written")
     if manifest["schema"] != SCHEMA:
         raise FolderError(f"{path} has schema {manifest['schema']}, but this gen2d reads {SCHEMA}")
     return manifest
+
+
+def identity_of(root: Path) -> dict[str, Any] | None:
+    """What the dataset in the folder was made from, as its manifest says or else its mark; None if neither is whole."""
+    there = read_sealed(root / "manifest.json", SEAL) or read_sealed(mark_path(root), MARK_SEAL)
+    return None if there is None else {key: there[key] for key in IDENTITY}
+
+
+def read_record(root: Path, name: str) -> dict[str, Any] | None:
+    """The record of the shard called `name`; None if there is none or any byte of it changed."""
+    return read_sealed(record_path(root, name), RECORD_SEAL)
 
 
 def field_of(about: Mapping[str, Any]) -> Field:
@@ -68,13 +82,7 @@ def describe(
         "producer": {key: value for key, value in dataset.producer.items() if key != "fingerprint"},
     }
     # As it will be read back: JSON makes every key a string and every tuple a list.
-    return _sealed(json.loads(as_json(manifest)))
-
-
-def _sealed(manifest: Mapping[str, Any]) -> dict[str, Any]:
-    """The manifest with the hash of all else in it."""
-    rest = {key: value for key, value in manifest.items() if key != "manifest_sha256"}
-    return rest | {"manifest_sha256": sha256(as_json(rest))}
+    return sealed(json.loads(as_json(manifest)), SEAL)
 
 
 def _described(field: Field, dataset: Dataset) -> dict[str, Any]:

@@ -83,6 +83,11 @@ def shard_path(root: Path, name: str) -> Path:
     return root / "shards" / f"{name}.h5"
 
 
+def mark_path(root: Path) -> Path:
+    """What says which dataset the folder is of, from the start on."""
+    return root / MARK / "dataset.json"
+
+
 def record_path(root: Path, name: str) -> Path:
     """What says that the shard is done, and what went into it."""
     return root / MARK / "done" / f"{name}.json"

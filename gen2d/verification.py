@@ -1,8 +1,9 @@
-"""Whether a dataset on disk is what was written: `quick` looks at names and sizes, `full` at every byte and value."""
+"""Whether a dataset on disk is what was written: `quick` looks at names and sizes, `full` at every byte and value,
+`regen` also makes some videos again from their recipe and compares them to the bit."""
 
 import dataclasses
 import os
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -11,12 +12,15 @@ import h5py
 import numpy as np
 
 from gen2d import loader
+from gen2d.cards import croissant
+from gen2d.dataloader import order
 from gen2d.errors import ConfigError, DamagedError, FolderError
-from gen2d.files import file_sha256
-from gen2d.manifest import field_of, read_manifest
-from gen2d.plan import shard_path
+from gen2d.files import as_json, file_sha256, sealed, sha256
+from gen2d.manifest import MARK_SEAL, field_of, read_manifest, read_record
+from gen2d.plan import IDENTITY, MARK, mark_path, record_path, shard_path, table_path
 
-LEVELS = ("quick", "full")
+LEVELS = ("quick", "full", "regen")
+VIDEOS = 8  # made again, unless told otherwise
 
 # Of static bodies these are infinite; in every other field a value that is not finite is an error.
 INFINITE = ("objects/mass", "objects/moment")
@@ -30,19 +34,47 @@ class Problem:
     shard: str = ""
 
 
+@dataclasses.dataclass(frozen=True)
+class Outcome:
+    """What a check found, a sentence each, and what a repair did."""
+
+    problems: list[str]  # what is wrong, after the repair if there was one
+    repaired: list[str]  # what was wrong before it and is no more
+    remade: list[str]  # names of the shards that were made again
+
+
 def verify(
-    root: str | Path, level: str = "quick", repair_with: Callable[[list[str]], object] | None = None
+    root: str | Path,
+    level: str = "quick",
+    repair_with: Callable[[list[str]], Sequence[str] | None] | None = None,
+    videos: int = VIDEOS,
+    seed: int = 0,
 ) -> list[str]:
     """What is wrong with the dataset, a sentence each; empty if nothing is.
 
-    `repair_with` is called with the names of the bad shards, if there are problems, and must make these again and
-    finish the dataset; what is returned is then what remains wrong.
+    At the level "regen", as many `videos` as told are made again, chosen from `seed`; that imports jax, and raises
+    FolderError where this machine would make other bits. `repair_with` is called with the names of the bad shards, if
+    there are problems, and must make these again and finish the dataset, as `gen2d.regeneration.repair` does; what is
+    returned is then what remains wrong.
     """
-    found = list(problems(root, level))
-    if found and repair_with is not None:
-        repair_with(sorted({problem.shard for problem in found if problem.shard}))
-        found = list(problems(root, level))
-    return [problem.sentence for problem in found]
+    return checked(root, level, repair_with, videos, seed).problems
+
+
+def checked(
+    root: str | Path,
+    level: str = "quick",
+    repair_with: Callable[[list[str]], Sequence[str] | None] | None = None,
+    videos: int = VIDEOS,
+    seed: int = 0,
+) -> Outcome:
+    """What `verify` finds, and what was repaired."""
+    found = list(problems(root, level, videos, seed))
+    if not found or repair_with is None:
+        return Outcome([problem.sentence for problem in found], [], [])
+    remade = repair_with(sorted({problem.shard for problem in found if problem.shard}))
+    left = [problem.sentence for problem in problems(root, level, videos, seed)]
+    repaired = [problem.sentence for problem in found if problem.sentence not in left]
+    return Outcome(left, repaired, list(remade or ()))
 
 
 def damaged_shards(root: str | Path, level: str = "quick") -> list[str]:
@@ -50,36 +82,100 @@ def damaged_shards(root: str | Path, level: str = "quick") -> list[str]:
     return sorted({problem.shard for problem in problems(root, level) if problem.shard})
 
 
-def problems(root: str | Path, level: str = "quick") -> Iterator[Problem]:
-    """Everything that is wrong, the folder first, then shard by shard."""
+def problems(root: str | Path, level: str = "quick", videos: int = VIDEOS, seed: int = 0) -> Iterator[Problem]:
+    """Everything that is wrong, the folder first, then shard by shard, then what made again is another video."""
     root = Path(root)
     if level not in LEVELS:
         raise ConfigError(f"level is {level!r}, but must be one of {', '.join(LEVELS)}")
+    if videos < 1:
+        raise ConfigError(f"--videos is {videos}, but must be 1 or more")
     try:
         manifest = read_manifest(root)
     except (FolderError, DamagedError) as error:
         yield Problem(str(error))
         return
+    remade = _remade(root, manifest, videos, seed) if level == "regen" else iter(())
     whole = list(_hashed_files(root, manifest))
     yield from whole
+    yield from _cards(root, manifest)
+    yield from _records(root, manifest)
     missized = list(_shard_files(root, manifest))
     yield from missized
-    if level == "full":
+    if level != "quick":
         absent = {problem.shard for problem in missized}
         present = [shard for shard in manifest["shards"] if shard["name"] not in absent]
         with ThreadPoolExecutor(min(os.cpu_count() or 1, 8)) as pool:
             for found in pool.map(lambda shard: list(_contents(root, manifest, shard, not whole)), present):
                 yield from found
+    yield from remade
+
+
+def _remade(root: Path, manifest: Mapping[str, Any], videos: int, seed: int) -> Iterator[Problem]:
+    """What differs in videos made again; raises FolderError, at once, where that cannot be judged here."""
+    from gen2d import regeneration  # imports jax
+
+    rollout = regeneration.rollout_of(root, manifest)
+    chosen = chosen_videos(manifest["splits"], videos, seed)
+    return (
+        Problem(f"{shard_path(root, shard)}: {wrong}", shard)
+        for shard, wrong in regeneration.differing(rollout, root, manifest, chosen)
+    )
+
+
+def chosen_videos(splits: Mapping[str, int], videos: int, seed: int) -> list[tuple[str, int]]:
+    """Split and number of as many videos as asked, or of all there are: which, the seed decides."""
+    everything = sum(splits.values())
+    places = np.sort(order(seed, 0, np.arange(min(videos, everything)), everything))
+    ends = np.cumsum(list(splits.values()))
+    owner = np.searchsorted(ends, places, side="right")
+    return [
+        (list(splits)[k], int(place - ends[k] + list(splits.values())[k]))
+        for k, place in zip(owner, places, strict=True)
+    ]
 
 
 def _hashed_files(root: Path, manifest: Mapping[str, Any]) -> Iterator[Problem]:
-    for name, sha256 in manifest["files"].items():
-        if not (root / name).is_file():
-            yield Problem(f"{root / name} is missing")
-        elif file_sha256(root / name) != sha256:
-            yield Problem(f"{root / name} is not what was written")
-    for path in (root / "index").rglob("*"):
+    for name, expected in manifest["files"].items():
+        yield from map(Problem, _wrong(root / name, expected))
+    for path in sorted((root / "index").rglob("*")):
         if path.is_file() and path.relative_to(root).as_posix() not in manifest["files"]:
+            yield Problem(f"{path} does not belong to the dataset")
+
+
+def _wrong(path: Path, expected: str) -> Iterator[str]:
+    """What is wrong with a file that must have this sha256."""
+    try:
+        if not path.is_file():
+            yield f"{path} is missing"
+        elif file_sha256(path) != expected:
+            yield f"{path} is not what was written"
+    except OSError as error:
+        yield f"{path} cannot be read ({error.strerror or error})"
+
+
+def _cards(root: Path, manifest: Mapping[str, Any]) -> Iterator[Problem]:
+    """README.md is for people, who may write in it, so it only has to be there."""
+    yield from map(Problem, _wrong(root / "croissant.json", sha256(as_json(croissant(manifest)))))
+    if not (root / "README.md").is_file():
+        yield Problem(f"{root / 'README.md'} is missing")
+
+
+def _records(root: Path, manifest: Mapping[str, Any]) -> Iterator[Problem]:
+    """What is wrong with what a later run needs; a copy may well have been made without it."""
+    if not (root / MARK).is_dir():
+        return
+    identity = {key: manifest[key] for key in IDENTITY}
+    yield from map(Problem, _wrong(mark_path(root), sha256(as_json(sealed(identity, MARK_SEAL)))))
+    expected = {record_path(root, shard["name"]): shard for shard in manifest["shards"]}
+    for path, shard in expected.items():
+        record = read_record(root, shard["name"])
+        if record is None or any(record[key] != shard[key] for key in shard):
+            yield Problem(f"{path} is {'not what was written' if path.is_file() else 'missing'}", shard["name"])
+        else:
+            tables = _wrong(table_path(root, shard["name"]), record["tables_sha256"])
+            yield from (Problem(sentence, shard["name"]) for sentence in tables)
+    for path in sorted((root / MARK / "done").glob("*")):
+        if path.with_suffix(".json") not in expected:
             yield Problem(f"{path} does not belong to the dataset")
 
 

@@ -17,8 +17,8 @@ PACKAGE = ROOT / "gen2d"
 ORDER = [
     *("errors", "fields", "files", "codecs", "formats", "plan", "manifest", "cards", "shards", "loader"),
     *(
-        "verification",
         "dataloader",
+        "verification",
         "report",
         "types",
         "shapes",
@@ -50,7 +50,7 @@ ORDER = [
         "annotations",
     ),
     *("placement", "scenes", "renderers", "drawing", "devices", "rollout", "redraw", "pipeline"),
-    *("generation", "preview", "gallery", "space", "pictures"),
+    *("generation", "regeneration", "preview", "gallery", "space", "pictures"),
 ]
 WITHOUT_JAX = ORDER[: ORDER.index("report") + 1]
 PLUGINS = ("scenes", "renderers", "annotations", "formats")
