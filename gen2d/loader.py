@@ -173,6 +173,7 @@ class Dataset:
             if column.codec != "none":
                 codecs.decode_into(column.codec, data, target)
         except (DamagedError, OSError) as error:
+            _opened.cache_clear()  # a shard that is made again is another file under the same name
             where = f"{path}: {column.name} of {self.options.split} video {video}"
             raise DamagedError(f"{where} cannot be read ({error}): gen2d verify finds all such damage") from error
 

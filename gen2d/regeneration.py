@@ -1,6 +1,7 @@
 """A stored dataset against its recipe: some of its videos made again and compared, its bad shards made again."""
 
 import dataclasses
+import functools
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -9,6 +10,7 @@ import numpy as np
 
 from gen2d import devices, loader, shards
 from gen2d.codecs import decode_into
+from gen2d.config import load_config, parse_yaml
 from gen2d.errors import DamagedError, FolderError
 from gen2d.files import read_sealed
 from gen2d.generation import dataset_of, make
@@ -23,8 +25,12 @@ Identity = Mapping[str, Any]  # of a dataset; its manifest has the same keys
 
 def rollout_of(root: Path, identity: Identity) -> Rollout:
     """The programs that made the dataset in the folder. Raises ConfigError where its config cannot be used here."""
-    on_cpu = identity["fingerprint"]["device"].startswith("cpu")
-    return Rollout(config_from(root, identity), devices.prepare("cpu" if on_cpu else "auto"))
+    return _rollout(config_from(root, identity).text(), identity["fingerprint"]["device"].startswith("cpu"))
+
+
+@functools.lru_cache(maxsize=1)  # a check, a repair and the check that follows compile once
+def _rollout(config: str, on_cpu: bool) -> Rollout:
+    return Rollout(load_config(parse_yaml(config, "config")), devices.prepare("cpu" if on_cpu else "auto"))
 
 
 def check_fingerprint(root: Path, rollout: Rollout, identity: Identity) -> None:
@@ -40,17 +46,21 @@ def differing(
 ) -> Iterator[tuple[str, str]]:
     """For each field of the videos (split, number) that is another when made again: its shard and a sentence.
 
-    Pieces that cannot be read are passed over: the level "full" names them.
+    Videos that cannot be read are passed over: the level "full" names them.
     """
     dataset = dataset_of(rollout, root, manifest["splits"])
     constants = {name: values.tolist() for name, values in dataset.constants.items()}
     if constants != manifest["constants"]:
         raise FolderError(f"{root}: its constants {', '.join(constants)} are not those that its recipe gives")
+    try:
+        stored = {split: loader.open(root, split, fields=("*",)) for split in manifest["splits"]}
+    except DamagedError:
+        return
     encoder = Encoder(rollout, dataset, threads_for(devices.cores()))
     try:
         for shard, block in encoder.blocks(_work(dataset, rollout.lanes, chosen)):
             number = int(block.arrays["index"][0])
-            for name in _other(root, shard.split, number, _values(block, dataset)):
+            for name in _other(stored[shard.split], number, _values(block, dataset)):
                 yield shard.name, f"{name} of {shard.split} video {number} is not what its recipe makes"
     finally:
         encoder.close()
@@ -78,15 +88,13 @@ def _values(block: Block, dataset: Dataset) -> dict[str, np.ndarray]:
     return found
 
 
-def _other(root: Path, split: str, number: int, made: Mapping[str, np.ndarray]) -> Iterator[str]:
+def _other(stored: loader.Dataset, number: int, made: Mapping[str, np.ndarray]) -> list[str]:
     """The names of the fields that are stored otherwise, to the bit."""
-    for name, values in made.items():
-        try:
-            stored = loader.open(root, split, fields=(name,))[number][name]
-        except DamagedError:
-            continue
-        if np.ascontiguousarray(stored).tobytes() != np.ascontiguousarray(values).tobytes():
-            yield name
+    try:
+        video = stored[number]
+    except DamagedError:
+        return []
+    return [name for name, values in made.items() if video[name].tobytes() != values.tobytes()]
 
 
 def repair(root: str | Path, bad: Sequence[str], say: Callable[[str], None] | None = None) -> list[str]:

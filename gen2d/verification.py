@@ -115,6 +115,7 @@ def _remade(root: Path, manifest: Mapping[str, Any], videos: int, seed: int) -> 
     from gen2d import regeneration  # imports jax
 
     rollout = regeneration.rollout_of(root, manifest)
+    regeneration.check_fingerprint(root, rollout, manifest)
     chosen = chosen_videos(manifest["splits"], videos, seed)
     return (
         Problem(f"{shard_path(root, shard)}: {wrong}", shard)
