@@ -2,7 +2,7 @@
 
 import dataclasses
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -102,6 +102,14 @@ def _stats(records: list[Record]) -> dict[str, dict[str, list[float] | None]]:
         values = {"mean": mean, "std": spread, "min": low, "max": high}
         stats[name] = {key: value.tolist() if np.isfinite(value).all() else None for key, value in values.items()}
     return stats
+
+
+def statistics(manifest: Mapping[str, Any]) -> Iterator[tuple[str, ...]]:
+    """The stored statistics as rows for a person: split, field, mean, standard deviation, least and largest value."""
+    for split, fields in sorted(manifest["stats"].items()):
+        for name, about in fields.items():
+            parts = (about[key] for key in ("mean", "std", "min", "max"))
+            yield split, name, *(", ".join(f"{x:.4g}" for x in part) if part else "-" for part in parts)
 
 
 # ---- The index

@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 
 from gen2d import cards
+from gen2d.cards import SHEET
 from gen2d.errors import FolderError
 from gen2d.files import as_json, file_sha256, publish, publishing, read_json, read_sealed, sealed, sha256, sweep
 from gen2d.formats import Block, Places, encode, hdf5, head, merged, stored_bytes
@@ -124,7 +125,7 @@ def _is_dataset(root: Path) -> bool:
 def _clear(root: Path) -> None:
     """Removes what is written here and no more; the mark stays, so that a crash here leaves a dataset's folder."""
     (root / MARK).mkdir(exist_ok=True)
-    for name in ("manifest.json", "croissant.json", "README.md", "sheet.png", "config.yaml", MARK / "dataset.json"):
+    for name in ("manifest.json", "croissant.json", "README.md", SHEET, "config.yaml", MARK / "dataset.json"):
         (root / name).unlink(missing_ok=True)
     for name in ("shards", "index", MARK / "done"):
         shutil.rmtree(root / name, ignore_errors=True)
@@ -312,9 +313,12 @@ def finish(dataset: Dataset) -> bool:
 
 def _complete(dataset: Dataset, shards: list[Shard], records: list[Mapping[str, Any]]) -> None:
     root, recipe = dataset.root, dataset.config_text.encode()
+    publish(root / "config.yaml", recipe)
     files = write_index(dataset, shards, records) | {"config.yaml": sha256(recipe)}
     manifest = describe(dataset, shards, records, files)
-    publish(root / "config.yaml", recipe)
+    if "frames" in dataset.fields:
+        publish(root / SHEET, cards.picture(root, manifest))
+        manifest = describe(dataset, shards, records, files | {SHEET: file_sha256(root / SHEET)})
     publish(root / "README.md", cards.readme(manifest, dataset.command).encode())
     publish(root / "croissant.json", as_json(cards.croissant(manifest)))
     publish(root / "manifest.json", as_json(manifest))  # last: it says that all is there

@@ -15,7 +15,7 @@ ROOT = Path(gen2d.__file__).parent.parent
 PACKAGE = ROOT / "gen2d"
 # Each module may import those before it; a family or look may import all of a Python file's neighbours but the last.
 ORDER = [
-    *("errors", "fields", "files", "codecs", "formats", "plan", "manifest", "cards", "shards", "loader"),
+    *("errors", "fields", "files", "codecs", "formats", "plan", "manifest", "loader", "preview", "cards", "shards"),
     *(
         "dataloader",
         "verification",
@@ -50,7 +50,7 @@ ORDER = [
         "annotations",
     ),
     *("placement", "scenes", "renderers", "drawing", "devices", "rollout", "redraw", "pipeline"),
-    *("generation", "regeneration", "preview", "gallery", "space", "pictures"),
+    *("generation", "regeneration", "gallery", "space", "pictures"),
 ]
 WITHOUT_JAX = ORDER[: ORDER.index("report") + 1]
 PLUGINS = ("scenes", "renderers", "annotations", "formats")
