@@ -19,18 +19,20 @@ if TYPE_CHECKING:
     from gen2d.dataloader import DataLoader
     from gen2d.generation import generate
     from gen2d.loader import open
+    from gen2d.mixing import mix
     from gen2d.redraw import render, simulate_again
     from gen2d.space import Space
     from gen2d.verification import verify
 
 __version__ = "0.1.0"
-__all__ = ["DataLoader", "Space", "generate", "load_config", "open", "render", "simulate_again", "verify"]
+__all__ = ["DataLoader", "Space", "generate", "load_config", "mix", "open", "render", "simulate_again", "verify"]
 
 _HOME = {
     "DataLoader": "gen2d.dataloader",
     "Space": "gen2d.space",
     "generate": "gen2d.generation",
     "load_config": "gen2d.config",
+    "mix": "gen2d.mixing",
     "open": "gen2d.loader",
     "render": "gen2d.redraw",
     "simulate_again": "gen2d.redraw",

@@ -16,6 +16,8 @@ import numpy as np
 
 from gen2d.errors import ConfigError
 from gen2d.loader import Batch, Dataset
+from gen2d.mixing import Mixture
+from gen2d.ordering import WINDOWS, hashed
 
 
 class DataLoader:
@@ -28,12 +30,13 @@ class DataLoader:
     `shuffle` is "global" (or True) or False. `remainder` says what happens to the last videos of an epoch that fill no
     global batch: "drop" or "keep" (then the ranks' shares may differ by one, or be empty). `transform` gets each batch
     in a thread, and returns new arrays each time. `to` is "numpy", "torch" or "jax", which has no 64-bit numbers unless
-    told to.
+    told to. `device` is where batches are put, a torch device or its name or a jax device, and `sharding` how jax lays
+    them out on several. `dataset` is of `gen2d.open` or `gen2d.mix`.
     """
 
     def __init__(
         self,
-        dataset: Dataset,
+        dataset: Dataset | Mixture,
         batch_size: int,
         seed: int = 0,
         shuffle: bool | str = "global",
@@ -45,9 +48,12 @@ class DataLoader:
         prefetch: int = 2,
         transform: Callable[[Batch], Any] | None = None,
         to: str = "numpy",
+        device: Any = None,
+        sharding: Any = None,
     ) -> None:
         threads = num_threads or min(os.cpu_count() or 1, 8)
         _check(to, shuffle, remainder)
+        _check_place(to, device, sharding)
         if min(batch_size, world_size, prefetch, threads) < 1 or not 0 <= rank < world_size:
             told = "batch_size, world_size, prefetch and num_threads must be 1 or more, and rank from 0 to"
             raise ConfigError(f"{told} world_size - 1")
@@ -55,6 +61,7 @@ class DataLoader:
         self.rank, self.world_size, self.global_size = rank, world_size, batch_size * world_size
         self.least = 1 if remainder == "keep" else self.global_size  # how many videos still make a global batch
         self.threads, self.prefetch, self.transform, self.to = threads, prefetch, transform, to
+        self.device, self.sharding = device, sharding
         self._epoch = self._position = 0
         self._running: Generator[Any, None, None] | None = None
         if len(dataset) < self.least:
@@ -116,7 +123,7 @@ class DataLoader:
             ahead = deque((step, self._submit(pool, *step)) for step in itertools.islice(steps, self.prefetch))
             while ahead:
                 (epoch, position, size), coming = ahead.popleft()
-                batch = _DELIVER[self.to](coming.result())
+                batch = _DELIVER[self.to](coming.result(), self.device, self.sharding)
                 # Asked for before this one is handed out, so that threads read while the caller trains.
                 ahead.extend((step, self._submit(pool, *step)) for step in itertools.islice(steps, 1))
                 self._epoch, self._position = self._settled(epoch, position + size)
@@ -128,8 +135,8 @@ class DataLoader:
         """This rank's slice of a global batch, being filled by all threads."""
         share = (size * rank // self.world_size for rank in (self.rank, self.rank + 1))
         positions = position + np.arange(*share)
-        indices = order(self.seed, epoch, positions, len(self.dataset)) if self.shuffle else positions
-        starts = self._starts(epoch, positions)
+        indices = self.dataset.numbers_at(positions, epoch, self.seed if self.shuffle else None)
+        starts = self.dataset.starts(indices, hashed(WINDOWS, self.seed, epoch, positions))
         # A new batch each time, never one used before: jax may keep the very memory that it is given.
         out = self.dataset.empty(len(indices))
         parts = [
@@ -145,25 +152,31 @@ class DataLoader:
             part.result()
         return out if self.transform is None else self.transform(out)
 
-    def _starts(self, epoch: int, positions: np.ndarray) -> np.ndarray | None:
-        options = self.dataset.options
-        if options.window is None or options.start != "random":
-            return None
-        choices = self.dataset.manifest["sizes"]["T"] - options.span + 1
-        return (_hashed(_WINDOWS, self.seed, epoch, positions) % np.uint64(choices)).astype(np.int64)
 
-
-def _to_torch(batch: Batch) -> dict[str, Any]:
+def _to_torch(batch: Batch, device: Any, sharding: Any) -> dict[str, Any]:
     torch = importlib.import_module("torch")
-    return {name: torch.from_numpy(values) for name, values in batch.items()}
+    tensors = {name: torch.from_numpy(values) for name, values in batch.items()}
+    return tensors if device is None else {name: tensor.to(device) for name, tensor in tensors.items()}
 
 
-def _to_jax(batch: Batch) -> dict[str, Any]:
-    return importlib.import_module("jax").device_put(batch)
+def _to_jax(batch: Batch, device: Any, sharding: Any) -> dict[str, Any]:
+    return importlib.import_module("jax").device_put(batch, device if sharding is None else sharding)
 
 
 # How batches are handed out, by the value of `to`.
-_DELIVER: dict[str, Callable[[Any], Any]] = {"numpy": lambda batch: batch, "torch": _to_torch, "jax": _to_jax}
+_DELIVER: dict[str, Callable[[Any, Any, Any], Any]] = {
+    "numpy": lambda batch, device, sharding: batch,
+    "torch": _to_torch,
+    "jax": _to_jax,
+}
+
+
+def _check_place(to: str, device: Any, sharding: Any) -> None:
+    """Raises ConfigError for a place that such batches cannot have."""
+    if device is not None and to == "numpy":
+        raise ConfigError(f"device is {device!r}, but must be None with to='numpy'")
+    if sharding is not None and (to != "jax" or device is not None):
+        raise ConfigError(f"sharding is {sharding!r}, but must be None unless to is 'jax' and device None")
 
 
 def _check(to: str, shuffle: bool | str, remainder: str) -> None:
@@ -172,47 +185,3 @@ def _check(to: str, shuffle: bool | str, remainder: str) -> None:
     for name, (value, values) in (allowed | {"remainder": (remainder, ("drop", "keep"))}).items():
         if value not in values:
             raise ConfigError(f"{name} is {value!r}, but must be one of {', '.join(map(str, values))}")
-
-
-# What a random number is for, so that no two uses share one.
-_ORDER, _WINDOWS = 0, 1
-
-
-def order(seed: int, epoch: int, positions: np.ndarray, count: int) -> np.ndarray:
-    """The numbers of the videos at these positions of an epoch: a permutation of 0 to count - 1, nowhere stored.
-
-    A Feistel network permutes the smallest square power of two that holds `count`; what falls outside goes through
-    again until it falls inside (Black and Rogaway, CT-RSA 2002).
-    """
-    half = np.uint64(max(1, ((count - 1).bit_length() + 1) // 2))
-    keys = [_hashed(_ORDER, seed, epoch, step) for step in range(8)]
-    values = positions.astype(np.uint64)
-    outside = np.ones(values.shape, bool)
-    while outside.any():
-        values[outside] = _feistel(values[outside], keys, half)
-        outside = values >= count
-    return values.astype(np.int64)
-
-
-def _feistel(values: np.ndarray, keys: list[np.ndarray], half: np.uint64) -> np.ndarray:
-    mask = (np.uint64(1) << half) - np.uint64(1)
-    left, right = values >> half, values & mask
-    for key in keys:
-        left, right = right, left ^ (_mixed(right ^ key) & mask)
-    return (left << half) | right
-
-
-def _hashed(*parts: int | np.ndarray) -> np.ndarray:
-    """64 random bits that the parts decide, uint64, for each element of the parts."""
-    bits = np.zeros(1, np.uint64)
-    for part in parts:
-        bits = _mixed(bits ^ np.asarray(part).astype(np.uint64))
-    return bits
-
-
-def _mixed(bits: np.ndarray) -> np.ndarray:
-    """The next output of SplitMix64 (Steele, Lea and Flood, OOPSLA 2014), for each element."""
-    bits = bits + np.uint64(0x9E3779B97F4A7C15)
-    bits = (bits ^ (bits >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
-    bits = (bits ^ (bits >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
-    return bits ^ (bits >> np.uint64(31))

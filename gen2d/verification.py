@@ -13,10 +13,10 @@ import numpy as np
 
 from gen2d import loader
 from gen2d.cards import croissant
-from gen2d.dataloader import order
 from gen2d.errors import ConfigError, DamagedError, FolderError
 from gen2d.files import as_json, file_sha256, sealed, sha256
 from gen2d.manifest import MARK_SEAL, field_of, read_manifest, read_record
+from gen2d.ordering import order
 from gen2d.plan import IDENTITY, MARK, mark_path, record_path, shard_path, table_path
 
 LEVELS = ("quick", "full", "regen")

@@ -15,7 +15,8 @@ ROOT = Path(gen2d.__file__).parent.parent
 PACKAGE = ROOT / "gen2d"
 # Each module may import those before it; a family or look may import all of a Python file's neighbours but the last.
 ORDER = [
-    *("errors", "fields", "files", "codecs", "formats", "plan", "manifest", "loader", "preview", "cards", "shards"),
+    *("errors", "fields", "files", "codecs", "formats", "plan", "manifest", "ordering", "loader", "mixing", "preview"),
+    *("cards", "shards"),
     *(
         "dataloader",
         "verification",
