@@ -82,13 +82,14 @@ class Mixture:
         """A batch of `count` videos that is yet to be filled."""
         return self._sources[0].empty(count)
 
-    def fill(self, out: Batch, row: int, numbers: np.ndarray, starts: np.ndarray | None = None) -> None:
+    def fill(self, out: Batch, row: int, indices: Numbers, starts: Numbers | None = None) -> None:
         """Returns nothing; puts the videos with these numbers into `out` from `row` on, windows from `starts`."""
+        numbers = np.asarray(indices)
         owners = self._owners(numbers)
         for run in np.split(np.arange(len(numbers)), np.flatnonzero(np.diff(owners)) + 1):
             if len(run):
                 owner = owners[run[0]]
-                own = None if starts is None else starts[run]
+                own = None if starts is None else np.asarray(starts)[run]
                 self._sources[owner].fill(out, row + int(run[0]), numbers[run] - self._firsts[owner], own)
 
     def numbers_at(self, positions: np.ndarray, epoch: int = 0, seed: int | None = None) -> np.ndarray:
