@@ -178,9 +178,8 @@ def verify(arguments: Sequence[str]) -> int:
         return 1 if outcome.problems else 0
     for sentence in (*(f"repaired: {what}" for what in outcome.repaired), *outcome.problems):
         print(sentence)
-    if not outcome.problems:
-        chosen = f", {options.videos} videos chosen by --seed {seed}" if options.level == "regen" else ""
-        print(f"{options.dataset}: whole ({options.level} check{chosen})")
+    chosen = f", {options.videos} videos chosen by --seed {seed}" if options.level == "regen" else ""
+    print(f"{options.dataset}: {'damaged' if outcome.problems else 'whole'} ({options.level} check{chosen})")
     return 1 if outcome.problems else 0
 
 

@@ -38,7 +38,8 @@ def check_fingerprint(root: Path, rollout: Rollout, identity: Identity) -> None:
     here = devices.fingerprint(rollout.devices[0], rollout.lanes)
     differing = list(shards.differences(identity["fingerprint"], here, "fingerprint"))
     if differing:
-        raise FolderError(f"{root}: its videos cannot be made again to the bit: {' and '.join(differing)}")
+        told = " and ".join(differing)
+        raise FolderError(f"{root}: its videos can be neither judged nor repaired here, as bits would differ: {told}")
 
 
 def differing(
