@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from gen2d.exporting import export
     from gen2d.generation import generate
     from gen2d.loader import open
+    from gen2d.mixing import mix
     from gen2d.redraw import render, simulate_again
     from gen2d.space import Space
     from gen2d.streaming import stream
@@ -27,7 +28,8 @@ if TYPE_CHECKING:
 
 __version__ = "0.1.0"
 __all__ = [
-    "DataLoader", "Space", "export", "generate", "load_config", "open", "render", "simulate_again", "stream", "verify",
+    "DataLoader", "Space", "export", "generate", "load_config", "mix", "open", "render", "simulate_again", "stream",
+    "verify",
 ]  # fmt: skip
 
 _HOME = {
@@ -36,6 +38,7 @@ _HOME = {
     "export": "gen2d.exporting",
     "generate": "gen2d.generation",
     "load_config": "gen2d.config",
+    "mix": "gen2d.mixing",
     "open": "gen2d.loader",
     "render": "gen2d.redraw",
     "simulate_again": "gen2d.redraw",

@@ -1,19 +1,21 @@
 """The command line: `python -m gen2d --config bouncing.yaml --n 100000`, and verbs for what a dataset needs later."""
 
 import argparse
+import dataclasses
 import json
 import os
+import secrets
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
 from gen2d import __version__
 from gen2d.errors import DamagedError, UserError
-from gen2d.remote import place, reading
+from gen2d.remote import Place, place, reading
 
 VERBS = {
-    "verify": "check a dataset against its checksums",
+    "verify": "check a dataset against its checksums, or its recipe, and repair it",
     "info": "tell what a dataset holds",
     "list": "list scene families, looks and configs, with all options",
     "preview": "draw a contact sheet and an animation of a dataset or a config",
@@ -95,9 +97,15 @@ def _verb_parser(verb: str) -> Parser:
     parser.add_argument("dataset", metavar="DIR" + ("|CONFIG" if verb == "preview" else ""), help=help_text)
     if verb == "verify":
         parser.add_argument(
-            "--level", choices=("quick", "full"), default="full", help="quick: sizes and index; full: every byte"
+            "--level",
+            choices=("quick", "full", "regen"),
+            default="full",
+            help="quick: sizes and index; full: every byte; regen: also some videos made again and compared",
         )
-        parser.add_argument("--json", action="store_true", help="print the problems as JSON")
+        parser.add_argument("--videos", type=int, default=8, metavar="K", help="how many videos regen makes again (8)")
+        parser.add_argument("--seed", type=int, metavar="S", help="chooses them (default: another one each time, told)")
+        parser.add_argument("--repair", action="store_true", help="make what is wrong again, from the recipe")
+        parser.add_argument("--json", action="store_true", help="print what was found and repaired as JSON")
     if verb == "export":
         _add_export(parser)
     if verb == "preview":
@@ -178,18 +186,34 @@ def _told(summary: Any) -> str:
 def verify(arguments: Sequence[str]) -> int:
     """0 if the dataset is whole, else 1 and what is wrong."""
     options = _verb_parser("verify").parse_args(arguments)
-    from gen2d.verification import verify as check
+    from gen2d.verification import checked
 
     root = place(options.dataset)
     with reading(root):
         if not (root / "manifest.json").exists() and not (root / ".gen2d").is_dir():
             raise UserError(f"{root} is not a dataset that gen2d made")
-    problems = check(root, options.level)
+    seed = secrets.randbelow(2**32) if options.seed is None else options.seed
+    outcome = checked(root, options.level, _repairing(root) if options.repair else None, options.videos, seed)
     if options.json:
-        print(json.dumps({"dataset": options.dataset, "level": options.level, "problems": problems}))
-    else:
-        print("\n".join(problems) if problems else f"{options.dataset}: whole ({options.level} check)")
-    return 1 if problems else 0
+        about = {"dataset": options.dataset, "level": options.level, **dataclasses.asdict(outcome)}
+        print(json.dumps(about | ({"videos": options.videos, "seed": seed} if options.level == "regen" else {})))
+        return 1 if outcome.problems else 0
+    for sentence in (*(f"repaired: {what}" for what in outcome.repaired), *outcome.problems):
+        print(sentence)
+    chosen = f", {options.videos} videos chosen by --seed {seed}" if options.level == "regen" else ""
+    print(f"{options.dataset}: {'damaged' if outcome.problems else 'whole'} ({options.level} check{chosen})")
+    return 1 if outcome.problems else 0
+
+
+def _repairing(root: Place) -> Callable[[list[str]], list[str]]:
+    """What makes the shards with these names again."""
+
+    def repair(names: list[str]) -> list[str]:
+        from gen2d import regeneration  # imports jax: only now
+
+        return regeneration.repair(root, names, lambda line: print(line, file=sys.stderr, flush=True))
+
+    return repair
 
 
 def info(arguments: Sequence[str]) -> int:

@@ -3,9 +3,30 @@
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
+
+from gen2d import loader, preview
 from gen2d.files import as_json, sha256
+from gen2d.manifest import statistics
+from gen2d.remote import Place
 
 Manifest = Mapping[str, Any]
+
+SHEET, ROWS = "sheet.png", 4  # the picture of a dataset with frames, and how many videos it shows
+
+
+def picture(root: Place, manifest: Manifest) -> bytes:
+    """A contact sheet of the first videos, as a PNG; the manifest need not be in the folder yet."""
+    options = loader.Options(shown_split(manifest), ("frames",), None, 1, "first", "THWC", "uint8", "checksum")
+    ds = loader.Dataset(root, manifest, options)
+    # One video in memory at a time: they may be long and large.
+    videos = (ds[number]["frames"] for number in range(min(ROWS, len(ds))))
+    return preview.png(preview.contact_sheet(np.stack([preview.reduced(video) for video in videos])))
+
+
+def shown_split(manifest: Manifest) -> str:
+    """The split that cards show and load."""
+    return "train" if "train" in manifest["splits"] else min(manifest["splits"])
 
 
 def readme(manifest: Manifest, command: str) -> str:
@@ -19,7 +40,10 @@ def readme(manifest: Manifest, command: str) -> str:
         rows="\n".join(lines),
         sizes=", ".join(f"{axis} = {size}" for axis, size in sorted(manifest["sizes"].items())),
         conventions=manifest["conventions"],
-        split="train" if "train" in splits else min(splits),
+        split=shown_split(manifest),
+        sheet=f"\n![the first videos, time from left to right]({SHEET})\n" if SHEET in manifest["files"] else "",
+        statistics="\n".join(f"| {' | '.join(row)} |" for row in statistics(manifest)),
+        sampled=manifest["stats_sampled"],
         field="frames" if "frames" in fields else min(fields),
         plugin=", hdf5plugin" if manifest["codec"] == "zstd" else "",
         command="` and `".join(f"{command} --n {n} --split {split}" for split, n in manifest["splits"].items()),
@@ -33,7 +57,7 @@ _README = """# {name}
 
 Rendered videos of two-dimensional rigid bodies with everything that is true about them: {counts} videos,
 {fps:g} frames per second.
-
+{sheet}
 ## What it holds
 
 | field | dtype | axes | unit | meaning |
@@ -63,6 +87,16 @@ loader = torch.utils.data.DataLoader(dataset, batch_size=32, shuffle=True)
 batch = next(iter(loader))
 ```
 
+With JAX, on its default device (`device=` and `sharding=` name others):
+
+```python
+import gen2d, jax
+dataset = gen2d.open(".", split="{split}")
+loader = gen2d.DataLoader(dataset, batch_size=32, to="jax", epochs=1, remainder="keep")
+for batch in loader:
+    means = jax.tree.map(jax.numpy.mean, batch)
+```
+
 With h5py alone:
 
 ```python
@@ -72,6 +106,14 @@ video = file["{field}"][0]
 ```
 
 `manifest.json` describes every field and file, with checksums; `config.yaml` is the recipe.
+
+## Statistics
+
+| split | field | mean | standard deviation | least | largest |
+|---|---|---|---|---|---|
+{statistics}
+
+One number for each channel or component, of {sampled}.
 
 ## How it was made
 

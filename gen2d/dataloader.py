@@ -15,6 +15,7 @@ import numpy as np
 
 from gen2d.errors import ConfigError
 from gen2d.loader import Batch, Dataset
+from gen2d.mixing import Mixture
 from gen2d.order import Step, Walk, one_of
 
 
@@ -28,12 +29,13 @@ class DataLoader:
     `shuffle` is "global" (or True) or False. `remainder` says what happens to the last videos of an epoch that fill no
     global batch: "drop" or "keep" (then the ranks' shares may differ by one, or be empty). `transform` gets each batch
     in a thread, and returns new arrays each time. `to` is "numpy", "torch" or "jax", which has no 64-bit numbers unless
-    told to.
+    told to. `device` is where batches are put, a torch device or its name or a jax device, and `sharding` how jax lays
+    them out on several. `dataset` is of `gen2d.open` or `gen2d.mix`.
     """
 
     def __init__(
         self,
-        dataset: Dataset,
+        dataset: Dataset | Mixture,
         batch_size: int,
         seed: int = 0,
         shuffle: bool | str = "global",
@@ -45,13 +47,17 @@ class DataLoader:
         prefetch: int = 2,
         transform: Callable[[Batch], Any] | None = None,
         to: str = "numpy",
+        device: Any = None,
+        sharding: Any = None,
     ) -> None:
         self.threads, self.prefetch = num_threads or min(os.cpu_count() or 1, 8), prefetch
         one_of("to", to, tuple(_DELIVER))
+        _check_place(to, device, sharding)
         if min(self.prefetch, self.threads) < 1:
             raise ConfigError("prefetch and num_threads must be 1 or more")
         self.walk = Walk(len(dataset), batch_size, seed, shuffle, epochs, rank, world_size, remainder)
         self.dataset, self.transform, self.to = dataset, transform, to
+        self.device, self.sharding = device, sharding
         self._running: Generator[Any, None, None] | None = None
 
     def __len__(self) -> int:
@@ -90,7 +96,7 @@ class DataLoader:
             ahead = deque((step, self._submit(pool, step)) for step in itertools.islice(steps, self.prefetch))
             while ahead:
                 step, coming = ahead.popleft()
-                batch = _DELIVER[self.to](coming.result())
+                batch = _DELIVER[self.to](coming.result(), self.device, self.sharding)
                 # Asked for before this one is handed out, so that threads read while the caller trains.
                 ahead.extend((following, self._submit(pool, following)) for following in itertools.islice(steps, 1))
                 self.walk.passed(step)
@@ -100,9 +106,9 @@ class DataLoader:
 
     def _submit(self, pool: ThreadPoolExecutor, step: Step) -> Future[Any]:
         """This rank's slice of a global batch, being filled by all threads."""
-        positions, indices = self.walk.share(step)
-        options, frames = self.dataset.options, self.dataset.manifest["sizes"].get("T", 0)
-        starts = self.walk.starts(step, positions, frames - options.span + 1) if options.is_random else None
+        positions = self.walk.share(step)
+        indices = self.dataset.numbers_at(positions, step.epoch, self.walk.shuffled_by)
+        starts = self.dataset.starts(indices, self.walk.bits(step, positions))
         # A new batch each time, never one used before: jax may keep the very memory that it is given.
         out = self.dataset.empty(len(indices))
         parts = [
@@ -119,14 +125,27 @@ class DataLoader:
         return out if self.transform is None else self.transform(out)
 
 
-def _to_torch(batch: Batch) -> dict[str, Any]:
+def _to_torch(batch: Batch, device: Any, sharding: Any) -> dict[str, Any]:
     torch = importlib.import_module("torch")
-    return {name: torch.from_numpy(values) for name, values in batch.items()}
+    tensors = {name: torch.from_numpy(values) for name, values in batch.items()}
+    return tensors if device is None else {name: tensor.to(device) for name, tensor in tensors.items()}
 
 
-def _to_jax(batch: Batch) -> dict[str, Any]:
-    return importlib.import_module("jax").device_put(batch)
+def _to_jax(batch: Batch, device: Any, sharding: Any) -> dict[str, Any]:
+    return importlib.import_module("jax").device_put(batch, device if sharding is None else sharding)
 
 
 # How batches are handed out, by the value of `to`.
-_DELIVER: dict[str, Callable[[Any], Any]] = {"numpy": lambda batch: batch, "torch": _to_torch, "jax": _to_jax}
+_DELIVER: dict[str, Callable[[Any, Any, Any], Any]] = {
+    "numpy": lambda batch, device, sharding: batch,
+    "torch": _to_torch,
+    "jax": _to_jax,
+}
+
+
+def _check_place(to: str, device: Any, sharding: Any) -> None:
+    """Raises ConfigError for a place that such batches cannot have."""
+    if device is not None and to == "numpy":
+        raise ConfigError(f"device is {device!r}, but must be None with to='numpy'")
+    if sharding is not None and (to != "jax" or device is not None):
+        raise ConfigError(f"sharding is {sharding!r}, but must be None unless to is 'jax' and device None")

@@ -9,6 +9,7 @@ import sys
 from importlib.metadata import version
 from typing import Any
 
+import cv2
 import h5py
 import isal
 import jax
@@ -106,5 +107,6 @@ def producer(device: Device, lanes: int) -> dict[str, Any]:
         "hdf5": h5py.version.hdf5_version,
         "isal": isal.__version__,
         "zstandard": zstandard.__version__,
+        "opencv": cv2.__version__,
         "fingerprint": fingerprint(device, lanes),
     }

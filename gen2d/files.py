@@ -12,7 +12,7 @@ import shutil
 import socket
 import stat
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -134,8 +134,13 @@ def as_json(value: Any) -> bytes:
 
 def read_json(path: Place) -> dict[str, Any] | None:
     """The JSON object in the file; None if there is none. Raises OSError if that cannot be known of a Url."""
+    content = _content(path)
+    return None if content is None else parsed(content)
+
+
+def _content(path: Place) -> bytes | None:
     try:
-        return parsed(path.read_bytes())
+        return path.read_bytes()
     except FileNotFoundError:
         return None
     except OSError:
@@ -151,6 +156,24 @@ def parsed(content: bytes) -> dict[str, Any] | None:
     except ValueError:
         return None
     return value if isinstance(value, dict) else None
+
+
+def sealed(values: Mapping[str, Any], key: str) -> dict[str, Any]:
+    """The values, and under `key` the sha256 of all the others."""
+    rest = {name: value for name, value in values.items() if name != key}
+    return rest | {key: sha256(as_json(rest))}
+
+
+def unsealed(content: bytes, key: str) -> dict[str, Any] | None:
+    """What `sealed` gave, from its bytes; None if any of them changed."""
+    values = parsed(content)
+    return values if values is not None and content == as_json(sealed(values, key)) else None
+
+
+def read_sealed(path: Place, key: str) -> dict[str, Any] | None:
+    """What `sealed` gave and the file holds; None as for `read_json`, or if any byte changed."""
+    content = _content(path)
+    return None if content is None else unsealed(content, key)
 
 
 def sha256(content: bytes) -> str:

@@ -83,7 +83,7 @@ def generate(
     todo = shards.mine(remaining, *worker)
     began, made, size = time.perf_counter(), sum(shard.count for shard in todo), 0
     if todo:
-        size = _make(rollout, dataset, todo, say)
+        size = make(rollout, dataset, todo, say)
     complete = shards.finish(dataset)
     seconds = time.perf_counter() - began
     if todo:
@@ -126,8 +126,8 @@ def dataset_of(rollout: Rollout, out: Place, counts: Mapping[str, int]) -> Datas
     )
 
 
-def _make(rollout: Rollout, dataset: Dataset, todo: list[Shard], say: Callable[[str], None]) -> int:
-    """The bytes written for these shards."""
+def make(rollout: Rollout, dataset: Dataset, todo: list[Shard], say: Callable[[str], None]) -> int:
+    """The bytes written for these shards, which are done then."""
     encoder, writers = Encoder(rollout, dataset, threads_for(devices.cores())), Writers(dataset)
     work = batches(todo, rollout.lanes)
     size = 0

@@ -14,7 +14,7 @@ import io
 import os
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
@@ -25,6 +25,7 @@ from gen2d.fields import Field
 from gen2d.files import file_sha256, sha256
 from gen2d.formats import stored_bytes
 from gen2d.manifest import field_of, read_manifest
+from gen2d.order import shuffled
 from gen2d.plan import shard_path
 from gen2d.remote import Place, Range, Url, place, read_ranges
 
@@ -149,16 +150,11 @@ class Dataset:
 
     def __getitem__(self, key: Any) -> Batch:
         """One video, or for a slice or a sequence of numbers several, stacked."""
-        if isinstance(key, slice):
-            return self.batch(range(*key.indices(len(self))))
-        if np.ndim(key) == 1:
-            return self.batch(key)
-        return {name: values[0] for name, values in self.batch([key]).items()}
+        return item(self, key)
 
     def __getitems__(self, indices: Numbers) -> list[Batch]:
         """The videos one by one; torch's DataLoader asks for a whole batch so."""
-        batch = self.batch(indices)
-        return [{name: values[row] for name, values in batch.items()} for row in range(len(indices))]
+        return taken_apart(self.batch(indices))
 
     def __repr__(self) -> str:
         return f"<{len(self)} {self.options.split} videos of {self.root}: {', '.join(self.fields)}>"
@@ -220,6 +216,7 @@ class Dataset:
             if isinstance(data, bytes):
                 codecs.decode_into(column.codec, data, target)
         except (DamagedError, OSError) as error:
+            _opened.cache_clear()  # a shard that is made again is another file under the same name
             where = f"{self._shard_path(piece.shard)}: {column.name} of {self.options.split} video {video}"
             raise DamagedError(f"{where} cannot be read ({_why(error)}): gen2d verify finds all such damage") from error
 
@@ -258,15 +255,19 @@ class Dataset:
         assert isinstance(url, Url)
         return self._cache.path(url, sha256, size)
 
+    def numbers_at(self, positions: np.ndarray, epoch: int = 0, seed: int | None = None) -> np.ndarray:
+        """The numbers of the videos at these positions of an epoch: in order, or as the seed shuffles them."""
+        return shuffled(seed, epoch, positions, len(self))
+
+    def starts(self, numbers: np.ndarray, bits: np.ndarray) -> np.ndarray | None:
+        """Where the windows of these videos begin, drawn by random bits; None if that is not random."""
+        if not self.options.is_random:
+            return None
+        return (bits % np.uint64(self.manifest["sizes"]["T"] - self.options.span + 1)).astype(np.int64)
+
     def numbers(self, indices: Numbers) -> np.ndarray:
         """Indices as the numbers of videos, int64: negative ones count from the end."""
-        numbers = np.asarray(indices)
-        if not np.issubdtype(numbers.dtype, np.integer) and len(numbers):
-            raise TypeError(f"a video's number must be an integer, not {numbers.dtype}")
-        wrong = numbers[(numbers < -len(self)) | (numbers >= len(self))]
-        if len(wrong):
-            raise IndexError(f"video {wrong[0]} is not there: {self.options.split} has {len(self)} videos")
-        return np.where(numbers < 0, numbers + len(self), numbers).astype(np.int64)
+        return checked_numbers(indices, len(self), self.options.split)
 
     def _fitting(self, out: Batch, count: int) -> Batch:
         for column in self._columns:
@@ -299,6 +300,39 @@ class Dataset:
         if table is None:
             raise DamagedError(f"{path} is not what was written")
         return table
+
+
+class Videos(Protocol):
+    """What gives batches by number."""
+
+    def __len__(self) -> int: ...
+
+    def batch(self, indices: Numbers, /) -> Batch: ...
+
+
+def item(videos: Videos, key: Any) -> Batch:
+    """What `videos[key]` is: one video, or for a slice or a sequence of numbers several, stacked."""
+    if isinstance(key, slice):
+        return videos.batch(range(*key.indices(len(videos))))
+    if np.ndim(key) == 1:
+        return videos.batch(key)
+    return {name: values[0] for name, values in videos.batch([key]).items()}
+
+
+def taken_apart(batch: Batch) -> list[Batch]:
+    """The videos of a batch one by one."""
+    return [dict(zip(batch, values, strict=True)) for values in zip(*batch.values(), strict=True)]
+
+
+def checked_numbers(indices: Numbers, count: int, whose: str) -> np.ndarray:
+    """Indices as numbers from 0 to count - 1, int64: negative ones count from the end."""
+    numbers = np.asarray(indices)
+    if not np.issubdtype(numbers.dtype, np.integer) and len(numbers):
+        raise TypeError(f"a video's number must be an integer, not {numbers.dtype}")
+    wrong = numbers[(numbers < -count) | (numbers >= count)]
+    if len(wrong):
+        raise IndexError(f"video {wrong[0]} is not there: {whose} has {count} videos")
+    return np.where(numbers < 0, numbers + count, numbers).astype(np.int64)
 
 
 class _Column:

@@ -3,20 +3,23 @@
 import dataclasses
 import io
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
 import numpy as np
 
 from gen2d.errors import DamagedError, FolderError
 from gen2d.fields import Field
-from gen2d.files import as_json, file_sha256, parsed, publishing, sha256
+from gen2d.files import as_json, file_sha256, publishing, read_sealed, sealed, sha256, unsealed
 from gen2d.formats import MOMENTS_OF, image_names, merged, row_names
-from gen2d.plan import MARK, SCHEMA, Dataset, Shard, table_path
+from gen2d.plan import IDENTITY, MARK, SCHEMA, Dataset, Shard, mark_path, record_path, table_path
 from gen2d.remote import Place, reading
 
 Record = Mapping[str, Any]  # of a shard that is done, as shards.py writes it
 Tables = dict[str, np.ndarray]
+
+# Where each file keeps the hash of all else in it.
+SEAL, MARK_SEAL, RECORD_SEAL = "manifest_sha256", "identity_sha256", "record_sha256"
 
 
 def read_manifest(root: Place) -> dict[str, Any]:
@@ -36,12 +39,23 @@ def read_manifest(root: Place) -> dict[str, Any]:
         raise FolderError(f"{root} is incomplete: {told}") from None
     except OSError as error:
         raise FolderError(f"{path} cannot be read ({error.strerror or error})") from error
-    manifest = parsed(content)
-    if manifest is None or content != as_json(_sealed(manifest)):
+    manifest = unsealed(content, SEAL)
+    if manifest is None:
         raise DamagedError(f"{path} is not what was written")
     if manifest["schema"] != SCHEMA:
         raise FolderError(f"{path} has schema {manifest['schema']}, but this gen2d reads {SCHEMA}")
     return manifest
+
+
+def identity_of(root: Place) -> dict[str, Any] | None:
+    """What the dataset in the folder was made from, as its manifest says or else its mark; None if neither is whole."""
+    there = read_sealed(root / "manifest.json", SEAL) or read_sealed(mark_path(root), MARK_SEAL)
+    return None if there is None else {key: there[key] for key in IDENTITY}
+
+
+def read_record(root: Place, name: str) -> dict[str, Any] | None:
+    """The record of the shard called `name`; None if there is none or any byte of it changed."""
+    return read_sealed(record_path(root, name), RECORD_SEAL)
 
 
 def field_of(about: Mapping[str, Any]) -> Field:
@@ -76,13 +90,7 @@ def describe(
         "producer": {key: value for key, value in dataset.producer.items() if key != "fingerprint"},
     }
     # As it will be read back: JSON makes every key a string and every tuple a list.
-    return _sealed(json.loads(as_json(manifest)))
-
-
-def _sealed(manifest: Mapping[str, Any]) -> dict[str, Any]:
-    """The manifest with the hash of all else in it."""
-    rest = {key: value for key, value in manifest.items() if key != "manifest_sha256"}
-    return rest | {"manifest_sha256": sha256(as_json(rest))}
+    return sealed(json.loads(as_json(manifest)), SEAL)
 
 
 def _described(field: Field, dataset: Dataset) -> dict[str, Any]:
@@ -102,6 +110,14 @@ def _stats(records: list[Record]) -> dict[str, dict[str, list[float] | None]]:
         values = {"mean": mean, "std": spread, "min": low, "max": high}
         stats[name] = {key: value.tolist() if np.isfinite(value).all() else None for key, value in values.items()}
     return stats
+
+
+def statistics(manifest: Mapping[str, Any]) -> Iterator[tuple[str, ...]]:
+    """The stored statistics as rows for a person: split, field, mean, standard deviation, least and largest value."""
+    for split, fields in sorted(manifest["stats"].items()):
+        for name, about in fields.items():
+            parts = (about[key] for key in ("mean", "std", "min", "max"))
+            yield split, name, *(", ".join(f"{x:.4g}" for x in part) if part else "-" for part in parts)
 
 
 # ---- The index

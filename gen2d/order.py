@@ -85,15 +85,19 @@ class Walk:
         """Where the next global batch begins."""
         return (epoch, position) if self.videos - position >= self.least else (epoch + 1, 0)
 
-    def share(self, step: Step) -> tuple[np.ndarray, np.ndarray]:
-        """The positions of this rank's slice of a global batch, and the numbers of the videos there."""
+    def share(self, step: Step) -> np.ndarray:
+        """The positions of this rank's slice of a global batch."""
         begin, end = (step.size * rank // self.world_size for rank in (self.rank, self.rank + 1))
-        positions = step.position + np.arange(begin, end)
-        return positions, order(self.seed, step.epoch, positions, self.videos) if self.shuffle else positions
+        return step.position + np.arange(begin, end)
 
-    def starts(self, step: Step, positions: np.ndarray, choices: int) -> np.ndarray:
-        """At which of so many frames the window at each position begins."""
-        return (_hashed(_WINDOWS, self.seed, step.epoch, positions) % np.uint64(choices)).astype(np.int64)
+    @property
+    def shuffled_by(self) -> int | None:
+        """The seed that shuffles; None where nothing does."""
+        return self.seed if self.shuffle else None
+
+    def bits(self, step: Step, positions: np.ndarray) -> np.ndarray:
+        """Random bits for the window at each position."""
+        return hashed(WINDOWS, self.seed, step.epoch, positions)
 
 
 def one_of(name: str, value: Any, allowed: tuple) -> None:
@@ -103,7 +107,12 @@ def one_of(name: str, value: Any, allowed: tuple) -> None:
 
 
 # What a random number is for, so that no two uses share one.
-_ORDER, _WINDOWS = 0, 1
+ORDER, WINDOWS, SOURCES = 0, 1, 2
+
+
+def shuffled(seed: int | None, epoch: int, positions: np.ndarray, count: int) -> np.ndarray:
+    """The numbers of the videos at these positions of an epoch, as the seed shuffles them; in order without one."""
+    return positions if seed is None else order(seed, epoch, positions, count)
 
 
 def order(seed: int, epoch: int, positions: np.ndarray, count: int) -> np.ndarray:
@@ -113,7 +122,7 @@ def order(seed: int, epoch: int, positions: np.ndarray, count: int) -> np.ndarra
     again until it falls inside (Black and Rogaway, CT-RSA 2002).
     """
     half = np.uint64(max(1, ((count - 1).bit_length() + 1) // 2))
-    keys = [_hashed(_ORDER, seed, epoch, step) for step in range(8)]
+    keys = [hashed(ORDER, seed, epoch, step) for step in range(8)]
     values = positions.astype(np.uint64)
     outside = np.ones(values.shape, bool)
     while outside.any():
@@ -130,7 +139,7 @@ def _feistel(values: np.ndarray, keys: list[np.ndarray], half: np.uint64) -> np.
     return (left << half) | right
 
 
-def _hashed(*parts: int | np.ndarray) -> np.ndarray:
+def hashed(*parts: int | np.ndarray) -> np.ndarray:
     """64 random bits that the parts decide, uint64, for each element of the parts."""
     bits = np.zeros(1, np.uint64)
     for part in parts:

@@ -85,6 +85,11 @@ def shard_path(root: Place, name: str) -> Place:
     return root / "shards" / f"{name}.h5"
 
 
+def mark_path(root: Place) -> Place:
+    """What says which dataset the folder is of, from the start on."""
+    return root / MARK / "dataset.json"
+
+
 def record_path(root: Place, name: str) -> Place:
     """What says that the shard is done, and what went into it."""
     return root / MARK / "done" / f"{name}.json"

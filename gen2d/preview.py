@@ -14,6 +14,7 @@ from gen2d.loader import open as open_dataset
 from gen2d.remote import Url, place
 
 COLUMNS = 10  # frames across the sheet
+LARGEST = 192  # px: of a frame on a dataset's card
 GAP, GREY = 2, 170  # px between pictures, and its sRGB
 SMALLEST = 96  # px: smaller frames are enlarged by whole factors, so that pixels stay pixels
 
@@ -106,6 +107,16 @@ def contact_sheet(frames: np.ndarray) -> np.ndarray:
     return np.concatenate(rows)
 
 
+def reduced(video: np.ndarray) -> np.ndarray:
+    """The frames of a video [T, H, W, 3] that a sheet shows, larger ones averaged down."""
+    frames = video[shown(len(video))]
+    factor = -(-max(frames.shape[1:3]) // LARGEST)
+    if factor == 1:
+        return frames
+    size = frames.shape[2] // factor, frames.shape[1] // factor
+    return np.stack([cv2.resize(frame, size, interpolation=cv2.INTER_AREA) for frame in frames])
+
+
 def enlarged(image: np.ndarray) -> np.ndarray:
     """A small image [H, W] or [H, W, 3] larger by a whole factor."""
     factor = -(-SMALLEST // min(image.shape[:2]))
@@ -135,5 +146,12 @@ def _tiled(video: np.ndarray) -> np.ndarray:
 
 def write(path: Path, image: np.ndarray) -> None:
     """Writes a picture [H, W, 3]."""
-    if not cv2.imwrite(str(path), image[..., ::-1]):
+    path.write_bytes(png(image))
+
+
+def png(image: np.ndarray) -> bytes:
+    """A picture [H, W, 3] as the bytes of a PNG file."""
+    done, content = cv2.imencode(".png", image[..., ::-1])
+    if not done:
         raise OSError("OpenCV could not write a PNG")
+    return content.tobytes()

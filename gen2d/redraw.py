@@ -21,6 +21,7 @@ from gen2d.errors import ConfigError
 from gen2d.loader import Dataset, Numbers
 from gen2d.manifest import field_of
 from gen2d.picture import Plan, Stage, on_cpu
+from gen2d.remote import Place
 from gen2d.rollout import Rollout, keep_of, rules_of
 from gen2d.simulate import simulate, substeps
 from gen2d.types import Array, Joints, Layout, Objects, Scene, State
@@ -31,11 +32,15 @@ POINTS = 8  # of each object, where tracks are asked for that the config does no
 
 def config_of(ds: Dataset, sets: Sequence[str] = ()) -> Config:
     """The config that a dataset was made from, with `sets` changed ('video.height=128')."""
-    recipe = ds.manifest["config"] | {"seed": ds.manifest["seed"]}
+    return config_from(ds.root, ds.manifest, sets)
+
+
+def config_from(root: Place, identity: Mapping[str, Any], sets: Sequence[str] = ()) -> Config:
+    """The config that the folder's manifest, or its mark, tells of."""
     try:
-        return load_config(recipe, sets)
+        return load_config(identity["config"] | {"seed": identity["seed"]}, sets)
     except ConfigError as error:
-        raise ConfigError(f"{ds.root}: its config cannot be used ({error})") from None
+        raise ConfigError(f"{root}: its config cannot be used ({error})") from None
 
 
 def render(

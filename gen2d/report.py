@@ -1,11 +1,12 @@
 """What a dataset holds, and what gen2d knows, as text for a terminal."""
 
 import dataclasses
+from collections.abc import Iterator
 from typing import Any
 
 from gen2d.errors import ConfigError
+from gen2d.manifest import read_manifest, statistics
 from gen2d.remote import Place
-from gen2d.shards import read_manifest
 
 
 def in_bytes(size: float) -> str:
@@ -37,26 +38,50 @@ def sheet(root: Place) -> str:
     """The data sheet of a dataset: what it holds, field by field, and what made it."""
     manifest = read_manifest(root)
     splits = ", ".join(f"{name}: {count:,} videos" for name, count in manifest["splits"].items())
-    size = sum(shard["bytes"] for shard in manifest["shards"])
     sizes = ", ".join(f"{name} = {value}" for name, value in manifest["sizes"].items())
     rows = [("field", "type", "axes", "unit", "meaning")]
     rows += [(name, f["dtype"], f["axes"], f["unit"], f["meaning"]) for name, f in manifest["fields"].items()]
-    producer = manifest["producer"]
-    versions = ", ".join(f"{key} {value}" for key, value in producer.items() if key != "fingerprint")
+    versions = ", ".join(f"{key} {value}" for key, value in manifest["producer"].items())
     fingerprint = ", ".join(f"{key} {value or '-'}" for key, value in manifest["fingerprint"].items())
-    volume = f"{in_bytes(size)} in {len(manifest['shards'])} shards"
+    made = [f"python -m gen2d --config config.yaml --n {n} --split {s}" for s, n in manifest["splits"].items()]
     return "\n".join(
         [
             f"{manifest['name']} ({root})",
-            f"  {splits}; {volume}; seed {manifest['seed']}, {manifest['fps']:g} frames/s",
+            f"  {splits}; seed {manifest['seed']}, {manifest['fps']:g} frames/s, {_duration(manifest)}",
             f"  sizes: {sizes}",
             "",
             *_table(rows),
             "",
-            f"  made by {versions}",
+            f"  {manifest['conventions']}",
+            "",
+            *_table([("split", "field", "mean", "standard deviation", "least", "largest"), *statistics(manifest)]),
+            f"  of {manifest['stats_sampled']}",
+            "",
+            *_table([("on disk", "files", "size"), *_volumes(root, manifest)]),
+            f"  frames and other images compressed with {manifest['codec']}, up to {manifest['videos_per_shard']:,} "
+            "videos a shard",
+            "",
+            *(f"  made by {command} --seed {manifest['seed']}" for command in made),
+            f"  with {versions}",
             f"  bits fixed by {fingerprint}",
+            f"  config {manifest['config_sha256']}",
+            f"  licence: {manifest['licence'] or 'none was chosen'}",
         ]
     )
+
+
+def _duration(manifest: dict[str, Any]) -> str:
+    """How long all videos together are."""
+    return in_time(sum(manifest["splits"].values()) * manifest["sizes"]["T"] / manifest["fps"]) + " in all"
+
+
+def _volumes(root: Place, manifest: dict[str, Any]) -> Iterator[tuple[str, ...]]:
+    """What lies on disk: the shards of each split, and all the rest."""
+    for split in manifest["splits"]:
+        own = [shard["bytes"] for shard in manifest["shards"] if shard["split"] == split]
+        yield f"shards of {split}", f"{len(own):,}", in_bytes(sum(own))
+    index = [path.stat().st_size for path in (root / "index").rglob("*.npy")]
+    yield "index", f"{len(index):,}", in_bytes(sum(index))
 
 
 def plugins_text(name: str | None = None) -> str:

@@ -23,6 +23,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from gen2d import cards
+from gen2d.cards import SHEET
 from gen2d.errors import FolderError
 from gen2d.files import (
     as_json,
@@ -30,20 +31,31 @@ from gen2d.files import (
     publish,
     publishing,
     read_json,
+    read_sealed,
     remove_tree,
+    sealed,
     sha256,
     size_of,
     sweep,
     work_folder,
 )
 from gen2d.formats import Block, Places, encode, hdf5, head, merged, stored_bytes
-from gen2d.manifest import describe, read_manifest, write_index
-from gen2d.plan import IDENTITY, MARK, SCHEMA, Dataset, Shard, mine, plan, record_path, shard_path, table_path
+from gen2d.manifest import (
+    MARK_SEAL,
+    RECORD_SEAL,
+    SEAL,
+    describe,
+    identity_of,
+    read_manifest,
+    read_record,
+    write_index,
+)
+from gen2d.plan import MARK, SCHEMA, Dataset, Shard, mark_path, mine, plan, record_path, shard_path, table_path
 from gen2d.remote import Place, Url
 
 __all__ = [
-    "Block", "Dataset", "Shard", "encode", "finish", "forget", "free_bytes", "head", "log", "mine", "open_folder",
-    "plan", "read_manifest", "write",
+    "Block", "Dataset", "Shard", "differences", "encode", "finish", "forget", "free_bytes", "head", "log", "lost",
+    "mine", "open_folder", "plan", "read_manifest", "write",
 ]  # fmt: skip
 
 
@@ -69,6 +81,43 @@ def open_folder(dataset: Dataset, overwrite: bool = False) -> list[Shard]:
         if remaining:
             (root / "manifest.json").unlink(missing_ok=True)
         return remaining
+
+
+def lost(dataset: Dataset, bad: Iterable[str]) -> tuple[Dataset, list[str]]:
+    """The dataset with as many videos as it held, and which shards must be made again: those called `bad`, and all
+    whose record or file is not whole.
+
+    Where the manifest is damaged, the records say how many videos there were and what is in each shard, and every
+    shard is compared. Raises FolderError where they cannot say.
+    """
+    root, records = dataset.root, _records(dataset)
+    known = read_sealed(root / "manifest.json", SEAL)
+    planned = _whole_plan(dataset if known is None else _with_counts(dataset, known["splits"]), records)
+    missing = {shard.name for shard in planned if not _is_done(dataset, shard, records)}
+    if known is None:
+        _check_planned(root, planned)
+        missing |= {name for name in records.keys() - missing if not _has_bytes(shard_path(root, name), records[name])}
+    counts = {shard.split: shard.first + shard.count for shard in planned}
+    return _with_counts(dataset, counts), sorted(missing | set(bad))
+
+
+def _with_counts(dataset: Dataset, counts: Mapping[str, int]) -> Dataset:
+    return dataclasses.replace(dataset, splits=counts)
+
+
+def _has_bytes(path: Place, record: Mapping[str, Any]) -> bool:
+    return path.is_file() and file_sha256(path) == record["sha256"]
+
+
+def _check_planned(root: Place, planned: Iterable[Shard]) -> None:
+    """Raises FolderError for what a lost record may have been of: the dataset might have been larger."""
+    kinds = (root / "shards").glob("*.h5"), (root / MARK / "done").glob("*.json")
+    there = {path.name.rpartition(".")[0] for paths in kinds for path in paths}
+    for name in sorted(there - {shard.name for shard in planned}):
+        raise FolderError(
+            f"{root / 'manifest.json'} and the record of {name} are both not what was written, so nothing says how "
+            "many videos there were: run the command that made the dataset again"
+        )
 
 
 def forget(root: Place, name: str) -> None:
@@ -102,7 +151,7 @@ def _is_dataset(root: Place) -> bool:
 def _clear(root: Place) -> None:
     """Removes what is written here and no more; the mark stays, so that a crash here leaves a dataset's folder."""
     (root / MARK).mkdir(exist_ok=True)
-    for name in ("manifest.json", "croissant.json", "README.md", "config.yaml", MARK / "dataset.json"):
+    for name in ("manifest.json", "croissant.json", "README.md", SHEET, "config.yaml", MARK / "dataset.json"):
         (root / name).unlink(missing_ok=True)
     for name in ("shards", "index", MARK / "done"):
         remove_tree(root / name)
@@ -114,27 +163,28 @@ def _claim(dataset: Dataset) -> None:
         raise FolderError(f"{root} holds something else than a gen2d dataset: choose another --out")
     for folder in (MARK / "done", "shards", "index"):
         (root / folder).mkdir(parents=True, exist_ok=True)
-    mark = root / MARK / "dataset.json"
-    there = read_json(root / "manifest.json") or read_json(mark)
+    mark, there = mark_path(root), identity_of(root)
     if there is not None:
-        _compare(root, {key: there.get(key) for key in IDENTITY}, dataset.identity)
+        _compare(root, there, dataset.identity)
     elif mark.exists():
         raise FolderError(f"{mark} is damaged: choose another --out, or --overwrite to make the dataset anew")
-    else:
-        publish(mark, as_json(dataset.identity))
+    content = as_json(sealed(dataset.identity, MARK_SEAL))
+    if not mark.is_file() or mark.read_bytes() != content:
+        publish(mark, content)
 
 
 def _compare(root: Place, there: Mapping[str, Any], here: Mapping[str, Any]) -> None:
-    differing = list(_differences(there, here))
+    differing = list(differences(there, here))
     if differing:
         told = " and ".join(differing[:3])
         raise FolderError(f"{root} holds another dataset ({told}): choose another --out, or --overwrite to replace it")
 
 
-def _differences(there: Any, here: Any, name: str = "") -> Iterator[str]:
+def differences(there: Any, here: Any, name: str = "") -> Iterator[str]:
+    """In which entries two values as JSON has them differ."""
     if isinstance(there, dict) and isinstance(here, dict):
         for key in sorted(there.keys() | here.keys()):
-            yield from _differences(there.get(key), here.get(key), f"{name}.{key}".lstrip("."))
+            yield from differences(there.get(key), here.get(key), f"{name}.{key}".lstrip("."))
     elif there != here:
         yield f"{name} is {there} there and {here} here"
 
@@ -210,8 +260,9 @@ def _write(dataset: Dataset, shard: Shard, blocks: Iterable[Block], seen: _Seen)
         file = {"bytes": temporary.stat().st_size, "sha256": file_sha256(temporary)}
     tables = _packed(seen, places)
     publish(table_path(dataset.root, shard.name), tables)
-    record = _origin(dataset) | dataclasses.asdict(shard) | file | _contents(seen, places)
-    record["tables_sha256"] = sha256(tables)
+    own = {key: getattr(shard, key) for key in ("name", "split", "first", "count")}  # its number changes as splits grow
+    record = _origin(dataset) | own | file | _contents(seen, places)
+    record = sealed(record | {"tables_sha256": sha256(tables)}, RECORD_SEAL)
     publish(record_path(dataset.root, shard.name), as_json(record))
     return record
 
@@ -255,8 +306,10 @@ def _full(dataset: Dataset, shard: Shard, seen: _Seen) -> FolderError:
 def _records(dataset: Dataset) -> dict[str, dict[str, Any]]:
     """The records in the folder that are of this dataset, by shard."""
     identity = sha256(as_json(dataset.identity))
-    found = _at_once(read_json, sorted((dataset.root / MARK / "done").glob("*.json")))
-    return {record["name"]: record for record in found if record and record.get("identity") == identity}
+    names = [path.name.removesuffix(".json") for path in sorted((dataset.root / MARK / "done").glob("*.json"))]
+    found = zip(names, _at_once(lambda name: read_record(dataset.root, name), names), strict=True)
+    # A record under another's name would be taken for that one.
+    return {name: r for name, r in found if r is not None and (r["name"], r["identity"]) == (name, identity)}
 
 
 T = TypeVar("T")
@@ -307,9 +360,12 @@ def finish(dataset: Dataset) -> bool:
 
 def _complete(dataset: Dataset, shards: list[Shard], records: list[Mapping[str, Any]]) -> None:
     root, recipe = dataset.root, dataset.config_text.encode()
+    publish(root / "config.yaml", recipe)
     files = write_index(dataset, shards, records) | {"config.yaml": sha256(recipe)}
     manifest = describe(dataset, shards, records, files)
-    publish(root / "config.yaml", recipe)
+    if "frames" in dataset.fields:
+        publish(root / SHEET, cards.picture(root, manifest))
+        manifest = describe(dataset, shards, records, files | {SHEET: file_sha256(root / SHEET)})
     publish(root / "README.md", cards.readme(manifest, dataset.command).encode())
     publish(root / "croissant.json", as_json(cards.croissant(manifest)))
     publish(root / "manifest.json", as_json(manifest))  # last: it says that all is there

@@ -24,7 +24,7 @@ from gen2d.errors import ConfigError
 from gen2d.fields import Field
 from gen2d.generation import MAX_VIDEOS
 from gen2d.loader import LAYOUTS, Options, chosen_fields
-from gen2d.order import Step, Walk, one_of
+from gen2d.order import Step, Walk, one_of, shuffled
 from gen2d.pipeline import check_placed
 from gen2d.rollout import Batch, Rollout
 from gen2d.types import Array
@@ -134,9 +134,11 @@ class Stream:
     def _cells(self) -> Iterator[_Cell]:
         choices = self.rollout.config.video.frames - self.options.span + 1
         for step in self.walk.steps():
-            positions, numbers = self.walk.share(step)
-            random = self.options.is_random
-            first = self.walk.starts(step, positions, choices) if random else np.full(len(numbers), self.options.first)
+            positions = self.walk.share(step)
+            numbers = shuffled(self.walk.shuffled_by, step.epoch, positions, self.walk.videos)
+            first = np.full(len(numbers), self.options.first)
+            if self.options.is_random:
+                first = (self.walk.bits(step, positions) % np.uint64(choices)).astype(np.int64)
             real = len(numbers)  # a rank's share may be empty
             for begin in range(0, max(real, 1), self.cell):
                 end, held = min(begin + self.cell, real), np.arange(begin, begin + self.cell)

@@ -1,10 +1,11 @@
-"""Whether a dataset on disk is what was written: `quick` looks at names and sizes, `full` at every byte and value."""
+"""Whether a dataset on disk is what was written: `quick` looks at names and sizes, `full` at every byte and value,
+`regen` also makes some videos again from their recipe and compares them to the bit."""
 
 import contextlib
 import dataclasses
 import os
 import tempfile
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -13,13 +14,16 @@ import h5py
 import numpy as np
 
 from gen2d import loader
+from gen2d.cards import croissant
 from gen2d.errors import ConfigError, DamagedError, FolderError
-from gen2d.files import file_sha256, size_of
-from gen2d.manifest import field_of, read_manifest
-from gen2d.plan import shard_path
+from gen2d.files import as_json, file_sha256, sealed, sha256, size_of
+from gen2d.manifest import MARK_SEAL, field_of, read_manifest, read_record
+from gen2d.order import order
+from gen2d.plan import IDENTITY, MARK, mark_path, record_path, shard_path, table_path
 from gen2d.remote import Place, Url, download, place, reading
 
-LEVELS = ("quick", "full")
+LEVELS = ("quick", "full", "regen")
+VIDEOS = 8  # made again, unless told otherwise
 
 # Of static bodies these are infinite; in every other field a value that is not finite is an error.
 INFINITE = ("objects/mass", "objects/moment")
@@ -33,19 +37,47 @@ class Problem:
     shard: str = ""
 
 
+@dataclasses.dataclass(frozen=True)
+class Outcome:
+    """What a check found, a sentence each, and what a repair did."""
+
+    problems: list[str]  # what is wrong, after the repair if there was one
+    repaired: list[str]  # what was wrong before it and is no more
+    remade: list[str]  # names of the shards that were made again
+
+
 def verify(
-    root: str | Place, level: str = "quick", repair_with: Callable[[list[str]], object] | None = None
+    root: str | Place,
+    level: str = "quick",
+    repair_with: Callable[[list[str]], Sequence[str] | None] | None = None,
+    videos: int = VIDEOS,
+    seed: int = 0,
 ) -> list[str]:
     """What is wrong with the dataset, a sentence each; empty if nothing is.
 
-    `repair_with` is called with the names of the bad shards, if there are problems, and must make these again and
-    finish the dataset; what is returned is then what remains wrong.
+    At the level "regen", as many `videos` as told are made again, chosen from `seed`; that imports jax, and raises
+    FolderError where this machine would make other bits. `repair_with` is called with the names of the bad shards, if
+    there are problems, and must make these again and finish the dataset, as `gen2d.regeneration.repair` does; what is
+    returned is then what remains wrong.
     """
-    found = list(problems(root, level))
-    if found and repair_with is not None:
-        repair_with(sorted({problem.shard for problem in found if problem.shard}))
-        found = list(problems(root, level))
-    return [problem.sentence for problem in found]
+    return checked(root, level, repair_with, videos, seed).problems
+
+
+def checked(
+    root: str | Place,
+    level: str = "quick",
+    repair_with: Callable[[list[str]], Sequence[str] | None] | None = None,
+    videos: int = VIDEOS,
+    seed: int = 0,
+) -> Outcome:
+    """What `verify` finds, and what was repaired."""
+    found = list(problems(root, level, videos, seed))
+    if not found or repair_with is None:
+        return Outcome([problem.sentence for problem in found], [], [])
+    remade = repair_with(sorted({problem.shard for problem in found if problem.shard}))
+    left = [problem.sentence for problem in problems(root, level, videos, seed)]
+    repaired = [problem.sentence for problem in found if problem.sentence not in left]
+    return Outcome(left, repaired, list(remade or ()))
 
 
 def damaged_shards(root: str | Place, level: str = "quick") -> list[str]:
@@ -53,37 +85,109 @@ def damaged_shards(root: str | Place, level: str = "quick") -> list[str]:
     return sorted({problem.shard for problem in problems(root, level) if problem.shard})
 
 
-def problems(root: str | Place, level: str = "quick") -> Iterator[Problem]:
-    """Everything that is wrong, the folder first, then shard by shard."""
+def problems(root: str | Place, level: str = "quick", videos: int = VIDEOS, seed: int = 0) -> Iterator[Problem]:
+    """Everything that is wrong, the folder first, then shard by shard, then what made again is another video."""
     root = place(root)
     if level not in LEVELS:
         raise ConfigError(f"level is {level!r}, but must be one of {', '.join(LEVELS)}")
+    if videos < 1:
+        raise ConfigError(f"--videos is {videos}, but must be 1 or more")
     try:
         manifest = read_manifest(root)
     except (FolderError, DamagedError) as error:
         yield Problem(str(error))
         return
+    remade = _remade(root, manifest, videos, seed) if level == "regen" else iter(())
     with reading(root):
         whole = list(_hashed_files(root, manifest))
+        others = [*_cards(root, manifest), *_records(root, manifest)]
         missized = list(_shard_files(root, manifest))
-    yield from [*whole, *missized]
-    if level == "full":
+    yield from [*whole, *others, *missized]
+    if level != "quick":
         absent = {problem.shard for problem in missized}
         present = [shard for shard in manifest["shards"] if shard["name"] not in absent]
         with _nearby(root, manifest) as near, ThreadPoolExecutor(min(os.cpu_count() or 1, 8)) as pool:
-            for found in pool.map(lambda shard: _contents_near(root, near, manifest, shard, not whole), present):
+            # Opened here, not in the threads: NumPy parses the headers of the index by `ast`, in which threads of
+            # CPython 3.11 have been seen to disturb each other (SystemError: recursion depth mismatch).
+            opened = {} if whole else {split: loader.open(near, split, ("*",)) for split in manifest["splits"]}
+            for found in pool.map(lambda shard: _contents_near(root, near, manifest, shard, opened), present):
                 yield from found
+    yield from remade
+
+
+def _remade(root: Place, manifest: Mapping[str, Any], videos: int, seed: int) -> Iterator[Problem]:
+    """What differs in videos made again; raises FolderError, at once, where that cannot be judged here."""
+    from gen2d import regeneration  # imports jax
+
+    rollout = regeneration.rollout_of(root, manifest)
+    regeneration.check_fingerprint(root, rollout, manifest)
+    chosen = chosen_videos(manifest["splits"], videos, seed)
+    return (
+        Problem(f"{shard_path(root, shard)}: {wrong}", shard)
+        for shard, wrong in regeneration.differing(rollout, root, manifest, chosen)
+    )
+
+
+def chosen_videos(splits: Mapping[str, int], videos: int, seed: int) -> list[tuple[str, int]]:
+    """Split and number of as many videos as asked, or of all there are: which, the seed decides."""
+    everything = sum(splits.values())
+    places = np.sort(order(seed, 0, np.arange(min(videos, everything)), everything))
+    ends = np.cumsum(list(splits.values()))
+    owner = np.searchsorted(ends, places, side="right")
+    return [
+        (list(splits)[k], int(place - ends[k] + list(splits.values())[k]))
+        for k, place in zip(owner, places, strict=True)
+    ]
 
 
 def _hashed_files(root: Place, manifest: Mapping[str, Any]) -> Iterator[Problem]:
-    for name, sha256 in manifest["files"].items():
-        if not (root / name).is_file():
-            yield Problem(f"{root / name} is missing")
-        elif file_sha256(root / name) != sha256:
-            yield Problem(f"{root / name} is not what was written")
-    for path in (root / "index").rglob("*"):
+    for name, expected in manifest["files"].items():
+        yield from map(Problem, _wrong(root / name, expected))
+    for path in sorted((root / "index").rglob("*"), key=str):
         if path.is_file() and str(path).removeprefix(f"{root}/") not in manifest["files"]:
             yield Problem(f"{path} does not belong to the dataset")
+
+
+def _wrong(path: Place, expected: str) -> Iterator[str]:
+    """What is wrong with a file that must have this sha256."""
+    try:
+        if not path.is_file():
+            yield f"{path} is missing"
+        elif file_sha256(path) != expected:
+            yield f"{path} is not what was written"
+    except OSError as error:
+        yield f"{path} cannot be read ({error.strerror or error})"
+
+
+def _cards(root: Place, manifest: Mapping[str, Any]) -> Iterator[Problem]:
+    """README.md is for people, who may write in it, so it only has to be there."""
+    yield from map(Problem, _wrong(root / "croissant.json", sha256(as_json(croissant(manifest)))))
+    if not (root / "README.md").is_file():
+        yield Problem(f"{root / 'README.md'} is missing")
+
+
+def _records(root: Place, manifest: Mapping[str, Any]) -> Iterator[Problem]:
+    """What is wrong with what a later run needs; a copy may well have been made without it."""
+    if not (root / MARK).is_dir():
+        return
+    identity = {key: manifest[key] for key in IDENTITY}
+    yield from map(Problem, _wrong(mark_path(root), sha256(as_json(sealed(identity, MARK_SEAL)))))
+    with ThreadPoolExecutor(16) as pool:  # a server answers many questions at once
+        for found in pool.map(lambda shard: list(_record(root, shard)), manifest["shards"]):
+            yield from found
+    expected = {f"{shard['name']}.{kind}" for shard in manifest["shards"] for kind in ("json", "npz")}
+    for path in sorted((root / MARK / "done").glob("*"), key=str):
+        if path.name not in expected:
+            yield Problem(f"{path} does not belong to the dataset")
+
+
+def _record(root: Place, shard: Mapping[str, Any]) -> Iterator[Problem]:
+    path, record = record_path(root, shard["name"]), read_record(root, shard["name"])
+    if record is None or any(record[key] != shard[key] for key in shard):
+        yield Problem(f"{path} is {'not what was written' if path.is_file() else 'missing'}", shard["name"])
+    else:
+        tables = _wrong(table_path(root, shard["name"]), record["tables_sha256"])
+        yield from (Problem(sentence, shard["name"]) for sentence in tables)
 
 
 def _shard_files(root: Place, manifest: Mapping[str, Any]) -> Iterator[Problem]:
@@ -116,12 +220,15 @@ def _nearby(root: Place, manifest: Mapping[str, Any]) -> Iterator[Path]:
         yield near
 
 
+Opened = Mapping[str, loader.Dataset]  # by split; nothing where the index cannot be trusted
+
+
 def _contents_near(
-    root: Place, near: Path, manifest: Mapping[str, Any], shard: Mapping[str, Any], indexed: bool
+    root: Place, near: Path, manifest: Mapping[str, Any], shard: Mapping[str, Any], opened: Opened
 ) -> list[Problem]:
     """What is wrong within the shard, which is fetched first where it is not on disk."""
     if root == near:
-        return list(_contents(near, manifest, shard, indexed))
+        return list(_contents(near, manifest, shard, opened))
     url, path = shard_path(root, shard["name"]), shard_path(near, shard["name"])
     assert isinstance(url, Url)
     assert isinstance(path, Path)
@@ -129,12 +236,12 @@ def _contents_near(
         download(url, path, shard["bytes"])
     except OSError as error:
         return [Problem(f"{url} cannot be read ({error.strerror})", shard["name"])]
-    found = list(_contents(near, manifest, shard, indexed))
+    found = list(_contents(near, manifest, shard, opened))
     os.truncate(path, 0)  # it may still be open
     return [Problem(problem.sentence.replace(str(near), str(root)), problem.shard) for problem in found]
 
 
-def _contents(root: Path, manifest: Mapping[str, Any], shard: Mapping[str, Any], indexed: bool) -> Iterator[Problem]:
+def _contents(root: Path, manifest: Mapping[str, Any], shard: Mapping[str, Any], opened: Opened) -> Iterator[Problem]:
     path = shard_path(root, shard["name"])
     try:
         intact = file_sha256(path) == shard["sha256"]
@@ -143,17 +250,14 @@ def _contents(root: Path, manifest: Mapping[str, Any], shard: Mapping[str, Any],
         return
     if not intact:
         yield Problem(f"{path} is not what was written: its sha256 differs", shard["name"])
-    checks = [_pieces] if indexed else []
+    wrong = list(_pieces(opened[shard["split"]], shard)) if opened else []
     if intact:  # else HDF5 has nothing to say that is worth more
-        checks.append(_structure)
-    for check in checks:
-        for wrong in check(root, manifest, shard):
-            yield Problem(f"{path}: {wrong}", shard["name"])
+        wrong += _structure(root, manifest, shard)
+    yield from (Problem(f"{path}: {sentence}", shard["name"]) for sentence in wrong)
 
 
-def _pieces(root: Path, manifest: Mapping[str, Any], shard: Mapping[str, Any]) -> Iterator[str]:
+def _pieces(dataset: loader.Dataset, shard: Mapping[str, Any]) -> Iterator[str]:
     """What is wrong with the stored pieces, each found by the index, checked and decoded as for training."""
-    dataset = loader.open(root, shard["split"], fields=("*",))
     for number in range(shard["first"], shard["first"] + shard["count"]):
         try:
             values = dataset[number]

@@ -7,13 +7,16 @@ import subprocess
 import sys
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import synthetic
 from numpy.testing import assert_array_equal
 
-from gen2d import codecs
+from gen2d import codecs, preview
 from gen2d.files import file_sha256
+from gen2d.manifest import read_manifest
+from gen2d.verification import verify
 
 
 def test_the_cards_name_every_field_and_file(tmp_path: Path) -> None:
@@ -27,21 +30,73 @@ def test_the_cards_name_every_field_and_file(tmp_path: Path) -> None:
         assert part["contentSize"] == f"{(tmp_path / part['contentUrl']).stat().st_size} B"
 
 
+def test_the_sheet_shows_the_first_videos_and_is_verified(tmp_path: Path) -> None:
+    made = synthetic.make(synthetic.dataset(tmp_path))
+    sheet = cv2.imread(str(tmp_path / "sheet.png"))
+    assert sheet is not None
+    rows = np.split(sheet[..., ::-1], 4)
+    for number, row in enumerate(rows):
+        frames = np.split(row, made.sizes["T"], axis=1)
+        for frame, stored in zip(frames, synthetic.video(made, "train", number)["frames"], strict=True):
+            assert_array_equal(frame[2:-2, 2:-2][::12, ::12], stored)
+    (tmp_path / "sheet.png").unlink()
+    assert verify(tmp_path) == [f"{tmp_path / 'sheet.png'} is missing"]
+
+
+def test_without_frames_there_is_no_sheet(tmp_path: Path) -> None:
+    fields = {name: field for name, field in synthetic.FIELDS.items() if name != "frames"}
+    synthetic.make(synthetic.dataset(tmp_path, fields=fields))
+    assert not (tmp_path / "sheet.png").exists()
+    assert "sheet.png" not in (tmp_path / "README.md").read_text()
+    assert verify(tmp_path, "full") == []
+
+
+def test_a_large_frame_is_made_smaller_on_the_sheet() -> None:
+    video = np.random.default_rng(0).integers(0, 256, (30, 300, 400, 3), np.uint8)
+    found = preview.reduced(video)
+    assert found.shape == (10, 100, 133, 3)
+    assert abs(found.mean() - video[preview.shown(30)].mean()) < 1
+
+
+def test_the_readme_tells_the_statistics(tmp_path: Path) -> None:
+    synthetic.make(synthetic.dataset(tmp_path))
+    readme = (tmp_path / "README.md").read_text()
+    for split, fields in read_manifest(tmp_path)["stats"].items():
+        for name, about in fields.items():
+            assert f"| {split} | {name} | {', '.join(f'{x:.4g}' for x in about['mean'])} |" in readme
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")  # the validator's own
+def test_croissant_is_valid_and_lists_the_shards(tmp_path: Path) -> None:
+    mlcroissant = pytest.importorskip("mlcroissant")
+    synthetic.make(synthetic.dataset(tmp_path))
+    described = mlcroissant.Dataset(jsonld=str(tmp_path / "croissant.json"))
+    assert not described.metadata.ctx.issues.errors
+    rows = [{key.split("/")[1]: value for key, value in row.items()} for row in described.records("shards")]
+    expected = read_manifest(tmp_path)["shards"]
+    assert [(row["name"].decode(), row["first"], row["count"]) for row in rows] == [
+        (shard["name"], shard["first"], shard["count"]) for shard in expected
+    ]
+
+
 @pytest.mark.parametrize("codec", codecs.CODECS)
-@pytest.mark.parametrize("example", ["gen2d", "torch", "h5py"])
+@pytest.mark.parametrize("example", ["gen2d", "gen2d, torch", "gen2d, jax", "h5py"])
 def test_the_examples_of_the_card_run(tmp_path: Path, example: str, codec: str) -> None:
     made = synthetic.make(synthetic.dataset(tmp_path / "copied elsewhere", codec=codec))
-    blocks = re.findall(r"```python\n(.*?)```", (synthetic.folder(made) / "README.md").read_text(), re.S)
-    (code,) = (block for block in blocks if example in block and (example == "torch" or "torch" not in block))
+    root = synthetic.folder(made)
+    blocks = re.findall(r"```python\n(.*?)```", (root / "README.md").read_text(), re.S)
+    plugin = ", hdf5plugin" if codec == "zstd" and example == "h5py" else ""
+    (code,) = (block for block in blocks if f"import {example}{plugin}\n" in block)
     for module in re.findall(r"import (.*)", code)[0].split(", "):
         if not importlib.util.find_spec(module):
             pytest.skip(f"{module} is not installed")
-    shown = {"torch": 'batch["frames"].numpy()', "gen2d": 'video["frames"]', "h5py": "video"}[example]
+    batch = "numpy.asarray(batch['frames'])"
+    shown = {"gen2d, torch": batch, "gen2d, jax": batch, "gen2d": 'video["frames"]', "h5py": "video"}[example]
     code += f"\nimport numpy\nnumpy.save('shown.npy', {shown})"
     # In a process of its own: where hdf5plugin is imported, HDF5 writes the filter's name into new zstd files.
-    subprocess.run([sys.executable, "-c", code], cwd=synthetic.folder(made), check=True)
-    found = np.load(synthetic.folder(made) / "shown.npy")
-    if example == "torch":
+    subprocess.run([sys.executable, "-c", code], cwd=root, check=True)
+    found = np.load(root / "shown.npy")
+    if "," in example:
         assert found.shape == (20, 5, 8, 8, 3)
     else:
         assert_array_equal(found, synthetic.video(made, "train", 0)["frames"])

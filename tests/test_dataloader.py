@@ -192,6 +192,41 @@ def test_batches_stay_as_they_were_while_others_follow(toy: Path, kind: str) -> 
             assert_array_equal(np.asarray(found[name]), values)
 
 
+@pytest.mark.parametrize("place", ["device", "sharding"])
+def test_jax_batches_lie_where_they_are_asked_to(toy: Path, place: str) -> None:
+    jax = pytest.importorskip("jax")
+    device = jax.devices()[-1]
+    mesh = jax.sharding.Mesh(np.array(jax.devices()), ("videos",))
+    spread = jax.sharding.NamedSharding(mesh, jax.sharding.PartitionSpec("videos"))
+    count = 4 * len(jax.devices())
+    options: dict[str, Any] = {"device": device} if place == "device" else {"sharding": spread}
+    dataset = loader.open(toy, fields=("frames", "states/angle"))
+    expected = next(iter(DataLoader(dataset, count, epochs=1)))
+    for name, values in next(iter(DataLoader(dataset, count, epochs=1, to="jax", **options))).items():
+        assert values.devices() == ({device} if place == "device" else set(jax.devices()))
+        assert place == "device" or values.sharding.is_equivalent_to(spread, values.ndim)
+        assert_array_equal(np.asarray(values), expected[name])
+
+
+def test_torch_batches_lie_where_they_are_asked_to(toy: Path) -> None:
+    torch = pytest.importorskip("torch")
+    batch = next(iter(DataLoader(loader.open(toy), 4, to="torch", device="meta")))
+    assert all(values.device == torch.device("meta") for values in batch.values())
+
+
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        ({"device": "cpu"}, "device is 'cpu', but must be None with to='numpy'"),
+        ({"sharding": "all", "to": "torch"}, "sharding is 'all', but must be None unless to is 'jax'"),
+        ({"sharding": "all", "device": "cpu", "to": "jax"}, "sharding is 'all', but must be None"),
+    ],
+)
+def test_a_place_that_cannot_be_is_refused(toy: Path, options: dict[str, Any], told: str) -> None:
+    with pytest.raises(ConfigError, match=told):
+        DataLoader(loader.open(toy), 4, **options)
+
+
 # ---- Processes
 
 

@@ -15,24 +15,11 @@ ROOT = Path(gen2d.__file__).parent.parent
 PACKAGE = ROOT / "gen2d"
 # Each module may import those before it; a family or look may import all of a Python file's neighbours but the last.
 ORDER = [
+    *("errors", "fields", "remote", "files", "cache", "codecs", "formats", "plan", "manifest", "order", "loader"),
+    *("mixing", "preview", "cards", "shards"),
     *(
-        "errors",
-        "fields",
-        "remote",
-        "files",
-        "cache",
-        "codecs",
-        "formats",
-        "plan",
-        "manifest",
-        "cards",
-        "shards",
-        "loader",
-    ),
-    "order",
-    *(
-        "verification",
         "dataloader",
+        "verification",
         "report",
         "progress",
         "films",
@@ -68,7 +55,7 @@ ORDER = [
         "annotations",
     ),
     *("placement", "scenes", "renderers", "drawing", "devices", "rollout", "redraw", "pipeline"),
-    *("generation", "streaming", "preview", "gallery", "space", "pictures"),
+    *("generation", "streaming", "regeneration", "gallery", "space", "pictures"),
 ]
 WITHOUT_JAX = ORDER[: ORDER.index("exporting") + 1]
 PLUGINS = ("scenes", "renderers", "annotations", "formats", "exports")

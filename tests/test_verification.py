@@ -9,7 +9,7 @@ import pytest
 import synthetic
 
 from gen2d import loader, shards
-from gen2d.errors import ConfigError, DamagedError
+from gen2d.errors import ConfigError, DamagedError, FolderError
 from gen2d.verification import damaged_shards, verify
 
 
@@ -39,16 +39,82 @@ def test_what_was_written_passes(tmp_path: Path, codec: str, level: str) -> None
     assert damaged_shards(tmp_path, level) == []
 
 
-@pytest.mark.parametrize("kind", ["shards/*.h5", "index/**/*.npy", "manifest.json", "config.yaml"])
-def test_a_flipped_bit_anywhere_is_found(root: Path, kind: str) -> None:
-    random = np.random.default_rng(0)
-    for path in sorted(root.glob(kind)):
-        for bit in random.integers(0, 8 * path.stat().st_size, 5).tolist():
-            flip(path, bit)
-            found = verify(root, "full")
-            assert found, f"bit {bit} of {path}"
-            assert any(str(path) in sentence for sentence in found)
-            flip(path, bit)
+KINDS = [
+    *("shards/*.h5", "index/**/*.npy", "manifest.json", "config.yaml", "croissant.json", ".gen2d/dataset.json"),
+    *(".gen2d/done/*.json", ".gen2d/done/*.npz"),
+]
+
+
+def everything(root: Path) -> dict[str, dict[str, np.ndarray]]:
+    """Every field of every video, by split, as training reads it."""
+    return {split: loader.open(root, split, "*")[:] for split in ("train", "test")}
+
+
+def refused(root: Path, expected: dict[str, dict[str, np.ndarray]]) -> str:
+    """What the loader says of damage when it reads everything; empty if it gives what was written."""
+    try:
+        found = everything(root)
+    except (DamagedError, FolderError) as error:
+        return str(error)
+    for split, fields in expected.items():
+        for name, values in fields.items():
+            assert found[split][name].tobytes() == values.tobytes(), f"{name} of {split} was read wrong in silence"
+    return ""
+
+
+@pytest.mark.parametrize("kind", [*KINDS, pytest.param("**/*", marks=pytest.mark.slow)])
+def test_a_flipped_bit_anywhere_is_found_and_never_read(root: Path, kind: str) -> None:
+    """A hundred of each kind of file; slow: of all together, by their sizes."""
+    paths = sorted(p for p in root.glob(kind) if p.is_file() and p.name not in ("README.md", "run.jsonl"))
+    expected, random = everything(root), np.random.default_rng(0)
+    share = np.array([path.stat().st_size for path in paths], float)
+    for number in random.choice(len(paths), 100, p=share / share.sum()).tolist():
+        path, bit = paths[number], int(random.integers(0, 8 * share[number]))
+        flip(path, bit)
+        found = verify(root, "full")
+        assert any(str(path) in sentence for sentence in found), f"bit {bit} of {path}: {found}"
+        assert str(path) in (refused(root, expected) or str(path))
+        flip(path, bit)
+    assert verify(root, "full") == []
+
+
+@pytest.mark.parametrize("level", ["quick", "full"])
+def test_files_in_each_others_place_are_found_and_never_read(root: Path, level: str) -> None:
+    expected = everything(root)
+    for kind in ("shards/*.h5", "index/*/*.npy", "index/*.npy", ".gen2d/done/*.json", ".gen2d/done/*.npz"):
+        one, other = sorted(root.glob(kind))[:2]
+        contents = one.read_bytes(), other.read_bytes()
+        for path, content in zip((one, other), reversed(contents), strict=True):
+            path.write_bytes(content)
+        found = verify(root, level)
+        if level == "full" or len(contents[0]) != len(contents[1]) or not kind.startswith("shards"):
+            assert all(any(str(path) in sentence for sentence in found) for path in (one, other)), kind
+        told = refused(root, expected) or str(one)
+        assert str(one) in told or str(other) in told
+        for path, content in zip((one, other), contents, strict=True):
+            path.write_bytes(content)
+    assert verify(root, level) == []
+
+
+@pytest.mark.parametrize("size", ["gone", "empty", "half", "longer"])
+def test_a_file_of_another_length_is_found_and_never_read(root: Path, size: str) -> None:
+    expected = everything(root)
+    for path in sorted({path for kind in KINDS for path in root.glob(kind) if path.is_file()}):
+        content = path.read_bytes()
+        changed = {"gone": b"", "empty": b"", "half": content[: len(content) // 2], "longer": content + b"0"}[size]
+        path.write_bytes(changed)
+        if size == "gone":
+            path.unlink()
+        found = verify(root, "quick")
+        told = root if size == "gone" and path.name == "manifest.json" else path
+        assert any(str(told) in sentence for sentence in found), path
+        assert str(told) in (refused(root, expected) or str(told))
+        path.write_bytes(content)
+    assert verify(root, "quick") == []
+
+
+def test_a_copy_without_the_programs_own_files_is_whole(root: Path) -> None:
+    shutil.rmtree(root / ".gen2d")
     assert verify(root, "full") == []
 
 

@@ -1,0 +1,185 @@
+"""Several datasets as one, in exact proportions: which source each position takes follows from the position alone.
+
+Among the first p positions each source has its share of p within 1, for any number of sources and any weights
+(Tijdeman, Discrete Mathematics 32, 1980). Shuffling takes each source's videos in another order and leaves the
+positions of the sources as they are, so that every batch holds its shares, too.
+"""
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from fractions import Fraction
+from typing import Any
+
+import numpy as np
+
+from gen2d.errors import ConfigError
+from gen2d.loader import Batch, Dataset, Numbers, checked_numbers, item, taken_apart
+from gen2d.order import SOURCES, hashed
+
+FINEST = 1000  # a weight is taken as the nearest fraction with a denominator up to this
+Weights = Mapping[str, float] | Sequence[float]
+
+
+def mix(datasets: Mapping[str, Dataset], weights: Weights | None = None) -> "Mixture":
+    """The datasets as one, for DataLoader, torch and grain; `weights` are their shares, equal unless told otherwise.
+
+    An epoch is as long as no dataset has to give a video twice, and the next goes on with the videos that follow, so
+    that a large dataset is read through in several epochs. Raises ConfigError where the datasets' fields, shapes or
+    types differ, and where weights are not positive or not of these datasets.
+    """
+    if not datasets:
+        raise ConfigError("datasets is empty, but must name one dataset or more")
+    first = next(iter(datasets))
+    for name, other in datasets.items():
+        _compare(first, datasets[first], name, other)
+    return Mixture(datasets, _shares(list(datasets), weights))
+
+
+class Mixture:
+    """Videos of several datasets by position, as dictionaries of NumPy arrays; a map-style dataset itself.
+
+    A position's video has a number, which `fill` takes: the datasets' own, counted on from one dataset to the next.
+    """
+
+    def __init__(self, datasets: Mapping[str, Dataset], shares: Sequence[int]) -> None:
+        self.datasets, self.shares = dict(datasets), list(shares)
+        self.fields = next(iter(datasets.values())).fields
+        self._sources = list(datasets.values())
+        self._sizes = np.array([len(source) for source in self._sources])
+        self._firsts = np.cumsum(self._sizes) - self._sizes
+        self._turns = turns(self.shares, self._sizes.tolist())
+        taken = np.cumsum(self._turns[:, None] == np.arange(len(shares)), axis=0)
+        self._taken = np.concatenate([np.zeros_like(taken[:1]), taken])  # of each dataset before each turn
+        whole = len(self._turns) == sum(shares)
+        periods = min(size // share for size, share in zip(self._sizes.tolist(), shares, strict=True)) if whole else 0
+        rest = (self._taken <= self._sizes - periods * self._taken[-1]).all(axis=1).sum() - 1
+        self._count = periods * len(self._turns) + int(rest)
+        self._each = periods * self._taken[-1] + self._taken[rest]  # of each dataset in an epoch
+
+    def __len__(self) -> int:
+        return self._count
+
+    def __getitem__(self, key: Any) -> Batch:
+        """The video at a position, or for a slice or a sequence of positions several, stacked."""
+        return item(self, key)
+
+    def __getitems__(self, positions: Numbers) -> list[Batch]:
+        """The videos one by one; torch's DataLoader asks for a whole batch so."""
+        return taken_apart(self.batch(positions))
+
+    def __repr__(self) -> str:
+        parts = (f"{share} of {name}" for name, share in zip(self.datasets, self.shares, strict=True))
+        return f"<{len(self)} videos, in every {sum(self.shares)} {', '.join(parts)}>"
+
+    def batch(self, positions: Numbers) -> Batch:
+        """The videos at these positions of the first epoch, not shuffled, stacked."""
+        places = checked_numbers(positions, len(self), "the mixture")
+        out = self.empty(len(places))
+        self.fill(out, 0, self.numbers_at(places))
+        return out
+
+    def empty(self, count: int) -> Batch:
+        """A batch of `count` videos that is yet to be filled."""
+        return self._sources[0].empty(count)
+
+    def fill(self, out: Batch, row: int, indices: Numbers, starts: Numbers | None = None) -> None:
+        """Returns nothing; puts the videos with these numbers into `out` from `row` on, windows from `starts`."""
+        numbers = np.asarray(indices)
+        owners = self._owners(numbers)
+        for run in np.split(np.arange(len(numbers)), np.flatnonzero(np.diff(owners)) + 1):
+            if len(run):
+                owner = owners[run[0]]
+                own = None if starts is None else np.asarray(starts)[run]
+                self._sources[owner].fill(out, row + int(run[0]), numbers[run] - self._firsts[owner], own)
+
+    def numbers_at(self, positions: np.ndarray, epoch: int = 0, seed: int | None = None) -> np.ndarray:
+        """The numbers of the videos at these positions of an epoch: each dataset's one after the other, or as the seed
+        shuffles them; what an epoch leaves of a dataset comes in the next."""
+        periods, turn = np.divmod(positions, len(self._turns))
+        owners, numbers = self._turns[turn], np.empty(len(positions), np.int64)
+        for owner, own in self._shared(owners):
+            place = epoch * self._each[owner] + periods[own] * self._taken[-1, owner] + self._taken[turn[own], owner]
+            source, rounds = self._sources[owner], place // len(self._sources[owner])
+            own_seed = None if seed is None else int(hashed(SOURCES, seed, owner)[0])
+            for number in np.unique(rounds):
+                now = own[rounds == number]
+                found = source.numbers_at(place[rounds == number] % len(source), int(number), own_seed)
+                numbers[now] = self._firsts[owner] + found
+        return numbers
+
+    def starts(self, numbers: np.ndarray, bits: np.ndarray) -> np.ndarray | None:
+        """Where the windows of these videos begin, drawn by random bits; None if that is not random."""
+        starts = np.zeros(len(numbers), np.int64)
+        for owner, own in self._shared(self._owners(numbers)):
+            found = self._sources[owner].starts(numbers[own], bits[own])
+            if found is None:
+                return None
+            starts[own] = found
+        return starts
+
+    def source_of(self, positions: Numbers) -> list[str]:
+        """The names of the datasets that the videos at these positions are of, the same in every epoch."""
+        names = list(self.datasets)
+        return [names[owner] for owner in self._turns[np.asarray(positions) % len(self._turns)]]
+
+    def _owners(self, numbers: np.ndarray) -> np.ndarray:
+        return np.searchsorted(self._firsts, numbers, side="right") - 1
+
+    def _shared(self, owners: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
+        """Each dataset that occurs, and where."""
+        return ((int(owner), np.flatnonzero(owners == owner)) for owner in np.unique(owners))
+
+
+def turns(shares: Sequence[int], sizes: Sequence[int]) -> np.ndarray:
+    """Whose turn it is at each position of a period of sum(shares); shorter where one of these sizes is used up.
+
+    After p positions each of K has had its share within 1 - 1 / (2K - 2): of those that are that far behind, the one
+    goes first that will be too late first (Tijdeman 1980). In whole numbers, so that it is the same everywhere.
+    """
+    period, scale, unit = sum(shares), max(2 * len(shares) - 2, 1), math.lcm(*shares)
+    taken, found = [0] * len(shares), []
+    for place in range(1, period + 1):
+        behind = [k for k, share in enumerate(shares) if scale * (share * place - period * taken[k]) >= period]
+        owner = min(behind, key=lambda k: (scale - 1 + scale * taken[k]) * (unit // shares[k]))
+        if taken[owner] == sizes[owner]:
+            break
+        taken[owner] += 1
+        found.append(owner)
+    return np.array(found)
+
+
+def _shares(names: list[str], weights: Weights | None) -> list[int]:
+    """The weights as the smallest whole numbers in the same proportions."""
+    if isinstance(weights, Mapping):
+        if weights.keys() != set(names):
+            raise ConfigError(f"weights has the names {', '.join(weights)}, but must have {', '.join(names)}")
+        weights = [weights[name] for name in names]
+    given = [1.0] * len(names) if weights is None else list(weights)
+    if len(given) != len(names):
+        raise ConfigError(f"weights has {len(given)} numbers, but there are {len(names)} datasets")
+    fractions = [_fraction(name, weight) for name, weight in zip(names, given, strict=True)]
+    unit = math.lcm(*(fraction.denominator for fraction in fractions))
+    shares = [int(fraction * unit) for fraction in fractions]
+    return [share // math.gcd(*shares) for share in shares]
+
+
+def _fraction(name: str, weight: float) -> Fraction:
+    try:
+        fraction = Fraction(float(weight)).limit_denominator(FINEST)
+    except (TypeError, ValueError, OverflowError):
+        fraction = Fraction(0)
+    if fraction <= 0:
+        raise ConfigError(f"weights of {name} is {weight!r}, but must be a number of {1 / FINEST} or more")
+    return fraction
+
+
+def _compare(first: str, one: Dataset, name: str, other: Dataset) -> None:
+    """Raises ConfigError where videos of two datasets cannot stand in one batch."""
+    here, there = one.empty(1), other.empty(1)
+    for field in sorted(here.keys() ^ there.keys()):
+        has, lacks = (first, name) if field in here else (name, first)
+        raise ConfigError(f"dataset {lacks} has no field {field!r}, but {has} has: open both with the same fields")
+    for field, values in here.items():
+        kinds = [f"{array.dtype} {array.shape[1:]}" for array in (values, there[field])]
+        if kinds[0] != kinds[1]:
+            raise ConfigError(f"{field} of dataset {name} is {kinds[1]}, but of {first} {kinds[0]}")

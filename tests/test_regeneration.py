@@ -1,0 +1,170 @@
+"""Videos made again from the recipe are those that are stored, and what is damaged is made again to the byte."""
+
+import json
+import shutil
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from test_verification import flip
+from tiny import changed, ran
+
+from gen2d import codecs, shards
+from gen2d.errors import FolderError
+from gen2d.files import as_json, file_sha256, sealed
+from gen2d.generation import generate
+from gen2d.regeneration import repair
+from gen2d.verification import checked, chosen_videos, verify
+
+BY_HAND = ("README.md",)  # what people may have written in, so that only its absence is told
+
+
+@pytest.fixture(scope="module")
+def pristine(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("tiny") / "data"
+    config = changed(storage={"codec": "zstd"})
+    generate(config, 21, out)
+    generate(config, 3, out, split="test")
+    return out
+
+
+@pytest.fixture
+def root(pristine: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(pristine, tmp_path / "data"))
+
+
+def contents(root: Path) -> dict[str, bytes]:
+    """Every file and its bytes, the program's own too, but for the log, which holds times."""
+    files = (path for path in root.rglob("*") if path.is_file() and path.name != "run.jsonl")
+    return {path.relative_to(root).as_posix(): path.read_bytes() for path in files}
+
+
+def forge(root: Path, name: str, field: str, row: int) -> None:
+    """Another number in a shard, and every checksum as if it had been written so."""
+    about = shards.read_manifest(root)["fields"][field]
+    size = int(np.prod(about["shape"])) * np.dtype(about["dtype"]).itemsize
+    path, record_path = root / "shards" / f"{name}.h5", root / ".gen2d" / "done" / f"{name}.json"
+    with h5py.File(path, "r") as file:
+        stored = file[field]
+        assert isinstance(stored, h5py.Dataset)
+        place = stored.id.get_offset() + row * size
+    flip(path, 8 * place)
+    tables_path = record_path.with_suffix(".npz")
+    with np.load(tables_path) as stored_tables:
+        tables = dict(stored_tables)
+    tables[f"crc/{field}"][row] = codecs.crc32(path.read_bytes()[place : place + size])
+    np.savez(tables_path, allow_pickle=False, **tables)
+    record = json.loads(record_path.read_bytes())
+    record |= {"sha256": file_sha256(path), "tables_sha256": file_sha256(tables_path)}
+    record_path.write_bytes(as_json(sealed(record, "record_sha256")))
+    repair(root, [])  # index, cards and manifest, which follow from the records
+
+
+def test_what_was_made_is_what_is_made_again(pristine: Path) -> None:
+    assert verify(pristine, "regen", videos=24) == []
+
+
+def test_videos_are_chosen_by_the_seed() -> None:
+    splits = {"test": 3, "train": 21}
+    everything = [("test", i) for i in range(3)] + [("train", i) for i in range(21)]
+    assert chosen_videos(splits, 99, 0) == everything
+    few = [chosen_videos(splits, 5, seed) for seed in range(60)]
+    assert all(len(set(own)) == 5 and set(own) <= set(everything) for own in few)
+    assert few[0] == chosen_videos(splits, 5, 0)
+    assert {video for own in few for video in own} == set(everything)
+
+
+def test_a_dataset_with_other_values_but_right_checksums_is_found_and_made_again(pristine: Path, root: Path) -> None:
+    forge(root, "train-00001", "states/position", 2)
+    assert verify(root, "full") == []
+    outcome = checked(root, "regen", videos=24)
+    (sentence,) = outcome.problems
+    assert "train-00001.h5: states/position of train video 10 is not what its recipe makes" in sentence
+    outcome = checked(root, "regen", lambda names: repair(root, names), videos=24)
+    assert (outcome.problems, outcome.repaired, outcome.remade) == ([], [sentence], ["train-00001"])
+    assert contents(root) == contents(pristine)
+
+
+DAMAGES = {
+    "shard": ["shards/train-00000.h5"],
+    "index": ["index/frames.npy"],
+    "records": [".gen2d/done/train-00002.json", ".gen2d/done/test-00000.npz"],
+    "mark": [".gen2d/dataset.json"],
+    "manifest": ["manifest.json"],
+    "manifest and a shard": ["manifest.json", "shards/train-00002.h5"],
+    "manifest and a record": ["manifest.json", ".gen2d/done/train-00000.json"],
+    "many": ["shards/train-00001.h5", "shards/test-00000.h5", "config.yaml", "README.md", "croissant.json"],
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_a_repair_restores_every_byte(pristine: Path, root: Path, damage: str) -> None:
+    for name in DAMAGES[damage]:
+        flip(root / name, 8 * ((root / name).stat().st_size // 2) + 3)
+    outcome = checked(root, "full", lambda names: repair(root, names))
+    assert outcome.problems == []
+    named = "\n".join(outcome.repaired)
+    listed = DAMAGES[damage][:1] if damage.startswith("manifest") else DAMAGES[damage]
+    assert all(name in named for name in listed if name not in BY_HAND)
+    assert contents(root) == contents(pristine)
+
+
+def test_missing_and_empty_files_are_restored(pristine: Path, root: Path) -> None:
+    for name in ("index/videos.npy", "shards/train-00000.h5", "README.md", ".gen2d/dataset.json"):
+        (root / name).unlink()
+    for name in ("config.yaml", "shards/test-00000.h5"):
+        (root / name).write_bytes(b"")
+    outcome = checked(root, "quick", lambda names: repair(root, names))
+    assert (outcome.problems, outcome.remade) == ([], ["test-00000", "train-00000"])
+    assert contents(root) == contents(pristine)
+
+
+def test_a_dataset_that_nothing_describes_is_not_guessed(root: Path) -> None:
+    for name in ("manifest.json", ".gen2d/dataset.json"):
+        flip(root / name, 1000)
+    before = contents(root)
+    with pytest.raises(FolderError, match="both damaged"):
+        repair(root, [])
+    assert contents(root) == before
+
+
+def test_a_dataset_that_may_have_been_larger_is_not_made_smaller(root: Path) -> None:
+    for name in ("manifest.json", ".gen2d/done/train-00002.json"):
+        flip(root / name, 1000)
+    before = contents(root)
+    with pytest.raises(FolderError, match=r"record of train-00002.*run the command"):
+        repair(root, [])
+    assert contents(root) == before
+
+
+def test_other_versions_are_told_and_nothing_is_changed(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XLA_FLAGS", "--xla_cpu_enable_fast_math=false")
+    flip(root / "shards" / "train-00000.h5", 80000)
+    before = contents(root)
+    for call in (lambda: verify(root, "regen"), lambda: repair(root, ["train-00000"])):
+        with pytest.raises(FolderError, match=r"fingerprint.xla_flags is .* there and --xla"):
+            call()
+    assert contents(root) == before
+    flip(root / "shards" / "train-00000.h5", 80000)
+    flip(root / "index" / "videos.npy", 3000)
+    assert verify(root, "full", lambda names: repair(root, names)) == []  # that takes no simulation
+
+
+def test_the_command_line_repairs(pristine: Path, root: Path) -> None:
+    told = ran("verify", root, "--level", "regen", "--videos", 3, "--seed", 5)
+    assert (told.returncode, "3 videos chosen by --seed 5" in told.stdout) == (0, True), told.stderr
+    flip(root / "shards" / "train-00001.h5", 80000)
+    flip(root / "manifest.json", 3000)
+    found = ran("verify", root, "--json")
+    assert found.returncode == 1
+    assert json.loads(found.stdout)["level"] == "full"
+    done = ran("verify", root, "--repair", "--json")
+    assert done.returncode == 0, done.stderr
+    about = json.loads(done.stdout)
+    assert (about["problems"], about["remade"]) == ([], ["train-00001"])
+    assert "manifest.json" in about["repaired"][0]
+    assert contents(root) == contents(pristine)
+    other = ran("verify", root, "--level", "regen", XLA_FLAGS="--xla_cpu_enable_fast_math=false")
+    assert (other.returncode, other.stdout) == (2, "")
+    assert other.stderr.count("\n") == 1
