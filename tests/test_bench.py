@@ -5,6 +5,7 @@ from pathlib import Path
 import bench
 import bench_physics
 import bench_render
+import bench_storage
 import cv2
 import h5py
 import numpy as np
@@ -38,6 +39,15 @@ def test_every_stage_is_timed(tmp_path: Path) -> None:
     turns = bench.stages(tmp_path, turns=1, peer_videos=1, sets=TINY)
     assert {"sampler", "simulate", "render", "transfer", "compress", "write", "peer body", "peer draw"} <= turns.keys()
     assert all(seconds > 0 for (seconds,) in turns.values())
+
+
+def test_every_way_to_store_is_timed(tmp_path: Path) -> None:
+    case = bench_storage.Case(16, 4, 8, 1, 1, 1, 1)
+    seconds = {name: work() for name, work in bench_storage.works(case, tmp_path).items()}
+    ways = {f"{what} {codec}" for what in ("loader", "h5py") for codec in ("gzip", "zstd", "none")}
+    assert ways | {"copy", "h5py gzip-4", "codec zstd", "write zstd", "codec gzip", "write gzip"} == seconds.keys()
+    assert all(value > 0 for value in seconds.values())
+    assert bench_storage.table([bench_storage.stored_of(case, seconds)])
 
 
 def test_bounds_counts_whole_videos_only(tmp_path: Path) -> None:
