@@ -156,6 +156,8 @@ def _wrong(path: Place, expected: str) -> Iterator[str]:
         elif file_sha256(path) != expected:
             yield f"{path} is not what was written"
     except OSError as error:
+        if isinstance(path, Url):  # of what a server does not give, nothing is known
+            raise
         yield f"{path} cannot be read ({error.strerror or error})"
 
 
