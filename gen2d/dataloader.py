@@ -22,6 +22,8 @@ from gen2d.order import Step, Walk, one_of
 class DataLoader:
     """Batches as dictionaries of arrays, each rank its slice of every global batch of `batch_size * world_size`.
 
+    Unless given, rank and world size are those that torchrun sets in the environment, or one process is all.
+
     Video and window at each position follow from (seed, epoch, position) alone, so a state is a few numbers and fits
     another world size. An iteration ends when `epochs` epochs are through, and the next goes on with the epochs that
     follow; after `break` or `load_state_dict` it goes on with the batch after the last one delivered.
@@ -40,8 +42,8 @@ class DataLoader:
         seed: int = 0,
         shuffle: bool | str = "global",
         epochs: int | None = None,
-        rank: int = 0,
-        world_size: int = 1,
+        rank: int | None = None,
+        world_size: int | None = None,
         remainder: str = "drop",
         num_threads: int | None = None,
         prefetch: int = 2,

@@ -60,19 +60,24 @@ def background_of(options: Plain, layout: Layout, key: Array) -> Background:
     return Background(color, texture=Texture(jax.random.bits(key, (), jnp.uint32), cell, to_color))
 
 
+def shades(background: Background) -> Array:
+    """The colours [B, 3] of a background: its own, or both that it goes between and what is halfway."""
+    color, other = background.color, background.to_color if background.texture is None else background.texture.color
+    return color[None] if other is None else jnp.stack([color, (color + other) / 2, other])
+
+
 def mean_color(background: Background) -> Array:
     """The colour [3] halfway between the two of a background."""
-    other = background.to_color if background.texture is None else background.texture.color
-    return background.color if other is None else (background.color + other) / 2
+    return shades(background).mean(0)
 
 
 def colors_of(scene: Scene, layout: Layout, options: Plain, key: Array, background: Background) -> Array:
     """The colours [K, 3] of the slots: the scene's, or random ones for all that moves, which differ from one another
-    and from the background's mean."""
+    and from the background's."""
     colors, moving = scene.objects.color.astype(jnp.float32), np.flatnonzero(are_moving(layout))
     if options.palette == "scene" or not len(moving):
         return colors
-    return colors.at[moving].set(palette(key, len(moving), options.contrast, mean_color(background)))
+    return colors.at[moving].set(palette(key, len(moving), options.contrast, shades(background)))
 
 
 def lines_of(scene: Scene, options: Lines) -> tuple[Array, Array]:

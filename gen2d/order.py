@@ -4,6 +4,7 @@ Nothing is drawn from a generator that has a state: video and window at each pos
 position, so going on anywhere takes no replay.
 """
 
+import os
 from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
 
@@ -34,10 +35,11 @@ class Walk:
         seed: int,
         shuffle: bool | str,
         epochs: int | None,
-        rank: int,
-        world_size: int,
+        rank: int | None,
+        world_size: int | None,
         remainder: str,
     ) -> None:
+        rank, world_size = _ranks(rank, world_size)
         one_of("shuffle", shuffle, ("global", True, False))
         one_of("remainder", remainder, ("drop", "keep"))
         if min(batch_size, world_size) < 1 or not 0 <= rank < world_size:
@@ -98,6 +100,16 @@ class Walk:
     def bits(self, step: Step, positions: np.ndarray) -> np.ndarray:
         """Random bits for the window at each position."""
         return hashed(WINDOWS, self.seed, step.epoch, positions)
+
+
+def _ranks(rank: int | None, world_size: int | None) -> tuple[int, int]:
+    """Which of how many processes this is: as told, else as torchrun says in RANK and WORLD_SIZE, else the only one."""
+    if rank is None and world_size is None and {"RANK", "WORLD_SIZE"} <= os.environ.keys():
+        told = os.environ["RANK"], os.environ["WORLD_SIZE"]
+        if not all(word.isdecimal() for word in told):
+            raise ConfigError(f"RANK and WORLD_SIZE are {told[0]!r} and {told[1]!r}, but must be whole numbers")
+        return int(told[0]), int(told[1])
+    return 0 if rank is None else rank, 1 if world_size is None else world_size
 
 
 def one_of(name: str, value: Any, allowed: tuple) -> None:

@@ -91,22 +91,22 @@ def textured(color: Array, texture: Texture, x: Array, y: Array) -> Array:
     return color + share * (texture.color - color)
 
 
-def palette(key: Array, count: int, distance: float, background: Array) -> Array:
-    """`count` random colours [count, 3], each at least `distance` from the background and from those before it.
+def palette(key: Array, count: int, distance: float, backgrounds: Array) -> Array:
+    """`count` random colours [count, 3], each at least `distance` from backgrounds [B, 3] and from those before it.
 
     The first of some tries that is so far from all is taken, and the farthest where none is. Distances are those of
     a Euclidean approximation of what the eye sees (T. Riemersma, 'Colour metric').
     """
-    tries = _vivid(key, count * TRIES).reshape(count, TRIES, 3)
+    tries, first = _vivid(key, count * TRIES).reshape(count, TRIES, 3), len(backgrounds)
 
     def add(chosen: Array, entry: tuple[Array, Array]) -> tuple[Array, Array]:
         number, colors = entry
-        known = jnp.arange(count + 1) <= number
+        known = jnp.arange(first + count) < first + number
         apart = jnp.where(known, contrast(colors[:, None], chosen[None]), jnp.inf).min(1)
         best = jnp.where((apart >= distance).any(), jnp.argmax(apart >= distance), jnp.argmax(apart))
-        return chosen.at[number + 1].set(colors[best]), colors[best]
+        return chosen.at[first + number].set(colors[best]), colors[best]
 
-    start = jnp.zeros((count + 1, 3)).at[0].set(background)
+    start = jnp.zeros((first + count, 3)).at[:first].set(backgrounds)
     return jax.lax.scan(add, start, (jnp.arange(count), tries))[1]
 
 

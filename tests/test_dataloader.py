@@ -123,6 +123,20 @@ def test_random_windows_follow_from_seed_epoch_and_position(toy: Path) -> None:
     assert len(starts()) == 3 * TRAIN
 
 
+def test_ranks_are_those_that_torchrun_tells_unless_given(toy: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    ds = loader.open(toy, fields="index")
+    monkeypatch.setenv("RANK", "1")
+    monkeypatch.setenv("WORLD_SIZE", "2")
+    told, given = DataLoader(ds, 4, epochs=1), DataLoader(ds, 4, epochs=1, rank=1, world_size=2)
+    alone = DataLoader(ds, 4, epochs=1, rank=0, world_size=1)
+    assert len(told) == len(given) == TRAIN // 8 != len(alone)
+    for one, other in zip(told, given, strict=True):
+        assert_array_equal(one["index"], other["index"])
+    monkeypatch.setenv("RANK", "one")
+    with pytest.raises(ConfigError, match="RANK and WORLD_SIZE are 'one'"):
+        DataLoader(ds, 4)
+
+
 def test_a_state_of_another_order_is_refused(toy: Path) -> None:
     dataset = loader.open(toy, fields="index")
     state = DataLoader(dataset, 4, seed=1).state_dict()

@@ -146,8 +146,9 @@ def test_one_key_paints_the_same_and_another_key_what_is_random(name):
 def test_random_colours_can_be_told_apart(name):
     made = painted(name, 4, **FREE)
     colors = np.asarray(made.color)[:, :3]
-    behind = np.asarray(jax.vmap(looks.mean_color)(made.background))[:, None]
-    assert least(np.concatenate([behind, colors], 1)).min() >= 150
+    behind = np.asarray(jax.vmap(looks.shades)(made.background))
+    for shade in range(behind.shape[1]):
+        assert least(np.concatenate([behind[:, shade : shade + 1], colors], 1)).min() >= 150
 
 
 def test_random_colours_are_the_same_in_all_looks_on_one_background():
@@ -167,7 +168,7 @@ def least(colors):
 @functools.partial(jax.jit, static_argnums=1)
 @functools.partial(jax.vmap, in_axes=(0, None, None, 0))
 def chosen(key, count, distance, behind):
-    return paint.palette(key, count, distance, behind)
+    return paint.palette(key, count, distance, behind[None])
 
 
 def palettes(count, distance, videos=200):
