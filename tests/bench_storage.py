@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import h5py
-import hdf5plugin  # noqa: F401 (h5py reads zstd with it)
 import numpy as np
 import synthetic
 
@@ -62,7 +61,12 @@ class Stored(NamedTuple):
 
 
 def works(case: Case, folder: Path) -> dict[str, Callable[[], float]]:
-    """By name what reads, copies, compresses or writes all videos of a case and returns the CPU seconds."""
+    """By name what reads, copies, compresses or writes all videos of a case and returns the CPU seconds.
+
+    In a process of its own: where hdf5plugin is imported, HDF5 writes the filter's name into new zstd files.
+    """
+    import hdf5plugin  # noqa: F401 (h5py reads zstd with it)
+
     frames = synthetic.discs(case.videos, case.frames, case.pixels)
     columns = {"frames": frames, "states/position": np.zeros((case.videos, case.frames, 8, 2), np.float32)}
     out = {name: np.empty_like(values) for name, values in columns.items()}

@@ -20,3 +20,8 @@ def _compiled_programs_end_with_their_file():
     if "jax" in sys.modules:
         sys.modules["jax"].clear_caches()
         gc.collect()
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """The file that takes longest comes first, so that no process works at it alone in the end."""
+    items.sort(key=lambda item: item.path.name != "test_readme.py")
