@@ -44,6 +44,10 @@ class Parser(argparse.ArgumentParser):
         fail(f"{message}; see {self.prog} --help", 2)
 
 
+def _tell(line: str) -> None:
+    print(line, file=sys.stderr, flush=True)
+
+
 def fail(sentence: str, code: int) -> NoReturn:
     """Ends the program with a sentence for a person."""
     print(f"gen2d: {sentence}", file=sys.stderr)
@@ -150,9 +154,8 @@ def generate(arguments: Sequence[str]) -> int:
     options = generating().parse_args(arguments)
     from gen2d import generation as job  # imports jax: only now
 
-    begin = job.generate
     try:
-        summary = begin(
+        summary = job.generate(
             options.config,
             options.n,
             options.out,
@@ -162,7 +165,7 @@ def generate(arguments: Sequence[str]) -> int:
             device=options.device,
             worker=_worker(options.worker),
             overwrite=options.overwrite,
-            say=lambda line: print(line, file=sys.stderr, flush=True),
+            say=_tell,
         )
     except KeyboardInterrupt:
         again = [a for a in arguments if a != "--overwrite"]
@@ -211,7 +214,7 @@ def _repairing(root: Place) -> Callable[[list[str]], list[str]]:
     def repair(names: list[str]) -> list[str]:
         from gen2d import regeneration  # imports jax: only now
 
-        return regeneration.repair(root, names, lambda line: print(line, file=sys.stderr, flush=True))
+        return regeneration.repair(root, names, _tell)
 
     return repair
 
@@ -264,7 +267,7 @@ def export(arguments: Sequence[str]) -> int:
         split=options.split,
         fields=options.fields,
         overwrite=options.overwrite,
-        say=lambda line: print(line, file=sys.stderr, flush=True),
+        say=_tell,
     )
     loss = f"\n{options.to} is {made.loss}" if made.loss else ""
     print(f"{made.videos:,} videos in {in_time(made.seconds)}, {in_bytes(made.bytes)}, in {made.out}{loss}")

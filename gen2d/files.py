@@ -12,7 +12,7 @@ import shutil
 import socket
 import stat
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -44,8 +44,7 @@ def _renaming(path: Path) -> Iterator[Path]:
 @contextlib.contextmanager
 def publishing_folder(path: Path) -> Iterator[Path]:
     """A temporary folder to write in; it appears as `path`, instead of what was there, when the block ends well."""
-    temporary = path.with_name(f"{path.name}.tmp.{_HOST}.{os.getpid()}")
-    replaced = path.with_name(f"{path.name}.old.tmp.{_HOST}.{os.getpid()}")
+    temporary, replaced = (path.with_name(f"{path.name}{old}{_mark()}") for old in ("", ".old"))
     try:
         temporary.mkdir()
         yield temporary
@@ -89,24 +88,22 @@ def sweep(root: Place) -> None:
     """Returns nothing; removes what dead processes of this host left behind. Of other hosts nothing is known."""
     pattern = f"*.tmp.{_HOST}.*"
     left = work_folder(root).glob(f"gen2d-{pattern}") if isinstance(root, Url) else root.rglob(pattern)
-    for path in left:
-        if not _is_abandoned(path):
-            continue
-        if isinstance(root, Url):
-            shutil.rmtree(path, ignore_errors=True)
-        else:
-            path.unlink(missing_ok=True)
+    _remove_abandoned(left)
 
 
 def sweep_beside(path: Path) -> None:
     """Returns nothing; removes what dead processes of this host left when they were to publish `path`."""
-    for left in path.parent.glob(f"{glob.escape(path.name)}.*tmp.{_HOST}.*"):
-        if not _is_abandoned(left):
+    _remove_abandoned(path.parent.glob(f"{glob.escape(path.name)}.*tmp.{_HOST}.*"))
+
+
+def _remove_abandoned(paths: Iterable[Path]) -> None:
+    for path in paths:
+        if not _is_abandoned(path):
             continue
-        if left.is_dir():
-            shutil.rmtree(left, ignore_errors=True)
+        if path.is_dir():
+            shutil.rmtree(path, ignore_errors=True)
         else:
-            left.unlink(missing_ok=True)
+            path.unlink(missing_ok=True)
 
 
 def remove_tree(folder: Place) -> None:

@@ -11,6 +11,7 @@ import numpy as np
 
 from gen2d.errors import ConfigError, UserError
 
+LOSS = "lossy: colours at half the resolution, and rounded"  # of YUV 4:2:0
 SLOWEST = 0.1  # frames/s; OpenCV rounds rates to a thousandth
 FASTEST = 2**16 - 1  # frames/s; what MPEG-4 has bits for
 

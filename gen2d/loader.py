@@ -92,10 +92,11 @@ class Options:
         """The frame at which windows begin unless told otherwise."""
         return self.start if isinstance(self.start, int) else 0
 
-    @property
-    def is_random(self) -> bool:
-        """Whether windows begin at random frames."""
-        return self.window is not None and self.start == "random"
+    def starts(self, bits: np.ndarray, frames: int) -> np.ndarray | None:
+        """Where windows in so many frames begin, drawn by random bits; None if that is not random."""
+        if self.window is None or self.start != "random":
+            return None
+        return (bits % np.uint64(frames - self.span + 1)).astype(np.int64)
 
     @property
     def span(self) -> int:
@@ -261,9 +262,7 @@ class Dataset:
 
     def starts(self, numbers: np.ndarray, bits: np.ndarray) -> np.ndarray | None:
         """Where the windows of these videos begin, drawn by random bits; None if that is not random."""
-        if not self.options.is_random:
-            return None
-        return (bits % np.uint64(self.manifest["sizes"]["T"] - self.options.span + 1)).astype(np.int64)
+        return self.options.starts(bits, self.manifest["sizes"].get("T", 0))
 
     def numbers(self, indices: Numbers) -> np.ndarray:
         """Indices as the numbers of videos, int64: negative ones count from the end."""

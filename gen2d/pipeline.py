@@ -144,14 +144,14 @@ def _result(job: Job) -> tuple[Shard, Block]:
 def _check_placed(batch: Batch, firsts: list[int], pieces: list[list[Piece]]) -> None:
     for first, own, placed in zip(firsts, pieces, parts(batch.placed), strict=True):
         for _, start, stop in own:
-            check_placed(placed[start:stop], first + start)
+            check_placed(placed[start:stop], np.arange(first + start, first + stop))
 
 
-def check_placed(placed: np.ndarray, first: int) -> None:
-    """Returns nothing; raises NoPlaceError if a scene, the first of which is video `first`, did not fit its box."""
+def check_placed(placed: np.ndarray, numbers: np.ndarray) -> None:
+    """Returns nothing; raises NoPlaceError if the scene of one of the videos with these numbers did not fit."""
     if not placed.all():
         raise NoPlaceError(
-            f"scene: video {first + int(np.argmin(placed))} could not be placed without overlap in 100 attempts; "
+            f"scene: video {numbers[np.argmin(placed)]} could not be placed without overlap in 100 attempts; "
             "ask for fewer or smaller objects, or for a larger box"
         )
 

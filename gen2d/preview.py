@@ -90,7 +90,8 @@ def _drawn(source: str, videos: int, seed: int | None, sets: Sequence[str]) -> t
     frames = []
     for first in range(0, videos, rollout.lanes):
         batch = rollout.begin("train", [first])
-        check_placed(parts(batch.placed)[0][: videos - first], first)
+        placed = parts(batch.placed)[0][: videos - first]
+        check_placed(placed, np.arange(first, first + len(placed)))
         for start in range(0, min(rollout.lanes, videos - first), rollout.slice):
             frames.append(np.asarray(rollout.draw(batch, start, rollout.slice)[0]["frames"]))
     return config.name, np.concatenate(frames)[:videos], config.video.fps

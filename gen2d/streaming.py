@@ -26,7 +26,7 @@ from gen2d.generation import MAX_VIDEOS
 from gen2d.loader import LAYOUTS, Options, chosen_fields
 from gen2d.order import Step, Walk, one_of, shuffled
 from gen2d.pipeline import check_placed
-from gen2d.rollout import Batch, Rollout
+from gen2d.rollout import Batch, Rollout, divisor
 from gen2d.types import Array
 
 Arrays = dict[str, Any]
@@ -132,13 +132,12 @@ class Stream:
                     yield _DELIVER[self.to](made)
 
     def _cells(self) -> Iterator[_Cell]:
-        choices = self.rollout.config.video.frames - self.options.span + 1
+        frames = self.rollout.config.video.frames
         for step in self.walk.steps():
             positions = self.walk.share(step)
             numbers = shuffled(self.walk.shuffled_by, step.epoch, positions, self.walk.videos)
-            first = np.full(len(numbers), self.options.first)
-            if self.options.is_random:
-                first = (self.walk.bits(step, positions) % np.uint64(choices)).astype(np.int64)
+            first = self.options.starts(self.walk.bits(step, positions), frames)
+            first = np.full(len(numbers), self.options.first) if first is None else first
             real = len(numbers)  # a rank's share may be empty
             for begin in range(0, max(real, 1), self.cell):
                 end, held = min(begin + self.cell, real), np.arange(begin, begin + self.cell)
@@ -152,19 +151,13 @@ class Stream:
         before = None
         while group := list(itertools.islice(cells, number)):
             held = [group[min(i, len(group) - 1)].numbers for i in range(number)]
-            after = group, self.rollout.begin_with(self.options.split, np.concatenate(held))
+            numbers = np.concatenate(held)
+            after = group, numbers, self.rollout.begin_with(self.options.split, numbers)
             if before is not None:
-                yield self._checked(*before)
+                yield _checked(*before)
             before = after
         if before is not None:
-            yield self._checked(*before)
-
-    def _checked(self, cells: list[_Cell], batch: Batch) -> tuple[list[_Cell], Batch]:
-        placed = np.asarray(batch.placed)
-        for place, cell in enumerate(cells):
-            for lane, number in enumerate(cell.numbers.tolist()):
-                check_placed(placed[place * self.cell + lane, None], number)
-        return cells, batch
+            yield _checked(*before)
 
     def _drawn(self, batch: Batch, lane: int, cell: _Cell) -> Arrays:
         """A cell's videos as they are delivered."""
@@ -177,7 +170,7 @@ class Stream:
 
     def _pictures(self, batch: Batch, lane: int) -> Arrays:
         """What is drawn of a cell, in slices that fit the cache."""
-        size = next(s for s in range(min(self.cell, self.rollout.slice), 0, -1) if self.cell % s == 0)
+        size = divisor(self.cell, self.rollout.slice)
         parts = [self.rollout.draw(batch, start, size)[0] for start in range(lane, lane + self.cell, size)]
         wanted = self.fields.keys() & parts[0].keys()
         return {name: jnp.concatenate([part[name] for part in parts]) for name in wanted}
@@ -191,6 +184,11 @@ class Stream:
                 values = jax.lax.dynamic_slice_in_dim(values, lane, self.cell)
             made[name] = _as_asked(name, field, values, starts, self.options)
         return made
+
+
+def _checked(cells: list[_Cell], numbers: np.ndarray, batch: Batch) -> tuple[list[_Cell], Batch]:
+    check_placed(np.asarray(batch.placed), numbers)
+    return cells, batch
 
 
 def cell_size(batch_size: int, lanes: int) -> int:

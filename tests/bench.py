@@ -33,6 +33,7 @@ import numpy as np
 from bench_physics import CASES, Cost
 from bench_render import Annotated, Drawing
 from bench_storage import Stored
+from timing import timed
 
 HERE = Path(__file__).resolve()
 CONFIG = "benchmark.yaml"
@@ -56,20 +57,11 @@ def stages(folder: Path, turns: int = 5, peer_videos: int = 32, sets: Sequence[s
     import peer
 
     cv2.setNumThreads(1)
-    works = {name: _timed(work, videos) for name, (work, videos) in _parts(folder, sets).items()}
+    works = {name: timed(work, videos, time.perf_counter) for name, (work, videos) in _parts(folder, sets).items()}
     works |= {
         f"peer {read}": lambda read=read: peer.seconds_to_step(peer_videos, read) / peer_videos for read in peer.READERS
     }
     return in_turns(works | {"peer draw": lambda: peer.seconds_to_draw(peer_videos) / peer_videos}, turns)
-
-
-def _timed(work: Callable[[], Any], videos: int) -> Callable[[], float]:
-    def seconds() -> float:
-        began = time.perf_counter()
-        work()
-        return (time.perf_counter() - began) / videos
-
-    return seconds
 
 
 def _parts(folder: Path, sets: Sequence[str]) -> dict[str, tuple[Callable[[], Any], int]]:

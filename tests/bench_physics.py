@@ -20,10 +20,10 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import cv2
 import numpy as np
 import peer
 import pymunk
+from charts import FAINT, LEFT, Chart
 
 FRAMES, STEPS, STEP = 64, 4, 1 / 240  # s
 GRAVITY, ELASTICITY, FRICTION = -9.81, 0.9, 0.2  # m/s^2; each body's, of which gen2d and Chipmunk make products
@@ -298,71 +298,24 @@ def table(costs: Sequence[Cost]) -> list[str]:
     return lines
 
 
-# Of the chart, in pixels. It is drawn four times as large and then made smaller, which smooths text and lines.
-WIDTH, HEIGHT, ZOOM = 640, 420, 4
-LEFT, RIGHT, TOP, BOTTOM = 74, 18, 40, 52
-INK, FAINT, GRID = (51, 51, 51), (153, 153, 153), (238, 238, 238)  # blue, green, red, as cv2 has it
 COLORS = {"states": (221, 170, 68), "all": (153, 68, 17), "pymunk": (34, 102, 221), "phyjax2d": (119, 153, 34)}
 
 
 def chart(costs: Sequence[Cost], path: Path) -> None:
     """Returns nothing; draws the cost of discs against their number, both in logarithms, into a PNG file."""
     costs = [cost for cost in costs if cost.name.endswith("discs")]
-    values = [micros for cost in costs for micros in cost.micros.values()]
-    low, high = min(values) / 1.5, max(values) * 2
-    first, last = min(cost.objects for cost in costs) / 1.15, max(cost.objects for cost in costs) * 1.15
-    image = np.full((HEIGHT * ZOOM, WIDTH * ZOOM, 3), 255, np.uint8)
-
-    def pixel(count: float, micros: float) -> tuple[float, float]:
-        x, y = math.log(count / first) / math.log(last / first), math.log(micros / low) / math.log(high / low)
-        return LEFT + x * (WIDTH - LEFT - RIGHT), HEIGHT - BOTTOM - y * (HEIGHT - TOP - BOTTOM)
-
-    for power in range(math.floor(math.log10(low)), math.ceil(math.log10(high))):
-        for micros in (k * 10.0**power for k in range(1, 10)):
-            if low < micros < high:
-                ends, whole = (pixel(first, micros), pixel(last, micros)), micros == 10.0**power
-                line(image, ends, GRID, 1 if whole else 0.5)
-                text(image, f"{micros:g}" if whole else "", (LEFT - 8, ends[0][1] + 4), align=1)
-    for cost in costs:
-        line(image, (pixel(cost.objects, low), pixel(cost.objects, high)), GRID, 1)
-        text(image, str(cost.objects), (pixel(cost.objects, low)[0], HEIGHT - BOTTOM + 18), align=0.5)
-    guide = [pixel(cost.objects, cost.pairs * min(costs[0].micros.values()) / costs[0].pairs) for cost in costs]
-    line(image, guide, FAINT, 1)
+    values, counts = [micros for cost in costs for micros in cost.micros.values()], [cost.objects for cost in costs]
+    drawn = Chart(min(counts) / 1.15, max(counts) * 1.15, min(values) / 1.5, max(values) * 2)
+    drawn.grid(counts)
+    guide = [drawn.place(cost.objects, cost.pairs * min(costs[0].micros.values()) / costs[0].pairs) for cost in costs]
+    drawn.line(guide, FAINT, 1)
     for name, color in COLORS.items():
-        points = [pixel(cost.objects, cost.micros[name]) for cost in costs if name in cost.micros]
-        line(image, points, color, 2)
-        for x, y in points:
-            cv2.circle(image, (round(x * ZOOM), round(y * ZOOM)), 4 * ZOOM, color, -1, cv2.LINE_AA)
-    line(image, [(LEFT, TOP), (LEFT, HEIGHT - BOTTOM), (WIDTH - RIGHT, HEIGHT - BOTTOM)], INK, 1)
-    _legend(image, [name for name in COLORS if any(name in cost.micros for cost in costs)])
-    text(image, "Physics on one core", (LEFT, 24), size=0.52)
-    text(image, "discs in a box, N", (LEFT + (WIDTH - LEFT - RIGHT) / 2, HEIGHT - 12), align=0.5)
-    side = np.ascontiguousarray(cv2.rotate(image, cv2.ROTATE_90_CLOCKWISE))  # so that the text runs upwards
-    text(side, "microseconds a video and step", (TOP + (HEIGHT - TOP - BOTTOM) / 2 + BOTTOM - TOP, 20), align=0.5)
-    image = cv2.rotate(side, cv2.ROTATE_90_COUNTERCLOCKWISE)
-    small = np.asarray(cv2.resize(image, (WIDTH, HEIGHT), interpolation=cv2.INTER_AREA), np.uint8)
-    cv2.imwrite(str(path), small // 17 * 17, [cv2.IMWRITE_PNG_COMPRESSION, 9])  # fewer shades make a smaller file
-
-
-def _legend(image: np.ndarray, names: Sequence[str]) -> None:
-    rows = [(LINES[name], COLORS[name], 2) for name in names] + [("pairs that can meet, slope only", FAINT, 1)]
-    image[(TOP + 4) * ZOOM : (TOP + 10 + 18 * len(rows)) * ZOOM, (LEFT + 8) * ZOOM : (LEFT + 244) * ZOOM] = 255
-    for i, (name, color, width) in enumerate(rows):
-        y = TOP + 16 + 18 * i
-        line(image, [(LEFT + 14, y), (LEFT + 42, y)], color, width)
-        if width > 1:
-            cv2.circle(image, ((LEFT + 28) * ZOOM, y * ZOOM), 4 * ZOOM, color, -1, cv2.LINE_AA)
-        text(image, name, (LEFT + 50, y + 4))
-
-
-def line(image: np.ndarray, points: Sequence[tuple[float, float]], color: Sequence[int], width: float) -> None:
-    at = np.rint(np.array(points) * ZOOM).astype(np.int32)
-    cv2.polylines(image, [at], False, color, round(width * ZOOM), cv2.LINE_AA)
-
-
-def text(image: np.ndarray, text: str, at: tuple[float, float], align: float = 0, size: float = 0.42) -> None:
-    """Writes with its baseline there, to the right (align 0), around (0.5) or to the left (1)."""
-    font, scale, thick = cv2.FONT_HERSHEY_SIMPLEX, size * ZOOM, ZOOM
-    (width, _), _ = cv2.getTextSize(text, font, scale, thick)
-    place = round(at[0] * ZOOM - align * width), round(at[1] * ZOOM)
-    cv2.putText(image, text, place, font, scale, INK, thick, cv2.LINE_AA)
+        points = [drawn.place(cost.objects, cost.micros[name]) for cost in costs if name in cost.micros]
+        drawn.line(points, color, 2)
+        for point in points:
+            drawn.dot(point, color)
+    drawn.axes()
+    names = [name for name in COLORS if any(name in cost.micros for cost in costs)]
+    rows = [*((LINES[name], COLORS[name], 2) for name in names), ("pairs that can meet, slope only", FAINT, 1)]
+    drawn.legend(rows, LEFT + 244, dots=True)
+    drawn.save(path, "Physics on one core", "discs in a box, N", "microseconds a video and step")

@@ -8,8 +8,6 @@ same states and into a buffer of the size of a slice. A turn makes 100 MB of fra
 this process's CPU, which is on one core, so other work on the machine disturbs little.
 """
 
-import math
-import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -17,7 +15,8 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 import peer
-from bench_physics import BOTTOM, FAINT, GRID, HEIGHT, INK, LEFT, RIGHT, TOP, WIDTH, ZOOM, line, text
+from charts import FAINT, LEFT, Chart
+from timing import timed
 
 FRAMES = 64  # of a video
 SIZES = {64: 128, 128: 32, 256: 8}  # px, and how many videos are 100 MB
@@ -82,7 +81,7 @@ def works(case: Case, rollout: Any) -> dict[str, Callable[[], float]]:
             drawn(columns, video, buffer[video % len(buffer)])
 
     by_name = {"gen2d": _drawing(rollout, batch), "opencv": opencv, "copy": lambda: np.copyto(target, source)}
-    return {name: _timed(work, case.videos * FRAMES) for name, work in by_name.items()}
+    return {name: timed(work, case.videos * FRAMES) for name, work in by_name.items()}
 
 
 def annotating(rollouts: Mapping[str, Any]) -> tuple[dict[str, Callable[[], float]], dict[str, int]]:
@@ -90,7 +89,7 @@ def annotating(rollouts: Mapping[str, Any]) -> tuple[dict[str, Callable[[], floa
     first = next(iter(rollouts.values()))
     batch = first.begin("train", [0] * len(first.devices))  # annotations change nothing of what is drawn from
     frames = first.config.video.frames
-    each = {name: _timed(_drawing(rollout, batch), first.lanes * frames) for name, rollout in rollouts.items()}
+    each = {name: timed(_drawing(rollout, batch), first.lanes * frames) for name, rollout in rollouts.items()}
     made = {name: rollout.draw(batch, 0, rollout.slice)[0] for name, rollout in rollouts.items()}
     told = {name: {of: array for of, array in arrays.items() if of != "frames"} for name, arrays in made.items()}
     return each, {
@@ -106,15 +105,6 @@ def _drawing(rollout: Any, batch: Any) -> Callable[[], None]:
             jax.block_until_ready(rollout.draw(batch, start, rollout.slice))
 
     return draw
-
-
-def _timed(work: Callable[[], None], frames: int) -> Callable[[], float]:
-    def seconds() -> float:
-        began = time.process_time()
-        work()
-        return (time.process_time() - began) / frames
-
-    return seconds
 
 
 def drawn(columns: Mapping[str, np.ndarray], video: int, frames: np.ndarray) -> None:
@@ -187,47 +177,18 @@ def chart(drawings: Sequence[Drawing], path: Path) -> None:
     """Returns nothing; draws the cost of a frame against its side, both in logarithms, into a PNG file: a line for each
     number of discs, with the number at its end."""
     values, sizes = [d.micros[name] for d in drawings for name in COLORS], sorted({d.pixels for d in drawings})
-    low, high, first, last = min(values) / 1.5, max(values) * 3, sizes[0] / 1.2, sizes[-1] * 1.2
-    image = np.full((HEIGHT * ZOOM, WIDTH * ZOOM, 3), 255, np.uint8)
-
-    def place(pixels: float, micros: float) -> tuple[float, float]:
-        x, y = math.log(pixels / first) / math.log(last / first), math.log(micros / low) / math.log(high / low)
-        return LEFT + x * (WIDTH - LEFT - RIGHT), HEIGHT - BOTTOM - y * (HEIGHT - TOP - BOTTOM)
-
-    for power in range(math.floor(math.log10(low)), math.ceil(math.log10(high))):
-        for micros in (k * 10.0**power for k in range(1, 10)):
-            if low < micros < high:
-                ends, whole = (place(first, micros), place(last, micros)), micros == 10.0**power
-                line(image, ends, GRID, 1 if whole else 0.5)
-                text(image, f"{micros:g}" if whole else "", (LEFT - 8, ends[0][1] + 4), align=1)
-    for size in sizes:
-        line(image, (place(size, low), place(size, high)), GRID, 1)
-        text(image, str(size), (place(size, low)[0], HEIGHT - BOTTOM + 18), align=0.5)
-    line(image, [place(size, min(values) * (size / sizes[0]) ** 2) for size in sizes], FAINT, 1)
+    made = Chart(sizes[0] / 1.2, sizes[-1] * 1.2, min(values) / 1.5, max(values) * 3)
+    made.grid(sizes)
+    made.line([made.place(size, min(values) * (size / sizes[0]) ** 2) for size in sizes], FAINT, 1)
     for name, color in COLORS.items():
         end, aside = ENDS[name]
         for count in sorted({d.objects for d in drawings}):
-            points = [place(d.pixels, d.micros[name]) for d in drawings if d.objects == count]
-            line(image, points, color, 2)
-            for x, y in points:
-                cv2.circle(image, (round(x * ZOOM), round(y * ZOOM)), 4 * ZOOM, color, -1, cv2.LINE_AA)
-            text(image, str(count), (points[end][0] + aside, points[end][1] + 4), align=0.5)
-    line(image, [(LEFT, TOP), (LEFT, HEIGHT - BOTTOM), (WIDTH - RIGHT, HEIGHT - BOTTOM)], INK, 1)
-    _legend(image)
-    text(image, "Drawing on one core", (LEFT, 24), size=0.52)
-    text(image, "side of the frame, pixels", (LEFT + (WIDTH - LEFT - RIGHT) / 2, HEIGHT - 12), align=0.5)
-    side = np.ascontiguousarray(cv2.rotate(image, cv2.ROTATE_90_CLOCKWISE))  # so that the text runs upwards
-    text(side, "microseconds a frame", (TOP + (HEIGHT - TOP - BOTTOM) / 2 + BOTTOM - TOP, 20), align=0.5)
-    image = cv2.rotate(side, cv2.ROTATE_90_COUNTERCLOCKWISE)
-    small = np.asarray(cv2.resize(image, (WIDTH, HEIGHT), interpolation=cv2.INTER_AREA), np.uint8)
-    cv2.imwrite(str(path), small // 17 * 17, [cv2.IMWRITE_PNG_COMPRESSION, 9])  # fewer shades make a smaller file
-
-
-def _legend(image: np.ndarray) -> None:
+            points = [made.place(d.pixels, d.micros[name]) for d in drawings if d.objects == count]
+            made.line(points, color, 2)
+            for point in points:
+                made.dot(point, color)
+            made.text(str(count), (points[end][0] + aside, points[end][1] + 4), align=0.5)
+    made.axes()
     rows = [(f"{LINES[name]}, N discs", color, 2) for name, color in COLORS.items()]
-    rows += [("pixels, slope only", FAINT, 1)]
-    image[(TOP + 4) * ZOOM : (TOP + 10 + 18 * len(rows)) * ZOOM, (LEFT + 8) * ZOOM : (LEFT + 264) * ZOOM] = 255
-    for i, (name, color, width) in enumerate(rows):
-        y = TOP + 16 + 18 * i
-        line(image, [(LEFT + 14, y), (LEFT + 42, y)], color, width)
-        text(image, name, (LEFT + 50, y + 4))
+    made.legend([*rows, ("pixels, slope only", FAINT, 1)], LEFT + 264, dots=False)
+    made.save(path, "Drawing on one core", "side of the frame, pixels", "microseconds a frame")

@@ -6,7 +6,6 @@ The videos are those of synthetic.discs, about 50 MB of frames, with a state bes
 from files that the system still has in memory, into a batch that is there already. Times are of this process's CPU.
 """
 
-import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -14,6 +13,7 @@ from typing import Any, NamedTuple
 import h5py
 import numpy as np
 import synthetic
+from timing import timed
 
 from gen2d import codecs, loader, shards
 from gen2d.fields import Field
@@ -89,7 +89,7 @@ def works(case: Case, folder: Path) -> dict[str, Callable[[], float]]:
             large = _dataset(case, folder / f"{codec} again", codec, ROUNDS)
             found[f"codec {codec}"] = lambda codec=codec: [codecs.encode(codec, video) for video in frames]
             found[f"write {codec}"] = lambda large=large: _write(large, columns)
-    return {name: _timed(work, ROUNDS if name.startswith("write") else 1) for name, work in found.items()}
+    return {name: timed(work, ROUNDS if name.startswith("write") else 1) for name, work in found.items()}
 
 
 def _dataset(case: Case, root: Path, codec: str, rounds: int = 1) -> shards.Dataset:
@@ -118,15 +118,6 @@ def _looped(path: Path, out: Mapping[str, np.ndarray]) -> None:
             dataset: Any = file[name]
             for i in range(len(target)):
                 target[i] = dataset[i]
-
-
-def _timed(work: Callable[[], Any], rounds: int) -> Callable[[], float]:
-    def seconds() -> float:
-        began = time.process_time()
-        work()
-        return (time.process_time() - began) / rounds
-
-    return seconds
 
 
 def stored_of(case: Case, seconds: Mapping[str, float]) -> Stored:

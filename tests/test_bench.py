@@ -9,6 +9,7 @@ import bench
 import bench_physics
 import bench_render
 import bench_storage
+import charts
 import cv2
 import h5py
 import numpy as np
@@ -110,7 +111,7 @@ def test_the_chart_of_the_physics_section_draws_what_was_measured(tmp_path: Path
     bench_physics.chart(costs, tmp_path / "chart.png")
     image = cv2.imread(str(tmp_path / "chart.png"))
     assert image is not None
-    assert image.shape == (bench_physics.HEIGHT, bench_physics.WIDTH, 3)
+    assert image.shape == (charts.HEIGHT, charts.WIDTH, 3)
     drawn = {name: (image == color).all(-1).any() for name, color in bench_physics.COLORS.items()}
     assert drawn == {"states": False, "all": True, "pymunk": True, "phyjax2d": False}
 
@@ -158,5 +159,5 @@ def test_the_chart_of_the_render_section_draws_what_was_measured(tmp_path: Path)
     bench_render.chart(drawings, tmp_path / "chart.png")
     image = cv2.imread(str(tmp_path / "chart.png"))
     assert image is not None
-    assert image.shape == (bench_physics.HEIGHT, bench_physics.WIDTH, 3)
+    assert image.shape == (charts.HEIGHT, charts.WIDTH, 3)
     assert all((image == color).all(-1).any() for color in bench_render.COLORS.values())

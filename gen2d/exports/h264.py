@@ -5,7 +5,7 @@ from pathlib import Path
 from gen2d import films
 from gen2d.exports import Source
 
-LOSS = "lossy: colours at half the resolution, and rounded"
+LOSS = films.LOSS
 FIELDS, FIXED = ("frames",), True
 SUFFIX = ""
 # Flat discs need a better quality than the camera's pictures that the usual 23 is meant for. With mbtree (x264 as in

@@ -18,7 +18,7 @@ from gen2d.errors import ConfigError
 from gen2d.exports import Source
 from gen2d.loader import Batch
 
-LOSS = "lossy: colours at half the resolution, and rounded; positions and first speeds of the balls alone"
+LOSS = f"{films.LOSS}; positions and first speeds of the balls alone"
 CAMERA = ("camera/center", "camera/scale", "camera/angle")
 OBJECTS = ("objects/present", "objects/kind", "objects/shape")
 FIELDS = ("frames", "states/position", "states/velocity", "objects/radius", *OBJECTS, *CAMERA)
