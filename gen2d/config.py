@@ -25,7 +25,8 @@ MAX_SLOTS = 254  # a slot's mask id is one byte, 0 is the background
 
 @dataclasses.dataclass(frozen=True)
 class Option:
-    """What an option may be. `parts` > 0: a list of so many values. `draw`: a distribution, else a single value."""
+    """What an option may be. `parts` > 0: a list of so many values. `draw`: a distribution, else a single value; of a
+    scene family a factor, `each` names what every one has a draw of its own for."""
 
     kind: type  # int, float, str or bool
     unit: str
@@ -36,6 +37,7 @@ class Option:
     choices: tuple[str, ...] = ()
     draw: bool = False
     parts: int = 0
+    each: str = ""
     optional: bool = False  # may be null: decided by the program
 
     @property

@@ -14,6 +14,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 import numpy as np
 
 from gen2d import shards
+from gen2d.config import Plugin
 from gen2d.errors import UserError
 from gen2d.rollout import Batch, Rollout, parts
 from gen2d.shards import Block, Dataset, Shard
@@ -106,7 +107,7 @@ class Encoder:
         batch = self.rollout.begin(*waiting[0][:2]) if waiting else None
         for place, (_, firsts, pieces) in enumerate(waiting):
             assert batch is not None
-            _check_placed(batch, firsts, pieces)
+            _check_placed(self.rollout, batch, firsts, pieces)
             jobs = jobs_of(firsts, pieces, self.rollout.lanes, self.rollout.slice)
             line.extend(jobs)
             for _ in self._submitted(jobs, batch):
@@ -141,18 +142,20 @@ def _result(job: Job) -> tuple[Shard, Block]:
     return job.shard, job.future.result()
 
 
-def _check_placed(batch: Batch, firsts: list[int], pieces: list[list[Piece]]) -> None:
+def _check_placed(rollout: Rollout, batch: Batch, firsts: list[int], pieces: list[list[Piece]]) -> None:
     for first, own, placed in zip(firsts, pieces, parts(batch.placed), strict=True):
         for _, start, stop in own:
-            check_placed(placed[start:stop], np.arange(first + start, first + stop))
+            check_placed(rollout.config.scene, placed[start:stop], np.arange(first + start, first + stop))
 
 
-def check_placed(placed: np.ndarray, numbers: np.ndarray) -> None:
+def check_placed(scene: Plugin, placed: np.ndarray, numbers: np.ndarray) -> None:
     """Returns nothing; raises NoPlaceError if the scene of one of the videos with these numbers did not fit."""
     if not placed.all():
+        options = [f"scene.{name}" for name in getattr(scene.module, "CROWDED_BY", ())]
+        cause = f": it depends on {', '.join(options)}" if options else ""
         raise NoPlaceError(
-            f"scene: video {numbers[np.argmin(placed)]} could not be placed without overlap in 100 attempts; "
-            "ask for fewer or smaller objects, or for a larger box"
+            f"scene: video {numbers[np.argmin(placed)]} could not be placed without overlap in 100 attempts{cause}; "
+            "ask for fewer or smaller objects, or for more room"
         )
 
 

@@ -91,7 +91,7 @@ def _drawn(source: str, videos: int, seed: int | None, sets: Sequence[str]) -> t
     for first in range(0, videos, rollout.lanes):
         batch = rollout.begin("train", [first])
         placed = parts(batch.placed)[0][: videos - first]
-        check_placed(placed, np.arange(first, first + len(placed)))
+        check_placed(config.scene, placed, np.arange(first, first + len(placed)))
         for start in range(0, min(rollout.lanes, videos - first), rollout.slice):
             frames.append(np.asarray(rollout.draw(batch, start, rollout.slice)[0]["frames"]))
     return config.name, np.concatenate(frames)[:videos], config.video.fps

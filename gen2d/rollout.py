@@ -18,9 +18,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-from gen2d import annotations, drawing, factors, types
+from gen2d import annotations, drawing, factors, sampling, types
 from gen2d.config import Config, PhysicsOptions
 from gen2d.fields import Field
+from gen2d.parts import Sampled
 from gen2d.picture import Stage
 from gen2d.rows import Rules
 from gen2d.simulate import Keep, simulate, substeps
@@ -77,16 +78,16 @@ class Rollout:
     @property
     def sizes(self) -> dict[str, int]:
         """The sizes of the lettered axes of every field."""
-        video, family = self.config.video, self.config.scene.module
+        video = self.config.video
         own = {"T": video.frames, "K": self.layout.slots, "H": video.height, "W": video.width}
         own |= {"C": self.keep.contacts} if self.keep.contacts else {}
         own |= annotations.sizes(self.config.annotations, self.plan)
-        return own | family.sizes(self.config.scene.options)
+        return own | sampling.sizes(self.config.scene)
 
     @property
     def fields(self) -> dict[str, Field]:
         """Every stored field."""
-        _, scene, *_ = jax.eval_shape(self._sampled, jax.eval_shape(lambda: jax.random.key(0)))
+        scene = jax.eval_shape(lambda key: self._sampled(key)[1].scene, jax.eval_shape(lambda: jax.random.key(0)))
         made = [types.State, types.Quality, *([types.Contacts] if self.keep.contacts else [])]
         made += [types.Energy] if self.keep.energy else []
         fields = {name: field for record in made for name, (_, field) in types.described(record).items()}
@@ -101,9 +102,7 @@ class Rollout:
         fields["quality/rejected_draws"] = Field("int32", "n", "1", "places drawn again as they did not fit")
         for name, axes, unit, meaning in CAMERA:
             fields[f"camera/{name}"] = Field("float32", axes, unit, meaning)
-        for name, option in _factor_options(self.config).items():
-            axes = self.config.scene.module.FACTORS[name] + (f" {option.parts}" if option.parts else "")
-            fields[f"factors/{name}"] = Field("float32", axes, option.unit or "1", f"as drawn: {option.meaning}")
+        fields |= sampling.fields(self.config.scene)
         return dict(sorted(fields.items()))
 
     @property
@@ -142,7 +141,7 @@ class Rollout:
         """One device's share: from numbers to everything but the frames."""
         config, layout = self.config, self.layout
         keys = factors.video_keys(root, numbers)
-        drawn, scene, state, rejected, placed = jax.vmap(self._sampled)(keys)
+        drawn, (scene, state, rejected, placed, _) = jax.vmap(self._sampled)(keys)
         rules = rules_of(config.physics, config.video.fps, self.steps)
         device = types.to_device(scene), types.to_device(state)
         sparse = self.devices[0].platform == "cpu"
@@ -162,16 +161,8 @@ class Rollout:
         columns["quality/rejected_draws"] = rejected
         return Batch(columns, stages, placed)
 
-    def _sampled(self, key: Array) -> tuple:
-        family, options = self.config.scene.module, self.config.scene.options
-        sizes = family.sizes(options)
-        wanted = {
-            name: (getattr(options, name), tuple(sizes[a] for a in axes.split()[1:]))
-            for name, axes in family.FACTORS.items()
-        }
-        draw_key, place_key = jax.random.split(key)
-        drawn = factors.draw(draw_key, wanted)
-        return drawn, *family.sample(place_key, drawn, options)
+    def _sampled(self, key: Array) -> tuple[dict[str, Array], Sampled]:
+        return sampling.sampled(key, self.config.scene)
 
     def host_columns(self, batch: Batch) -> list[dict[str, np.ndarray]]:
         """For each device its columns as NumPy arrays; waits until they are there."""
@@ -220,9 +211,3 @@ def rules_of(physics: PhysicsOptions, fps: float, steps: int) -> Rules:
         damping=physics.damping,
         mixing=physics.mixing,
     )
-
-
-def _factor_options(config: Config) -> dict[str, Any]:
-    """The option behind each factor that the family draws."""
-    known = type(config.scene.options).__dataclass_fields__
-    return {name: known[name].metadata["option"] for name in config.scene.module.FACTORS}

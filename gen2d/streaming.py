@@ -154,10 +154,14 @@ class Stream:
             numbers = np.concatenate(held)
             after = group, numbers, self.rollout.begin_with(self.options.split, numbers)
             if before is not None:
-                yield _checked(*before)
+                yield self._checked(*before)
             before = after
         if before is not None:
-            yield _checked(*before)
+            yield self._checked(*before)
+
+    def _checked(self, cells: list[_Cell], numbers: np.ndarray, batch: Batch) -> tuple[list[_Cell], Batch]:
+        check_placed(self.rollout.config.scene, np.asarray(batch.placed), numbers)
+        return cells, batch
 
     def _drawn(self, batch: Batch, lane: int, cell: _Cell) -> Arrays:
         """A cell's videos as they are delivered."""
@@ -184,11 +188,6 @@ class Stream:
                 values = jax.lax.dynamic_slice_in_dim(values, lane, self.cell)
             made[name] = _as_asked(name, field, values, starts, self.options)
         return made
-
-
-def _checked(cells: list[_Cell], numbers: np.ndarray, batch: Batch) -> tuple[list[_Cell], Batch]:
-    check_placed(np.asarray(batch.placed), numbers)
-    return cells, batch
 
 
 def cell_size(batch_size: int, lanes: int) -> int:

@@ -126,7 +126,7 @@ def test_every_option_says_its_unit_and_meaning():
 
 def test_a_family_of_ones_own_is_a_file(tmp_path):
     own = tmp_path / "own.py"
-    own.write_text("from gen2d.scenes.bouncing import *\nfrom gen2d.scenes.bouncing import FACTORS, Options\n")
+    own.write_text("from gen2d.scenes.bouncing import *\nfrom gen2d.scenes.bouncing import Options\n")
     config = load_config({"scene": {"name": str(own), "balls": 2}})
     assert config.scene.options.balls.support == (2, 2)
     before = config.sha256()

@@ -40,6 +40,8 @@ ORDER = [
         "factors",
         "plugins",
         "config",
+        "parts",
+        "sampling",
     ),
     *(
         "coverage",

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gen2d import drawing, factors, types
+from gen2d import drawing, factors, sampling, types
 from gen2d.config import Config, load_config
 from gen2d.picture import Plan, Stage
 from gen2d.rows import Rules
@@ -200,13 +200,8 @@ def _all_flown(config: Config, layout: Layout, keys: jax.Array) -> tuple[Stage, 
 
 
 def _flown(config: Config, layout: Layout, key: jax.Array) -> tuple[Stage, Scene, State]:
-    family, options, video, steps = config.scene.module, config.scene.options, config.video, 4
-    sizes = family.sizes(options)
-    wanted = {
-        name: (getattr(options, name), tuple(sizes[axis] for axis in axes.split()[1:]))
-        for name, axes in family.FACTORS.items()
-    }
-    scene, begin, *_ = family.sample(key, factors.draw(key, wanted), options)
+    video, steps = config.video, 4
+    scene, begin, *_ = sampling.sampled(key, config.scene)[1]
 
     def at(time: jax.Array) -> State:
         def moved(start: jax.Array, rate: jax.Array) -> jax.Array:
