@@ -44,10 +44,11 @@ def gallery(source: str, out: Path, videos: int = 1, *, seed: int | None = None,
 
 def _made(source: str, videos: int, seed: int | None, sets: Sequence[str]) -> tuple[np.ndarray, str]:
     """The gallery of a config, and its name."""
-    plain = load_config(source, sets).plain()
+    config = load_config(source, sets)
+    plain, split = config.plain(), config.training.name if config.training else "train"
     bare = plain | {"look": "flat", "annotations": {}, "storage": plain["storage"] | {"frames": "none"}}
     with tempfile.TemporaryDirectory() as folder:
-        generate(bare, videos, Path(folder) / "states", seed=seed)
+        generate(bare, videos, Path(folder) / "states", seed=seed, split=split)
         return _sheet(open_dataset(Path(folder) / "states"), videos, _looks(plain["look"])), plain["name"]
 
 

@@ -31,8 +31,8 @@ POINTS = 8  # of each object, where tracks are asked for that the config does no
 
 
 def config_of(ds: Dataset, sets: Sequence[str] = ()) -> Config:
-    """The config that a dataset was made from, with `sets` changed ('video.height=128')."""
-    return config_from(ds.root, ds.manifest, sets)
+    """The config that a dataset's split was made from, with `sets` changed ('video.height=128')."""
+    return load_config(config_from(ds.root, ds.manifest).of_split(ds.options.split), sets)
 
 
 def config_from(root: Place, identity: Mapping[str, Any], sets: Sequence[str] = ()) -> Config:

@@ -12,7 +12,7 @@ from gen2d.codecs import decode_into
 from gen2d.config import load_config, parse_yaml
 from gen2d.errors import DamagedError, FolderError
 from gen2d.files import read_sealed
-from gen2d.generation import dataset_of, make
+from gen2d.generation import dataset_of, make, rollouts_of
 from gen2d.manifest import SEAL, identity_of, read_manifest
 from gen2d.pipeline import Encoder, Piece, threads_for
 from gen2d.redraw import config_from
@@ -57,14 +57,15 @@ def differing(
         stored = {split: loader.open(root, split, fields=("*",)) for split in manifest["splits"]}
     except DamagedError:
         return
-    encoder = Encoder(rollout, dataset, threads_for(devices.cores()))
-    try:
-        for shard, block in encoder.blocks(_work(dataset, rollout.lanes, chosen)):
-            number = int(block.arrays["index"][0])
-            for name in _other(stored[shard.split], number, _values(block, dataset)):
-                yield shard.name, f"{name} of {shard.split} video {number} is not what its recipe makes"
-    finally:
-        encoder.close()
+    for own, splits in rollouts_of(rollout, [split for split, _ in chosen]):
+        encoder = Encoder(own, dataset, threads_for(devices.cores()))
+        try:
+            for shard, block in encoder.blocks(_work(dataset, own.lanes, [c for c in chosen if c[0] in splits])):
+                number = int(block.arrays["index"][0])
+                for name in _other(stored[shard.split], number, _values(block, dataset)):
+                    yield shard.name, f"{name} of {shard.split} video {number} is not what its recipe makes"
+        finally:
+            encoder.close()
 
 
 def _work(dataset: Dataset, lanes: int, chosen: Sequence[tuple[str, int]]) -> list[tuple[str, int, list[Piece]]]:

@@ -67,7 +67,7 @@ def stream(
     if seed is not None:
         config = dataclasses.replace(config, seed=checked_seed(seed))
     one_of("to", to, tuple(_DELIVER))
-    rollout = _rollout(config, device)
+    rollout = _rollout(config.of_split(split), device)
     names = chosen_fields(config.name, rollout.fields, fields)
     options = Options(split, names, window, stride, start, layout, dtype, "none")
     options.check(config.video.frames)

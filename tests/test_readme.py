@@ -10,6 +10,8 @@ from pathlib import Path
 import pytest
 from tiny import ran
 
+from gen2d.config import load_config
+
 README = Path(__file__).parent.parent / "README.md"
 BLOCKS = re.findall(r"```(\w+)\n(.*?)```", README.read_text(encoding="utf-8"), re.S)
 
@@ -28,7 +30,9 @@ def test_every_block_runs(tmp_path: Path):
         if "import torch" in block and not torch:
             continue
         if kind == "yaml":
-            (tmp_path / "mine.yaml").write_text(block)
+            name, config = block.partition("\n")[0].removeprefix("# "), block.replace("videos: 1000", "videos: 8")
+            (tmp_path / name).write_text(config)
+            assert load_config(tmp_path / name).name == name.removesuffix(".yaml")
         elif kind == "python":
             words = [sys.executable, "-c", block]
             done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, check=False)
@@ -46,6 +50,7 @@ def test_every_block_runs(tmp_path: Path):
         "touched",
         "seen",
         "annotated",
+        "splits",
     }
 
 
