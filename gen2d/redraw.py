@@ -18,13 +18,14 @@ from gen2d import annotations, drawing, factors, loader, types
 from gen2d.camera import View
 from gen2d.config import AnnotationOptions, Config, load_config
 from gen2d.errors import ConfigError
-from gen2d.loader import Dataset, Numbers
+from gen2d.loader import Dataset
 from gen2d.manifest import field_of
 from gen2d.picture import Plan, Stage, on_cpu
 from gen2d.remote import Place
 from gen2d.rollout import Rollout, keep_of, rules_of
 from gen2d.simulate import simulate, substeps
 from gen2d.types import Array, Joints, Layout, Objects, Scene, State
+from gen2d.videos import Numbers
 
 Columns = Mapping[str, Any]
 POINTS = 8  # of each object, where tracks are asked for that the config does not have
@@ -32,6 +33,8 @@ POINTS = 8  # of each object, where tracks are asked for that the config does no
 
 def config_of(ds: Dataset, sets: Sequence[str] = ()) -> Config:
     """The config that a dataset was made from, with `sets` changed ('video.height=128')."""
+    if not isinstance(ds, Dataset):
+        raise ConfigError(f"ds is of {len(ds.datasets)} folders, but must be of one: give one of ds.datasets")
     return config_from(ds.root, ds.manifest, sets)
 
 
