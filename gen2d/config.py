@@ -9,17 +9,19 @@ import json
 import pathlib
 import re
 from collections.abc import Mapping, Sequence
-from types import ModuleType
+from types import MappingProxyType, ModuleType
 from typing import Any
 
 import yaml
 
-from gen2d import plugins
+from gen2d import files, plugins
 from gen2d.codecs import CODECS
 from gen2d.errors import ConfigError
 from gen2d.factors import Distribution, is_number, parse
 
 MAX_SEED = 2**63 - 1
+Copies = Mapping[str, bytes]  # what files of the user's own held, by their names in the config
+NO_COPIES: Copies = MappingProxyType({})
 MAX_SLOTS = 254  # a slot's mask id is one byte, 0 is the background
 
 
@@ -218,6 +220,7 @@ class Plugin:
     module: ModuleType
     options: Any
     sha256: str | None = None  # of a file of the user's own, which may change
+    content: bytes = b""  # of that file
 
     def plain(self) -> dict[str, Any]:
         """The plug-in as YAML and JSON hold it."""
@@ -249,6 +252,11 @@ class Config:
     def text(self) -> str:
         """The resolved config as YAML; read again it gives the same config."""
         return yaml.safe_dump(self.plain(), sort_keys=False)
+
+    @property
+    def copies(self) -> Copies:
+        """What the files of the user's own hold, by their names in the config."""
+        return {plugin.name: plugin.content for plugin in (self.scene, self.look) if plugin.sha256}
 
     def recipe(self) -> dict[str, Any]:
         """The config without its seed, which a dataset keeps and compares by itself."""
@@ -371,7 +379,7 @@ def build(cls: type, values: Any, where: str, source: str) -> Any:
     return cls(**filled)
 
 
-def _plugin(kind: str, values: Any, default: str, source: str) -> Plugin:
+def _plugin(kind: str, values: Any, default: str, source: str, copies: Copies) -> Plugin:
     """A plug-in with its options; its bare name is enough."""
     values = {"name": values} if isinstance(values, str) else {} if values is None else values
     if not isinstance(values, Mapping):
@@ -379,17 +387,25 @@ def _plugin(kind: str, values: Any, default: str, source: str) -> Plugin:
     name = values.get("name", default)
     if not isinstance(name, str):
         raise ConfigError(f"{source}: {kind}.name is {name!r}, but must be one of {', '.join(plugins.names(kind))}")
-    module = plugins.load(kind, name, source)
-    sha256 = plugins.sha256(name)
+    content, sha256 = _content(kind, name, values, source, copies) if plugins.is_own(name) else (b"", None)
     if values.get("sha256", sha256) != sha256:
         raise ConfigError(f"{source}: {kind}.sha256 is of another version of {name}")
+    module = plugins.load(kind, name, source, content)
     options = build(module.Options, {k: v for k, v in values.items() if k not in ("name", "sha256")}, kind, source)
     if hasattr(module, "check"):
         try:
             module.check(options)
         except ValueError as error:
             raise ConfigError(f"{source}: {kind}.{error}") from None
-    return Plugin(name, module, options, sha256)
+    return Plugin(name, module, options, sha256, content)
+
+
+def _content(kind: str, name: str, values: Mapping, source: str, copies: Copies) -> tuple[bytes, str]:
+    """What a file of the user's own holds, and its sha256: of the copy if that is the version asked for."""
+    if name in copies and files.sha256(copies[name]) == values.get("sha256"):
+        return copies[name], values["sha256"]
+    content = plugins.content_of(kind, name, source)
+    return content, files.sha256(content)
 
 
 def _overridden(values: dict, sets: Sequence[str]) -> dict:
@@ -417,7 +433,7 @@ def checked_seed(value: Any, what: str = "--seed") -> int:
     return value
 
 
-def from_mapping(values: Any, source: str, name: str = "dataset") -> Config:
+def from_mapping(values: Any, source: str, name: str = "dataset", copies: Copies = NO_COPIES) -> Config:
     """The config that a mapping stands for; every error names `source`."""
     if not isinstance(values, Mapping):
         raise ConfigError(f"{source}: holds {type(values).__name__}, but must hold a mapping of sections")
@@ -432,19 +448,24 @@ def from_mapping(values: Any, source: str, name: str = "dataset") -> Config:
     sections: dict[str, Any] = {
         s: build(cls, {} if values.get(s) is None else values[s], s, source) for s, cls in SECTIONS.items()
     }
-    plugs: dict[str, Any] = {p: _plugin(p, values.get(p), default, source) for p, default in PLUGINS.items()}
+    plugs: dict[str, Any] = {p: _plugin(p, values.get(p), default, source, copies) for p, default in PLUGINS.items()}
     frames, chunk = sections["video"].frames, sections["storage"].chunk_frames
     if chunk is not None and frames % chunk:
         raise ConfigError(f"{source}: storage.chunk_frames is {chunk}, but must divide video.frames, which is {frames}")
     return Config(name=name, seed=seed, **sections, **plugs)
 
 
-def load_config(config: "Config | Mapping | str | pathlib.Path", sets: Sequence[str] = ()) -> Config:
-    """A Config from a file's name or path, from a mapping, or from a Config; `sets` overrides: 'physics.substeps=8'."""
+def load_config(
+    config: "Config | Mapping | str | pathlib.Path", sets: Sequence[str] = (), copies: Copies = NO_COPIES
+) -> Config:
+    """A Config from a file's name or path, from a mapping, or from a Config; `sets` overrides: 'physics.substeps=8'.
+
+    `copies` are of families and looks of the user's own, by their names, for where these are gone or have changed.
+    """
     if isinstance(config, Config):
-        return from_mapping(_overridden(config.plain(), sets), "config") if sets else config
+        return load_config(config.plain(), sets, config.copies) if sets else config
     if isinstance(config, Mapping):
-        return from_mapping(_overridden(dict(config), sets), "config")
+        return from_mapping(_overridden(dict(config), sets), "config", copies=copies)
     path = plugins.find_config(str(config))
     try:
         text = path.read_text(encoding="utf-8")
