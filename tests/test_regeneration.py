@@ -8,7 +8,7 @@ import h5py
 import numpy as np
 import pytest
 from test_verification import flip
-from tiny import changed, ran, ran_here
+from tiny import changed, ran
 
 from gen2d import codecs, shards
 from gen2d.errors import FolderError
@@ -151,21 +151,20 @@ def test_other_versions_are_told_and_nothing_is_changed(root: Path, monkeypatch:
     assert verify(root, "full", lambda names: repair(root, names)) == []  # that takes no simulation
 
 
-def test_the_command_line_repairs(pristine: Path, root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_command_line_repairs(pristine: Path, root: Path) -> None:
     told = ran("verify", root, "--level", "regen", "--videos", 3, "--seed", 5)
     assert (told.returncode, "3 videos chosen by --seed 5" in told.stdout) == (0, True), told.stderr
     flip(root / "shards" / "train-00001.h5", 80000)
     flip(root / "manifest.json", 3000)
-    found = ran_here("verify", root, "--json")
+    found = ran("verify", root, "--json")
     assert found.returncode == 1
     assert json.loads(found.stdout)["level"] == "full"
-    done = ran_here("verify", root, "--repair", "--json")
+    done = ran("verify", root, "--repair", "--json")
     assert done.returncode == 0, done.stderr
     about = json.loads(done.stdout)
     assert (about["problems"], about["remade"]) == ([], ["train-00001"])
     assert "manifest.json" in about["repaired"][0]
     assert contents(root) == contents(pristine)
-    monkeypatch.setenv("XLA_FLAGS", "--xla_cpu_enable_fast_math=false")
-    other = ran_here("verify", root, "--level", "regen")
+    other = ran("verify", root, "--level", "regen", XLA_FLAGS="--xla_cpu_enable_fast_math=false")
     assert (other.returncode, other.stdout) == (2, "")
     assert other.stderr.count("\n") == 1

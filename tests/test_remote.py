@@ -541,7 +541,7 @@ def test_a_run_leaves_at_a_url_what_it_leaves_in_a_folder(server: Server, tmp_pa
     config = tmp_path / "tiny.yaml"
     config.write_text(json.dumps(tiny.CONFIG))
     for out in (tmp_path / "tiny", "s3://bucket/tiny"):
-        done = (tiny.ran if "s3" in str(out) else tiny.ran_here)("--config", config, "--n", 12, "--out", out)
+        done = tiny.ran("--config", config, "--n", 12, "--out", out, "--device", "cpu")
         assert done.returncode == 0, done.stderr
         assert f"in {out}" in done.stdout
     assert buckets.tree("s3://bucket/tiny") == synthetic.tree(tmp_path / "tiny")
@@ -552,6 +552,6 @@ def test_a_run_leaves_at_a_url_what_it_leaves_in_a_folder(server: Server, tmp_pa
     done = tiny.ran_here("preview", "s3://bucket/tiny", "--out", tmp_path, "--videos", 2)
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "tiny-sheet.png").is_file()
-    done = tiny.ran_here("--config", config, "--n", 12, "--out", "s3://bucket/tiny", "--seed", 3)
+    done = tiny.ran("--config", config, "--n", 12, "--out", "s3://bucket/tiny", "--seed", 3, "--device", "cpu")
     assert done.returncode == 2
     assert "seed is 0 there and 3 here" in done.stderr

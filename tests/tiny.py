@@ -42,14 +42,14 @@ def same(one: dict[str, np.ndarray], other: dict[str, np.ndarray], count: int | 
         assert a.tobytes() == b.tobytes(), name
 
 
-def command(*arguments: object) -> list:
+def command(*arguments: object, **changes: str) -> list:
     """The arguments and environment of `python -m gen2d ...`."""
-    return [[sys.executable, "-m", "gen2d", *map(str, arguments)], {**os.environ}]
+    return [[sys.executable, "-m", "gen2d", *map(str, arguments)], {**os.environ, **changes}]
 
 
-def ran(*arguments: object, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
+def ran(*arguments: object, cwd: Path | None = None, **changes: str) -> subprocess.CompletedProcess[str]:
     """What `python -m gen2d ...` printed, and its exit code."""
-    words, environment = command(*arguments)
+    words, environment = command(*arguments, **changes)
     return subprocess.run(words, env=environment, cwd=cwd, capture_output=True, text=True, timeout=300, check=False)
 
 
