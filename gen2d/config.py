@@ -18,7 +18,7 @@ from gen2d.codecs import CODECS
 from gen2d.distributions import Distribution
 from gen2d.errors import ConfigError
 from gen2d.laws import Law
-from gen2d.options import Plugin, build, coordinates, option, plain_of, plugin_of
+from gen2d.options import NO_COPIES, Copies, Plugin, build, coordinates, option, plain_of, plugin_of
 from gen2d.splits import CHANGES, Split, laws_of, with_splits
 
 MAX_SEED = 2**63 - 1
@@ -216,6 +216,11 @@ class Config:
         """The resolved config as YAML; read again it gives the same config."""
         return yaml.safe_dump(self.plain(), sort_keys=False)
 
+    @property
+    def copies(self) -> Copies:
+        """What the files of the user's own hold, by their names in the config."""
+        return {plugin.name: plugin.content for plugin in (self.scene, self.look) if plugin.sha256}
+
     def recipe(self) -> dict[str, Any]:
         """The config without its seed, which a dataset keeps and compares by itself, and without numbers of videos."""
         plain = {key: value for key, value in self.plain().items() if key != "seed"}
@@ -248,7 +253,7 @@ class Config:
         plain, own = self.plain(), {}
         for name in CHANGES:
             if name in changes:
-                own[name] = _section(name, _merged(plain[name], changes[name]), "config")
+                own[name] = _section(name, _merged(plain[name], changes[name]), "config", self.copies)
         return dataclasses.replace(self, **own)
 
     def sha256(self) -> str:
@@ -339,14 +344,14 @@ def checked_seed(value: Any, what: str = "--seed") -> int:
     return value
 
 
-def _section(name: str, values: Any, source: str) -> Any:
+def _section(name: str, values: Any, source: str, copies: Copies) -> Any:
     """The options of a section, or a plug-in."""
     if name in PLUGINS:
-        return plugin_of(name, values, PLUGINS[name], source)
+        return plugin_of(name, values, PLUGINS[name], source, copies)
     return build(SECTIONS[name], {} if values is None else values, name, source)
 
 
-def from_mapping(values: Any, source: str, name: str = "dataset") -> Config:
+def from_mapping(values: Any, source: str, name: str = "dataset", copies: Copies = NO_COPIES) -> Config:
     """The config that a mapping stands for; every error names `source`."""
     if not isinstance(values, Mapping):
         raise ConfigError(f"{source}: holds {type(values).__name__}, but must hold a mapping of sections")
@@ -358,7 +363,7 @@ def from_mapping(values: Any, source: str, name: str = "dataset") -> Config:
     if not isinstance(name, str) or not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}", name):
         raise ConfigError(f"{source}: name is {name!r}, but must be letters, digits, '.', '_' and '-', 100 at most")
     seed = checked_seed(values.get("seed", 0), f"{source}: seed")
-    sections: dict[str, Any] = {s: _section(s, values.get(s), source) for s in (*SECTIONS, *PLUGINS)}
+    sections: dict[str, Any] = {s: _section(s, values.get(s), source, copies) for s in (*SECTIONS, *PLUGINS)}
     frames, chunk = sections["video"].frames, sections["storage"].chunk_frames
     if chunk is not None and frames % chunk:
         raise ConfigError(f"{source}: storage.chunk_frames is {chunk}, but must divide video.frames, which is {frames}")
@@ -395,12 +400,17 @@ def _check_grids(config: Config, source: str) -> None:
                 )
 
 
-def load_config(config: "Config | Mapping | str | pathlib.Path", sets: Sequence[str] = ()) -> Config:
-    """A Config from a file's name or path, from a mapping, or from a Config; `sets` overrides: 'physics.substeps=8'."""
+def load_config(
+    config: "Config | Mapping | str | pathlib.Path", sets: Sequence[str] = (), copies: Copies = NO_COPIES
+) -> Config:
+    """A Config from a file's name or path, from a mapping, or from a Config; `sets` overrides: 'physics.substeps=8'.
+
+    `copies` are of families and looks of the user's own, by their names, for where these are gone or have changed.
+    """
     if isinstance(config, Config):
-        return from_mapping(_overridden(config.plain(), sets), "config") if sets else config
+        return load_config(config.plain(), sets, config.copies) if sets else config
     if isinstance(config, Mapping):
-        return from_mapping(_overridden(dict(config), sets), "config")
+        return from_mapping(_overridden(dict(config), sets), "config", copies=copies)
     path = plugins.find_config(str(config))
     try:
         text = path.read_text(encoding="utf-8")

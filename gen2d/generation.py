@@ -17,6 +17,7 @@ from gen2d import devices, shards
 from gen2d.config import Config, checked_seed, load_config
 from gen2d.errors import ConfigError, FolderError, UserError
 from gen2d.pipeline import Encoder, Job, Writers, batches, jobs_of, threads_for
+from gen2d.plugins import copy_name
 from gen2d.progress import progress, stopping_on_sigterm
 from gen2d.remote import Place, place
 from gen2d.report import in_bytes, in_time
@@ -140,6 +141,11 @@ def dataset_of(rollout: Rollout, out: Place, counts: Mapping[str, int]) -> Datas
         constants={"time": rollout.time},
         conventions=CONVENTIONS,
         command="python -m gen2d --config config.yaml",
+        copies={
+            copy_name(kind, plugin.name): plugin.content
+            for kind, plugin in (("scene", config.scene), ("look", config.look))
+            if plugin.sha256
+        },
     )
 
 

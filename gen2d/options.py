@@ -5,13 +5,16 @@ An error is one sentence with the file, the field, its value and what is allowed
 
 import dataclasses
 from collections.abc import Mapping
-from types import ModuleType
+from types import MappingProxyType, ModuleType
 from typing import Any
 
-from gen2d import plugins
+from gen2d import files, plugins
 from gen2d.distributions import Distribution
 from gen2d.errors import ConfigError
 from gen2d.factors import is_number, parse
+
+Copies = Mapping[str, bytes]  # what files of the user's own held, by their names in the config
+NO_COPIES: Copies = MappingProxyType({})
 
 
 @dataclasses.dataclass(frozen=True)
@@ -67,6 +70,7 @@ class Plugin:
     module: ModuleType
     options: Any
     sha256: str | None = None  # of a file of the user's own, which may change
+    content: bytes = b""  # of that file
     own: Any = None  # the options as written, where splits draw others
 
     def plain(self) -> dict[str, Any]:
@@ -141,7 +145,7 @@ def build(cls: type, values: Any, where: str, source: str) -> Any:
     return cls(**filled)
 
 
-def plugin_of(kind: str, values: Any, default: str, source: str) -> Plugin:
+def plugin_of(kind: str, values: Any, default: str, source: str, copies: Copies) -> Plugin:
     """A plug-in with its options; its bare name is enough."""
     values = {"name": values} if isinstance(values, str) else {} if values is None else values
     if not isinstance(values, Mapping):
@@ -149,14 +153,22 @@ def plugin_of(kind: str, values: Any, default: str, source: str) -> Plugin:
     name = values.get("name", default)
     if not isinstance(name, str):
         raise ConfigError(f"{source}: {kind}.name is {name!r}, but must be one of {', '.join(plugins.names(kind))}")
-    module = plugins.load(kind, name, source)
-    sha256 = plugins.sha256(name)
+    content, sha256 = _content(kind, name, values, source, copies) if plugins.is_own(name) else (b"", None)
     if values.get("sha256", sha256) != sha256:
         raise ConfigError(f"{source}: {kind}.sha256 is of another version of {name}")
+    module = plugins.load(kind, name, source, content)
     options = build(module.Options, {k: v for k, v in values.items() if k not in ("name", "sha256")}, kind, source)
-    plugin = Plugin(name, module, options, sha256)
+    plugin = Plugin(name, module, options, sha256, content)
     check_plugin(plugin, kind, source)
     return plugin
+
+
+def _content(kind: str, name: str, values: Mapping, source: str, copies: Copies) -> tuple[bytes, str]:
+    """What a file of the user's own holds, and its sha256: of the copy if that is the version asked for."""
+    if name in copies and files.sha256(copies[name]) == values.get("sha256"):
+        return copies[name], values["sha256"]
+    content = plugins.content_of(kind, name, source)
+    return content, files.sha256(content)
 
 
 def check_plugin(plugin: Plugin, kind: str, source: str) -> None:

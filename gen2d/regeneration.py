@@ -9,7 +9,7 @@ import numpy as np
 
 from gen2d import devices, loader, shards
 from gen2d.codecs import decode_into
-from gen2d.config import load_config, parse_yaml
+from gen2d.config import Config
 from gen2d.errors import DamagedError, FolderError
 from gen2d.files import read_sealed
 from gen2d.generation import dataset_of, make, rollouts_of
@@ -25,12 +25,12 @@ Identity = Mapping[str, Any]  # of a dataset; its manifest has the same keys
 
 def rollout_of(root: Place, identity: Identity) -> Rollout:
     """The programs that made the dataset in the folder. Raises ConfigError where its config cannot be used here."""
-    return _rollout(config_from(root, identity).text(), identity["fingerprint"]["device"].startswith("cpu"))
+    return _rollout(config_from(root, identity), identity["fingerprint"]["device"].startswith("cpu"))
 
 
 @functools.lru_cache(maxsize=1)  # a check, a repair and the check that follows compile once
-def _rollout(config: str, on_cpu: bool) -> Rollout:
-    return Rollout(load_config(parse_yaml(config, "config")), devices.prepare("cpu" if on_cpu else "auto"))
+def _rollout(config: Config, on_cpu: bool) -> Rollout:
+    return Rollout(config, devices.prepare("cpu" if on_cpu else "auto"))
 
 
 def check_fingerprint(root: Place, rollout: Rollout, identity: Identity) -> None:

@@ -1,4 +1,4 @@
-"""The README's own commands and code, run in an empty folder as a reader would run them, with fewer videos."""
+"""The README's own commands and code, run in an empty folder as a reader would, with fewer videos and steps."""
 
 import importlib.util
 import re
@@ -34,7 +34,8 @@ def test_every_block_runs(tmp_path: Path):
             (tmp_path / name).write_text(config)
             assert load_config(tmp_path / name).name == name.removesuffix(".yaml")
         elif kind == "python":
-            words = [sys.executable, "-c", block]
+            shorter = block.replace("150", "50") if "gen2d.stream" in block else block  # batches, still enough to win
+            words = [sys.executable, "-c", shorter]
             done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, check=False)
             assert done.returncode == 0, block + done.stderr
             told = re.search(r"error ([\d.]+), of .* ([\d.]+)", done.stdout)
