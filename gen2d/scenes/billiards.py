@@ -43,7 +43,7 @@ class Options:
         [245, 245, 240], int, "sRGB", "of the cue ball", parts=3, draw=True, low=0, high=255
     )
     color: tuple[Distribution, ...] = option(
-        [[60, 254], [40, 200], [40, 254]], int, "sRGB", "of each ball of the rack",
+        [[90, 254], [40, 180], [90, 254]], int, "sRGB", "of each ball of the rack",
         parts=3, draw=True, low=0, high=255, each="rack",
     )  # fmt: skip
     cushion_color: tuple[Distribution, ...] = option(
