@@ -90,7 +90,7 @@ def test_a_video_begins_in_view_without_overlap_and_stays_finite(name):
     holds(f"{name}: out of view at the start, m", np.maximum(0, -np.array(inside)[:, there]), 1e-4)
     apart = np.linalg.norm(place[:, :, None] - place[:, None], axis=-1) - around[:, :, None] - around[:, None]
     pairs = there[:, :, None] & there[:, None] & ~np.eye(there.shape[1], dtype=bool)
-    holds(f"{name}: overlap at the start, m", np.maximum(0, -apart[pairs]), 1e-4)
+    holds(f"{name}: overlap at the start, m", np.maximum(0, np.where(pairs, -apart, 0)), 1e-4)
     for span, (run, _) in zip(runs(name), layout.spans, strict=True):
         if run.shape == "segment":
             holds(f"{name}: overlap with segments, m", np.maximum(0, -gaps(place, around, columns, span)[there]), 1e-4)
@@ -149,7 +149,7 @@ def test_marble_run_is_run_from_ramp_to_ramp():
     floor = gaps(place, radius, columns, slice(box.start, box.start + 1))[:, :, 0, 0].min(1) < 0.01
     assert (first.max(1, where=np.arange(first.shape[1]) < count[:, None], initial=0) < frames)[floor].all()
     print(f"marble_run: {floor.mean():.0%} reach the floor")
-    assert floor.mean() > 0.7
+    assert floor.mean() > 0.8
     holds("marble_run: deepest overlap, m", columns["quality/max_penetration"], 0.02)
 
 
@@ -170,9 +170,12 @@ def test_pile_comes_to_rest_in_its_bin():
     columns, options = made("pile"), rollout_of("pile").config.scene.options
     there = columns["objects/present"] * (columns["objects/kind"] == 0) > 0
     speed = np.linalg.norm(columns["states/velocity"][:, -1], axis=-1)[there]
-    print(f"pile: speeds at the end, median {np.median(speed):.2g}, 95 % {np.quantile(speed, 0.95):.2g} m/s")
-    holds("pile: speed at the end, 95 of 100, m/s", np.quantile(speed, 0.95), 0.1)
-    holds("pile: deepest overlap, m", columns["quality/max_penetration"], 0.1)
+    # A disc that nothing stops rolls on.
+    holds("pile: speed at the end of half of all, m/s", np.median(speed), 1e-3)
+    holds("pile: speed at the end of nine out of ten, m/s", np.quantile(speed, 0.9), 0.05)
+    # What is hit from several sides in a step may overlap by what it moves in that step.
+    fastest = np.linalg.norm(columns["states/velocity"], axis=-1).max() / 240
+    holds("pile: deepest overlap, of the longest way in a step", columns["quality/max_penetration"] / fastest, 3)
     place = columns["states/position"]
     inside = np.minimum(place, np.array([options.width, np.inf]) - place).min(-1)
     assert (inside > 0)[np.broadcast_to(there[:, None], inside.shape)].all()

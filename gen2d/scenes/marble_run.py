@@ -19,9 +19,9 @@ class Options:
 
     ramps: Distribution = option([3, 4], int, "ramps", "in a video", low=1, high=16, draw=True)
     width: float = option(4.0, float, "m", "of the box, inside", above=0, high=1000)
-    height: float = option(6.0, float, "m", "of the box, inside", above=0, high=1000)
+    height: float = option(6.5, float, "m", "of the box, inside", above=0, high=1000)
     slope: Distribution = option(
-        [0.12, 0.25], float, "rad", "of each ramp, down from the side that it begins at", above=0, high=1.5,
+        [0.16, 0.3], float, "rad", "of each ramp, down from the side that it begins at", above=0, high=1.5,
         draw=True, each="ramps",
     )  # fmt: skip
     length: Distribution = option(
