@@ -48,7 +48,7 @@ def check(options: Options) -> None:
         raise ValueError(f"apart is {options.apart:g} m, but must be above the diameter of a ball, {2 * largest:g} m")
     aside = max(map(abs, options.jitter.support))
     if not aside + largest < width(options) / 2:
-        raise ValueError(f"jitter may be {aside:g} m, but a ball must fit a board of {width(options):g} m")
+        raise ValueError(f"jitter may be {aside:g} m to a side, but a ball must fit a board of {width(options):g} m")
 
 
 def width(options: Options) -> float:
