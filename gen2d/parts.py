@@ -58,6 +58,7 @@ MATERIAL = {
     "color": "sRGB, [3] or [K, 3]; default grey",
     "kind": "DYNAMIC, STATIC or KINEMATIC, of all; segments are static by default, all else is dynamic",
     "layer": "of all, in the drawing order",
+    "collides": "whether others can touch them, of all that do not move by themselves; default True",
     "rolling_resistance": "torque over normal force and radius",
     "force": "N, [2] or [K, 2], constant",
     "torque": "N m, constant",
@@ -133,9 +134,10 @@ def _part(
     """`mass` is that of the density, `moment` that of one kilogram."""
     assert material.keys() <= MATERIAL.keys(), f"{material.keys() - MATERIAL.keys()} are not of {list(MATERIAL)}"
     count, kind = position.shape[0], material.get("kind", DYNAMIC)
+    assert kind != DYNAMIC or material.get("collides", True), "what moves by itself collides"
     present = jnp.broadcast_to(present, (count,))
     vertices = sizes["vertices"].shape[1] if "vertices" in sizes else 0
-    run = Run(shape, count, kind, vertices, layer=material.get("layer"))
+    run = Run(shape, count, kind, vertices, layer=material.get("layer"), collides=material.get("collides", True))
 
     def slots(value: Any, *more: int, dtype: Any = jnp.float32) -> Array:
         values = jnp.broadcast_to(jnp.asarray(value, jnp.float32), (count, *more))

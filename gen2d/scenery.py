@@ -66,8 +66,8 @@ def moving(layout: Layout) -> list[tuple[Run, int]]:
 
 
 def standing(layout: Layout) -> list[tuple[Run, int]]:
-    """Every static and kinematic slot, and the run that it is in."""
-    runs = [(run, first) for run, first in layout.spans if run.kind != DYNAMIC]
+    """Every static and kinematic slot that others can touch, and the run that it is in."""
+    runs = [(run, first) for run, first in layout.spans if run.kind != DYNAMIC and run.collides]
     return [(run, first + i) for run, first in runs for i in range(run.count)]
 
 
