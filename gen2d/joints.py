@@ -14,6 +14,7 @@ import jax.numpy as jnp
 from gen2d.contacts import dot, turned
 from gen2d.ledger import Work
 from gen2d.rows import Inertia, Motion, Rules, reciprocal
+from gen2d.tournament import settled
 from gen2d.types import Array
 
 HERTZ, DAMPING_RATIO = 60.0, 5.0  # of rigid joints; at 120 Hz a light chain with a heavy end explodes
@@ -155,16 +156,20 @@ def _along(apart: Array) -> tuple[Array, Array]:
 
 
 class _Book:
-    """The work that a joint's impulses do, as they are applied."""
+    """The work that a joint's impulses do, as they are applied. `one` is 1.0 in a way that the compiler cannot know:
+    else a CPU computes each impulse again for all that come after it, and takes minutes to compile two hinges."""
 
-    def __init__(self, held: Held, still: dict[int, Motion], bodies: Bodies) -> None:
-        self.held, self.still, self.bodies = held, still, bodies
+    def __init__(self, held: Held, still: dict[int, Motion], bodies: Bodies, one: Array) -> None:
+        self.held, self.still, self.bodies, self.one = held, still, bodies, one
         self.lost, self.driven = jnp.zeros_like(held.angle), jnp.zeros_like(held.angle)
 
     def apply(self, push: Array | None, twist: Array | None, motor: bool = False) -> None:
         """Applies an impulse, and books what it does."""
-        before = _speed(self.held, self.bodies, self.still)
+        push, twist = settled((push, twist), self.one)
+        before = settled(_speed(self.held, self.bodies, self.still), self.one)
         self.bodies = _apply(self.held, self.bodies, push, twist)
+        moved = {_key(end) for end in (self.held.tied.a, self.held.tied.b) if end.inertia is not None}
+        self.bodies |= settled({key: self.bodies[key] for key in sorted(moved)}, self.one)
         sums = [x + y for x, y in zip(before, _speed(self.held, self.bodies, self.still), strict=True)]
         parts = [dot(push, sums[0])] if push is not None else []
         parts += [twist * sums[1]] if twist is not None else []
@@ -182,7 +187,7 @@ class _Book:
 
 
 def warm(
-    ties: list[Tied], bodies: list[Any], fixed: dict[int, Any], motions: list[Motion], memory: list[tuple]
+    ties: list[Tied], bodies: list[Any], fixed: dict[int, Any], motions: list[Motion], memory: list[tuple], one: Array
 ) -> tuple:
     """Every joint as it stands, the motions with its last impulses, and the work done."""
     if not ties:
@@ -191,10 +196,10 @@ def warm(
     held, works = [], []
     for tied, impulses in zip(ties, memory, strict=True):
         a, b = (fixed[e.place] if e.group is None else places[_key(e)] for e in (tied.a, tied.b))
-        arm_a, arm_b = _turned(tied.a.anchor, a.angle), _turned(tied.b.anchor, b.angle)
+        arm_a, arm_b = settled((_turned(tied.a.anchor, a.angle), _turned(tied.b.anchor, b.angle)), one)
         apart = b.position + arm_b - a.position - arm_a
         joint = Held(tied, arm_a, arm_b, apart, b.angle - a.angle - tied.rest, impulses)
-        book = _Book(joint, still, now)
+        book = _Book(joint, still, now, one)
         if tied.kind == "distance":
             book.apply(impulses[0] * _along(apart)[0], None)
         else:
@@ -213,6 +218,7 @@ def solve(
     falls: list[Array],
     fixed: dict[int, Any],
     rules: Rules,
+    one: Array,
     biased: bool,
 ) -> tuple:
     """Every joint after a pass, motions and ways (what a body goes beyond its velocity), and the work done."""
@@ -222,8 +228,8 @@ def solve(
     now, way, fall = _taken(motions, ties), _taken(ways, ties), _taken(falls, ties)
     done, works = [], []
     for joint in held:
-        joint = joint if biased else _moved(joint, way, still, rules.step)
-        book = _Book(joint, still, now)
+        joint = joint if biased else _moved(joint, way, still, rules.step, one)
+        book = _Book(joint, still, now, one)
         if joint.tied.kind == "distance":
             impulses, spring = _rod(joint, book, rules, biased), None
             if biased:
@@ -237,12 +243,12 @@ def solve(
     return done, _put(motions, now), _put(ways, way), works
 
 
-def _moved(joint: Held, way: Bodies, still: dict[int, Motion], h: float) -> Held:
+def _moved(joint: Held, way: Bodies, still: dict[int, Motion], h: float, one: Array) -> Held:
     """The joint as it stands after the bodies have gone their ways."""
     arms, apart = [], joint.apart
     for end, arm, sign in ((joint.tied.a, joint.arm_a, -1), (joint.tied.b, joint.arm_b, 1)):
         gone = way[_key(end)] if end.group is not None else jax.tree.map(lambda x: h * x, still[end.place])
-        arms.append(_turned(arm, gone.spin))
+        arms.append(settled(_turned(arm, gone.spin), one))
         apart = apart + sign * (gone.velocity + arms[-1] - arm)
     return joint._replace(arm_a=arms[0], arm_b=arms[1], apart=apart)
 

@@ -81,6 +81,9 @@ class Rollout:
         video = self.config.video
         own = {"T": video.frames, "K": self.layout.slots, "H": video.height, "W": video.width}
         own |= {"C": self.keep.contacts} if self.keep.contacts else {}
+        own |= {"J": len(self.layout.joints)} if self.layout.joints else {}
+        corners = max(run.vertices for run in self.layout.runs)
+        own |= {"V": corners} if corners else {}
         own |= annotations.sizes(self.config.annotations, self.plan)
         return own | sampling.sizes(self.config.scene)
 

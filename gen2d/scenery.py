@@ -81,7 +81,7 @@ def _group(objects: Objects, layout: Layout, run: Run, first: int) -> Group:
     mass, moment = (_inverse(x, x > 0) for x in inverse)
     rigid = {slot for tie in layout.joints for slot in (tie.a, tie.b)}
     jointed = jnp.asarray([float(first + i in rigid) for i in range(padded(run.count))], mass.dtype)[:, None]
-    return Group(form_of(some, run, slice(None)), inverse, mass, moment, jnp.broadcast_to(jointed, mass.shape))
+    return Group(form_of(some, run, slice(None)), inverse, mass, moment, jnp.broadcast_to(jointed, mass.shape), run.touches)
 
 
 def _fixed(objects: Objects, state: State, run: Run, slot: int) -> Fixed:
@@ -109,9 +109,13 @@ def _sides(objects: Objects, layout: Layout, groups: list[Group]) -> tuple[list[
 
 
 def _apart(a: Side, b: Side, layout: Layout) -> Array:
-    """Where two are not tied together by a joint, so that they collide."""
+    """Where two collide: where no joint ties them together, and neither is of a run that nothing touches."""
     tied = [tie for tie in layout.joints if not tie.collide]
     together = jnp.zeros(b.slot.shape, bool)
+    for run, first in layout.spans:
+        if not run.touches:
+            for slot in (a.slot, b.slot):
+                together = together | ((slot >= first) & (slot < first + run.count))
     for i, j in ((tie.a, tie.b) for tie in tied):
         together = together | ((a.slot == i) & (b.slot == j)) | ((a.slot == j) & (b.slot == i))
     return ~together
@@ -201,6 +205,7 @@ def _sparse(
 ) -> Sparse:
     ours, theirs = _sides(objects, layout, groups)
     sizes, firsts = [side.slot.shape[0] for side in ours], [first for _, first in moving(layout)]
+    solid, firm = ([run.touches for run, _ in of] for of in (moving(layout), standing(layout)))
     fixed_slots, ways, kinds = [slot for _, slot in standing(layout)], _ways(fixed), []
 
     def add(forms: tuple[Form, Form], of_a: np.ndarray, b: np.ndarray, **more: Any) -> None:
@@ -211,6 +216,8 @@ def _sparse(
         kinds.append(Kind(b=b, slots=slots, row=row, points=_points(*forms), **more))
 
     for m in matches(sizes, 0):
+        if not (solid[m.first] and solid[m.second]):
+            continue
         a, b = meetings(sizes[m.first], sizes[m.second], m)
         ring = ring_of(a, b) if m.first == m.second else None
         forms = groups[m.first].form, groups[m.second].form
@@ -222,7 +229,8 @@ def _sparse(
             of = fixed[i]
             return type(of.form), len(jax.tree.leaves(of.form)), of.motion is None, i in ways and _is_disc(form)
 
-        for alike, numbers in itertools.groupby(range(len(fixed)), key=like):
+        touching = [i for i in range(len(fixed)) if solid[g] and firm[i]]
+        for alike, numbers in itertools.groupby(touching, key=like):
             some = list(numbers)
             onward = {i: ways[i] if alike[-1] else (None, None) for i in some}
             posts = {i: Post(theirs[i], left, right, theirs[i].present) for i, (left, right) in onward.items()}
@@ -291,7 +299,7 @@ def scenery_of(
     at_rest = 2 * rules.step * jnp.sqrt(jnp.sum(scene.gravity**2, axis=0))
     setup = Setup(scene.gravity[:, None], jnp.maximum(rules.bounce_threshold, at_rest), one, contacts)
     made = (_sparse if sparse else _dense)(objects, layout, groups, fixed, setup, rules)
-    rails = [_rail(f, objects.present[s : s + 1]) for f, (_, s) in zip(fixed, standing(layout), strict=True)]
+    rails = [_rail(f, objects.present[s : s + 1]) for f, (r, s) in zip(fixed, standing(layout), strict=True) if r.touches]
     return Scenery(
         groups, fixed, [r for r in rails if r is not None], scene.gravity, made, _ties(scene, layout, groups), forces
     )

@@ -56,6 +56,7 @@ class Group(NamedTuple):
     mass: Array  # [N, ...] kg
     moment: Array  # [N, ...] kg m^2
     jointed: Array  # [N, ...] 1 where a rigid joint holds it
+    touches: bool = True  # whether they meet anything
 
 
 class Fixed(NamedTuple):
@@ -167,7 +168,7 @@ def step(world: World, scenery: Scenery, rules: Rules) -> World:
     fixed = [Body(*body.at(world.time), body.still) for body in scenery.fixed]
     known = dict(enumerate(fixed))
 
-    held, motions, tied = joints.warm(scenery.ties, world.bodies, known, flying, world.ties)
+    held, motions, tied = joints.warm(scenery.ties, world.bodies, known, flying, world.ties, one)
     shapes = [placed(g.form, b.position, b.angle) for g, b in zip(groups, world.bodies, strict=True)]
     walls = [(f.shape_at(b), f.motion) for f, b in zip(scenery.fixed, fixed, strict=True)]
     unlike = falls if spin_ups else [None] * len(groups)
@@ -178,15 +179,15 @@ def step(world: World, scenery: Scenery, rules: Rules) -> World:
     pushes = [_warmth(*of) for of in zip(motions, flying, groups, strict=True)]
 
     ways = [Motion(*(jnp.zeros_like(x) for x in m)) for m in motions]
-    held, motions, ways, tied_more = joints.solve(held, motions, ways, falls, known, rules, biased=True)
+    held, motions, ways, tied_more = joints.solve(held, motions, ways, falls, known, rules, one, biased=True)
     drifts = [Drift(way, push) for way, push in zip(ways, pushes, strict=True)]
     motions, drifts, works, rows = contacts.solve(past, found, walls, motions, drifts, works)
 
     ways = [_moved(*of, h) for of in zip(motions, drifts, more, strict=True)]
-    ways = kept_in(ways, shapes, scenery.rails)
+    ways = kept_in(ways, [s if g.touches else None for s, g in zip(shapes, groups, strict=True)], scenery.rails)
     places = [_arrived(b, way, one) for b, way in zip(world.bodies, ways, strict=True)]
 
-    held, motions, _, tied_last = joints.solve(held, motions, ways, falls, known, rules, biased=False)
+    held, motions, _, tied_last = joints.solve(held, motions, ways, falls, known, rules, one, biased=False)
     motions, works, past = contacts.relax(past, rows, walls, motions, drifts, works, world.time)
     if book is not None:
         olds = [body.motion for body in world.bodies]
