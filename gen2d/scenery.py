@@ -20,7 +20,7 @@ from gen2d.solver import Fixed, Group, Scenery
 from gen2d.sparse import Kind, Post, Seat, Sparse, chunk_of
 from gen2d.sweeps import Setup
 from gen2d.tournament import matches, meetings, of_rows, sweep
-from gen2d.types import DYNAMIC, KINEMATIC, Array, Layout, Objects, Record, Run, Scene, State
+from gen2d.types import DYNAMIC, KINEMATIC, Array, Layout, Objects, Record, Run, Scene, State, Tie
 
 
 class Side(NamedTuple):
@@ -253,36 +253,31 @@ def _is_disc(form: Form) -> bool:
     return isinstance(form, DiscForm)
 
 
-def _end(slot: int, anchor: Array, layout: Layout, groups: list[Group]) -> joints.End:
-    for g, (run, first) in enumerate(moving(layout)):
-        if first <= slot < first + run.count:
-            inverse = slots_of(groups[g].inverse, slot - first, 1)
-            return joints.End(g, slot - first, inverse, anchor)
-    return joints.End(None, [s for _, s in standing(layout)].index(slot), None, anchor)
-
-
 def _ties(scene: Scene, layout: Layout, groups: list[Group]) -> list[joints.Tied]:
-    found, values = [], scene.joints
-    for j, tie in enumerate(layout.joints):
-        assert values is not None, "a layout with joints needs scene.joints"
-        of = slots_of(values, j, 1)
-        there = scene.objects.present[tie.a : tie.a + 1] & scene.objects.present[tie.b : tie.b + 1]
-        a, b = (_end(slot, x, layout, groups) for slot, x in ((tie.a, of.anchor_a), (tie.b, of.anchor_b)))
-        found.append(
-            joints.Tied(
-                tie.kind,
-                a,
-                b,
-                there,
-                of.rest,
-                of.stiffness,
-                of.damping,
-                of.lower,
-                of.upper,
-                of.motor_speed,
-                of.motor_torque,
-            )
-        )
+    """The joints in rounds. A body's line in the solver's table is its place among the groups, or behind them."""
+    if not layout.joints:
+        return []
+    values, nothing = scene.joints, jnp.zeros_like(scene.objects.mass[:1])
+    assert values is not None, "a layout with joints needs scene.joints"
+    sizes, still = [padded(run.count) for run, _ in moving(layout)], [slot for _, slot in standing(layout)]
+    lines = {slot: sum(sizes) + place for place, slot in enumerate(still)}
+    for g, (run, first) in enumerate(moving(layout)):
+        lines |= {first + i: sum(sizes[:g]) + i for i in range(run.count)}
+    unmoved = [Inertia(nothing, nothing)] * len(still)
+    inverse = jax.tree.map(lambda *x: jnp.concatenate(x, axis=-2), *(g.inverse for g in groups), *unmoved)
+
+    def end(slots: np.ndarray, anchor: Array) -> joints.End:
+        of = np.array([lines[int(slot)] for slot in slots])
+        return joints.End(of, of >= sum(sizes), jax.tree.map(lambda x: x[..., of, :], inverse), anchor)
+
+    found, named = [], [Tie(tie.kind, lines[tie.a], lines[tie.b]) for tie in layout.joints]
+    for numbers in joints.rounds(named, sum(sizes)):
+        ties, of = [layout.joints[j] for j in numbers], jax.tree.map(lambda x, j=numbers: x[..., np.array(j), :], values)
+        a, b = (np.array([getattr(tie, side) for tie in ties]) for side in "ab")
+        there = scene.objects.present[a] & scene.objects.present[b]
+        ends = end(a, of.anchor_a), end(b, of.anchor_b)
+        rest = (of.rest, of.stiffness, of.damping, of.lower, of.upper, of.motor_speed, of.motor_torque)
+        found.append(joints.Tied(ties[0].kind, *ends, there, *rest))
     return found
 
 
