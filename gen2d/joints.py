@@ -111,9 +111,7 @@ def _with(table: Any, held: Held, a: Any, b: Any) -> Any:
 def _groups(table: Any, groups: list[Any]) -> list[Any]:
     """The groups' part of a table."""
     ends = list(itertools.accumulate((jax.tree.leaves(group)[0].shape[-2] for group in groups), initial=0))
-    return [
-        jax.tree.map(lambda x, span=slice(*span): x[..., span, :], table) for span in itertools.pairwise(ends)
-    ]
+    return [jax.tree.map(lambda x, span=slice(*span): x[..., span, :], table) for span in itertools.pairwise(ends)]
 
 
 def _turned(vector: Array, angle: Array) -> Array:

@@ -81,7 +81,9 @@ def _group(objects: Objects, layout: Layout, run: Run, first: int) -> Group:
     mass, moment = (_inverse(x, x > 0) for x in inverse)
     rigid = {slot for tie in layout.joints for slot in (tie.a, tie.b)}
     jointed = jnp.asarray([float(first + i in rigid) for i in range(padded(run.count))], mass.dtype)[:, None]
-    return Group(form_of(some, run, slice(None)), inverse, mass, moment, jnp.broadcast_to(jointed, mass.shape), run.touches)
+    return Group(
+        form_of(some, run, slice(None)), inverse, mass, moment, jnp.broadcast_to(jointed, mass.shape), run.touches
+    )
 
 
 def _fixed(objects: Objects, state: State, run: Run, slot: int) -> Fixed:
@@ -272,7 +274,10 @@ def _ties(scene: Scene, layout: Layout, groups: list[Group]) -> list[joints.Tied
 
     found, named = [], [Tie(tie.kind, lines[tie.a], lines[tie.b]) for tie in layout.joints]
     for numbers in joints.rounds(named, sum(sizes)):
-        ties, of = [layout.joints[j] for j in numbers], jax.tree.map(lambda x, j=numbers: x[..., np.array(j), :], values)
+        ties, of = (
+            [layout.joints[j] for j in numbers],
+            jax.tree.map(lambda x, j=numbers: x[..., np.array(j), :], values),
+        )
         a, b = (np.array([getattr(tie, side) for tie in ties]) for side in "ab")
         there = scene.objects.present[a] & scene.objects.present[b]
         ends = end(a, of.anchor_a), end(b, of.anchor_b)
@@ -294,7 +299,9 @@ def scenery_of(
     at_rest = 2 * rules.step * jnp.sqrt(jnp.sum(scene.gravity**2, axis=0))
     setup = Setup(scene.gravity[:, None], jnp.maximum(rules.bounce_threshold, at_rest), one, contacts)
     made = (_sparse if sparse else _dense)(objects, layout, groups, fixed, setup, rules)
-    rails = [_rail(f, objects.present[s : s + 1]) for f, (r, s) in zip(fixed, standing(layout), strict=True) if r.touches]
+    rails = [
+        _rail(f, objects.present[s : s + 1]) for f, (r, s) in zip(fixed, standing(layout), strict=True) if r.touches
+    ]
     return Scenery(
         groups, fixed, [r for r in rails if r is not None], scene.gravity, made, _ties(scene, layout, groups), forces
     )

@@ -28,9 +28,13 @@ class Options:
     aim: Distribution = option(
         [0.75, 0.95], float, "1", "height of the ball at the start, over that of a domino", low=0, high=1, draw=True
     )
-    way: Distribution = option([0.2, 0.6], float, "m", "from the ball to the first domino", low=1e-3, high=100, draw=True)
+    way: Distribution = option(
+        [0.2, 0.6], float, "m", "from the ball to the first domino", low=1e-3, high=100, draw=True
+    )
     speed: Distribution = option([2.0, 4.0], float, "m/s", "of the ball", low=0, high=1000, draw=True)
-    spin: Distribution = option(0.0, float, "rad/s", "of the first domino at the start, about its right foot", draw=True)
+    spin: Distribution = option(
+        0.0, float, "rad/s", "of the first domino at the start, about its right foot", draw=True
+    )
     gravity: tuple[Distribution, ...] = option([0, -9.8], float, "m/s^2", "x right, y up", parts=2, draw=True)
     ball_color: tuple[Distribution, ...] = option(
         [254, 254, 254], int, "sRGB", "of the ball", parts=3, draw=True, low=0, high=255

@@ -48,7 +48,7 @@ class Options:
 
 
 def check(options: Options) -> None:
-    """ValueError where a weight may be wider than its part of the plank, or the plank thicker than its pivot is high."""
+    """ValueError where a weight may be wider than its part of the plank, or the plank may touch the floor."""
     part = options.length.support[0] / options.weights.support[1]
     if options.width.support[1] > part:
         raise ValueError(

@@ -80,6 +80,7 @@ def _margin(x: Array, width: Array, mass: Array, present: Array) -> Array:
     centre = jnp.cumsum((mass * x)[::-1])[::-1] / jnp.where(above > 0, above, 1.0)
     left, right = x - width / 2, x + width / 2
     left, right = (
-        jnp.concatenate([end[:1], choose(end[1:], end[:-1])]) for end, choose in ((left, jnp.maximum), (right, jnp.minimum))
+        jnp.concatenate([end[:1], choose(end[1:], end[:-1])])
+        for end, choose in ((left, jnp.maximum), (right, jnp.minimum))
     )
     return jnp.where(present, jnp.minimum(centre - left, right - centre), jnp.inf).min()

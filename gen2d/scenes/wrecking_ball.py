@@ -26,7 +26,9 @@ class Options:
     friction: Distribution = option([0.6, 0.9], float, "1", "of all", low=0, high=100, draw=True)
     elasticity: Distribution = option(0.0, float, "1", "of ball and blocks", low=0, high=1, draw=True)
     radius: Distribution = option([0.4, 0.6], float, "m", "of the ball", low=1e-2, high=100, draw=True)
-    ball_density: Distribution = option(5.0, float, "kg/m^2", "of the ball and its chain", low=1e-6, high=1e6, draw=True)
+    ball_density: Distribution = option(
+        5.0, float, "kg/m^2", "of the ball and its chain", low=1e-6, high=1e6, draw=True
+    )
     chain: Distribution = option([3.0, 4.0], float, "m", "from the pin to the ball's middle", low=0.1, draw=True)
     angle: Distribution = option(
         [0.8, 1.4], float, "rad", "of the chain at the start, from hanging down", low=0, high=1.57, draw=True
@@ -45,12 +47,12 @@ class Options:
 
 
 def check(options: Options) -> None:
-    """ValueError where the ball might swing through the floor, or begin in the tower."""
+    """ValueError where the ball might swing through the floor."""
     lowest = options.aim.support[0] * options.blocks.support[0] * options.height.support[0]
     if options.radius.support[1] > lowest:
         raise ValueError(
-            f"radius may be {options.radius.support[1]:g} m, but the ball's middle may swing as low as {lowest:g} m (aim "
-            "times blocks times height)"
+            f"radius may be {options.radius.support[1]:g} m, but the ball's middle may swing as low as {lowest:g} m "
+            "(aim times blocks times height)"
         )
 
 
