@@ -99,7 +99,8 @@ def _verb_parser(verb: str) -> Parser:
     if verb == "list":
         parser.add_argument("name", nargs="?", help="a family, look or config: only this one")
         return parser
-    help_text = "a dataset's folder or URL" + (", or a config" if verb == "preview" else "")
+    more = ", or a config; with --gallery also 'all': every scene family" if verb == "preview" else ""
+    help_text = f"a dataset's folder or URL{more}"
     parser.add_argument("dataset", metavar="DIR" + ("|CONFIG" if verb == "preview" else ""), help=help_text)
     if verb == "verify":
         parser.add_argument(
@@ -245,9 +246,10 @@ def preview(arguments: Sequence[str]) -> int:
     changes = {"seed": options.seed, "sets": options.sets}
     changes |= {} if options.videos is None else {"videos": options.videos}
     if options.gallery:
-        from gen2d.gallery import gallery
+        from gen2d.gallery import families, gallery
 
-        made = [gallery(options.dataset, options.out or Path(), **changes)]
+        out, every = options.out or Path(), options.dataset == "all"
+        made = families(out, **changes) if every else [gallery(options.dataset, out, **changes)]
     else:
         from gen2d.preview import preview as draw
 

@@ -1,8 +1,10 @@
-"""A gallery for a person: the same videos in every look, then in the flat one with what is told of their pixels.
+"""A gallery for a person: the same videos in every look, then in the flat one with what is told of their pixels; and
+that of every scene family, with a page that has a row of each.
 
 The videos of a config are made in a temporary folder, as states alone; from there on it is one way for all.
 """
 
+import contextlib
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -19,7 +21,8 @@ from gen2d.loader import open as open_dataset
 from gen2d.preview import GAP, check_folder, check_videos, contact_sheet, enlarged, is_dataset, shown, write, writing
 from gen2d.redraw import config_of, render
 
-LABEL = 110  # px, of the strip with a row's name
+LABEL = 125  # px, of the strip with a row's name
+PAGE = 1000  # px, width of a row without its name, on the page of all families
 TRACKS = 6  # points of an object
 SEEN, WHOLE = (255, 255, 255), (255, 140, 0)  # boxes around what is seen, and around all of an object
 Columns = Mapping[str, np.ndarray]
@@ -35,21 +38,49 @@ def gallery(source: str, out: Path, videos: int = 1, *, seed: int | None = None,
         looks = _looks(config_of(ds, sets).plain()["look"])
         picture, name = _sheet(ds, videos, looks, sets), ds.manifest["name"]
     else:
-        picture, name = _made(source, videos, seed, sets)
+        with _made(source, videos, seed, sets) as (ds, plain):
+            picture, name = _sheet(ds, videos, _looks(plain["look"])), plain["name"]
     path = out / f"{name}-gallery.png"
     with writing(out):
         write(path, picture)
     return path
 
 
-def _made(source: str, videos: int, seed: int | None, sets: Sequence[str]) -> tuple[np.ndarray, str]:
-    """The gallery of a config, and its name."""
+def families(out: Path, videos: int = 1, *, seed: int | None = None, sets: Sequence[str] = ()) -> list[Path]:
+    """The files made in the folder `out`: families.png with a row for each of the first `videos` of every scene family,
+    in its config's own look, and the gallery of each, FAMILY-gallery.png."""
+    check_videos(videos)
+    check_folder(out)
+    rows, paths = [], []
+    for name in plugins.names("scene"):
+        own = f"{name}.yaml" in plugins.config_names()
+        with _made(name if own else {"name": name, "scene": name}, videos, seed, sets) as (ds, plain):
+            frames = np.asarray(render(ds, range(videos), look=plain["look"]))
+            rows.append(_labelled(name, _fitted(contact_sheet(frames))))
+            paths.append(out / f"{name}-gallery.png")
+            with writing(out):
+                write(paths[-1], _sheet(ds, videos, _looks(plain["look"])))
+    with writing(out):
+        write(out / "families.png", np.concatenate(rows))
+    return [out / "families.png", *paths]
+
+
+def _fitted(sheet: np.ndarray) -> np.ndarray:
+    """The sheet, as wide as all rows of the page."""
+    return cv2.resize(sheet, (PAGE, round(PAGE * sheet.shape[0] / sheet.shape[1])), interpolation=cv2.INTER_AREA)
+
+
+@contextlib.contextmanager
+def _made(
+    source: str | Mapping[str, Any], videos: int, seed: int | None, sets: Sequence[str]
+) -> Iterator[tuple[Dataset, dict[str, Any]]]:
+    """A config's first videos, states alone, which last as long as the block, and the config."""
     config = load_config(source, sets)
     plain, split = config.plain(), config.training.name if config.training else "train"
     bare = plain | {"look": "flat", "annotations": {}, "storage": plain["storage"] | {"frames": "none"}}
     with tempfile.TemporaryDirectory() as folder:
         generate(bare, videos, Path(folder) / "states", seed=seed, split=split)
-        return _sheet(open_dataset(Path(folder) / "states"), videos, _looks(plain["look"])), plain["name"]
+        yield open_dataset(Path(folder) / "states"), plain
 
 
 def _looks(own: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:

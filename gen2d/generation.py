@@ -138,7 +138,7 @@ def dataset_of(rollout: Rollout, out: Place, counts: Mapping[str, int]) -> Datas
         codec=config.storage.codec,
         chunk_frames=config.storage.chunk_frames,
         fps=config.video.fps,
-        constants={"time": rollout.time},
+        constants=rollout.constants,
         conventions=CONVENTIONS,
         command="python -m gen2d --config config.yaml",
         copies={

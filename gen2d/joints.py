@@ -1,36 +1,44 @@
-"""Joints: rigid rods, springs, hinges with limits and motors, solved one after the other before the contacts.
+"""Joints: rigid rods, springs, hinges with limits and motors, solved one round after the other before the contacts.
 
 A rod keeps the distance of two anchors, a hinge ('revolute') keeps them in one place; both are soft constraints at
 60 Hz (E. Catto, 'Solver2D', 2024), warm-started and relaxed like contacts. A spring is not a constraint but a force:
 the mean of what it is at both ends of the step, found implicitly and acting at half of the step, which keeps the energy
 of a linear spring exactly and is stable at any stiffness (the implicit midpoint rule).
+
+A round is some joints of one kind that share no moving body, solved at once; so a chain of any length takes two, and a
+program does not grow with it. Bodies lie in a table: those of all groups, then the fixed ones.
 """
 
+import itertools
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from gen2d.contacts import dot, turned
 from gen2d.ledger import Work
 from gen2d.rows import Inertia, Motion, Rules, reciprocal
-from gen2d.types import Array
+from gen2d.tournament import settled
+from gen2d.types import Array, Tie
 
 HERTZ, DAMPING_RATIO = 60.0, 5.0  # of rigid joints; at 120 Hz a light chain with a heavy end explodes
 SHORTEST = 1e-6  # m: a shorter rod has no direction
 
 
 class End(NamedTuple):
-    """One of a joint's bodies: which one of a group of moving bodies, or of the fixed ones."""
+    """One of the two bodies of each joint in a round."""
 
-    group: int | None  # None: fixed
-    place: int  # in it
-    inertia: Inertia | None  # [1, ...]; None: fixed
-    anchor: Array  # [2, 1, ...] m, in the body's frame
+    lines: np.ndarray  # [P] in the table of bodies
+    fixed: np.ndarray  # [P] bool: whether it is a fixed one
+    inertia: Inertia  # [P, ...]; zero of a fixed one
+    anchor: Array  # [2, P, ...] m, in the body's frame
 
 
 class Tied(NamedTuple):
-    """What stays the same of a joint, each [1, ...]. A distance joint is a spring where its stiffness is finite."""
+    """What stays the same of the joints of a round, each [P, ...]. A distance joint is a spring where its stiffness is
+    finite."""
 
     kind: str
     a: End
@@ -46,52 +54,64 @@ class Tied(NamedTuple):
 
 
 class Held(NamedTuple):
-    """A joint in this step."""
+    """The joints of a round in this step."""
 
     tied: Tied
-    arm_a: Array  # [2, 1, ...] m
+    arm_a: Array  # [2, P, ...] m
     arm_b: Array
-    apart: Array  # [2, 1, ...] m: from a's anchor to b's
-    angle: Array  # [1, ...] rad: b's over a's, beyond that at rest
+    apart: Array  # [2, P, ...] m: from a's anchor to b's
+    angle: Array  # [P, ...] rad: b's over a's, beyond that at rest
     impulses: tuple[Array, ...]
 
 
-Bodies = dict[tuple[int | None, int], Any]  # one body's values, by group and place
+def rounds(ties: Sequence[Tie], moving: int) -> list[list[int]]:
+    """The numbers of the joints of each round: every joint is in the first of its kind in which both of its bodies are
+    free. They are named by their lines in the table, of which those below `moving` are moving bodies."""
+    found: list[tuple[str, set[int], list[int]]] = []
+    for number, tie in enumerate(ties):
+        ours = {line for line in (tie.a, tie.b) if line < moving}
+        place = next((r for r in found if r[0] == tie.kind and not r[1] & ours), None)
+        if place is None:
+            place = tie.kind, set(), []
+            found.append(place)
+        place[1].update(ours)
+        place[2].append(number)
+    return [numbers for *_, numbers in found]
 
 
 def nothing(tied: Tied) -> tuple[Array, ...]:
-    """The impulses of a joint that has done nothing.
+    """The impulses of joints that have done nothing.
 
     A rod has one, along it; a hinge has five: along x and y, at both limits, and by the motor.
     """
     return (jnp.zeros_like(tied.rest),) * (1 if tied.kind == "distance" else 5)
 
 
-def _key(end: End) -> tuple[int | None, int]:
-    return end.group, end.place
+def _table(groups: Sequence[Any], fixed: Sequence[Any]) -> Any:
+    """The bodies' values one after the other, [..., N, n]."""
+    return jax.tree.map(lambda *x: jnp.concatenate(x, axis=-2), *groups, *fixed)
 
 
-def _taken(groups: list[Any], ties: list[Tied]) -> Bodies:
-    return {
-        _key(end): jax.tree.map(lambda x, i=end.place: x[..., i : i + 1, :], groups[end.group])
-        for tie in ties
-        for end in (tie.a, tie.b)
-        if end.group is not None
-    }
+def _at(table: Any, lines: np.ndarray) -> Any:
+    return jax.tree.map(lambda x: x[..., lines, :], table)
 
 
-def _put(groups: list[Any], bodies: Bodies) -> list[Any]:
-    """The groups with the bodies back in them."""
+def _with(table: Any, held: Held, a: Any, b: Any) -> Any:
+    """The table with both bodies of each joint put back into it."""
 
-    def whole(g: int, group: Any) -> Any:
-        mine = {i: body for (h, i), body in bodies.items() if h == g}
-        if not mine:
-            return group
-        count = jax.tree.leaves(group)[0].shape[-2]
-        rows = [mine.get(i, jax.tree.map(lambda x, i=i: x[..., i : i + 1, :], group)) for i in range(count)]
-        return jax.tree.map(lambda *x: jnp.concatenate(x, axis=-2), *rows)
+    def put(x: Array, new_a: Array, new_b: Array) -> Array:
+        count, lines = x.shape[-2], np.concatenate([held.tied.a.lines, held.tied.b.lines])
+        order = np.arange(count)
+        order[lines] = count + np.arange(len(lines))  # of a fixed one any, as it stays as it is
+        return jnp.concatenate([x, new_a, new_b], axis=-2)[..., order, :]
 
-    return [whole(g, group) for g, group in enumerate(groups)]
+    return jax.tree.map(put, table, a, b)
+
+
+def _groups(table: Any, groups: list[Any]) -> list[Any]:
+    """The groups' part of a table."""
+    ends = list(itertools.accumulate((jax.tree.leaves(group)[0].shape[-2] for group in groups), initial=0))
+    return [jax.tree.map(lambda x, span=slice(*span): x[..., span, :], table) for span in itertools.pairwise(ends)]
 
 
 def _turned(vector: Array, angle: Array) -> Array:
@@ -99,16 +119,10 @@ def _turned(vector: Array, angle: Array) -> Array:
     return jnp.stack([cos * vector[0] - sin * vector[1], sin * vector[0] + cos * vector[1]])
 
 
-def _apply(held: Held, bodies: Bodies, push: Array | None, twist: Array | None) -> Bodies:
-    """The bodies' motions after an impulse on b at its anchor, an angular one beside it, and their reactions on a."""
-    bodies = dict(bodies)
-    for end, arm, sign in ((held.tied.a, held.arm_a, -1), (held.tied.b, held.arm_b, 1)):
-        if end.inertia is None:
-            continue
-        motion, turn = bodies[_key(end)], _twist(arm, push, twist)
-        velocity = motion.velocity if push is None else motion.velocity + sign * end.inertia.mass * push
-        bodies[_key(end)] = Motion(velocity, motion.spin + sign * end.inertia.moment * turn)
-    return bodies
+def _pushed(end: End, arm: Array, motion: Motion, push: Array | None, twist: Array | None) -> Motion:
+    """The motion after an impulse at an arm, and an angular one beside it."""
+    velocity = motion.velocity if push is None else motion.velocity + end.inertia.mass * push
+    return Motion(velocity, motion.spin + end.inertia.moment * _twist(arm, push, twist))
 
 
 def _twist(arm: Array, push: Array | None, twist: Array | None) -> Array:
@@ -119,28 +133,22 @@ def _twist(arm: Array, push: Array | None, twist: Array | None) -> Array:
     return dot(turned(arm), push) if twist is None else dot(turned(arm), push) + twist
 
 
-def _speed(held: Held, bodies: Bodies, still: dict[int, Motion]) -> tuple[Array, Array]:
+def _reaction(impulse: Array | None) -> Array | None:
+    return None if impulse is None else -impulse
+
+
+def _speed(held: Held, a: Motion, b: Motion) -> tuple[Array, Array]:
     """Velocity of b's anchor over a's, and spin of b over a."""
-    of = []
-    for end, arm in ((held.tied.a, held.arm_a), (held.tied.b, held.arm_b)):
-        motion = still[end.place] if end.group is None else bodies[_key(end)]
-        of.append((motion.velocity + motion.spin * turned(arm), motion.spin))
-    return of[1][0] - of[0][0], of[1][1] - of[0][1]
+    of_a, of_b = (m.velocity + m.spin * turned(arm) for m, arm in ((a, held.arm_a), (b, held.arm_b)))
+    return of_b - of_a, b.spin - a.spin
 
 
 def _k(held: Held, direction: Array) -> Array:
     """Speed along a direction that a unit impulse along it gives, 1/kg."""
     k = jnp.zeros_like(held.tied.rest)
     for end, arm in ((held.tied.a, held.arm_a), (held.tied.b, held.arm_b)):
-        if end.inertia is not None:
-            k = k + end.inertia.mass + end.inertia.moment * dot(turned(arm), direction) ** 2
+        k = k + end.inertia.mass + end.inertia.moment * dot(turned(arm), direction) ** 2
     return k
-
-
-def _k_turn(held: Held) -> Array:
-    return sum(
-        (e.inertia.moment for e in (held.tied.a, held.tied.b) if e.inertia is not None), jnp.zeros_like(held.angle)
-    )
 
 
 def _over(x: Array, usable: Array) -> Array:
@@ -154,18 +162,39 @@ def _along(apart: Array) -> tuple[Array, Array]:
     return jnp.where(squared > SHORTEST**2, apart / length, 0.0), jnp.where(squared > SHORTEST**2, length, 0.0)
 
 
-class _Book:
-    """The work that a joint's impulses do, as they are applied."""
+def _total(x: Array) -> Array:
+    """The sum over a round, [1, ...]."""
+    return jnp.sum(x, axis=-2, keepdims=True)
 
-    def __init__(self, held: Held, still: dict[int, Motion], bodies: Bodies) -> None:
-        self.held, self.still, self.bodies = held, still, bodies
+
+class _Book:
+    """Both bodies' motions while the impulses of a round are applied, and the work that these do, each [P, ...].
+
+    `one` is 1.0 in a way that the compiler cannot know: else a CPU computes each impulse again for all that come after
+    it, and takes minutes to compile two hinges.
+    """
+
+    def __init__(self, held: Held, motions: Motion, one: Array) -> None:
+        self.held, self.one = held, one
+        self.a, self.b = _at(motions, held.tied.a.lines), _at(motions, held.tied.b.lines)
         self.lost, self.driven = jnp.zeros_like(held.angle), jnp.zeros_like(held.angle)
 
+    @property
+    def speed(self) -> tuple[Array, Array]:
+        """Velocity of b's anchor over a's, and spin of b over a."""
+        return _speed(self.held, self.a, self.b)
+
     def apply(self, push: Array | None, twist: Array | None, motor: bool = False) -> None:
-        """Applies an impulse, and books what it does."""
-        before = _speed(self.held, self.bodies, self.still)
-        self.bodies = _apply(self.held, self.bodies, push, twist)
-        sums = [x + y for x, y in zip(before, _speed(self.held, self.bodies, self.still), strict=True)]
+        """Applies an impulse on b at its anchor, an angular one beside it, and their reactions on a; books their
+        work."""
+        held, before = self.held, self.speed
+        push, twist, before = settled((push, twist, before), self.one)
+        back = _reaction(push), _reaction(twist)
+        moved = (
+            _pushed(held.tied.a, held.arm_a, self.a, *back), _pushed(held.tied.b, held.arm_b, self.b, push, twist)
+        )  # fmt: skip
+        self.a, self.b = settled(moved, self.one)
+        sums = [x + y for x, y in zip(before, self.speed, strict=True)]
         parts = [dot(push, sums[0])] if push is not None else []
         parts += [twist * sums[1]] if twist is not None else []
         gained = 0.5 * sum(parts[1:], parts[0])
@@ -173,37 +202,36 @@ class _Book:
             self.driven = self.driven + gained
         else:
             self.lost = self.lost - gained
-        for end, sign in ((self.held.tied.a, -1), (self.held.tied.b, 1)):
-            if end.group is None:  # what moves as it likes does work where it is held
-                motion, arm = self.still[end.place], self.held.arm_a if sign < 0 else self.held.arm_b
+        for end, arm, motion, sign in ((held.tied.a, held.arm_a, self.a, -1), (held.tied.b, held.arm_b, self.b, 1)):
+            if end.fixed.any():  # what moves as it likes does work where it is held
                 work = motion.spin * _twist(arm, push, twist)
                 work = work if push is None else work + dot(motion.velocity, push)
-                self.driven = self.driven - sign * work
+                self.driven = self.driven - sign * jnp.where(end.fixed[:, None], work, 0.0)
 
 
 def warm(
-    ties: list[Tied], bodies: list[Any], fixed: dict[int, Any], motions: list[Motion], memory: list[tuple]
+    ties: list[Tied], bodies: list[Any], fixed: list[Any], motions: list[Motion], memory: list[tuple], one: Array
 ) -> tuple:
-    """Every joint as it stands, the motions with its last impulses, and the work done."""
+    """Every round as it stands, the motions with its last impulses, and the work done."""
     if not ties:
         return [], motions, []
-    places, now, still = _taken(bodies, ties), _taken(motions, ties), {i: b.motion for i, b in fixed.items()}
-    held, works = [], []
+    places = _table(*([(body.position, body.angle) for body in some] for some in (bodies, fixed)))
+    now, held, works = _table(motions, [body.motion for body in fixed]), [], []
     for tied, impulses in zip(ties, memory, strict=True):
-        a, b = (fixed[e.place] if e.group is None else places[_key(e)] for e in (tied.a, tied.b))
-        arm_a, arm_b = _turned(tied.a.anchor, a.angle), _turned(tied.b.anchor, b.angle)
-        apart = b.position + arm_b - a.position - arm_a
-        joint = Held(tied, arm_a, arm_b, apart, b.angle - a.angle - tied.rest, impulses)
-        book = _Book(joint, still, now)
+        (place_a, angle_a), (place_b, angle_b) = (_at(places, end.lines) for end in (tied.a, tied.b))
+        arm_a, arm_b = settled((_turned(tied.a.anchor, angle_a), _turned(tied.b.anchor, angle_b)), one)
+        apart = place_b + arm_b - place_a - arm_a
+        joint = Held(tied, arm_a, arm_b, apart, angle_b - angle_a - tied.rest, impulses)
+        book = _Book(joint, now, one)
         if tied.kind == "distance":
             book.apply(impulses[0] * _along(apart)[0], None)
         else:
             book.apply(jnp.stack(impulses[:2]), impulses[2] - impulses[3])
             book.apply(None, impulses[4], motor=True)
-        now = book.bodies
+        now = _with(now, joint, book.a, book.b)
         held.append(joint)
-        works.append(Work(book.lost, book.driven, None))
-    return held, _put(motions, now), works
+        works.append(Work(_total(book.lost), _total(book.driven), None))
+    return held, _groups(now, motions), works
 
 
 def solve(
@@ -211,38 +239,41 @@ def solve(
     motions: list[Motion],
     ways: list[Motion],
     falls: list[Array],
-    fixed: dict[int, Any],
+    fixed: list[Any],
     rules: Rules,
+    one: Array,
     biased: bool,
 ) -> tuple:
-    """Every joint after a pass, motions and ways (what a body goes beyond its velocity), and the work done."""
+    """Every round after a pass, motions and ways (what a body goes beyond its velocity), and the work done."""
     if not held:
         return [], motions, ways, []
-    ties, still = [h.tied for h in held], {i: b.motion for i, b in fixed.items()}
-    now, way, fall = _taken(motions, ties), _taken(ways, ties), _taken(falls, ties)
+    still = [body.motion for body in fixed]
+    goes = [jax.tree.map(lambda x: rules.step * x, motion) for motion in still]
+    now, way = _table(motions, still), _table(ways, goes)
+    fall = _table(falls, [jnp.zeros_like(motion.velocity) for motion in still])
     done, works = [], []
     for joint in held:
-        joint = joint if biased else _moved(joint, way, still, rules.step)
-        book = _Book(joint, still, now)
+        joint = joint if biased else _moved(joint, way, one)
+        book = _Book(joint, now, one)
         if joint.tied.kind == "distance":
             impulses, spring = _rod(joint, book, rules, biased), None
             if biased:
                 way, spring = _spring(joint, book, way, fall, rules.step)
-            works.append(Work(book.lost, book.driven, spring))
+            works.append(Work(_total(book.lost), _total(book.driven), spring))
         else:
             impulses = _hinge(joint, book, rules, biased)
-            works.append(Work(book.lost, book.driven, None))
+            works.append(Work(_total(book.lost), _total(book.driven), None))
         done.append(joint._replace(impulses=impulses))
-        now = book.bodies
-    return done, _put(motions, now), _put(ways, way), works
+        now = _with(now, joint, book.a, book.b)
+    return done, _groups(now, motions), _groups(way, ways), works
 
 
-def _moved(joint: Held, way: Bodies, still: dict[int, Motion], h: float) -> Held:
-    """The joint as it stands after the bodies have gone their ways."""
+def _moved(joint: Held, way: Motion, one: Array) -> Held:
+    """The joints as they stand after the bodies have gone their ways."""
     arms, apart = [], joint.apart
     for end, arm, sign in ((joint.tied.a, joint.arm_a, -1), (joint.tied.b, joint.arm_b, 1)):
-        gone = way[_key(end)] if end.group is not None else jax.tree.map(lambda x: h * x, still[end.place])
-        arms.append(_turned(arm, gone.spin))
+        gone = _at(way, end.lines)
+        arms.append(settled(_turned(arm, gone.spin), one))
         apart = apart + sign * (gone.velocity + arms[-1] - arm)
     return joint._replace(arm_a=arms[0], arm_b=arms[1], apart=apart)
 
@@ -254,8 +285,8 @@ def _curve(joint: Held, book: _Book, h: float) -> Array:
     energy, while the straight line at the start leaves the circle and loses (h spin)^2 of it in every step.
     """
     aside = jnp.zeros_like(joint.apart)
-    for end, arm, sign in ((joint.tied.a, joint.arm_a, -1), (joint.tied.b, joint.arm_b, 1)):
-        turn = h * (book.still[end.place].spin if end.group is None else book.bodies[_key(end)].spin)
+    for motion, arm, sign in ((book.a, joint.arm_a, -1), (book.b, joint.arm_b, 1)):
+        turn = h * motion.spin
         beyond = (jnp.sin(turn) - turn) * turned(arm) - 2 * jnp.sin(turn / 2) ** 2 * arm
         aside = aside + sign / h * beyond
     return aside
@@ -265,7 +296,7 @@ def _rod(joint: Held, book: _Book, rules: Rules, biased: bool) -> tuple[Array, .
     tied, (old,) = joint.tied, joint.impulses
     rate, mass_scale, impulse_scale = rules.softness(HERTZ, DAMPING_RATIO) if biased else (0.0, 1.0, 0.0)
     axis, length = _along(joint.apart)
-    velocity = _speed(joint, book.bodies, book.still)[0]
+    velocity = book.speed[0]
     speed = dot(axis, velocity)
     if biased:
         mean = velocity + _curve(joint, book, rules.step)
@@ -278,7 +309,7 @@ def _rod(joint: Held, book: _Book, rules: Rules, biased: bool) -> tuple[Array, .
     return (new,)
 
 
-def _spring(joint: Held, book: _Book, way: Bodies, fall: Bodies, h: float) -> tuple[Bodies, Array]:
+def _spring(joint: Held, book: _Book, way: Motion, fall: Array, h: float) -> tuple[Motion, Array]:
     """The ways with an impulse at half of the step, and the work that it took from the motion.
 
     What the spring holds of that is taken off when the books are closed.
@@ -287,34 +318,38 @@ def _spring(joint: Held, book: _Book, way: Bodies, fall: Bodies, h: float) -> tu
     soft = tied.there & jnp.isfinite(tied.stiffness)
     k, c = (jnp.where(soft, x, 0.0) for x in (tied.stiffness, tied.damping))
     axis, length = _along(joint.apart)
-    speed, inverse = dot(axis, _speed(joint, book.bodies, book.still)[0]), _k(joint, axis)
+    speed, inverse = dot(axis, book.speed[0]), _k(joint, axis)
     stretch = length - tied.rest + 0.5 * h * speed
     push = -h * (k * stretch + c * speed) / (1 + inverse * h * (0.25 * h * k + 0.5 * c)) * axis
     lost = book.lost
     book.apply(push, None)
-    ends = [(end, sign) for end, sign in ((tied.a, -1), (tied.b, 1)) if end.inertia is not None]
-    aside = sum((0.5 * h * sign * dot(fall[_key(end)], push) for end, sign in ends), jnp.zeros_like(push[0]))
+    ends = ((tied.a, joint.arm_a, -1), (tied.b, joint.arm_b, 1))
+    aside = sum((0.5 * h * sign * dot(_at(fall, end.lines), push) for end, _, sign in ends), jnp.zeros_like(push[0]))
     spent = book.lost - lost + aside
     book.lost = lost - aside  # what it changes in the fall is its own, not the contacts'
-    return _apply(joint, way, -0.5 * h * push, None), spent
+    gone = (_pushed(end, arm, _at(way, end.lines), -0.5 * h * sign * push, None) for end, arm, sign in ends)
+    return _with(way, joint, *gone), _total(spent)
 
 
-def springs_energy(ties: list[Tied], bodies: list[Any], fixed: dict[int, Any]) -> Array | float:
+def springs_energy(ties: list[Tied], bodies: list[Any], fixed: list[Any]) -> Array | float:
     """What all springs hold now, J [...]: k x^2 / 2 each."""
-    places, energy = _taken(bodies, ties), 0.0
-    for tied in (t for t in ties if t.kind == "distance"):
-        a, b = (fixed[e.place] if e.group is None else places[_key(e)] for e in (tied.a, tied.b))
-        length = _along(b.position + _turned(tied.b.anchor, b.angle) - a.position - _turned(tied.a.anchor, a.angle))[1]
-        soft = tied.there & jnp.isfinite(tied.stiffness)
-        energy = energy + (0.5 * jnp.where(soft, tied.stiffness, 0.0) * (length - tied.rest) ** 2)[0]
+    soft = [tied for tied in ties if tied.kind == "distance"]
+    if not soft:
+        return 0.0
+    places, energy = _table(*([(body.position, body.angle) for body in some] for some in (bodies, fixed))), 0.0
+    for tied in soft:
+        (place_a, angle_a), (place_b, angle_b) = (_at(places, end.lines) for end in (tied.a, tied.b))
+        length = _along(place_b + _turned(tied.b.anchor, angle_b) - place_a - _turned(tied.a.anchor, angle_a))[1]
+        stiffness = jnp.where(tied.there & jnp.isfinite(tied.stiffness), tied.stiffness, 0.0)
+        energy = energy + jnp.sum(0.5 * stiffness * (length - tied.rest) ** 2, axis=-2)
     return energy
 
 
 def _hinge(joint: Held, book: _Book, rules: Rules, biased: bool) -> tuple[Array, ...]:
     tied, (x, y, low, high, motor) = joint.tied, joint.impulses
     rate, mass_scale, impulse_scale = rules.softness(HERTZ, DAMPING_RATIO) if biased else (0.0, 1.0, 0.0)
-    turn_mass = _over(_k_turn(joint), tied.there)
-    spin = _speed(joint, book.bodies, book.still)[1]
+    turn_mass = _over(tied.a.inertia.moment + tied.b.inertia.moment, tied.there)
+    spin = book.speed[1]
     bound = rules.step * tied.motor_torque
     new_motor = jnp.clip(motor - turn_mass * (spin - tied.motor_speed), -bound, bound)
     book.apply(None, new_motor - motor, motor=True)
@@ -322,13 +357,13 @@ def _hinge(joint: Held, book: _Book, rules: Rules, biased: bool) -> tuple[Array,
     for old, sign, room in ((low, 1, joint.angle - tied.lower), (high, -1, tied.upper - joint.angle)):
         limited = jnp.isfinite(room)
         room = jnp.where(limited, room, 1.0)
-        speed = sign * _speed(joint, book.bodies, book.still)[1]
+        speed = sign * book.speed[1]
         bias = jnp.where(room > 0, room / rules.step, rate * room)
         scale, keep = jnp.where(room > 0, 1.0, mass_scale), jnp.where(room > 0, 0.0, impulse_scale)
         new = jnp.maximum(old - scale * turn_mass * (speed + bias) - keep * old, 0.0)
         news.append(jnp.where(limited, new, 0.0))
         book.apply(None, sign * (news[-1] - old))
-    velocity = _speed(joint, book.bodies, book.still)[0]
+    velocity = book.speed[0]
     if biased:
         velocity = velocity + rate * joint.apart + _curve(joint, book, rules.step)
     push = _point_push(joint, velocity)
@@ -342,9 +377,8 @@ def _point_push(joint: Held, velocity: Array) -> Array:
     """The impulse that takes away the anchors' relative velocity: the inverse of a symmetric matrix."""
     kxx = kxy = kyy = jnp.zeros_like(joint.angle)
     for end, (rx, ry) in ((joint.tied.a, joint.arm_a), (joint.tied.b, joint.arm_b)):
-        if end.inertia is not None:
-            m, i = end.inertia
-            kxx, kxy, kyy = kxx + m + i * ry * ry, kxy - i * rx * ry, kyy + m + i * rx * rx
+        m, i = end.inertia
+        kxx, kxy, kyy = kxx + m + i * ry * ry, kxy - i * rx * ry, kyy + m + i * rx * rx
     one_over = _over(kxx * kyy - kxy * kxy, joint.tied.there)
     x, y = velocity
     return -one_over * jnp.stack([kyy * x - kxy * y, kxx * y - kxy * x])

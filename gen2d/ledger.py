@@ -17,7 +17,7 @@ from gen2d.types import Array
 
 
 class Work(NamedTuple):
-    """What was done to a body since frame 0, J [N, ...], or by a joint, J [1, ...]. None: nothing can do such work."""
+    """What was done to a body since frame 0, J [N, ...], or by joints, J [1, ...]. None: nothing can do such work."""
 
     lost: Array  # in contacts and rigid joints
     driven: Array | None  # by forces, motors, and bodies that move as they like

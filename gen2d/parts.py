@@ -58,7 +58,7 @@ MATERIAL = {
     "color": "sRGB, [3] or [K, 3]; default grey",
     "kind": "DYNAMIC, STATIC or KINEMATIC, of all; segments are static by default, all else is dynamic",
     "layer": "of all, in the drawing order",
-    "collides": "whether others can touch them, of all that do not move by themselves; default True",
+    "collides": "whether anything meets them; of all, default True",
     "rolling_resistance": "torque over normal force and radius",
     "force": "N, [2] or [K, 2], constant",
     "torque": "N m, constant",
@@ -77,6 +77,14 @@ def capsules(position: Array, angle: Any, half_length: Any, radius: Any, present
     half, radius = (jnp.broadcast_to(x, position.shape[:1]).astype(jnp.float32) for x in (half_length, radius))
     mass, moment = stadium_mass(half, radius, material.get("density", 1.0)), stadium_moment(half, radius, jnp.ones(()))
     return _part("capsule", position, angle, present, material, mass, moment, radius=radius, half_length=half)
+
+
+def bars(a: Any, b: Any, radius: Any, present: Any = True, **material: Any) -> Part:
+    """Capsules whose ends have their centres at these points [K, 2] m and those."""
+    a, b = (jnp.asarray(x, jnp.float32) for x in (a, b))
+    way = b - a
+    angle, half = jnp.arctan2(way[:, 1], way[:, 0]), jnp.linalg.norm(way, axis=-1) / 2
+    return capsules((a + b) / 2, angle, half, radius, present, **material)
 
 
 def segments(a: Any, b: Any, present: Any = True, **material: Any) -> Part:
@@ -134,7 +142,6 @@ def _part(
     """`mass` is that of the density, `moment` that of one kilogram."""
     assert material.keys() <= MATERIAL.keys(), f"{material.keys() - MATERIAL.keys()} are not of {list(MATERIAL)}"
     count, kind = position.shape[0], material.get("kind", DYNAMIC)
-    assert kind != DYNAMIC or material.get("collides", True), "what moves by itself collides"
     present = jnp.broadcast_to(present, (count,))
     vertices = sizes["vertices"].shape[1] if "vertices" in sizes else 0
     run = Run(shape, count, kind, vertices, layer=material.get("layer"), collides=material.get("collides", True))
@@ -211,3 +218,14 @@ def joined(anchor_a: Any, anchor_b: Any, **numbers: Any) -> Joints:
         name: jnp.broadcast_to(jnp.asarray((usual | numbers)[name], jnp.float32), len(anchors[0])) for name in known
     }
     return Joints(*anchors, **values)
+
+
+def hinged(links: Part, tail: bool, **numbers: Any) -> Joints:
+    """The revolute joints of bars in a row: where each begins, in the middle of an object or at the end of the bar
+    before, and with a `tail` where the last ends, in the middle of another object, which is that joint's `a`."""
+    half = links.objects["half_length"]
+    ends, middle = jnp.stack([half, jnp.zeros_like(half)], -1), jnp.zeros((1, 2))
+    above, below = jnp.concatenate([middle, ends[:-1]]), -ends
+    if tail:
+        above, below = jnp.concatenate([above, middle]), jnp.concatenate([below, ends[-1:]])
+    return joined(above, below, **numbers)

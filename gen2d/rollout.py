@@ -32,6 +32,7 @@ SHARD_BYTES = 2**30  # of raw frames in a shard
 SHARD_VIDEOS = 1024  # at most, unless the config says otherwise
 LANES, ROWS = 512, 2**20  # videos simulated at once, and pairs that can meet in all of them; 300 bytes for each
 VIDEOS = PartitionSpec("videos")
+JOINTS = ("distance", "revolute")  # joints/kind is an index into this
 
 
 class Batch(NamedTuple):
@@ -82,6 +83,9 @@ class Rollout:
         video = self.config.video
         own = {"T": video.frames, "K": self.layout.slots, "H": video.height, "W": video.width}
         own |= {"C": self.keep.contacts} if self.keep.contacts else {}
+        own |= {"J": len(self.layout.joints)} if self.layout.joints else {}
+        corners = max(run.vertices for run in self.layout.runs)
+        own |= {"V": corners} if corners else {}
         own |= annotations.sizes(self.config.annotations, self.plan)
         return own | self.sampler.lengths
 
@@ -100,12 +104,24 @@ class Rollout:
         fields |= annotations.fields(self.config.annotations)
         fields["index"] = Field("int64", "n", "1", "the video's number in its split")
         fields["time"] = Field("float64", "T", "s", "of each frame; frame 0 is the initial state")
+        if self.layout.joints:
+            fields["joints/kind"] = Field("uint8", "J", "1", f"index into {', '.join(JOINTS)}")
+            fields |= {f"joints/{side}": Field("int16", "J", "object", f"slot of object {side}") for side in "ab"}
         fields["quality/rejected_draws"] = Field("int32", "n", "1", "places drawn again as they did not fit")
         fields |= {"quality/rejected_videos": quality.FIELD} if self.wanted else {}
         for name, axes, unit, meaning in CAMERA:
             fields[f"camera/{name}"] = Field("float32", axes, unit, meaning)
         fields |= sampling.fields(self.config)
         return dict(sorted(fields.items()))
+
+    @property
+    def constants(self) -> dict[str, np.ndarray]:
+        """The stored fields that are one for all videos."""
+        if not self.layout.joints:
+            return {"time": self.time}
+        ties = self.layout.joints
+        slots = {f"joints/{side}": np.array([getattr(tie, side) for tie in ties], np.int16) for side in "ab"}
+        return {"time": self.time, "joints/kind": np.array([JOINTS.index(tie.kind) for tie in ties], np.uint8), **slots}
 
     @property
     def time(self) -> np.ndarray:

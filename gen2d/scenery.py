@@ -20,7 +20,7 @@ from gen2d.solver import Fixed, Group, Scenery
 from gen2d.sparse import Kind, Post, Seat, Sparse, chunk_of
 from gen2d.sweeps import Setup
 from gen2d.tournament import matches, meetings, of_rows, sweep
-from gen2d.types import DYNAMIC, KINEMATIC, Array, Layout, Objects, Record, Run, Scene, State
+from gen2d.types import DYNAMIC, KINEMATIC, Array, Layout, Objects, Record, Run, Scene, State, Tie
 
 
 class Side(NamedTuple):
@@ -66,8 +66,8 @@ def moving(layout: Layout) -> list[tuple[Run, int]]:
 
 
 def standing(layout: Layout) -> list[tuple[Run, int]]:
-    """Every static and kinematic slot that others can touch, and the run that it is in."""
-    runs = [(run, first) for run, first in layout.spans if run.kind != DYNAMIC and run.collides]
+    """Every static and kinematic slot, and the run that it is in."""
+    runs = [(run, first) for run, first in layout.spans if run.kind != DYNAMIC]
     return [(run, first + i) for run, first in runs for i in range(run.count)]
 
 
@@ -81,7 +81,9 @@ def _group(objects: Objects, layout: Layout, run: Run, first: int) -> Group:
     mass, moment = (_inverse(x, x > 0) for x in inverse)
     rigid = {slot for tie in layout.joints for slot in (tie.a, tie.b)}
     jointed = jnp.asarray([float(first + i in rigid) for i in range(padded(run.count))], mass.dtype)[:, None]
-    return Group(form_of(some, run, slice(None)), inverse, mass, moment, jnp.broadcast_to(jointed, mass.shape))
+    return Group(
+        form_of(some, run, slice(None)), inverse, mass, moment, jnp.broadcast_to(jointed, mass.shape), run.collides
+    )
 
 
 def _fixed(objects: Objects, state: State, run: Run, slot: int) -> Fixed:
@@ -109,9 +111,13 @@ def _sides(objects: Objects, layout: Layout, groups: list[Group]) -> tuple[list[
 
 
 def _apart(a: Side, b: Side, layout: Layout) -> Array:
-    """Where two are not tied together by a joint, so that they collide."""
+    """Where two collide: where no joint ties them together, and neither is of a run that nothing touches."""
     tied = [tie for tie in layout.joints if not tie.collide]
     together = jnp.zeros(b.slot.shape, bool)
+    for run, first in layout.spans:
+        if not run.collides:
+            for slot in (a.slot, b.slot):
+                together = together | ((slot >= first) & (slot < first + run.count))
     for i, j in ((tie.a, tie.b) for tie in tied):
         together = together | ((a.slot == i) & (b.slot == j)) | ((a.slot == j) & (b.slot == i))
     return ~together
@@ -201,6 +207,7 @@ def _sparse(
 ) -> Sparse:
     ours, theirs = _sides(objects, layout, groups)
     sizes, firsts = [side.slot.shape[0] for side in ours], [first for _, first in moving(layout)]
+    solid, firm = ([run.collides for run, _ in of] for of in (moving(layout), standing(layout)))
     fixed_slots, ways, kinds = [slot for _, slot in standing(layout)], _ways(fixed), []
 
     def add(forms: tuple[Form, Form], of_a: np.ndarray, b: np.ndarray, **more: Any) -> None:
@@ -211,6 +218,8 @@ def _sparse(
         kinds.append(Kind(b=b, slots=slots, row=row, points=_points(*forms), **more))
 
     for m in matches(sizes, 0):
+        if not (solid[m.first] and solid[m.second]):
+            continue
         a, b = meetings(sizes[m.first], sizes[m.second], m)
         ring = ring_of(a, b) if m.first == m.second else None
         forms = groups[m.first].form, groups[m.second].form
@@ -222,7 +231,8 @@ def _sparse(
             of = fixed[i]
             return type(of.form), len(jax.tree.leaves(of.form)), of.motion is None, i in ways and _is_disc(form)
 
-        for alike, numbers in itertools.groupby(range(len(fixed)), key=like):
+        touching = [i for i in range(len(fixed)) if solid[g] and firm[i]]
+        for alike, numbers in itertools.groupby(touching, key=like):
             some = list(numbers)
             onward = {i: ways[i] if alike[-1] else (None, None) for i in some}
             posts = {i: Post(theirs[i], left, right, theirs[i].present) for i, (left, right) in onward.items()}
@@ -245,36 +255,34 @@ def _is_disc(form: Form) -> bool:
     return isinstance(form, DiscForm)
 
 
-def _end(slot: int, anchor: Array, layout: Layout, groups: list[Group]) -> joints.End:
-    for g, (run, first) in enumerate(moving(layout)):
-        if first <= slot < first + run.count:
-            inverse = slots_of(groups[g].inverse, slot - first, 1)
-            return joints.End(g, slot - first, inverse, anchor)
-    return joints.End(None, [s for _, s in standing(layout)].index(slot), None, anchor)
-
-
 def _ties(scene: Scene, layout: Layout, groups: list[Group]) -> list[joints.Tied]:
-    found, values = [], scene.joints
-    for j, tie in enumerate(layout.joints):
-        assert values is not None, "a layout with joints needs scene.joints"
-        of = slots_of(values, j, 1)
-        there = scene.objects.present[tie.a : tie.a + 1] & scene.objects.present[tie.b : tie.b + 1]
-        a, b = (_end(slot, x, layout, groups) for slot, x in ((tie.a, of.anchor_a), (tie.b, of.anchor_b)))
-        found.append(
-            joints.Tied(
-                tie.kind,
-                a,
-                b,
-                there,
-                of.rest,
-                of.stiffness,
-                of.damping,
-                of.lower,
-                of.upper,
-                of.motor_speed,
-                of.motor_torque,
-            )
+    """The joints in rounds. A body's line in the solver's table is its place among the groups, or behind them."""
+    if not layout.joints:
+        return []
+    values, nothing = scene.joints, jnp.zeros_like(scene.objects.mass[:1])
+    assert values is not None, "a layout with joints needs scene.joints"
+    sizes, still = [padded(run.count) for run, _ in moving(layout)], [slot for _, slot in standing(layout)]
+    lines = {slot: sum(sizes) + place for place, slot in enumerate(still)}
+    for g, (run, first) in enumerate(moving(layout)):
+        lines |= {first + i: sum(sizes[:g]) + i for i in range(run.count)}
+    unmoved = [Inertia(nothing, nothing)] * len(still)
+    inverse = jax.tree.map(lambda *x: jnp.concatenate(x, axis=-2), *(g.inverse for g in groups), *unmoved)
+
+    def end(slots: np.ndarray, anchor: Array) -> joints.End:
+        of = np.array([lines[int(slot)] for slot in slots])
+        return joints.End(of, of >= sum(sizes), jax.tree.map(lambda x: x[..., of, :], inverse), anchor)
+
+    found, named = [], [Tie(tie.kind, lines[tie.a], lines[tie.b]) for tie in layout.joints]
+    for numbers in joints.rounds(named, sum(sizes)):
+        ties, of = (
+            [layout.joints[j] for j in numbers],
+            jax.tree.map(lambda x, j=numbers: x[..., np.array(j), :], values),
         )
+        a, b = (np.array([getattr(tie, side) for tie in ties]) for side in "ab")
+        there = scene.objects.present[a] & scene.objects.present[b]
+        ends = end(a, of.anchor_a), end(b, of.anchor_b)
+        rest = (of.rest, of.stiffness, of.damping, of.lower, of.upper, of.motor_speed, of.motor_torque)
+        found.append(joints.Tied(ties[0].kind, *ends, there, *rest))
     return found
 
 
@@ -291,7 +299,9 @@ def scenery_of(
     at_rest = 2 * rules.step * jnp.sqrt(jnp.sum(scene.gravity**2, axis=0))
     setup = Setup(scene.gravity[:, None], jnp.maximum(rules.bounce_threshold, at_rest), one, contacts)
     made = (_sparse if sparse else _dense)(objects, layout, groups, fixed, setup, rules)
-    rails = [_rail(f, objects.present[s : s + 1]) for f, (_, s) in zip(fixed, standing(layout), strict=True)]
+    rails = [
+        _rail(f, objects.present[s : s + 1]) for f, (r, s) in zip(fixed, standing(layout), strict=True) if r.collides
+    ]
     return Scenery(
         groups, fixed, [r for r in rails if r is not None], scene.gravity, made, _ties(scene, layout, groups), forces
     )

@@ -110,7 +110,7 @@ def _books(bodies: list[Body], scenery: Scenery, rules: Rules) -> ledger.Ledger:
     groups = [work(b.angle) for b in bodies]
     if not scenery.ties:
         return ledger.Ledger(groups, None)
-    lost, put_in, damped = (jnp.zeros_like(scenery.ties[0].rest) for _ in range(3))
+    lost, put_in, damped = (jnp.zeros_like(scenery.ties[0].rest[..., :1, :]) for _ in range(3))
     return ledger.Ledger(groups, ledger.Work(lost, put_in, damped))
 
 
@@ -132,7 +132,7 @@ def _start(state: State, layout: Layout, scenery: Scenery, keep: Keep, rules: Ru
 def _sums(world: World, scenery: Scenery) -> tuple | None:
     if world.ledger is None:
         return None
-    fixed = {i: Body(*f.at(world.time), f.still) for i, f in enumerate(scenery.fixed)}
+    fixed = [Body(*f.at(world.time), f.still) for f in scenery.fixed]
     springs = joints.springs_energy(scenery.ties, world.bodies, fixed)
     springs = springs + jnp.zeros_like(scenery.gravity[0])
     now = ledger.balance(scenery.groups, world.bodies, scenery.gravity, springs)

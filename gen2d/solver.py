@@ -56,6 +56,7 @@ class Group(NamedTuple):
     mass: Array  # [N, ...] kg
     moment: Array  # [N, ...] kg m^2
     jointed: Array  # [N, ...] 1 where a rigid joint holds it
+    collides: bool = True  # whether they meet anything
 
 
 class Fixed(NamedTuple):
@@ -101,7 +102,7 @@ class World(NamedTuple):
     bodies: list[Body]
     time: Array  # s
     contacts: Any  # what the contacts hand on from step to step
-    ties: list[Any]  # of each joint: its impulses
+    ties: list[Any]  # of each round of joints: its impulses
     ledger: Ledger | None
 
 
@@ -165,9 +166,8 @@ def step(world: World, scenery: Scenery, rules: Rules) -> World:
     free = [_free(*of, rules) for of in zip(world.bodies, falls, turns, strict=True)]
     flying, more = settled([motion for motion, _ in free], one), [way for _, way in free]
     fixed = [Body(*body.at(world.time), body.still) for body in scenery.fixed]
-    known = dict(enumerate(fixed))
 
-    held, motions, tied = joints.warm(scenery.ties, world.bodies, known, flying, world.ties)
+    held, motions, tied = joints.warm(scenery.ties, world.bodies, fixed, flying, world.ties, one)
     shapes = [placed(g.form, b.position, b.angle) for g, b in zip(groups, world.bodies, strict=True)]
     walls = [(f.shape_at(b), f.motion) for f, b in zip(scenery.fixed, fixed, strict=True)]
     unlike = falls if spin_ups else [None] * len(groups)
@@ -178,15 +178,15 @@ def step(world: World, scenery: Scenery, rules: Rules) -> World:
     pushes = [_warmth(*of) for of in zip(motions, flying, groups, strict=True)]
 
     ways = [Motion(*(jnp.zeros_like(x) for x in m)) for m in motions]
-    held, motions, ways, tied_more = joints.solve(held, motions, ways, falls, known, rules, biased=True)
+    held, motions, ways, tied_more = joints.solve(held, motions, ways, falls, fixed, rules, one, biased=True)
     drifts = [Drift(way, push) for way, push in zip(ways, pushes, strict=True)]
     motions, drifts, works, rows = contacts.solve(past, found, walls, motions, drifts, works)
 
     ways = [_moved(*of, h) for of in zip(motions, drifts, more, strict=True)]
-    ways = kept_in(ways, shapes, scenery.rails)
+    ways = kept_in(ways, [s if g.collides else None for s, g in zip(shapes, groups, strict=True)], scenery.rails)
     places = [_arrived(b, way, one) for b, way in zip(world.bodies, ways, strict=True)]
 
-    held, motions, _, tied_last = joints.solve(held, motions, ways, falls, known, rules, biased=False)
+    held, motions, _, tied_last = joints.solve(held, motions, ways, falls, fixed, rules, one, biased=False)
     motions, works, past = contacts.relax(past, rows, walls, motions, drifts, works, world.time)
     if book is not None:
         olds = [body.motion for body in world.bodies]

@@ -163,7 +163,7 @@ class Run:
     vertices: int = 0  # of each polygon, at most
     rounded: bool = False  # whether polygons have a radius
     layer: int | None = None  # lower layers are drawn first; None: 0 for static objects, 1 for those that move
-    collides: bool = True  # False, of static or kinematic objects alone: they are drawn, and nothing touches them
+    collides: bool = True  # False: it is drawn, and joints may hold on to it, but it meets nothing
 
     @property
     def painted(self) -> int:

@@ -26,7 +26,7 @@ LEVELS = ("quick", "full", "regen")
 VIDEOS = 8  # made again, unless told otherwise
 
 # Of static bodies these are infinite; in every other field a value that is not finite is an error.
-INFINITE = ("objects/mass", "objects/moment")
+INFINITE = ("objects/mass", "objects/moment", "joints/stiffness", "joints/lower", "joints/upper")
 
 
 @dataclasses.dataclass(frozen=True)

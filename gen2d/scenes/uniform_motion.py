@@ -9,8 +9,8 @@ import math
 
 import jax.numpy as jnp
 
-from gen2d.config import option
-from gen2d.factors import Distribution
+from gen2d.distributions import Distribution
+from gen2d.options import option
 from gen2d.parts import Sampled, assembled, discs
 from gen2d.placement import beginning
 from gen2d.types import Array, Layout, Run

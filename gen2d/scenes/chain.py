@@ -1,0 +1,122 @@
+"""A chain that hangs between two pins, pulled tight by one of its joints and let go; or that swings from one pin.
+
+The links pass one another, and what they hang from, freely.
+"""
+
+import dataclasses
+import math
+
+import jax.numpy as jnp
+
+from gen2d.distributions import Distribution
+from gen2d.fields import Field
+from gen2d.options import option
+from gen2d.parts import Sampled, assembled, bars, discs, hinged
+from gen2d.types import STATIC, Array, Layout, Run, Tie
+
+DERIVED = {"kink": Field("float32", "n", "1", "joint that it is pulled by at the start, counted from the left pin")}
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """How the chain is made and hung, and what is drawn at random."""
+
+    links: int = option(12, int, "links", "of the chain", low=2, high=200)
+    ends: int = option(2, int, "pins", "that it hangs from", low=1, high=2)
+    length: Distribution = option([0.35, 0.5], float, "m", "of a link, joint to joint", low=1e-2, high=100, draw=True)
+    radius: Distribution = option([0.06, 0.1], float, "m", "of a link", low=1e-3, high=100, draw=True)
+    density: Distribution = option(1.0, float, "kg/m^2", "of the links", low=1e-6, high=1e6, draw=True)
+    span: Distribution = option(
+        [0.4, 0.85], float, "1", "between two pins, over the chain's length", low=0, high=1, draw=True
+    )
+    slope: Distribution = option([-0.3, 0.3], float, "rad", "of the line from the left pin to the right", draw=True)
+    held: Distribution = option(
+        [0.0, 1.0], float, "1", "which joint it is pulled by; 0: the first that is possible, 1: the last",
+        low=0, high=1, draw=True,
+    )  # fmt: skip
+    above: Distribution = option(
+        [0, 1], int, "1", "1: pulled to above the line between the pins, 0: to below", low=0, high=1, draw=True
+    )
+    angle: Distribution = option(
+        [-2.0, 2.0], float, "rad", "of a chain with one pin at the start, from hanging down", draw=True
+    )
+    friction: Distribution = option(0.0, float, "N m", "most torque of a joint's friction", low=0, draw=True)
+    gravity: tuple[Distribution, ...] = option([0, -9.8], float, "m/s^2", "x right, y up", parts=2, draw=True)
+    color: tuple[Distribution, ...] = option(
+        [[60, 254]] * 3, int, "sRGB", "of each link", parts=3, draw=True, low=0, high=255, each="links"
+    )
+
+
+def sizes(options: Options) -> dict[str, int]:
+    """How many links there are."""
+    return {"links": options.links}
+
+
+def check(options: Options) -> None:
+    """ValueError where there may be no joint that it can be pulled tight by."""
+    least = options.span.support[0]
+    if options.ends == 2 and not 2 / options.links <= least <= options.span.support[1] < 1:
+        raise ValueError(
+            f"span may be {least:g} to {options.span.support[1]:g}, but must be {2 / options.links:g} (2 over links) or "
+            "more, and below 1"
+        )
+
+
+def layout(options: Options) -> Layout:
+    """The pins, then the links, each hung from the one before."""
+    n, pins, radius = options.links, options.ends, options.radius.support[1]
+    ties = [Tie("revolute", pins + i - 1 if i else 0, pins + i) for i in range(n)]
+    ties += [Tie("revolute", 1, pins + n - 1)] if pins == 2 else []
+    runs = Run("circle", pins, STATIC, layer=2, collides=False), Run("capsule", n, collides=False)
+    length = options.length.support[1]
+    return Layout(runs, _bounds(options, n * length), length / 2 + radius, tuple(ties))
+
+
+def _bounds(options: Options, whole: float) -> tuple[float, float, float, float]:
+    """All that a chain of a length in m can reach, but for the upper part of what it hardly does."""
+    rim = 2 * options.radius.support[1]
+    if options.ends == 1:
+        turn = min(max(map(abs, options.angle.support)), math.pi)
+        return -whole - rim, -whole - rim, whole + rim, max(-math.cos(turn), 0.2) * whole + rim
+    # An ellipse with the pins as its foci.
+    depth = whole / 2 * math.sqrt(1 - options.span.support[0] ** 2)
+    tilt = whole / 2 * math.sin(min(max(map(abs, options.slope.support)), math.pi / 2))
+    top = depth if options.above.support[1] else 0.2 * depth
+    return -whole / 2 - rim, -depth - tilt - rim, whole / 2 + rim, top + tilt + rim
+
+
+def sample(key: Array, factors: dict[str, Array], options: Options) -> Sampled:
+    """One video's scene and start: the chain at rest, taut."""
+    n, radius = options.links, factors["radius"]
+    corners, kink = _straight(factors, n) if options.ends == 1 else _pulled(factors, n)
+    pins = discs(corners[:: n if options.ends == 2 else n + 1], 1.5 * radius, kind=STATIC, layer=2, collides=False)
+    material = {"density": factors["density"], "color": factors["color"], "collides": False}
+    links = bars(corners[:-1], corners[1:], radius, **material)
+    joints = hinged(links, options.ends == 2, motor_torque=factors["friction"])
+    scene, state = assembled(layout(options), [pins, links], factors["gravity"], joints)
+    return Sampled(scene, state, derived={"kink": kink})
+
+
+def _straight(factors: dict[str, Array], n: int) -> tuple[Array, Array]:
+    """The corners [n + 1, 2] in m of a straight chain from the pin at the origin, and its kink, at the pin."""
+    way = jnp.stack([jnp.sin(factors["angle"]), -jnp.cos(factors["angle"])])
+    return jnp.arange(n + 1.0)[:, None] * factors["length"] * way, jnp.zeros(())
+
+
+def _pulled(factors: dict[str, Array], n: int) -> tuple[Array, Array]:
+    """The corners [n + 1, 2] in m of a chain along two sides of a triangle, and the number of the joint between them.
+
+    The third side, from pin to pin, has its middle at the origin.
+    """
+    apart = factors["span"] * n  # all in lengths of a link
+    first, last = jnp.ceil((n - apart) / 2 + 1e-3), jnp.floor((n + apart) / 2 - 1e-3)
+    kink = first + jnp.minimum(jnp.floor(factors["held"] * (last - first + 1)), last - first)
+    along = (kink**2 - (n - kink) ** 2 + apart**2) / (2 * apart)
+    aside = jnp.sqrt(jnp.maximum(kink**2 - along**2, 0.0)) * (2 * factors["above"] - 1)
+    number, zero = jnp.arange(n + 1.0), jnp.zeros(())
+    one, tip, other = jnp.stack([zero, zero]), jnp.stack([along, aside]), jnp.stack([apart, zero])
+    up, down = (number / kink)[:, None], ((number - kink) / (n - kink))[:, None]
+    corners = jnp.where(number[:, None] <= kink, one + up * (tip - one), tip + down * (other - tip))
+    corners = corners - jnp.stack([apart / 2, zero])
+    cos, sin = jnp.cos(factors["slope"]), jnp.sin(factors["slope"])
+    return factors["length"] * corners @ jnp.stack([jnp.stack([cos, sin]), jnp.stack([-sin, cos])]), kink

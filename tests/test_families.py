@@ -1,0 +1,186 @@
+"""What every scene family keeps, over some hundred keys of its own config: the layout that it tells, no overlap at the
+start, factors within what they are declared to be, and scenes that depend on their keys alone.
+
+What moves begins inside the layout's bounds; a family where some of it comes from outside says `BEGINS_OUTSIDE = True`.
+"""
+
+import functools
+import itertools
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from gen2d import plugins, sampling
+from gen2d.config import Plugin, load_config
+from gen2d.contacts import Disc, Hull, Shape, touches
+from gen2d.forms import form_of, placed
+from gen2d.rollout import rules_of
+from gen2d.simulate import simulate, substeps
+from gen2d.types import DYNAMIC, SHAPES, Layout, Objects, Run, Scene, State, Trajectory, to_device, to_stored
+
+FAMILIES = plugins.names("scene")
+KEYS, LANES, FRAMES = 256, 4, 3
+OVERLAP, EDGE = 1e-4, 1e-3  # m
+
+
+class Made(NamedTuple):
+    """What a family makes of some keys; arrays have them first."""
+
+    factors: dict[str, Any]
+    scene: Scene
+    state: State
+    fits: Any
+    overlap: Any  # [n] m, the deepest
+    extent: Any  # [n, 4] m: left, bottom, right and top end of all that moves
+    trajectory: Trajectory  # of the first LANES
+
+
+@functools.cache
+def program(family: str) -> tuple[Plugin, Layout, Any]:
+    """A family's config, its layout, and the one program that a test of it compiles."""
+    config = load_config(f"{family}.yaml")
+    scene, video, physics = config.scene, config.video, config.physics
+    layout, steps = scene.module.layout(scene.options), substeps(video.fps, physics.substeps, physics.max_step)
+    rules = rules_of(physics, video.fps, steps)
+
+    def run(keys: jax.Array) -> Made:
+        factors, (things, state, _, fits, _) = jax.vmap(lambda key: sampling.sampled(key, scene))(keys)
+        on_device = to_device(things), to_device(state)
+        shapes = shapes_of(layout, on_device[0].objects, on_device[1])
+        few = (jax.tree.map(lambda x: x[..., :LANES], value) for value in on_device)
+        trajectory = to_stored(simulate(*few, layout, rules, FRAMES, steps, sparse=True))
+        present = on_device[0].objects.present
+        return Made(
+            factors, things, state, fits, overlap(layout, shapes, present), extent(layout, shapes, present), trajectory
+        )
+
+    return scene, layout, jax.jit(run)
+
+
+@functools.cache
+def made(family: str) -> Made:
+    """What a family makes of KEYS keys."""
+    return jax.tree.map(np.asarray, program(family)[2](jax.random.split(jax.random.key(0), KEYS)))
+
+
+def shapes_of(layout: Layout, objects: Objects, state: State) -> list[Any]:
+    """The shape of each run at the start: from numbers of its slots."""
+
+    def of(run: Run, first: int) -> Any:
+        def some(numbers: np.ndarray) -> Shape:
+            slots = first + numbers
+            form = form_of(objects, run, jnp.asarray(slots))
+            return placed(form, state.position[:, slots], state.angle[slots])
+
+        return some
+
+    return [of(run, first) for run, first in layout.spans]
+
+
+def overlap(layout: Layout, shapes: list[Any], present: jax.Array) -> jax.Array:
+    """The deepest overlap [n] in m of two that collide."""
+    tied = {frozenset((tie.a, tie.b)) for tie in layout.joints if not tie.collide}
+    deepest = jnp.full(present.shape[1:], -jnp.inf)
+    spans = zip(layout.spans, shapes, strict=True)
+    for ((a, first), of_a), ((b, second), of_b) in itertools.combinations_with_replacement(spans, 2):
+        if not (a.collides and b.collides) or DYNAMIC not in (a.kind, b.kind):
+            continue
+        pairs = [(i, j) for i in range(a.count) for j in range(b.count) if first + i < second + j]
+        pairs = [pair for pair in pairs if frozenset((first + pair[0], second + pair[1])) not in tied]
+        if not pairs:
+            continue
+        i, j = np.array(pairs).T
+        gaps = jnp.stack([point.gap for point in touches(of_a(i), of_b(j))]).min(0)
+        both = present[first + i] & present[second + j]
+        deepest = jnp.maximum(deepest, jnp.where(both, -gaps, -jnp.inf).max(0))
+    return deepest
+
+
+def extent(layout: Layout, shapes: list[Any], present: jax.Array) -> jax.Array:
+    """The ends [n, 4] of all that moves, in m."""
+    lows, highs = [], []
+    for (run, first), of in zip(layout.spans, shapes, strict=True):
+        if run.kind != DYNAMIC:
+            continue
+        shape, there = of(np.arange(run.count)), present[first : first + run.count]
+        low, high = ends(shape)
+        lows.append(jnp.where(there, low, jnp.inf).min(1))
+        highs.append(jnp.where(there, high, -jnp.inf).max(1))
+    low, high = (choose(jnp.stack(x), axis=0) for choose, x in ((jnp.min, lows), (jnp.max, highs)))
+    return jnp.concatenate([low, high]).T
+
+
+def ends(shape: Shape) -> tuple[jax.Array, jax.Array]:
+    """The lower left and upper right ends [2, K, n] of shapes."""
+    if isinstance(shape, Hull):
+        corners = jnp.stack(shape.vertices)
+        return corners.min(0) - shape.radius, corners.max(0) + shape.radius
+    half = jnp.zeros_like(shape.centre) if isinstance(shape, Disc) else jnp.abs(shape.direction) * shape.half_length
+    return shape.centre - half - shape.radius, shape.centre + half + shape.radius
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_slots_hold_what_the_layout_tells(family):
+    (_, layout, _), objects = program(family), made(family).scene.objects
+    assert layout.slots <= 254
+    for run, first in layout.spans:
+        here = slice(first, first + run.count)
+        there = objects.present[:, here]
+        assert (objects.kind[:, here][there] == run.kind).all()
+        assert (objects.shape[:, here][there] == SHAPES.index(run.shape)).all()
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_everything_finds_a_place_without_overlap(family):
+    found = made(family)
+    assert found.fits.all()
+    assert np.isfinite(found.state.position).all()
+    assert found.overlap.max() <= OVERLAP
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_what_moves_begins_in_view(family):
+    scene, layout, _ = program(family)
+    if getattr(scene.module, "BEGINS_OUTSIDE", False):
+        return
+    left, bottom, right, top = made(family).extent.T
+    bounds = layout.bounds
+    assert min(left.min() - bounds[0], bottom.min() - bounds[1]) > -EDGE
+    assert min(bounds[2] - right.max(), bounds[3] - top.max()) > -EDGE
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_factors_are_what_they_are_declared_to_be(family):
+    scene, found = program(family)[0], made(family).factors
+    for name, spec in sampling.options_of(scene.module).items():
+        source, values = getattr(scene.options, name), found[name]
+        parts = source if spec.parts else [source]
+        values = values if spec.parts else values[..., None]
+        there = np.ones(values.shape[:-1], bool)
+        if spec.each in found:
+            there = np.arange(values.shape[1]) < found[spec.each][:, None]
+        assert (values[~there] == 0).all(), name
+        for part, drawn in zip(parts, np.moveaxis(values, -1, 0), strict=True):
+            low, high = np.float32(part.support)
+            assert ((drawn[there] >= low) & (drawn[there] <= high)).all(), name
+    for name in getattr(scene.module, "DERIVED", {}):
+        assert np.isfinite(found[name]).all(), name
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_a_key_is_a_scene(family):
+    found = made(family)
+    again = program(family)[2](jax.random.split(jax.random.key(0), KEYS))
+    for one, other in zip(jax.tree.leaves(found), jax.tree.leaves(again), strict=True):
+        np.testing.assert_array_equal(one, other)
+    rows = [np.asarray(x, np.float32).reshape(KEYS, -1) for x in (found.state.position, *found.factors.values())]
+    assert len(np.unique(np.concatenate(rows, axis=1), axis=0)) == KEYS
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_the_first_frames_are_numbers(family):
+    trajectory = made(family).trajectory
+    assert all(np.isfinite(x).all() for x in jax.tree.leaves(trajectory))
