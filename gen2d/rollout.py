@@ -193,7 +193,7 @@ class Rollout:
 
     def _scene(self, key: Array) -> Scene:
         """A scene of a video, for its shape."""
-        return self.sampler.sampled(key, jnp.int32(0), jnp.zeros(len(self.sampler.gridded)))[1].scene
+        return self.sampler.sampled(key, given=jnp.zeros(len(self.sampler.gridded)))[1].scene
 
     def host_columns(self, batch: Batch) -> list[dict[str, np.ndarray]]:
         """For each device its columns as NumPy arrays; waits until they are there."""

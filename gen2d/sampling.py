@@ -75,15 +75,18 @@ class Sampler:
             found[np.ix_(own, [self.gridded.index(name) for name in names])] = chosen
         return found
 
-    def sampled(self, key: Array, row: Array, given: Array) -> tuple[Factors, Sampled]:
-        """A video's factors, those that follow from others included, and its scene and start."""
+    def sampled(self, key: Array, row: Any = 0, given: Any = ()) -> tuple[Factors, Sampled]:
+        """A video's factors, those that follow from others included, and its scene and start.
+
+        `row` is that of the split, `given` [G] what `combination` says of the video.
+        """
         draw_key, place_key = jax.random.split(key)
         drawn = self.drawn(draw_key, row, given)
         made: Any = self.scene.module.sample(place_key, drawn, self.scene.options)
         rejected, fits = jnp.asarray(made.rejected, jnp.int32), jnp.asarray(made.fits, bool)
         return {**drawn, **made.derived}, made._replace(rejected=rejected, fits=fits, derived={})
 
-    def drawn(self, key: Array, row: Array, given: Array) -> Factors:
+    def drawn(self, key: Array, row: Any = 0, given: Any = ()) -> Factors:
         """A video's factors by name; zero for what is beyond the number there is.
 
         Each has a key of its own name, so that its draws do not depend on which others there are.
@@ -105,9 +108,7 @@ class Sampler:
     def _coordinates(self, name: str) -> list[str]:
         return list(coordinates(name, getattr(self.scene.options, name)))
 
-    def _coordinate(
-        self, key: Array, name: str, shape: tuple[int, ...], which: Array, row: Array, given: Array
-    ) -> Array:
+    def _coordinate(self, key: Array, name: str, shape: tuple[int, ...], which: Array, row: Any, given: Any) -> Array:
         """One coordinate's draws, from the distribution that its product has."""
         own = [product.parts[name] for product in self.products]
         distinct = list(dict.fromkeys(own))
@@ -122,7 +123,7 @@ class Sampler:
         here = jnp.asarray([name in names for names, _ in self.combinations])[row]
         return jnp.where(here, given[self.gridded.index(name)].astype(values.dtype), values)
 
-    def _components(self, key: Array, row: Array) -> dict[str, Array]:
+    def _components(self, key: Array, row: Any) -> dict[str, Array]:
         """By axis ("" is the video) the number of the product that is drawn from, of all splits' one after the other.
 
         A law whose products differ in numbers of one axis alone, such as each ball's, is drawn from for each of these.

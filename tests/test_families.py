@@ -13,11 +13,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gen2d import plugins, sampling
-from gen2d.config import Plugin, load_config
+from gen2d import cuts, plugins
+from gen2d.config import load_config
 from gen2d.contacts import Disc, Hull, Shape, touches
+from gen2d.distributions import Distribution, Span, after
 from gen2d.forms import form_of, placed
+from gen2d.options import Plugin, drawn_options
 from gen2d.rollout import rules_of
+from gen2d.sampling import Sampler
 from gen2d.simulate import simulate, substeps
 from gen2d.types import DYNAMIC, SHAPES, Layout, Objects, Run, Scene, State, Trajectory, to_device, to_stored
 
@@ -47,7 +50,7 @@ def program(family: str) -> tuple[Plugin, Layout, Any]:
     rules = rules_of(physics, video.fps, steps)
 
     def run(keys: jax.Array) -> Made:
-        factors, (things, state, _, fits, _) = jax.vmap(lambda key: sampling.sampled(key, scene))(keys)
+        factors, (things, state, _, fits, _) = jax.vmap(Sampler(config).sampled)(keys)
         on_device = to_device(things), to_device(state)
         shapes = shapes_of(layout, on_device[0].objects, on_device[1])
         few = (jax.tree.map(lambda x: x[..., :LANES], value) for value in on_device)
@@ -152,10 +155,17 @@ def test_what_moves_begins_in_view(family):
     assert min(bounds[2] - right.max(), bounds[3] - top.max()) > -EDGE
 
 
+def distance(source: Distribution, values: np.ndarray) -> float:
+    """The largest difference of the share of draws up to a number and of its probability."""
+    x, counts = np.unique(values, return_counts=True)
+    expected = [cuts.total(cuts.inside(source, [Span(-np.inf, after(value))])) for value in x]
+    return float(np.abs(np.cumsum(counts) / len(values) - expected).max())
+
+
 @pytest.mark.parametrize("family", FAMILIES)
 def test_factors_are_what_they_are_declared_to_be(family):
     scene, found = program(family)[0], made(family).factors
-    for name, spec in sampling.options_of(scene.module).items():
+    for name, spec in drawn_options(scene.module).items():
         source, values = getattr(scene.options, name), found[name]
         parts = source if spec.parts else [source]
         values = values if spec.parts else values[..., None]
@@ -164,8 +174,8 @@ def test_factors_are_what_they_are_declared_to_be(family):
             there = np.arange(values.shape[1]) < found[spec.each][:, None]
         assert (values[~there] == 0).all(), name
         for part, drawn in zip(parts, np.moveaxis(values, -1, 0), strict=True):
-            low, high = np.float32(part.support)
-            assert ((drawn[there] >= low) & (drawn[there] <= high)).all(), name
+            assert part.contains(drawn[there]).all(), name
+            assert distance(part, drawn[there]) < 1.95 / np.sqrt(there.sum()), name  # Kolmogorov-Smirnov, p = .001
     for name in getattr(scene.module, "DERIVED", {}):
         assert np.isfinite(found[name]).all(), name
 

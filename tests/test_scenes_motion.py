@@ -16,11 +16,11 @@ from numpy.testing import assert_array_equal
 from tiny import everything
 
 import gen2d
-from gen2d import sampling
 from gen2d.config import Config, load_config
 from gen2d.errors import ConfigError
 from gen2d.generation import generate
 from gen2d.rollout import keep_of, rules_of
+from gen2d.sampling import Sampler
 from gen2d.simulate import simulate, substeps
 from gen2d.types import to_device, to_stored
 
@@ -44,9 +44,11 @@ class Played(NamedTuple):
 def begun(config: Config, n: int, given: dict[str, Any] | None = None) -> Played:
     """The starts of n videos, with the given factors [n, ...] in place of those drawn."""
 
+    sampler = Sampler(config)
+
     def made(key: jax.Array, given: dict) -> tuple:
         draw_key, place_key = jax.random.split(key)
-        drawn = sampling.drawn(draw_key, config.scene) | given
+        drawn = sampler.drawn(draw_key) | given
         found = config.scene.module.sample(place_key, drawn, config.scene.options)
         return drawn | found.derived, found.scene, found.state
 
@@ -66,7 +68,7 @@ def played(config: Config, n: int, given: dict[str, Any] | None = None) -> Playe
         keep = keep_of(config, layout)
         return to_stored(simulate(*device, layout, rules, config.video.frames, steps, keep, sparse=True))
 
-    kinds = jax.eval_shape(lambda: sampling.sampled(jax.random.key(0), config.scene)[1])
+    kinds = jax.eval_shape(lambda: Sampler(config).sampled(jax.random.key(0))[1])
     scene = jax.tree.map(lambda x, like: jnp.asarray(x, like.dtype), start.scene, kinds.scene)
     state = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), start.start)
     made = jax.tree.map(lambda x: np.asarray(x, np.float64), jax.jit(run)(scene, state))
