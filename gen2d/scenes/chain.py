@@ -57,8 +57,8 @@ def check(options: Options) -> None:
     least = options.span.support[0]
     if options.ends == 2 and not 2 / options.links <= least <= options.span.support[1] < 1:
         raise ValueError(
-            f"span may be {least:g} to {options.span.support[1]:g}, but must be {2 / options.links:g} (2 over links) or "
-            "more, and below 1"
+            f"span may be {least:g} to {options.span.support[1]:g}, but must be {2 / options.links:g} (2 over links) "
+            "or more, and below 1"
         )
 
 
