@@ -66,10 +66,12 @@ def generating() -> Parser:
     parser.add_argument(
         "--config", required=True, metavar="YAML", help="a file, or the name of one that comes with gen2d"
     )
-    parser.add_argument("--n", required=True, type=int, metavar="N", help="how many videos the dataset is to hold")
+    parser.add_argument("--n", required=True, type=int, metavar="N", help="how many videos a split is to hold")
     parser.add_argument("--out", metavar="DIR", help="a folder or URL (default: datasets/NAME in the current folder)")
     parser.add_argument("--seed", type=int, metavar="S", help="0 to 2**63 - 1 (default: the config's, else 0)")
-    parser.add_argument("--split", default="train", metavar="NAME", help="the split that the videos belong to (train)")
+    parser.add_argument(
+        "--split", metavar="NAME", help="the only split to make (default: train, or each that the config has)"
+    )
     parser.add_argument(
         "--set",
         action="append",

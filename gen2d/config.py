@@ -9,63 +9,20 @@ import json
 import pathlib
 import re
 from collections.abc import Mapping, Sequence
-from types import ModuleType
 from typing import Any
 
 import yaml
 
-from gen2d import plugins
+from gen2d import plugins, quality
 from gen2d.codecs import CODECS
+from gen2d.distributions import Distribution
 from gen2d.errors import ConfigError
-from gen2d.factors import Distribution, is_number, parse
+from gen2d.laws import Law
+from gen2d.options import NO_COPIES, Copies, Plugin, build, coordinates, option, plain_of, plugin_of
+from gen2d.splits import CHANGES, Split, laws_of, with_splits
 
 MAX_SEED = 2**63 - 1
 MAX_SLOTS = 254  # a slot's mask id is one byte, 0 is the background
-
-
-@dataclasses.dataclass(frozen=True)
-class Option:
-    """What an option may be. `parts` > 0: a list of so many values. `draw`: a distribution, else a single value; of a
-    scene family a factor, `each` names what every one has a draw of its own for."""
-
-    kind: type  # int, float, str or bool
-    unit: str
-    meaning: str
-    low: float | None = None
-    high: float | None = None
-    above: float | None = None
-    choices: tuple[str, ...] = ()
-    draw: bool = False
-    parts: int = 0
-    each: str = ""
-    optional: bool = False  # may be null: decided by the program
-
-    @property
-    def allowed(self) -> str:
-        """What the option may be, for a sentence."""
-        if self.choices:
-            return "one of " + ", ".join(self.choices)
-        if self.kind is bool:
-            return "true or false"
-        noun = {int: "whole number", float: "number", str: "text"}[self.kind]
-        ends = [
-            f"above {self.above:g}" if self.above is not None else "",
-            f"{self.low:g} or more" if self.low is not None else "",
-        ]
-        ends.append(f"{self.high:g} or less" if self.high is not None else "")
-        limits = " and ".join(end for end in ends if end)
-        text = f"a {noun}" if not self.parts else f"a list of {self.parts} {noun}s"
-        return text + (f", {limits}" if limits else "") + (" (or null)" if self.optional else "")
-
-
-def option(default: Any, kind: type, unit: str, meaning: str, **limits: Any) -> Any:
-    """A dataclass field that is an option; a drawn one's default is written as in a config."""
-    spec = Option(kind, unit, meaning, **limits)
-    if spec.draw:
-        default = [parse(v, kind is int) for v in default] if spec.parts else parse(default, kind is int)
-    if isinstance(default, list):
-        default = tuple(default)
-    return dataclasses.field(default=default, metadata={"option": spec})
 
 
 @dataclasses.dataclass(frozen=True)
@@ -170,6 +127,25 @@ class AnnotationOptions:
 
 
 @dataclasses.dataclass(frozen=True)
+class QualityOptions:
+    """Which videos are kept: those within these ranges, others are made instead (null: any)."""
+
+    contacts_least: int | None = option(None, int, "contacts", "that begin in a video", low=0, optional=True)
+    contacts_most: int | None = option(None, int, "contacts", "that begin in a video", low=0, optional=True)
+    penetration_least: float | None = option(None, float, "m", "of a video's deepest overlap", low=0, optional=True)
+    penetration_most: float | None = option(None, float, "m", "of a video's deepest overlap", low=0, optional=True)
+    growth_least: float | None = option(
+        None, float, "1/s", "of a small change; needs annotations.predictability", optional=True
+    )
+    growth_most: float | None = option(
+        None, float, "1/s", "of a small change; needs annotations.predictability", optional=True
+    )
+    residual_least: float | None = option(None, float, "J", "of energy; needs annotations.energy", low=0, optional=True)
+    residual_most: float | None = option(None, float, "J", "of energy; needs annotations.energy", low=0, optional=True)
+    attempts: int = option(1000, int, "attempts", "at a video, at most", low=1, high=1_000_000)
+
+
+@dataclasses.dataclass(frozen=True)
 class StorageOptions:
     """How videos lie on disk."""
 
@@ -213,21 +189,6 @@ class StorageOptions:
 
 
 @dataclasses.dataclass(frozen=True)
-class Plugin:
-    """A named plug-in and its options."""
-
-    name: str
-    module: ModuleType
-    options: Any
-    sha256: str | None = None  # of a file of the user's own, which may change
-
-    def plain(self) -> dict[str, Any]:
-        """The plug-in as YAML and JSON hold it."""
-        own = {"sha256": self.sha256} if self.sha256 else {}
-        return {"name": self.name, **own, **_plain(self.options)}
-
-
-@dataclasses.dataclass(frozen=True)
 class Config:
     """Everything that decides what a dataset holds, but for its number of videos."""
 
@@ -240,21 +201,60 @@ class Config:
     image: ImageOptions
     look: Plugin
     annotations: AnnotationOptions
+    quality: QualityOptions
     storage: StorageOptions
+    splits: tuple[Split, ...] = ()
 
     def plain(self) -> dict[str, Any]:
         """The config as YAML and JSON hold it, every default filled in."""
-        sections = {s: _plain(getattr(self, s)) for s in SECTIONS}
+        sections = {s: plain_of(getattr(self, s)) for s in SECTIONS}
         plugs = {p: getattr(self, p).plain() for p in PLUGINS}
-        return {"name": self.name, "seed": self.seed, **sections, **plugs}
+        splits = {"splits": {split.name: split.plain() for split in self.splits}} if self.splits else {}
+        return {"name": self.name, "seed": self.seed, **sections, **plugs, **splits}
 
     def text(self) -> str:
         """The resolved config as YAML; read again it gives the same config."""
         return yaml.safe_dump(self.plain(), sort_keys=False)
 
+    @property
+    def copies(self) -> Copies:
+        """What the files of the user's own hold, by their names in the config."""
+        return {plugin.name: plugin.content for plugin in (self.scene, self.look) if plugin.sha256}
+
     def recipe(self) -> dict[str, Any]:
-        """The config without its seed, which a dataset keeps and compares by itself."""
-        return {key: value for key, value in self.plain().items() if key != "seed"}
+        """The config without its seed, which a dataset keeps and compares by itself, and without numbers of videos."""
+        plain = {key: value for key, value in self.plain().items() if key != "seed"}
+        for split in plain.get("splits", {}).values():
+            split.pop("videos", None)
+        return plain
+
+    @property
+    def training(self) -> Split | None:
+        """The split that the others are compared with: `train`, or else the first; None where there are none."""
+        return next((split for split in self.splits if split.name == "train"), next(iter(self.splits), None))
+
+    def row(self, split: str) -> int:
+        """The place of a split's law among the config's; any split has the only one where the config has none."""
+        names = [own.name for own in self.splits]
+        if names and split not in names:
+            raise ConfigError(f"--split is {split!r}, but must be one of the config's: {', '.join(names)}")
+        return names.index(split) if names else 0
+
+    @property
+    def laws(self) -> list[Law]:
+        """The laws of the splits in order, or that of the scene alone."""
+        return laws_of(self.scene, self.splits)
+
+    def of_split(self, name: str) -> "Config":
+        """The config as it is for a split, with the look or the physics that this one has of its own."""
+        if not self.splits:
+            return self
+        changes = self.splits[self.row(name)].plain()
+        plain, own = self.plain(), {}
+        for name in CHANGES:
+            if name in changes:
+                own[name] = _section(name, _merged(plain[name], changes[name]), "config", self.copies)
+        return dataclasses.replace(self, **own)
 
     def sha256(self) -> str:
         """A hash of the recipe."""
@@ -267,18 +267,18 @@ SECTIONS = {
     "camera": CameraOptions,
     "image": ImageOptions,
     "annotations": AnnotationOptions,
+    "quality": QualityOptions,
     "storage": StorageOptions,
 }
 PLUGINS = {"scene": "bouncing", "look": "flat"}
 
 
-def _plain(options: Any) -> dict[str, Any]:
-    def value(v: Any) -> Any:
-        if isinstance(v, tuple):
-            return [value(x) for x in v]
-        return v.plain() if isinstance(v, Distribution) else v
-
-    return {f.name: value(getattr(options, f.name)) for f in dataclasses.fields(options)}
+def _merged(own: Mapping[str, Any], other: Any) -> Any:
+    """A section with other options; another plug-in has its defaults."""
+    other = {"name": other} if isinstance(other, str) else other
+    if not isinstance(other, Mapping):
+        return other  # reading it says what is wrong
+    return dict(other) if other.get("name", own.get("name")) != own.get("name") else {**own, **other}
 
 
 # Reading ------------------------------------------------------------------------------------------------------------
@@ -319,81 +319,6 @@ def parse_yaml(text: str, source: str) -> Any:
         raise ConfigError(f"{source}: not valid YAML: {error}") from None
 
 
-def _check(spec: Option, low: float, high: float) -> bool:
-    return (
-        (spec.low is None or low >= spec.low)
-        and (spec.above is None or low > spec.above)
-        and (spec.high is None or high <= spec.high)
-    )
-
-
-def _single(spec: Option, value: Any) -> Any:
-    """A checked value, or ValueError with what is allowed."""
-    if spec.draw:
-        distribution = parse(value, spec.kind is int)
-        if not _check(spec, *distribution.support):
-            raise ValueError(spec.allowed + (" for every value drawn" if distribution.kind != "constant" else ""))
-        return distribution
-    if spec.kind is str:
-        if not isinstance(value, str) or (spec.choices and value not in spec.choices):
-            raise ValueError(spec.allowed)
-        return value
-    if spec.kind is bool and isinstance(value, bool):
-        return value
-    if not is_number(value) or spec.kind is bool:
-        raise ValueError(spec.allowed)
-    if (spec.kind is int and not float(value).is_integer()) or not _check(spec, value, value):
-        raise ValueError(spec.allowed)
-    return spec.kind(value)
-
-
-def _value(spec: Option, value: Any) -> Any:
-    if value is None and spec.optional:
-        return None
-    if not spec.parts:
-        return _single(spec, value)
-    if not isinstance(value, list | tuple) or len(value) != spec.parts:
-        raise ValueError(spec.allowed)
-    return tuple(_single(spec, part) for part in value)
-
-
-def build(cls: type, values: Any, where: str, source: str) -> Any:
-    """An options dataclass from a mapping; `where` is the path of the mapping in the config."""
-    if not isinstance(values, Mapping):
-        raise ConfigError(f"{source}: {where} is {values!r}, but must be a mapping of options")
-    known = {f.name: f.metadata["option"] for f in dataclasses.fields(cls)}
-    filled = {}
-    for key, value in values.items():
-        if key not in known:
-            raise ConfigError(f"{source}: {where}.{key} is not an option; {plugins.nearest(key, list(known))}")
-        try:
-            filled[key] = _value(known[key], value)
-        except ValueError as error:
-            raise ConfigError(f"{source}: {where}.{key} is {value!r}, but must be {error}") from None
-    return cls(**filled)
-
-
-def _plugin(kind: str, values: Any, default: str, source: str) -> Plugin:
-    """A plug-in with its options; its bare name is enough."""
-    values = {"name": values} if isinstance(values, str) else {} if values is None else values
-    if not isinstance(values, Mapping):
-        raise ConfigError(f"{source}: {kind} is {values!r}, but must be a name, or a mapping with a name and options")
-    name = values.get("name", default)
-    if not isinstance(name, str):
-        raise ConfigError(f"{source}: {kind}.name is {name!r}, but must be one of {', '.join(plugins.names(kind))}")
-    module = plugins.load(kind, name, source)
-    sha256 = plugins.sha256(name)
-    if values.get("sha256", sha256) != sha256:
-        raise ConfigError(f"{source}: {kind}.sha256 is of another version of {name}")
-    options = build(module.Options, {k: v for k, v in values.items() if k not in ("name", "sha256")}, kind, source)
-    if hasattr(module, "check"):
-        try:
-            module.check(options)
-        except ValueError as error:
-            raise ConfigError(f"{source}: {kind}.{error}") from None
-    return Plugin(name, module, options, sha256)
-
-
 def _overridden(values: dict, sets: Sequence[str]) -> dict:
     """The mapping with each `a.b=value` put in its place."""
     for text in sets:
@@ -419,11 +344,18 @@ def checked_seed(value: Any, what: str = "--seed") -> int:
     return value
 
 
-def from_mapping(values: Any, source: str, name: str = "dataset") -> Config:
+def _section(name: str, values: Any, source: str, copies: Copies) -> Any:
+    """The options of a section, or a plug-in."""
+    if name in PLUGINS:
+        return plugin_of(name, values, PLUGINS[name], source, copies)
+    return build(SECTIONS[name], {} if values is None else values, name, source)
+
+
+def from_mapping(values: Any, source: str, name: str = "dataset", copies: Copies = NO_COPIES) -> Config:
     """The config that a mapping stands for; every error names `source`."""
     if not isinstance(values, Mapping):
         raise ConfigError(f"{source}: holds {type(values).__name__}, but must hold a mapping of sections")
-    known = ["name", "seed", *SECTIONS, *PLUGINS]
+    known = ["name", "seed", *SECTIONS, *PLUGINS, "splits"]
     for key in values:
         if key not in known:
             raise ConfigError(f"{source}: {key} is not a section; {plugins.nearest(key, known)}")
@@ -431,22 +363,54 @@ def from_mapping(values: Any, source: str, name: str = "dataset") -> Config:
     if not isinstance(name, str) or not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}", name):
         raise ConfigError(f"{source}: name is {name!r}, but must be letters, digits, '.', '_' and '-', 100 at most")
     seed = checked_seed(values.get("seed", 0), f"{source}: seed")
-    sections: dict[str, Any] = {
-        s: build(cls, {} if values.get(s) is None else values[s], s, source) for s, cls in SECTIONS.items()
-    }
-    plugs: dict[str, Any] = {p: _plugin(p, values.get(p), default, source) for p, default in PLUGINS.items()}
+    sections: dict[str, Any] = {s: _section(s, values.get(s), source, copies) for s in (*SECTIONS, *PLUGINS)}
     frames, chunk = sections["video"].frames, sections["storage"].chunk_frames
     if chunk is not None and frames % chunk:
         raise ConfigError(f"{source}: storage.chunk_frames is {chunk}, but must divide video.frames, which is {frames}")
-    return Config(name=name, seed=seed, **sections, **plugs)
+    config = Config(name=name, seed=seed, **sections)
+    _check_grids(config, source)
+    enabled = {f"annotations.{name}": bool(value) for name, value in vars(config.annotations).items()}
+    try:
+        quality.check(config.quality, enabled)
+    except ValueError as error:
+        raise ConfigError(f"{source}: quality.{error}") from None
+    if not values.get("splits"):
+        return config
+    scene, splits = with_splits(config.scene, values["splits"], source)
+    config = dataclasses.replace(config, scene=scene, splits=splits)
+    for split in splits:
+        try:
+            config.of_split(split.name)
+        except ConfigError as error:
+            raise ConfigError(f"{source}: splits.{split.name}: {str(error).removeprefix('config: ')}") from None
+    return config
 
 
-def load_config(config: "Config | Mapping | str | pathlib.Path", sets: Sequence[str] = ()) -> Config:
-    """A Config from a file's name or path, from a mapping, or from a Config; `sets` overrides: 'physics.substeps=8'."""
+def _check_grids(config: Config, source: str) -> None:
+    """Raises ConfigError for a grid that is not of a scene's factor, one number a video."""
+    sections = {name: getattr(config, name) for name in SECTIONS} | {p: getattr(config, p).options for p in PLUGINS}
+    for section, options in sections.items():
+        for field in dataclasses.fields(options):
+            spec, value = field.metadata["option"], getattr(options, field.name)
+            parts = coordinates(field.name, value).values() if spec.draw else ()
+            gridded = any(simple.kind == "grid" for part in parts for _, simple in part.weighted)
+            if gridded and (section != "scene" or spec.each):
+                raise ConfigError(
+                    f"{source}: {section}.{field.name} is on a grid, but only a scene's numbers of a whole video can be"
+                )
+
+
+def load_config(
+    config: "Config | Mapping | str | pathlib.Path", sets: Sequence[str] = (), copies: Copies = NO_COPIES
+) -> Config:
+    """A Config from a file's name or path, from a mapping, or from a Config; `sets` overrides: 'physics.substeps=8'.
+
+    `copies` are of families and looks of the user's own, by their names, for where these are gone or have changed.
+    """
     if isinstance(config, Config):
-        return from_mapping(_overridden(config.plain(), sets), "config") if sets else config
+        return load_config(config.plain(), sets, config.copies) if sets else config
     if isinstance(config, Mapping):
-        return from_mapping(_overridden(dict(config), sets), "config")
+        return from_mapping(_overridden(dict(config), sets), "config", copies=copies)
     path = plugins.find_config(str(config))
     try:
         text = path.read_text(encoding="utf-8")

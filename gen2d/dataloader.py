@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 
 from gen2d.errors import ConfigError
-from gen2d.loader import Batch, Dataset
 from gen2d.mixing import Mixture
 from gen2d.order import Step, Walk, one_of
+from gen2d.videos import Batch, Source
 
 
 class DataLoader:
@@ -37,7 +37,7 @@ class DataLoader:
 
     def __init__(
         self,
-        dataset: Dataset | Mixture,
+        dataset: Source | Mixture,
         batch_size: int,
         seed: int = 0,
         shuffle: bool | str = "global",
@@ -114,7 +114,7 @@ class DataLoader:
         # A new batch each time, never one used before: jax may keep the very memory that it is given.
         out = self.dataset.empty(len(indices))
         parts = [
-            pool.submit(self.dataset.fill, out, part[0], indices[part], None if starts is None else starts[part])
+            pool.submit(self.dataset.fill, out, part, indices[part], None if starts is None else starts[part])
             for part in np.array_split(np.arange(len(indices)), min(self.threads, len(indices) or 1))
             if len(part)
         ]

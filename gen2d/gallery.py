@@ -75,10 +75,11 @@ def _made(
     source: str | Mapping[str, Any], videos: int, seed: int | None, sets: Sequence[str]
 ) -> Iterator[tuple[Dataset, dict[str, Any]]]:
     """A config's first videos, states alone, which last as long as the block, and the config."""
-    plain = load_config(source, sets).plain()
+    config = load_config(source, sets)
+    plain, split = config.plain(), config.training.name if config.training else "train"
     bare = plain | {"look": "flat", "annotations": {}, "storage": plain["storage"] | {"frames": "none"}}
     with tempfile.TemporaryDirectory() as folder:
-        generate(bare, videos, Path(folder) / "states", seed=seed)
+        generate(bare, videos, Path(folder) / "states", seed=seed, split=split)
         yield open_dataset(Path(folder) / "states"), plain
 
 

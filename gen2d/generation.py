@@ -6,7 +6,7 @@ import os
 import re
 import shlex
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,7 @@ from gen2d import devices, shards
 from gen2d.config import Config, checked_seed, load_config
 from gen2d.errors import ConfigError, FolderError, UserError
 from gen2d.pipeline import Encoder, Job, Writers, batches, jobs_of, threads_for
+from gen2d.plugins import copy_name
 from gen2d.progress import progress, stopping_on_sigterm
 from gen2d.remote import Place, place
 from gen2d.report import in_bytes, in_time
@@ -56,16 +57,17 @@ def generate(
     out: str | Place | None = None,
     *,
     seed: int | None = None,
-    split: str = "train",
+    split: str | None = None,
     sets: Sequence[str] = (),
     device: str = "auto",
     worker: tuple[int, int] = (0, 1),
     overwrite: bool = False,
     say: Callable[[str], None] | None = None,
 ) -> Summary:
-    """Makes what is missing of a dataset of `n` videos, and returns what it did.
+    """Makes what is missing of a dataset of `n` videos in a split, and returns what it did.
 
     `config` is a file's name or path, a mapping or a Config; `sets` overrides single options ('physics.substeps=8').
+    Without `split` it is "train", or each that the config has: `n` videos, or as many as it says there.
     Video i depends on the config, the seed, the split and i alone, so a run may be stopped and repeated, extended to a
     larger `n`, or shared by workers (`worker=(r, W)`: this one is number r of W). `out` is datasets/NAME by default,
     and may be a URL that fsspec can write to.
@@ -75,28 +77,44 @@ def generate(
     config = load_config(config, sets)
     if seed is not None:
         config = dataclasses.replace(config, seed=checked_seed(seed))
-    n = _check_run(n, split, worker)
+    counts = _counts(config, _check_run(n, split, worker), split)
     out = place(out) if out is not None else Path("datasets") / config.name
-    rollout = Rollout(config, devices.prepare(device))
-    dataset = dataset_of(rollout, out, {split: n})
-    remaining = [shard for shard in shards.open_folder(dataset, overwrite) if shard.split == split]
+    on = devices.prepare(device)
+    rollout = Rollout(config, on)
+    dataset = dataset_of(rollout, out, counts)
+    remaining = [shard for shard in shards.open_folder(dataset, overwrite) if shard.split in counts]
     todo = shards.mine(remaining, *worker)
-    began, made, size = time.perf_counter(), sum(shard.count for shard in todo), 0
-    if todo:
-        size = make(rollout, dataset, todo, say)
+    began, made = time.perf_counter(), sum(shard.count for shard in todo)
+    size = make(rollout, dataset, todo, say)
     complete = shards.finish(dataset)
     seconds = time.perf_counter() - began
     if todo:
         entry = {"time": time.time(), "host": os.uname().nodename, "videos": made, "seconds": seconds, "bytes": size}
-        shards.log(out, entry | {"devices": len(rollout.devices), "platform": rollout.devices[0].platform})
-    return Summary(out, made, n, seconds, size, complete)
+        shards.log(out, entry | {"devices": len(on), "platform": on[0].platform})
+    return Summary(out, made, sum(counts.values()), seconds, size, complete)
 
 
-def _check_run(n: Any, split: str, worker: tuple[int, int]) -> int:
+def _counts(config: Config, n: int, split: str | None) -> dict[str, int]:
+    """How many videos of each split are wanted."""
+    if split is not None:
+        config.row(split)  # says if there is no such split
+        return {split: n}
+    return {own.name: own.videos or n for own in config.splits} or {"train": n}
+
+
+def rollouts_of(rollout: Rollout, splits: Iterable[str]) -> list[tuple[Rollout, set[str]]]:
+    """The programs that make these splits, each with its splits: one may have a look of its own."""
+    lots: dict[Config, set[str]] = {}
+    for split in splits:
+        lots.setdefault(rollout.config.of_split(split), set()).add(split)
+    return [(rollout if own == rollout.config else Rollout(own, rollout.devices), lot) for own, lot in lots.items()]
+
+
+def _check_run(n: Any, split: str | None, worker: tuple[int, int]) -> int:
     """n as an int, if all of it is possible."""
     if isinstance(n, bool) or not isinstance(n, numbers.Integral) or not 1 <= int(n) <= MAX_VIDEOS:
         raise ConfigError(f"--n is {n!r}, but must be a whole number from 1 to 2**32 - 1")
-    if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}", split):
+    if split is not None and not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}", split):
         raise ConfigError(f"--split is {split!r}, but must be letters, digits, '.', '_' and '-', 64 at most")
     if not 0 <= worker[0] < worker[1]:
         raise ConfigError(f"--worker is {worker[0]}/{worker[1]}, but must be r/W with r from 0 to W - 1")
@@ -123,11 +141,21 @@ def dataset_of(rollout: Rollout, out: Place, counts: Mapping[str, int]) -> Datas
         constants=rollout.constants,
         conventions=CONVENTIONS,
         command="python -m gen2d --config config.yaml",
+        copies={
+            copy_name(kind, plugin.name): plugin.content
+            for kind, plugin in (("scene", config.scene), ("look", config.look))
+            if plugin.sha256
+        },
     )
 
 
 def make(rollout: Rollout, dataset: Dataset, todo: list[Shard], say: Callable[[str], None]) -> int:
     """The bytes written for these shards, which are done then."""
+    lots = rollouts_of(rollout, [shard.split for shard in todo])
+    return sum(_make(own, dataset, [shard for shard in todo if shard.split in lot], say) for own, lot in lots)
+
+
+def _make(rollout: Rollout, dataset: Dataset, todo: list[Shard], say: Callable[[str], None]) -> int:
     encoder, writers = Encoder(rollout, dataset, threads_for(devices.cores())), Writers(dataset)
     work = batches(todo, rollout.lanes)
     size = 0

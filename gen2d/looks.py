@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gen2d.config import option
+from gen2d.options import option
 from gen2d.paint import Background, Paint, Texture, palette, to_linear
 from gen2d.types import SHAPES, STATIC, Array, Layout, Scene
 

@@ -6,21 +6,21 @@ positions of the sources as they are, so that every batch holds its shares, too.
 """
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from fractions import Fraction
 from typing import Any
 
 import numpy as np
 
 from gen2d.errors import ConfigError
-from gen2d.loader import Batch, Dataset, Numbers, checked_numbers, item, taken_apart
 from gen2d.order import SOURCES, hashed
+from gen2d.videos import Batch, Joined, Numbers, Source, checked_numbers, item, occurring, taken_apart
 
 FINEST = 1000  # a weight is taken as the nearest fraction with a denominator up to this
 Weights = Mapping[str, float] | Sequence[float]
 
 
-def mix(datasets: Mapping[str, Dataset], weights: Weights | None = None) -> "Mixture":
+def mix(datasets: Mapping[str, Source], weights: Weights | None = None) -> "Mixture":
     """The datasets as one, for DataLoader, torch and grain; `weights` are their shares, equal unless told otherwise.
 
     An epoch is as long as no dataset has to give a video twice, and the next goes on with the videos that follow, so
@@ -41,18 +41,17 @@ class Mixture:
     A position's video has a number, which `fill` takes: the datasets' own, counted on from one dataset to the next.
     """
 
-    def __init__(self, datasets: Mapping[str, Dataset], shares: Sequence[int]) -> None:
+    def __init__(self, datasets: Mapping[str, Source], shares: Sequence[int]) -> None:
         self.datasets, self.shares = dict(datasets), list(shares)
         self.fields = next(iter(datasets.values())).fields
-        self._sources = list(datasets.values())
-        self._sizes = np.array([len(source) for source in self._sources])
-        self._firsts = np.cumsum(self._sizes) - self._sizes
-        self._turns = turns(self.shares, self._sizes.tolist())
+        self._joined = Joined(list(datasets.values()))
+        sizes = self._joined.sizes
+        self._turns = turns(self.shares, sizes.tolist())
         taken = np.cumsum(self._turns[:, None] == np.arange(len(shares)), axis=0)
         self._taken = np.concatenate([np.zeros_like(taken[:1]), taken])  # of each dataset before each turn
         whole = len(self._turns) == sum(shares)
-        periods = min(size // share for size, share in zip(self._sizes.tolist(), shares, strict=True)) if whole else 0
-        rest = (self._taken <= self._sizes - periods * self._taken[-1]).all(axis=1).sum() - 1
+        periods = min(size // share for size, share in zip(sizes.tolist(), shares, strict=True)) if whole else 0
+        rest = (self._taken <= sizes - periods * self._taken[-1]).all(axis=1).sum() - 1
         self._count = periods * len(self._turns) + int(rest)
         self._each = periods * self._taken[-1] + self._taken[rest]  # of each dataset in an epoch
 
@@ -75,59 +74,40 @@ class Mixture:
         """The videos at these positions of the first epoch, not shuffled, stacked."""
         places = checked_numbers(positions, len(self), "the mixture")
         out = self.empty(len(places))
-        self.fill(out, 0, self.numbers_at(places))
+        self.fill(out, range(len(places)), self.numbers_at(places))
         return out
 
     def empty(self, count: int) -> Batch:
         """A batch of `count` videos that is yet to be filled."""
-        return self._sources[0].empty(count)
+        return self._joined.empty(count)
 
-    def fill(self, out: Batch, row: int, indices: Numbers, starts: Numbers | None = None) -> None:
-        """Returns nothing; puts the videos with these numbers into `out` from `row` on, windows from `starts`."""
-        numbers = np.asarray(indices)
-        owners = self._owners(numbers)
-        for run in np.split(np.arange(len(numbers)), np.flatnonzero(np.diff(owners)) + 1):
-            if len(run):
-                owner = owners[run[0]]
-                own = None if starts is None else np.asarray(starts)[run]
-                self._sources[owner].fill(out, row + int(run[0]), numbers[run] - self._firsts[owner], own)
+    def fill(self, out: Batch, rows: Numbers, indices: Numbers, starts: Numbers | None = None) -> None:
+        """Returns nothing; puts the videos with these numbers into these rows of `out`, windows from `starts` on."""
+        self._joined.fill(out, rows, indices, starts)
 
     def numbers_at(self, positions: np.ndarray, epoch: int = 0, seed: int | None = None) -> np.ndarray:
         """The numbers of the videos at these positions of an epoch: each dataset's one after the other, or as the seed
         shuffles them; what an epoch leaves of a dataset comes in the next."""
         periods, turn = np.divmod(positions, len(self._turns))
         owners, numbers = self._turns[turn], np.empty(len(positions), np.int64)
-        for owner, own in self._shared(owners):
+        for owner, own in occurring(owners):
             place = epoch * self._each[owner] + periods[own] * self._taken[-1, owner] + self._taken[turn[own], owner]
-            source, rounds = self._sources[owner], place // len(self._sources[owner])
+            source, rounds = self._joined.datasets[owner], place // self._joined.sizes[owner]
             own_seed = None if seed is None else int(hashed(SOURCES, seed, owner)[0])
             for number in np.unique(rounds):
                 now = own[rounds == number]
                 found = source.numbers_at(place[rounds == number] % len(source), int(number), own_seed)
-                numbers[now] = self._firsts[owner] + found
+                numbers[now] = self._joined.firsts[owner] + found
         return numbers
 
     def starts(self, numbers: np.ndarray, bits: np.ndarray) -> np.ndarray | None:
         """Where the windows of these videos begin, drawn by random bits; None if that is not random."""
-        starts = np.zeros(len(numbers), np.int64)
-        for owner, own in self._shared(self._owners(numbers)):
-            found = self._sources[owner].starts(numbers[own], bits[own])
-            if found is None:
-                return None
-            starts[own] = found
-        return starts
+        return self._joined.starts(numbers, bits)
 
     def source_of(self, positions: Numbers) -> list[str]:
         """The names of the datasets that the videos at these positions are of, the same in every epoch."""
         names = list(self.datasets)
         return [names[owner] for owner in self._turns[np.asarray(positions) % len(self._turns)]]
-
-    def _owners(self, numbers: np.ndarray) -> np.ndarray:
-        return np.searchsorted(self._firsts, numbers, side="right") - 1
-
-    def _shared(self, owners: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
-        """Each dataset that occurs, and where."""
-        return ((int(owner), np.flatnonzero(owners == owner)) for owner in np.unique(owners))
 
 
 def turns(shares: Sequence[int], sizes: Sequence[int]) -> np.ndarray:
@@ -173,7 +153,7 @@ def _fraction(name: str, weight: float) -> Fraction:
     return fraction
 
 
-def _compare(first: str, one: Dataset, name: str, other: Dataset) -> None:
+def _compare(first: str, one: Source, name: str, other: Source) -> None:
     """Raises ConfigError where videos of two datasets cannot stand in one batch."""
     here, there = one.empty(1), other.empty(1)
     for field in sorted(here.keys() ^ there.keys()):

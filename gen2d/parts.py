@@ -58,7 +58,7 @@ MATERIAL = {
     "color": "sRGB, [3] or [K, 3]; default grey",
     "kind": "DYNAMIC, STATIC or KINEMATIC, of all; segments are static by default, all else is dynamic",
     "layer": "of all, in the drawing order",
-    "touches": "whether anything meets them; of all, default True",
+    "collides": "whether anything meets them; of all, default True",
     "rolling_resistance": "torque over normal force and radius",
     "force": "N, [2] or [K, 2], constant",
     "torque": "N m, constant",
@@ -144,7 +144,7 @@ def _part(
     count, kind = position.shape[0], material.get("kind", DYNAMIC)
     present = jnp.broadcast_to(present, (count,))
     vertices = sizes["vertices"].shape[1] if "vertices" in sizes else 0
-    run = Run(shape, count, kind, vertices, layer=material.get("layer"), touches=material.get("touches", True))
+    run = Run(shape, count, kind, vertices, layer=material.get("layer"), collides=material.get("collides", True))
 
     def slots(value: Any, *more: int, dtype: Any = jnp.float32) -> Array:
         values = jnp.broadcast_to(jnp.asarray(value, jnp.float32), (count, *more))

@@ -1,4 +1,9 @@
-"""Random places that do not overlap. What fails is drawn again: the place only, never the size, which would bias it."""
+"""Where things start: at a share of the room there is for them, or at random places that do not overlap.
+
+What overlaps is drawn again: the place only, never the size, which would bias it.
+"""
+
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -8,6 +13,17 @@ from gen2d.types import Array
 TRIES = 100  # places tried for one object before all are placed anew
 RESTARTS = 100  # after which the scene is given up
 CLEARANCE = 1e-3  # m between objects at the start
+
+
+def beginning(share: Array, low: Any, high: Any, way: Array, entry: float) -> Array:
+    """Where on a line something starts that goes `way` m and shall then still be between `low` and `high` m: at this
+    share, in [0, 1], of the places that are possible, from the lowest on.
+
+    If it goes too far for any, it starts at this share of `entry` m from the end that it leaves.
+    """
+    lowest, highest = low - jnp.minimum(way, 0), high - jnp.maximum(way, 0)
+    near = share * jnp.minimum(entry, high - low)
+    return jnp.where(lowest < highest, lowest + share * (highest - lowest), jnp.where(way < 0, high - near, low + near))
 
 
 def place(key: Array, radius: Array, present: Array, low: Array, high: Array) -> tuple[Array, Array, Array]:

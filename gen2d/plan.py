@@ -41,6 +41,7 @@ class Dataset:
     rng: str = "threefry2x32"
     command: str = ""
     licence: str = ""
+    copies: Mapping[str, bytes] = dataclasses.field(default_factory=dict)  # the user's own files, by name in the folder
 
     @property
     def identity(self) -> dict[str, Any]:

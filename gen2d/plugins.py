@@ -1,9 +1,8 @@
 """A name in a config is a file in a folder: find it, load it, or say which names there are."""
 
 import difflib
-import hashlib
+import functools
 import importlib
-import importlib.util
 import pathlib
 import pkgutil
 import sys
@@ -25,34 +24,48 @@ def names(kind: str) -> list[str]:
     return sorted(module.name for module in pkgutil.iter_modules(importlib.import_module(FOLDERS[kind]).__path__))
 
 
-def load(kind: str, name: str, source: str = "--set") -> ModuleType:
-    """The module behind a name, or behind the path of a Python file."""
-    if name.endswith(".py"):
-        return _load_path(kind, pathlib.Path(name).expanduser(), source)
-    if name not in names(kind):
-        raise ConfigError(f"{source}: {kind} is {name!r}, which is not known; {nearest(name, names(kind))}")
-    return importlib.import_module(f"{FOLDERS[kind]}.{name}")
-
-
-def sha256(name: str) -> str | None:
-    """The hash of a plug-in that is a file of the user's own; None of one that comes with gen2d."""
-    return hashlib.sha256(pathlib.Path(name).expanduser().read_bytes()).hexdigest() if name.endswith(".py") else None
-
-
-def _load_path(kind: str, path: pathlib.Path, source: str) -> ModuleType:
-    if not path.is_file():
-        raise ConfigError(f"{source}: {kind} is {str(path)!r}, but there is no such file")
-    spec = importlib.util.spec_from_file_location(f"gen2d_user_{kind}_{path.stem}", path)
-    assert spec is not None  # a .py file always has a loader
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module  # dataclasses look their module up
+def load(kind: str, name: str, source: str = "--set", content: bytes = b"") -> ModuleType:
+    """The module behind a name, or behind the path of a Python file of the user's own that holds `content`."""
+    if not is_own(name):
+        if name not in names(kind):
+            raise ConfigError(f"{source}: {kind} is {name!r}, which is not known; {nearest(name, names(kind))}")
+        return importlib.import_module(f"{FOLDERS[kind]}.{name}")
     try:
-        spec.loader.exec_module(module)
+        module = _run(kind, pathlib.Path(name).expanduser(), content)
     except Exception as error:
-        raise ConfigError(f"{source}: {kind} is {str(path)!r}, which cannot be run ({error!r})") from error
+        raise ConfigError(f"{source}: {kind} is {name!r}, which cannot be run ({error!r})") from error
     if not hasattr(module, "Options"):
-        raise ConfigError(f"{source}: {kind} is {str(path)!r}, but it has no Options")
+        raise ConfigError(f"{source}: {kind} is {name!r}, but it has no Options")
+    return module
+
+
+def is_own(name: str) -> bool:
+    """Whether it is the path of a file of the user's own."""
+    return name.endswith(".py")
+
+
+def copy_name(kind: str, name: str) -> str:
+    """Where in a dataset's folder the copy of a file of the user's own lies."""
+    return f"plugins/{kind}/{pathlib.PurePath(name).name}"
+
+
+def content_of(kind: str, name: str, source: str) -> bytes:
+    """What a file of the user's own holds."""
+    path = pathlib.Path(name).expanduser()
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        told = "there is no such file" if isinstance(error, FileNotFoundError) else "it cannot be read"
+        raise ConfigError(f"{source}: {kind} is {str(path)!r}, but {told}") from None
+
+
+@functools.lru_cache(maxsize=64)  # the same module each time, so that what was compiled for it is found again
+def _run(kind: str, path: pathlib.Path, content: bytes) -> ModuleType:
+    """The module that the content is, as if it stood at the path: of a copy, where it was copied from."""
+    module = ModuleType(f"gen2d_user_{kind}_{path.stem}")
+    module.__file__ = str(path)
+    sys.modules[module.__name__] = module  # dataclasses look their module up
+    exec(compile(content, path, "exec"), vars(module))
     return module
 
 

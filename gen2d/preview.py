@@ -86,10 +86,11 @@ def _drawn(source: str, videos: int, seed: int | None, sets: Sequence[str]) -> t
     config = load_config(source, [*sets, "storage.frames=video"])
     if seed is not None:
         config = dataclasses.replace(config, seed=checked_seed(seed))
-    rollout = Rollout(config, devices.prepare()[:1])
+    split = config.training.name if config.training else "train"
+    rollout = Rollout(config.of_split(split), devices.prepare()[:1])
     frames = []
     for first in range(0, videos, rollout.lanes):
-        batch = rollout.begin("train", [first])
+        batch = rollout.begin(split, [first])
         placed = parts(batch.placed)[0][: videos - first]
         check_placed(config.scene, placed, np.arange(first, first + len(placed)))
         for start in range(0, min(rollout.lanes, videos - first), rollout.slice):

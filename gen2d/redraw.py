@@ -4,6 +4,7 @@ A dataset holds all that a frame depends on: what was drawn at random comes back
 So a dataset of states alone (`storage: {frames: none}`) is drawn inside the training loop, on its device.
 """
 
+import contextlib
 import dataclasses
 import functools
 import zlib
@@ -14,33 +15,48 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gen2d import annotations, drawing, factors, loader, types
+from gen2d import annotations, drawing, factors, loader, plugins, types
 from gen2d.camera import View
-from gen2d.config import AnnotationOptions, Config, load_config
+from gen2d.config import PLUGINS, AnnotationOptions, Config, load_config
 from gen2d.errors import ConfigError
-from gen2d.loader import Dataset, Numbers
+from gen2d.loader import Dataset
 from gen2d.manifest import field_of
 from gen2d.picture import Plan, Stage, on_cpu
-from gen2d.remote import Place
+from gen2d.remote import Place, reading
 from gen2d.rollout import Rollout, keep_of, rules_of
 from gen2d.simulate import simulate, substeps
 from gen2d.types import Array, Joints, Layout, Objects, Scene, State
+from gen2d.videos import Numbers
 
 Columns = Mapping[str, Any]
 POINTS = 8  # of each object, where tracks are asked for that the config does not have
 
 
 def config_of(ds: Dataset, sets: Sequence[str] = ()) -> Config:
-    """The config that a dataset was made from, with `sets` changed ('video.height=128')."""
-    return config_from(ds.root, ds.manifest, sets)
+    """The config that a dataset's split was made from, with `sets` changed ('video.height=128')."""
+    if not isinstance(ds, Dataset):
+        raise ConfigError(f"ds is of {len(ds.datasets)} folders, but must be of one: give one of ds.datasets")
+    return load_config(config_from(ds.root, ds.manifest).of_split(ds.options.split), sets)
 
 
 def config_from(root: Place, identity: Mapping[str, Any], sets: Sequence[str] = ()) -> Config:
-    """The config that the folder's manifest, or its mark, tells of."""
+    """The config that the folder's manifest, or its mark, tells of; where a family or look of the user's own is gone or
+    has changed, with the copy in the folder."""
+    config = identity["config"]
     try:
-        return load_config(identity["config"] | {"seed": identity["seed"]}, sets)
+        return load_config(config | {"seed": identity["seed"]}, sets, _copies(root, config))
     except ConfigError as error:
         raise ConfigError(f"{root}: its config cannot be used ({error})") from None
+
+
+def _copies(root: Place, config: Mapping[str, Any]) -> dict[str, bytes]:
+    """What the folder holds of files of the user's own, by their names in the config."""
+    found = {}
+    for kind, plugin in ((kind, config[kind]) for kind in PLUGINS):
+        if plugins.is_own(plugin["name"]):
+            with reading(root), contextlib.suppress(FileNotFoundError):
+                found[plugin["name"]] = (root / plugins.copy_name(kind, plugin["name"])).read_bytes()
+    return found
 
 
 def render(
@@ -67,7 +83,7 @@ def render(
     config = load_config(config, _asked(fields, config.annotations))
     if look is not None:
         plain = {"name": look} if isinstance(look, str) else dict(look)
-        config = load_config(config.plain() | {"look": plain})
+        config = load_config(config.plain() | {"look": plain}, copies=config.copies)
     if config.image.exposure and states is not None:
         raise ConfigError("states have no motion between frames: image.exposure must be 0 where they are given")
     if config.image.exposure:

@@ -9,10 +9,10 @@ import numpy as np
 
 from gen2d import devices, loader, shards
 from gen2d.codecs import decode_into
-from gen2d.config import load_config, parse_yaml
+from gen2d.config import Config
 from gen2d.errors import DamagedError, FolderError
 from gen2d.files import read_sealed
-from gen2d.generation import dataset_of, make
+from gen2d.generation import dataset_of, make, rollouts_of
 from gen2d.manifest import SEAL, identity_of, read_manifest
 from gen2d.pipeline import Encoder, Piece, threads_for
 from gen2d.redraw import config_from
@@ -25,12 +25,12 @@ Identity = Mapping[str, Any]  # of a dataset; its manifest has the same keys
 
 def rollout_of(root: Place, identity: Identity) -> Rollout:
     """The programs that made the dataset in the folder. Raises ConfigError where its config cannot be used here."""
-    return _rollout(config_from(root, identity).text(), identity["fingerprint"]["device"].startswith("cpu"))
+    return _rollout(config_from(root, identity), identity["fingerprint"]["device"].startswith("cpu"))
 
 
 @functools.lru_cache(maxsize=1)  # a check, a repair and the check that follows compile once
-def _rollout(config: str, on_cpu: bool) -> Rollout:
-    return Rollout(load_config(parse_yaml(config, "config")), devices.prepare("cpu" if on_cpu else "auto"))
+def _rollout(config: Config, on_cpu: bool) -> Rollout:
+    return Rollout(config, devices.prepare("cpu" if on_cpu else "auto"))
 
 
 def check_fingerprint(root: Place, rollout: Rollout, identity: Identity) -> None:
@@ -57,14 +57,15 @@ def differing(
         stored = {split: loader.open(root, split, fields=("*",)) for split in manifest["splits"]}
     except DamagedError:
         return
-    encoder = Encoder(rollout, dataset, threads_for(devices.cores()))
-    try:
-        for shard, block in encoder.blocks(_work(dataset, rollout.lanes, chosen)):
-            number = int(block.arrays["index"][0])
-            for name in _other(stored[shard.split], number, _values(block, dataset)):
-                yield shard.name, f"{name} of {shard.split} video {number} is not what its recipe makes"
-    finally:
-        encoder.close()
+    for own, splits in rollouts_of(rollout, [split for split, _ in chosen]):
+        encoder = Encoder(own, dataset, threads_for(devices.cores()))
+        try:
+            for shard, block in encoder.blocks(_work(dataset, own.lanes, [c for c in chosen if c[0] in splits])):
+                number = int(block.arrays["index"][0])
+                for name in _other(stored[shard.split], number, _values(block, dataset)):
+                    yield shard.name, f"{name} of {shard.split} video {number} is not what its recipe makes"
+        finally:
+            encoder.close()
 
 
 def _work(dataset: Dataset, lanes: int, chosen: Sequence[tuple[str, int]]) -> list[tuple[str, int, list[Piece]]]:

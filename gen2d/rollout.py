@@ -18,12 +18,12 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-from gen2d import annotations, drawing, factors, sampling, types
+from gen2d import annotations, drawing, factors, quality, sampling, types
 from gen2d.config import Config, PhysicsOptions
 from gen2d.fields import Field
-from gen2d.parts import Sampled
 from gen2d.picture import Stage
 from gen2d.rows import Rules
+from gen2d.sampling import Sampler
 from gen2d.simulate import Keep, simulate, substeps
 from gen2d.types import Array, Scene, State
 
@@ -57,8 +57,9 @@ class Rollout:
 
     def __init__(self, config: Config, devices: Sequence[Any]) -> None:
         self.config, self.devices = config, list(devices)
-        family, options, video = config.scene.module, config.scene.options, config.video
-        self.layout = family.layout(options)
+        video = config.video
+        self.layout = config.scene.module.layout(config.scene.options)
+        self.sampler, self.wanted = Sampler(config), quality.ranges(config.quality)
         self.plan = drawing.plan_of(config, self.layout)
         self.steps = substeps(video.fps, config.physics.substeps, config.physics.max_step)
         self.keep = keep_of(config, self.layout)
@@ -71,7 +72,7 @@ class Rollout:
         self.lanes = config.storage.lanes or min(together, auto)  # not the shard size: that must not change a video
         self.slice = divisor(self.lanes, max(1, SLICE_BYTES // frame_bytes))
         self.mesh = Mesh(np.array(self.devices), ("videos",))
-        self._simulate = jax.jit(self._shared(self._made, (PartitionSpec(), VIDEOS)))
+        self._simulate = jax.jit(self._shared(self._made, (PartitionSpec(), PartitionSpec(), *[VIDEOS] * 3)))
 
     def _shared(self, function: Any, specs: tuple) -> Any:
         return jax.shard_map(function, mesh=self.mesh, in_specs=specs, out_specs=VIDEOS, check_vma=False)
@@ -86,12 +87,12 @@ class Rollout:
         corners = max(run.vertices for run in self.layout.runs)
         own |= {"V": corners} if corners else {}
         own |= annotations.sizes(self.config.annotations, self.plan)
-        return own | sampling.sizes(self.config.scene)
+        return own | self.sampler.lengths
 
     @property
     def fields(self) -> dict[str, Field]:
         """Every stored field."""
-        scene = jax.eval_shape(lambda key: self._sampled(key)[1].scene, jax.eval_shape(lambda: jax.random.key(0)))
+        scene = jax.eval_shape(self._scene, jax.eval_shape(lambda: jax.random.key(0)))
         made = [types.State, types.Quality, *([types.Contacts] if self.keep.contacts else [])]
         made += [types.Energy] if self.keep.energy else []
         fields = {name: field for record in made for name, (_, field) in types.described(record).items()}
@@ -107,9 +108,10 @@ class Rollout:
             fields["joints/kind"] = Field("uint8", "J", "1", f"index into {', '.join(JOINTS)}")
             fields |= {f"joints/{side}": Field("int16", "J", "object", f"slot of object {side}") for side in "ab"}
         fields["quality/rejected_draws"] = Field("int32", "n", "1", "places drawn again as they did not fit")
+        fields |= {"quality/rejected_videos": quality.FIELD} if self.wanted else {}
         for name, axes, unit, meaning in CAMERA:
             fields[f"camera/{name}"] = Field("float32", axes, unit, meaning)
-        fields |= sampling.fields(self.config.scene)
+        fields |= sampling.fields(self.config)
         return dict(sorted(fields.items()))
 
     @property
@@ -133,8 +135,18 @@ class Rollout:
 
     def begin_with(self, split: str, numbers: np.ndarray) -> Batch:
         """Starts the videos with these numbers, uint32, `lanes` for each device."""
-        root = np.asarray(factors.seed_words(self.config.seed, zlib.crc32(split.encode())))
-        return self._simulate(root, jax.device_put(numbers, NamedSharding(self.mesh, VIDEOS)))
+        root, row = factors.seed_words(self.config.seed, zlib.crc32(split.encode())), self.config.row(split)
+        given = self.sampler.combination(row, root, numbers)
+
+        def make(lanes: np.ndarray, attempts: np.ndarray) -> Batch:
+            of_videos = given[lanes], numbers[lanes], attempts.astype(np.uint32)
+            return self._simulate(root, np.int32(row), *jax.device_put(of_videos, NamedSharding(self.mesh, VIDEOS)))
+
+        if not self.wanted:
+            return make(np.arange(len(numbers)), np.zeros(len(numbers)))
+        batch, attempts = quality.fitting(make, numbers, self.config.quality)
+        rejected = jax.device_put(attempts.astype(np.int32), NamedSharding(self.mesh, VIDEOS))
+        return batch._replace(columns=batch.columns | {"quality/rejected_videos": rejected})
 
     def draw(self, batch: Batch, start: int, count: int) -> list[dict[str, Array]]:
         """Starts to draw `count` videos of each device, from lane `start` on: for each device their frames
@@ -153,11 +165,12 @@ class Rollout:
 
         return jax.jit(drawn)
 
-    def _made(self, root: Array, numbers: Array) -> Batch:
+    def _made(self, root: Array, row: Array, given: Array, numbers: Array, attempts: Array) -> Batch:
         """One device's share: from numbers to everything but the frames."""
         config, layout = self.config, self.layout
         keys = factors.video_keys(root, numbers)
-        drawn, (scene, state, rejected, placed, _) = jax.vmap(self._sampled)(keys)
+        own = quality.attempt_keys(keys, attempts) if self.wanted else keys
+        drawn, (scene, state, rejected, placed, _) = jax.vmap(self.sampler.sampled, (0, None, 0))(own, row, given)
         rules = rules_of(config.physics, config.video.fps, self.steps)
         device = types.to_device(scene), types.to_device(state)
         sparse = self.devices[0].platform == "cpu"
@@ -174,11 +187,13 @@ class Rollout:
         columns["objects/color"] = colors
         columns |= drawing.camera_columns(stages.instants.view)
         columns |= {f"factors/{name}": values.astype(jnp.float32) for name, values in drawn.items()}
+        columns |= jax.vmap(self.sampler.outside)(drawn)
         columns["quality/rejected_draws"] = rejected
         return Batch(columns, stages, placed)
 
-    def _sampled(self, key: Array) -> tuple[dict[str, Array], Sampled]:
-        return sampling.sampled(key, self.config.scene)
+    def _scene(self, key: Array) -> Scene:
+        """A scene of a video, for its shape."""
+        return self.sampler.sampled(key, jnp.int32(0), jnp.zeros(len(self.sampler.gridded)))[1].scene
 
     def host_columns(self, batch: Batch) -> list[dict[str, np.ndarray]]:
         """For each device its columns as NumPy arrays; waits until they are there."""

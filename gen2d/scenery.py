@@ -82,7 +82,7 @@ def _group(objects: Objects, layout: Layout, run: Run, first: int) -> Group:
     rigid = {slot for tie in layout.joints for slot in (tie.a, tie.b)}
     jointed = jnp.asarray([float(first + i in rigid) for i in range(padded(run.count))], mass.dtype)[:, None]
     return Group(
-        form_of(some, run, slice(None)), inverse, mass, moment, jnp.broadcast_to(jointed, mass.shape), run.touches
+        form_of(some, run, slice(None)), inverse, mass, moment, jnp.broadcast_to(jointed, mass.shape), run.collides
     )
 
 
@@ -115,7 +115,7 @@ def _apart(a: Side, b: Side, layout: Layout) -> Array:
     tied = [tie for tie in layout.joints if not tie.collide]
     together = jnp.zeros(b.slot.shape, bool)
     for run, first in layout.spans:
-        if not run.touches:
+        if not run.collides:
             for slot in (a.slot, b.slot):
                 together = together | ((slot >= first) & (slot < first + run.count))
     for i, j in ((tie.a, tie.b) for tie in tied):
@@ -207,7 +207,7 @@ def _sparse(
 ) -> Sparse:
     ours, theirs = _sides(objects, layout, groups)
     sizes, firsts = [side.slot.shape[0] for side in ours], [first for _, first in moving(layout)]
-    solid, firm = ([run.touches for run, _ in of] for of in (moving(layout), standing(layout)))
+    solid, firm = ([run.collides for run, _ in of] for of in (moving(layout), standing(layout)))
     fixed_slots, ways, kinds = [slot for _, slot in standing(layout)], _ways(fixed), []
 
     def add(forms: tuple[Form, Form], of_a: np.ndarray, b: np.ndarray, **more: Any) -> None:
@@ -300,7 +300,7 @@ def scenery_of(
     setup = Setup(scene.gravity[:, None], jnp.maximum(rules.bounce_threshold, at_rest), one, contacts)
     made = (_sparse if sparse else _dense)(objects, layout, groups, fixed, setup, rules)
     rails = [
-        _rail(f, objects.present[s : s + 1]) for f, (r, s) in zip(fixed, standing(layout), strict=True) if r.touches
+        _rail(f, objects.present[s : s + 1]) for f, (r, s) in zip(fixed, standing(layout), strict=True) if r.collides
     ]
     return Scenery(
         groups, fixed, [r for r in rails if r is not None], scene.gravity, made, _ties(scene, layout, groups), forces

@@ -153,7 +153,7 @@ def _clear(root: Place) -> None:
     (root / MARK).mkdir(exist_ok=True)
     for name in ("manifest.json", "croissant.json", "README.md", SHEET, "config.yaml", MARK / "dataset.json"):
         (root / name).unlink(missing_ok=True)
-    for name in ("shards", "index", MARK / "done"):
+    for name in ("shards", "index", "plugins", MARK / "done"):
         remove_tree(root / name)
 
 
@@ -360,8 +360,12 @@ def finish(dataset: Dataset) -> bool:
 
 def _complete(dataset: Dataset, shards: list[Shard], records: list[Mapping[str, Any]]) -> None:
     root, recipe = dataset.root, dataset.config_text.encode()
-    publish(root / "config.yaml", recipe)
-    files = write_index(dataset, shards, records) | {"config.yaml": sha256(recipe)}
+    copies = {"config.yaml": recipe, **dataset.copies}
+    for name, content in copies.items():
+        (root / name).parent.mkdir(parents=True, exist_ok=True)
+        publish(root / name, content)
+    hashes = {name: sha256(content) for name, content in copies.items()}
+    files = write_index(dataset, shards, records) | hashes
     manifest = describe(dataset, shards, records, files)
     if "frames" in dataset.fields:
         publish(root / SHEET, cards.picture(root, manifest))

@@ -56,7 +56,7 @@ class Group(NamedTuple):
     mass: Array  # [N, ...] kg
     moment: Array  # [N, ...] kg m^2
     jointed: Array  # [N, ...] 1 where a rigid joint holds it
-    touches: bool = True  # whether they meet anything
+    collides: bool = True  # whether they meet anything
 
 
 class Fixed(NamedTuple):
@@ -183,7 +183,7 @@ def step(world: World, scenery: Scenery, rules: Rules) -> World:
     motions, drifts, works, rows = contacts.solve(past, found, walls, motions, drifts, works)
 
     ways = [_moved(*of, h) for of in zip(motions, drifts, more, strict=True)]
-    ways = kept_in(ways, [s if g.touches else None for s, g in zip(shapes, groups, strict=True)], scenery.rails)
+    ways = kept_in(ways, [s if g.collides else None for s, g in zip(shapes, groups, strict=True)], scenery.rails)
     places = [_arrived(b, way, one) for b, way in zip(world.bodies, ways, strict=True)]
 
     held, motions, _, tied_last = joints.solve(held, motions, ways, falls, fixed, rules, one, biased=False)

@@ -23,8 +23,9 @@ from gen2d.config import Config, checked_seed, load_config
 from gen2d.errors import ConfigError
 from gen2d.fields import Field
 from gen2d.generation import MAX_VIDEOS
-from gen2d.loader import LAYOUTS, Options, chosen_fields
+from gen2d.loader import Options, chosen_fields
 from gen2d.order import Step, Walk, one_of, shuffled
+from gen2d.pieces import LAYOUTS
 from gen2d.pipeline import check_placed
 from gen2d.rollout import Batch, Rollout, divisor
 from gen2d.types import Array
@@ -67,7 +68,7 @@ def stream(
     if seed is not None:
         config = dataclasses.replace(config, seed=checked_seed(seed))
     one_of("to", to, tuple(_DELIVER))
-    rollout = _rollout(config, device)
+    rollout = _rollout(config.of_split(split), device)
     names = chosen_fields(config.name, rollout.fields, fields)
     options = Options(split, names, window, stride, start, layout, dtype, "none")
     options.check(config.video.frames)

@@ -163,7 +163,7 @@ class Run:
     vertices: int = 0  # of each polygon, at most
     rounded: bool = False  # whether polygons have a radius
     layer: int | None = None  # lower layers are drawn first; None: 0 for static objects, 1 for those that move
-    touches: bool = True  # whether it meets what is in its way; what joints hold on to, and rods, need not
+    collides: bool = True  # False: it is drawn, and joints may hold on to it, but it meets nothing
 
     @property
     def painted(self) -> int:

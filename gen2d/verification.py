@@ -143,7 +143,7 @@ def chosen_videos(splits: Mapping[str, int], videos: int, seed: int) -> list[tup
 def _hashed_files(root: Place, manifest: Mapping[str, Any]) -> Iterator[Problem]:
     for name, expected in manifest["files"].items():
         yield from map(Problem, _wrong(root / name, expected))
-    for path in sorted((root / "index").rglob("*"), key=str):
+    for path in sorted([*(root / "index").rglob("*"), *(root / "plugins").rglob("*")], key=str):
         if path.is_file() and str(path).removeprefix(f"{root}/") not in manifest["files"]:
             yield Problem(f"{path} does not belong to the dataset")
 

@@ -4,8 +4,8 @@ import dataclasses
 
 import jax.numpy as jnp
 
-from gen2d.config import option
 from gen2d.looks import Plain, are_lines, are_moving, contrasting, plain
+from gen2d.options import option
 from gen2d.paint import Paint
 from gen2d.types import Array, Layout, Scene
 

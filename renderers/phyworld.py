@@ -8,8 +8,8 @@ import dataclasses
 import jax.numpy as jnp
 import numpy as np
 
-from gen2d.config import option
 from gen2d.looks import Lines, are_moving, lines_of
+from gen2d.options import option
 from gen2d.paint import Background, Paint
 from gen2d.types import Array, Layout, Scene
 

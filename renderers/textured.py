@@ -5,8 +5,8 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 
-from gen2d.config import option
 from gen2d.looks import Plain, contrasting, mean_color, plain
+from gen2d.options import option
 from gen2d.paint import Paint, Texture
 from gen2d.types import Array, Layout, Scene
 

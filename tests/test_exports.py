@@ -394,7 +394,7 @@ def test_every_format_keeps_the_contract() -> None:
 )
 def test_bad_input_gets_one_line_and_code_2(toy: Path, tmp_path: Path, words: list[str], told: str) -> None:
     (tmp_path / "file").write_text("")
-    done = tiny.ran("export", toy, *words, cwd=tmp_path)
+    done = tiny.ran_here("export", toy, *words, cwd=tmp_path)
     assert done.returncode == 2, done
     assert told in done.stderr
     assert len(done.stderr.splitlines()) == 1
@@ -412,7 +412,8 @@ def test_the_command_says_what_it_made_and_what_was_lost(toy: Path, tmp_path: Pa
     assert done.returncode == 0, done.stderr
     assert f"{TRAIN} videos in" in done.stdout
     assert "mp4 is lossy" in done.stdout
-    exact = tiny.ran("export", toy, "--to", "npz", "--split", "test", "--fields", "index", "states/*", cwd=tmp_path)
+    words = "--to", "npz", "--split", "test", "--fields", "index", "states/*"
+    exact = tiny.ran_here("export", toy, *words, cwd=tmp_path)
     assert "lossy" not in exact.stdout
     assert (toy.parent / "toy-npz" / "test-000000002.npz").is_file()  # beside the dataset
 

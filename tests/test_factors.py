@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
-from gen2d.factors import draw, parse, seed_words, video_keys
+from gen2d.config import load_config
+from gen2d.factors import parse, seed_words, video_keys
+from gen2d.sampling import Sampler
 
 COUNT = 20_000
 # Config value -> cumulative distribution function, or None where the counts are compared.
@@ -46,10 +48,14 @@ def test_whole_numbers_are_equally_frequent(value):
 
 
 def test_a_factor_does_not_depend_on_the_others():
-    key, radius, spin = jax.random.key(3), (parse([1, 2]), (4,)), ((parse(0), parse([0, 1])), (4,))
-    alone, both = draw(key, {"radius": radius}), draw(key, {"spin": spin, "radius": radius})
-    assert_array_equal(alone["radius"], both["radius"])
-    assert both["spin"].shape == (4, 2)
+    def drawn(**scene):
+        sampler = Sampler(load_config({"scene": {"name": "bouncing", "balls": 4, "radius": [1, 2]} | scene}))
+        return sampler.drawn(jax.random.key(3), jnp.int32(0), jnp.zeros(0))
+
+    one, other = drawn(), drawn(spin=[0, 1], elasticity=0.5)
+    assert_array_equal(one["radius"], other["radius"])
+    assert one["velocity"].shape == (4, 2)
+    assert one["gravity"].shape == (2,)
 
 
 def test_a_key_is_of_seed_split_and_number_alone():

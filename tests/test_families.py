@@ -86,7 +86,7 @@ def overlap(layout: Layout, shapes: list[Any], present: jax.Array) -> jax.Array:
     deepest = jnp.full(present.shape[1:], -jnp.inf)
     spans = zip(layout.spans, shapes, strict=True)
     for ((a, first), of_a), ((b, second), of_b) in itertools.combinations_with_replacement(spans, 2):
-        if not (a.touches and b.touches) or DYNAMIC not in (a.kind, b.kind):
+        if not (a.collides and b.collides) or DYNAMIC not in (a.kind, b.kind):
             continue
         pairs = [(i, j) for i in range(a.count) for j in range(b.count) if first + i < second + j]
         pairs = [pair for pair in pairs if frozenset((first + pair[0], second + pair[1])) not in tied]

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import yaml
 from numpy.testing import assert_allclose, assert_array_equal
-from tiny import CONFIG, changed, command, everything, ran, same
+from tiny import CONFIG, CROWDED, changed, command, everything, ran, ran_here, same
 
 import gen2d
 from gen2d.errors import ConfigError, FolderError, UserError
@@ -205,9 +205,8 @@ def test_a_signal_stops_it_and_says_how_to_go_on(tmp_path: Path, number: int):
 
 
 def test_scenes_that_cannot_be_placed_are_an_error_with_the_options_to_change(tmp_path: Path):
-    crowded = changed(scene={"balls": 6, "radius": 1.6, "width": 8, "height": 8})
     with pytest.raises(UserError, match="video 0 could not be placed"):
-        generate(crowded, 4, tmp_path / "data")
+        generate(changed(scene=CROWDED), 4, tmp_path / "data")
 
 
 def test_states_that_are_no_numbers_are_an_error_not_data(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -267,12 +266,12 @@ def test_the_command_line_tells_what_it_did(tmp_path: Path):
     assert "9 videos in" in done.stdout
     assert "datasets/tiny" in done.stdout
     assert "will take about" in done.stderr
-    again = ran("--config", "tiny.yaml", "--n", 9, cwd=tmp_path)
+    again = ran_here("--config", "tiny.yaml", "--n", 9, cwd=tmp_path)
     assert (again.returncode, "nothing to do" in again.stdout) == (0, True)
-    sheet = ran("info", "datasets/tiny", cwd=tmp_path)
+    sheet = ran_here("info", "datasets/tiny", cwd=tmp_path)
     assert "train: 9 videos" in sheet.stdout
     assert "m/s^2" in sheet.stdout
-    assert ran("verify", "datasets/tiny", cwd=tmp_path).returncode == 0
+    assert ran_here("verify", "datasets/tiny", cwd=tmp_path).returncode == 0
     path = tmp_path / "datasets/tiny/shards/train-00001.h5"
     content = bytearray(path.read_bytes())
     content[len(content) // 2] ^= 4
@@ -280,7 +279,7 @@ def test_the_command_line_tells_what_it_did(tmp_path: Path):
     broken = ran("verify", "datasets/tiny", cwd=tmp_path)
     assert broken.returncode == 1
     assert "train-00001" in broken.stdout
-    pictures = ran("preview", "tiny.yaml", "--videos", 2, "--out", "pictures", cwd=tmp_path)
+    pictures = ran_here("preview", "tiny.yaml", "--videos", 2, "--out", "pictures", cwd=tmp_path)
     assert pictures.returncode == 0, pictures.stderr
     for name in pictures.stdout.split():
         assert (tmp_path / name).stat().st_size > 500
@@ -309,7 +308,7 @@ def test_the_command_line_tells_what_it_did(tmp_path: Path):
 def test_bad_commands_end_with_one_sentence_and_code_two(tmp_path: Path, arguments: list[str]):
     if "gpu" in arguments and any(d.platform == "gpu" for d in jax.devices()):
         return
-    done = ran(*arguments, cwd=tmp_path)
+    done = (ran if "many" in arguments else ran_here)(*arguments, cwd=tmp_path)
     assert done.returncode == 2, done.stdout + done.stderr
     sentences = [line for line in done.stderr.splitlines() if line.startswith("gen2d: ")]
     assert len(sentences) == 1

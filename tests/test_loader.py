@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_array_equal
 
-from gen2d import loader
+from gen2d import loader, pieces
 from gen2d.errors import ConfigError, FolderError
 
 TRAIN = 20
@@ -159,7 +159,7 @@ def test_files_are_closed_when_many_are_open(tmp_path: Path) -> None:
     before = len(list(Path("/proc/self/fd").iterdir()))
     assert dataset[:]["index"].tolist() == list(range(140))
     assert len(list(Path("/proc/self/fd").iterdir())) <= before + 128
-    assert loader._opened.cache_info().currsize <= 128
+    assert pieces._opened.cache_info().currsize <= 128
 
 
 def test_no_jax_is_imported() -> None:

@@ -15,8 +15,8 @@ ROOT = Path(gen2d.__file__).parent.parent
 PACKAGE = ROOT / "gen2d"
 # Each module may import those before it; a family or look may import all of a Python file's neighbours but the last.
 ORDER = [
-    *("errors", "fields", "remote", "files", "cache", "codecs", "formats", "plan", "manifest", "order", "loader"),
-    *("mixing", "preview", "cards", "shards"),
+    *("errors", "fields", "remote", "files", "cache", "codecs", "formats", "plan", "manifest", "order", "pieces"),
+    *("videos", "loader", "mixing", "preview", "cards", "shards"),
     *(
         "dataloader",
         "verification",
@@ -37,8 +37,14 @@ ORDER = [
     *("ledger", "joints", "forms", "sweeps", "events", "near", "dense", "sparse", "solver", "scenery"),
     *(
         "simulate",
+        "distributions",
+        "cuts",
         "factors",
+        "quality",
+        "laws",
         "plugins",
+        "options",
+        "splits",
         "config",
         "parts",
         "sampling",

@@ -522,7 +522,7 @@ def test_a_wrong_url_is_one_sentence(url: str, told: str) -> None:
     with pytest.raises(UserError, match=told):
         gen2d.open(url)
     for verb in ("verify", "info"):
-        done = tiny.ran(verb, url)
+        done = tiny.ran_here(verb, url)
         assert done.returncode == 2
         assert re.fullmatch(rf"gen2d: .*{told}.*\n", done.stderr), done.stderr
 
@@ -546,10 +546,10 @@ def test_a_run_leaves_at_a_url_what_it_leaves_in_a_folder(server: Server, tmp_pa
         assert f"in {out}" in done.stdout
     assert buckets.tree("s3://bucket/tiny") == synthetic.tree(tmp_path / "tiny")
     for verb in ("verify", "info"):
-        done = tiny.ran(verb, "s3://bucket/tiny")
+        done = tiny.ran_here(verb, "s3://bucket/tiny")
         assert done.returncode == 0, done.stderr
         assert "s3://bucket/tiny" in done.stdout
-    done = tiny.ran("preview", "s3://bucket/tiny", "--out", tmp_path, "--videos", 2)
+    done = tiny.ran_here("preview", "s3://bucket/tiny", "--out", tmp_path, "--videos", 2)
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "tiny-sheet.png").is_file()
     done = tiny.ran("--config", config, "--n", 12, "--out", "s3://bucket/tiny", "--seed", 3, "--device", "cpu")

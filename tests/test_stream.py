@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_array_equal
-from tiny import CONFIG, changed
+from tiny import CONFIG, CROWDED, changed
 
 import gen2d
 from gen2d.errors import ConfigError
@@ -122,6 +122,5 @@ def test_a_wrong_option_is_told(options: dict, told: str):
 
 
 def test_a_scene_that_does_not_fit_is_told():
-    crowded = changed(scene={"balls": 12, "radius": 1.2})
     with pytest.raises(NoPlaceError, match="could not be placed"):
-        next(iter(gen2d.stream(crowded, batch_size=4)))
+        next(iter(gen2d.stream(changed(scene=CROWDED), batch_size=4)))

@@ -201,7 +201,7 @@ def _all_flown(config: Config, layout: Layout, keys: jax.Array) -> tuple[Stage, 
 
 def _flown(config: Config, layout: Layout, key: jax.Array) -> tuple[Stage, Scene, State]:
     video, steps = config.video, 4
-    scene, begin, *_ = sampling.sampled(key, config.scene)[1]
+    scene, begin, *_ = sampling.Sampler(config).sampled(key, jnp.int32(0), jnp.zeros(0))[1]
 
     def at(time: jax.Array) -> State:
         def moved(start: jax.Array, rate: jax.Array) -> jax.Array:

@@ -16,7 +16,7 @@ import numpy as np
 from gen2d import films, loader
 from gen2d.errors import ConfigError
 from gen2d.exports import Source
-from gen2d.loader import Batch
+from gen2d.videos import Batch
 
 LOSS = f"{films.LOSS}; positions and first speeds of the balls alone"
 CAMERA = ("camera/center", "camera/scale", "camera/angle")

@@ -14,7 +14,7 @@ import numpy as np
 
 from gen2d.exports import Source
 from gen2d.files import as_json
-from gen2d.loader import Batch
+from gen2d.videos import Batch
 
 LOSS = ""
 FIELDS, FIXED = ("frames", "*"), False

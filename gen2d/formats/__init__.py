@@ -115,9 +115,9 @@ def _moments(column: np.ndarray, field: Field, present: np.ndarray | None) -> np
     Sums of uint8 are exact. Each video is summed by itself, so that no grouping of videos changes a bit.
     """
     axes = field.axes.split()
-    if field.is_image:
-        column = column[:, ::8, ::4, ::4]  # all pixels would cost more than the rest of `encode` together
     components = column.shape[-1] if axes[-1].isdigit() else 1
+    if field.is_image:
+        return _image_moments(column, components)
     # Components before values, so that each is summed in one piece of memory.
     values = column.reshape(len(column), -1, components).transpose(0, 2, 1).astype(np.float64, order="C")
     count, low, high = np.full(values.shape[:2], values.shape[2], np.float64), values, values
@@ -128,6 +128,15 @@ def _moments(column: np.ndarray, field: Field, present: np.ndarray | None) -> np
         values = np.where(there, values, 0.0)
     sums = count, values.sum(-1), (values * values).sum(-1)
     return np.stack([*sums, low.min(-1, initial=np.inf), high.max(-1, initial=-np.inf)], axis=1)
+
+
+def _image_moments(images: np.ndarray, components: int) -> np.ndarray:
+    """The moments of uint8 images [m, T, H, W, ...], in whole numbers, which takes half as long."""
+    some = images[:, ::8, ::4, ::4]  # all pixels would cost more than the rest of `encode` together
+    values = np.ascontiguousarray(some.reshape(len(images), -1, components).transpose(0, 2, 1))
+    wide = values.astype(np.uint32)
+    count = np.full(values.shape[:2], values.shape[2], np.float64)
+    return np.stack([count, wide.sum(-1), (wide * wide).sum(-1), values.min(-1), values.max(-1)], axis=1)
 
 
 def _spread(present: np.ndarray, axes: list[str], shape: tuple[int, ...]) -> np.ndarray:

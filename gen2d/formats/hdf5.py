@@ -46,7 +46,7 @@ def write(
         chunked = {name: _chunked(file, name, fields[name].dtype, shapes[name], codec, chunk_frames) for name in images}
         table = {name: np.zeros(shapes[name], fields[name].dtype) for name in rows}
         for first, block in _numbered(blocks, count, path):
-            _write_chunks(chunked, block, first)
+            _write_chunks(chunked, block, first, chunk_frames)
             for name in rows:
                 _fill(table[name], first, block.arrays[name], name)
         for name, values in sorted((table | dict(constants)).items()):
@@ -124,14 +124,15 @@ def _numbered(blocks: Iterable[Block], count: int, path: Path) -> Iterator[tuple
         raise ValueError(f"{path.name} takes {count} videos, but was given {first}")
 
 
-def _write_chunks(chunked: Mapping[str, h5py.Dataset], block: Block, first: int) -> None:
+def _write_chunks(chunked: Mapping[str, h5py.Dataset], block: Block, first: int, chunk_frames: int | None) -> None:
+    # h5py asks the file for a dataset's rank each time, which takes longer than to write a small chunk.
+    targets = {name: (dataset.id, (0,) * (dataset.ndim - 2)) for name, dataset in chunked.items()}
     # Video by video, so that the file does not depend on the size of a block.
     for row in range(len(block)):
-        for name, dataset in chunked.items():
-            pieces, frames = len(block.chunks[name]) // len(block), _frames(dataset)
+        for name, (target, rest) in targets.items():
+            pieces = len(block.chunks[name]) // len(block)
             for piece, data in enumerate(block.chunks[name][row * pieces : (row + 1) * pieces]):
-                corner = (first + row, piece * frames, *[0] * (dataset.ndim - 2))
-                dataset.id.write_direct_chunk(corner, data)
+                target.write_direct_chunk((first + row, piece * (chunk_frames or 0), *rest), data)
 
 
 def _fill(table: np.ndarray, first: int, values: np.ndarray, name: str) -> None:

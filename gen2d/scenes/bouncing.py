@@ -5,8 +5,8 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 
-from gen2d.config import option
-from gen2d.factors import Distribution
+from gen2d.distributions import Distribution
+from gen2d.options import option
 from gen2d.parts import Sampled, assembled, box_walls, discs
 from gen2d.placement import place
 from gen2d.types import STATIC, Array, Layout, Run

@@ -8,9 +8,9 @@ import math
 
 import jax.numpy as jnp
 
-from gen2d.config import option
-from gen2d.factors import Distribution
+from gen2d.distributions import Distribution
 from gen2d.fields import Field
+from gen2d.options import option
 from gen2d.parts import Sampled, assembled, bars, discs, hinged
 from gen2d.types import STATIC, Array, Layout, Run, Tie
 
@@ -67,7 +67,7 @@ def layout(options: Options) -> Layout:
     n, pins, radius = options.links, options.ends, options.radius.support[1]
     ties = [Tie("revolute", pins + i - 1 if i else 0, pins + i) for i in range(n)]
     ties += [Tie("revolute", 1, pins + n - 1)] if pins == 2 else []
-    runs = Run("circle", pins, STATIC, layer=2, touches=False), Run("capsule", n, touches=False)
+    runs = Run("circle", pins, STATIC, layer=2, collides=False), Run("capsule", n, collides=False)
     length = options.length.support[1]
     return Layout(runs, _bounds(options, n * length), length / 2 + radius, tuple(ties))
 
@@ -89,8 +89,8 @@ def sample(key: Array, factors: dict[str, Array], options: Options) -> Sampled:
     """One video's scene and start: the chain at rest, taut."""
     n, radius = options.links, factors["radius"]
     corners, kink = _straight(factors, n) if options.ends == 1 else _pulled(factors, n)
-    pins = discs(corners[:: n if options.ends == 2 else n + 1], 1.5 * radius, kind=STATIC, layer=2, touches=False)
-    material = {"density": factors["density"], "color": factors["color"], "touches": False}
+    pins = discs(corners[:: n if options.ends == 2 else n + 1], 1.5 * radius, kind=STATIC, layer=2, collides=False)
+    material = {"density": factors["density"], "color": factors["color"], "collides": False}
     links = bars(corners[:-1], corners[1:], radius, **material)
     joints = hinged(links, options.ends == 2, motor_torque=factors["friction"])
     scene, state = assembled(layout(options), [pins, links], factors["gravity"], joints)

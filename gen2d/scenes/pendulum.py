@@ -5,9 +5,9 @@ import math
 
 import jax.numpy as jnp
 
-from gen2d.config import option
-from gen2d.factors import Distribution
+from gen2d.distributions import Distribution
 from gen2d.fields import Field
+from gen2d.options import option
 from gen2d.parts import Sampled, assembled, bars, discs, joined
 from gen2d.types import STATIC, Array, Layout, Run, Tie
 
@@ -44,8 +44,8 @@ def sizes(options: Options) -> dict[str, int]:
 def layout(options: Options) -> Layout:
     """The pin, the rods and the bobs; each rod hangs from what is above it, and its bob turns at its end."""
     n, length, radius = options.links, options.length.support[1], options.radius.support[1]
-    rods, bobs = Run("capsule", n, layer=1, touches=False), Run("circle", n, layer=2, touches=False)
-    pin = Run("circle", 1, STATIC, layer=3, touches=False)
+    rods, bobs = Run("capsule", n, layer=1, collides=False), Run("circle", n, layer=2, collides=False)
+    pin = Run("circle", 1, STATIC, layer=3, collides=False)
     ties = [(Tie("revolute", 1 + n + i - 1 if i else 0, 1 + i), Tie("revolute", 1 + i, 1 + n + i)) for i in range(n)]
     room, widest = n * length + radius, max(map(abs, options.angle.support))
     low = n == 1 and options.swing.support == (0.0, 0.0) and widest < math.pi / 2
@@ -60,13 +60,13 @@ def sample(key: Array, factors: dict[str, Array], options: Options) -> Sampled:
     ways = length[:, None] * jnp.stack([jnp.sin(angle), -jnp.cos(angle)], -1)
     speeds = factors["swing"][:, None] * jnp.stack([-ways[:, 1], ways[:, 0]], -1)
     ends, end_speeds = jnp.cumsum(ways, 0), jnp.cumsum(speeds, 0)
-    pin = discs(jnp.zeros((1, 2)), PIN, kind=STATIC, layer=3, touches=False)
+    pin = discs(jnp.zeros((1, 2)), PIN, kind=STATIC, layer=3, collides=False)
     rods = bars(
         ends - ways, ends, ROD, density=factors["rod_density"], velocity=end_speeds - speeds / 2, spin=factors["swing"],
-        layer=1, touches=False,
+        layer=1, collides=False,
     )  # fmt: skip
     bob = {name: factors[name] for name in ("density", "color")}
-    bobs = discs(ends, factors["radius"], velocity=end_speeds, layer=2, touches=False, **bob)
+    bobs = discs(ends, factors["radius"], velocity=end_speeds, layer=2, collides=False, **bob)
     half = jnp.stack([rods.objects["half_length"], jnp.zeros(n)], -1)
     nothing = jnp.zeros((n, 2))
     above, below = (jnp.stack(pair, 1).reshape(-1, 2) for pair in ((nothing, half), (-half, nothing)))

@@ -4,8 +4,8 @@ import dataclasses
 
 import jax.numpy as jnp
 
-from gen2d.config import option
-from gen2d.factors import Distribution
+from gen2d.distributions import Distribution
+from gen2d.options import option
 from gen2d.parts import Sampled, assembled, bars, boxes, discs, hinged, segments
 from gen2d.types import STATIC, Array, Layout, Run, Tie
 
@@ -62,8 +62,8 @@ def layout(options: Options) -> Layout:
     width, height, radius, chain = (getattr(options, x).support[1] for x in ("width", "height", "radius", "chain"))
     runs = (
         Run("segment", 1, STATIC),
-        Run("circle", 1, STATIC, layer=3, touches=False),
-        Run("capsule", n, layer=2, touches=False),
+        Run("circle", 1, STATIC, layer=3, collides=False),
+        Run("capsule", n, layer=2, collides=False),
         Run("circle", 1, layer=3),
         Run("polygon", most, vertices=4),
     )
@@ -84,11 +84,11 @@ def sample(key: Array, factors: dict[str, Array], options: Options) -> Sampled:
     floor = segments([(-wide, 0.0)], [(wide, 0.0)], friction=factors["friction"])
     lowest = factors["aim"] * factors["blocks"] * height
     top = jnp.stack([-radius - factors["gap"], lowest + chain])
-    pin = discs(top[None], PIN, kind=STATIC, layer=3, touches=False)
+    pin = discs(top[None], PIN, kind=STATIC, layer=3, collides=False)
     way = chain * jnp.stack([-jnp.sin(angle), -jnp.cos(angle)])
     corners = top + (jnp.arange(n + 1.0) / n)[:, None] * way
     heavy = factors["ball_density"]
-    links = bars(corners[:-1], corners[1:], LINK, density=heavy, layer=2, touches=False)
+    links = bars(corners[:-1], corners[1:], LINK, density=heavy, layer=2, collides=False)
     ball = discs(corners[-1:], radius, density=heavy, color=factors["ball_color"], layer=3, **surface)
     numbers = jnp.arange(most)
     places = jnp.stack([jnp.full(most, 0.5) * width, (numbers + 0.5) * height], -1)

@@ -1,0 +1,191 @@
+"""What an option may be: its unit, default and range, said once where it is declared, and checked where it is read.
+
+An error is one sentence with the file, the field, its value and what is allowed.
+"""
+
+import dataclasses
+from collections.abc import Mapping
+from types import MappingProxyType, ModuleType
+from typing import Any
+
+from gen2d import files, plugins
+from gen2d.distributions import Distribution
+from gen2d.errors import ConfigError
+from gen2d.factors import is_number, parse
+
+Copies = Mapping[str, bytes]  # what files of the user's own held, by their names in the config
+NO_COPIES: Copies = MappingProxyType({})
+
+
+@dataclasses.dataclass(frozen=True)
+class Option:
+    """What an option may be. `parts` > 0: a list of so many values. `draw`: a distribution, else a single value; of a
+    scene family a factor, `each` names what every one has a draw of its own for."""
+
+    kind: type  # int, float, str or bool
+    unit: str
+    meaning: str
+    low: float | None = None
+    high: float | None = None
+    above: float | None = None
+    choices: tuple[str, ...] = ()
+    draw: bool = False
+    parts: int = 0
+    each: str = ""
+    optional: bool = False  # may be null: decided by the program
+
+    @property
+    def allowed(self) -> str:
+        """What the option may be, for a sentence."""
+        if self.choices:
+            return "one of " + ", ".join(self.choices)
+        if self.kind is bool:
+            return "true or false"
+        noun = {int: "whole number", float: "number", str: "text"}[self.kind]
+        ends = [
+            f"above {self.above:g}" if self.above is not None else "",
+            f"{self.low:g} or more" if self.low is not None else "",
+        ]
+        ends.append(f"{self.high:g} or less" if self.high is not None else "")
+        limits = " and ".join(end for end in ends if end)
+        text = f"a {noun}" if not self.parts else f"a list of {self.parts} {noun}s"
+        return text + (f", {limits}" if limits else "") + (" (or null)" if self.optional else "")
+
+
+def option(default: Any, kind: type, unit: str, meaning: str, **limits: Any) -> Any:
+    """A dataclass field that is an option; a drawn one's default is written as in a config."""
+    spec = Option(kind, unit, meaning, **limits)
+    if spec.draw:
+        default = [parse(v, kind is int) for v in default] if spec.parts else parse(default, kind is int)
+    if isinstance(default, list):
+        default = tuple(default)
+    return dataclasses.field(default=default, metadata={"option": spec})
+
+
+@dataclasses.dataclass(frozen=True)
+class Plugin:
+    """A named plug-in and its options. A scene's `options` can give whatever any split may draw."""
+
+    name: str
+    module: ModuleType
+    options: Any
+    sha256: str | None = None  # of a file of the user's own, which may change
+    content: bytes = b""  # of that file
+    own: Any = None  # the options as written, where splits draw others
+
+    def plain(self) -> dict[str, Any]:
+        """The plug-in as YAML and JSON hold it."""
+        own = {"sha256": self.sha256} if self.sha256 else {}
+        return {"name": self.name, **own, **plain_of(self.own or self.options)}
+
+
+def plain_of(options: Any) -> dict[str, Any]:
+    """Options as YAML and JSON hold them."""
+
+    def value(v: Any) -> Any:
+        if isinstance(v, tuple):
+            return [value(x) for x in v]
+        return v.plain() if isinstance(v, Distribution) else v
+
+    return {f.name: value(getattr(options, f.name)) for f in dataclasses.fields(options)}
+
+
+def _check(spec: Option, low: float, high: float) -> bool:
+    return (
+        (spec.low is None or low >= spec.low)
+        and (spec.above is None or low > spec.above)
+        and (spec.high is None or high <= spec.high)
+    )
+
+
+def _single(spec: Option, value: Any) -> Any:
+    """A checked value, or ValueError with what is allowed."""
+    if spec.draw:
+        distribution = parse(value, spec.kind is int)
+        if not _check(spec, *distribution.support):
+            raise ValueError(spec.allowed + (" for every value drawn" if distribution.kind != "constant" else ""))
+        return distribution
+    if spec.kind is str:
+        if not isinstance(value, str) or (spec.choices and value not in spec.choices):
+            raise ValueError(spec.allowed)
+        return value
+    if spec.kind is bool and isinstance(value, bool):
+        return value
+    if not is_number(value) or spec.kind is bool:
+        raise ValueError(spec.allowed)
+    if (spec.kind is int and not float(value).is_integer()) or not _check(spec, value, value):
+        raise ValueError(spec.allowed)
+    return spec.kind(value)
+
+
+def value_of(spec: Option, value: Any) -> Any:
+    """A checked value, in a tuple if it has parts; ValueError with what is allowed."""
+    if value is None and spec.optional:
+        return None
+    if not spec.parts:
+        return _single(spec, value)
+    if not isinstance(value, list | tuple) or len(value) != spec.parts:
+        raise ValueError(spec.allowed)
+    return tuple(_single(spec, part) for part in value)
+
+
+def build(cls: type, values: Any, where: str, source: str) -> Any:
+    """An options dataclass from a mapping; `where` is the path of the mapping in the config."""
+    if not isinstance(values, Mapping):
+        raise ConfigError(f"{source}: {where} is {values!r}, but must be a mapping of options")
+    known = {f.name: f.metadata["option"] for f in dataclasses.fields(cls)}
+    filled = {}
+    for key, value in values.items():
+        if key not in known:
+            raise ConfigError(f"{source}: {where}.{key} is not an option; {plugins.nearest(key, list(known))}")
+        try:
+            filled[key] = value_of(known[key], value)
+        except ValueError as error:
+            raise ConfigError(f"{source}: {where}.{key} is {value!r}, but must be {error}") from None
+    return cls(**filled)
+
+
+def plugin_of(kind: str, values: Any, default: str, source: str, copies: Copies) -> Plugin:
+    """A plug-in with its options; its bare name is enough."""
+    values = {"name": values} if isinstance(values, str) else {} if values is None else values
+    if not isinstance(values, Mapping):
+        raise ConfigError(f"{source}: {kind} is {values!r}, but must be a name, or a mapping with a name and options")
+    name = values.get("name", default)
+    if not isinstance(name, str):
+        raise ConfigError(f"{source}: {kind}.name is {name!r}, but must be one of {', '.join(plugins.names(kind))}")
+    content, sha256 = _content(kind, name, values, source, copies) if plugins.is_own(name) else (b"", None)
+    if values.get("sha256", sha256) != sha256:
+        raise ConfigError(f"{source}: {kind}.sha256 is of another version of {name}")
+    module = plugins.load(kind, name, source, content)
+    options = build(module.Options, {k: v for k, v in values.items() if k not in ("name", "sha256")}, kind, source)
+    plugin = Plugin(name, module, options, sha256, content)
+    check_plugin(plugin, kind, source)
+    return plugin
+
+
+def _content(kind: str, name: str, values: Mapping, source: str, copies: Copies) -> tuple[bytes, str]:
+    """What a file of the user's own holds, and its sha256: of the copy if that is the version asked for."""
+    if name in copies and files.sha256(copies[name]) == values.get("sha256"):
+        return copies[name], values["sha256"]
+    content = plugins.content_of(kind, name, source)
+    return content, files.sha256(content)
+
+
+def check_plugin(plugin: Plugin, kind: str, source: str) -> None:
+    """Returns nothing; raises ConfigError for options that the plug-in itself refuses."""
+    if hasattr(plugin.module, "check"):
+        try:
+            plugin.module.check(plugin.options)
+        except ValueError as error:
+            raise ConfigError(f"{source}: {kind}.{error}") from None
+
+
+def coordinates(name: str, value: Any) -> dict[str, Any]:
+    """The single numbers that an option's value is made of, by name: `radius`, or `velocity[0]` and `velocity[1]`."""
+    return {f"{name}[{i}]": part for i, part in enumerate(value)} if isinstance(value, tuple) else {name: value}
+
+
+def drawn_options(module: ModuleType) -> dict[str, Option]:
+    """The option behind each factor of a family, by name."""
+    found = {field.name: field.metadata["option"] for field in dataclasses.fields(module.Options)}
+    return {name: spec for name, spec in found.items() if spec.draw}

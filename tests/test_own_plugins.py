@@ -1,0 +1,154 @@
+"""A family or look of one's own goes with the dataset: its videos are made again after the file is gone or changed."""
+
+import importlib
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import synthetic
+from numpy.testing import assert_array_equal
+from test_regeneration import contents
+from test_verification import flip
+from tiny import changed
+
+import gen2d
+from gen2d import shards
+from gen2d.config import load_config
+from gen2d.errors import ConfigError, FolderError
+from gen2d.generation import generate
+from gen2d.redraw import config_of
+from gen2d.regeneration import repair
+from gen2d.scenes import bouncing
+from gen2d.verification import verify
+
+flat = importlib.import_module("gen2d.renderers.flat")
+COPIES = ["plugins/look/mine.py", "plugins/scene/mine.py"]
+
+
+@pytest.fixture(scope="module")
+def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a family and a look of one name, and a dataset of them."""
+    home = tmp_path_factory.mktemp("home")
+    for folder, module in (("families", bouncing), ("looks", flat)):
+        (home / folder).mkdir()
+        shutil.copy(str(module.__file__), home / folder / "mine.py")
+    generate(config(home), 6, home / "data")
+    return home
+
+
+def config(home: Path) -> dict:
+    names = {
+        "scene": {"name": f"{home}/families/mine.py", "balls": 2},
+        "look": {"name": f"{home}/looks/mine.py"},
+    }
+    return changed(video={"frames": 3}, physics={"substeps": 1}, storage={"videos_per_shard": 4}, **names)
+
+
+GONE = {
+    "removed": lambda path: path.unlink(),
+    "changed": lambda path: path.write_text("raise RuntimeError('what is there now')"),
+    "a folder": lambda path: (path.unlink(), path.mkdir()),
+}
+
+
+@pytest.fixture(params=["there", *GONE])
+def root(request: pytest.FixtureRequest, home: Path, tmp_path: Path) -> Iterator[Path]:
+    """The dataset, its originals there, gone, or something else."""
+    originals = [home / "families" / "mine.py", home / "looks" / "mine.py"]
+    kept = [path.read_bytes() for path in originals]
+    if request.param != "there":
+        for path in originals:
+            GONE[request.param](path)
+    yield Path(shutil.copytree(home / "data", tmp_path / "data"))
+    for path, content in zip(originals, kept, strict=True):
+        shutil.rmtree(path, ignore_errors=True)
+        path.write_bytes(content)
+
+
+def test_the_files_lie_in_the_folder_and_in_its_manifest(home: Path) -> None:
+    files = shards.read_manifest(home / "data")["files"]
+    assert sorted(name for name in files if name.startswith("plugins/")) == COPIES
+    for name, kind in zip(COPIES, ("looks", "families"), strict=True):
+        assert (home / "data" / name).read_bytes() == (home / kind / "mine.py").read_bytes()
+    assert verify(home / "data", "full") == []
+
+
+def test_videos_are_made_again(root: Path) -> None:
+    assert verify(root, "regen", videos=6) == []
+    ds = gen2d.open(root)
+    expected = ds[[1, 5]]["frames"]
+    assert_array_equal(np.asarray(gen2d.render(ds, [1, 5])), expected)
+    look = config_of(ds).plain()["look"]
+    assert_array_equal(np.asarray(gen2d.render(ds, [1, 5], look=look)), expected)
+    assert config_of(ds, ["look.background=[9, 9, 9]"]).look.content == config_of(ds).look.content
+
+
+def test_what_is_damaged_is_made_again(home: Path, root: Path) -> None:
+    flip(root / "shards" / "train-00000.h5", 80000)
+    flip(root / "config.yaml", 80)
+    (root / "index" / "videos.npy").unlink()
+    assert verify(root, "full", lambda names: repair(root, names)) == []
+    assert contents(root) == contents(home / "data")
+
+
+def test_a_damaged_copy_is_found_and_comes_back_where_the_original_is_there(
+    request: pytest.FixtureRequest, home: Path, root: Path
+) -> None:
+    for name in COPIES:
+        flip(root / name, 80)
+    found = verify(root, "quick")
+    assert [f"{root}/{name} is not what was written" for name in COPIES] == found
+    if request.node.callspec.params["root"] == "there":
+        assert verify(root, "quick", lambda names: repair(root, names)) == []
+        assert contents(root) == contents(home / "data")
+        return
+    for call in (lambda: verify(root, "regen"), lambda: repair(root, []), lambda: gen2d.render(gen2d.open(root), [0])):
+        with pytest.raises(ConfigError, match=r"mine\.py") as caught:
+            call()
+        assert "\n" not in str(caught.value)
+
+
+def test_a_copy_is_of_its_own_file_only(home: Path, root: Path) -> None:
+    """Another file that is asked for is not taken for the one that the dataset has a copy of."""
+    other = home / "other.py"
+    other.write_bytes(Path(str(flat.__file__)).read_bytes() + b"# other\n")
+    ds = gen2d.open(root)
+    own = load_config({"look": str(other)}).look
+    assert own.sha256 != config_of(ds).look.sha256
+    assert load_config(config_of(ds).plain() | {"look": own.plain()}, copies=config_of(ds).copies).look == own
+    with pytest.raises(ConfigError, match=r"sha256 is of another version of .*other\.py"):
+        config_of(ds, [f"look.name={other}"])
+
+
+# ---- What stays an error
+
+
+def test_a_run_goes_on_with_the_very_file_only(home: Path, tmp_path: Path) -> None:
+    out = Path(shutil.copytree(home / "data", tmp_path / "data"))
+    own = config(home)
+    original = home / "looks" / "mine.py"
+    content = original.read_bytes()
+    try:
+        original.write_bytes(content + b"# changed\n")
+        with pytest.raises(FolderError, match=r"config\.look\.sha256 is .* there and .* here"):
+            generate(own, 8, out)
+        original.unlink()
+        with pytest.raises(ConfigError, match=r"looks/mine.py', but there is no such file"):
+            generate(own, 8, out)
+    finally:
+        original.write_bytes(content)
+    assert contents(out) == contents(home / "data")
+
+
+def test_another_dataset_takes_the_place_of_the_copies_too(tmp_path: Path) -> None:
+    copies = {name: name.encode() for name in COPIES}
+    synthetic.make(synthetic.dataset(tmp_path, train=1, copies=copies))
+    assert all((tmp_path / name).read_bytes() == content for name, content in copies.items())
+    synthetic.make(synthetic.dataset(tmp_path, train=1, seed=8, copies={COPIES[0]: b"other"}), overwrite=True)
+    assert (tmp_path / COPIES[0]).read_bytes() == b"other"
+    assert not (tmp_path / COPIES[1]).exists()
+    (tmp_path / COPIES[1]).parent.mkdir()
+    (tmp_path / COPIES[1]).touch()
+    assert verify(tmp_path) == [f"{tmp_path / COPIES[1]} does not belong to the dataset"]
