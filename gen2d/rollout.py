@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-from gen2d import annotations, drawing, factors, sampling, types
+from gen2d import annotations, drawing, factors, predictability, sampling, types, words
 from gen2d.config import Config, PhysicsOptions
 from gen2d.fields import Field
 from gen2d.parts import Sampled
@@ -96,7 +96,9 @@ class Rollout:
             del fields["quality/energy_residual"]
         if self.plan.frames:
             fields["frames"] = Field("uint8", "n T H W 3", "sRGB", "the video")
-        fields |= annotations.fields(self.config.annotations)
+        fields |= annotations.fields(self.config.annotations) | self.word_fields
+        if self.config.annotations.predictability:
+            fields |= predictability.FIELDS
         fields["index"] = Field("int64", "n", "1", "the video's number in its split")
         fields["time"] = Field("float64", "T", "s", "of each frame; frame 0 is the initial state")
         fields["quality/rejected_draws"] = Field("int32", "n", "1", "places drawn again as they did not fit")
@@ -104,6 +106,15 @@ class Rollout:
             fields[f"camera/{name}"] = Field("float32", axes, unit, meaning)
         fields |= sampling.fields(self.config.scene)
         return dict(sorted(fields.items()))
+
+    @property
+    def word_fields(self) -> dict[str, Field]:
+        """Those fields that are made on the host."""
+        return words.fields(self.layout.slots, self.config.video.frames) if self.config.annotations.words else {}
+
+    def told(self, columns: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+        """The fields of some videos that are made on the host, from their others there."""
+        return words.told(columns, self.config.video) if self.config.annotations.words else {}
 
     @property
     def time(self) -> np.ndarray:
@@ -159,6 +170,11 @@ class Rollout:
         columns |= drawing.camera_columns(stages.instants.view)
         columns |= {f"factors/{name}": values.astype(jnp.float32) for name, values in drawn.items()}
         columns["quality/rejected_draws"] = rejected
+        if config.annotations.predictability:
+            again = functools.partial(
+                simulate, layout=layout, rules=rules, frames=config.video.frames, steps=self.steps, sparse=sparse
+            )
+            columns["quality/growth"] = predictability.growth(keys, *device, again, float(self.time[-1]))
         return Batch(columns, stages, placed)
 
     def _sampled(self, key: Array) -> tuple[dict[str, Array], Sampled]:

@@ -21,6 +21,7 @@ ORDER = [
         "dataloader",
         "verification",
         "report",
+        "words",
         "progress",
         "films",
         "exports",
@@ -38,6 +39,7 @@ ORDER = [
     *(
         "simulate",
         "factors",
+        "predictability",
         "plugins",
         "config",
         "parts",
