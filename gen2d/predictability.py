@@ -25,31 +25,31 @@ def growth(keys: Array, scene: Scene, state: State, run: Callable[[Scene, State]
     of speed counts as the way that it makes in a second. The unit of length is of no matter, as sizes are divided.
     Records and what `run` gives are in the device's layout.
     """
-    change = _direction(keys, scene, state)
-    _, after = jax.jvp(lambda start: _last(run(scene, start).states), (state,), (change,))
+    change = direction(keys, scene, state)
+    _, after = jax.jvp(lambda start: last(run(scene, start).states), (state,), (change,))
     most = jnp.finfo(jnp.float32).max  # what overflows has grown as much as can be told
-    grown = jnp.clip(jnp.nan_to_num(_size(after), nan=most, posinf=most), SMALL * SMALL)
-    moves = _size((change.position, change.velocity)) > 0
+    grown = jnp.clip(jnp.nan_to_num(size(after), nan=most, posinf=most), SMALL * SMALL)
+    moves = size((change.position, change.velocity)) > 0
     return jnp.where(moves, jnp.log10(grown) - jnp.log10(SMALL), 0.0) / (seconds or 1.0)
 
 
-def _direction(keys: Array, scene: Scene, state: State) -> State:
+def direction(keys: Array, scene: Scene, state: State) -> State:
     """A change of the size SMALL."""
     dynamic = scene.objects.present & (scene.objects.kind == DYNAMIC)
     drawn = jax.vmap(lambda key: jax.random.normal(key_for(key, "growth"), (2, *state.position.shape[:2])))(keys)
     place, velocity = jnp.where(dynamic, jnp.moveaxis(drawn, 0, -1), 0.0)
     still = jnp.zeros_like(state.angle)
     way = State(place, still, velocity, still)
-    size = _size((place, velocity))
-    return jax.tree.map(lambda x: SMALL * x / jnp.where(size > 0, size, 1.0), way)
+    whole = size((place, velocity))
+    return jax.tree.map(lambda x: SMALL * x / jnp.where(whole > 0, whole, 1.0), way)
 
 
-def _last(states: State) -> tuple[Array, Array]:
+def last(states: State) -> tuple[Array, Array]:
     """Place and velocity in the last frame."""
     return states.position[-1], states.velocity[-1]
 
 
-def _size(change: tuple[Array, Array]) -> Array:
+def size(change: tuple[Array, Array]) -> Array:
     """The size [n] of a change of places and velocities [2, K, n]; its square might leave a float32's range."""
     numbers = jnp.concatenate([part.reshape(-1, part.shape[-1]) for part in change])
     largest = jnp.abs(numbers).max(0)

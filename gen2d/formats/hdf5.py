@@ -44,13 +44,13 @@ def write(
         file.attrs.update(attributes)
         shapes = {name: (count, *fields[name].shape(sizes)) for name in images + rows}
         chunked = {name: _chunked(file, name, fields[name].dtype, shapes[name], codec, chunk_frames) for name in images}
-        table = {name: np.zeros(shapes[name], fields[name].dtype) for name in rows}
+        table = {name: np.zeros(shapes[name], _stored_type(fields[name])) for name in rows}
         for first, block in _numbered(blocks, count, path):
             _write_chunks(chunked, block, first)
             for name in rows:
                 _fill(table[name], first, block.arrays[name], name)
         for name, values in sorted((table | dict(constants)).items()):
-            file.create_dataset(name, data=np.asarray(values, fields[name].dtype), dtype=_stored_type(fields[name]))
+            file.create_dataset(name, data=np.asarray(values, _stored_type(fields[name])))
         for name, field in sorted(fields.items()):
             file[name].attrs.update(axes=field.axes, unit=field.unit, meaning=field.meaning)
         return Places(
