@@ -172,7 +172,6 @@ class Stream:
         numbers, starts = jnp.asarray(cell.numbers.astype(np.int32)), jnp.asarray(cell.starts, jnp.int32)
         made = self._view(found, numbers, starts, np.int32(lane))
         made |= self._words(batch, lane, told) if told else {}
-        made = {name: made[name] for name in self.fields}
         return made if cell.videos == self.cell else {name: array[: cell.videos] for name, array in made.items()}
 
     def _words(self, batch: Batch, lane: int, wanted: Set[str]) -> Arrays:

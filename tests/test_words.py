@@ -326,7 +326,8 @@ def test_shapes_have_their_nouns() -> None:
 # ---- In a dataset
 
 
-WORDY = tiny.changed(annotations={"words": True, "contacts": 8, "visibility": True}, video={"frames": 16})
+ASKED = {"words": True, "contacts": 8, "visibility": True, "predictability": True}
+WORDY = tiny.changed(annotations=ASKED, video={"frames": 16})
 
 
 @pytest.fixture(scope="module")
@@ -351,15 +352,21 @@ def test_the_least_visibility_is_that_of_what_moves(made: Path) -> None:
     assert_array_equal(videos["quality/min_visibility"], np.where(there, videos["visibility/fraction"], 1).min((1, 2)))
 
 
+def test_growth_is_a_number_that_each_video_has_for_itself(made: Path) -> None:
+    growth = gen2d.open(made, fields="quality/growth")[:]["quality/growth"]
+    assert np.isfinite(growth).all()
+    assert len(np.unique(growth)) == 8
+
+
 @pytest.mark.parametrize("to", ["jax", "torch"])
 def test_a_stream_tells_the_same(made: Path, to: str) -> None:
     if to == "torch":
         pytest.importorskip("torch")
-    names = ["text/*", "index"]
+    names = ["text/*", "index", "quality/*"]
     stream = gen2d.stream(WORDY, 5, 3, n=8, fields=names, epochs=1, to=to)
     loader = gen2d.DataLoader(gen2d.open(made, fields=names), 3, shuffle=False, epochs=1)
     for here, there in zip(stream, loader, strict=True):
-        assert list(here) == list(there)
+        assert here.keys() == there.keys()
         for name, values in there.items():
             assert_array_equal(np.asarray(here[name]), values)
 
