@@ -7,7 +7,7 @@ import numpy as np
 
 from gen2d import loader, preview
 from gen2d.files import as_json, sha256
-from gen2d.manifest import statistics
+from gen2d.manifest import field_of, statistics
 from gen2d.remote import Place
 
 Manifest = Mapping[str, Any]
@@ -135,13 +135,16 @@ def croissant(manifest: Manifest) -> dict[str, Any]:
         "description": "Rendered videos of two-dimensional rigid bodies with full ground truth, made by gen2d.",
         "license": manifest["licence"],
         "version": "1.0.0",
-        "variableMeasured": [
-            {"@type": "sc:PropertyValue", "name": name, "unitText": about["unit"], "description": about["meaning"]}
-            for name, about in manifest["fields"].items()
-        ],
+        "variableMeasured": [_variable(name, about) for name, about in manifest["fields"].items()],
         "distribution": _files(manifest),
         "recordSet": [_shards()],
     }
+
+
+def _variable(name: str, about: Mapping[str, Any]) -> dict[str, Any]:
+    kind = {"valueReference": "sc:Text"} if field_of(about).is_text else {}
+    told = {"name": name, "unitText": about["unit"], "description": about["meaning"]}
+    return {"@type": "sc:PropertyValue"} | told | kind
 
 
 def _files(manifest: Manifest) -> list[dict[str, Any]]:

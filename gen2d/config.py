@@ -124,6 +124,8 @@ class AnnotationOptions:
         0, int, "rows", "of contacts, per object and 16 frames; 4 is a good number, 0: none", low=0, high=1000
     )
     energy: bool = option(False, bool, "", "books of energy and momentum, and what they leave unexplained")
+    words: bool = option(False, bool, "", "a caption and a list of events, as text; they need contacts")
+    predictability: bool = option(False, bool, "", "how fast a small change of the start grows")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -367,6 +369,8 @@ def from_mapping(values: Any, source: str, name: str = "dataset", copies: Copies
     frames, chunk = sections["video"].frames, sections["storage"].chunk_frames
     if chunk is not None and frames % chunk:
         raise ConfigError(f"{source}: storage.chunk_frames is {chunk}, but must divide video.frames, which is {frames}")
+    if sections["annotations"].words and not sections["annotations"].contacts:
+        raise ConfigError(f"{source}: annotations.contacts is 0, but annotations.words needs them: 4 is a good number")
     config = Config(name=name, seed=seed, **sections)
     _check_grids(config, source)
     enabled = {f"annotations.{name}": bool(value) for name, value in vars(config.annotations).items()}

@@ -31,8 +31,8 @@ class DataLoader:
     `shuffle` is "global" (or True) or False. `remainder` says what happens to the last videos of an epoch that fill no
     global batch: "drop" or "keep" (then the ranks' shares may differ by one, or be empty). `transform` gets each batch
     in a thread, and returns new arrays each time. `to` is "numpy", "torch" or "jax", which has no 64-bit numbers unless
-    told to. `device` is where batches are put, a torch device or its name or a jax device, and `sharding` how jax lays
-    them out on several. `dataset` is of `gen2d.open` or `gen2d.mix`.
+    told to; text stays NumPy's bytes in both. `device` is where batches are put, a torch device or its name or a jax
+    device, and `sharding` how jax lays them out on several. `dataset` is of `gen2d.open` or `gen2d.mix`.
     """
 
     def __init__(
@@ -129,12 +129,23 @@ class DataLoader:
 
 def _to_torch(batch: Batch, device: Any, sharding: Any) -> dict[str, Any]:
     torch = importlib.import_module("torch")
-    tensors = {name: torch.from_numpy(values) for name, values in batch.items()}
-    return tensors if device is None else {name: tensor.to(device) for name, tensor in tensors.items()}
+    numbers, text = without_text(batch)
+    tensors = {name: torch.from_numpy(values) for name, values in numbers.items()}
+    return (tensors if device is None else {name: tensor.to(device) for name, tensor in tensors.items()}) | text
 
 
-def _to_jax(batch: Batch, device: Any, sharding: Any) -> dict[str, Any]:
-    return importlib.import_module("jax").device_put(batch, device if sharding is None else sharding)
+def _to_jax(batch: Any, device: Any, sharding: Any) -> Any:
+    numbers, text = without_text(batch) if isinstance(batch, dict) else (batch, {})
+    placed = importlib.import_module("jax").device_put(numbers, device if sharding is None else sharding)
+    return placed | text if text else placed
+
+
+def without_text(batch: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
+    """The fields of a batch that are numbers, and those that are text, which stay in NumPy."""
+    text = {
+        name: values for name, values in batch.items() if isinstance(values, np.ndarray) and values.dtype.kind == "S"
+    }
+    return {name: values for name, values in batch.items() if name not in text}, text
 
 
 # How batches are handed out, by the value of `to`.

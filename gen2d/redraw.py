@@ -157,9 +157,9 @@ def _check_frames(columns: Columns, states: Columns | None) -> None:
 
 @functools.lru_cache(maxsize=16)
 def _whole(ds: Dataset) -> Dataset:
-    """The same dataset with every field but the images."""
+    """The same dataset with every field but images and text."""
     fields = {name: field_of(about) for name, about in ds.manifest["fields"].items()}
-    names = tuple(name for name, field in fields.items() if field.per_video and not field.is_image)
+    names = tuple(name for name, f in fields.items() if f.per_video and not f.is_image and not f.is_text)
     kept = {key: getattr(ds.options, key) for key in ("split", "verify", "cache_dir", "cache_bytes")}
     return loader.open(ds.root, fields=names, **kept)
 

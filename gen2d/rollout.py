@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-from gen2d import annotations, drawing, factors, quality, sampling, types
+from gen2d import annotations, drawing, factors, predictability, quality, sampling, types, words
 from gen2d.config import Config, PhysicsOptions
 from gen2d.fields import Field
 from gen2d.picture import Stage
@@ -101,7 +101,9 @@ class Rollout:
             del fields["quality/energy_residual"]
         if self.plan.frames:
             fields["frames"] = Field("uint8", "n T H W 3", "sRGB", "the video")
-        fields |= annotations.fields(self.config.annotations)
+        fields |= annotations.fields(self.config.annotations) | self.word_fields
+        if self.config.annotations.predictability:
+            fields |= predictability.FIELDS
         fields["index"] = Field("int64", "n", "1", "the video's number in its split")
         fields["time"] = Field("float64", "T", "s", "of each frame; frame 0 is the initial state")
         if self.layout.joints:
@@ -122,6 +124,15 @@ class Rollout:
         ties = self.layout.joints
         slots = {f"joints/{side}": np.array([getattr(tie, side) for tie in ties], np.int16) for side in "ab"}
         return {"time": self.time, "joints/kind": np.array([JOINTS.index(tie.kind) for tie in ties], np.uint8), **slots}
+
+    @property
+    def word_fields(self) -> dict[str, Field]:
+        """Those fields that are made on the host."""
+        return words.fields(self.layout.slots, self.config.video.frames) if self.config.annotations.words else {}
+
+    def told(self, columns: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+        """The fields of some videos that are made on the host, from their others there."""
+        return words.told(columns, self.config.video) if self.config.annotations.words else {}
 
     @property
     def time(self) -> np.ndarray:
@@ -189,6 +200,11 @@ class Rollout:
         columns |= {f"factors/{name}": values.astype(jnp.float32) for name, values in drawn.items()}
         columns |= jax.vmap(self.sampler.outside)(drawn)
         columns["quality/rejected_draws"] = rejected
+        if config.annotations.predictability:
+            again = functools.partial(
+                simulate, layout=layout, rules=rules, frames=config.video.frames, steps=self.steps, sparse=sparse
+            )
+            columns["quality/growth"] = predictability.growth(keys, *device, again, float(self.time[-1]))
         return Batch(columns, stages, placed)
 
     def _scene(self, key: Array) -> Scene:

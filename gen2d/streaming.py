@@ -10,7 +10,7 @@ import dataclasses
 import functools
 import importlib
 import itertools
-from collections.abc import Generator, Iterator, Mapping, Sequence
+from collections.abc import Generator, Iterator, Mapping, Sequence, Set
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -20,6 +20,7 @@ import numpy as np
 
 from gen2d import devices
 from gen2d.config import Config, checked_seed, load_config
+from gen2d.dataloader import without_text
 from gen2d.errors import ConfigError
 from gen2d.fields import Field
 from gen2d.generation import MAX_VIDEOS
@@ -61,7 +62,8 @@ def stream(
 
     Those that `DataLoader(open(folder, split, fields, window, ...), batch_size, order_seed, shuffle, ...)` gives of the
     dataset that `generate(config, n, folder, seed=seed, split=split)` makes, frame for frame, with the same
-    `state_dict`. Without `n` there is no end of new videos. `to` is "jax" or "torch" (the same memory, by DLPack).
+    `state_dict`. Without `n` there is no end of new videos. `to` is "jax" or "torch" (the same memory, by DLPack); text
+    is NumPy's bytes in both.
     Raises ConfigError and, where a scene does not fit, NoPlaceError (all UserError).
     """
     config = load_config(config, sets)
@@ -125,9 +127,7 @@ class Stream:
             for place, cell in enumerate(cells):
                 parts.append(self._drawn(batch, place * self.cell, cell))
                 if cell.ends:
-                    made = (
-                        parts[0] if len(parts) == 1 else {k: jnp.concatenate([p[k] for p in parts]) for k in parts[0]}
-                    )
+                    made = parts[0] if len(parts) == 1 else {k: _joined([p[k] for p in parts]) for k in parts[0]}
                     parts = []
                     self.walk.passed(cell.step)
                     yield _DELIVER[self.to](made)
@@ -167,11 +167,19 @@ class Stream:
     def _drawn(self, batch: Batch, lane: int, cell: _Cell) -> Arrays:
         """A cell's videos as they are delivered."""
         found = {name: batch.columns[name] for name in self.fields if name in batch.columns}
-        if self.fields.keys() - batch.columns.keys() - {"index"}:
+        told = self.fields.keys() & self.rollout.word_fields.keys()
+        if self.fields.keys() - batch.columns.keys() - told - {"index"}:
             found |= self._pictures(batch, lane)
         numbers, starts = jnp.asarray(cell.numbers.astype(np.int32)), jnp.asarray(cell.starts, jnp.int32)
         made = self._view(found, numbers, starts, np.int32(lane))
+        made |= self._words(batch, lane, told) if told else {}
         return made if cell.videos == self.cell else {name: array[: cell.videos] for name, array in made.items()}
+
+    def _words(self, batch: Batch, lane: int, wanted: Set[str]) -> Arrays:
+        """What is told of a cell, on the host; text stays there."""
+        columns = self.rollout.host_columns(batch)[0]
+        told = self.rollout.told({name: column[lane : lane + self.cell] for name, column in columns.items()})
+        return {name: v if self.fields[name].is_text else jnp.asarray(v) for name, v in told.items() if name in wanted}
 
     def _pictures(self, batch: Batch, lane: int) -> Arrays:
         """What is drawn of a cell, in slices that fit the cache."""
@@ -184,6 +192,8 @@ class Stream:
         """The fields of a cell with windows, layout and type as asked for; columns are of all lanes."""
         made = {}
         for name, field in self.fields.items():
+            if name not in found and name != "index":
+                continue  # it is made on the host
             values = numbers if name == "index" else found[name]
             if len(values) != self.cell:
                 values = jax.lax.dynamic_slice_in_dim(values, lane, self.cell)
@@ -195,6 +205,10 @@ def cell_size(batch_size: int, lanes: int) -> int:
     """How many videos a cell holds: as many as possible, so that at most an eighth of what is made is left over."""
     sizes = [size for size in range(1, min(batch_size, lanes) * 2) if lanes % size == 0]
     return max(size for size in sizes if -(-batch_size // size) * size <= batch_size * 9 / 8)
+
+
+def _joined(parts: list[Any]) -> Any:
+    return np.concatenate(parts) if isinstance(parts[0], np.ndarray) else jnp.concatenate(parts)
 
 
 def _as_asked(name: str, field: Field, values: Array, starts: Array, options: Options) -> Array:
@@ -212,7 +226,8 @@ def _as_asked(name: str, field: Field, values: Array, starts: Array, options: Op
 
 def _to_torch(batch: Arrays) -> Arrays:
     torch = importlib.import_module("torch")
-    return {name: torch.from_dlpack(values) for name, values in batch.items()}
+    numbers, text = without_text(batch)
+    return {name: torch.from_dlpack(values) for name, values in numbers.items()} | text
 
 
 # How batches are handed out, by the value of `to`.

@@ -9,6 +9,7 @@ import numpy as np
 from gen2d import extents
 from gen2d.fields import Field
 from gen2d.folds import folded
+from gen2d.looks import are_moving
 from gen2d.picture import Plan, Stage, each_video
 from gen2d.types import Array
 
@@ -16,16 +17,19 @@ OWNERS = True
 FIELDS = {
     "visibility/pixels": Field("int32", "n T K", "px", "pixels of the instance mask"),
     "visibility/fraction": Field("float32", "n T K", "1", "those over the area of the whole object, 1 at most"),
+    "quality/min_visibility": Field("float32", "n", "1", "least visibility/fraction of what moves, in any frame"),
 }
 
 
 def annotate(stages: Stage, owners: Array, plan: Plan, options: object) -> dict[str, Array]:
-    """The number of pixels and the part seen."""
+    """The number of pixels and the part seen, and the least of it."""
     pixels = each_video(functools.partial(counts, slots=plan.layout.slots), owners)
     area = jax.vmap(functools.partial(extents.areas, plan=plan))(stages)
+    fraction = jnp.minimum(pixels / jnp.where(area > 0, area, 1.0), 1.0)
     return {
         "visibility/pixels": pixels,
-        "visibility/fraction": jnp.where(area > 0, jnp.minimum(pixels / jnp.where(area > 0, area, 1.0), 1.0), 0.0),
+        "visibility/fraction": jnp.where(area > 0, fraction, 0.0),
+        "quality/min_visibility": jnp.where((area > 0) & are_moving(plan.layout), fraction, 1.0).min((1, 2)),
     }
 
 

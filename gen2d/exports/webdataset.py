@@ -1,4 +1,5 @@
-"""Tar files of whole videos, as WebDataset reads them: KEY.frames.npy, KEY.states.position.npy, ... and KEY.json.
+"""Tar files of whole videos, as WebDataset reads them: KEY.frames.npy, KEY.states.position.npy, ... and KEY.json;
+text is KEY.text.caption.txt and KEY.text.events.json.
 
 A key is followed by a dot and the field's name, whose slashes become dots, as a key's files must lie in one folder.
 """
@@ -41,9 +42,13 @@ def _add_video(tar: tarfile.TarFile, source: Source, number: int, video: Batch) 
     key = source.key(number)
     _add(tar, f"{key}.json", as_json(_about(source, number)))
     for name, values in video.items():
-        file = io.BytesIO()
-        np.save(file, values, allow_pickle=False)
-        _add(tar, f"{key}.{name.replace('/', '.')}.npy", file.getvalue())
+        field, path = source.fields[name], f"{key}.{name.replace('/', '.')}"
+        if field.is_text:
+            _add(tar, f"{path}.{'json' if field.unit == 'JSON' else 'txt'}", bytes(values))
+        else:
+            file = io.BytesIO()
+            np.save(file, values, allow_pickle=False)
+            _add(tar, f"{path}.npy", file.getvalue())
 
 
 def _about(source: Source, number: int) -> dict[str, Any]:

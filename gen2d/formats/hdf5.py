@@ -44,13 +44,13 @@ def write(
         file.attrs.update(attributes)
         shapes = {name: (count, *fields[name].shape(sizes)) for name in images + rows}
         chunked = {name: _chunked(file, name, fields[name].dtype, shapes[name], codec, chunk_frames) for name in images}
-        table = {name: np.zeros(shapes[name], fields[name].dtype) for name in rows}
+        table = {name: np.zeros(shapes[name], _stored_type(fields[name])) for name in rows}
         for first, block in _numbered(blocks, count, path):
             _write_chunks(chunked, block, first, chunk_frames)
             for name in rows:
                 _fill(table[name], first, block.arrays[name], name)
         for name, values in sorted((table | dict(constants)).items()):
-            file.create_dataset(name, data=np.asarray(values, fields[name].dtype))
+            file.create_dataset(name, data=np.asarray(values, _stored_type(fields[name])))
         for name, field in sorted(fields.items()):
             file[name].attrs.update(axes=field.axes, unit=field.unit, meaning=field.meaning)
         return Places(
@@ -110,6 +110,12 @@ def _chunked(
     links = h5py.h5p.create(h5py.h5p.LINK_CREATE)
     links.set_create_intermediate_group(True)
     return h5py.Dataset(h5py.h5d.create(file.id, name.encode(), kind, space, settings, links))
+
+
+def _stored_type(field: Field) -> np.dtype:
+    """The type in the file: of text, one that says that it is UTF-8."""
+    dtype = np.dtype(field.dtype)
+    return h5py.string_dtype("utf-8", dtype.itemsize) if field.is_text else dtype
 
 
 def _numbered(blocks: Iterable[Block], count: int, path: Path) -> Iterator[tuple[int, Block]]:

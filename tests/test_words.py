@@ -1,0 +1,381 @@
+"""Text is stored whole and read by everything; words tell what the contacts and states hold, once each, in order."""
+
+import io
+import itertools
+import json
+import tarfile
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+import synthetic
+import tiny
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose, assert_array_equal
+
+import gen2d
+from gen2d import words
+from gen2d.config import load_config
+from gen2d.errors import ConfigError
+from gen2d.fields import Field
+
+TEXT = {
+    "text/name": Field("S24", "n", "UTF-8", "of the video"),
+    "text/list": Field("S16", "n", "JSON", "of numbers"),
+}
+
+
+# ---- Text in files
+
+
+@pytest.fixture(scope="module")
+def toy(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    made = synthetic.dataset(tmp_path_factory.mktemp("data") / "toy", train=20, fields=synthetic.FIELDS | TEXT)
+    with pytest.MonkeyPatch.context() as patch:
+        plain = synthetic.video
+        patch.setattr(synthetic, "video", lambda *of: plain(*of) | said(of[2]))
+        return synthetic.folder(synthetic.make(made))
+
+
+def said(number: int) -> dict[str, np.ndarray]:
+    """The text of a video, some of it empty or as long as it may be."""
+    names = ["", "caf\u00e9", "x" * 24, f"video {number}"]
+    return {
+        "text/name": np.array(names[number % 4].encode(), "S24"),
+        "text/list": np.array(json.dumps(list(range(number % 4))).encode(), "S16"),
+    }
+
+
+def expected(name: str, count: int = 20) -> np.ndarray:
+    return np.array([said(number)[name] for number in range(count)])
+
+
+def test_text_is_what_was_written_for_the_loader_and_for_plain_h5py(toy: Path) -> None:
+    ds = gen2d.open(toy, "train", "text/*")
+    assert ds.fields == TEXT
+    for name in TEXT:
+        assert_array_equal(ds[:][name], expected(name))
+        assert ds[2][name] == expected(name)[2]
+    with h5py.File(toy / "shards" / "train-00000.h5") as file:
+        field = file["text/name"]
+        assert isinstance(field, h5py.Dataset)
+        assert field.asstr()[:].tolist() == [text.decode() for text in expected("text/name", 8).tolist()]
+        assert field.attrs["unit"] == "UTF-8"
+
+
+def test_a_damaged_letter_is_found(toy: Path, tmp_path: Path) -> None:
+    assert gen2d.verify(toy, "full") == []
+    made = synthetic.dataset(tmp_path, train=3, fields=synthetic.FIELDS | TEXT)
+    path = synthetic.folder(synthetic.make(made)) / "shards" / "train-00000.h5"
+    with h5py.File(path, "r+") as file:
+        file["text/name"][1] = b"another"  # pyright: ignore[reportIndexIssue]
+    assert any("text/name of train video 1" in sentence for sentence in gen2d.verify(tmp_path, "full"))
+
+
+@pytest.mark.parametrize("to", ["numpy", "torch", "jax"])
+def test_text_stays_bytes_in_batches_of_any_kind(toy: Path, to: str) -> None:
+    if to == "torch":
+        pytest.importorskip("torch")
+    ds = gen2d.open(toy, "train", ["text/name", "states/angle"])
+    for number, batch in enumerate(gen2d.DataLoader(ds, 5, shuffle=False, epochs=1, to=to)):
+        assert_array_equal(batch["text/name"], expected("text/name")[5 * number : 5 * number + 5])
+        assert isinstance(batch["text/name"], np.ndarray)
+        assert to in str(type(batch["states/angle"])) or (to == "jax" and hasattr(batch["states/angle"], "devices"))
+
+
+def test_torchs_own_loader_lists_it(toy: Path) -> None:
+    torch = pytest.importorskip("torch")
+    batch = next(iter(torch.utils.data.DataLoader(gen2d.open(toy, "train", ["text/name", "index"]), batch_size=6)))
+    assert batch["text/name"] == expected("text/name", 6).tolist()
+
+
+def test_exports_hold_text_as_other_programs_read_it(toy: Path, tmp_path: Path) -> None:
+    archives = gen2d.export(toy, "npz", tmp_path / "npz", split="train").out
+    tars = gen2d.export(toy, "webdataset", tmp_path / "tars", split="train").out
+    with tarfile.open(next(tars.glob("*.tar"))) as tar:
+        files = {member.name: tar.extractfile(member) for member in tar}
+        content = {name: file.read() for name, file in files.items() if file}
+    for number in range(20):
+        text, key = said(number), f"train-{number:09d}"
+        with np.load(archives / f"{key}.npz") as archive:
+            assert archive["text/name"] == text["text/name"]
+        assert content[f"{key}.text.name.txt"] == text["text/name"].item()
+        assert json.loads(content[f"{key}.text.list.json"]) == list(range(number % 4))
+        assert np.load(io.BytesIO(content[f"{key}.states.angle.npy"])).dtype == np.float32
+
+
+def test_cards_say_that_it_is_text(toy: Path) -> None:
+    about = json.loads((toy / "croissant.json").read_text())["variableMeasured"]
+    assert {entry["name"] for entry in about if entry.get("valueReference") == "sc:Text"} == TEXT.keys()
+
+
+# ---- Events
+
+
+VIDEO = SimpleNamespace(frames=32, fps=20.0, height=60, width=80)
+BALLS, ROWS = 3, 60
+
+
+def seen(seed: int, **changes: Any) -> dict[str, np.ndarray]:
+    """The fields of a video in which anything happens: three balls and a box of 8 x 6 m, which is seen."""
+    rng = np.random.default_rng(seed)
+    frames = VIDEO.frames
+    wall = {"a": [[0, 0], [8, 0], [8, 6], [0, 6]], "b": [[8, 0], [8, 6], [0, 6], [0, 0]]}
+    a, b = (np.array(wall[end], float) for end in "ab")
+    slots = np.arange(BALLS + 4)
+    ball = slots < BALLS
+    place = np.cumsum(rng.normal(0, 0.7, (frames, BALLS, 2)), 0) + rng.uniform(1, 5, (BALLS, 2))
+    made = {
+        "objects/present": np.ones(len(slots), bool),
+        "objects/kind": np.where(ball, 0, 1).astype(np.uint8),
+        "objects/shape": np.where(ball, 0, 1).astype(np.uint8),
+        "objects/radius": np.where(ball, 0.5, 0).astype(np.float32),
+        "objects/half_length": np.append(np.zeros(BALLS), np.hypot(*(b - a).T) / 2).astype(np.float32),
+        "objects/color": np.where(ball[:, None], rng.integers(0, 256, (len(slots), 3)), 128).astype(np.uint8),
+        "world/gravity": np.float32([0, -9.8]),
+        "states/position": np.concatenate([place, np.broadcast_to((a + b) / 2, (frames, 4, 2))], 1),
+        "states/angle": np.append(np.zeros(BALLS), np.arctan2(*(b - a).T[::-1])) * np.ones((frames, 1)),
+        "states/velocity": np.where(ball[:, None], rng.normal(0, 2, (frames, len(slots), 2)), 0),
+        "states/angular_velocity": np.zeros((frames, len(slots))),
+        "camera/center": np.full((frames, 2), [4.0, 3.0]),
+        "camera/scale": np.full(frames, 10.0),
+        "camera/angle": np.zeros(frames),
+        **touches(rng),
+    }
+    return {**{name: v.astype(np.float32) if v.dtype == float else v for name, v in made.items()}, **changes}
+
+
+def touches(rng: np.random.Generator) -> dict[str, np.ndarray]:
+    """Rows of contacts, at most one for a pair and frame, in time's order."""
+    pairs = [(a, b) for a, b in itertools.combinations(range(BALLS + 4), 2) if a < BALLS]
+    frames = np.flatnonzero(rng.random((VIDEO.frames - 1) * len(pairs)) < 0.1)[:ROWS]
+    count = len(frames)
+    frame, pair = frames // len(pairs) + 1, np.array(pairs)[frames % len(pairs)]
+    time = (frame - rng.random(count)) / VIDEO.fps
+    order = np.argsort(time)
+
+    def rows(values: Any, dtype: Any) -> np.ndarray:
+        values = np.asarray(values, dtype)[order]
+        return np.concatenate([values, np.zeros((ROWS - count, *values.shape[1:]), dtype)])
+
+    return {
+        "contacts/time": rows(time, np.float64),
+        "contacts/frame": rows(frame, np.int32),
+        "contacts/a": rows(pair[:, 0], np.int16),
+        "contacts/b": rows(pair[:, 1], np.int16),
+        "contacts/point": rows(rng.uniform(0, 6, (count, 2)), np.float32),
+        "contacts/approach_speed": rows(rng.exponential(2, count), np.float32),
+        "contacts/kind": rows(rng.integers(1, 5, count), np.uint8),
+        "contacts/count": np.array(count, np.int32),
+    }
+
+
+def rows_of(made: dict[str, np.ndarray]) -> list[tuple[int, ...]]:
+    """Kind, frame, slots and time of each row of contacts."""
+    names = ("kind", "frame", "a", "b", "time")
+    return [row for row in zip(*(made[f"contacts/{n}"].tolist() for n in names), strict=True) if row[0]]
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_every_impact_is_told_once_unless_the_pair_was_in_touch(seed: int) -> None:
+    made = seen(seed)
+    told = [(e.frame, e.about["a"], e.about["b"]) for e in words.events_of(made, VIDEO) if e.kind == "hit"]
+    rows, impacts = rows_of(made), []
+    for kind, frame, a, b, time in rows:
+        before = [r for r in rows if r[1:4] == (frame - 1, a, b)]
+        held = before and (before[0][0] in (2, 3) or (before[0][0] == 1 and time - before[0][4] < 0.1))
+        if kind == 1 and not held:
+            impacts.append((frame, a, b))
+    assert len(told) == len(set(told))
+    assert sorted(told) == sorted(impacts)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_events_are_in_times_order_and_each_lies_in_the_interval_before_its_frame(seed: int) -> None:
+    events = json.loads(words.as_json(words.events_of(seen(seed), VIDEO), 10**6))
+    times, frames = (np.array([event[name] for event in events]) for name in ("time", "frame"))
+    assert (np.diff(times) >= 0).all()
+    assert (times <= frames / VIDEO.fps + 1e-5).all()
+    assert (times >= (frames - 1) / VIDEO.fps - 1e-5).all()
+    for event in (event for event in events if event["event"] == "hit"):
+        row = rows_of(seen(seed)).index((1, event["frame"], event["a"], event["b"], *_time_of(seen(seed), event)))
+        assert_allclose(event["time"], seen(seed)["contacts/time"][row], rtol=1e-5)
+        assert_allclose(event["point"], seen(seed)["contacts/point"][row], rtol=1e-5)
+        assert_allclose(event["speed"], seen(seed)["contacts/approach_speed"][row], rtol=1e-5)
+
+
+def _time_of(made: dict[str, np.ndarray], event: dict) -> tuple[float]:
+    return next((t,) for kind, f, a, b, t in rows_of(made) if (f, a, b) == (event["frame"], event["a"], event["b"]))
+
+
+@pytest.mark.parametrize("angle", [0.0, 0.7])
+def test_a_ball_leaves_when_its_rim_crosses_the_edge_and_comes_back_when_it_does_again(angle: float) -> None:
+    time = np.arange(VIDEO.frames) / VIDEO.fps
+    made = seen(0, **{"objects/present": np.arange(BALLS + 4) == 0, "contacts/kind": np.zeros(ROWS, np.uint8)})
+    to_right, up = np.array([np.cos(angle), np.sin(angle)]), np.array([-np.sin(angle), np.cos(angle)])
+    way = np.where(time < 0.8, 3 + 6 * time, 7.8 - 6 * (time - 0.8))  # along the picture's columns, from its middle, m
+    made["camera/angle"] = np.full(VIDEO.frames, angle, np.float32)
+    for direction, side in ((to_right, "right"), (-to_right, "left")):
+        made["states/position"][:, 0] = np.array([4, 3]) + way[:, None] * direction
+        left, entered = words.passages(made, VIDEO)
+        assert (left.kind, entered.kind) == ("leaves", "enters")
+        assert left.about == entered.about == {"a": 0, "side": side}
+        assert_allclose([left.time, entered.time], [0.25, 0.8 + 3.3 / 6], atol=1e-5)
+    made["states/position"][:, 0] = np.array([4, 3]) + (way[:, None] - 1) * up
+    assert [event.about["side"] for event in words.passages(made, VIDEO)] == ["top", "top"]
+
+
+def test_rest_is_told_where_all_is_still_to_the_end() -> None:
+    made = seen(0)
+    made["states/velocity"][11:] = 0
+    assert [(event.frame, event.time) for event in words.rests(made, VIDEO.fps)] == [(11, 0.55)]
+    made["states/velocity"][-1, 1] = 1
+    assert words.rests(made, VIDEO.fps) == []
+    made["states/velocity"][:] = 0  # it never moved
+    assert words.rests(made, VIDEO.fps) == []
+    made["states/angular_velocity"][:5, 2] = 3
+    assert [event.frame for event in words.rests(made, VIDEO.fps)] == [5]
+
+
+@settings(max_examples=50, deadline=None)
+@given(seed=st.integers(0, 1000), width=st.integers(2, 3000))
+def test_events_that_do_not_fit_are_left_out_whole(seed: int, width: int) -> None:
+    events = words.events_of(seen(seed), VIDEO)
+    text = words.as_json(events, width)
+    assert len(text) <= width
+    found = json.loads(text)
+    assert found == json.loads(words.as_json(events, 10**6))[: len(found)]
+    assert len(found) == len(events) or len(text) + 1 + len(events[len(found)].text) > width
+
+
+# ---- Captions
+
+
+@settings(max_examples=100, deadline=None)
+@given(seed=st.integers(0, 10**6))
+def test_a_caption_fits_is_ascii_and_follows_from_the_video_alone(seed: int) -> None:
+    made, other = seen(seed), seen(seed + 1)
+    both = {name: np.stack([other[name], made[name]]) for name in made}
+    alone = {name: made[name][None] for name in made}
+    one, two = words.told(alone, VIDEO), words.told(both, VIDEO)
+    for name, field in words.fields(BALLS + 4, VIDEO.frames).items():
+        assert one[name].dtype == two[name].dtype == np.dtype(field.dtype)
+        assert one[name][0] == two[name][1]
+    text = one["text/caption"][0].decode("ascii")
+    assert len(text) < words.CAPTION_BYTES
+    assert text.startswith("Three balls in a box under gravity.")
+    assert text.endswith(".")
+    assert one["text/event_count"][0] == len(words.events_of(made, VIDEO))
+
+
+def still(**changes: Any) -> dict[str, np.ndarray]:
+    """A video in which nothing happens."""
+    made = seen(1, **changes)
+    made["states/position"][:, :BALLS] = [[2, 2], [4, 4], [6, 2]]
+    return made | {"contacts/kind": np.zeros(ROWS, np.uint8), "contacts/count": np.array(0, np.int32)}
+
+
+def test_a_video_without_events() -> None:
+    made = still()
+    found = words.told({name: values[None] for name, values in made.items()}, VIDEO)
+    assert found["text/events"].tolist() == [b"[]"]
+    assert found["text/event_count"].tolist() == [0]
+    assert found["text/caption"].tolist() == [b"Three balls in a box under gravity."]
+
+
+def test_a_caption_tells_the_first_events_and_how_many_more() -> None:
+    made = still()
+    made["objects/color"][:BALLS] = [[230, 30, 30], [30, 60, 230], [20, 50, 220]]
+    made["states/velocity"][:, :BALLS] = 0
+    made["states/velocity"][:, 0] = 3
+    pairs = [(0, 3), (0, 1), (1, 2), (0, 4), (1, 3), (2, 3)]
+    for row, (a, b) in enumerate(pairs):
+        for name, value in (("kind", 1), ("frame", 2 + 2 * row), ("a", a), ("b", b), ("time", 0.1 * (row + 1))):
+            made[f"contacts/{name}"][row] = value
+    text = words.caption(made, words.events_of(made, VIDEO))
+    assert text == (
+        "Three balls in a box under gravity. The red ball hits the floor at 0.1 s, then blue ball 1 at 0.2 s. "
+        "Blue ball 1 hits blue ball 2 at 0.3 s. The red ball hits the right wall at 0.4 s. And 2 more events."
+    )
+
+
+def test_colours_of_the_table_have_their_own_names_and_so_have_slightly_others() -> None:
+    rng = np.random.default_rng(0)
+    for name, color in words.COLORS.items():
+        for _ in range(20):
+            assert words.color_name(np.clip(np.array(color) + rng.integers(-9, 10, 3), 0, 255)) == name
+
+
+def test_shapes_have_their_nouns() -> None:
+    made = still()
+    made["objects/shape"][:BALLS] = [2, 3, 3]
+    made |= {"objects/vertices": np.zeros((BALLS + 4, 4, 2)), "objects/vertex_count": np.array([0, 4, 3, 0, 0, 0, 0])}
+    made["world/gravity"][:] = 0
+    assert words.caption(made, []) == "One capsule, one box and one triangle in a box."
+    made["objects/kind"][1] = 1
+    assert words.caption(made, []) == "One capsule and one triangle in a box among one block."
+    made["objects/present"][BALLS + 1 :] = False
+    assert words.caption(made, []) == "One capsule and one triangle among one block."
+    assert words.names_of(made)[BALLS] == "the floor"
+
+
+# ---- In a dataset
+
+
+ASKED = {"words": True, "contacts": 8, "visibility": True, "predictability": True}
+WORDY = tiny.changed(annotations=ASKED, video={"frames": 16})
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("made") / "tiny"
+    gen2d.generate(WORDY, 8, out, seed=5, device="cpu")
+    return out
+
+
+def test_words_are_stored_and_made_again(made: Path) -> None:
+    videos = gen2d.open(made, fields="*")[:]
+    found = words.told(videos, load_config(WORDY).video)
+    for name, values in found.items():
+        assert_array_equal(videos[name], values)
+    assert videos["text/event_count"].sum() > 0
+    assert gen2d.verify(made, "regen", videos=2) == []
+
+
+def test_the_least_visibility_is_that_of_what_moves(made: Path) -> None:
+    videos = gen2d.open(made, fields=["visibility/*", "objects/*", "quality/*"])[:]
+    there = (videos["objects/present"] & (videos["objects/kind"] == 0))[:, None]
+    assert_array_equal(videos["quality/min_visibility"], np.where(there, videos["visibility/fraction"], 1).min((1, 2)))
+
+
+def test_growth_is_a_number_that_each_video_has_for_itself(made: Path) -> None:
+    growth = gen2d.open(made, fields="quality/growth")[:]["quality/growth"]
+    assert np.isfinite(growth).all()
+    assert len(np.unique(growth)) == 8
+
+
+@pytest.mark.parametrize("to", ["jax", "torch"])
+def test_a_stream_tells_the_same(made: Path, to: str) -> None:
+    if to == "torch":
+        pytest.importorskip("torch")
+    names = ["text/*", "index", "quality/*"]
+    stream = gen2d.stream(WORDY, 5, 3, n=8, fields=names, epochs=1, to=to)
+    loader = gen2d.DataLoader(gen2d.open(made, fields=names), 3, shuffle=False, epochs=1)
+    for here, there in zip(stream, loader, strict=True):
+        assert here.keys() == there.keys()
+        for name, values in there.items():
+            assert_array_equal(np.asarray(here[name]), values)
+
+
+def test_frames_are_drawn_again_beside_words(made: Path) -> None:
+    ds = gen2d.open(made, fields="frames")
+    assert_array_equal(gen2d.render(ds, [1]), ds[1:2]["frames"])
+
+
+def test_words_need_contacts() -> None:
+    with pytest.raises(ConfigError, match=r"annotations\.contacts is 0, but annotations\.words needs them"):
+        load_config(tiny.changed(annotations={"words": True}))
