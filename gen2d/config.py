@@ -14,7 +14,7 @@ from typing import Any
 
 import yaml
 
-from gen2d import plugins
+from gen2d import matched, plugins
 from gen2d.codecs import CODECS
 from gen2d.errors import ConfigError
 from gen2d.factors import Distribution, is_number, parse
@@ -39,6 +39,7 @@ class Option:
     parts: int = 0
     each: str = ""
     optional: bool = False  # may be null: decided by the program
+    several: bool = False  # may be a list of such values
 
     @property
     def allowed(self) -> str:
@@ -55,13 +56,14 @@ class Option:
         ends.append(f"{self.high:g} or less" if self.high is not None else "")
         limits = " and ".join(end for end in ends if end)
         text = f"a {noun}" if not self.parts else f"a list of {self.parts} {noun}s"
+        text += f" or a list of {noun}s" if self.several else ""
         return text + (f", {limits}" if limits else "") + (" (or null)" if self.optional else "")
 
 
 def option(default: Any, kind: type, unit: str, meaning: str, **limits: Any) -> Any:
     """A dataclass field that is an option; a drawn one's default is written as in a config."""
     spec = Option(kind, unit, meaning, **limits)
-    if spec.draw:
+    if spec.draw and default is not None:
         default = [parse(v, kind is int) for v in default] if spec.parts else parse(default, kind is int)
     if isinstance(default, list):
         default = tuple(default)
@@ -170,6 +172,32 @@ class AnnotationOptions:
 
 
 @dataclasses.dataclass(frozen=True)
+class MatchedOptions:
+    """Sets of videos that share a scene and differ in one thing (matched.py); without `change` there are none."""
+
+    change: tuple[str, ...] | None = option(
+        None,
+        str,
+        "",
+        f"what members differ in: a factor of the scene's, or {', '.join(matched.ACTS)}; one of a list for each set",
+        several=True,
+        optional=True,
+    )
+    members: int = option(2, int, "videos", "in a set, the original included", low=2, high=256)
+    scale: Distribution | None = option(
+        None, float, "1", "that a factor is multiplied by; null: it is drawn anew", above=0, draw=True, optional=True
+    )
+    objects: str = option(
+        "one", str, "", "whose factor is changed where each has its own: one's or all's", choices=("one", "all")
+    )
+    onset: Distribution = option(
+        [0.3, 0.7], float, "1", "share of a video before a violation", low=0, high=1, draw=True
+    )
+    distance: Distribution = option([2, 4], float, "m", "that teleport moves an object by", above=0, draw=True)
+    gain: Distribution = option([1.5, 2.5], float, "1", "of an object's speed in energy_gain", low=0, draw=True)
+
+
+@dataclasses.dataclass(frozen=True)
 class StorageOptions:
     """How videos lie on disk."""
 
@@ -240,6 +268,7 @@ class Config:
     image: ImageOptions
     look: Plugin
     annotations: AnnotationOptions
+    matched: MatchedOptions
     storage: StorageOptions
 
     def plain(self) -> dict[str, Any]:
@@ -267,6 +296,7 @@ SECTIONS = {
     "camera": CameraOptions,
     "image": ImageOptions,
     "annotations": AnnotationOptions,
+    "matched": MatchedOptions,
     "storage": StorageOptions,
 }
 PLUGINS = {"scene": "bouncing", "look": "flat"}
@@ -350,6 +380,9 @@ def _single(spec: Option, value: Any) -> Any:
 def _value(spec: Option, value: Any) -> Any:
     if value is None and spec.optional:
         return None
+    if spec.several:
+        values = value if isinstance(value, list | tuple) and value else [value]
+        return tuple(_single(spec, single) for single in values)
     if not spec.parts:
         return _single(spec, value)
     if not isinstance(value, list | tuple) or len(value) != spec.parts:
@@ -438,6 +471,11 @@ def from_mapping(values: Any, source: str, name: str = "dataset") -> Config:
     frames, chunk = sections["video"].frames, sections["storage"].chunk_frames
     if chunk is not None and frames % chunk:
         raise ConfigError(f"{source}: storage.chunk_frames is {chunk}, but must divide video.frames, which is {frames}")
+    sets = (plugs["scene"], sections["video"], sections["annotations"], sections["camera"])
+    try:
+        matched.check(sections["matched"], MatchedOptions(), *sets)
+    except ValueError as error:
+        raise ConfigError(f"{source}: matched.{error}") from None
     return Config(name=name, seed=seed, **sections, **plugs)
 
 

@@ -9,6 +9,7 @@ import math
 import zlib
 from collections.abc import Mapping
 from numbers import Integral, Real
+from types import ModuleType
 from typing import Any
 
 import jax
@@ -126,6 +127,12 @@ def draw(key: Array, wanted: Mapping[str, tuple[Drawn, tuple[int, ...]]]) -> dic
             keys = jax.random.split(own, len(source))
             drawn[name] = jnp.stack([part.sample(k, shape) for k, part in zip(keys, source, strict=True)], axis=-1)
     return drawn
+
+
+def options_of(module: ModuleType) -> dict[str, Any]:
+    """The option behind each factor of a scene family, by name."""
+    found = {field.name: field.metadata["option"] for field in dataclasses.fields(module.Options)}
+    return {name: spec for name, spec in found.items() if spec.draw}
 
 
 def seed_words(seed: int, split: int) -> np.ndarray:

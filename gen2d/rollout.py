@@ -10,7 +10,7 @@ import dataclasses
 import functools
 import math
 import zlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -18,14 +18,14 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-from gen2d import annotations, drawing, factors, sampling, types
+from gen2d import annotations, drawing, factors, matched, sampling, types
 from gen2d.config import Config, PhysicsOptions
 from gen2d.fields import Field
 from gen2d.parts import Sampled
 from gen2d.picture import Stage
 from gen2d.rows import Rules
 from gen2d.simulate import Keep, simulate, substeps
-from gen2d.types import Array, Scene, State
+from gen2d.types import Array, Scene, State, Trajectory
 
 SLICE_BYTES = 16 * 2**20  # of raw frames drawn at once; larger buffers cost page faults
 SHARD_BYTES = 2**30  # of raw frames in a shard
@@ -94,6 +94,8 @@ class Rollout:
         fields |= types.fields_of(scene)
         if not self.keep.energy:
             del fields["quality/energy_residual"]
+        for name in matched.untold(self.config.matched):
+            del fields[name]
         if self.plan.frames:
             fields["frames"] = Field("uint8", "n T H W 3", "sRGB", "the video")
         fields |= annotations.fields(self.config.annotations)
@@ -102,7 +104,7 @@ class Rollout:
         fields["quality/rejected_draws"] = Field("int32", "n", "1", "places drawn again as they did not fit")
         for name, axes, unit, meaning in CAMERA:
             fields[f"camera/{name}"] = Field("float32", axes, unit, meaning)
-        fields |= sampling.fields(self.config.scene)
+        fields |= sampling.fields(self.config.scene) | matched.fields(self.config.matched)
         return dict(sorted(fields.items()))
 
     @property
@@ -139,15 +141,14 @@ class Rollout:
 
     def _made(self, root: Array, numbers: Array) -> Batch:
         """One device's share: from numbers to everything but the frames."""
-        config, layout = self.config, self.layout
-        keys = factors.video_keys(root, numbers)
-        drawn, (scene, state, rejected, placed, _) = jax.vmap(self._sampled)(keys)
-        rules = rules_of(config.physics, config.video.fps, self.steps)
-        device = types.to_device(scene), types.to_device(state)
-        sparse = self.devices[0].platform == "cpu"
-        made = simulate(*device, layout, rules, config.video.frames, self.steps, self.keep, sparse=sparse)
-        between = None if made.between is None else _videos_first(made.between)
-        made = types.to_stored(dataclasses.replace(made, between=None))
+        config = self.config
+        keys, told = matched.keys_of(root, numbers, config.matched), {}
+        if config.matched.change:
+            drawn, own, made, told = matched.simulated(keys, numbers, config, self.layout, self._sampled, self._run)
+        else:
+            drawn, own = jax.vmap(self._sampled)(keys)
+            made = self._run(own.scene, own.state)
+        scene, between, made = own.scene, made.between, dataclasses.replace(made, between=None)
 
         def staged(key: Array, scene: Scene, states: State, between: State | None) -> tuple[Stage, Array]:
             stage = drawing.stage_of(key, config, self.plan, scene, states, between=between)
@@ -158,11 +159,21 @@ class Rollout:
         columns["objects/color"] = colors
         columns |= drawing.camera_columns(stages.instants.view)
         columns |= {f"factors/{name}": values.astype(jnp.float32) for name, values in drawn.items()}
-        columns["quality/rejected_draws"] = rejected
-        return Batch(columns, stages, placed)
+        columns["quality/rejected_draws"] = own.rejected
+        columns = {name: values for name, values in columns.items() if name not in matched.untold(config.matched)}
+        return Batch(columns | told, stages, own.fits)
 
-    def _sampled(self, key: Array) -> tuple[dict[str, Array], Sampled]:
-        return sampling.sampled(key, self.config.scene)
+    def _sampled(self, key: Array, change: Callable | None = None) -> tuple[dict[str, Array], Sampled]:
+        return sampling.sampled(key, self.config.scene, change)
+
+    def _run(self, scene: Scene, state: State) -> Trajectory:
+        """What becomes of these starts; videos first."""
+        config = self.config
+        rules = rules_of(config.physics, config.video.fps, self.steps)
+        device, sparse = (types.to_device(scene), types.to_device(state)), self.devices[0].platform == "cpu"
+        made = simulate(*device, self.layout, rules, config.video.frames, self.steps, self.keep, sparse=sparse)
+        between = None if made.between is None else _videos_first(made.between)
+        return dataclasses.replace(types.to_stored(dataclasses.replace(made, between=None)), between=between)
 
     def host_columns(self, batch: Batch) -> list[dict[str, np.ndarray]]:
         """For each device its columns as NumPy arrays; waits until they are there."""

@@ -4,24 +4,18 @@ A factor is an option that is drawn: one number a video, or one for each of the 
 drawn whole number such as `balls`, whose largest value is the length of the axis, or a size that the family fixes.
 """
 
-import dataclasses
-from types import ModuleType
+from collections.abc import Callable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 
 from gen2d import factors
-from gen2d.config import Option, Plugin
+from gen2d.config import Plugin
+from gen2d.factors import options_of
 from gen2d.fields import Field
 from gen2d.parts import Sampled
 from gen2d.types import Array
-
-
-def options_of(module: ModuleType) -> dict[str, Option]:
-    """The option behind each factor of a family, by name."""
-    found = {field.name: field.metadata["option"] for field in dataclasses.fields(module.Options)}
-    return {name: spec for name, spec in found.items() if spec.draw}
 
 
 def sizes(scene: Plugin) -> dict[str, int]:
@@ -41,14 +35,16 @@ def fields(scene: Plugin) -> dict[str, Field]:
     return found | {f"factors/{name}": field for name, field in derived.items()}
 
 
-def drawn(key: Array, scene: Plugin) -> dict[str, Array]:
-    """A video's factors by name; zero for what is beyond the number there is."""
+def drawn(key: Array, scene: Plugin, change: Callable | None = None) -> dict[str, Array]:
+    """A video's factors by name; zero for what is beyond the number there is. `change(found, draw)` makes others of
+    those that are found; `draw(key)` draws all anew."""
     lengths = sizes(scene)
     wanted = {
         name: (getattr(scene.options, name), (lengths[spec.each],) if spec.each else ())
         for name, spec in options_of(scene.module).items()
     }
     found = factors.draw(key, wanted)
+    found = found if change is None else change(found, lambda other: factors.draw(other, wanted))
     return {name: _counted(values, name, found, scene) for name, values in found.items()}
 
 
@@ -60,10 +56,10 @@ def _counted(values: Array, name: str, found: dict[str, Array], scene: Plugin) -
     return jnp.where(there.reshape(-1, *[1] * (values.ndim - 1)), values, 0)
 
 
-def sampled(key: Array, scene: Plugin) -> tuple[dict[str, Array], Sampled]:
+def sampled(key: Array, scene: Plugin, change: Callable | None = None) -> tuple[dict[str, Array], Sampled]:
     """A video's factors, those that follow from others included, and its scene and start."""
     draw_key, place_key = jax.random.split(key)
-    found = drawn(draw_key, scene)
+    found = drawn(draw_key, scene, change)
     made: Any = scene.module.sample(place_key, found, scene.options)
     rejected, fits = jnp.asarray(made.rejected, jnp.int32), jnp.asarray(made.fits, bool)
     return {**found, **made.derived}, made._replace(rejected=rejected, fits=fits, derived={})

@@ -39,8 +39,9 @@ ORDER = [
         "simulate",
         "factors",
         "plugins",
-        "config",
         "parts",
+        "matched",
+        "config",
         "sampling",
     ),
     *(
