@@ -311,7 +311,7 @@ def _acted(
     member: Member, scene: Scene, state: State, states: State, options: Any, layout: Layout
 ) -> tuple[Scene, Scene, State, Array, dict[str, Array]]:
     """One video's scene as it is stored, the scene, state and frame to simulate it from, and what is told of that."""
-    free = untied(layout) & scene.objects.present
+    free = jnp.asarray(untied(layout)) & scene.objects.present
     here = jax.tree.map(lambda values: values[member.frame], states)
     later = Moment(scene, here, free & _inside(here.position, layout))
     chosen, frame = Act(scene, state, jnp.zeros(()), jnp.int32(-1), jnp.int32(-1)), jnp.int32(0)

@@ -40,7 +40,7 @@ CONFIG = {
     "storage": {"lanes": 48, "videos_per_shard": 96},
 }
 STATES = ("position", "angle", "velocity", "angular_velocity")
-Videos = dict[str, np.ndarray]
+Videos = dict[str, Any]
 
 
 @pytest.fixture(scope="module")
@@ -79,7 +79,7 @@ def differ(one: Videos, other: Videos) -> np.ndarray:
     )
 
 
-def free_gaps(video: Videos, frame: int, slot: int) -> np.ndarray:
+def free_gaps(video: Videos, frame: Any, slot: Any) -> np.ndarray:
     """The gaps in m between a ball and the other balls, and the walls, at a frame."""
     place, radius = video["states/position"][frame], video["objects/radius"]
     others = (video["objects/kind"] == 0) & video["objects/present"] & (np.arange(len(radius)) != slot)
@@ -87,7 +87,7 @@ def free_gaps(video: Videos, frame: int, slot: int) -> np.ndarray:
     return np.concatenate([balls, place[slot] - radius[slot], [6, 5] - place[slot] - radius[slot]])
 
 
-def travelled(video: Videos, frame: int) -> float:
+def travelled(video: Videos, frame: Any) -> float:
     """No two objects come nearer to each other by more in the frame before this one, m."""
     speed = np.linalg.norm(video["states/velocity"][[frame - 1, frame]], axis=-1).max()
     return float(2 * (speed + 6 / FPS) / FPS + 1e-3)
@@ -115,7 +115,8 @@ def test_before_its_onset_a_member_is_the_original_to_the_bit(videos: Videos, ki
         different, onset = (differ(one, other) & both).any(1), other["matched/onset"]
         assert onset == (np.argmax(different) if different.any() else -1)
         if kind != "remove":
-            assert_array_equal(one["frames"][:onset], other["frames"][:onset]) if onset > 0 else None
+            alike = onset if onset >= 0 or kind == "gravity" else 16
+            assert_array_equal(one["frames"][:alike], other["frames"][:alike])
         assert other["matched/partner"] == -1 or kind == "identity_swap"
 
 
@@ -370,7 +371,7 @@ def test_what_cannot_be_is_one_sentence(kind: str, also: str, told: str):
 def test_without_sets_nothing_is_told_and_keys_are_the_videos_own():
     plain: dict[str, Any] = {name: options for name, options in CONFIG.items() if name != "matched"}
     config = load_config(plain)
-    words, numbers = np.zeros(3, np.uint32), jnp.arange(6, dtype=jnp.uint32)
+    words, numbers = jnp.zeros(3, jnp.uint32), jnp.arange(6, dtype=jnp.uint32)
     assert matched.fields(config.matched) == {}
     keys = jax.random.key_data(matched.keys_of(words, numbers, config.matched))
     assert len(np.unique(keys, axis=0)) == 6

@@ -46,6 +46,8 @@ def test_every_block_runs(tmp_path: Path):
         "touched",
         "seen",
         "annotated",
+        "counterfactuals",
+        "violations",
     }
 
 
