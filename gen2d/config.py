@@ -13,7 +13,7 @@ from typing import Any
 
 import yaml
 
-from gen2d import plugins, quality
+from gen2d import matched, plugins, quality
 from gen2d.codecs import CODECS
 from gen2d.distributions import Distribution
 from gen2d.errors import ConfigError
@@ -148,6 +148,32 @@ class QualityOptions:
 
 
 @dataclasses.dataclass(frozen=True)
+class MatchedOptions:
+    """Sets of videos that share a scene and differ in one thing (matched.py); without `change` there are none."""
+
+    change: tuple[str, ...] | None = option(
+        None,
+        str,
+        "",
+        f"what members differ in: a factor of the scene's, or {', '.join(matched.ACTS)}; one of a list for each set",
+        several=True,
+        optional=True,
+    )
+    members: int = option(2, int, "videos", "in a set, the original included", low=2, high=256)
+    scale: Distribution | None = option(
+        None, float, "1", "that a factor is multiplied by; null: it is drawn anew", above=0, draw=True, optional=True
+    )
+    objects: str = option(
+        "one", str, "", "whose factor is changed where each has its own: one's or all's", choices=("one", "all")
+    )
+    onset: Distribution = option(
+        [0.3, 0.7], float, "1", "share of a video before a violation", low=0, high=1, draw=True
+    )
+    distance: Distribution = option([2, 4], float, "m", "that teleport moves an object by", above=0, draw=True)
+    gain: Distribution = option([1.5, 2.5], float, "1", "of an object's speed in energy_gain", low=0, draw=True)
+
+
+@dataclasses.dataclass(frozen=True)
 class StorageOptions:
     """How videos lie on disk."""
 
@@ -203,6 +229,7 @@ class Config:
     image: ImageOptions
     look: Plugin
     annotations: AnnotationOptions
+    matched: MatchedOptions
     quality: QualityOptions
     storage: StorageOptions
     splits: tuple[Split, ...] = ()
@@ -269,6 +296,7 @@ SECTIONS = {
     "camera": CameraOptions,
     "image": ImageOptions,
     "annotations": AnnotationOptions,
+    "matched": MatchedOptions,
     "quality": QualityOptions,
     "storage": StorageOptions,
 }
@@ -378,9 +406,14 @@ def from_mapping(values: Any, source: str, name: str = "dataset", copies: Copies
         quality.check(config.quality, enabled)
     except ValueError as error:
         raise ConfigError(f"{source}: quality.{error}") from None
-    if not values.get("splits"):
-        return config
-    scene, splits = with_splits(config.scene, values["splits"], source)
+    if values.get("splits"):
+        config = _with_splits(config, values["splits"], source)
+    _check_sets(config, source)
+    return config
+
+
+def _with_splits(config: Config, written: Any, source: str) -> Config:
+    scene, splits = with_splits(config.scene, written, source)
     config = dataclasses.replace(config, scene=scene, splits=splits)
     for split in splits:
         try:
@@ -388,6 +421,19 @@ def from_mapping(values: Any, source: str, name: str = "dataset", copies: Copies
         except ConfigError as error:
             raise ConfigError(f"{source}: splits.{split.name}: {str(error).removeprefix('config: ')}") from None
     return config
+
+
+def _check_sets(config: Config, source: str) -> None:
+    """Raises ConfigError for matched sets that cannot be made."""
+    about = config.scene, config.video, config.annotations, config.camera
+    try:
+        matched.check(config.matched, MatchedOptions(), *about)
+        if config.matched.change and quality.ranges(config.quality):
+            raise ValueError("change is given, but a set has one scene: quality must ask for nothing")
+        if config.matched.change and any(law.combinations()[0] for law in config.laws):
+            raise ValueError("change is given, but its scenes cannot be on a grid")
+    except ValueError as error:
+        raise ConfigError(f"{source}: matched.{error}") from None
 
 
 def _check_grids(config: Config, source: str) -> None:

@@ -33,6 +33,7 @@ class Option:
     parts: int = 0
     each: str = ""
     optional: bool = False  # may be null: decided by the program
+    several: bool = False  # may be a list of such values
 
     @property
     def allowed(self) -> str:
@@ -49,13 +50,14 @@ class Option:
         ends.append(f"{self.high:g} or less" if self.high is not None else "")
         limits = " and ".join(end for end in ends if end)
         text = f"a {noun}" if not self.parts else f"a list of {self.parts} {noun}s"
+        text += f" or a list of {noun}s" if self.several else ""
         return text + (f", {limits}" if limits else "") + (" (or null)" if self.optional else "")
 
 
 def option(default: Any, kind: type, unit: str, meaning: str, **limits: Any) -> Any:
     """A dataclass field that is an option; a drawn one's default is written as in a config."""
     spec = Option(kind, unit, meaning, **limits)
-    if spec.draw:
+    if spec.draw and default is not None:
         default = [parse(v, kind is int) for v in default] if spec.parts else parse(default, kind is int)
     if isinstance(default, list):
         default = tuple(default)
@@ -122,6 +124,9 @@ def value_of(spec: Option, value: Any) -> Any:
     """A checked value, in a tuple if it has parts; ValueError with what is allowed."""
     if value is None and spec.optional:
         return None
+    if spec.several:
+        values = value if isinstance(value, list | tuple) and value else [value]
+        return tuple(_single(spec, single) for single in values)
     if not spec.parts:
         return _single(spec, value)
     if not isinstance(value, list | tuple) or len(value) != spec.parts:

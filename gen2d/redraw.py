@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gen2d import annotations, drawing, factors, loader, plugins, types
+from gen2d import annotations, drawing, factors, loader, matched, plugins, types
 from gen2d.camera import View
 from gen2d.config import PLUGINS, AnnotationOptions, Config, load_config
 from gen2d.errors import ConfigError
@@ -122,6 +122,8 @@ def simulate_again(
         *([] if frames is None else [f"video.frames={frames}"]),
     ]
     config, numbers = config_of(ds, changes), ds.numbers(np.atleast_1d(indices))
+    if not set(matched.VIOLATIONS).isdisjoint(config.matched.change or ()):
+        raise ConfigError(f"{ds.root}: matched.change has violations, which cannot be simulated again from a scene")
     columns = _stored(ds, numbers)
     made = _simulated(columns, _key_words(ds), jnp.asarray(numbers, jnp.uint32), _Settings(config_of(ds), config))
     return made | {"time": jnp.arange(config.video.frames) / config.video.fps}
@@ -224,7 +226,7 @@ def _staged(columns: Columns, words: Array, numbers: Array, settings: _Settings)
     def staged(key: Array, scene: Scene, states: State, view: View) -> Stage:
         return drawing.stage_of(key, config, plan, scene, states, view)
 
-    return jax.vmap(staged)(factors.video_keys(words, numbers), scene, states, view)
+    return jax.vmap(staged)(matched.keys_of(words, numbers, settings.base.matched), scene, states, view)
 
 
 @functools.partial(jax.jit, static_argnames="settings")
@@ -243,7 +245,7 @@ def _simulated(columns: Columns, words: Array, numbers: Array, settings: _Settin
     keep = dataclasses.replace(keep_of(config, layout), between=False)
     device = types.to_device(scene), types.to_device(first)
     made = types.to_stored(simulate(*device, layout, rules, config.video.frames, steps, keep, sparse=on_cpu()))
-    keys = factors.video_keys(words, numbers)
+    keys = matched.keys_of(words, numbers, settings.base.matched)
     view = jax.vmap(lambda key, states: drawing.view_of(key, config, layout, states))(keys, made.states)
     return types.columns(made) | drawing.camera_columns(view)
 

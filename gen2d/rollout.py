@@ -18,14 +18,15 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-from gen2d import annotations, drawing, factors, predictability, quality, sampling, types, words
+from gen2d import annotations, drawing, factors, matched, predictability, quality, sampling, types, words
 from gen2d.config import Config, PhysicsOptions
 from gen2d.fields import Field
+from gen2d.parts import Sampled
 from gen2d.picture import Stage
 from gen2d.rows import Rules
-from gen2d.sampling import Sampler
+from gen2d.sampling import Change, Sampler
 from gen2d.simulate import Keep, simulate, substeps
-from gen2d.types import Array, Scene, State
+from gen2d.types import Array, Scene, State, Trajectory
 
 SLICE_BYTES = 16 * 2**20  # of raw frames drawn at once; larger buffers cost page faults
 SHARD_BYTES = 2**30  # of raw frames in a shard
@@ -99,6 +100,8 @@ class Rollout:
         fields |= types.fields_of(scene)
         if not self.keep.energy:
             del fields["quality/energy_residual"]
+        for name in matched.untold(self.config.matched):
+            del fields[name]
         if self.plan.frames:
             fields["frames"] = Field("uint8", "n T H W 3", "sRGB", "the video")
         fields |= annotations.fields(self.config.annotations) | self.word_fields
@@ -113,7 +116,7 @@ class Rollout:
         fields |= {"quality/rejected_videos": quality.FIELD} if self.wanted else {}
         for name, axes, unit, meaning in CAMERA:
             fields[f"camera/{name}"] = Field("float32", axes, unit, meaning)
-        fields |= sampling.fields(self.config)
+        fields |= sampling.fields(self.config) | matched.fields(self.config.matched)
         return dict(sorted(fields.items()))
 
     @property
@@ -178,16 +181,19 @@ class Rollout:
 
     def _made(self, root: Array, row: Array, given: Array, numbers: Array, attempts: Array) -> Batch:
         """One device's share: from numbers to everything but the frames."""
-        config, layout = self.config, self.layout
-        keys = factors.video_keys(root, numbers)
-        own = quality.attempt_keys(keys, attempts) if self.wanted else keys
-        drawn, (scene, state, rejected, placed, _) = jax.vmap(self.sampler.sampled, (0, None, 0))(own, row, given)
-        rules = rules_of(config.physics, config.video.fps, self.steps)
-        device = types.to_device(scene), types.to_device(state)
-        sparse = self.devices[0].platform == "cpu"
-        made = simulate(*device, layout, rules, config.video.frames, self.steps, self.keep, sparse=sparse)
-        between = None if made.between is None else _videos_first(made.between)
-        made = types.to_stored(dataclasses.replace(made, between=None))
+        config = self.config
+        keys, told = matched.keys_of(root, numbers, config.matched), {}
+        if config.matched.change:
+
+            def member(key: Array, change: Change | None = None) -> tuple[dict[str, Array], Sampled]:
+                return self.sampler.sampled(key, row, change=change)
+
+            drawn, own, made, told = matched.simulated(keys, numbers, config, self.layout, member, self._run)
+        else:
+            own_keys = quality.attempt_keys(keys, attempts) if self.wanted else keys
+            drawn, own = jax.vmap(self.sampler.sampled, (0, None, 0))(own_keys, row, given)
+            made = self._run(own.scene, own.state)
+        scene, between, made = own.scene, made.between, dataclasses.replace(made, between=None)
 
         def staged(key: Array, scene: Scene, states: State, between: State | None) -> tuple[Stage, Array]:
             stage = drawing.stage_of(key, config, self.plan, scene, states, between=between)
@@ -199,13 +205,28 @@ class Rollout:
         columns |= drawing.camera_columns(stages.instants.view)
         columns |= {f"factors/{name}": values.astype(jnp.float32) for name, values in drawn.items()}
         columns |= jax.vmap(self.sampler.outside)(drawn)
-        columns["quality/rejected_draws"] = rejected
+        columns["quality/rejected_draws"] = own.rejected
         if config.annotations.predictability:
-            again = functools.partial(
-                simulate, layout=layout, rules=rules, frames=config.video.frames, steps=self.steps, sparse=sparse
-            )
-            columns["quality/growth"] = predictability.growth(keys, *device, again, float(self.time[-1]))
-        return Batch(columns, stages, placed)
+            columns["quality/growth"] = self._growth(keys, own)
+        columns = {name: values for name, values in columns.items() if name not in matched.untold(config.matched)}
+        return Batch(columns | told, stages, own.fits)
+
+    def _simulated(self, scene: Scene, state: State, keep: Keep) -> Trajectory:
+        """What becomes of these starts, in the device's layout."""
+        config, sparse = self.config, self.devices[0].platform == "cpu"
+        rules = rules_of(config.physics, config.video.fps, self.steps)
+        return simulate(scene, state, self.layout, rules, config.video.frames, self.steps, keep, sparse=sparse)
+
+    def _run(self, scene: Scene, state: State) -> Trajectory:
+        """What becomes of these starts; videos first."""
+        made = self._simulated(types.to_device(scene), types.to_device(state), self.keep)
+        between = None if made.between is None else _videos_first(made.between)
+        return dataclasses.replace(types.to_stored(dataclasses.replace(made, between=None)), between=between)
+
+    def _growth(self, keys: Array, own: Sampled) -> Array:
+        again = functools.partial(self._simulated, keep=Keep())
+        starts = types.to_device(own.scene), types.to_device(own.state)
+        return predictability.growth(keys, *starts, again, float(self.time[-1]))
 
     def _scene(self, key: Array) -> Scene:
         """A scene of a video, for its shape."""

@@ -7,6 +7,7 @@ Each split has a law of its own (laws.py). One program draws from all of them: i
 """
 
 import functools
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -24,6 +25,7 @@ from gen2d.parts import Sampled
 from gen2d.types import Array
 
 Factors = dict[str, Array]
+Change = Callable[[Factors, Callable[[Array], Factors]], Factors]
 
 
 def sizes(scene: Plugin) -> dict[str, int]:
@@ -75,22 +77,28 @@ class Sampler:
             found[np.ix_(own, [self.gridded.index(name) for name in names])] = chosen
         return found
 
-    def sampled(self, key: Array, row: Any = 0, given: Any = ()) -> tuple[Factors, Sampled]:
+    def sampled(
+        self, key: Array, row: Any = 0, given: Any = (), change: Change | None = None
+    ) -> tuple[Factors, Sampled]:
         """A video's factors, those that follow from others included, and its scene and start.
 
-        `row` is that of the split, `given` [G] what `combination` says of the video.
+        `row` is that of the split, `given` [G] what `combination` says of the video. `change(found, draw)` makes other
+        factors of those that are found, where `draw(key)` draws all anew.
         """
         draw_key, place_key = jax.random.split(key)
-        drawn = self.drawn(draw_key, row, given)
+        drawn = self.drawn(draw_key, row, given, change)
         made: Any = self.scene.module.sample(place_key, drawn, self.scene.options)
         rejected, fits = jnp.asarray(made.rejected, jnp.int32), jnp.asarray(made.fits, bool)
         return {**drawn, **made.derived}, made._replace(rejected=rejected, fits=fits, derived={})
 
-    def drawn(self, key: Array, row: Any = 0, given: Any = ()) -> Factors:
-        """A video's factors by name; zero for what is beyond the number there is.
+    def drawn(self, key: Array, row: Any = 0, given: Any = (), change: Change | None = None) -> Factors:
+        """A video's factors by name; zero for what is beyond the number there is."""
+        found = self._found(key, row, given)
+        found = change(found, lambda other: self._found(other, row, given)) if change else found
+        return {name: self._counted(name, values, found) for name, values in found.items()}
 
-        Each has a key of its own name, so that its draws do not depend on which others there are.
-        """
+    def _found(self, key: Array, row: Any, given: Any) -> Factors:
+        """All factors by name. Each has a key of its own, so that its draws do not depend on which others there are."""
         components = self._components(key, row)
         found = {}
         for name, spec in self.options.items():
@@ -103,7 +111,7 @@ class Sampler:
                 for k, coordinate in zip(keys, self._coordinates(name), strict=True)
             ]
             found[name] = jnp.stack(parts, axis=-1) if spec.parts else parts[0]
-        return {name: self._counted(name, values, found) for name, values in found.items()}
+        return found
 
     def _coordinates(self, name: str) -> list[str]:
         return list(coordinates(name, getattr(self.scene.options, name)))

@@ -49,6 +49,8 @@ ORDER = [
         "splits",
         "config",
         "parts",
+        "matched",
+        "config",
         "sampling",
     ),
     *(

@@ -52,6 +52,8 @@ def test_every_block_runs(tmp_path: Path):
         "seen",
         "annotated",
         "splits",
+        "counterfactuals",
+        "violations",
     }
 
 
