@@ -442,7 +442,7 @@ def _check_grids(config: Config, source: str) -> None:
     for section, options in sections.items():
         for field in dataclasses.fields(options):
             spec, value = field.metadata["option"], getattr(options, field.name)
-            parts = coordinates(field.name, value).values() if spec.draw else ()
+            parts = coordinates(field.name, value).values() if spec.draw and value is not None else ()
             gridded = any(simple.kind == "grid" for part in parts for _, simple in part.weighted)
             if gridded and (section != "scene" or spec.each):
                 raise ConfigError(
