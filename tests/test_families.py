@@ -12,11 +12,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from worlds import sampled
 
-from gen2d import plugins, sampling
-from gen2d.config import Plugin, load_config
+from gen2d import plugins
+from gen2d.config import load_config
 from gen2d.contacts import Disc, Hull, Shape, touches
 from gen2d.forms import form_of, placed
+from gen2d.options import Plugin, drawn_options
 from gen2d.rollout import rules_of
 from gen2d.simulate import simulate, substeps
 from gen2d.types import DYNAMIC, SHAPES, Layout, Objects, Run, Scene, State, Trajectory, to_device, to_stored
@@ -47,7 +49,7 @@ def program(family: str) -> tuple[Plugin, Layout, Any]:
     rules = rules_of(physics, video.fps, steps)
 
     def run(keys: jax.Array) -> Made:
-        factors, (things, state, _, fits, _) = jax.vmap(lambda key: sampling.sampled(key, scene))(keys)
+        factors, (things, state, _, fits, _) = jax.vmap(lambda key: sampled(config, key))(keys)
         on_device = to_device(things), to_device(state)
         shapes = shapes_of(layout, on_device[0].objects, on_device[1])
         few = (jax.tree.map(lambda x: x[..., :LANES], value) for value in on_device)
@@ -155,7 +157,7 @@ def test_what_moves_begins_in_view(family):
 @pytest.mark.parametrize("family", FAMILIES)
 def test_factors_are_what_they_are_declared_to_be(family):
     scene, found = program(family)[0], made(family).factors
-    for name, spec in sampling.options_of(scene.module).items():
+    for name, spec in drawn_options(scene.module).items():
         source, values = getattr(scene.options, name), found[name]
         parts = source if spec.parts else [source]
         values = values if spec.parts else values[..., None]

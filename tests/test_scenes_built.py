@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from laws import holds
 from tiny import ran
+from worlds import sampled
 
-from gen2d import sampling
 from gen2d.config import load_config
 from gen2d.errors import ConfigError
 from gen2d.rollout import rules_of
@@ -41,7 +41,7 @@ def film(family: str, lanes: int, seconds: float, fps: float, *sets: str, energy
 
     @jax.jit
     def run(keys: jax.Array) -> tuple:
-        factors, (things, state, *_) = jax.vmap(lambda key: sampling.sampled(key, scene))(keys)
+        factors, (things, state, *_) = jax.vmap(lambda key: sampled(config, key))(keys)
         device = to_device(things), to_device(state)
         made = simulate(*device, layout, rules, frames, steps, Keep(energy=energy), sparse=True)
         return factors, things, to_stored(made)
