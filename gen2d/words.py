@@ -227,7 +227,7 @@ def rests(made: Columns, fps: float) -> list[Event]:
 def caption(made: Columns, events: list[Event], missed: bool = False) -> str:
     """What is there and what happens first, in English; `missed`: whether there were more hits than are known."""
     names = names_of(made)
-    first = opening(made, names)
+    first, text = opening(made, names), ""
     for shown in range(min(SHOWN, len(events)), -1, -1):
         left = len(events) - shown
         more = f"{'At least ' if missed else 'And '}{left} more event{'s' if left > 1 else ''}." if left else ""

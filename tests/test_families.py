@@ -32,7 +32,7 @@ OVERLAP, EDGE = 1e-4, 1e-3  # m
 class Made(NamedTuple):
     """What a family makes of some keys; arrays have them first."""
 
-    factors: dict[str, Any]
+    factors: Any  # by name
     scene: Scene
     state: State
     fits: Any

@@ -162,7 +162,7 @@ def _drawn(of, keys, row, given):
 def drawn(config, of, split, count=COUNT):
     words, numbers = factors.seed_words(3, 7), np.arange(count, dtype=np.uint32)
     given = of.combination(config.row(split), words, numbers)
-    found = _drawn(of, factors.video_keys(jnp.asarray(words), numbers), config.row(split), given)
+    found = _drawn(of, factors.video_keys(jnp.asarray(words), jnp.asarray(numbers)), config.row(split), given)
     return [{name: np.asarray(values) for name, values in each.items()} for each in found]
 
 

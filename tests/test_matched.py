@@ -13,10 +13,11 @@ from numpy.testing import assert_allclose, assert_array_equal
 from tiny import everything
 
 import gen2d
-from gen2d import matched, sampling
+from gen2d import matched
 from gen2d.config import load_config
 from gen2d.errors import ConfigError, FolderError
 from gen2d.parts import assembled, boxes, capsules, discs
+from gen2d.sampling import Sampler
 from gen2d.types import STATIC, Layout
 
 MEMBERS, VIDEOS, FPS = 3, 241, 20  # 80 sets and an original
@@ -176,7 +177,7 @@ def drawn(sets: list[str], number: int) -> tuple[Videos, Videos]:
 
     def factors(number: int) -> Videos:
         member = matched._member(key, jnp.int32(number), config.matched, 8)
-        return sampling.drawn(key, config.scene, lambda *found: matched._other_factors(member, config, *found))
+        return Sampler(config).drawn(key, change=lambda *found: matched._other_factors(member, config, *found))
 
     return factors(0), factors(number)
 

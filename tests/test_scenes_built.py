@@ -106,7 +106,7 @@ def test_dominoes_fall_in_order_in_a_steady_wave_unless_their_gap_is_too_wide():
     assert fallen[wide, -1, 0].all()
     assert not fallen[wide, -1, 1:].any()
     assert fallen[~wide, -1].all()
-    begins = when(made.states.angle[~wide][:, :, slots(made, 2)], made.time)
+    begins = when(np.asarray(made.states.angle[~wide][:, :, slots(made, 2)]), made.time)
     steps = np.diff(begins, axis=1)
     assert steps.min() > 0
     middle = steps[:, 3:-1]

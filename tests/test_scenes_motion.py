@@ -215,7 +215,7 @@ def pairs(n: int) -> dict[str, np.ndarray]:
     given |= {f"speed_{k}": mixed(SPEEDS, n, 20 + k) for k in (1, 2)}
     special = [(0, 0), (0, 3), (2, 0), (0.01, 0), (0.005, 0.0051), (0, 0.02), (6, 6), (0, 0)]
     for k in (1, 2):
-        given[f"speed_{k}"][: len(special)] = np.float32(special)[:, k - 1]
+        given[f"speed_{k}"][: len(special)] = np.array(special, np.float32)[:, k - 1]
     for k in (1, 2):
         given[f"radius_{k}"][6] = 2.0
     return given

@@ -63,7 +63,7 @@ def test_text_is_what_was_written_for_the_loader_and_for_plain_h5py(toy: Path) -
     with h5py.File(toy / "shards" / "train-00000.h5") as file:
         field = file["text/name"]
         assert isinstance(field, h5py.Dataset)
-        assert field.asstr()[:].tolist() == [text.decode() for text in expected("text/name", 8).tolist()]
+        assert list(field.asstr()[:]) == [text.decode() for text in expected("text/name", 8).tolist()]
         assert field.attrs["unit"] == "UTF-8"
 
 
@@ -136,7 +136,7 @@ def seen(seed: int, **changes: Any) -> dict[str, np.ndarray]:
         "objects/radius": np.where(ball, 0.5, 0).astype(np.float32),
         "objects/half_length": np.append(np.zeros(BALLS), np.hypot(*(b - a).T) / 2).astype(np.float32),
         "objects/color": np.where(ball[:, None], rng.integers(0, 256, (len(slots), 3)), 128).astype(np.uint8),
-        "world/gravity": np.float32([0, -9.8]),
+        "world/gravity": np.array([0, -9.8], np.float32),
         "states/position": np.concatenate([place, np.broadcast_to((a + b) / 2, (frames, 4, 2))], 1),
         "states/angle": np.append(np.zeros(BALLS), np.arctan2(*(b - a).T[::-1])) * np.ones((frames, 1)),
         "states/velocity": np.where(ball[:, None], rng.normal(0, 2, (frames, len(slots), 2)), 0),
@@ -174,7 +174,7 @@ def touches(rng: np.random.Generator) -> dict[str, np.ndarray]:
     }
 
 
-def rows_of(made: dict[str, np.ndarray]) -> list[tuple[int, ...]]:
+def rows_of(made: dict[str, np.ndarray]) -> list[tuple]:
     """Kind, frame, slots and time of each row of contacts."""
     names = ("kind", "frame", "a", "b", "time")
     return [row for row in zip(*(made[f"contacts/{n}"].tolist() for n in names), strict=True) if row[0]]

@@ -14,7 +14,6 @@ import numpy as np
 
 from gen2d import drawing, factors, sampling, types
 from gen2d.config import Config, load_config
-from gen2d.parts import Sampled
 from gen2d.picture import Plan, Stage
 from gen2d.rows import Rules
 from gen2d.simulate import Forces, Keep, simulate
@@ -182,11 +181,6 @@ def momenta(worlds: Sequence[tuple[Scene, State, Layout]], made: Trajectory) -> 
     return np.array(linear), np.array(angular)
 
 
-def sampled(config: Config, key: jax.Array) -> tuple[dict[str, jax.Array], Sampled]:
-    """A video's factors, scene and start, as a config without splits has them."""
-    return sampling.Sampler(config).sampled(key, jnp.int32(0), jnp.zeros(0))
-
-
 # ---- Videos that no solver makes, to be drawn
 
 
@@ -207,11 +201,7 @@ def _all_flown(config: Config, layout: Layout, keys: jax.Array) -> tuple[Stage, 
 
 def _flown(config: Config, layout: Layout, key: jax.Array) -> tuple[Stage, Scene, State]:
     video, steps = config.video, 4
-<<<<<<< HEAD
     scene, begin, *_ = sampling.Sampler(config).sampled(key)[1]
-=======
-    scene, begin, *_ = sampled(config, key)[1]
->>>>>>> hf3
 
     def at(time: jax.Array) -> State:
         def moved(start: jax.Array, rate: jax.Array) -> jax.Array:

@@ -69,6 +69,6 @@ def sample(key: Array, factors: dict[str, Array], options: Options) -> Sampled:
         **{name: factors[name] for name in ("density", "spin", "friction", "color")},
     )  # fmt: skip
     # A ball that leaves the view is far away when it comes to the end of its floor.
-    ends = [jnp.stack([jnp.full(most, end * options.width), floor], 1) for end in (-9.0, 10.0)]
-    floors = segments(*ends, present, friction=factors["floor_friction"], color=factors["floor_color"])
+    left, right = (jnp.stack([jnp.full(most, end * options.width), floor], 1) for end in (-9.0, 10.0))
+    floors = segments(left, right, present, friction=factors["floor_friction"], color=factors["floor_color"])
     return Sampled(*assembled(layout(options), [balls, floors], factors["gravity"]))
