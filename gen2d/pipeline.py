@@ -93,7 +93,7 @@ class Encoder:
         for name, array in drawn.items():
             own[name] = np.asarray(array)[rows.start - start : rows.stop - start]
         own["index"] = np.arange(job.first + rows.start, job.first + rows.stop, dtype=np.int64)
-        own |= self.rollout.told(own)
+        own |= self.rollout.told(own, job.shard.split)
         block = shards.encode(own, self.dataset.fields, self.dataset.codec, self.dataset.chunk_frames)
         _check_finite(block, job.first + rows.start)
         return block

@@ -131,11 +131,16 @@ class Rollout:
     @property
     def word_fields(self) -> dict[str, Field]:
         """Those fields that are made on the host."""
-        return words.fields(self.layout.slots, self.config.video.frames) if self.config.annotations.words else {}
+        longest = max((len(split.name) for split in self.config.splits), default=0)
+        found = {"split": Field(f"S{longest}", "n", "", "the split that the video belongs to")} if longest else {}
+        spoken = self.config.annotations.words
+        return found | (words.fields(self.layout.slots, self.config.video.frames) if spoken else {})
 
-    def told(self, columns: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-        """The fields of some videos that are made on the host, from their others there."""
-        return words.told(columns, self.config.video) if self.config.annotations.words else {}
+    def told(self, columns: dict[str, np.ndarray], split: str) -> dict[str, np.ndarray]:
+        """The fields of some videos of a split that are made on the host, from their others there."""
+        count = len(columns["objects/present"])
+        named = {"split": np.full(count, split.encode())} if self.config.splits else {}
+        return named | (words.told(columns, self.config.video) if self.config.annotations.words else {})
 
     @property
     def time(self) -> np.ndarray:

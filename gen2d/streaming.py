@@ -178,7 +178,8 @@ class Stream:
     def _words(self, batch: Batch, lane: int, wanted: Set[str]) -> Arrays:
         """What is told of a cell, on the host; text stays there."""
         columns = self.rollout.host_columns(batch)[0]
-        told = self.rollout.told({name: column[lane : lane + self.cell] for name, column in columns.items()})
+        own = {name: column[lane : lane + self.cell] for name, column in columns.items()}
+        told = self.rollout.told(own, self.options.split)
         return {name: v if self.fields[name].is_text else jnp.asarray(v) for name, v in told.items() if name in wanted}
 
     def _pictures(self, batch: Batch, lane: int) -> Arrays:

@@ -126,7 +126,8 @@ def _physics(rollout: Any) -> tuple[Callable, Callable, np.ndarray]:
     rules = rules_of(config.physics, config.video.fps, rollout.steps)
 
     def sampled(numbers: Any) -> Any:
-        return jax.vmap(rollout._sampled)(factors.video_keys(jnp.asarray(root), numbers))[1:3]
+        made = jax.vmap(rollout.sampler.sampled)(factors.video_keys(jnp.asarray(root), numbers))[1]
+        return made.scene, made.state
 
     def simulated(scene: Any, state: Any) -> Any:
         device = types.to_device(scene), types.to_device(state)

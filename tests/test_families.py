@@ -50,7 +50,8 @@ def program(family: str) -> tuple[Plugin, Layout, Any]:
     rules = rules_of(physics, video.fps, steps)
 
     def run(keys: jax.Array) -> Made:
-        factors, (things, state, _, fits, _) = jax.vmap(Sampler(config).sampled)(keys)
+        factors, begun = jax.vmap(Sampler(config).sampled)(keys)
+        things, state, fits = begun.scene, begun.state, begun.fits
         on_device = to_device(things), to_device(state)
         shapes = shapes_of(layout, on_device[0].objects, on_device[1])
         few = (jax.tree.map(lambda x: x[..., :LANES], value) for value in on_device)

@@ -7,8 +7,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 from tiny import everything
 
@@ -170,31 +168,37 @@ def test_members_that_hide_a_factor_hide_it_of_one_object(videos: Videos):
     assert {len(slots) for slots in hidden.values()} == {1}
 
 
-def drawn(sets: list[str], number: int) -> tuple[Videos, Videos]:
-    """The factors of an original, and of a member of its set."""
-    config = load_config(CONFIG, [*sets, "matched.members=256"])
-    key = jax.random.key(3)
+def drawn(*sets: str) -> tuple[Videos, Videos]:
+    """The factors of an original [...], and of the 255 members of its set [255, ...]."""
+    config = load_config(CONFIG, ["matched.members=256", *(f"matched.{text}" for text in sets)])
+    key, sampler = jax.random.key(3), Sampler(config)
 
-    def factors(number: int) -> Videos:
-        member = matched._member(key, jnp.int32(number), config.matched, 8)
-        return Sampler(config).drawn(key, change=lambda *found: matched._other_factors(member, config, *found))
+    def factors(number: jax.Array) -> dict[str, jax.Array]:
+        member = matched._member(key, number, config.matched, 8)
+        return sampler.drawn(key, change=lambda *found: matched._other_factors(member, config, *found))
 
-    return factors(0), factors(number)
+    found = {name: np.asarray(values) for name, values in jax.jit(jax.vmap(factors))(jnp.arange(256)).items()}
+    return {name: values[0] for name, values in found.items()}, {name: values[1:] for name, values in found.items()}
 
 
-@given(st.integers(1, 255))
-@settings(max_examples=5, deadline=None)
-def test_a_factor_is_another_one_for_one_or_for_all_drawn_anew_or_scaled(number: int):
-    for objects in ("one", "all"):
-        one, other = drawn(["matched.change=density", f"matched.objects={objects}"], number)
-        assert {name for name in one if (one[name] != other[name]).any()} == {"density"}
-        changed, there = one["density"] != other["density"], np.arange(3) < one["balls"]
-        assert changed.sum() == 1 if objects == "one" else (changed == there).all()
-        assert (changed <= there).all()
-        assert ((other["density"] >= 1) & (other["density"] <= 5))[there].all()
-        scaled = drawn(["matched.change=density", "matched.scale=0.5", f"matched.objects={objects}"], number)[1]
-        assert_allclose(scaled["density"], np.where(changed, one["density"] / 2, one["density"]), rtol=1e-6)
-    assert drawn(["matched.change=elasticity", "matched.scale=9"], number)[1]["elasticity"].max() == 1
+@pytest.mark.parametrize("objects", ["one", "all"])
+@pytest.mark.parametrize("scale", ["null", "0.5"])
+def test_a_factor_is_another_one_for_one_or_for_all_drawn_anew_or_scaled(objects: str, scale: str):
+    one, others = drawn("change=density", f"objects={objects}", f"scale={scale}")
+    assert {name for name in one if (one[name] != others[name]).any()} == {"density"}
+    changed, there = one["density"] != others["density"], np.arange(3) < one["balls"]
+    assert (changed == changed[0]).all()
+    assert changed[0].sum() == 1 if objects == "one" else (changed[0] == there).all()
+    assert (changed <= there).all()
+    if scale == "null":
+        assert len(np.unique(others["density"][changed])) == changed.sum()
+        assert ((others["density"] >= 1) & (others["density"] <= 5))[:, there].all()
+    else:
+        assert_allclose(others["density"], np.where(changed, one["density"] / 2, one["density"]), rtol=1e-6)
+
+
+def test_a_scaled_factor_stays_within_what_it_may_be():
+    assert drawn("change=elasticity", "scale=9")[1]["elasticity"].max() == 1
 
 
 # ---- Violations
