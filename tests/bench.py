@@ -4,6 +4,7 @@
     python tests/bench.py --quick         # only what a change to the code should be tried on
     python tests/bench.py --only physics  # what it costs against the number of objects: bench_physics.py
     python tests/bench.py --only render   # what drawing costs, and annotations: bench_render.py
+    python tests/bench.py --only families # what sampling costs, for every scene family
     python tests/bench.py --only storage  # what writing and reading cost: bench_storage.py
 
 Machines are noisy, so whatever is compared is measured in turns, and a ratio is the median of the ratios of the turns.
@@ -64,14 +65,14 @@ def stages(folder: Path, turns: int = 5, peer_videos: int = 32, sets: Sequence[s
     return in_turns(works | {"peer draw": lambda: peer.seconds_to_draw(peer_videos) / peer_videos}, turns)
 
 
-def _parts(folder: Path, sets: Sequence[str]) -> dict[str, tuple[Callable[[], Any], int]]:
+def _parts(folder: Path, sets: Sequence[str], config: str = CONFIG) -> dict[str, tuple[Callable[[], Any], int]]:
     """For each stage of gen2d what does it for a batch, and of how many videos."""
     import jax
 
     from gen2d import devices, pipeline, shards
     from gen2d.generation import dataset_of
 
-    rollout = rollout_of(sets)
+    rollout = rollout_of(sets, config)
     sample, simulate, numbers = _physics(rollout)
     start, batch = sample(numbers), rollout.begin("train", [0] * len(rollout.devices))
     whole = rollout.videos_per_shard // rollout.lanes * rollout.lanes
@@ -103,13 +104,13 @@ def _parts(folder: Path, sets: Sequence[str]) -> dict[str, tuple[Callable[[], An
     }
 
 
-def rollout_of(sets: Sequence[str] = ()) -> Any:
-    """The compiled programs of the benchmark's config, on all devices of this process."""
+def rollout_of(sets: Sequence[str] = (), config: str = CONFIG) -> Any:
+    """The compiled programs of the benchmark's or another config, on all devices of this process."""
     from gen2d import devices
     from gen2d.config import load_config
     from gen2d.rollout import Rollout
 
-    return Rollout(load_config(CONFIG, sets), devices.prepare())
+    return Rollout(load_config(config, sets), devices.prepare())
 
 
 def _physics(rollout: Any) -> tuple[Callable, Callable, np.ndarray]:
@@ -214,12 +215,21 @@ def annotated(folder: Path, turns: int) -> Turns:
     return in_turns(works, turns) | {f"bytes {name}": [size] for name, size in sizes.items()}
 
 
+def family(folder: Path, name: str, turns: int) -> Turns:
+    """Seconds a video of each stage, of a scene family's own config."""
+    works = {
+        part: timed(work, videos, time.perf_counter)
+        for part, (work, videos) in _parts(folder, (), f"{name}.yaml").items()
+    }
+    return in_turns(works, turns)
+
+
 def storage(folder: Path, case: str, turns: int) -> Turns:
     """CPU seconds of writing, reading and copying all videos of a case."""
     return in_turns(bench_storage.works(bench_storage.CASES[case], folder), turns)
 
 
-MEASUREMENTS = {work.__name__: work for work in (stages, steady, bounds, physics, render, annotated, storage)}
+MEASUREMENTS = {work.__name__: work for work in (stages, steady, bounds, physics, render, annotated, family, storage)}
 
 
 # ---- Processes
@@ -456,10 +466,25 @@ def storage_section(folder: Path, quick: bool) -> Found:
         )
 
 
+def families_section(folder: Path, quick: bool) -> Found:
+    """What sampling a scene costs of all that its video does, for every family."""
+    from gen2d import plugins
+
+    for name in plugins.names("scene"):
+        own = folder / name
+        own.mkdir()
+        turns = measured(family, own, CORES[:1], name=name, turns=2 if quick else 5)
+        shares = [
+            turns["sampler"][i] / sum(of[i] for part, of in turns.items() if part != "sampler")
+            for i in range(len(turns["sampler"]))
+        ]
+        yield Promise(f"{name}: sampler of all", 100 * statistics.median(shares), "%", target=5, most=True)
+
+
 SECTIONS = {
     "parts": parts_section, "steady": steady_section, "command": command_section, "memory": memory_section,
     "scaling": scaling_section, "start": start_section, "physics": physics_section,
-    "render": render_section, "storage": storage_section,
+    "render": render_section, "families": families_section, "storage": storage_section,
 }  # fmt: skip
 QUICK = ("parts", "steady")
 

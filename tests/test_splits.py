@@ -1,0 +1,148 @@
+"""Splits and videos of a kind as datasets: the same whatever is made first, alone or together; the study's presets."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from numpy.testing import assert_array_equal
+from synthetic import tree
+
+import gen2d
+from gen2d import factors, quality
+from gen2d.config import load_config
+from gen2d.errors import ConfigError
+from gen2d.laws import common
+from gen2d.rollout import Batch
+from gen2d.sampling import Sampler
+
+CONFIG = {
+    "name": "tiny",
+    "video": {"frames": 6, "height": 16, "width": 16},
+    "scene": {"name": "bouncing", "balls": [2, 3], "radius": [0.5, 1.0]},
+    "physics": {"substeps": 2},
+    "storage": {"lanes": 8, "videos_per_shard": 8},
+}
+SPLITS = {
+    "train": {"factors": {"minus": [{}, {"radius": [0.7, 0.8]}]}},
+    "holes": {"videos": 9, "factors": {"radius": [0.7, 0.8]}},
+    "heavy": {"videos": 3, "factors": {"gravity": [0, -30]}},
+}
+PRESETS = {"uniform_motion": 7, "parabola": 7, "collision": 13}
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    root = tmp_path_factory.mktemp("data") / "whole"
+    summary = gen2d.generate(CONFIG | {"splits": SPLITS}, 12, root, seed=4)
+    assert (summary.made, summary.complete) == (24, True)
+    return root
+
+
+def test_a_dataset_is_the_same_whatever_split_is_made_first(whole, tmp_path):
+    config = CONFIG | {"splits": SPLITS}
+    for split, count in (("heavy", 3), ("train", 12), ("holes", 9)):
+        gen2d.generate(config, count, tmp_path / "one", seed=4, split=split)
+    assert tree(tmp_path / "one") == tree(whole)
+
+
+def test_each_video_says_its_split_and_how_far_outside_it_is(whole):
+    for split, count in (("train", 12), ("holes", 9), ("heavy", 3)):
+        videos = gen2d.open(whole, split, fields=("split", "outside/*", "factors/*"))[:]
+        assert videos["split"].tolist() == [split.encode()] * count
+        assert (videos["outside/training"] == (split != "train")).all()
+        assert (videos["outside/radius"].max(1) > 0).all() == (split == "holes")
+        assert (videos["outside/gravity"][:, 1] > 0).all() == (split == "heavy")
+
+
+def test_a_stream_of_a_split_is_the_dataset_s(whole):
+    fields = ["factors/radius", "states/position", "split"]
+    batch = next(iter(gen2d.stream(CONFIG | {"splits": SPLITS}, 4, 8, split="holes", fields=fields, n=9)))
+    stored = gen2d.open(whole, "holes", fields=fields)[:8]
+    for name in fields:
+        assert_array_equal(np.asarray(batch[name]), stored[name])
+
+
+def test_a_split_that_there_is_not_is_said():
+    with pytest.raises(ConfigError, match="must be one of the config's: train, holes, heavy"):
+        gen2d.generate(CONFIG | {"splits": SPLITS}, 3, "nowhere", split="hole")
+
+
+@pytest.mark.parametrize("family", PRESETS)
+def test_the_study_s_splits_have_nothing_in_common_with_training_and_start_in_view(family):
+    config = load_config(f"phyworld_{family}.yaml")
+    assert len(config.splits) == PRESETS[family] + 1
+    training, of = config.training, Sampler(config)
+    assert training is not None
+    starts = jax.jit(jax.vmap(of.sampled, (0, None)))
+    for row, split in enumerate(config.splits):
+        assert (common(training.law, split.law) is None) == (split.name not in ("train", "test"))
+        keys = factors.video_keys(jnp.asarray(factors.seed_words(0, row)), jnp.arange(500, dtype=jnp.uint32))
+        drawn, made = jax.tree.map(np.asarray, starts(keys, row))
+        position, radius = made.state.position, made.scene.objects.radius
+        assert np.isfinite(position).all()
+        assert (position[..., 1] - radius >= -1e-5).all()
+        assert (position[..., 1] + radius <= 10 + 1e-5).all()
+        assert (np.abs(position[..., 0] - 5) + radius <= 5 + 1e-5).all()
+        assert len(np.unique(position.reshape(500, -1), axis=0)) == 500
+        if family == "collision":
+            gap = position[:, 1, 0] - position[:, 0, 0] - radius.sum(1)
+            closing, frame = drawn["speed_1"] + drawn["speed_2"], drawn["contact_frame"]
+            np.testing.assert_allclose(gap[closing > 0], (frame * closing / 10)[closing > 0], rtol=1e-3, atol=1e-4)
+            feasible = 10 - 2 * radius.sum(1) >= 0.8 * closing
+            assert (((frame >= 8 - 1e-4) & (frame <= 24 + 1e-4)) | ~feasible | (closing == 0)).all()
+
+
+# ---- Videos of a kind
+
+
+def test_videos_of_a_kind_are_the_first_attempts_that_are(tmp_path):
+    asked = {"contacts_least": 3, "contacts_most": 8}
+    fields = ("states/position", "quality/*")
+    any_kind = gen2d.open(gen2d.generate(CONFIG, 16, tmp_path / "any").out, fields=fields)[:]
+    root = gen2d.generate(CONFIG | {"quality": asked}, 16, tmp_path / "some").out
+    some = gen2d.open(root, fields=fields)[:]
+    assert ((some["quality/contacts"] >= 3) & (some["quality/contacts"] <= 8)).all()
+    first = some["quality/rejected_videos"] == 0
+    assert 0 < first.sum() < 16
+    assert_array_equal(first, (any_kind["quality/contacts"] >= 3) & (any_kind["quality/contacts"] <= 8))
+    assert_array_equal(some["states/position"][first], any_kind["states/position"][first])
+    few = gen2d.open(gen2d.generate(CONFIG | {"quality": asked}, 5, tmp_path / "few").out, fields=fields)[:]
+    for name, values in few.items():
+        assert_array_equal(values, some[name][:5])
+    assert gen2d.verify(root, level="regen") == []
+
+
+def test_a_video_does_not_depend_on_what_is_made_with_it():
+    """Attempts are tried in order, however many of them fit into a batch."""
+
+    def luck(lanes: np.ndarray, attempts: np.ndarray) -> np.ndarray:
+        return (lanes * 7919 + attempts * 104729 + attempts**2 * 31) % 17
+
+    options = load_config(CONFIG | {"quality": {"contacts_most": 1}}).quality
+    for count in (1, 3, 8):
+        numbers = np.arange(count)
+        _, chosen = quality.fitting(lambda lanes, attempts: _batch(luck(lanes, attempts)), numbers, options)
+        for number in numbers:
+            tries = luck(np.full(1000, number), np.arange(1000))
+            assert chosen[number] == np.argmax(tries <= 1)
+
+
+def _batch(values: np.ndarray) -> Batch:
+    return Batch({"quality/contacts": jnp.asarray(values)}, (), jnp.ones(len(values), bool))  # type: ignore[arg-type]
+
+
+def test_a_kind_that_there_is_not_is_said(tmp_path):
+    asked = {"contacts_least": 500, "attempts": 20}
+    with pytest.raises(
+        quality.NoVideoError, match="none of 20 attempts at video 0 has quality/contacts from 500 to inf"
+    ):
+        gen2d.generate(CONFIG | {"quality": asked}, 2, tmp_path / "none")
+    for wrong, message in (
+        (
+            {"contacts_least": 5, "contacts_most": 2},
+            "quality.contacts_least is 5, but must be contacts_most, 2, or less",
+        ),
+        ({"growth_most": 2}, "quality.growth_most is asked for, but needs annotations.predictability"),
+    ):
+        with pytest.raises(ConfigError, match=message):
+            load_config(CONFIG | {"quality": wrong})
