@@ -33,6 +33,8 @@ def test_every_block_runs(tmp_path: Path):
             name, config = block.partition("\n")[0].removeprefix("# "), block.replace("videos: 1000", "videos: 8")
             (tmp_path / name).write_text(config)
             assert load_config(tmp_path / name).name == name.removesuffix(".yaml")
+        elif block.startswith("# drop.py"):
+            (tmp_path / "drop.py").write_text(block)
         elif kind == "python":
             shorter = block.replace("150", "50") if "gen2d.stream" in block else block  # batches, still enough to win
             words = [sys.executable, "-c", shorter]
@@ -54,6 +56,8 @@ def test_every_block_runs(tmp_path: Path):
         "splits",
         "counterfactuals",
         "violations",
+        "told",
+        "drop",
     }
 
 

@@ -132,8 +132,9 @@ def test_funnel_lets_pass_what_fits_through_its_gap_and_gains_no_energy():
     assert_array_equal(passed, (y.min(1) < options.neck) & there)
     assert not passed[gap < 2 * options.radius.support[0]].any()
     assert passed[gap > 2].sum() > 0.5 * there[gap > 2].sum()
-    energy = np.sum([columns[f"energy/{part}"] for part in ("kinetic", "rotational", "potential")], axis=0)
-    holds("funnel: energy gained in a frame, of the first", np.diff(energy, axis=1) / energy[:, :1], 2e-3)
+    energy = sum(columns[f"energy/{part}"] for part in ("kinetic", "rotational", "potential"))
+    gained = np.maximum(0, np.diff(energy, axis=1)) / energy[:, :1]
+    holds("funnel: energy gained in a frame, of the first", gained, 2e-3)
 
 
 def test_marble_run_is_run_from_ramp_to_ramp():
@@ -198,7 +199,7 @@ def test_occluder_hides_balls_and_does_nothing_else():
     behind = (time[:, None] >= begin[:, None]) & (time[:, None] <= end[:, None]) & every
     assert (behind.any(1) | ~there | (columns["factors/hidden_for"] < time[1])).all()
     assert (seen[behind] == 0).all()
-    assert (seen[:, 0][there] > 0.97).all()
+    holds("occluder: unseen at the start, counted in whole pixels", 1 - seen[:, 0][there], 0.1)
 
 
 def test_hidden_mass_shows_in_the_first_collision_and_nowhere_before():
