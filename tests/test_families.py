@@ -54,8 +54,8 @@ def program(family: str) -> tuple[Plugin, Layout, Any]:
         things, state, fits = begun.scene, begun.state, begun.fits
         on_device = to_device(things), to_device(state)
         shapes = shapes_of(layout, on_device[0].objects, on_device[1])
-        few = (jax.tree.map(lambda x: x[..., :LANES], value) for value in on_device)
-        trajectory = to_stored(simulate(*few, layout, rules, FRAMES, steps, sparse=True))
+        few = [jax.tree.map(lambda x: x[..., :LANES], value) for value in on_device]
+        trajectory = to_stored(simulate(few[0], few[1], layout, rules, FRAMES, steps, sparse=True))
         present = on_device[0].objects.present
         return Made(
             factors, things, state, fits, overlap(layout, shapes, present), extent(layout, shapes, present), trajectory

@@ -132,7 +132,7 @@ def test_funnel_lets_pass_what_fits_through_its_gap_and_gains_no_energy():
     assert_array_equal(passed, (y.min(1) < options.neck) & there)
     assert not passed[gap < 2 * options.radius.support[0]].any()
     assert passed[gap > 2].sum() > 0.5 * there[gap > 2].sum()
-    energy = sum(columns[f"energy/{part}"] for part in ("kinetic", "rotational", "potential"))
+    energy = np.sum([columns[f"energy/{part}"] for part in ("kinetic", "rotational", "potential")], axis=0)
     gained = np.maximum(0, np.diff(energy, axis=1)) / energy[:, :1]
     holds("funnel: energy gained in a frame, of the first", gained, 2e-3)
 

@@ -99,7 +99,7 @@ def test_the_study_s_splits_have_nothing_in_common_with_training_and_start_in_vi
 def columns(numbers, **asked):
     """The columns of the training videos with these numbers, a lane each."""
     config = CONFIG | {"quality": asked, "storage": {"lanes": len(numbers)}}
-    batch = Rollout(load_config(config), devices.prepare("cpu")[:1]).begin_with("train", np.uint32(numbers))
+    batch = Rollout(load_config(config), devices.prepare("cpu")[:1]).begin_with("train", np.array(numbers, np.uint32))
     return {name: np.asarray(values) for name, values in batch.columns.items()}
 
 
