@@ -102,7 +102,7 @@ def told_of(made: Columns, video: Any, stored: Mapping[str, Field]) -> dict[str,
     missed = int(made["contacts/count"]) > len(made["contacts/kind"])
     width = np.dtype(stored["text/events"].dtype).itemsize
     return {
-        "text/caption": caption(made, events, missed).encode(),
+        "text/caption": caption(made, events, video.fps, missed).encode(),
         "text/events": as_json(events, width).encode(),
         "text/event_count": len(events),
     }
@@ -224,17 +224,17 @@ def rests(made: Columns, fps: float) -> list[Event]:
 # ---- The caption
 
 
-def caption(made: Columns, events: list[Event], missed: bool = False) -> str:
+def caption(made: Columns, events: list[Event], fps: float, missed: bool = False) -> str:
     """What is there and what happens first, in English; `missed`: whether there were more hits than are known."""
-    names = names_of(made)
-    first = opening(made, names)
-    for shown in range(min(SHOWN, len(events)), -1, -1):
+    names, decimals = names_of(made), max(2, math.ceil(math.log10(fps)))
+
+    def telling(shown: int) -> str:
         left = len(events) - shown
-        more = f"{'At least ' if missed else 'And '}{left} more event{'s' if left > 1 else ''}." if left else ""
-        text = " ".join(part for part in (first, *sentences(made, names, events[:shown]), more) if part)
-        if len(text.encode()) <= CAPTION_BYTES:
-            break
-    return text
+        more = [f"{'At least' if missed else 'And'} {left} more event{'s' if left > 1 else ''}."] if left else []
+        return " ".join([opening(made, names), *sentences(made, names, events[:shown], decimals), *more])
+
+    texts = (telling(shown) for shown in range(min(SHOWN, len(events)), -1, -1))
+    return next(text for text in texts if len(text) <= CAPTION_BYTES)
 
 
 def opening(made: Columns, names: Mapping[int, str]) -> str:
@@ -325,12 +325,12 @@ def color_name(color: np.ndarray) -> str:
     return list(COLORS)[int((apart**2 @ np.array([3, 4, 2])).argmin())]
 
 
-def sentences(made: Columns, names: Mapping[int, str], events: list[Event]) -> list[str]:
-    """The events in English; hits of one object in a row are one sentence."""
+def sentences(made: Columns, names: Mapping[int, str], events: list[Event], decimals: int) -> list[str]:
+    """The events in English, with times in s; hits of one object in a row are one sentence."""
     found: list[str] = []
     hitting = -1  # the slot that the last sentence is about
     for event in events:
-        at = f"at {event.time:.3g} s"
+        at = f"at {event.time:.{decimals}f} s"
         if event.kind == "rest":
             found, hitting = [*found, f"All is at rest {at}."], -1
         elif event.kind != "hit":
@@ -351,7 +351,8 @@ def _begun(sentence: str) -> str:
 
 
 def _who(made: Columns, event: Event) -> tuple[int, int]:
-    """Who hits whom: what was faster in the frame before; nothing that is static hits."""
+    """Who hits whom: what was faster in the frame before; what is static hits nothing."""
     a, b = event.about["a"], event.about["b"]
     speed = np.linalg.norm(made["states/velocity"][event.frame - 1, [a, b]], axis=-1)
+    speed[made["objects/kind"][[a, b]] == STATIC] = -1
     return (a, b) if speed[0] >= speed[1] else (b, a)

@@ -38,7 +38,7 @@ def made() -> tuple:
 @functools.cache
 def growths() -> dict[str, float]:
     keys, scene, state, run = made()
-    found = jax.jit(lambda *records: predictability.growth(*records, run, SECONDS))(keys, scene, state)
+    found = jax.jit(lambda k, a, b: predictability.growth(k, a, b, run, SECONDS))(keys, scene, state)
     return dict(zip(VELOCITIES, np.asarray(found, float).tolist(), strict=True))
 
 
