@@ -8,12 +8,13 @@ import functools
 import itertools
 from typing import Any, NamedTuple
 
+import cv2
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gen2d import cuts, plugins
+from gen2d import cuts, gallery, plugins
 from gen2d.config import load_config
 from gen2d.contacts import Disc, Hull, Shape, touches
 from gen2d.distributions import Distribution, Span, after
@@ -195,3 +196,13 @@ def test_a_key_is_a_scene(family):
 def test_the_first_frames_are_numbers(family):
     trajectory = made(family).trajectory
     assert all(np.isfinite(x).all() for x in jax.tree.leaves(trajectory))
+
+
+def test_the_page_of_all_families_has_a_row_of_each(tmp_path, monkeypatch):
+    monkeypatch.setattr(plugins, "names", lambda kind: ["bouncing"] if kind == "scene" else ["flat"])
+    monkeypatch.setattr(gallery, "_annotation_rows", lambda *_: iter(()))
+    small = ["video.frames=3", "video.height=16", "video.width=16", "storage.lanes=1"]
+    page, own = gallery.families(tmp_path, sets=small)
+    assert (page.name, own.name) == ("families.png", "bouncing-gallery.png")
+    assert cv2.imread(str(page)).shape == (333, gallery.LABEL + gallery.PAGE, 3)
+    assert own.stat().st_size > 0
