@@ -42,15 +42,16 @@ def sizes(options: Options) -> dict[str, int]:
 
 
 def layout(options: Options) -> Layout:
-    """The pin, the rods and the bobs; each rod hangs from what is above it, and its bob turns at its end."""
+    """The pin, the rods and the bobs; each bob hangs on its rod from what is above it."""
     n, length, radius = options.links, options.length.support[1], options.radius.support[1]
     rods, bobs = Run("capsule", n, layer=1, collides=False), Run("circle", n, layer=2, collides=False)
     pin = Run("circle", 1, STATIC, layer=3, collides=False)
-    ties = [(Tie("revolute", 1 + n + i - 1 if i else 0, 1 + i), Tie("revolute", 1 + i, 1 + n + i)) for i in range(n)]
+    # A bob turns with its rod, about what is above it; the rod, which is light, is fixed to it at both ends.
+    ties = [(Tie("revolute", n + i if i else 0, 1 + n + i), *[Tie("revolute", 1 + i, 1 + n + i)] * 2) for i in range(n)]
     room, widest = n * length + radius, max(map(abs, options.angle.support))
     low = n == 1 and options.swing.support == (0.0, 0.0) and widest < math.pi / 2
     bounds = (-room, -room, room, radius - math.cos(widest) * options.length.support[0] if low else room)
-    joints = tuple(tie for pair in ties for tie in pair)
+    joints = tuple(tie for link in ties for tie in link)
     return Layout((pin, rods, bobs), (*bounds[:3], max(bounds[3], PIN)), max(length / 2 + ROD, radius), joints)
 
 
@@ -66,16 +67,20 @@ def sample(key: Array, factors: dict[str, Array], options: Options) -> Sampled:
         layer=1, collides=False,
     )  # fmt: skip
     bob = {name: factors[name] for name in ("density", "color")}
-    bobs = discs(ends, factors["radius"], velocity=end_speeds, layer=2, collides=False, **bob)
-    half = jnp.stack([rods.objects["half_length"], jnp.zeros(n)], -1)
-    nothing = jnp.zeros((n, 2))
-    above, below = (jnp.stack(pair, 1).reshape(-1, 2) for pair in ((nothing, half), (-half, nothing)))
+    bobs = discs(
+        ends, factors["radius"], angle=angle, velocity=end_speeds, spin=factors["swing"], layer=2, collides=False, **bob
+    )  # fmt: skip
+    half, up = (jnp.stack(pair, -1) for pair in ((rods.objects["half_length"], jnp.zeros(n)), (jnp.zeros(n), length)))
+    nothing = jnp.zeros(
+        (n, 2)
+    )  # in the frame of a bob `up` is where it hangs; a rod goes from its left end to its right
+    above, below = (jnp.stack(x, 1).reshape(-1, 2) for x in ((nothing, -half, half), (up, up, nothing)))
     scene, state = assembled(layout(options), [pin, rods, bobs], factors["gravity"], joined(above, below))
     return Sampled(scene, state, derived={"period": _period(rods.objects, bobs.objects, length, factors["gravity"])})
 
 
 def _period(rods: dict[str, Array], bobs: dict[str, Array], length: Array, gravity: Array) -> Array:
-    """Seconds of a small swing of the first link: 2 pi sqrt(I / m g d); its bob, free to turn, is as if at a point."""
+    """Seconds of a small swing of the first link: 2 pi sqrt(I / m g d)."""
     rod, bob = rods["mass"][0], bobs["mass"][0]
-    inertia = rods["moment"][0] + (rod / 4 + bob) * length[0] ** 2
+    inertia = rods["moment"][0] + bobs["moment"][0] + (rod / 4 + bob) * length[0] ** 2
     return 2 * jnp.pi * jnp.sqrt(inertia / ((rod / 2 + bob) * length[0] * jnp.maximum(jnp.linalg.norm(gravity), 1e-6)))
