@@ -26,7 +26,7 @@ LAWS = {
     "hidden_mass": ["storage.lanes=256"],
 }
 WRONG = {
-    "galton": ["radius=0.4", "radius={normal: [0.2, 0.1]}", "apart=0.3", "jitter=[-3, 0]"],
+    "galton": ["radius=0.35", "radius={normal: [0.2, 0.1]}", "apart=0.3", "jitter=[-3, 0]"],
     "funnel": ["gap=[1, 9]", "radius=5", "angle=[0.5, 1.2]"],
     "marble_run": ["length=[0.4, 0.7]", "length=[0.6, 0.95]", "slope=[0.1, 0.5]", "ramps=9"],
     "cradle": ["moving=[1, 3]", "radius=3", "width=8"],
@@ -108,7 +108,9 @@ def test_galton_s_balls_end_in_bins_as_often_left_as_right():
     columns, options = made("galton"), rollout_of("galton").config.scene.options
     there, last = columns["objects/present"][:, runs("galton")[0]] > 0, columns["states/position"][:, -1]
     x, y = np.moveaxis(last[:, runs("galton")[0]][there], -1, 0)
-    assert (y < options.bin_height).all()
+    late = y >= options.bin_height
+    holds("galton: balls in no bin at the end, of all", late.mean(), 0.01)
+    x = x[~late]
     counts = np.bincount((x / options.spacing).astype(int), minlength=options.rows + 1)
     assert len(counts) == options.rows + 1
     both = counts + counts[::-1]

@@ -1,4 +1,4 @@
-"""Balls dropped through a triangle of pegs into bins: Galton's board."""
+"""Balls dropped through a lattice of pegs into bins: Galton's board."""
 
 import dataclasses
 import math
@@ -16,19 +16,21 @@ class Options:
     """What is drawn at random, and the board."""
 
     balls: Distribution = option([1, 3], int, "balls", "one above the other", low=1, high=64, draw=True)
-    rows: int = option(5, int, "rows", "of pegs: one peg, two, and so on; there is one bin more", low=1, high=12)
+    rows: int = option(
+        5, int, "rows", "of pegs, each half a spacing beside the last; there is one bin more", low=1, high=12
+    )
     spacing: float = option(1.0, float, "m", "of pegs that are neighbours, in and between rows", above=0, high=100)
-    peg_radius: float = option(0.12, float, "m", "of each peg", above=0)
+    peg_radius: float = option(0.18, float, "m", "of each peg", above=0)
     bin_height: float = option(1.8, float, "m", "of the bins", above=0, high=1000)
     apart: float = option(0.9, float, "m", "from one ball's centre to the next one's at the start", above=0)
-    radius: Distribution = option([0.22, 0.28], float, "m", "of each ball", low=1e-3, draw=True, each="balls")
+    radius: Distribution = option([0.2, 0.26], float, "m", "of each ball", low=1e-3, draw=True, each="balls")
     jitter: Distribution = option(
         [-0.15, 0.15], float, "m", "of each ball at the start, right of the middle", draw=True, each="balls"
     )
     density: Distribution = option(1.0, float, "kg/m^2", "of each ball", low=1e-6, high=1e6, draw=True, each="balls")
     elasticity: Distribution = option([0.5, 0.9], float, "1", "of each ball", low=0, high=1, draw=True, each="balls")
     friction: Distribution = option(0.2, float, "1", "of each ball", low=0, high=100, draw=True, each="balls")
-    board_elasticity: Distribution = option([0.5, 0.9], float, "1", "of pegs and bins", low=0, high=1, draw=True)
+    board_elasticity: Distribution = option([0.5, 0.8], float, "1", "of pegs and bins", low=0, high=1, draw=True)
     board_friction: Distribution = option(0.2, float, "1", "of pegs and bins", low=0, high=100, draw=True)
     gravity: tuple[Distribution, ...] = option(
         [0, -9.8], float, "m/s^2", "x right, y up; the same for a whole video", parts=2, draw=True
@@ -61,12 +63,27 @@ def top_peg(options: Options) -> float:
     return options.bin_height + options.spacing * (0.5 + math.sqrt(0.75) * (options.rows - 1))
 
 
+def pegs(options: Options) -> list[tuple[float, float]]:
+    """Their centres, m, in rows from the top; those of the last stand above the walls between bins.
+
+    No peg is nearer to a wall than a spacing, so that no ball is caught there.
+    """
+    half, down = options.spacing / 2, math.sqrt(0.75) * options.spacing
+    halves = range(2, 2 * options.rows + 1)
+    return [
+        (i * half, top_peg(options) - row * down)
+        for row in range(options.rows)
+        for i in halves
+        if (i - row - options.rows - 1) % 2 == 0
+    ]
+
+
 def layout(options: Options) -> Layout:
     """The balls, the pegs from the top, the walls between bins from the left, then floor, right wall, ceiling, left."""
     largest, most = options.radius.support[1], int(options.balls.support[1])
     runs = (
         Run("circle", most),
-        Run("circle", options.rows * (options.rows + 1) // 2, STATIC),
+        Run("circle", len(pegs(options)), STATIC),
         Run("segment", options.rows, STATIC),
         Run("segment", 4, STATIC),
     )
@@ -84,14 +101,7 @@ def sample(key: Array, factors: dict[str, Array], options: Options) -> Sampled:
     balls = discs(places, factors["radius"], number < factors["balls"], **material)
 
     board = {"elasticity": factors["board_elasticity"], "friction": factors["board_friction"]}
-    rows = [(row, i) for row in range(options.rows) for i in range(row + 1)]
-    pegs = jnp.asarray(
-        [
-            (right / 2 + (i - row / 2) * options.spacing, top_peg(options) - row * math.sqrt(0.75) * options.spacing)
-            for row, i in rows
-        ]
-    )
-    lattice = discs(pegs, options.peg_radius, kind=STATIC, color=factors["peg_color"], **board)
+    lattice = discs(jnp.asarray(pegs(options)), options.peg_radius, kind=STATIC, color=factors["peg_color"], **board)
     at = jnp.arange(1, options.rows + 1) * options.spacing
     feet = jnp.stack([at, jnp.zeros_like(at)], axis=-1)
     bins = segments(feet, feet + jnp.asarray([0.0, options.bin_height]), **board)
