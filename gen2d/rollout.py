@@ -139,7 +139,8 @@ class Rollout:
     def told(self, columns: dict[str, np.ndarray], split: str) -> dict[str, np.ndarray]:
         """The fields of some videos of a split that are made on the host, from their others there."""
         count = len(columns["objects/present"])
-        named = {"split": np.full(count, split.encode())} if self.config.splits else {}
+        fields = self.word_fields
+        named = {"split": np.full(count, split.encode(), fields["split"].dtype)} if self.config.splits else {}
         return named | (words.told(columns, self.config.video) if self.config.annotations.words else {})
 
     @property

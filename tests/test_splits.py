@@ -26,7 +26,7 @@ CONFIG = {
 SPLITS = {
     "train": {"factors": {"minus": [{}, {"radius": [0.7, 0.8]}]}},
     "holes": {"videos": 9, "factors": {"radius": [0.7, 0.8]}},
-    "heavy": {"videos": 3, "factors": {"gravity": [0, -30]}},
+    "heavier": {"videos": 3, "factors": {"gravity": [0, -30]}},
 }
 PRESETS = {"uniform_motion": 7, "parabola": 7, "collision": 13}
 
@@ -41,18 +41,18 @@ def whole(tmp_path_factory):
 
 def test_a_dataset_is_the_same_whatever_split_is_made_first(whole, tmp_path):
     config = CONFIG | {"splits": SPLITS}
-    for split, count in (("heavy", 3), ("train", 12), ("holes", 9)):
+    for split, count in (("heavier", 3), ("train", 12), ("holes", 9)):
         gen2d.generate(config, count, tmp_path / "one", seed=4, split=split)
     assert tree(tmp_path / "one") == tree(whole)
 
 
 def test_each_video_says_its_split_and_how_far_outside_it_is(whole):
-    for split, count in (("train", 12), ("holes", 9), ("heavy", 3)):
+    for split, count in (("train", 12), ("holes", 9), ("heavier", 3)):
         videos = gen2d.open(whole, split, fields=("split", "outside/*", "factors/*"))[:]
         assert videos["split"].tolist() == [split.encode()] * count
         assert (videos["outside/training"] == (split != "train")).all()
         assert (videos["outside/radius"].max(1) > 0).all() == (split == "holes")
-        assert (videos["outside/gravity"][:, 1] > 0).all() == (split == "heavy")
+        assert (videos["outside/gravity"][:, 1] > 0).all() == (split == "heavier")
 
 
 def test_a_stream_of_a_split_is_the_dataset_s(whole):
@@ -64,7 +64,7 @@ def test_a_stream_of_a_split_is_the_dataset_s(whole):
 
 
 def test_a_split_that_there_is_not_is_said():
-    with pytest.raises(ConfigError, match="must be one of the config's: train, holes, heavy"):
+    with pytest.raises(ConfigError, match="must be one of the config's: train, holes, heavier"):
         gen2d.generate(CONFIG | {"splits": SPLITS}, 3, "nowhere", split="hole")
 
 
