@@ -24,7 +24,8 @@ def test_the_set_up_is_one_line_each():
     assert installing[1].endswith("&& pytest")
 
 
-def test_every_block_runs(tmp_path: Path):
+def test_every_block_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.chdir(tmp_path)  # where the blocks' own files lie
     compared, torch = 0, importlib.util.find_spec("torch") is not None  # models with what they must beat
     for kind, block in BLOCKS:
         if "import torch" in block and not torch:
