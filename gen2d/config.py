@@ -144,6 +144,12 @@ class QualityOptions:
     )
     residual_least: float | None = option(None, float, "J", "of energy; needs annotations.energy", low=0, optional=True)
     residual_most: float | None = option(None, float, "J", "of energy; needs annotations.energy", low=0, optional=True)
+    visibility_least: float | None = option(
+        None, float, "1", "of the object least seen; needs annotations.visibility", low=0, high=1, optional=True
+    )
+    visibility_most: float | None = option(
+        None, float, "1", "of the object least seen; needs annotations.visibility", low=0, high=1, optional=True
+    )
     attempts: int = option(1000, int, "attempts", "at a video, at most", low=1, high=1_000_000)
 
 
@@ -416,6 +422,9 @@ def _with_splits(config: Config, written: Any, source: str) -> Config:
     scene, splits = with_splits(config.scene, written, source)
     config = dataclasses.replace(config, scene=scene, splits=splits)
     for split in splits:
+        if (split.frames or 0) > config.video.frames:
+            told = f"{source}: splits.{split.name}.frames is {split.frames}, but must be video.frames"
+            raise ConfigError(f"{told}, {config.video.frames}, or less")
         try:
             config.of_split(split.name)
         except ConfigError as error:

@@ -75,7 +75,7 @@ def open(
     described = {name: field_of(about) for name, about in manifest["fields"].items()}
     names = chosen_fields(f"{root}", described, fields)
     options = Options(split, names, window, stride, start, layout, dtype, verify, cache_dir, cache_bytes)
-    options.check(manifest["sizes"].get("T", 0))
+    options = options.within(_frames_of(manifest, split), manifest["sizes"].get("T", 0))
     _check_cache(options, max(shard["bytes"] for shard in manifest["shards"]))
     return Dataset(root, manifest, options)
 
@@ -111,8 +111,15 @@ class Options:
         """How many frames a window reaches over."""
         return 0 if self.window is None else (self.window - 1) * self.stride + 1
 
-    def check(self, frames: int) -> None:
-        """Returns nothing; raises ConfigError for what cannot be of videos with so many frames."""
+    def within(self, frames: int, whole: int) -> "Options":
+        """The same for the first so many frames of whole videos, without a window a window of all of them. Raises
+        ConfigError for what cannot be."""
+        self._check(frames)
+        if self.window is not None or frames == whole:
+            return self
+        return dataclasses.replace(self, window=frames, stride=1, start="first")
+
+    def _check(self, frames: int) -> None:
         allowed = {"layout": tuple(LAYOUTS), "dtype": ("uint8", "float32"), "verify": ("checksum", "none")}
         for name, values in allowed.items():
             if getattr(self, name) not in values:
@@ -141,7 +148,7 @@ class Dataset:
         if isinstance(root, Url) and options.cache_dir is not None:
             cache = Cache(Path(options.cache_dir), options.cache_bytes)
         self._files = Files(root, manifest, cache, options.verify == "checksum")
-        self._count = manifest["splits"][options.split]
+        self._count, self._frames = manifest["splits"][options.split], _frames_of(manifest, options.split)
         sizes = {split: count for split, count in sorted(manifest["splits"].items()) if split < options.split}
         self._base = sum(sizes.values())  # the index holds one split after the other
         self._videos = self._files.table("videos")
@@ -173,7 +180,7 @@ class Dataset:
     @property
     def time(self) -> np.ndarray:
         """The time of every frame of a whole video, s, float64 [T]."""
-        return np.array(self.manifest["constants"]["time"])
+        return np.array(self.manifest["constants"]["time"])[: self._frames]
 
     def batch(self, indices: Numbers, starts: Numbers | None = None, out: Batch | None = None) -> Batch:
         """The videos with these numbers, stacked; windows begin at `starts`; `out` is filled if given."""
@@ -187,7 +194,7 @@ class Dataset:
         """Returns nothing; puts the videos into these rows of `out`. Threads may fill one batch together."""
         numbers = self.numbers(indices)
         first = np.full(len(numbers), self.options.first) if starts is None else np.asarray(starts)
-        last = self.manifest["sizes"].get("T", 0) - self.options.span
+        last = self._frames - self.options.span
         if first.shape != numbers.shape or ((first < 0) | (first > last)).any():
             raise ConfigError(f"starts must be a frame from 0 to {last} for each video, but are {first.tolist()}")
         videos = self._videos[self._base + numbers]
@@ -232,7 +239,7 @@ class Dataset:
 
     def starts(self, numbers: np.ndarray, bits: np.ndarray) -> np.ndarray | None:
         """Where the windows of these videos begin, drawn by random bits; None if that is not random."""
-        return self.options.starts(bits, self.manifest["sizes"].get("T", 0))
+        return self.options.starts(bits, self._frames)
 
     def numbers(self, indices: Numbers) -> np.ndarray:
         """Indices as the numbers of videos, int64: negative ones count from the end."""
@@ -260,6 +267,11 @@ def _facts(ds: Dataset) -> Iterator[tuple[str, Any]]:
     yield from ((f"size {axis}", size) for axis, size in ds.manifest["sizes"].items())
     for name, field in ds.fields.items():
         yield f"field {name}", f"{field.dtype} {field.axes}, {field.unit or 'no unit'}"
+
+
+def _frames_of(manifest: Mapping[str, Any], split: str) -> int:
+    """How many frames of a split's videos are given: all, or as many as the config says of the split."""
+    return manifest["config"].get("splits", {}).get(split, {}).get("frames") or manifest["sizes"].get("T", 0)
 
 
 def _chosen_split(root: Place, manifest: Mapping[str, Any], split: str | None) -> str:

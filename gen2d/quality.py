@@ -18,12 +18,14 @@ from gen2d.fields import Field
 from gen2d.types import Array
 
 FIELD = Field("int32", "n", "1", "scenes drawn again as they were not of the kind that was asked for")
+VISIBILITY = "quality/min_visibility"  # the one that is known only when a video is drawn
 # Options of a config's section `quality`: the field that each is about, and the option that makes it be stored.
 MEASURES = {
     "contacts": ("quality/contacts", ""),
     "penetration": ("quality/max_penetration", ""),
     "growth": ("quality/growth", "annotations.predictability"),
     "residual": ("quality/energy_residual", "annotations.energy"),
+    "visibility": (VISIBILITY, "annotations.visibility"),
 }
 
 

@@ -160,13 +160,29 @@ class Rollout:
 
         def make(lanes: np.ndarray, attempts: np.ndarray) -> Batch:
             of_videos = given[lanes], numbers[lanes], attempts.astype(np.uint32)
-            return self._simulate(root, np.int32(row), *jax.device_put(of_videos, NamedSharding(self.mesh, VIDEOS)))
+            return self._simulate(root, np.int32(row), *self._shares(of_videos))
 
         if not self.wanted:
             return make(np.arange(len(numbers)), np.zeros(len(numbers)))
-        batch, attempts = quality.fitting(make, numbers, self.config.quality)
-        rejected = jax.device_put(attempts.astype(np.int32), NamedSharding(self.mesh, VIDEOS))
-        return batch._replace(columns=batch.columns | {"quality/rejected_videos": rejected})
+        if quality.VISIBILITY not in self.wanted:
+            batch, attempts = quality.fitting(make, numbers, self.config.quality)
+        else:
+            batch, attempts = quality.fitting(lambda *of: self._seen(make(*of)), numbers, self.config.quality)
+            del batch.columns[quality.VISIBILITY]  # it comes with the pictures
+        return batch._replace(
+            columns=batch.columns | {"quality/rejected_videos": self._shares(attempts.astype(np.int32))}
+        )
+
+    def _shares(self, arrays: Any) -> Any:
+        """Arrays over videos, each device with its part."""
+        return jax.device_put(arrays, NamedSharding(self.mesh, VIDEOS))
+
+    def _seen(self, batch: Batch) -> Batch:
+        """The batch with what is known of its visibility when it is drawn."""
+        drawn = [self.draw(batch, start, self.slice) for start in range(0, self.lanes, self.slice)]
+        of_devices = zip(*drawn, strict=True)
+        seen = np.concatenate([np.asarray(part[quality.VISIBILITY]) for parts in of_devices for part in parts])
+        return batch._replace(columns=batch.columns | {quality.VISIBILITY: self._shares(seen)})
 
     def draw(self, batch: Batch, start: int, count: int) -> list[dict[str, Array]]:
         """Starts to draw `count` videos of each device, from lane `start` on: for each device their frames

@@ -4,13 +4,14 @@ The layout says which slots hold what, so all of this is known when a program is
 """
 
 import itertools
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gen2d import joints
+from gen2d import joints, linkage
 from gen2d.contacts import FAR, Stadium, dot, from_core
 from gen2d.dense import Dense
 from gen2d.forms import DiscForm, Form, StadiumForm, form_of, placed
@@ -79,11 +80,7 @@ def _group(objects: Objects, layout: Layout, run: Run, first: int) -> Group:
     some = slots_of(objects, first, run.count, padded(run.count))
     inverse = Inertia(_inverse(some.mass, some.present), _inverse(some.moment, some.present))
     mass, moment = (_inverse(x, x > 0) for x in inverse)
-    rigid = {slot for tie in layout.joints for slot in (tie.a, tie.b)}
-    jointed = jnp.asarray([float(first + i in rigid) for i in range(padded(run.count))], mass.dtype)[:, None]
-    return Group(
-        form_of(some, run, slice(None)), inverse, mass, moment, jnp.broadcast_to(jointed, mass.shape), run.collides
-    )
+    return Group(form_of(some, run, slice(None)), inverse, mass, moment, run.collides)
 
 
 def _fixed(objects: Objects, state: State, run: Run, slot: int) -> Fixed:
@@ -255,10 +252,11 @@ def _is_disc(form: Form) -> bool:
     return isinstance(form, DiscForm)
 
 
-def _ties(scene: Scene, layout: Layout, groups: list[Group]) -> list[joints.Tied]:
-    """The joints in rounds. A body's line in the solver's table is its place among the groups, or behind them."""
+def _ties(scene: Scene, layout: Layout, groups: list[Group]) -> tuple[list[joints.Tied], linkage.Linkage | None]:
+    """The joints in rounds, and what of them is rigid. A body's line in the solver's table is its place among the
+    groups, or behind them."""
     if not layout.joints:
-        return []
+        return [], None
     values, nothing = scene.joints, jnp.zeros_like(scene.objects.mass[:1])
     assert values is not None, "a layout with joints needs scene.joints"
     sizes, still = [padded(run.count) for run, _ in moving(layout)], [slot for _, slot in standing(layout)]
@@ -270,20 +268,23 @@ def _ties(scene: Scene, layout: Layout, groups: list[Group]) -> list[joints.Tied
 
     def end(slots: np.ndarray, anchor: Array) -> joints.End:
         of = np.array([lines[int(slot)] for slot in slots])
-        return joints.End(of, of >= sum(sizes), jax.tree.map(lambda x: x[..., of, :], inverse), anchor)
+        return joints.End(of, of >= sum(sizes), joints.at_lines(inverse, of), anchor)
 
-    found, named = [], [Tie(tie.kind, lines[tie.a], lines[tie.b]) for tie in layout.joints]
-    for numbers in joints.rounds(named, sum(sizes)):
-        ties, of = (
-            [layout.joints[j] for j in numbers],
-            jax.tree.map(lambda x, j=numbers: x[..., np.array(j), :], values),
-        )
+    def tied(numbers: Sequence[int]) -> joints.Tied:
+        ties, of = [layout.joints[j] for j in numbers], joints.at_lines(values, np.array(numbers))
         a, b = (np.array([getattr(tie, side) for tie in ties]) for side in "ab")
         there = scene.objects.present[a] & scene.objects.present[b]
         ends = end(a, of.anchor_a), end(b, of.anchor_b)
         rest = (of.rest, of.stiffness, of.damping, of.lower, of.upper, of.motor_speed, of.motor_torque)
-        found.append(joints.Tied(ties[0].kind, *ends, there, *rest))
-    return found
+        return joints.Tied(ties[0].kind, *ends, there, *rest)
+
+    named = [Tie(tie.kind, lines[tie.a], lines[tie.b]) for tie in layout.joints]
+    every = tied(range(len(named)))
+    springs = np.array([tie.kind == "distance" for tie in named])[:, None] & jnp.isfinite(every.stiffness)
+    linked = linkage.Linkage(
+        linkage.plan_of(named, sum(sizes)), every.a, every.b, inverse, every.there & ~springs, every.rest
+    )
+    return [tied(numbers) for numbers in joints.rounds(named, sum(sizes))], linked
 
 
 def scenery_of(
@@ -303,7 +304,7 @@ def scenery_of(
         _rail(f, objects.present[s : s + 1]) for f, (r, s) in zip(fixed, standing(layout), strict=True) if r.collides
     ]
     return Scenery(
-        groups, fixed, [r for r in rails if r is not None], scene.gravity, made, _ties(scene, layout, groups), forces
+        groups, fixed, [r for r in rails if r is not None], scene.gravity, made, *_ties(scene, layout, groups), forces
     )
 
 

@@ -8,7 +8,7 @@ import chex
 import jax
 import jax.numpy as jnp
 
-from gen2d import joints, ledger
+from gen2d import joints, ledger, linkage
 from gen2d.errors import ConfigError
 from gen2d.rows import Motion, Rules
 from gen2d.scenery import cleaned, moving, padded, scenery_of, slots_of
@@ -125,6 +125,7 @@ def _start(state: State, layout: Layout, scenery: Scenery, keep: Keep, rules: Ru
         time=jnp.zeros((), state.angle.dtype),
         contacts=scenery.contacts.start(keep.contacts),
         ties=[joints.nothing(tied) for tied in scenery.ties],
+        pushes=None if scenery.linkage is None else linkage.unpushed(scenery.linkage),
         ledger=_books(bodies, scenery, rules) if keep.energy else None,
     )
 

@@ -4,13 +4,13 @@ A step of h seconds reads as the sentences of `step`:
 
 1. gravity, forces and damping change the velocities;
 2. the impulses of the last step are applied again (warm starting, as all of a stack's weight is known by then);
-3. every joint and pair is solved once with its soft bias, bounces included, at the exact time of impact;
+3. every pair is solved once with its soft bias, bounces included, at the exact time of impact, then all joints at once;
 4. the bodies move;
-5. every joint and pair is solved once more without the bias, so that pushing apart leaves no speed behind.
+5. every pair and all joints are solved once more without the bias, so that pushing apart leaves no speed behind.
 
 Pairs are solved in rounds of disjoint pairs (tournament.py), all of them (dense.py) or those that are near (sparse.py),
-and each round sees the last one's result: Gauss-Seidel, which is what 'sequential' means. Joints come first; fixed
-bodies come last and so have the last word.
+and each round sees the last one's result: Gauss-Seidel, which is what 'sequential' means. Springs, limits and motors
+(joints.py) come first, fixed bodies last of all pairs, and what is rigid (linkage.py) has the last word.
 
 Restitution. A row that closes within the step bounces: Newton's law is applied to the velocities that the row finds, so
 impacts happen one after the other and never add energy. The impulse P acts at the time of impact tau, not at the
@@ -29,12 +29,12 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from gen2d import joints
+from gen2d import joints, linkage
 from gen2d.contacts import Shape, Stadium
 from gen2d.forms import Form, placed
 from gen2d.ledger import Ledger, booked, tallied
 from gen2d.rows import Inertia, Motion, Rules
-from gen2d.sweeps import HELD, Drift, kept_in
+from gen2d.sweeps import Drift, kept_in
 from gen2d.tournament import settled
 from gen2d.types import Array
 
@@ -55,7 +55,6 @@ class Group(NamedTuple):
     inverse: Inertia
     mass: Array  # [N, ...] kg
     moment: Array  # [N, ...] kg m^2
-    jointed: Array  # [N, ...] 1 where a rigid joint holds it
     collides: bool = True  # whether they meet anything
 
 
@@ -93,6 +92,7 @@ class Scenery(NamedTuple):
     gravity: Array  # [2, ...] m/s^2
     contacts: Any  # how pairs are solved: Dense or Sparse
     ties: list[joints.Tied]
+    linkage: linkage.Linkage | None
     forces: Callable | None  # (bodies, time) -> for each group force [2, N, ...] N and torque [N, ...] N m
 
 
@@ -103,6 +103,7 @@ class World(NamedTuple):
     time: Array  # s
     contacts: Any  # what the contacts hand on from step to step
     ties: list[Any]  # of each round of joints: its impulses
+    pushes: Array | None  # of the linkage's rows
     ledger: Ledger | None
 
 
@@ -135,17 +136,17 @@ def _free(body: Body, fall: Array, spin_up: Array | float, rules: Rules) -> tupl
     return motion, Motion(velocity, spin)
 
 
-def _moved(motion: Motion, drift: Drift, more: Motion, h: float) -> Motion:
-    """By how much a body goes; free flight is exact for what no contact but an impact held."""
+def _beyond(drift: Drift, more: Motion) -> Motion:
+    """By how much more than h times its motion a body goes; free flight is exact for what no contact but an impact
+    held."""
     free = jnp.where(drift.push > 0, 0.0, 1.0)
-    way = h * motion.velocity + drift.way.velocity + free * more.velocity
-    return Motion(way, h * motion.spin + drift.way.spin + free * more.spin)
+    return jax.tree.map(lambda x, y: x + free * y, drift.way, more)
 
 
-def _warmth(warmed: Motion, flying: Motion, group: Group) -> Array:
-    """What the last step's impulses may have added to a speed, m/s; not zero where a joint holds the body."""
-    x, y = jnp.abs(warmed.velocity - flying.velocity)
-    return x + y + HELD * group.jointed
+def _warmth(warmed: Motion, before: Motion) -> Array:
+    """What the contacts' last impulses may have added to a speed, m/s."""
+    x, y = jnp.abs(warmed.velocity - before.velocity)
+    return x + y
 
 
 def _arrived(body: Body, way: Motion, one: Array) -> tuple[tuple[Array, Array], Motion]:
@@ -155,6 +156,39 @@ def _arrived(body: Body, way: Motion, one: Array) -> tuple[tuple[Array, Array], 
     new = settled(jax.tree.map(jnp.add, old, add), one)
     gone = jax.tree.map(lambda n, o, d: jax.lax.stop_gradient(d - (n - o)), new, old, add)
     return (new.velocity, new.spin), gone
+
+
+class _Rigid:
+    """The linkage in a step: its impulses so far and their work; nothing where there is none."""
+
+    def __init__(self, linked: linkage.Linkage | None, world: World, fixed: list[Body], h: float, one: Array) -> None:
+        self._of, self._world, self._fixed, self._h, self._one = linked, world, fixed, h, one
+        self.pushes, self.works = world.pushes, []
+
+    def warm(self, motions: list[Motion]) -> list[Motion]:
+        """The motions with the last step's impulses."""
+        if self._of is None:
+            return motions
+        bodies = self._world.bodies
+        self._stance, motions, work = linkage.warm(self._of, bodies, self._fixed, motions, self.pushes, self._one)
+        self.works.append(work)
+        return motions
+
+    def solve(self, motions: list[Motion], beyond: list[Motion]) -> list[Motion]:
+        """The motions with which the joints hold at the end of the step."""
+        return self._after(linkage.solve, motions, beyond)
+
+    def relax(self, motions: list[Motion], ways: list[Motion]) -> list[Motion]:
+        """The motions with which they go on to hold from there."""
+        return self._after(linkage.relax, motions, ways)
+
+    def _after(self, play: Callable, motions: list[Motion], ways: list[Motion]) -> list[Motion]:
+        if self._of is None:
+            return motions
+        of = self._of, self._stance, motions, ways, self._fixed, self.pushes, self._h, self._one
+        motions, self.pushes, work = play(*of)
+        self.works.append(work)
+        return motions
 
 
 def step(world: World, scenery: Scenery, rules: Rules) -> World:
@@ -168,35 +202,41 @@ def step(world: World, scenery: Scenery, rules: Rules) -> World:
     fixed = [Body(*body.at(world.time), body.still) for body in scenery.fixed]
 
     held, motions, tied = joints.warm(scenery.ties, world.bodies, fixed, flying, world.ties, one)
+    rigid = _Rigid(scenery.linkage, world, fixed, h, one)
+    joined = rigid.warm(motions)
     shapes = [placed(g.form, b.position, b.angle) for g, b in zip(groups, world.bodies, strict=True)]
     walls = [(f.shape_at(b), f.motion) for f, b in zip(scenery.fixed, fixed, strict=True)]
     unlike = falls if spin_ups else [None] * len(groups)
     book = world.ledger
     works = [None] * len(groups) if book is None else book.groups
     bodies = list(zip(shapes, unlike, strict=True))
-    motions, works, found = contacts.warm(past, bodies, walls, motions, works)
-    pushes = [_warmth(*of) for of in zip(motions, flying, groups, strict=True)]
+    motions, works, found = contacts.warm(past, bodies, walls, joined, works)
+    pushes = [_warmth(*of) for of in zip(motions, joined, strict=True)]
 
     ways = [Motion(*(jnp.zeros_like(x) for x in m)) for m in motions]
     held, motions, ways, tied_more = joints.solve(held, motions, ways, falls, fixed, rules, one, biased=True)
     drifts = [Drift(way, push) for way, push in zip(ways, pushes, strict=True)]
     motions, drifts, works, rows = contacts.solve(past, found, walls, motions, drifts, works)
+    beyond = [_beyond(*of) for of in zip(drifts, more, strict=True)]
+    motions = rigid.solve(motions, beyond)
 
-    ways = [_moved(*of, h) for of in zip(motions, drifts, more, strict=True)]
+    ways = [jax.tree.map(lambda x, y: h * x + y, *of) for of in zip(motions, beyond, strict=True)]
     ways = kept_in(ways, [s if g.collides else None for s, g in zip(shapes, groups, strict=True)], scenery.rails)
     places = [_arrived(b, way, one) for b, way in zip(world.bodies, ways, strict=True)]
 
     held, motions, _, tied_last = joints.solve(held, motions, ways, falls, fixed, rules, one, biased=False)
     motions, works, past = contacts.relax(past, rows, walls, motions, drifts, works, world.time)
+    motions = rigid.relax(motions, ways)
     if book is not None:
         olds = [body.motion for body in world.bodies]
         done = zip(works, groups, olds, flying, more, ways, falls, turns, strict=True)
-        tally = tallied(book.joints, [*tied, *tied_more, *tied_last])
+        tally = tallied(book.joints, [*tied, *tied_more, *tied_last, *rigid.works])
         book = Ledger([booked(*of, gravity=scenery.gravity, h=h) for of in done], tally)
     return World(
         bodies=[Body(*place, motion, rest) for (place, rest), motion in zip(places, motions, strict=True)],
         time=world.time + h,
         contacts=past,
         ties=[joint.impulses for joint in held],
+        pushes=rigid.pushes,
         ledger=book,
     )

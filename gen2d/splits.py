@@ -27,6 +27,11 @@ class Split:
     written: str  # the split as in a config, as JSON
     law: Law = dataclasses.field(compare=False)
 
+    @property
+    def frames(self) -> int | None:
+        """How many frames of a video its reader gets, the first ones; None: all."""
+        return self.plain().get("frames")
+
     def plain(self) -> dict[str, Any]:
         """The split as YAML and JSON hold it."""
         return json.loads(self.written)
@@ -60,7 +65,7 @@ def with_splits(scene: Plugin, written: Any, source: str) -> tuple[Plugin, tuple
 
 
 def _split(scene: Plugin, name: str, written: Any, training: Split | None, source: str) -> Split:
-    where, known = f"splits.{name}", ("videos", "factors", "overlaps", *CHANGES)
+    where, known = f"splits.{name}", ("videos", "frames", "factors", "overlaps", *CHANGES)
     if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}", name):
         raise ConfigError(f"{source}: {where} must have a name of letters, digits, '.', '_' and '-', 64 at most")
     written = {} if written is None else written
@@ -69,14 +74,15 @@ def _split(scene: Plugin, name: str, written: Any, training: Split | None, sourc
     for key in written:
         if key not in known:
             raise ConfigError(f"{source}: {where}.{key} is not an option; {plugins.nearest(key, list(known))}")
-    videos = written.get("videos")
-    if videos is not None and (isinstance(videos, bool) or not isinstance(videos, int) or not 1 <= videos < 2**32):
-        raise ConfigError(f"{source}: {where}.videos is {videos!r}, but must be a whole number from 1 to 2**32 - 1")
+    for key in ("videos", "frames"):
+        count = written.get(key)
+        if count is not None and (isinstance(count, bool) or not isinstance(count, int) or not 1 <= count < 2**32):
+            raise ConfigError(f"{source}: {where}.{key} is {count!r}, but must be a whole number from 1 to 2**32 - 1")
     if not isinstance(written.get("overlaps", False), bool):
         raise ConfigError(f"{source}: {where}.overlaps is {written['overlaps']!r}, but must be true or false")
     like = None if "factors" in written else training
     law = like.law if like else _law(scene, written.get("factors", {}), f"{where}.factors", source)
-    return Split(name, videos, json.dumps(written), law)
+    return Split(name, written.get("videos"), json.dumps(written), law)
 
 
 def _law(scene: Plugin, written: Any, where: str, source: str) -> Law:

@@ -72,13 +72,13 @@ def stream(
     one_of("to", to, tuple(_DELIVER))
     rollout = _rollout(config.of_split(split), device)
     names = chosen_fields(config.name, rollout.fields, fields)
-    options = Options(split, names, window, stride, start, layout, dtype, "none")
-    options.check(config.video.frames)
+    frames = next((own.frames for own in config.splits if own.name == split), None) or config.video.frames
+    options = Options(split, names, window, stride, start, layout, dtype, "none").within(frames, config.video.frames)
     if n is not None and not 1 <= n <= MAX_VIDEOS:
         raise ConfigError(f"n is {n}, but must be from 1 to 2**32 - 1, or None")
     count = MAX_VIDEOS if n is None else n
     walk = Walk(count, batch_size, order_seed, shuffle, epochs, rank, world_size, remainder)
-    return Stream(rollout, options, walk, batch_size, to)
+    return Stream(rollout, options, walk, batch_size, to, frames)
 
 
 @functools.lru_cache(maxsize=4)
@@ -100,8 +100,8 @@ class _Cell(NamedTuple):
 class Stream:
     """Batches without end, or of some epochs, from wherever the state says."""
 
-    def __init__(self, rollout: Rollout, options: Options, walk: Walk, batch_size: int, to: str) -> None:
-        self.rollout, self.options, self.walk, self.to = rollout, options, walk, to
+    def __init__(self, rollout: Rollout, options: Options, walk: Walk, batch_size: int, to: str, frames: int) -> None:
+        self.rollout, self.options, self.walk, self.to, self._frames = rollout, options, walk, to, frames
         self.fields = {name: rollout.fields[name] for name in options.fields}
         self.cell = cell_size(batch_size, rollout.lanes)
         self._view = jax.jit(self._viewed)
@@ -133,11 +133,10 @@ class Stream:
                     yield _DELIVER[self.to](made)
 
     def _cells(self) -> Iterator[_Cell]:
-        frames = self.rollout.config.video.frames
         for step in self.walk.steps():
             positions = self.walk.share(step)
             numbers = shuffled(self.walk.shuffled_by, step.epoch, positions, self.walk.videos)
-            first = self.options.starts(self.walk.bits(step, positions), frames)
+            first = self.options.starts(self.walk.bits(step, positions), self._frames)
             first = np.full(len(numbers), self.options.first) if first is None else first
             real = len(numbers)  # a rank's share may be empty
             for begin in range(0, max(real, 1), self.cell):

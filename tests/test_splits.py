@@ -24,7 +24,7 @@ CONFIG = {
     "storage": {"lanes": 8, "videos_per_shard": 8},
 }
 SPLITS = {
-    "train": {"factors": {"minus": [{}, {"radius": [0.7, 0.8]}]}},
+    "train": {"frames": 6, "factors": {"minus": [{}, {"radius": [0.7, 0.8]}]}},
     "holes": {"videos": 9, "factors": {"radius": [0.7, 0.8]}},
     "heavier": {"videos": 3, "factors": {"gravity": [0, -30]}},
 }
@@ -53,6 +53,24 @@ def test_each_video_says_its_split_and_how_far_outside_it_is(whole):
         assert (videos["outside/training"] == (split != "train")).all()
         assert (videos["outside/radius"].max(1) > 0).all() == (split == "holes")
         assert (videos["outside/gravity"][:, 1] > 0).all() == (split == "heavier")
+
+
+def test_a_split_may_give_the_first_frames_only(whole):
+    """So that what is learnt on short videos can be asked of longer ones."""
+    short, long = gen2d.open(whole, "train"), gen2d.open(whole, "holes")
+    assert (short[0]["frames"].shape[0], len(short.time)) == (6, 6)
+    assert (long[0]["frames"].shape[0], len(long.time)) == (10, 10)
+    every = gen2d.open(whole, "train", window=2)
+    starts = every.starts(np.zeros(5, np.int64), np.arange(5, dtype=np.uint64) * 7)
+    assert starts is not None
+    assert starts.max() <= 4
+    with pytest.raises(ConfigError, match="need 7 frames, but the videos have 6"):
+        gen2d.open(whole, "train", window=7, start="first")
+    batch = next(iter(gen2d.stream(CONFIG | {"splits": SPLITS}, 4, 8, split="train", n=12)))
+    for name, values in gen2d.open(whole, "train").batch(np.arange(8)).items():
+        assert_array_equal(batch[name], values)
+    with pytest.raises(ConfigError, match=r"splits.train.frames is 11, but must be video.frames, 10, or less"):
+        load_config(CONFIG | {"splits": {"train": {"frames": 11}}})
 
 
 def test_a_stream_of_a_split_is_the_dataset_s(whole):
@@ -114,6 +132,20 @@ def test_videos_of_a_kind_are_those_that_are_and_others_in_place_of_the_rest():
     assert (every["states/position"][tried > 0] != some["states/position"][tried > 0]).any((1, 2, 3)).all()
 
 
+def test_how_little_may_be_seen_of_an_object_can_be_asked_for(tmp_path):
+    seen = {"annotations": {"visibility": True}, "scene": {"name": "bouncing", "balls": 4, "radius": [0.8, 1.0]}}
+    every, some = ({"quality": asked} | seen for asked in ({}, {"visibility_least": 0.7}))
+    found = []
+    for number, more in enumerate((every, some)):
+        gen2d.generate(CONFIG | more, 8, tmp_path / str(number), seed=1)
+        found.append(gen2d.open(tmp_path / str(number), fields=("quality/*", "frames"))[:])
+    least, tried = found[1]["quality/min_visibility"], found[1]["quality/rejected_videos"]
+    assert (least >= 0.7).all()
+    assert_array_equal(tried == 0, found[0]["quality/min_visibility"] >= 0.7)
+    assert 0 < (tried == 0).sum() < 8
+    assert_array_equal(found[0]["frames"][tried == 0], found[1]["frames"][tried == 0])
+
+
 def test_a_video_does_not_depend_on_what_is_made_with_it():
     """Attempts are tried in order, however many of them fit into a batch."""
 
@@ -144,6 +176,7 @@ def test_a_kind_that_there_is_not_is_said(tmp_path):
             {"contacts_least": 5, "contacts_most": 2},
             "quality.contacts_least is 5, but must be contacts_most, 2, or less",
         ),
+        ({"visibility_most": 0.5}, "quality.visibility_most is asked for, but needs annotations.visibility"),
         ({"growth_most": 2}, "quality.growth_most is asked for, but needs annotations.predictability"),
     ):
         with pytest.raises(ConfigError, match=message):
