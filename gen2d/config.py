@@ -254,7 +254,8 @@ class Config:
     @property
     def copies(self) -> Copies:
         """What the files of the user's own hold, by their names in the config."""
-        return {plugin.name: plugin.content for plugin in (self.scene, self.look) if plugin.sha256}
+        looks = [split.own["look"] for split in self.splits if "look" in split.own]
+        return {plugin.name: plugin.content for plugin in (self.scene, self.look, *looks) if plugin.sha256}
 
     def recipe(self) -> dict[str, Any]:
         """The config without its seed, which a dataset keeps and compares by itself, and without numbers of videos."""
@@ -282,14 +283,7 @@ class Config:
 
     def of_split(self, name: str) -> "Config":
         """The config as it is for a split, with the look or the physics that this one has of its own."""
-        if not self.splits:
-            return self
-        changes = self.splits[self.row(name)].plain()
-        plain, own = self.plain(), {}
-        for name in CHANGES:
-            if name in changes:
-                own[name] = _section(name, _merged(plain[name], changes[name]), "config", self.copies)
-        return dataclasses.replace(self, **own)
+        return dataclasses.replace(self, **self.splits[self.row(name)].own) if self.splits else self
 
     def sha256(self) -> str:
         """A hash of the recipe."""
@@ -413,23 +407,37 @@ def from_mapping(values: Any, source: str, name: str = "dataset", copies: Copies
     except ValueError as error:
         raise ConfigError(f"{source}: quality.{error}") from None
     if values.get("splits"):
-        config = _with_splits(config, values["splits"], source)
+        config = _with_splits(config, values["splits"], source, copies)
     _check_sets(config, source)
     return config
 
 
-def _with_splits(config: Config, written: Any, source: str) -> Config:
+def _with_splits(config: Config, written: Any, source: str, copies: Copies) -> Config:
     scene, splits = with_splits(config.scene, written, source)
-    config = dataclasses.replace(config, scene=scene, splits=splits)
+    plain, copies, made = config.plain(), {**copies, **config.copies}, []
     for split in splits:
         if (split.frames or 0) > config.video.frames:
             told = f"{source}: splits.{split.name}.frames is {split.frames}, but must be video.frames"
             raise ConfigError(f"{told}, {config.video.frames}, or less")
+        changes, own = split.plain(), {}
         try:
-            config.of_split(split.name)
+            for name in (name for name in CHANGES if name in changes):
+                own[name] = _section(name, _merged(plain[name], changes[name]), "config", copies)
         except ConfigError as error:
             raise ConfigError(f"{source}: splits.{split.name}: {str(error).removeprefix('config: ')}") from None
-    return config
+        if "look" in own and own["look"].sha256:
+            look = {"name": changes["look"]} if isinstance(changes["look"], str) else changes["look"]
+            changes["look"] = look | {"sha256": own["look"].sha256}
+        made.append(dataclasses.replace(split, written=json.dumps(changes), own=own))
+    return dataclasses.replace(config, scene=scene, splits=tuple(made))
+
+
+def own_files(plain: Mapping[str, Any]) -> dict[str, str]:
+    """The names of the user's own files in a config, as `Config.plain` has it, by where a dataset keeps their copies."""
+    splits = {f"splits/{name}/look": split for name, split in plain.get("splits", {}).items() if "look" in split}
+    places = {kind: plain[kind] for kind in PLUGINS} | {place: split["look"] for place, split in splits.items()}
+    names = {kind: look if isinstance(look, str) else look.get("name", "") for kind, look in places.items()}
+    return {plugins.copy_name(kind, name): name for kind, name in names.items() if plugins.is_own(name)}
 
 
 def _check_sets(config: Config, source: str) -> None:

@@ -14,10 +14,9 @@ import jax
 import numpy as np
 
 from gen2d import devices, shards
-from gen2d.config import Config, checked_seed, load_config
+from gen2d.config import Config, checked_seed, load_config, own_files
 from gen2d.errors import ConfigError, FolderError, UserError
 from gen2d.pipeline import Encoder, Job, Writers, batches, jobs_of, threads_for
-from gen2d.plugins import copy_name
 from gen2d.progress import progress, stopping_on_sigterm
 from gen2d.remote import Place, place
 from gen2d.report import in_bytes, in_time
@@ -141,11 +140,7 @@ def dataset_of(rollout: Rollout, out: Place, counts: Mapping[str, int]) -> Datas
         constants=rollout.constants,
         conventions=CONVENTIONS,
         command="python -m gen2d --config config.yaml",
-        copies={
-            copy_name(kind, plugin.name): plugin.content
-            for kind, plugin in (("scene", config.scene), ("look", config.look))
-            if plugin.sha256
-        },
+        copies={place: config.copies[name] for place, name in own_files(config.plain()).items()},
     )
 
 

@@ -15,9 +15,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gen2d import annotations, drawing, factors, loader, matched, plugins, types
+from gen2d import annotations, drawing, factors, loader, matched, types
 from gen2d.camera import View
-from gen2d.config import PLUGINS, AnnotationOptions, Config, load_config
+from gen2d.config import AnnotationOptions, Config, load_config, own_files
 from gen2d.errors import ConfigError
 from gen2d.loader import Dataset
 from gen2d.manifest import field_of
@@ -52,10 +52,9 @@ def config_from(root: Place, identity: Mapping[str, Any], sets: Sequence[str] = 
 def _copies(root: Place, config: Mapping[str, Any]) -> dict[str, bytes]:
     """What the folder holds of files of the user's own, by their names in the config."""
     found = {}
-    for kind, plugin in ((kind, config[kind]) for kind in PLUGINS):
-        if plugins.is_own(plugin["name"]):
-            with reading(root), contextlib.suppress(FileNotFoundError):
-                found[plugin["name"]] = (root / plugins.copy_name(kind, plugin["name"])).read_bytes()
+    for where, name in own_files(config).items():
+        with reading(root), contextlib.suppress(FileNotFoundError):
+            found[name] = (root / where).read_bytes()
     return found
 
 

@@ -26,6 +26,7 @@ class Split:
     videos: int | None  # null: as many as are asked for
     written: str  # the split as in a config, as JSON
     law: Law = dataclasses.field(compare=False)
+    own: Mapping[str, Any] = dataclasses.field(default_factory=dict, compare=False)  # sections
 
     @property
     def frames(self) -> int | None:

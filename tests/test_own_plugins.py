@@ -152,3 +152,19 @@ def test_another_dataset_takes_the_place_of_the_copies_too(tmp_path: Path) -> No
     (tmp_path / COPIES[1]).parent.mkdir()
     (tmp_path / COPIES[1]).touch()
     assert verify(tmp_path) == [f"{tmp_path / COPIES[1]} does not belong to the dataset"]
+
+
+def test_a_look_of_a_split_s_own_goes_with_the_dataset_too(home: Path, tmp_path: Path) -> None:
+    look = tmp_path / "mine.py"
+    look.write_bytes((home / "looks" / "mine.py").read_bytes() + b"# another\n")
+    splits = {"train": {"videos": 2}, "dark": {"videos": 2, "look": {"name": str(look), "background": [0, 0, 0]}}}
+    generate(config(home) | {"splits": splits}, 2, tmp_path / "data")
+    content = look.read_bytes()
+    assert (tmp_path / "data" / "plugins" / "splits" / "dark" / "look" / "mine.py").read_bytes() == content
+    expected = gen2d.open(tmp_path / "data", "dark")[:]["frames"]
+    look.write_bytes(content + b"# changed\n")
+    with pytest.raises(FolderError, match=r"config\.splits\.dark\.look\.sha256 is .* there and .* here"):
+        generate(config(home) | {"splits": splits}, 2, tmp_path / "data")
+    look.unlink()
+    assert verify(tmp_path / "data", "regen", videos=4) == []
+    assert_array_equal(np.asarray(gen2d.render(gen2d.open(tmp_path / "data", "dark"), [0, 1])), expected)
