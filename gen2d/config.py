@@ -433,7 +433,7 @@ def _with_splits(config: Config, written: Any, source: str, copies: Copies) -> C
 
 
 def own_files(plain: Mapping[str, Any]) -> dict[str, str]:
-    """The names of the user's own files in a config, as `Config.plain` has it, by where a dataset keeps their copies."""
+    """The names of the user's own files in a config (`Config.plain`), by where a dataset keeps their copies."""
     splits = {f"splits/{name}/look": split for name, split in plain.get("splits", {}).items() if "look" in split}
     places = {kind: plain[kind] for kind in PLUGINS} | {place: split["look"] for place, split in splits.items()}
     names = {kind: look if isinstance(look, str) else look.get("name", "") for kind, look in places.items()}

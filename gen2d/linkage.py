@@ -30,6 +30,7 @@ from gen2d.types import Array, Tie
 X, Y, ALONG, ACROSS = range(4)  # the direction of a row
 GIVE = 1e-5  # of a row's own term, as softness: what keeps the impulses of joints bounded that say the same twice
 NEWTON = 2  # times: one leaves a fast double pendulum three times the error of energy
+UNROLL = 4  # rows in a turn of a loop
 FASTEST = 10.0  # m/s: anchors that are apart come together no faster
 
 
@@ -228,7 +229,7 @@ def factored(bands: list[Array]) -> Factors:
         return new, Factors(below, inverse)
 
     start = [[zero] * (width - 1 - p) for p in range(width - 1)]
-    return jax.lax.scan(row, start, bands)[1]
+    return jax.lax.scan(row, start, bands, unroll=UNROLL)[1]
 
 
 def solved(factors: Factors, wanted: Array) -> Array:
@@ -246,8 +247,8 @@ def solved(factors: Factors, wanted: Array) -> Array:
             x = x - f * y
         return [x, *later][: len(later)], x
 
-    found = jax.lax.scan(down, start, (factors, wanted))[1]
-    return jax.lax.scan(up, start, found, reverse=True)[1]
+    found = jax.lax.scan(down, start, (factors, wanted), unroll=UNROLL)[1]
+    return jax.lax.scan(up, start, found, reverse=True, unroll=UNROLL)[1]
 
 
 def _exchanged(linkage: Linkage, rows: Rows, table: Motion, impulses: Array, one: Array) -> tuple[Motion, Work]:

@@ -191,7 +191,7 @@ def test_killed_at_random_moments_it_completes_to_the_same_bits(tiny: Path, tmp_
 def test_a_signal_stops_it_and_says_how_to_go_on(tmp_path: Path, number: int):
     config, out = tmp_path / "tiny.yaml", tmp_path / "data"
     config.write_text(yaml.safe_dump(changed(storage={"videos_per_shard": 4})))
-    arguments = ["--config", config, "--n", 4000, "--out", out]
+    arguments = ["--config", config, "--n", 40_000, "--out", out]  # enough for a process that is seldom looked at
     words, environment = command(*arguments)
     process = subprocess.Popen(words, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     while process.poll() is None and len(list((out / "shards").glob("*.h5"))) < 3:

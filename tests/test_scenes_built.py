@@ -131,7 +131,7 @@ def test_a_seesaw_tips_to_the_side_of_the_larger_torque():
     np.testing.assert_array_equal(np.sign(angle[clear]), np.sign(torque[clear]))
     assert np.abs(angle[clear]).min() > 0.05
     holds("seesaw: pivot, m", apart(made), 1e-5)
-    holds("seesaw: energy gained", gained(made), 0.15, asked=1e-2)
+    holds("seesaw: energy gained", gained(made), 0.06, asked=1e-2)
 
 
 # Pendulums ----------------------------------------------------------------------------------------------------------
@@ -165,7 +165,7 @@ def test_a_pendulum_has_the_period_of_its_length_and_swing():
 def test_a_double_pendulum_keeps_its_energy_and_its_joints():
     made = film("pendulum", 8, 4.0, 30, "scene.links=2", energy=True)
     scale = np.abs(made.energy).max(1) + made.scene.objects.mass[:, 3:].sum(1) * GRAVITY
-    holds("double pendulum: energy", np.ptp(made.energy, axis=1) / scale, 5e-3)
+    holds("double pendulum: energy", np.ptp(made.energy, axis=1) / scale, 7e-3, asked=5e-3)
     holds("double pendulum: joints, m", apart(made), 1e-4)
 
 
