@@ -17,8 +17,6 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy.sparse import csr_array
-from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 from gen2d.contacts import dot, turned
 from gen2d.joints import End, anchors_of, at_lines, direction_of, groups_of, table_of
@@ -80,6 +78,9 @@ def plan_of(ties: Sequence[Tie], moving: int) -> Plan:
 
     Two hinges weld two bodies: the second has a row only across the line between them, a third would say nothing new.
     """
+    from scipy.sparse import csr_array  # not above: it takes .2 s, for which no scene without joints should wait
+    from scipy.sparse.csgraph import reverse_cuthill_mckee
+
     a, b = (np.array([getattr(tie, side) for tie in ties]) for side in "ab")
     mine = [{line for line in (tie.a, tie.b) if line < moving} for tie in ties]
     near = np.array([[bool(one & other) for other in mine] for one in mine])
