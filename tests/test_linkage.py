@@ -1,0 +1,88 @@
+"""Rigid joints as one linear system: its solution, mass ratios, joints that say the same twice, what they conserve."""
+
+import itertools
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from gen2d import Space
+from gen2d.linkage import factored, plan_of, solved
+from gen2d.space import Video
+from gen2d.types import Tie
+
+
+@pytest.mark.parametrize(("rows", "width"), [(1, 1), (2, 2), (3, 1), (7, 3), (20, 4), (6, 6)])
+def test_a_band_is_solved_as_the_whole_matrix_is(rows, width):
+    random = np.random.default_rng(rows)
+    i, j = np.indices((rows, rows))
+    half = random.normal(size=(5, rows, rows)) * (i >= j) * (i - j < width) + 5 * np.eye(rows)
+    matrix, wanted = half @ half.swapaxes(1, 2), random.normal(size=(5, rows))
+    bands = [jnp.asarray(np.pad(np.diagonal(matrix, o, 1, 2), ((0, 0), (0, o))).T) for o in range(width)]
+    found = np.asarray(solved(factored(bands), jnp.asarray(wanted.T))).T
+    assert_allclose(found, np.linalg.solve(matrix, wanted[..., None])[..., 0], rtol=1e-4, atol=1e-5)
+
+
+def test_chains_are_narrow_bands_and_hinges_that_say_nothing_new_have_no_row():
+    links = [Tie("revolute", 30, 0), *(Tie("revolute", i, i + 1) for i in range(29))]
+    shuffled = [links[i] for i in np.random.default_rng(0).permutation(30)]
+    assert (plan_of(shuffled, 30).width, len(plan_of(shuffled, 30).joint)) == (4, 60)
+    welded = plan_of([Tie("revolute", 0, 1), Tie("revolute", 1, 0), Tie("revolute", 0, 1)], 2)
+    assert welded.joint.tolist().count(0) == 2
+    assert len(welded.joint) == 3
+
+
+def ends(video: Video, number: int, half: float) -> np.ndarray:
+    """Both ends of a rod in every frame, m [2, T, 2]."""
+    angle = video.angle[:, number]
+    way = half * np.stack([np.cos(angle), np.sin(angle)], -1)
+    return np.stack([video.position[:, number] - way, video.position[:, number] + way])
+
+
+def test_light_links_hold_a_weight_that_is_a_hundred_times_as_heavy():
+    space = Space()
+    links = [space.add_capsule((i, 0), (i + 1, 0), 0.05, mass=0.01) for i in range(6)]
+    weight = space.add_circle((6.5, 0), 0.5, mass=1)
+    space.add_joint("revolute", links[0], anchor_a=(0, 0))
+    for i, (a, b) in enumerate(zip(links, [*links[1:], weight], strict=True)):
+        space.add_joint("revolute", a, b, anchor_a=(i + 1, 0))
+    video = space.simulate(3, contacts=0)
+    places = [ends(video, link, 0.5) for link in links]
+    gaps = [np.hypot(*(b[0] - a[1]).T) for a, b in itertools.pairwise(places)]
+    assert np.max(gaps) < 1e-4
+    assert np.hypot(*places[0][0].T).max() < 1e-4
+    assert video.position[:, weight, 1].min() < -5
+
+
+def test_a_mechanism_that_is_held_twice_over_stays_whole_and_keeps_its_momentum():
+    """A square of bars with more rods between its corners than it takes, and two bars in one, free in space."""
+    space = Space(gravity=(0, 0))
+    corners = [(0.0, 0.0), (2.0, 0.0), (2.0, 2.0), (0.0, 2.0)]
+    bars = [
+        space.add_capsule(a, b, 0.05, velocity=(0.5, 0.2), spin=1.0)
+        for a, b in zip(corners, [*corners[1:], corners[0]], strict=True)
+    ]
+    for i in range(4):
+        space.add_joint("revolute", bars[i - 1], bars[i], anchor_a=corners[i])
+    for a, b in ((0, 2), (1, 3)):
+        for one, other in ((0, 0), (1, 1), (0, 1), (1, 0)):
+            space.add_joint(
+                "distance", bars[a], bars[b], anchor_a=corners[(a + one) % 4], anchor_b=corners[(b + other) % 4]
+            )
+    weld = [space.add_capsule((x, 5), (x + 1, 5), 0.05, velocity=(0, x - 5)) for x in (5, 6)]
+    for x in (6.0, 6.5, 5.5):
+        space.add_joint("revolute", *weld, anchor_a=(x, 5))
+    video = space.simulate(4, contacts=0)
+    places = [ends(video, bar, 1.0) for bar in bars]
+    for i in range(4):
+        assert np.hypot(*(places[i][0] - places[i - 1][1]).T).max() < 1e-3
+        assert_allclose(np.hypot(*(places[i][0] - places[i - 2][0]).T), np.sqrt(8), atol=2e-3)
+    assert_allclose(video.angle[:, weld[0]], video.angle[:, weld[1]], atol=1e-3)
+    assert abs(video.angle[-1, weld[0]]) > 1
+    masses = np.array([body.mass for body in space.bodies])
+    momentum = (masses[:, None] * video.velocity).sum(1)
+    assert_allclose(momentum, np.broadcast_to(momentum[0], momentum.shape), atol=1e-4)
+    # Once the joints have made one motion of what was given, it goes on without loss.
+    energy = np.asarray(video.energy.kinetic + video.energy.rotational)[1:]
+    assert_allclose(energy, np.broadcast_to(energy[0], energy.shape), rtol=2e-3)
