@@ -111,7 +111,7 @@ def direction_of(apart: Array) -> tuple[Array, Array]:
     return jnp.where(squared > SHORTEST**2, apart / length, 0.0), jnp.where(squared > SHORTEST**2, length, 0.0)
 
 
-def anchors_of(a: End, b: End, places: Any, one: Array) -> tuple[Array, Array, Array]:
+def anchors_of(a: End, b: End, places: Any, one: Array | float) -> tuple[Array, Array, Array]:
     """Both arms, and how far the anchors are apart, m [2, P, ...]; of a table of positions and angles."""
     (place_a, angle_a), (place_b, angle_b) = (at_lines(places, end.lines) for end in (a, b))
     arm_a, arm_b = settled((rotated(a.anchor, angle_a), rotated(b.anchor, angle_b)), one)
@@ -286,7 +286,9 @@ def _spring(joint: Held, now: Motion, way: Motion, fall: Array, h: float, one: A
             work = dot(motion.velocity + motion.spin * turned(arm), push)
             driven = driven - sign * jnp.where(end.fixed[:, None], work, 0.0)
     # What it changes in the fall is its own, not the contacts'.
-    aside = sum(0.5 * h * sign * dot(at_lines(fall, end.lines), push) for end, _, sign in ends)
+    aside = jnp.zeros_like(lost)
+    for end, _, sign in ends:
+        aside = aside + 0.5 * h * sign * dot(at_lines(fall, end.lines), push)
     gone = [_pushed(end, arm, at_lines(way, end.lines), -0.5 * h * sign * push) for end, arm, sign in ends]
     work = Work(_total(-aside), _total(driven), _total(lost + aside))
     return _with(now, joint, *news), _with(way, joint, *gone), work

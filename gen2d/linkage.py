@@ -97,7 +97,8 @@ def plan_of(ties: Sequence[Tie], moving: int) -> Plan:
         return [[(j, X, j), (j, Y, j)], [(j, ACROSS, alike[0])], []][min(alike.index(j), 2)]
 
     rows = [row for j in order for row in ways(int(j))]
-    return Plan(*(np.array(x) for x in zip(*rows, strict=True)), (a, b), moving)
+    joint, way, other = (np.array(x) for x in zip(*rows, strict=True))
+    return Plan(joint, way, other, (a, b), moving)
 
 
 class Linkage(NamedTuple):
@@ -151,8 +152,8 @@ def _rows(linkage: Linkage, stance: Stance, one: Array) -> Rows:
         same = (a[plan.joint] == a[plan.other])[:, None]
         between = at_lines(stance.arm_a, plan.joint) - jnp.where(same, of_other, at_lines(stance.arm_b, plan.other))
         direction = jnp.where((plan.way == ACROSS)[:, None], turned(direction_of(between)[0]), direction)
-    levers = (dot(turned(at_lines(arm, plan.joint)), direction) for arm in (stance.arm_a, stance.arm_b))
-    return settled(Rows(direction, (*levers,)), one)
+    lever_a, lever_b = (dot(turned(at_lines(arm, plan.joint)), direction) for arm in (stance.arm_a, stance.arm_b))
+    return settled(Rows(direction, (lever_a, lever_b)), one)
 
 
 def _pushed(linkage: Linkage, rows: Rows, table: Motion, impulses: Array, one: Array) -> Motion:
@@ -263,7 +264,8 @@ def _exchanged(linkage: Linkage, rows: Rows, table: Motion, impulses: Array, one
             motion = at_lines(new, end.lines[of])
             work = impulses * (dot(rows.direction, motion.velocity) + lever * motion.spin)
             driven = driven - sign * jnp.where(end.fixed[of][:, None], work, 0.0)
-    return new, Work(*(jnp.sum(x, axis=-2, keepdims=True) for x in (-gained, driven)), None)
+    lost, driven = (jnp.sum(x, axis=-2, keepdims=True) for x in (-gained, driven))
+    return new, Work(lost, driven, None)
 
 
 def warm(
@@ -331,7 +333,7 @@ def _gone(linkage: Linkage, stance: Stance, ways: Motion, one: Array) -> Stance:
         more = jnp.sin(way.spin) * turned(arm) - 2 * jnp.sin(way.spin / 2) ** 2 * arm
         arms.append(settled(arm + more, one))
         apart = apart + sign * (way.velocity + more)
-    return Stance(*arms, apart)
+    return Stance(arms[0], arms[1], apart)
 
 
 class _Matrix:

@@ -167,7 +167,7 @@ class _Rigid:
 
     def warm(self, motions: list[Motion]) -> list[Motion]:
         """The motions with the last step's impulses."""
-        if self._of is None:
+        if self._of is None or self.pushes is None:
             return motions
         bodies = self._world.bodies
         self._stance, motions, work = linkage.warm(self._of, bodies, self._fixed, motions, self.pushes, self._one)
