@@ -11,6 +11,7 @@ import functools
 import math
 import zlib
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
 import jax
@@ -73,6 +74,7 @@ class Rollout:
         self.lanes = config.storage.lanes or min(together, auto)  # not the shard size: that must not change a video
         self.slice = divisor(self.lanes, max(1, SLICE_BYTES // frame_bytes))
         self.mesh = Mesh(np.array(self.devices), ("videos",))
+        self._compiled: set[int] = set()  # how many videos have been drawn together
         self._simulate = jax.jit(self._shared(self._made, (PartitionSpec(), PartitionSpec(), *[VIDEOS] * 3)))
 
     def _shared(self, function: Any, specs: tuple) -> Any:
@@ -191,7 +193,13 @@ class Rollout:
         Each device runs a program of its own: compiled for several at once, another rounding would differ.
         """
         own = [jax.tree.map(lambda array, d=d: _pieces(array)[d].data, batch.stages) for d in range(len(self.devices))]
-        return [self._draw(count)(stages, np.int32(start)) for stages in own]
+        draw = functools.partial(self._draw(count), start=np.int32(start))
+        if count in self._compiled:
+            return [draw(stages) for stages in own]
+        with ThreadPoolExecutor(len(own)) as pool:  # compiles for all devices at once
+            drawn = list(pool.map(draw, own))
+        self._compiled.add(count)
+        return drawn
 
     @functools.lru_cache(maxsize=8)  # noqa: B019 (a Rollout lives as long as its run)
     def _draw(self, count: int) -> Any:

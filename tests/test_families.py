@@ -1,5 +1,6 @@
 """What every scene family keeps, over some hundred keys of its own config: the layout that it tells, no overlap at the
-start, factors within what they are declared to be, and scenes that depend on their keys alone.
+start, factors within what they are declared to be, and scenes that depend on their keys alone; over 100,000 keys also
+that whole videos are numbers and that nothing gets out of walls (`pytest -m slow tests/test_families.py`).
 
 What moves begins inside the layout's bounds; a family where some of it comes from outside says `BEGINS_OUTSIDE = True`.
 """
@@ -23,11 +24,12 @@ from gen2d.options import Plugin, drawn_options
 from gen2d.rollout import rules_of
 from gen2d.sampling import Sampler
 from gen2d.simulate import simulate, substeps
-from gen2d.types import DYNAMIC, SHAPES, Layout, Objects, Run, Scene, State, Trajectory, to_device, to_stored
+from gen2d.types import DYNAMIC, SHAPES, Layout, Objects, Run, Scene, State, to_device, to_stored
 
 FAMILIES = plugins.names("scene")
-KEYS, LANES, FRAMES = 256, 4, 3
+KEYS, MANY, LANES = 256, 100_000, 500
 OVERLAP, EDGE = 1e-4, 1e-3  # m
+WALLED = ("billiards", "bouncing", "hidden_mass", "occluder", "pile")  # by walls on all sides
 
 
 class Made(NamedTuple):
@@ -39,36 +41,30 @@ class Made(NamedTuple):
     fits: Any
     overlap: Any  # [n] m, the deepest
     extent: Any  # [n, 4] m: left, bottom, right and top end of all that moves
-    trajectory: Trajectory  # of the first LANES
 
 
 @functools.cache
 def program(family: str) -> tuple[Plugin, Layout, Any]:
     """A family's config, its layout, and the one program that a test of it compiles."""
     config = load_config(f"{family}.yaml")
-    scene, video, physics = config.scene, config.video, config.physics
-    layout, steps = scene.module.layout(scene.options), substeps(video.fps, physics.substeps, physics.max_step)
-    rules = rules_of(physics, video.fps, steps)
+    scene = config.scene
+    layout = scene.module.layout(scene.options)
 
     def run(keys: jax.Array) -> Made:
         factors, begun = jax.vmap(Sampler(config).sampled)(keys)
         things, state, fits = begun.scene, begun.state, begun.fits
         on_device = to_device(things), to_device(state)
         shapes = shapes_of(layout, on_device[0].objects, on_device[1])
-        few = [jax.tree.map(lambda x: x[..., :LANES], value) for value in on_device]
-        trajectory = to_stored(simulate(few[0], few[1], layout, rules, FRAMES, steps, sparse=True))
         present = on_device[0].objects.present
-        return Made(
-            factors, things, state, fits, overlap(layout, shapes, present), extent(layout, shapes, present), trajectory
-        )
+        return Made(factors, things, state, fits, overlap(layout, shapes, present), extent(layout, shapes, present))
 
     return scene, layout, jax.jit(run)
 
 
 @functools.cache
-def made(family: str) -> Made:
-    """What a family makes of KEYS keys."""
-    return jax.tree.map(np.asarray, program(family)[2](jax.random.split(jax.random.key(0), KEYS)))
+def made(family: str, seed: int = 0, count: int = KEYS) -> Made:
+    """What a family makes of some keys."""
+    return jax.tree.map(np.asarray, program(family)[2](jax.random.split(jax.random.key(seed), count)))
 
 
 def shapes_of(layout: Layout, objects: Objects, state: State) -> list[Any]:
@@ -166,7 +162,11 @@ def distance(source: Distribution, values: np.ndarray) -> float:
 
 @pytest.mark.parametrize("family", FAMILIES)
 def test_factors_are_what_they_are_declared_to_be(family):
-    scene, found = program(family)[0], made(family).factors
+    check_factors(program(family)[0], made(family).factors)
+
+
+def check_factors(scene: Plugin, found: dict[str, np.ndarray]) -> None:
+    """Asserts that factors are in their support, and drawn as they are declared to be."""
     for name, spec in drawn_options(scene.module).items():
         source, values = getattr(scene.options, name), found[name]
         parts = source if spec.parts else [source]
@@ -192,10 +192,36 @@ def test_a_key_is_a_scene(family):
     assert len(np.unique(np.concatenate(rows, axis=1), axis=0)) == KEYS
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("family", FAMILIES)
-def test_the_first_frames_are_numbers(family):
-    trajectory = made(family).trajectory
-    assert all(np.isfinite(x).all() for x in jax.tree.leaves(trajectory))
+def test_a_hundred_thousand_videos_are_numbers_begin_apart_and_stay_within_walls(family):
+    config = load_config(f"{family}.yaml")
+    scene, video, physics = config.scene, config.video, config.physics
+    layout, steps = scene.module.layout(scene.options), substeps(video.fps, physics.substeps, physics.max_step)
+    rules = rules_of(physics, video.fps, steps)
+
+    @jax.jit
+    def run(scene: Scene, state: State) -> tuple[jax.Array, jax.Array, jax.Array]:
+        """Whether all is a number, and the ends [2] of where centres are, of each video."""
+        made = to_stored(simulate(to_device(scene), to_device(state), layout, rules, video.frames, steps, sparse=True))
+        there = (scene.objects.present & (scene.objects.kind == DYNAMIC))[:, None, :, None]
+        place = made.states.position
+        good = jnp.stack([jnp.isfinite(x).reshape(len(x), -1).all(1) for x in jax.tree.leaves(made)]).all(0)
+        low, high = jnp.where(there, place, jnp.inf).min((1, 2)), jnp.where(there, place, -jnp.inf).max((1, 2))
+        return good, low, high
+
+    factors = []
+    for seed in range(MANY // LANES):
+        found = made.__wrapped__(family, 1 + seed, LANES)
+        assert found.fits.all()
+        assert found.overlap.max() <= OVERLAP
+        factors.append(found.factors)
+        good, low, high = (np.asarray(x) for x in run(found.scene, found.state))
+        assert good.all()
+        if family in WALLED:
+            assert (low > layout.bounds[:2]).all()
+            assert (high < layout.bounds[2:]).all()
+    check_factors(scene, jax.tree.map(lambda *x: np.concatenate(x), *factors))
 
 
 def test_the_page_of_all_families_has_a_row_of_each(tmp_path, monkeypatch):
