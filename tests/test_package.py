@@ -35,7 +35,7 @@ ORDER = [
         "impacts",
         "rows",
     ),
-    *("ledger", "joints", "forms", "sweeps", "events", "near", "dense", "sparse", "solver", "scenery"),
+    *("ledger", "joints", "linkage", "forms", "sweeps", "events", "near", "dense", "sparse", "solver", "scenery"),
     *(
         "simulate",
         "distributions",
