@@ -165,8 +165,9 @@ def test_factors_are_what_they_are_declared_to_be(family):
     check_factors(program(family)[0], made(family).factors)
 
 
-def check_factors(scene: Plugin, found: dict[str, np.ndarray]) -> None:
-    """Asserts that factors are in their support, and drawn as they are declared to be."""
+def check_factors(scene: Plugin, found: dict[str, np.ndarray], doubt: float = 1e-3) -> None:
+    """Asserts that factors are in their support, and drawn as they are declared to be (A. Kolmogorov, N. Smirnov)."""
+    most = np.sqrt(-np.log(doubt / 2) / 2)
     for name, spec in drawn_options(scene.module).items():
         source, values = getattr(scene.options, name), found[name]
         parts = source if spec.parts else [source]
@@ -177,7 +178,7 @@ def check_factors(scene: Plugin, found: dict[str, np.ndarray]) -> None:
         assert (values[~there] == 0).all(), name
         for part, drawn in zip(parts, np.moveaxis(values, -1, 0), strict=True):
             assert part.contains(drawn[there]).all(), name
-            assert distance(part, drawn[there]) < 1.95 / np.sqrt(there.sum()), name  # Kolmogorov-Smirnov, p = .001
+            assert distance(part, drawn[there]) < most / np.sqrt(there.sum()), name
     for name in getattr(scene.module, "DERIVED", {}):
         assert np.isfinite(found[name]).all(), name
 
@@ -221,7 +222,8 @@ def test_a_hundred_thousand_videos_are_numbers_begin_apart_and_stay_within_walls
         if family in WALLED:
             assert (low > layout.bounds[:2]).all()
             assert (high < layout.bounds[2:]).all()
-    check_factors(scene, jax.tree.map(lambda *x: np.concatenate(x), *factors))
+    # Of 300 numbers of all families one is beyond .001 by chance every third time.
+    check_factors(scene, jax.tree.map(lambda *x: np.concatenate(x), *factors), doubt=1e-3 / 300)
 
 
 def test_the_page_of_all_families_has_a_row_of_each(tmp_path, monkeypatch):
