@@ -18,7 +18,7 @@ from gen2d.codecs import CODECS
 from gen2d.distributions import Distribution
 from gen2d.errors import ConfigError
 from gen2d.laws import Law
-from gen2d.options import NO_COPIES, Copies, Plugin, build, coordinates, option, plain_of, plugin_of
+from gen2d.options import NO_COPIES, Copies, Plugin, build, coordinates, named, option, plain_of, plugin_of
 from gen2d.splits import CHANGES, Split, laws_of, with_splits
 
 MAX_SEED = 2**63 - 1
@@ -281,6 +281,11 @@ class Config:
         """The laws of the splits in order, or that of the scene alone."""
         return laws_of(self.scene, self.splits)
 
+    def frames_of(self, split: str) -> int:
+        """How many frames of a split's videos its reader gets, the first ones."""
+        own = self.splits[self.row(split)].frames if self.splits else None
+        return own or self.video.frames
+
     def of_split(self, name: str) -> "Config":
         """The config as it is for a split, with the look or the physics that this one has of its own."""
         return dataclasses.replace(self, **self.splits[self.row(name)].own) if self.splits else self
@@ -305,7 +310,7 @@ PLUGINS = {"scene": "bouncing", "look": "flat"}
 
 def _merged(own: Mapping[str, Any], other: Any) -> Any:
     """A section with other options; another plug-in has its defaults."""
-    other = {"name": other} if isinstance(other, str) else other
+    other = named(other)
     if not isinstance(other, Mapping):
         return other  # reading it says what is wrong
     return dict(other) if other.get("name", own.get("name")) != own.get("name") else {**own, **other}
@@ -361,7 +366,7 @@ def _overridden(values: dict, sets: Sequence[str]) -> dict:
             inner = place.get(key)
             if not isinstance(inner, str | Mapping | None):
                 raise ConfigError(f"--set is {text!r}, but {key} is {inner!r}, which has no options of its own")
-            place[key] = {"name": inner} if isinstance(inner, str) else dict(inner or {})
+            place[key] = dict(named(inner) or {})
             place = place[key]
         place[keys[-1]] = parse_yaml(value, f"--set {path}")
     return values
@@ -426,8 +431,7 @@ def _with_splits(config: Config, written: Any, source: str, copies: Copies) -> C
         except ConfigError as error:
             raise ConfigError(f"{source}: splits.{split.name}: {str(error).removeprefix('config: ')}") from None
         if "look" in own and own["look"].sha256:
-            look = {"name": changes["look"]} if isinstance(changes["look"], str) else changes["look"]
-            changes["look"] = look | {"sha256": own["look"].sha256}
+            changes["look"] = named(changes["look"]) | {"sha256": own["look"].sha256}
         made.append(dataclasses.replace(split, written=json.dumps(changes), own=own))
     return dataclasses.replace(config, scene=scene, splits=tuple(made))
 
@@ -436,7 +440,7 @@ def own_files(plain: Mapping[str, Any]) -> dict[str, str]:
     """The names of the user's own files in a config (`Config.plain`), by where a dataset keeps their copies."""
     splits = {f"splits/{name}/look": split for name, split in plain.get("splits", {}).items() if "look" in split}
     places = {kind: plain[kind] for kind in PLUGINS} | {place: split["look"] for place, split in splits.items()}
-    names = {kind: look if isinstance(look, str) else look.get("name", "") for kind, look in places.items()}
+    names = {kind: named(look).get("name", "") for kind, look in places.items()}
     return {plugins.copy_name(kind, name): name for kind, name in names.items() if plugins.is_own(name)}
 
 

@@ -150,9 +150,14 @@ def build(cls: type, values: Any, where: str, source: str) -> Any:
     return cls(**filled)
 
 
+def named(values: Any) -> Any:
+    """A plug-in as a mapping with its name; in a config its bare name is enough."""
+    return {"name": values} if isinstance(values, str) else values
+
+
 def plugin_of(kind: str, values: Any, default: str, source: str, copies: Copies) -> Plugin:
-    """A plug-in with its options; its bare name is enough."""
-    values = {"name": values} if isinstance(values, str) else {} if values is None else values
+    """A plug-in with its options."""
+    values = {} if values is None else named(values)
     if not isinstance(values, Mapping):
         raise ConfigError(f"{source}: {kind} is {values!r}, but must be a name, or a mapping with a name and options")
     name = values.get("name", default)

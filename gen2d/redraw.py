@@ -21,6 +21,7 @@ from gen2d.config import AnnotationOptions, Config, load_config, own_files
 from gen2d.errors import ConfigError
 from gen2d.loader import Dataset
 from gen2d.manifest import field_of
+from gen2d.options import named
 from gen2d.picture import Plan, Stage, on_cpu
 from gen2d.remote import Place, reading
 from gen2d.rollout import Rollout, keep_of, rules_of
@@ -81,8 +82,7 @@ def render(
     config = config_of(ds, [*sets, *_changed(height, width), "storage.frames=video"])
     config = load_config(config, _asked(fields, config.annotations))
     if look is not None:
-        plain = {"name": look} if isinstance(look, str) else dict(look)
-        config = load_config(config.plain() | {"look": plain}, copies=config.copies)
+        config = load_config(config.plain() | {"look": named(look)}, copies=config.copies)
     if config.image.exposure and states is not None:
         raise ConfigError("states have no motion between frames: image.exposure must be 0 where they are given")
     if config.image.exposure:

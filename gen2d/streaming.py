@@ -72,7 +72,7 @@ def stream(
     one_of("to", to, tuple(_DELIVER))
     rollout = _rollout(config.of_split(split), device)
     names = chosen_fields(config.name, rollout.fields, fields)
-    frames = next((own.frames for own in config.splits if own.name == split), None) or config.video.frames
+    frames = config.frames_of(split)
     options = Options(split, names, window, stride, start, layout, dtype, "none").within(frames, config.video.frames)
     if n is not None and not 1 <= n <= MAX_VIDEOS:
         raise ConfigError(f"n is {n}, but must be from 1 to 2**32 - 1, or None")

@@ -20,7 +20,7 @@ Columns = Mapping[str, np.ndarray]
 
 CAPTION_BYTES, EVENT_BYTES = 512, 128  # the second for each object and 16 frames
 SHOWN = 4  # events that a caption tells at most
-DYNAMIC, STATIC = 0, 1  # objects/kind
+STATIC = 1  # objects/kind
 IMPACT, END = 1, 4  # contacts/kind
 TOGETHER = 0.1  # s: impacts of a pair in frames that follow one another, and no further apart, are one hit
 STILL, STILL_SECONDS = 0.02, 0.1  # m/s of the fastest point; all is at rest if it stays below, for so long at least

@@ -71,9 +71,8 @@ def sample(key: Array, factors: dict[str, Array], options: Options) -> Sampled:
         ends, factors["radius"], angle=angle, velocity=end_speeds, spin=factors["swing"], layer=2, collides=False, **bob
     )  # fmt: skip
     half, up = (jnp.stack(pair, -1) for pair in ((rods.objects["half_length"], jnp.zeros(n)), (jnp.zeros(n), length)))
-    nothing = jnp.zeros(
-        (n, 2)
-    )  # in the frame of a bob `up` is where it hangs; a rod goes from its left end to its right
+    nothing = jnp.zeros((n, 2))
+    # In the frame of a bob `up` is where it hangs; a rod goes from its left end to its right.
     above, below = (jnp.stack(x, 1).reshape(-1, 2) for x in ((nothing, -half, half), (up, up, nothing)))
     scene, state = assembled(layout(options), [pin, rods, bobs], factors["gravity"], joined(above, below))
     return Sampled(scene, state, derived={"period": _period(rods.objects, bobs.objects, length, factors["gravity"])})
