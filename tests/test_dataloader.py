@@ -2,7 +2,10 @@
 
 import itertools
 import multiprocessing
+import os
 import pickle
+import subprocess
+import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -206,20 +209,37 @@ def test_batches_stay_as_they_were_while_others_follow(toy: Path, kind: str) -> 
             assert_array_equal(np.asarray(found[name]), values)
 
 
-@pytest.mark.parametrize("place", ["device", "sharding"])
-def test_jax_batches_lie_where_they_are_asked_to(toy: Path, place: str) -> None:
-    jax = pytest.importorskip("jax")
-    device = jax.devices()[-1]
-    mesh = jax.sharding.Mesh(np.array(jax.devices()), ("videos",))
+def lie_where_they_are_asked_to(root: str) -> None:
+    """Fails unless batches for jax lie on the device, or over the devices, that they are asked to."""
+    import jax
+
+    devices = jax.devices()
+    mesh = jax.sharding.Mesh(np.array(devices), ("videos",))
     spread = jax.sharding.NamedSharding(mesh, jax.sharding.PartitionSpec("videos"))
-    count = 4 * len(jax.devices())
-    options: dict[str, Any] = {"device": device} if place == "device" else {"sharding": spread}
-    dataset = loader.open(toy, fields=("frames", "states/angle"))
+    dataset = loader.open(root, fields=("frames", "states/angle"))
+    count = 4 * len(devices)
     expected = next(iter(DataLoader(dataset, count, epochs=1)))
-    for name, values in next(iter(DataLoader(dataset, count, epochs=1, to="jax", **options))).items():
-        assert values.devices() == ({device} if place == "device" else set(jax.devices()))
-        assert place == "device" or values.sharding.is_equivalent_to(spread, values.ndim)
-        assert_array_equal(np.asarray(values), expected[name])
+    places: list[tuple[dict[str, Any], Any]] = [
+        ({"device": devices[-1]}, jax.sharding.SingleDeviceSharding(devices[-1])),
+        ({"sharding": spread}, spread),
+    ]
+    for options, place in places:
+        for name, values in next(iter(DataLoader(dataset, count, epochs=1, to="jax", **options))).items():
+            assert values.devices() == place.device_set
+            assert values.sharding.is_equivalent_to(place, values.ndim)
+            assert_array_equal(np.asarray(values), expected[name])
+
+
+def test_jax_batches_lie_where_they_are_asked_to(toy: Path) -> None:
+    pytest.importorskip("jax")
+    code = (
+        f"import sys; sys.path[:0] = [{str(Path(__file__).parent)!r}, {str(Path(__file__).parent.parent)!r}];"
+        "import jax; jax.config.update('jax_num_cpu_devices', 2); assert len(jax.devices()) == 2;"
+        f"import test_dataloader; test_dataloader.lie_where_they_are_asked_to({str(toy)!r})"
+    )
+    environment = {**os.environ, "JAX_PLATFORMS": "cpu"}
+    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
 
 
 def test_torch_batches_lie_where_they_are_asked_to(toy: Path) -> None:
