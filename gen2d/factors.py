@@ -6,8 +6,9 @@ several, `{minus: [one, others...]}` what of one lies outside the others' suppor
 what lies inside. A vector is a list of such values.
 """
 
+import functools
 import zlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from numbers import Integral, Real
 from typing import Any
 
@@ -103,7 +104,13 @@ def checked_weights(weights: Any, count: int) -> list[float]:
 
 def key_for(key: Array, what: str) -> Array:
     """The key of one of the things that numbers are drawn for."""
-    return jax.random.fold_in(key, zlib.crc32(what.encode()))
+    return keys_for(key, [what])[0]
+
+
+def keys_for(key: Array, whats: Sequence[str]) -> list[Array]:
+    """The keys of some of the things that numbers are drawn for, all made by one compiled loop."""
+    codes = np.array([zlib.crc32(what.encode()) for what in whats], np.uint32)
+    return list(jax.vmap(functools.partial(jax.random.fold_in, key))(codes))
 
 
 def seed_words(seed: int, split: int) -> np.ndarray:

@@ -16,7 +16,7 @@ import numpy as np
 
 from gen2d.config import Config
 from gen2d.distributions import Span
-from gen2d.factors import key_for
+from gen2d.factors import key_for, keys_for
 from gen2d.fields import Field
 from gen2d.laws import Law
 from gen2d.options import Option, Plugin, coordinates, drawn_options
@@ -101,9 +101,8 @@ class Sampler:
         """All factors by name. Each has a key of its own, so that its draws do not depend on which others there are."""
         components = self._components(key, row)
         found = {}
-        for name, spec in self.options.items():
+        for (name, spec), own in zip(self.options.items(), keys_for(key, [*self.options]), strict=True):
             shape = (self.lengths[spec.each],) if spec.each else ()
-            own = key_for(key, name)
             keys = jax.random.split(own, spec.parts) if spec.parts else [own]
             which = components[spec.each]
             parts = [
@@ -138,6 +137,8 @@ class Sampler:
         """
         counts = [len(law.products) for law in self.laws]
         firsts = jnp.asarray(np.cumsum([0, *counts[:-1]]))[row]
+        if max(counts) == 1:
+            return {"": firsts} | {axis: jnp.full(length, firsts) for axis, length in self.lengths.items()}
         ends = np.full((len(counts), max(counts)), 2.0, np.float32)
         for i, law in enumerate(self.laws):
             ends[i, : counts[i] - 1] = np.cumsum([product.share for product in law.products])[:-1]

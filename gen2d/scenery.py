@@ -148,19 +148,24 @@ def _row(a: Side, b: Side, forms: tuple[Form, Form], fixed: bool, layout: Layout
 TOGETHER = 1e-4  # m: ends that are so near to another segment lie on it
 
 
-def _onward(end: Array, others: list[Stadium]) -> tuple[Array, Array]:
-    """For an end [2, 1, ...] of a segment, the two directions in which others go on from there, zero if none do."""
-    found = [jnp.zeros_like(end)] * 2
-    for shape in others:
-        aside, along, _ = from_core(shape, end)
-        there = (dot(aside, aside) < TOGETHER**2) & (shape.half_length > TOGETHER)
+def _onward(ends: Array, own: np.ndarray, shapes: Stadium) -> tuple[Array, Array]:
+    """For ends [2, E, n] of segments `own` [E], the two directions in which others go on from there, zero if none do;
+    of all segments [S, ..., 1, n] one after the other, in a loop, which is compiled once for all of them."""
+
+    def on(found: tuple[Array, Array], other: tuple[Stadium, Array]) -> tuple[tuple[Array, Array], None]:
+        (first, second), (shape, number) = found, other
+        aside, along, _ = from_core(shape, ends)
+        there = (dot(aside, aside) < TOGETHER**2) & (shape.half_length > TOGETHER) & (number != own)[:, None]
         for way, goes in ((1, along < shape.half_length - TOGETHER), (-1, along > TOGETHER - shape.half_length)):
-            new, empty = there & goes, dot(found[0], found[0]) == 0
-            found = [
-                jnp.where(new & empty, way * shape.direction, found[0]),
-                jnp.where(new & ~empty, way * shape.direction, found[1]),
-            ]
-    return found[0], found[1]
+            new, empty = there & goes, dot(first, first) == 0
+            first, second = (
+                jnp.where(new & empty, way * shape.direction, first),
+                jnp.where(new & ~empty, way * shape.direction, second),
+            )
+        return (first, second), None
+
+    nothing = jnp.zeros_like(ends)
+    return jax.lax.scan(on, (nothing, nothing), (shapes, np.arange(len(shapes.radius))))[0]
 
 
 def _ways(fixed: list[Fixed]) -> dict[int, list]:
@@ -168,12 +173,13 @@ def _ways(fixed: list[Fixed]) -> dict[int, list]:
     lines = {i: f.shape for i, f in enumerate(fixed) if isinstance(f.shape, Stadium) and f.motion is None}
     if len(lines) < 2:
         return {}
-    ways = {}
-    for i, shape in lines.items():
-        others = [other for j, other in lines.items() if j != i]
-        reach = shape.half_length * shape.direction
-        ways[i] = [_onward(shape.centre + s * reach, others) for s in (-1, 1)]
-    return ways
+    shapes: Stadium = jax.tree.map(lambda *x: jnp.stack(jnp.broadcast_arrays(*x)), *lines.values())
+    reach = shapes.half_length[:, None] * shapes.direction
+    ends = jnp.stack([shapes.centre - reach, shapes.centre + reach], axis=1)  # [S, 2 ends, 2, 1, n]
+    numbers = np.arange(2 * len(lines))
+    found = _onward(jnp.moveaxis(ends[..., 0, :], 2, 0).reshape(2, len(numbers), -1), numbers // 2, shapes)
+    each = [tuple(x[:, k : k + 1] for x in found) for k in numbers]
+    return {i: each[2 * k : 2 * k + 2] for k, i in enumerate(lines)}
 
 
 def _dense(
