@@ -39,6 +39,7 @@ def test_the_peer_makes_the_scene_of_the_config() -> None:
     assert peer.FRAMES * peer.SIZE**2 * 3 == bench.FRAMES_BYTES
 
 
+@pytest.mark.slow
 def test_every_stage_is_timed(tmp_path: Path) -> None:
     turns = bench.stages(tmp_path, turns=1, peer_videos=1, sets=TINY)
     assert {"sampler", "simulate", "render", "transfer", "compress", "write", "peer body", "peer draw"} <= turns.keys()
@@ -95,6 +96,7 @@ def test_the_engines_of_the_physics_section_start_from_the_same_scene(shape: str
     np.testing.assert_allclose(np.column_stack([x[:5] for x in columns]), own, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_every_engine_of_the_physics_section_is_timed(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     case = bench_physics.Case("discs", 2, 2, (1, 0), 1)
     monkeypatch.setitem(bench_physics.CASES, case.name, case)

@@ -104,8 +104,8 @@ def test_a_video_does_not_depend_on_how_many_are_made_or_how_they_lie(
 def test_a_video_does_not_depend_on_the_number_of_devices(tiny: Path, tmp_path: Path):
     config = tmp_path / "tiny.yaml"
     config.write_text(yaml.safe_dump(CONFIG))
-    for devices in ("1", "3"):
-        out = tmp_path / devices
+    for devices in {1, 3} - {len(jax.devices())}:  # those of this process made the other
+        out = tmp_path / str(devices)
         code = (
             f"import jax; jax.config.update('jax_num_cpu_devices', {devices}); jax.devices();"
             f"from gen2d.generation import generate; generate({str(config)!r}, {N}, {str(out)!r})"
