@@ -165,7 +165,7 @@ def _onward(ends: Array, own: np.ndarray, shapes: Stadium) -> tuple[Array, Array
         return (first, second), None
 
     nothing = jnp.zeros_like(ends)
-    return jax.lax.scan(on, (nothing, nothing), (shapes, np.arange(len(shapes.radius))))[0]
+    return jax.lax.scan(on, (nothing, nothing), (shapes, jnp.arange(len(shapes.radius))))[0]
 
 
 def _ways(fixed: list[Fixed]) -> dict[int, list]:
