@@ -1,5 +1,6 @@
 """The one loop: which videos are missing, made batch by batch, written shard by shard."""
 
+import contextlib
 import dataclasses
 import numbers
 import os
@@ -79,12 +80,12 @@ def generate(
     counts = _counts(config, _check_run(n, split, worker), split)
     out = place(out) if out is not None else Path("datasets") / config.name
     on = devices.prepare(device)
-    rollout = Rollout(config, on)
-    dataset = dataset_of(rollout, out, counts)
-    remaining = [shard for shard in shards.open_folder(dataset, overwrite) if shard.split in counts]
-    todo = shards.mine(remaining, *worker)
-    began, made = time.perf_counter(), sum(shard.count for shard in todo)
-    size = make(rollout, dataset, todo, say)
+    with contextlib.closing(Rollout(config, on)) as rollout:
+        dataset = dataset_of(rollout, out, counts)
+        remaining = [shard for shard in shards.open_folder(dataset, overwrite) if shard.split in counts]
+        todo = shards.mine(remaining, *worker)
+        began, made = time.perf_counter(), sum(shard.count for shard in todo)
+        size = make(rollout, dataset, todo, say)
     complete = shards.finish(dataset)
     seconds = time.perf_counter() - began
     if todo:
@@ -146,8 +147,12 @@ def dataset_of(rollout: Rollout, out: Place, counts: Mapping[str, int]) -> Datas
 
 def make(rollout: Rollout, dataset: Dataset, todo: list[Shard], say: Callable[[str], None]) -> int:
     """The bytes written for these shards, which are done then."""
-    lots = rollouts_of(rollout, [shard.split for shard in todo])
-    return sum(_make(own, dataset, [shard for shard in todo if shard.split in lot], say) for own, lot in lots)
+    size = 0
+    for own, lot in rollouts_of(rollout, [shard.split for shard in todo]):
+        size += _make(own, dataset, [shard for shard in todo if shard.split in lot], say)
+        if own is not rollout:
+            own.close()
+    return size
 
 
 def _make(rollout: Rollout, dataset: Dataset, todo: list[Shard], say: Callable[[str], None]) -> int:

@@ -87,14 +87,14 @@ def _drawn(source: str, videos: int, seed: int | None, sets: Sequence[str]) -> t
     if seed is not None:
         config = dataclasses.replace(config, seed=checked_seed(seed))
     split = config.training.name if config.training else "train"
-    rollout = Rollout(config.of_split(split), devices.prepare()[:1])
     frames = []
-    for first in range(0, videos, rollout.lanes):
-        batch = rollout.begin(split, [first])
-        placed = parts(batch.placed)[0][: videos - first]
-        check_placed(config.scene, placed, np.arange(first, first + len(placed)))
-        for start in range(0, min(rollout.lanes, videos - first), rollout.slice):
-            frames.append(np.asarray(rollout.draw(batch, start, rollout.slice)[0]["frames"]))
+    with contextlib.closing(Rollout(config.of_split(split), devices.prepare()[:1])) as rollout:
+        for first in range(0, videos, rollout.lanes):
+            batch = rollout.begin(split, [first])
+            placed = parts(batch.placed)[0][: videos - first]
+            check_placed(config.scene, placed, np.arange(first, first + len(placed)))
+            for start in range(0, min(rollout.lanes, videos - first), rollout.slice):
+                frames.append(np.asarray(rollout.draw(batch, start, rollout.slice)[0]["frames"]))
     return config.name, np.concatenate(frames)[:videos], config.video.fps
 
 

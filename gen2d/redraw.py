@@ -31,6 +31,7 @@ from gen2d.videos import Numbers
 
 Columns = Mapping[str, Any]
 POINTS = 8  # of each object, where tracks are asked for that the config does not have
+MOST_KNOWN = 8  # looks, sizes and so on that programs are kept for
 
 
 def config_of(ds: Dataset, sets: Sequence[str] = ()) -> Config:
@@ -90,7 +91,7 @@ def render(
     else:
         columns = dict(_stored(ds, numbers)) | dict(states or {})
         _check_frames(columns, states)
-        settings = _Settings(base, config)
+        settings = _known(_Settings(base, config))
         stages = _staged(columns, _key_words(ds), jnp.asarray(numbers, jnp.uint32), settings)
         found = _pictures(stages, settings)
     if fields is None:
@@ -123,8 +124,8 @@ def simulate_again(
     config, numbers = config_of(ds, changes), ds.numbers(np.atleast_1d(indices))
     if not set(matched.VIOLATIONS).isdisjoint(config.matched.change or ()):
         raise ConfigError(f"{ds.root}: matched.change has violations, which cannot be simulated again from a scene")
-    columns = _stored(ds, numbers)
-    made = _simulated(columns, _key_words(ds), jnp.asarray(numbers, jnp.uint32), _Settings(config_of(ds), config))
+    columns, settings = _stored(ds, numbers), _known(_Settings(config_of(ds), config))
+    made = _simulated(columns, _key_words(ds), jnp.asarray(numbers, jnp.uint32), settings)
     return made | {"time": jnp.arange(config.video.frames) / config.video.fps}
 
 
@@ -249,16 +250,32 @@ def _simulated(columns: Columns, words: Array, numbers: Array, settings: _Settin
     return types.columns(made) | drawing.camera_columns(view)
 
 
+_KNOWN: set[_Settings] = set()  # what programs have been compiled for, since they were last let go of
+
+
+def _known(settings: _Settings) -> _Settings:
+    """The same settings; lets go of what was compiled for others where there are many, as a process may have no more
+    than some ten thousands of memory maps, and a program takes hundreds."""
+    if settings not in _KNOWN and len(_KNOWN) >= MOST_KNOWN:
+        programs: list[Any] = [_staged, _pictures, _simulated]
+        for program in programs:
+            program.clear_cache()
+        _KNOWN.clear()
+    _KNOWN.add(settings)
+    return settings
+
+
 def _again(ds: Dataset, config: Config, numbers: np.ndarray) -> dict[str, Array]:
     """Videos made from their keys again, as they were made: what blurs them is not stored."""
     lanes = ds.manifest["fingerprint"]["lanes"]
-    rollout = Rollout(load_config(config, [f"storage.lanes={lanes}"]), jax.devices()[:1])
     found: dict[str, list[Array]] = {}
     order = np.argsort(numbers, kind="stable")
-    for first in sorted({int(number) // lanes * lanes for number in numbers}):
-        batch = rollout.begin(ds.options.split, [first])
-        own = numbers[order][(numbers[order] >= first) & (numbers[order] < first + lanes)] - first
-        stages = jax.tree.map(lambda a, own=own: a[own], batch.stages)
-        for name, array in _pictures(stages, _Settings(config, config)).items():
-            found.setdefault(name, []).append(array)
+    own_lanes = load_config(config, [f"storage.lanes={lanes}"])
+    with contextlib.closing(Rollout(own_lanes, jax.devices()[:1])) as rollout:
+        for first in sorted({int(number) // lanes * lanes for number in numbers}):
+            batch = rollout.begin(ds.options.split, [first])
+            own = numbers[order][(numbers[order] >= first) & (numbers[order] < first + lanes)] - first
+            stages = jax.tree.map(lambda a, own=own: a[own], batch.stages)
+            for name, array in _pictures(stages, _known(_Settings(config, config))).items():
+                found.setdefault(name, []).append(array)
     return {name: jnp.concatenate(parts)[np.argsort(order)] for name, parts in found.items()}

@@ -74,7 +74,7 @@ class Rollout:
         self.lanes = config.storage.lanes or min(together, auto)  # not the shard size: that must not change a video
         self.slice = divisor(self.lanes, max(1, SLICE_BYTES // frame_bytes))
         self.mesh = Mesh(np.array(self.devices), ("videos",))
-        self._compiled: set[int] = set()  # how many videos have been drawn together
+        self._draws: dict[int, Any] = {}  # by how many videos are drawn together
         self._simulate = jax.jit(self._shared(self._made, (PartitionSpec(), PartitionSpec(), *[VIDEOS] * 3)))
 
     def _shared(self, function: Any, specs: tuple) -> Any:
@@ -193,15 +193,19 @@ class Rollout:
         Each device runs a program of its own: compiled for several at once, another rounding would differ.
         """
         own = [jax.tree.map(lambda array, d=d: _pieces(array)[d].data, batch.stages) for d in range(len(self.devices))]
-        draw = functools.partial(self._draw(count), start=np.int32(start))
-        if count in self._compiled:
+        known, program = count in self._draws, self._draws.setdefault(count, self._draw(count))
+        draw = functools.partial(program, start=np.int32(start))
+        if known:
             return [draw(stages) for stages in own]
         with ThreadPoolExecutor(len(own)) as pool:  # compiles for all devices at once
-            drawn = list(pool.map(draw, own))
-        self._compiled.add(count)
-        return drawn
+            return list(pool.map(draw, own))
 
-    @functools.lru_cache(maxsize=8)  # noqa: B019 (a Rollout lives as long as its run)
+    def close(self) -> None:
+        """Returns nothing; lets go of the compiled programs, which jax would keep, thousands of memory maps each."""
+        programs: list[Any] = [self._simulate, *self._draws.values()]
+        for program in programs:
+            program.clear_cache()
+
     def _draw(self, count: int) -> Any:
         def drawn(stages: Stage, start: Array) -> dict[str, Array]:
             cut = jax.tree.map(lambda x: jax.lax.dynamic_slice_in_dim(x, start, count), stages)

@@ -115,6 +115,20 @@ def test_a_video_does_not_depend_on_the_number_of_devices(tiny: Path, tmp_path: 
         same(everything(tiny), everything(out))
 
 
+def test_a_run_leaves_none_of_its_compiled_programs_behind(tmp_path: Path):
+    def kept() -> list[str]:
+        names = [each.hlo_modules()[0].name for each in jax.devices()[0].client.live_executables()]
+        return sorted(name for name in names if name in ("jit__made", "jit_drawn"))
+
+    before = kept()
+    for balls in (1, 2):
+        made = []
+        config = changed(scene={"balls": balls})
+        generate(config, 4, tmp_path / str(balls), say=lambda line, made=made: made.append(kept()))
+        assert len(max(made, key=len)) > len(before)  # while it ran
+        assert kept() == before
+
+
 def test_workers_together_make_what_one_makes(tiny: Path, tmp_path: Path):
     out = tmp_path / "data"
     assert not generate(CONFIG, N, out, worker=(1, 2)).complete
