@@ -641,7 +641,7 @@ def _meeting(runs: tuple[Run, Run], objects: Objects, sides: Sequence[jax.Array]
     return [(point.gap, a.centre + point.arm_a, point.normal) for point in touches(a, b)]
 
 
-@functools.lru_cache(maxsize=32)
+@functools.lru_cache(maxsize=8)  # a program takes up to thousands of memory maps, of which a process has some 60,000
 def _program(layout: Layout, rules: Rules, frames: int, steps: int, keep: Keep, forces: Any) -> Callable:
     """The compiled program of a layout; scenes, states and trajectories have videos first."""
     hook = None if forces is None else _by_slot(*forces)
