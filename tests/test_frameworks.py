@@ -34,6 +34,7 @@ def check(batches: Sequence[dict[str, Any]], source: Any, order: Sequence[int]) 
 # ---- torch
 
 
+@pytest.mark.filterwarnings("ignore:This DataLoader will create:UserWarning")  # more than this process has cores
 @pytest.mark.filterwarnings("ignore:.*multi-threaded.*fork.*:DeprecationWarning")
 @pytest.mark.filterwarnings("ignore:os.fork.*:RuntimeWarning")
 @pytest.mark.parametrize("method", [None, "fork", "spawn"])
