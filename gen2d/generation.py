@@ -7,7 +7,7 @@ import os
 import re
 import shlex
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -102,12 +102,18 @@ def _counts(config: Config, n: int, split: str | None) -> dict[str, int]:
     return {own.name: own.videos or n for own in config.splits} or {"train": n}
 
 
-def rollouts_of(rollout: Rollout, splits: Iterable[str]) -> list[tuple[Rollout, set[str]]]:
-    """The programs that make these splits, each with its splits: one may have a look of its own."""
+def rollouts_of(rollout: Rollout, splits: Iterable[str]) -> Iterator[tuple[Rollout, set[str]]]:
+    """The programs that make these splits, each with its splits: one may have a look of its own, whose programs last
+    until the next."""
     lots: dict[Config, set[str]] = {}
     for split in splits:
         lots.setdefault(rollout.config.of_split(split), set()).add(split)
-    return [(rollout if own == rollout.config else Rollout(own, rollout.devices), lot) for own, lot in lots.items()]
+    for own, lot in lots.items():
+        if own == rollout.config:
+            yield rollout, lot
+        else:
+            with contextlib.closing(Rollout(own, rollout.devices)) as other:
+                yield other, lot
 
 
 def _check_run(n: Any, split: str | None, worker: tuple[int, int]) -> int:
@@ -147,12 +153,8 @@ def dataset_of(rollout: Rollout, out: Place, counts: Mapping[str, int]) -> Datas
 
 def make(rollout: Rollout, dataset: Dataset, todo: list[Shard], say: Callable[[str], None]) -> int:
     """The bytes written for these shards, which are done then."""
-    size = 0
-    for own, lot in rollouts_of(rollout, [shard.split for shard in todo]):
-        size += _make(own, dataset, [shard for shard in todo if shard.split in lot], say)
-        if own is not rollout:
-            own.close()
-    return size
+    lots = rollouts_of(rollout, [shard.split for shard in todo])
+    return sum(_make(own, dataset, [shard for shard in todo if shard.split in lot], say) for own, lot in lots)
 
 
 def _make(rollout: Rollout, dataset: Dataset, todo: list[Shard], say: Callable[[str], None]) -> int:

@@ -8,7 +8,7 @@ import contextlib
 import dataclasses
 import functools
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import jax
@@ -31,7 +31,6 @@ from gen2d.videos import Numbers
 
 Columns = Mapping[str, Any]
 POINTS = 8  # of each object, where tracks are asked for that the config does not have
-MOST_KNOWN = 8  # looks, sizes and so on that programs are kept for
 
 
 def config_of(ds: Dataset, sets: Sequence[str] = ()) -> Config:
@@ -91,9 +90,9 @@ def render(
     else:
         columns = dict(_stored(ds, numbers)) | dict(states or {})
         _check_frames(columns, states)
-        settings = _known(_Settings(base, config))
-        stages = _staged(columns, _key_words(ds), jnp.asarray(numbers, jnp.uint32), settings)
-        found = _pictures(stages, settings)
+        settings = _Settings(base, config)
+        stages = _compiled(_staged, settings)(columns, _key_words(ds), jnp.asarray(numbers, jnp.uint32))
+        found = _compiled(_pictures, settings)(stages)
     if fields is None:
         return found["frames"]
     missing = [name for name in fields if name not in found]
@@ -124,8 +123,8 @@ def simulate_again(
     config, numbers = config_of(ds, changes), ds.numbers(np.atleast_1d(indices))
     if not set(matched.VIOLATIONS).isdisjoint(config.matched.change or ()):
         raise ConfigError(f"{ds.root}: matched.change has violations, which cannot be simulated again from a scene")
-    columns, settings = _stored(ds, numbers), _known(_Settings(config_of(ds), config))
-    made = _simulated(columns, _key_words(ds), jnp.asarray(numbers, jnp.uint32), settings)
+    simulated = _compiled(_simulated, _Settings(config_of(ds), config))
+    made = simulated(_stored(ds, numbers), _key_words(ds), jnp.asarray(numbers, jnp.uint32))
     return made | {"time": jnp.arange(config.video.frames) / config.video.fps}
 
 
@@ -217,7 +216,6 @@ class _Settings:
         return view._replace(scale=view.scale * min(new.height / old.height, new.width / old.width))
 
 
-@functools.partial(jax.jit, static_argnames="settings")
 def _staged(columns: Columns, words: Array, numbers: Array, settings: _Settings) -> Stage:
     config, plan = settings.config, settings.plan
     scene, states = scene_of(columns), record_of(State, columns)
@@ -229,13 +227,11 @@ def _staged(columns: Columns, words: Array, numbers: Array, settings: _Settings)
     return jax.vmap(staged)(matched.keys_of(words, numbers, settings.base.matched), scene, states, view)
 
 
-@functools.partial(jax.jit, static_argnames="settings")
 def _pictures(stages: Stage, settings: _Settings) -> dict[str, Array]:
     """What a run draws, in a program of its own, as there: so that its rounding is the same."""
     return drawing.pictures(stages, settings.plan, settings.config.annotations)
 
 
-@functools.partial(jax.jit, static_argnames="settings")
 def _simulated(columns: Columns, words: Array, numbers: Array, settings: _Settings) -> dict[str, Array]:
     config, layout = settings.config, settings.layout
     scene = scene_of(columns)
@@ -250,19 +246,10 @@ def _simulated(columns: Columns, words: Array, numbers: Array, settings: _Settin
     return types.columns(made) | drawing.camera_columns(view)
 
 
-_KNOWN: set[_Settings] = set()  # what programs have been compiled for, since they were last let go of
-
-
-def _known(settings: _Settings) -> _Settings:
-    """The same settings; lets go of what was compiled for others where there are many, as a process may have no more
-    than some ten thousands of memory maps, and a program takes hundreds."""
-    if settings not in _KNOWN and len(_KNOWN) >= MOST_KNOWN:
-        programs: list[Any] = [_staged, _pictures, _simulated]
-        for program in programs:
-            program.clear_cache()
-        _KNOWN.clear()
-    _KNOWN.add(settings)
-    return settings
+@functools.lru_cache(maxsize=16)  # a program takes up to thousands of memory maps, of which a process has some 60,000
+def _compiled(program: Callable, settings: _Settings) -> Callable:
+    """One of the programs above for these settings."""
+    return jax.jit(functools.partial(program, settings=settings))
 
 
 def _again(ds: Dataset, config: Config, numbers: np.ndarray) -> dict[str, Array]:
@@ -270,12 +257,15 @@ def _again(ds: Dataset, config: Config, numbers: np.ndarray) -> dict[str, Array]
     lanes = ds.manifest["fingerprint"]["lanes"]
     found: dict[str, list[Array]] = {}
     order = np.argsort(numbers, kind="stable")
-    own_lanes = load_config(config, [f"storage.lanes={lanes}"])
+    own_lanes, pictures = (
+        load_config(config, [f"storage.lanes={lanes}"]),
+        _compiled(_pictures, _Settings(config, config)),
+    )
     with contextlib.closing(Rollout(own_lanes, jax.devices()[:1])) as rollout:
         for first in sorted({int(number) // lanes * lanes for number in numbers}):
             batch = rollout.begin(ds.options.split, [first])
             own = numbers[order][(numbers[order] >= first) & (numbers[order] < first + lanes)] - first
             stages = jax.tree.map(lambda a, own=own: a[own], batch.stages)
-            for name, array in _pictures(stages, _known(_Settings(config, config))).items():
+            for name, array in pictures(stages).items():
                 found.setdefault(name, []).append(array)
     return {name: jnp.concatenate(parts)[np.argsort(order)] for name, parts in found.items()}

@@ -75,7 +75,7 @@ class Rollout:
         self.slice = divisor(self.lanes, max(1, SLICE_BYTES // frame_bytes))
         self.mesh = Mesh(np.array(self.devices), ("videos",))
         self._draws: dict[int, Any] = {}  # by how many videos are drawn together
-        self._simulate = jax.jit(self._shared(self._made, (PartitionSpec(), PartitionSpec(), *[VIDEOS] * 3)))
+        self._simulate: Any = jax.jit(self._shared(self._made, (PartitionSpec(), PartitionSpec(), *[VIDEOS] * 3)))
 
     def _shared(self, function: Any, specs: tuple) -> Any:
         return jax.shard_map(function, mesh=self.mesh, in_specs=specs, out_specs=VIDEOS, check_vma=False)
@@ -193,8 +193,10 @@ class Rollout:
         Each device runs a program of its own: compiled for several at once, another rounding would differ.
         """
         own = [jax.tree.map(lambda array, d=d: _pieces(array)[d].data, batch.stages) for d in range(len(self.devices))]
-        known, program = count in self._draws, self._draws.setdefault(count, self._draw(count))
-        draw = functools.partial(program, start=np.int32(start))
+        known = count in self._draws
+        if not known:
+            self._draws[count] = self._draw(count)
+        draw = functools.partial(self._draws[count], start=np.int32(start))
         if known:
             return [draw(stages) for stages in own]
         with ThreadPoolExecutor(len(own)) as pool:  # compiles for all devices at once
@@ -202,8 +204,7 @@ class Rollout:
 
     def close(self) -> None:
         """Returns nothing; lets go of the compiled programs, which jax would keep, thousands of memory maps each."""
-        programs: list[Any] = [self._simulate, *self._draws.values()]
-        for program in programs:
+        for program in (self._simulate, *self._draws.values()):
             program.clear_cache()
 
     def _draw(self, count: int) -> Any:

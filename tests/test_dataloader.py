@@ -2,10 +2,7 @@
 
 import itertools
 import multiprocessing
-import os
 import pickle
-import subprocess
-import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -14,6 +11,7 @@ import numpy as np
 import pytest
 import synthetic
 from numpy.testing import assert_array_equal
+from tiny import run_on
 
 from gen2d import loader
 from gen2d.dataloader import DataLoader
@@ -231,15 +229,8 @@ def lie_where_they_are_asked_to(root: str) -> None:
 
 
 def test_jax_batches_lie_where_they_are_asked_to(toy: Path) -> None:
-    pytest.importorskip("jax")
-    code = (
-        f"import sys; sys.path[:0] = [{str(Path(__file__).parent)!r}, {str(Path(__file__).parent.parent)!r}];"
-        "import jax; jax.config.update('jax_num_cpu_devices', 2); assert len(jax.devices()) == 2;"
-        f"import test_dataloader; test_dataloader.lie_where_they_are_asked_to({str(toy)!r})"
-    )
-    environment = {**os.environ, "JAX_PLATFORMS": "cpu"}
-    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
+    code = f"import test_dataloader; test_dataloader.lie_where_they_are_asked_to({str(toy)!r})"
+    run_on(2, "assert len(jax.devices()) == 2;" + code, JAX_PLATFORMS="cpu")
 
 
 def test_torch_batches_lie_where_they_are_asked_to(toy: Path) -> None:

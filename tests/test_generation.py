@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import yaml
 from numpy.testing import assert_allclose, assert_array_equal
-from tiny import CONFIG, CROWDED, changed, command, everything, ran, ran_here, same
+from tiny import CONFIG, CROWDED, changed, command, everything, ran, ran_here, run_on, same
 
 import gen2d
 from gen2d.errors import ConfigError, FolderError, UserError
@@ -106,12 +106,7 @@ def test_a_video_does_not_depend_on_the_number_of_devices(tiny: Path, tmp_path: 
     config.write_text(yaml.safe_dump(CONFIG))
     for devices in {1, 3} - {len(jax.devices())}:  # those of this process made the other
         out = tmp_path / str(devices)
-        code = (
-            f"import jax; jax.config.update('jax_num_cpu_devices', {devices}); jax.devices();"
-            f"from gen2d.generation import generate; generate({str(config)!r}, {N}, {str(out)!r})"
-        )
-        words, environment = command()
-        subprocess.run([words[0], "-c", code], env=environment, check=True, timeout=300)
+        run_on(devices, f"from gen2d.generation import generate; generate({str(config)!r}, {N}, {str(out)!r})")
         same(everything(tiny), everything(out))
 
 

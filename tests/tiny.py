@@ -53,6 +53,15 @@ def ran(*arguments: object, cwd: Path | None = None, **changes: str) -> subproce
     return subprocess.run(words, env=environment, cwd=cwd, capture_output=True, text=True, timeout=300, check=False)
 
 
+def run_on(devices: int, code: str, **changes: str) -> None:
+    """Runs code in a process of its own that has so many CPU devices, in the folder of the tests; fails if it fails."""
+    first = f"import jax; jax.config.update('jax_num_cpu_devices', {devices}); jax.devices();"
+    words, environment = command(**changes)
+    words, here = [words[0], "-c", first + code], Path(__file__).parent
+    done = subprocess.run(words, env=environment, cwd=here, capture_output=True, text=True, timeout=300, check=False)
+    assert done.returncode == 0, done.stderr
+
+
 def ran_here(*arguments: object, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
     """What `ran` returns, of the same command line in this process: starting one takes seconds."""
     words, out, told = [*map(str, arguments)], io.StringIO(), io.StringIO()
