@@ -16,11 +16,11 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from gen2d.config import load_config
-    from gen2d.dataloader import DataLoader
     from gen2d.exporting import export
     from gen2d.generation import generate
-    from gen2d.loader import open
-    from gen2d.mixing import mix
+    from gen2d.loading.dataloader import DataLoader
+    from gen2d.loading.dataset import open
+    from gen2d.loading.mixture import mix
     from gen2d.redraw import render, simulate_again
     from gen2d.space import Space
     from gen2d.streaming import stream
@@ -33,13 +33,13 @@ __all__ = [
 ]  # fmt: skip
 
 _HOME = {
-    "DataLoader": "gen2d.dataloader",
+    "DataLoader": "gen2d.loading.dataloader",
     "Space": "gen2d.space",
     "export": "gen2d.exporting",
     "generate": "gen2d.generation",
     "load_config": "gen2d.config",
-    "mix": "gen2d.mixing",
-    "open": "gen2d.loader",
+    "mix": "gen2d.loading.mixture",
+    "open": "gen2d.loading.dataset",
     "render": "gen2d.redraw",
     "simulate_again": "gen2d.redraw",
     "stream": "gen2d.streaming",

@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from gen2d import __version__
-from gen2d.errors import DamagedError, UserError
-from gen2d.remote import Place, place, reading
+from gen2d.core.errors import DamagedError, UserError
+from gen2d.storage.paths import Place, place, reading
 
 VERBS = {
     "verify": "check a dataset against its checksums, or its recipe, and repair it",
@@ -179,7 +179,7 @@ def generate(arguments: Sequence[str]) -> int:
 
 
 def _told(summary: Any) -> str:
-    from gen2d.report import in_bytes, in_time
+    from gen2d.core.humanize import in_bytes, in_time
 
     if not summary.made:
         ready = "is complete" if summary.complete else "has all of this worker's shards"
@@ -261,8 +261,8 @@ def preview(arguments: Sequence[str]) -> int:
 def export(arguments: Sequence[str]) -> int:
     """0, and what was made."""
     options = _verb_parser("export").parse_args(arguments)
+    from gen2d.core.humanize import in_bytes, in_time
     from gen2d.exporting import export as write
-    from gen2d.report import in_bytes, in_time
 
     made = write(
         options.dataset,

@@ -14,12 +14,12 @@ from typing import Any
 import yaml
 
 from gen2d import matched, plugins, quality
-from gen2d.codecs import CODECS
+from gen2d.core.errors import ConfigError
 from gen2d.distributions import Distribution
-from gen2d.errors import ConfigError
 from gen2d.laws import Law
 from gen2d.options import NO_COPIES, Copies, Plugin, build, coordinates, named, option, plain_of, plugin_of
 from gen2d.splits import CHANGES, Split, laws_of, with_splits
+from gen2d.storage.codecs import CODECS
 
 MAX_SEED = 2**63 - 1
 MAX_SLOTS = 254  # a slot's mask id is one byte, 0 is the background

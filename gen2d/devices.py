@@ -17,7 +17,7 @@ import numpy as np
 import zstandard
 
 from gen2d import __version__
-from gen2d.errors import UserError
+from gen2d.core.errors import UserError
 
 DEVICES = ("auto", "cpu", "gpu")
 Device = Any  # jax.Device, which jax declares in a way that type checkers do not take

@@ -11,10 +11,10 @@ from types import ModuleType
 from typing import Any
 
 from gen2d import exports
-from gen2d.errors import ConfigError, FolderError
+from gen2d.core.errors import ConfigError, FolderError
+from gen2d.core.progress import progress, stopping_on_sigterm
 from gen2d.exports import Source
-from gen2d.files import as_json, publishing, publishing_folder, read_json, sweep_beside
-from gen2d.progress import progress, stopping_on_sigterm
+from gen2d.storage.atomic import as_json, publishing, publishing_folder, read_json, sweep_beside
 
 SCHEMA = "gen2d.export/1"
 ABOUT = "export.json"  # in every folder that is made: what it is, and which files belong to it

@@ -9,7 +9,7 @@ from types import ModuleType
 import cv2
 import numpy as np
 
-from gen2d.errors import ConfigError, UserError
+from gen2d.core.errors import ConfigError, UserError
 
 LOSS = "lossy: colours at half the resolution, and rounded"  # of YUV 4:2:0
 SLOWEST = 0.1  # frames/s; OpenCV rounds rates to a thousandth

@@ -16,8 +16,8 @@ import numpy as np
 from gen2d import plugins
 from gen2d.config import load_config
 from gen2d.generation import generate
-from gen2d.loader import Dataset
-from gen2d.loader import open as open_dataset
+from gen2d.loading.dataset import Dataset
+from gen2d.loading.dataset import open as open_dataset
 from gen2d.preview import GAP, check_folder, check_videos, contact_sheet, enlarged, is_dataset, shown, write, writing
 from gen2d.redraw import config_of, render
 

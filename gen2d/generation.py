@@ -14,15 +14,16 @@ from typing import Any
 import jax
 import numpy as np
 
-from gen2d import devices, shards
+from gen2d import devices
 from gen2d.config import Config, checked_seed, load_config, own_files
-from gen2d.errors import ConfigError, FolderError, UserError
+from gen2d.core.errors import ConfigError, FolderError, UserError
+from gen2d.core.humanize import in_bytes, in_time
+from gen2d.core.progress import progress, stopping_on_sigterm
+from gen2d.dataset import folder as shards
+from gen2d.dataset.folder import Block, Dataset, Shard
 from gen2d.pipeline import Encoder, Job, Writers, batches, jobs_of, threads_for
-from gen2d.progress import progress, stopping_on_sigterm
-from gen2d.remote import Place, place
-from gen2d.report import in_bytes, in_time
 from gen2d.rollout import Batch, Rollout, divisor
-from gen2d.shards import Block, Dataset, Shard
+from gen2d.storage.paths import Place, place
 
 MAX_VIDEOS = 2**32 - 1
 CONVENTIONS = (

@@ -18,9 +18,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from gen2d import factors, plugins
+from gen2d.core.schema import Field
 from gen2d.distributions import Distribution
 from gen2d.factors import key_for
-from gen2d.fields import Field
 from gen2d.options import drawn_options
 from gen2d.parts import Sampled
 from gen2d.types import DYNAMIC, Array, Layout, Objects, Scene, State, Trajectory

@@ -8,10 +8,11 @@ from collections.abc import Mapping
 from types import MappingProxyType, ModuleType
 from typing import Any
 
-from gen2d import files, plugins
+from gen2d import plugins
+from gen2d.core.errors import ConfigError
 from gen2d.distributions import Distribution
-from gen2d.errors import ConfigError
 from gen2d.factors import is_number, parse
+from gen2d.storage import atomic as files
 
 Copies = Mapping[str, bytes]  # what files of the user's own held, by their names in the config
 NO_COPIES: Copies = MappingProxyType({})

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 
 from gen2d import films
-from gen2d.errors import ConfigError
+from gen2d.core.errors import ConfigError
 from gen2d.preview import animate
 from gen2d.space import Body, Poses, Space, Video
 from gen2d.types import DYNAMIC

@@ -13,11 +13,11 @@ from concurrent.futures import Future, ThreadPoolExecutor
 
 import numpy as np
 
-from gen2d import shards
 from gen2d.config import Plugin
-from gen2d.errors import UserError
+from gen2d.core.errors import UserError
+from gen2d.dataset import folder as shards
+from gen2d.dataset.folder import Block, Dataset, Shard
 from gen2d.rollout import Batch, Rollout, parts
-from gen2d.shards import Block, Dataset, Shard
 from gen2d.types import Array
 
 Piece = tuple[Shard, int, int]  # a shard's videos among those of a batch: lanes from the first to before the second

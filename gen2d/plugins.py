@@ -8,9 +8,9 @@ import pkgutil
 import sys
 from types import ModuleType
 
-from gen2d.errors import ConfigError
+from gen2d.core.errors import ConfigError
 
-FOLDERS = {"scene": "gen2d.scenes", "look": "gen2d.renderers", "format": "gen2d.formats"}
+FOLDERS = {"scene": "gen2d.scenes", "look": "gen2d.renderers", "format": "gen2d.dataset.block"}
 
 
 def nearest(name: str, names: list[str]) -> str:

@@ -5,8 +5,8 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 
+from gen2d.core.schema import Field
 from gen2d.factors import key_for
-from gen2d.fields import Field
 from gen2d.types import DYNAMIC, Array, Scene, State, Trajectory
 
 FIELDS = {

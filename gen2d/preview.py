@@ -8,10 +8,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from gen2d.errors import FolderError, UserError
-from gen2d.loader import Dataset
-from gen2d.loader import open as open_dataset
-from gen2d.remote import Url, place
+from gen2d.core.errors import FolderError, UserError
+from gen2d.loading.dataset import Dataset
+from gen2d.loading.dataset import open as open_dataset
+from gen2d.storage.paths import Url, place
 
 COLUMNS = 10  # frames across the sheet
 LARGEST = 192  # px: of a frame on a dataset's card

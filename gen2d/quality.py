@@ -12,9 +12,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gen2d.errors import UserError
+from gen2d.core.errors import UserError
+from gen2d.core.schema import Field
 from gen2d.factors import key_for
-from gen2d.fields import Field
 from gen2d.types import Array
 
 FIELD = Field("int32", "n", "1", "scenes drawn again as they were not of the kind that was asked for")

@@ -15,19 +15,20 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gen2d import annotations, drawing, factors, loader, matched, types
+from gen2d import annotations, drawing, factors, matched, types
 from gen2d.camera import View
 from gen2d.config import AnnotationOptions, Config, load_config, own_files
-from gen2d.errors import ConfigError
-from gen2d.loader import Dataset
-from gen2d.manifest import field_of
+from gen2d.core.errors import ConfigError
+from gen2d.dataset.manifest import field_of
+from gen2d.loading import dataset as loader
+from gen2d.loading.dataset import Dataset
+from gen2d.loading.protocols import Numbers
 from gen2d.options import named
 from gen2d.picture import Plan, Stage, on_cpu
-from gen2d.remote import Place, reading
 from gen2d.rollout import Rollout, keep_of, rules_of
 from gen2d.simulate import simulate, substeps
+from gen2d.storage.paths import Place, reading
 from gen2d.types import Array, Joints, Layout, Objects, Scene, State
-from gen2d.videos import Numbers
 
 Columns = Mapping[str, Any]
 POINTS = 8  # of each object, where tracks are asked for that the config does not have

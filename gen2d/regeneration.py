@@ -7,18 +7,20 @@ from typing import Any
 
 import numpy as np
 
-from gen2d import devices, loader, shards
-from gen2d.codecs import decode_into
+from gen2d import devices
 from gen2d.config import Config
-from gen2d.errors import DamagedError, FolderError
-from gen2d.files import read_sealed
+from gen2d.core.errors import DamagedError, FolderError
+from gen2d.dataset import folder as shards
+from gen2d.dataset.folder import Block, Dataset
+from gen2d.dataset.manifest import SEAL, identity_of, read_manifest
 from gen2d.generation import dataset_of, make, rollouts_of
-from gen2d.manifest import SEAL, identity_of, read_manifest
+from gen2d.loading import dataset as loader
 from gen2d.pipeline import Encoder, Piece, threads_for
 from gen2d.redraw import config_from
-from gen2d.remote import Place, place
 from gen2d.rollout import Rollout
-from gen2d.shards import Block, Dataset
+from gen2d.storage.atomic import read_sealed
+from gen2d.storage.codecs import decode_into
+from gen2d.storage.paths import Place, place
 
 Identity = Mapping[str, Any]  # of a dataset; its manifest has the same keys
 

@@ -21,7 +21,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from gen2d import annotations, drawing, factors, matched, predictability, quality, sampling, types, words
 from gen2d.config import Config, PhysicsOptions
-from gen2d.fields import Field
+from gen2d.core.schema import Field
 from gen2d.parts import Sampled
 from gen2d.picture import Stage
 from gen2d.rows import Rules

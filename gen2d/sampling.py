@@ -15,12 +15,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from gen2d.config import Config
+from gen2d.core.schema import Field
 from gen2d.distributions import Span
 from gen2d.factors import key_for, keys_for
-from gen2d.fields import Field
 from gen2d.laws import Law
+from gen2d.loading.epochs import hashed, order
 from gen2d.options import Option, Plugin, coordinates, drawn_options
-from gen2d.order import hashed, order
 from gen2d.parts import Sampled
 from gen2d.types import Array
 

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 
 from gen2d import joints, ledger, linkage
-from gen2d.errors import ConfigError
+from gen2d.core.errors import ConfigError
 from gen2d.rows import Motion, Rules
 from gen2d.scenery import cleaned, moving, padded, scenery_of, slots_of
 from gen2d.solver import Body, Scenery, World, step

@@ -28,7 +28,7 @@ import numpy as np
 from gen2d import shapes
 from gen2d.config import PhysicsOptions, build
 from gen2d.contacts import touches
-from gen2d.errors import ConfigError
+from gen2d.core.errors import ConfigError
 from gen2d.forms import form_of, placed
 from gen2d.rollout import rules_of
 from gen2d.rows import Rules

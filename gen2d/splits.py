@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from gen2d import plugins
-from gen2d.errors import ConfigError
+from gen2d.core.errors import ConfigError
 from gen2d.laws import Law, Parts, common, hull, law_of
 from gen2d.options import Plugin, check_plugin, coordinates, drawn_options, value_of
 

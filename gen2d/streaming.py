@@ -20,13 +20,13 @@ import numpy as np
 
 from gen2d import devices
 from gen2d.config import Config, checked_seed, load_config
-from gen2d.dataloader import without_text
-from gen2d.errors import ConfigError
-from gen2d.fields import Field
+from gen2d.core.errors import ConfigError
+from gen2d.core.schema import Field
 from gen2d.generation import MAX_VIDEOS
-from gen2d.loader import Options, chosen_fields
-from gen2d.order import Step, Walk, one_of, shuffled
-from gen2d.pieces import LAYOUTS
+from gen2d.loading.chunks import LAYOUTS
+from gen2d.loading.dataloader import without_text
+from gen2d.loading.dataset import Options, chosen_fields
+from gen2d.loading.epochs import Step, Walk, one_of, shuffled
 from gen2d.pipeline import check_placed
 from gen2d.rollout import Batch, Rollout, divisor
 from gen2d.types import Array

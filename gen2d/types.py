@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gen2d.fields import Field
+from gen2d.core.schema import Field
 
 Array = jax.Array
 Record = TypeVar("Record")

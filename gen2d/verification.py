@@ -13,14 +13,14 @@ from typing import Any
 import h5py
 import numpy as np
 
-from gen2d import loader
-from gen2d.cards import croissant
-from gen2d.errors import ConfigError, DamagedError, FolderError
-from gen2d.files import as_json, file_sha256, sealed, sha256, size_of
-from gen2d.manifest import MARK_SEAL, field_of, read_manifest, read_record
-from gen2d.order import order
-from gen2d.plan import IDENTITY, MARK, mark_path, record_path, shard_path, table_path
-from gen2d.remote import Place, Url, download, place, reading
+from gen2d.core.errors import ConfigError, DamagedError, FolderError
+from gen2d.dataset.cards import croissant
+from gen2d.dataset.manifest import MARK_SEAL, field_of, read_manifest, read_record
+from gen2d.dataset.spec import IDENTITY, MARK, mark_path, record_path, shard_path, table_path
+from gen2d.loading import dataset as loader
+from gen2d.loading.epochs import order
+from gen2d.storage.atomic import as_json, file_sha256, sealed, sha256, size_of
+from gen2d.storage.paths import Place, Url, download, place, reading
 
 LEVELS = ("quick", "full", "regen")
 VIDEOS = 8  # made again, unless told otherwise

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from gen2d.fields import Field
+from gen2d.core.schema import Field
 
 Columns = Mapping[str, np.ndarray]
 

@@ -69,7 +69,8 @@ def _parts(folder: Path, sets: Sequence[str], config: str = CONFIG) -> dict[str,
     """For each stage of gen2d what does it for a batch, and of how many videos."""
     import jax
 
-    from gen2d import devices, pipeline, shards
+    from gen2d import devices, pipeline
+    from gen2d.dataset import folder as shards
     from gen2d.generation import dataset_of
 
     rollout = rollout_of(sets, config)
@@ -158,7 +159,8 @@ def steady(folder: Path, videos: int = 4096, turns: int = 3, peer_videos: int = 
 
 def make(rollout: Any, videos: int, out: Path) -> None:
     """Returns nothing; makes a dataset as `gen2d.generate` does, with programs that are compiled already."""
-    from gen2d import devices, pipeline, shards
+    from gen2d import devices, pipeline
+    from gen2d.dataset import folder as shards
     from gen2d.generation import dataset_of
 
     dataset = dataset_of(rollout, out, {"train": videos})

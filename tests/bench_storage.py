@@ -15,8 +15,10 @@ import numpy as np
 import synthetic
 from timing import timed
 
-from gen2d import codecs, loader, shards
-from gen2d.fields import Field
+from gen2d.core.schema import Field
+from gen2d.dataset import folder as shards
+from gen2d.loading import dataset as loader
+from gen2d.storage import codecs
 
 FIELDS = {
     "frames": Field("uint8", "n T H W 3", "sRGB", "what is seen"),

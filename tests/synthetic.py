@@ -5,11 +5,11 @@ from pathlib import Path
 
 import numpy as np
 
-from gen2d import shards
-from gen2d.fields import Field
-from gen2d.formats import hdf5
-from gen2d.remote import Place
-from gen2d.shards import Dataset, Shard
+from gen2d.core.schema import Field
+from gen2d.dataset import folder as shards
+from gen2d.dataset import hdf5
+from gen2d.dataset.folder import Dataset, Shard
+from gen2d.storage.paths import Place
 
 FIELDS = {
     "frames": Field("uint8", "n T H W 3", "sRGB", "what is seen"),

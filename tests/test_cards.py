@@ -13,9 +13,10 @@ import pytest
 import synthetic
 from numpy.testing import assert_array_equal
 
-from gen2d import codecs, preview
-from gen2d.files import file_sha256
-from gen2d.manifest import read_manifest
+from gen2d import preview
+from gen2d.dataset.manifest import read_manifest
+from gen2d.storage import codecs
+from gen2d.storage.atomic import file_sha256
 from gen2d.verification import verify
 
 

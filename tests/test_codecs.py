@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from gen2d import codecs
-from gen2d.errors import DamagedError
+from gen2d.core.errors import DamagedError
+from gen2d.storage import codecs
 
 SHAPES = hnp.array_shapes(min_dims=0, max_dims=4, min_side=0, max_side=7)
 ARRAYS = st.sampled_from([np.uint8, np.bool_, np.float16, np.int32]).flatmap(lambda dtype: hnp.arrays(dtype, SHAPES))

@@ -10,7 +10,7 @@ from tiny import CONFIG, changed
 
 from gen2d import plugins
 from gen2d.config import MAX_SEED, load_config, parse_yaml
-from gen2d.errors import ConfigError
+from gen2d.core.errors import ConfigError
 from gen2d.factors import parse
 
 BAD = {

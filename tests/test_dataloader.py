@@ -13,10 +13,10 @@ import synthetic
 from numpy.testing import assert_array_equal
 from tiny import run_on
 
-from gen2d import loader
-from gen2d.dataloader import DataLoader
-from gen2d.errors import ConfigError
-from gen2d.order import order
+from gen2d.core.errors import ConfigError
+from gen2d.loading import dataset as loader
+from gen2d.loading.dataloader import DataLoader
+from gen2d.loading.epochs import order
 
 TRAIN = 20
 

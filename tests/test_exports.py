@@ -21,8 +21,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 import gen2d
 from gen2d import exporting, exports
-from gen2d.errors import ConfigError, FolderError, UserError
-from gen2d.fields import Field
+from gen2d.core.errors import ConfigError, FolderError, UserError
+from gen2d.core.schema import Field
 
 SIZES = {"T": 6, "H": 64, "W": 48, "K": 3}
 TRAIN = 10

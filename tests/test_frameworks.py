@@ -10,7 +10,7 @@ import synthetic
 from numpy.testing import assert_array_equal
 
 import gen2d
-from gen2d import loader
+from gen2d.loading import dataset as loader
 
 FIELDS = ("index", "frames", "states/*")
 

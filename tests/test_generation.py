@@ -17,7 +17,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from tiny import CONFIG, CROWDED, changed, command, everything, ran, ran_here, run_on, same
 
 import gen2d
-from gen2d.errors import ConfigError, FolderError, UserError
+from gen2d.core.errors import ConfigError, FolderError, UserError
 from gen2d.generation import generate
 from gen2d.rollout import Rollout
 
@@ -245,7 +245,7 @@ def test_splits_grow_apart_whatever_the_workers(tmp_path: Path):
 
 
 def test_a_disk_too_small_is_refused_before_it_starts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("gen2d.shards.free_bytes", lambda path: 1000)
+    monkeypatch.setattr("gen2d.dataset.folder.free_bytes", lambda path: 1000)
     with pytest.raises(FolderError, match="has 1.0 kB free".replace(".", "[.]")):
         generate(CONFIG, 64, tmp_path / "data")
 

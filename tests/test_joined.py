@@ -12,11 +12,11 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
 import gen2d
-from gen2d import loader
-from gen2d.errors import ConfigError, FolderError, UserError
-from gen2d.fields import Field
+from gen2d.core.errors import ConfigError, FolderError, UserError
+from gen2d.core.schema import Field
+from gen2d.loading import dataset as loader
+from gen2d.loading.protocols import Joined
 from gen2d.redraw import render
-from gen2d.videos import Joined
 
 COUNTS = {3: 20, 4: 9, 5: 1}  # videos by seed
 TOTAL = 30

@@ -12,8 +12,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from gen2d import cuts, factors
 from gen2d.config import load_config
+from gen2d.core.errors import ConfigError
 from gen2d.distributions import Distribution, Span, after
-from gen2d.errors import ConfigError
 from gen2d.factors import parse
 from gen2d.laws import common, law_of
 from gen2d.sampling import Sampler

@@ -13,8 +13,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_array_equal
 
-from gen2d import loader, pieces
-from gen2d.errors import ConfigError, FolderError
+from gen2d.core.errors import ConfigError, FolderError
+from gen2d.loading import chunks as pieces
+from gen2d.loading import dataset as loader
 
 TRAIN = 20
 AXES = {"THWC": (0, 1, 2, 3, 4), "TCHW": (0, 1, 4, 2, 3), "CTHW": (0, 4, 1, 2, 3)}
@@ -163,6 +164,6 @@ def test_files_are_closed_when_many_are_open(tmp_path: Path) -> None:
 
 
 def test_no_jax_is_imported() -> None:
-    code = "import sys, gen2d.dataloader; assert 'jax' not in sys.modules and 'h5py' not in sys.modules;"
-    code += "import gen2d.shards, gen2d.verification; assert 'jax' not in sys.modules"
+    code = "import sys, gen2d.loading.dataloader; assert 'jax' not in sys.modules and 'h5py' not in sys.modules;"
+    code += "import gen2d.dataset.folder, gen2d.verification; assert 'jax' not in sys.modules"
     subprocess.run([sys.executable, "-c", code], check=True)

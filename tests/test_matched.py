@@ -13,7 +13,7 @@ from tiny import everything
 import gen2d
 from gen2d import matched
 from gen2d.config import load_config
-from gen2d.errors import ConfigError, FolderError
+from gen2d.core.errors import ConfigError, FolderError
 from gen2d.parts import assembled, boxes, capsules, discs
 from gen2d.sampling import Sampler
 from gen2d.types import STATIC, Layout

@@ -14,9 +14,9 @@ from hypothesis import strategies as st
 from numpy.testing import assert_array_equal
 
 import gen2d
-from gen2d import loader
-from gen2d.errors import ConfigError
-from gen2d.mixing import Mixture, turns
+from gen2d.core.errors import ConfigError
+from gen2d.loading import dataset as loader
+from gen2d.loading.mixture import Mixture, turns
 
 WEIGHTS = {"a": 0.5, "b": 0.3, "c": 0.2}
 

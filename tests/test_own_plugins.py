@@ -14,9 +14,9 @@ from test_verification import flip
 from tiny import changed
 
 import gen2d
-from gen2d import shards
 from gen2d.config import load_config
-from gen2d.errors import ConfigError, FolderError
+from gen2d.core.errors import ConfigError, FolderError
+from gen2d.dataset import folder as shards
 from gen2d.generation import generate
 from gen2d.redraw import config_of
 from gen2d.regeneration import repair

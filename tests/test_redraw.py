@@ -5,7 +5,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 import gen2d
-from gen2d.errors import ConfigError
+from gen2d.core.errors import ConfigError
 
 SMALL = ["storage.lanes=4", "video.frames=8", "video.height=32", "video.width=48", "annotations.masks=true"]
 CASES = {

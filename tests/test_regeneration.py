@@ -10,11 +10,12 @@ import pytest
 from test_verification import flip
 from tiny import changed, ran
 
-from gen2d import codecs, shards
-from gen2d.errors import FolderError
-from gen2d.files import as_json, file_sha256, sealed
+from gen2d.core.errors import FolderError
+from gen2d.dataset import folder as shards
 from gen2d.generation import generate
 from gen2d.regeneration import repair
+from gen2d.storage import codecs
+from gen2d.storage.atomic import as_json, file_sha256, sealed
 from gen2d.verification import checked, chosen_videos, verify
 
 BY_HAND = ("README.md",)  # what people may have written in, so that only its absence is told

@@ -24,12 +24,14 @@ from buckets import Request, Server
 from numpy.testing import assert_array_equal
 
 import gen2d
-from gen2d import loader, remote, shards
-from gen2d.dataloader import DataLoader
-from gen2d.errors import ConfigError, DamagedError, FolderError, UserError
-from gen2d.files import sweep
-from gen2d.formats import hdf5
-from gen2d.remote import Range, Url, place
+from gen2d.core.errors import ConfigError, DamagedError, FolderError, UserError
+from gen2d.dataset import folder as shards
+from gen2d.dataset import hdf5
+from gen2d.loading import dataset as loader
+from gen2d.loading.dataloader import DataLoader
+from gen2d.storage import paths as remote
+from gen2d.storage.atomic import sweep
+from gen2d.storage.paths import Range, Url, place
 
 TOY = "s3://bucket/toy"
 
@@ -404,7 +406,7 @@ WRITING = """
 import sys
 sys.path.insert(0, sys.argv[1])
 import synthetic
-from gen2d.remote import place
+from gen2d.storage.paths import place
 synthetic.make(synthetic.dataset(place(sys.argv[2])))
 """
 

@@ -11,7 +11,7 @@ from laws import holds
 from tiny import ran
 
 from gen2d.config import load_config
-from gen2d.errors import ConfigError
+from gen2d.core.errors import ConfigError
 from gen2d.rollout import rules_of
 from gen2d.sampling import Sampler
 from gen2d.simulate import Keep, simulate, substeps

@@ -17,7 +17,7 @@ from tiny import everything
 
 import gen2d
 from gen2d.config import Config, load_config
-from gen2d.errors import ConfigError
+from gen2d.core.errors import ConfigError
 from gen2d.generation import generate
 from gen2d.rollout import keep_of, rules_of
 from gen2d.sampling import Sampler

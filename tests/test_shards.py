@@ -19,9 +19,10 @@ import pytest
 import synthetic
 from numpy.testing import assert_allclose, assert_array_equal
 
-from gen2d import codecs, shards
-from gen2d.errors import DamagedError, FolderError
-from gen2d.formats import hdf5
+from gen2d.core.errors import DamagedError, FolderError
+from gen2d.dataset import folder as shards
+from gen2d.dataset import hdf5
+from gen2d.storage import codecs
 
 CODECS = pytest.mark.parametrize("codec", codecs.CODECS)
 DEAD = 2**22 + 1  # above the largest process number of Linux
@@ -277,8 +278,8 @@ import resource, signal, sys
 from pathlib import Path
 sys.path.insert(0, {tests!r})
 import synthetic
-from gen2d import shards
-from gen2d.errors import FolderError
+from gen2d.dataset import folder as shards
+from gen2d.core.errors import FolderError
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 made = synthetic.dataset(Path({root!r}))
 shard = shards.open_folder(made)[1]
@@ -319,7 +320,7 @@ import sys, time
 from pathlib import Path
 sys.path.insert(0, {tests!r})
 import synthetic
-from gen2d import shards
+from gen2d.dataset import folder as shards
 made = synthetic.dataset(Path({root!r}), codec={codec!r})
 todo = shards.open_folder(made)
 shards.write(made, todo[1], synthetic.blocks(made, todo[1]))
@@ -353,7 +354,7 @@ import os, random, signal, sys, time
 from pathlib import Path
 sys.path.insert(0, {tests!r})
 import synthetic
-from gen2d import shards
+from gen2d.dataset import folder as shards
 def work(made, number):
     for shard in shards.mine(shards.open_folder(made), number, 3):
         shards.write(made, shard, synthetic.blocks(made, shard))

@@ -11,7 +11,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 import gen2d
 from gen2d import space as space_module
-from gen2d.errors import ConfigError
+from gen2d.core.errors import ConfigError
 from gen2d.simulate import simulate
 from gen2d.space import Space
 from gen2d.types import to_device, to_stored

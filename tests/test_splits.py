@@ -10,9 +10,9 @@ from synthetic import tree
 import gen2d
 from gen2d import devices, factors, quality
 from gen2d.config import load_config
-from gen2d.errors import ConfigError
+from gen2d.core.errors import ConfigError
 from gen2d.laws import common
-from gen2d.order import hashed
+from gen2d.loading.epochs import hashed
 from gen2d.rollout import Batch, Rollout
 from gen2d.sampling import Sampler
 

@@ -13,7 +13,7 @@ from numpy.testing import assert_array_equal
 from tiny import CONFIG, CROWDED, changed
 
 import gen2d
-from gen2d.errors import ConfigError
+from gen2d.core.errors import ConfigError
 from gen2d.pipeline import NoPlaceError
 from gen2d.streaming import Stream, cell_size
 

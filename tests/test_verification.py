@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 import synthetic
 
-from gen2d import loader, shards
-from gen2d.errors import ConfigError, DamagedError, FolderError
+from gen2d.core.errors import ConfigError, DamagedError, FolderError
+from gen2d.dataset import folder as shards
+from gen2d.loading import dataset as loader
 from gen2d.verification import damaged_shards, verify
 
 

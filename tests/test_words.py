@@ -20,8 +20,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 import gen2d
 from gen2d import words
 from gen2d.config import load_config
-from gen2d.errors import ConfigError
-from gen2d.fields import Field
+from gen2d.core.errors import ConfigError
+from gen2d.core.schema import Field
 
 TEXT = {
     "text/name": Field("S24", "n", "UTF-8", "of the video"),

@@ -10,7 +10,7 @@ import pkgutil
 from types import ModuleType
 from typing import Any
 
-from gen2d.fields import Field
+from gen2d.core.schema import Field
 from gen2d.picture import Plan, Stage
 from gen2d.types import Array
 

@@ -2,7 +2,7 @@
 
 import jax.numpy as jnp
 
-from gen2d.fields import Field
+from gen2d.core.schema import Field
 from gen2d.picture import Plan, Stage, each_video
 from gen2d.raster import alone
 from gen2d.types import Array

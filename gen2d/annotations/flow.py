@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 
 from gen2d.camera import pixel_at, to_pixels
-from gen2d.fields import Field
+from gen2d.core.schema import Field
 from gen2d.figures import Instants, Window
 from gen2d.layers import OCCLUDER
 from gen2d.picture import Plan, Stage, on_cpu, patch_of

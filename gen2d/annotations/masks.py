@@ -1,6 +1,6 @@
 """Which object each pixel shows: the one of which most is seen in it."""
 
-from gen2d.fields import Field
+from gen2d.core.schema import Field
 from gen2d.picture import Plan, Stage
 from gen2d.types import Array
 

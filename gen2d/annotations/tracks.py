@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from gen2d.camera import pixel_at, to_pixels
-from gen2d.fields import Field
+from gen2d.core.schema import Field
 from gen2d.paint import fraction, hashed
 from gen2d.picture import Plan, Stage
 from gen2d.types import Array, Run

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from gen2d import extents
-from gen2d.fields import Field
+from gen2d.core.schema import Field
 from gen2d.folds import folded
 from gen2d.looks import are_moving
 from gen2d.picture import Plan, Stage, each_video

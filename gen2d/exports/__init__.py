@@ -19,11 +19,11 @@ from pathlib import Path
 
 import numpy as np
 
-from gen2d import loader
-from gen2d.fields import Field
-from gen2d.formats import stored_bytes
-from gen2d.loader import Dataset
-from gen2d.videos import Batch
+from gen2d.core.schema import Field
+from gen2d.dataset.block import stored_bytes
+from gen2d.loading import dataset as loader
+from gen2d.loading.dataset import Dataset
+from gen2d.loading.protocols import Batch
 
 FRAMES = Field("uint8", "n T H W 3", "sRGB", "the video")  # as they are where they are stored
 DRAWN_BYTES = 2**26  # frames that are not stored are drawn so many at a time

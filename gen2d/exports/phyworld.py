@@ -13,10 +13,11 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from gen2d import films, loader
-from gen2d.errors import ConfigError
+from gen2d import films
+from gen2d.core.errors import ConfigError
 from gen2d.exports import Source
-from gen2d.videos import Batch
+from gen2d.loading import dataset as loader
+from gen2d.loading.protocols import Batch
 
 LOSS = f"{films.LOSS}; positions and first speeds of the balls alone"
 CAMERA = ("camera/center", "camera/scale", "camera/angle")

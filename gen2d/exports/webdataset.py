@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 
 from gen2d.exports import Source
-from gen2d.files import as_json
-from gen2d.videos import Batch
+from gen2d.loading.protocols import Batch
+from gen2d.storage.atomic import as_json
 
 LOSS = ""
 FIELDS, FIXED = ("frames", "*"), False

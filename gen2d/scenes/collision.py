@@ -11,8 +11,8 @@ import dataclasses
 
 import jax.numpy as jnp
 
+from gen2d.core.schema import Field
 from gen2d.distributions import Distribution
-from gen2d.fields import Field
 from gen2d.options import option
 from gen2d.parts import Sampled, assembled, discs
 from gen2d.placement import CLEARANCE

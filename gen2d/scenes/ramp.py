@@ -9,8 +9,8 @@ import math
 
 import jax.numpy as jnp
 
+from gen2d.core.schema import Field
 from gen2d.distributions import Distribution
-from gen2d.fields import Field
 from gen2d.options import option
 from gen2d.parts import Sampled, assembled, capsules, discs, segments
 from gen2d.types import STATIC, Array, Layout, Run

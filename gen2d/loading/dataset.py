@@ -12,15 +12,15 @@ from typing import Any, overload
 
 import numpy as np
 
-from gen2d import codecs
-from gen2d.cache import Cache
-from gen2d.errors import ConfigError, DamagedError
-from gen2d.fields import Field
-from gen2d.manifest import field_of, read_manifest
-from gen2d.order import shuffled
-from gen2d.pieces import LAYOUTS, Column, Files, Piece, Reader, forget, why
-from gen2d.remote import Place, Url, place
-from gen2d.videos import Batch, Joined, Numbers, checked_numbers, filled, item, taken_apart
+from gen2d.core.errors import ConfigError, DamagedError
+from gen2d.core.schema import Field
+from gen2d.dataset.manifest import field_of, read_manifest
+from gen2d.loading.chunks import LAYOUTS, Column, Files, Piece, Reader, forget, why
+from gen2d.loading.epochs import shuffled
+from gen2d.loading.protocols import Batch, Joined, Numbers, checked_numbers, filled, item, taken_apart
+from gen2d.storage import codecs
+from gen2d.storage.cache import Cache
+from gen2d.storage.paths import Place, Url, place
 
 
 @overload

@@ -16,9 +16,9 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from gen2d import codecs
-from gen2d.fields import Field
-from gen2d.formats import Block, Places, image_names, row_names
+from gen2d.core.schema import Field
+from gen2d.dataset.block import Block, Places, image_names, row_names
+from gen2d.storage import codecs
 
 _ZSTD = codecs.HDF5_FILTERS["zstd"][0]
 

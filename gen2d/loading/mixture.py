@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from gen2d.errors import ConfigError
-from gen2d.order import SOURCES, hashed
-from gen2d.videos import Batch, Joined, Numbers, Source, checked_numbers, item, occurring, taken_apart
+from gen2d.core.errors import ConfigError
+from gen2d.loading.epochs import SOURCES, hashed
+from gen2d.loading.protocols import Batch, Joined, Numbers, Source, checked_numbers, item, occurring, taken_apart
 
 FINEST = 1000  # a weight is taken as the nearest fraction with a denominator up to this
 Weights = Mapping[str, float] | Sequence[float]

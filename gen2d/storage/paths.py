@@ -18,7 +18,7 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path, PurePath
 from typing import Any, NamedTuple, TypeVar
 
-from gen2d.errors import FolderError
+from gen2d.core.errors import FolderError
 
 ATTEMPTS = 4
 PAUSE = 0.25  # s, before the second attempt; doubled before each that follows

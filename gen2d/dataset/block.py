@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from gen2d import codecs
-from gen2d.fields import Field
+from gen2d.core.schema import Field
+from gen2d.storage import codecs
 
 # What `Block.moments` are of, told in the manifest.
 MOMENTS_OF = "frames: every 8th frame, of it every 4th row and column; states: every frame, objects that are present"

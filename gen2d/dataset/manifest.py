@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from gen2d.errors import DamagedError, FolderError
-from gen2d.fields import Field
-from gen2d.files import as_json, file_sha256, publishing, read_sealed, sealed, sha256, unsealed
-from gen2d.formats import MOMENTS_OF, image_names, merged, row_names
-from gen2d.plan import IDENTITY, MARK, SCHEMA, Dataset, Shard, mark_path, record_path, table_path
-from gen2d.remote import Place, reading
+from gen2d.core.errors import DamagedError, FolderError
+from gen2d.core.schema import Field
+from gen2d.dataset.block import MOMENTS_OF, image_names, merged, row_names
+from gen2d.dataset.spec import IDENTITY, MARK, SCHEMA, Dataset, Shard, mark_path, record_path, table_path
+from gen2d.storage.atomic import as_json, file_sha256, publishing, read_sealed, sealed, sha256, unsealed
+from gen2d.storage.paths import Place, reading
 
 Record = Mapping[str, Any]  # of a shard that is done, as shards.py writes it
 Tables = dict[str, np.ndarray]

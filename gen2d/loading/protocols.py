@@ -5,9 +5,9 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from gen2d.errors import ConfigError
-from gen2d.fields import Field
-from gen2d.order import shuffled
+from gen2d.core.errors import ConfigError
+from gen2d.core.schema import Field
+from gen2d.loading.epochs import shuffled
 
 Batch = dict[str, np.ndarray]
 Numbers = Sequence[int] | np.ndarray

@@ -5,10 +5,11 @@ from typing import Any
 
 import numpy as np
 
-from gen2d import loader, preview
-from gen2d.files import as_json, sha256
-from gen2d.manifest import field_of, statistics
-from gen2d.remote import Place
+from gen2d import preview
+from gen2d.dataset.manifest import field_of, statistics
+from gen2d.loading import dataset as loader
+from gen2d.storage.atomic import as_json, sha256
+from gen2d.storage.paths import Place
 
 Manifest = Mapping[str, Any]
 

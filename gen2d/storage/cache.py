@@ -12,9 +12,9 @@ import re
 from collections.abc import Iterator
 from pathlib import Path
 
-from gen2d.errors import DamagedError
-from gen2d.files import file_sha256
-from gen2d.remote import Url, download
+from gen2d.core.errors import DamagedError
+from gen2d.storage.atomic import file_sha256
+from gen2d.storage.paths import Url, download
 
 _OURS = re.compile(r"[0-9a-f]{64}")
 

@@ -15,13 +15,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from gen2d.cache import Cache
-from gen2d.errors import DamagedError, FolderError
-from gen2d.files import file_sha256, sha256
-from gen2d.formats import stored_bytes
-from gen2d.manifest import field_of
-from gen2d.plan import shard_path
-from gen2d.remote import Place, Range, Url, read_ranges
+from gen2d.core.errors import DamagedError, FolderError
+from gen2d.dataset.block import stored_bytes
+from gen2d.dataset.manifest import field_of
+from gen2d.dataset.spec import shard_path
+from gen2d.storage.atomic import file_sha256, sha256
+from gen2d.storage.cache import Cache
+from gen2d.storage.paths import Place, Range, Url, read_ranges
 
 LAYOUTS = {"THWC": (0, 1, 2, 3), "TCHW": (0, 3, 1, 2), "CTHW": (3, 0, 1, 2)}
 

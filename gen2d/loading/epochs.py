@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from gen2d.errors import ConfigError
+from gen2d.core.errors import ConfigError
 
 
 class Step(NamedTuple):

@@ -22,10 +22,22 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from gen2d import cards
-from gen2d.cards import SHEET
-from gen2d.errors import FolderError
-from gen2d.files import (
+from gen2d.core.errors import FolderError
+from gen2d.dataset import cards, hdf5
+from gen2d.dataset.block import Block, Places, encode, head, merged, stored_bytes
+from gen2d.dataset.cards import SHEET
+from gen2d.dataset.manifest import (
+    MARK_SEAL,
+    RECORD_SEAL,
+    SEAL,
+    describe,
+    identity_of,
+    read_manifest,
+    read_record,
+    write_index,
+)
+from gen2d.dataset.spec import MARK, SCHEMA, Dataset, Shard, mark_path, mine, plan, record_path, shard_path, table_path
+from gen2d.storage.atomic import (
     as_json,
     file_sha256,
     publish,
@@ -39,19 +51,7 @@ from gen2d.files import (
     sweep,
     work_folder,
 )
-from gen2d.formats import Block, Places, encode, hdf5, head, merged, stored_bytes
-from gen2d.manifest import (
-    MARK_SEAL,
-    RECORD_SEAL,
-    SEAL,
-    describe,
-    identity_of,
-    read_manifest,
-    read_record,
-    write_index,
-)
-from gen2d.plan import MARK, SCHEMA, Dataset, Shard, mark_path, mine, plan, record_path, shard_path, table_path
-from gen2d.remote import Place, Url
+from gen2d.storage.paths import Place, Url
 
 __all__ = [
     "Block", "Dataset", "Shard", "differences", "encode", "finish", "forget", "free_bytes", "head", "log", "lost",

@@ -14,7 +14,7 @@ import numpy as np
 import zstandard
 from isal import isal_zlib
 
-from gen2d.errors import DamagedError
+from gen2d.core.errors import DamagedError
 
 CODECS = ("gzip", "zstd", "none")
 

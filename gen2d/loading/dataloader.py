@@ -13,10 +13,10 @@ from typing import Any
 
 import numpy as np
 
-from gen2d.errors import ConfigError
-from gen2d.mixing import Mixture
-from gen2d.order import Step, Walk, one_of
-from gen2d.videos import Batch, Source
+from gen2d.core.errors import ConfigError
+from gen2d.loading.epochs import Step, Walk, one_of
+from gen2d.loading.mixture import Mixture
+from gen2d.loading.protocols import Batch, Source
 
 
 class DataLoader:

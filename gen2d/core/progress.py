@@ -10,7 +10,7 @@ from typing import Any
 
 from tqdm import tqdm
 
-from gen2d.report import in_time
+from gen2d.core.humanize import in_time
 
 
 @contextmanager

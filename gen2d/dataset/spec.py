@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from gen2d.fields import Field
-from gen2d.files import as_json
-from gen2d.remote import Place
+from gen2d.core.schema import Field
+from gen2d.storage.atomic import as_json
+from gen2d.storage.paths import Place
 
 SCHEMA = "gen2d.dataset/1"
 MARK = Path(".gen2d")  # the folder, inside a dataset's, of what only the program needs

@@ -16,7 +16,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from gen2d.remote import Place, Url, upload
+from gen2d.storage.paths import Place, Url, upload
 
 _HOST = socket.gethostname()
 

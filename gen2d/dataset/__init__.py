@@ -1,0 +1,1 @@
+"""A dataset's folder: what it is to hold, its shards, its manifest, its cards. Imports no jax."""
