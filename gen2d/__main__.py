@@ -11,14 +11,15 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from gen2d import __version__
-from gen2d.core.errors import DamagedError, UserError
-from gen2d.storage.paths import Place, place, reading
+from gen2d.core.errors import DamagedError, UnreachableError, UserError
+from gen2d.storage.paths import Network, Place, place, reading
 
 VERBS = {
     "verify": "check a dataset against its checksums, or its recipe, and repair it",
     "info": "tell what a dataset holds",
     "list": "list scene families, looks and configs, with all options",
     "preview": "draw a contact sheet and an animation of a dataset or a config",
+    "clean": "remove earlier snapshots of a dataset, and temporary files that nobody writes any more",
     "export": "write a dataset as films, tar files, NumPy archives or in another program's layout",
 }
 
@@ -90,6 +91,7 @@ def generating() -> Parser:
         "--worker", default="0/1", metavar="R/W", help="make every W-th shard, from the R-th on, beside other workers"
     )
     parser.add_argument("--overwrite", action="store_true", help="replace a dataset of another config or seed")
+    _add_network(parser)
     parser.add_argument("--version", action="version", version=f"gen2d {__version__}")
     return parser
 
@@ -115,6 +117,15 @@ def _verb_parser(verb: str) -> Parser:
         parser.add_argument("--json", action="store_true", help="print what was found and repaired as JSON")
     if verb == "export":
         _add_export(parser)
+    if verb in ("verify", "preview", "export"):
+        parser.add_argument(
+            "--trust",
+            action="append",
+            default=[],
+            metavar="SHA256",
+            help="let a file of code that came with the dataset run, where one has to",
+        )
+    _add_network(parser)
     if verb == "preview":
         parser.add_argument(
             "--out", type=Path, metavar="FOLDER", help="where to put the pictures (default: the current folder)"
@@ -126,6 +137,15 @@ def _verb_parser(verb: str) -> Parser:
             "--set", action="append", default=[], dest="sets", metavar="A.B=V", help="override an option of a config"
         )
     return parser
+
+
+def _add_network(parser: Parser) -> None:
+    parser.add_argument(
+        "--timeout", type=float, default=30.0, metavar="S", help="of a URL: seconds to wait for a server at a time (30)"
+    )
+    parser.add_argument(
+        "--deadline", type=float, default=300.0, metavar="S", help="of a URL: seconds for a request in all (300)"
+    )
 
 
 def _add_export(parser: Parser) -> None:
@@ -169,6 +189,8 @@ def generate(arguments: Sequence[str]) -> int:
             worker=_worker(options.worker),
             overwrite=options.overwrite,
             say=_tell,
+            timeout=options.timeout,
+            deadline=options.deadline,
         )
     except KeyboardInterrupt:
         again = [a for a in arguments if a != "--overwrite"]
@@ -194,30 +216,39 @@ def verify(arguments: Sequence[str]) -> int:
     options = _verb_parser("verify").parse_args(arguments)
     from gen2d.verification import checked
 
-    root = place(options.dataset)
+    root = _root(options)
     with reading(root):
-        if not (root / "manifest.json").exists() and not (root / ".gen2d").is_dir():
+        begun = (root / ".gen2d" / "dataset.json").exists() or (isinstance(root, Path) and (root / ".gen2d").is_dir())
+        if not begun and not (root / "manifest.json").exists():
             raise UserError(f"{root} is not a dataset that gen2d made")
     seed = secrets.randbelow(2**32) if options.seed is None else options.seed
-    outcome = checked(root, options.level, _repairing(root) if options.repair else None, options.videos, seed)
+    repair = _repairing(root, options) if options.repair else None
+    limits = {"timeout": options.timeout, "deadline": options.deadline}
+    outcome = checked(root, options.level, repair, options.videos, seed, trust=options.trust, **limits)
     if options.json:
-        about = {"dataset": options.dataset, "level": options.level, **dataclasses.asdict(outcome)}
+        about = {"dataset": f"{root}", "level": options.level, **dataclasses.asdict(outcome)}
         print(json.dumps(about | ({"videos": options.videos, "seed": seed} if options.level == "regen" else {})))
         return 1 if outcome.problems else 0
     for sentence in (*(f"repaired: {what}" for what in outcome.repaired), *outcome.problems):
         print(sentence)
     chosen = f", {options.videos} videos chosen by --seed {seed}" if options.level == "regen" else ""
-    print(f"{options.dataset}: {'damaged' if outcome.problems else 'whole'} ({options.level} check{chosen})")
+    print(f"{root}: {'damaged' if outcome.problems else 'whole'} ({options.level} check{chosen})")
     return 1 if outcome.problems else 0
 
 
-def _repairing(root: Place) -> Callable[[list[str]], list[str]]:
+def _root(options: argparse.Namespace) -> Place:
+    """The dataset that a verb is about."""
+    return place(options.dataset, Network(options.timeout, options.deadline))
+
+
+def _repairing(root: Place, options: argparse.Namespace) -> Callable[[list[str]], list[str]]:
     """What makes the shards with these names again."""
 
     def repair(names: list[str]) -> list[str]:
         from gen2d import regeneration  # imports jax: only now
 
-        return regeneration.repair(root, names, _tell)
+        limits = {"timeout": options.timeout, "deadline": options.deadline}
+        return regeneration.repair(root, names, _tell, trust=options.trust, **limits)
 
     return repair
 
@@ -227,7 +258,18 @@ def info(arguments: Sequence[str]) -> int:
     options = _verb_parser("info").parse_args(arguments)
     from gen2d.report import sheet
 
-    print(sheet(place(options.dataset)))
+    print(sheet(_root(options)))
+    return 0
+
+
+def clean(arguments: Sequence[str]) -> int:
+    """0, and what was removed."""
+    options = _verb_parser("clean").parse_args(arguments)
+    from gen2d.dataset.folder import clean as remove
+
+    root = _root(options)
+    removed = remove(root)
+    print("\n".join([*(f"removed: {name}" for name in removed), f"{root}: nothing else is left over"]))
     return 0
 
 
@@ -243,7 +285,8 @@ def listing(arguments: Sequence[str]) -> int:
 def preview(arguments: Sequence[str]) -> int:
     """0, and the names of the pictures made."""
     options = _verb_parser("preview").parse_args(arguments)
-    changes = {"seed": options.seed, "sets": options.sets}
+    changes = {"seed": options.seed, "sets": options.sets, "trust": options.trust}
+    changes |= {"timeout": options.timeout, "deadline": options.deadline}
     changes |= {} if options.videos is None else {"videos": options.videos}
     if options.gallery:
         from gen2d.gallery import families, gallery
@@ -272,6 +315,9 @@ def export(arguments: Sequence[str]) -> int:
         fields=options.fields,
         overwrite=options.overwrite,
         say=_tell,
+        trust=options.trust,
+        timeout=options.timeout,
+        deadline=options.deadline,
     )
     loss = f"\n{options.to} is {made.loss}" if made.loss else ""
     print(f"{made.videos:,} videos in {in_time(made.seconds)}, {in_bytes(made.bytes)}, in {made.out}{loss}")
@@ -279,9 +325,10 @@ def export(arguments: Sequence[str]) -> int:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """The exit code: 0, 1 for damaged data or a full disk, 2 for what the user can mend, 130 when interrupted."""
+    """The exit code: 0, 1 for damaged data or a full disk, 2 for what the user can mend, 3 where a server or a disk
+    does not answer, 130 when interrupted."""
     arguments = sys.argv[1:] if arguments is None else list(arguments)
-    verbs = {"verify": verify, "info": info, "list": listing, "preview": preview, "export": export}
+    verbs = {"verify": verify, "info": info, "list": listing, "preview": preview, "export": export, "clean": clean}
     verb = verbs.get(arguments[0]) if arguments else None
     try:
         if verb:
@@ -293,7 +340,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             known = ", ".join(VERBS)
             fail(f"{arguments[0]!r} is not a verb; there are {known}, and without a verb --config and --n", 2)
         return generate(arguments)
-    except (UserError, DamagedError) as error:
+    except (UserError, DamagedError, UnreachableError) as error:
         fail(str(error), error.exit_code)
     except KeyboardInterrupt:
         fail("stopped", 130)

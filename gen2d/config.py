@@ -17,7 +17,18 @@ from gen2d import matched, plugins, quality
 from gen2d.core.errors import ConfigError
 from gen2d.distributions import Distribution
 from gen2d.laws import Law
-from gen2d.options import NO_COPIES, Copies, Plugin, build, coordinates, named, option, plain_of, plugin_of
+from gen2d.options import (
+    NO_COPIES,
+    Copies,
+    Plugin,
+    StoredCopies,
+    build,
+    coordinates,
+    named,
+    option,
+    plain_of,
+    plugin_of,
+)
 from gen2d.splits import CHANGES, Split, laws_of, with_splits
 from gen2d.storage.codecs import CODECS
 
@@ -251,6 +262,10 @@ class Config:
         """The resolved config as YAML; read again it gives the same config."""
         return yaml.safe_dump(self.plain(), sort_keys=False)
 
+    def recipe_text(self) -> str:
+        """The recipe with its seed as YAML: what a dataset keeps, however many videos it has."""
+        return yaml.safe_dump({"name": self.name, "seed": self.seed, **self.recipe()}, sort_keys=False)
+
     @property
     def copies(self) -> Copies:
         """What the files of the user's own hold, by their names in the config."""
@@ -419,7 +434,9 @@ def from_mapping(values: Any, source: str, name: str = "dataset", copies: Copies
 
 def _with_splits(config: Config, written: Any, source: str, copies: Copies) -> Config:
     scene, splits = with_splits(config.scene, written, source)
-    plain, copies, made = config.plain(), {**copies, **config.copies}, []
+    together = {**copies, **config.copies}
+    copies = StoredCopies(together) if isinstance(copies, StoredCopies) else together
+    plain, made = config.plain(), []
     for split in splits:
         if (split.frames or 0) > config.video.frames:
             told = f"{source}: splits.{split.name}.frames is {split.frames}, but must be video.frames"
@@ -438,10 +455,17 @@ def _with_splits(config: Config, written: Any, source: str, copies: Copies) -> C
 
 def own_files(plain: Mapping[str, Any]) -> dict[str, str]:
     """The names of the user's own files in a config (`Config.plain`), by where a dataset keeps their copies."""
-    splits = {f"splits/{name}/look": split for name, split in plain.get("splits", {}).items() if "look" in split}
-    places = {kind: plain[kind] for kind in PLUGINS} | {place: split["look"] for place, split in splits.items()}
-    names = {kind: named(look).get("name", "") for kind, look in places.items()}
-    return {plugins.copy_name(kind, name): name for kind, name in names.items() if plugins.is_own(name)}
+    splits = plain.get("splits")
+    written = {f"splits/{name}/look": split for name, split in (splits or {}).items()} if _is_mapping(splits) else {}
+    looks = {place: split["look"] for place, split in written.items() if _is_mapping(split) and "look" in split}
+    places = {kind: plain[kind] for kind in PLUGINS if kind in plain} | looks
+    names = {kind: named(look).get("name", "") for kind, look in places.items() if _is_mapping(named(look))}
+    own = {kind: name for kind, name in names.items() if isinstance(name, str) and plugins.is_own(name)}
+    return {plugins.copy_name(kind, name): name for kind, name in own.items()}
+
+
+def _is_mapping(value: Any) -> bool:
+    return isinstance(value, Mapping)
 
 
 def _check_sets(config: Config, source: str) -> None:

@@ -14,7 +14,10 @@ from gen2d import exports
 from gen2d.core.errors import ConfigError, FolderError
 from gen2d.core.progress import progress, stopping_on_sigterm
 from gen2d.exports import Source
-from gen2d.storage.atomic import as_json, publishing, publishing_folder, read_json, sweep_beside
+from gen2d.storage.atomic import publishing, publishing_folder, sweep_beside
+from gen2d.storage.explain import writing_error
+from gen2d.storage.paths import Network, Place, Url, place
+from gen2d.storage.sealed import JSON_BYTES, as_json, parsed, read_bytes
 
 SCHEMA = "gen2d.export/1"
 ABOUT = "export.json"  # in every folder that is made: what it is, and which files belong to it
@@ -37,7 +40,7 @@ def formats() -> list[str]:
 
 
 def export(
-    root: str | Path,
+    root: str | Place,
     to: str,
     out: str | Path | None = None,
     *,
@@ -45,18 +48,23 @@ def export(
     fields: Sequence[str] | None = None,
     overwrite: bool = False,
     say: Callable[[str], None] | None = None,
+    trust: Sequence[str] = (),
+    timeout: float = 30.0,
+    deadline: float = 300.0,
 ) -> Exported:
     """Writes a split of a complete dataset in another format, and returns what was made.
 
     `to` names the format, `out` the folder (for phyworld the file) that is made: ROOT-FORMAT by default. `split` may be
     left out as in `open`; `fields` are names or patterns, all unless told otherwise, and only for npz and webdataset.
     Frames that are not stored are drawn. It appears when it is whole; what an earlier export of the same dataset made
-    is replaced, what another made only with `overwrite`. `say` takes lines for a person.
-    Raises ConfigError and FolderError (UserError) with one sentence, and DamagedError.
+    is replaced, what another made only with `overwrite`. `say` takes lines for a person; `trust` is that of `render`,
+    `timeout` and `deadline` are those of `open`.
+    Raises ConfigError, FolderError and UntrustedError (UserErrors) with one sentence, DamagedError, UnreachableError.
     """
     began, module = time.perf_counter(), _module(to)
-    source = exports.source_of(root, split, _patterns(to, module, fields))
-    out = Path(out) if out is not None else _beside(Path(root), f"{to}{module.SUFFIX}")
+    where = place(root, Network(timeout, deadline))
+    source = exports.source_of(where, split, _patterns(to, module, fields), trust)
+    out = Path(out) if out is not None else _beside(where, f"{to}{module.SUFFIX}")
     about = _about(source, to)
     module.check(source)
     _check_out(out, module, about, overwrite)
@@ -83,7 +91,9 @@ def _patterns(to: str, module: ModuleType, fields: Sequence[str] | None) -> Sequ
     return fields
 
 
-def _beside(root: Path, ending: str) -> Path:
+def _beside(root: Place, ending: str) -> Path:
+    if isinstance(root, Url):
+        return Path(f"{root.name}-{ending}")
     root = root.resolve() if not root.name else root
     return root.with_name(f"{root.name}-{ending}")
 
@@ -92,7 +102,11 @@ def _about(source: Source, to: str) -> dict[str, Any]:
     """What a folder's export.json says, but for its files."""
     manifest = source.ds.manifest
     shown = ("name", "seed", "fps", "sizes", "conventions", "licence", "manifest_sha256", "config_sha256")
-    about = {key: manifest[key] for key in shown} | {"schema": SCHEMA, "format": to, "split": source.ds.options.split}
+    about = {key: manifest.plain[key] for key in shown} | {
+        "schema": SCHEMA,
+        "format": to,
+        "split": source.ds.options.split,
+    }
     fields = {name: dataclasses.asdict(field) for name, field in source.fields.items()}
     return about | {"fields": fields, "videos": len(source)}
 
@@ -115,8 +129,8 @@ def _check_out(out: Path, module: ModuleType, about: Mapping[str, Any], overwrit
 
 
 def _check_folder(out: Path, about: Mapping[str, Any], overwrite: bool) -> None:
-    there = read_json(out / ABOUT) or {}
-    own = {ABOUT, *there.get("files", ())} if there.get("schema") == SCHEMA else set()
+    there = _described(out)
+    own = {ABOUT, *there["files"]} if there else set()
     foreign = {path.name for path in out.iterdir()} - own
     if foreign:
         raise FolderError(f"{out} holds {min(foreign)}, which no export made: choose another --out")
@@ -125,6 +139,15 @@ def _check_folder(out: Path, about: Mapping[str, Any], overwrite: bool) -> None:
     same = all(there.get(key) == about[key] for key in ("format", "split", "name", "seed", "config_sha256"))
     if not same and not overwrite:
         raise FolderError(f"{out} holds another export: choose another --out, or --overwrite to replace it")
+
+
+def _described(out: Path) -> dict[str, Any]:
+    """What the folder's export.json says; nothing if no export made it."""
+    try:
+        there = parsed(read_bytes(out / ABOUT, JSON_BYTES)) or {}
+    except FileNotFoundError:
+        return {}
+    return there if there.get("schema") == SCHEMA and isinstance(there.get("files"), dict) else {}
 
 
 def _written(out: Path, module: ModuleType, source: Source, about: Mapping[str, Any]) -> int:
@@ -148,4 +171,4 @@ def _explained(out: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        raise FolderError(f"{out} cannot be written ({error.strerror or error}): choose another --out") from None
+        raise writing_error(out, error) from None

@@ -20,6 +20,7 @@ from gen2d.loading.dataset import Dataset
 from gen2d.loading.dataset import open as open_dataset
 from gen2d.preview import GAP, check_folder, check_videos, contact_sheet, enlarged, is_dataset, shown, write, writing
 from gen2d.redraw import config_of, render
+from gen2d.storage.sealed import sha256
 
 LABEL = 125  # px, of the strip with a row's name
 PAGE = 1000  # px, width of a row without its name, on the page of all families
@@ -28,25 +29,37 @@ SEEN, WHOLE = (255, 255, 255), (255, 140, 0)  # boxes around what is seen, and a
 Columns = Mapping[str, np.ndarray]
 
 
-def gallery(source: str, out: Path, videos: int = 1, *, seed: int | None = None, sets: Sequence[str] = ()) -> Path:
+def gallery(
+    source: str,
+    out: Path,
+    videos: int = 1,
+    *,
+    seed: int | None = None,
+    sets: Sequence[str] = (),
+    trust: Sequence[str] = (),
+    timeout: float = 30.0,
+    deadline: float = 300.0,
+) -> Path:
     """The file made in the folder `out`, NAME-gallery.png: a row for each look and annotation, or for each of the first
     `videos` of it. The config's own look has its options, the others their defaults."""
     check_videos(videos)
     check_folder(out)
     if is_dataset(source):
-        ds = open_dataset(source)
-        looks = _looks(config_of(ds, sets).plain()["look"])
-        picture, name = _sheet(ds, videos, looks, sets), ds.manifest["name"]
+        ds = open_dataset(source, timeout=timeout, deadline=deadline)
+        looks = _looks(config_of(ds, sets, trust).plain()["look"])
+        picture, name = _sheet(ds, videos, looks, sets, trust), ds.manifest.name
     else:
-        with _made(source, videos, seed, sets) as (ds, plain):
-            picture, name = _sheet(ds, videos, _looks(plain["look"])), plain["name"]
+        with _made(source, videos, seed, sets) as (ds, plain, own):
+            picture, name = _sheet(ds, videos, _looks(plain["look"]), (), own), plain["name"]
     path = out / f"{name}-gallery.png"
     with writing(out):
         write(path, picture)
     return path
 
 
-def families(out: Path, videos: int = 1, *, seed: int | None = None, sets: Sequence[str] = ()) -> list[Path]:
+def families(
+    out: Path, videos: int = 1, *, seed: int | None = None, sets: Sequence[str] = (), **_: object
+) -> list[Path]:
     """The files made in the folder `out`: families.png with a row for each of the first `videos` of every scene family,
     in its config's own look, and the gallery of each, FAMILY-gallery.png."""
     check_videos(videos)
@@ -54,12 +67,12 @@ def families(out: Path, videos: int = 1, *, seed: int | None = None, sets: Seque
     rows, paths = [], []
     for name in plugins.names("scene"):
         own = f"{name}.yaml" in plugins.config_names()
-        with _made(name if own else {"name": name, "scene": name}, videos, seed, sets) as (ds, plain):
-            frames = np.asarray(render(ds, range(videos), look=plain["look"]))
+        with _made(name if own else {"name": name, "scene": name}, videos, seed, sets) as (ds, plain, own_files):
+            frames = np.asarray(render(ds, range(videos), look=plain["look"], trust=own_files))
             rows.append(_labelled(name, _fitted(contact_sheet(frames))))
             paths.append(out / f"{name}-gallery.png")
             with writing(out):
-                write(paths[-1], _sheet(ds, videos, _looks(plain["look"])))
+                write(paths[-1], _sheet(ds, videos, _looks(plain["look"]), (), own_files))
     with writing(out):
         write(out / "families.png", np.concatenate(rows))
     return [out / "families.png", *paths]
@@ -73,14 +86,15 @@ def _fitted(sheet: np.ndarray) -> np.ndarray:
 @contextlib.contextmanager
 def _made(
     source: str | Mapping[str, Any], videos: int, seed: int | None, sets: Sequence[str]
-) -> Iterator[tuple[Dataset, dict[str, Any]]]:
-    """A config's first videos, states alone, which last as long as the block, and the config."""
+) -> Iterator[tuple[Dataset, dict[str, Any], list[str]]]:
+    """A config's first videos, states alone, which last as long as the block, the config, and the sha256 of its own
+    files."""
     config = load_config(source, sets)
     plain, split = config.plain(), config.training.name if config.training else "train"
     bare = plain | {"look": "flat", "annotations": {}, "storage": plain["storage"] | {"frames": "none"}}
     with tempfile.TemporaryDirectory() as folder:
         generate(bare, videos, Path(folder) / "states", seed=seed, split=split)
-        yield open_dataset(Path(folder) / "states"), plain
+        yield open_dataset(Path(folder) / "states"), plain, [sha256(own) for own in config.copies.values()]
 
 
 def _looks(own: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
@@ -88,10 +102,12 @@ def _looks(own: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
     return {name: {"name": name} for name in plugins.names("look")} | {Path(own["name"]).stem: own}
 
 
-def _sheet(ds: Dataset, videos: int, looks: Mapping[str, Mapping[str, Any]], sets: Sequence[str] = ()) -> np.ndarray:
+def _sheet(
+    ds: Dataset, videos: int, looks: Mapping[str, Mapping[str, Any]], sets: Sequence[str], trust: Sequence[str]
+) -> np.ndarray:
     """All rows as one picture [H, W, 3]."""
     numbers = range(min(videos, len(ds)))
-    rows = [*_look_rows(ds, numbers, looks, sets), *_annotation_rows(ds, numbers, sets)]
+    rows = [*_look_rows(ds, numbers, looks, sets, trust), *_annotation_rows(ds, numbers, sets, trust)]
     return np.concatenate([_labelled(name, contact_sheet(frames)) for name, frames in rows])
 
 
@@ -105,19 +121,23 @@ Rows = Iterator[tuple[str, np.ndarray]]
 
 
 def _look_rows(
-    ds: Dataset, numbers: Sequence[int], looks: Mapping[str, Mapping[str, Any]], sets: Sequence[str]
+    ds: Dataset,
+    numbers: Sequence[int],
+    looks: Mapping[str, Mapping[str, Any]],
+    sets: Sequence[str],
+    trust: Sequence[str],
 ) -> Rows:
     """Each look's name and frames [n, T, H, W, 3]."""
     for name, look in looks.items():
-        yield name, np.asarray(render(ds, numbers, look=look, sets=sets))
+        yield name, np.asarray(render(ds, numbers, look=look, sets=sets, trust=trust))
 
 
-def _annotation_rows(ds: Dataset, numbers: Sequence[int], sets: Sequence[str]) -> Rows:
+def _annotation_rows(ds: Dataset, numbers: Sequence[int], sets: Sequence[str], trust: Sequence[str]) -> Rows:
     """Each annotation's name and frames [n, T, H, W, 3] that show it."""
     sets = [*sets, f"annotations.tracks={TRACKS}"]
     fields = ["masks/instance", "masks/amodal", "boxes/visible", "boxes/amodal", "flow/forward", "tracks/points"]
     fields += ["tracks/visible", "frames"]
-    found = render(ds, numbers, look="flat", sets=sets, fields=fields)
+    found = render(ds, numbers, look="flat", sets=sets, fields=fields, trust=trust)
     times = shown(found["frames"].shape[1])
     columns = {name: np.asarray(array[:, times]) for name, array in found.items()}
     fastest = np.abs(columns["flow/forward"].astype(np.float32)).max()

@@ -4,7 +4,6 @@ import contextlib
 import dataclasses
 import numbers
 import os
-import re
 import shlex
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -15,15 +14,18 @@ import jax
 import numpy as np
 
 from gen2d import devices
+from gen2d.complete import complete
 from gen2d.config import Config, checked_seed, load_config, own_files
 from gen2d.core.errors import ConfigError, FolderError, UserError
 from gen2d.core.humanize import in_bytes, in_time
 from gen2d.core.progress import progress, stopping_on_sigterm
 from gen2d.dataset import folder as shards
-from gen2d.dataset.folder import Block, Dataset, Shard
+from gen2d.dataset.block import Block
+from gen2d.dataset.spec import SPLIT, DatasetSpec, Shard, mine
 from gen2d.pipeline import Encoder, Job, Writers, batches, jobs_of, threads_for
 from gen2d.rollout import Batch, Rollout, divisor
-from gen2d.storage.paths import Place, place
+from gen2d.storage.paths import Network, Place, place, shown
+from gen2d.trust import remember
 
 MAX_VIDEOS = 2**32 - 1
 CONVENTIONS = (
@@ -64,6 +66,8 @@ def generate(
     worker: tuple[int, int] = (0, 1),
     overwrite: bool = False,
     say: Callable[[str], None] | None = None,
+    timeout: float = 30.0,
+    deadline: float = 300.0,
 ) -> Summary:
     """Makes what is missing of a dataset of `n` videos in a split, and returns what it did.
 
@@ -71,28 +75,31 @@ def generate(
     Without `split` it is "train", or each that the config has: `n` videos, or as many as it says there.
     Video i depends on the config, the seed, the split and i alone, so a run may be stopped and repeated, extended to a
     larger `n`, or shared by workers (`worker=(r, W)`: this one is number r of W). `out` is datasets/NAME by default,
-    and may be a URL that fsspec can write to.
-    `say` takes lines for a person. Raises ConfigError, FolderError or DeviceError (all UserError) with one sentence.
+    and may be a URL that fsspec can write to, with `timeout` and `deadline` as in `open`.
+    `say` takes lines for a person. Raises ConfigError, FolderError or DeviceError (all UserError), or
+    UnreachableError, with one sentence.
     """
     say = say or (lambda line: None)
     config = load_config(config, sets)
     if seed is not None:
         config = dataclasses.replace(config, seed=checked_seed(seed))
     counts = _counts(config, _check_run(n, split, worker), split)
-    out = place(out) if out is not None else Path("datasets") / config.name
+    network = Network(timeout, deadline)
+    out = place(out, network) if out is not None else Path("datasets") / config.name
+    remember(config.copies.values())
     on = devices.prepare(device)
     with contextlib.closing(Rollout(config, on)) as rollout:
         dataset = dataset_of(rollout, out, counts)
         remaining = [shard for shard in shards.open_folder(dataset, overwrite) if shard.split in counts]
-        todo = shards.mine(remaining, *worker)
+        todo = mine(remaining, *worker)
         began, made = time.perf_counter(), sum(shard.count for shard in todo)
         size = make(rollout, dataset, todo, say)
-    complete = shards.finish(dataset)
+    is_complete = complete(dataset)
     seconds = time.perf_counter() - began
     if todo:
         entry = {"time": time.time(), "host": os.uname().nodename, "videos": made, "seconds": seconds, "bytes": size}
         shards.log(out, entry | {"devices": len(on), "platform": on[0].platform})
-    return Summary(out, made, sum(counts.values()), seconds, size, complete)
+    return Summary(out, made, sum(counts.values()), seconds, size, is_complete)
 
 
 def _counts(config: Config, n: int, split: str | None) -> dict[str, int]:
@@ -121,24 +128,24 @@ def _check_run(n: Any, split: str | None, worker: tuple[int, int]) -> int:
     """n as an int, if all of it is possible."""
     if isinstance(n, bool) or not isinstance(n, numbers.Integral) or not 1 <= int(n) <= MAX_VIDEOS:
         raise ConfigError(f"--n is {n!r}, but must be a whole number from 1 to 2**32 - 1")
-    if split is not None and not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}", split):
+    if split is not None and not SPLIT.fullmatch(split):
         raise ConfigError(f"--split is {split!r}, but must be letters, digits, '.', '_' and '-', 64 at most")
     if not 0 <= worker[0] < worker[1]:
         raise ConfigError(f"--worker is {worker[0]}/{worker[1]}, but must be r/W with r from 0 to W - 1")
     return int(n)
 
 
-def dataset_of(rollout: Rollout, out: Place, counts: Mapping[str, int]) -> Dataset:
+def dataset_of(rollout: Rollout, out: Place, counts: Mapping[str, int]) -> DatasetSpec:
     """What the folder `out` is to hold."""
     config = rollout.config
-    return Dataset(
+    return DatasetSpec(
         root=out,
         name=config.name,
         fields=rollout.fields,
         sizes=rollout.sizes,
         seed=config.seed,
         config=config.recipe(),
-        config_text=config.text(),
+        config_text=config.recipe_text(),
         producer=devices.producer(rollout.devices[0], rollout.lanes),
         splits=counts,
         videos_per_shard=rollout.videos_per_shard,
@@ -152,13 +159,13 @@ def dataset_of(rollout: Rollout, out: Place, counts: Mapping[str, int]) -> Datas
     )
 
 
-def make(rollout: Rollout, dataset: Dataset, todo: list[Shard], say: Callable[[str], None]) -> int:
+def make(rollout: Rollout, dataset: DatasetSpec, todo: list[Shard], say: Callable[[str], None]) -> int:
     """The bytes written for these shards, which are done then."""
     lots = rollouts_of(rollout, [shard.split for shard in todo])
     return sum(_make(own, dataset, [shard for shard in todo if shard.split in lot], say) for own, lot in lots)
 
 
-def _make(rollout: Rollout, dataset: Dataset, todo: list[Shard], say: Callable[[str], None]) -> int:
+def _make(rollout: Rollout, dataset: DatasetSpec, todo: list[Shard], say: Callable[[str], None]) -> int:
     encoder, writers = Encoder(rollout, dataset, threads_for(devices.cores())), Writers(dataset)
     work = batches(todo, rollout.lanes)
     size = 0
@@ -231,7 +238,7 @@ def _measured(
     return block, sum((b - a) / n for a, b, n in zip(marks, marks[1:], videos, strict=False))
 
 
-def _warn_of_ratio(dataset: Dataset, block: Block, say: Callable[[str], None]) -> None:
+def _warn_of_ratio(dataset: DatasetSpec, block: Block, say: Callable[[str], None]) -> None:
     """Says so, once, where gzip does not suit the frames."""
     if "frames" not in dataset.fields:
         return
@@ -258,4 +265,4 @@ def _explained(error: Exception) -> Exception:
 
 def command(arguments: Sequence[str]) -> str:
     """The shell command that runs gen2d with these arguments."""
-    return " ".join(["python -m gen2d", *map(shlex.quote, arguments)])
+    return " ".join(["python -m gen2d", *(shlex.quote(shown(word)) for word in arguments)])

@@ -12,10 +12,14 @@ from gen2d import plugins
 from gen2d.core.errors import ConfigError
 from gen2d.distributions import Distribution
 from gen2d.factors import is_number, parse
-from gen2d.storage import atomic as files
+from gen2d.storage.sealed import sha256
 
 Copies = Mapping[str, bytes]  # what files of the user's own held, by their names in the config
 NO_COPIES: Copies = MappingProxyType({})
+
+
+class StoredCopies(dict[str, bytes]):
+    """Those that a dataset holds: its config names no other file, least of all one that lies here by chance."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -164,22 +168,24 @@ def plugin_of(kind: str, values: Any, default: str, source: str, copies: Copies)
     name = values.get("name", default)
     if not isinstance(name, str):
         raise ConfigError(f"{source}: {kind}.name is {name!r}, but must be one of {', '.join(plugins.names(kind))}")
-    content, sha256 = _content(kind, name, values, source, copies) if plugins.is_own(name) else (b"", None)
-    if values.get("sha256", sha256) != sha256:
+    content, digest = _content(kind, name, values, source, copies) if plugins.is_own(name) else (b"", None)
+    if values.get("sha256", digest) != digest:
         raise ConfigError(f"{source}: {kind}.sha256 is of another version of {name}")
     module = plugins.load(kind, name, source, content)
     options = build(module.Options, {k: v for k, v in values.items() if k not in ("name", "sha256")}, kind, source)
-    plugin = Plugin(name, module, options, sha256, content)
+    plugin = Plugin(name, module, options, digest, content)
     check_plugin(plugin, kind, source)
     return plugin
 
 
 def _content(kind: str, name: str, values: Mapping, source: str, copies: Copies) -> tuple[bytes, str]:
     """What a file of the user's own holds, and its sha256: of the copy if that is the version asked for."""
-    if name in copies and files.sha256(copies[name]) == values.get("sha256"):
+    if name in copies and sha256(copies[name]) == values.get("sha256"):
         return copies[name], values["sha256"]
+    if isinstance(copies, StoredCopies):
+        raise ConfigError(f"{source}: {kind} is {name!r}, of which the dataset holds no copy that is what was written")
     content = plugins.content_of(kind, name, source)
-    return content, files.sha256(content)
+    return content, sha256(content)
 
 
 def check_plugin(plugin: Plugin, kind: str, source: str) -> None:

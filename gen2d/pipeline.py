@@ -15,8 +15,9 @@ import numpy as np
 
 from gen2d.config import Plugin
 from gen2d.core.errors import UserError
-from gen2d.dataset import folder as shards
-from gen2d.dataset.folder import Block, Dataset, Shard
+from gen2d.dataset.block import Block, encode
+from gen2d.dataset.shard_writer import ShardWriter
+from gen2d.dataset.spec import DatasetSpec, Shard
 from gen2d.rollout import Batch, Rollout, parts
 from gen2d.types import Array
 
@@ -80,7 +81,7 @@ def jobs_of(firsts: list[int], pieces: list[list[Piece]], lanes: int, size: int)
 class Encoder:
     """Draws batches slice by slice and compresses them in threads; `blocks` gives them back in order."""
 
-    def __init__(self, rollout: Rollout, dataset: Dataset, threads: int) -> None:
+    def __init__(self, rollout: Rollout, dataset: DatasetSpec, threads: int) -> None:
         self.rollout, self.dataset = rollout, dataset
         self.pool = ThreadPoolExecutor(threads, "encode")
         self.limit = 2 * (len(rollout.devices) + threads)  # jobs in flight
@@ -94,7 +95,7 @@ class Encoder:
             own[name] = np.asarray(array)[rows.start - start : rows.stop - start]
         own["index"] = np.arange(job.first + rows.start, job.first + rows.stop, dtype=np.int64)
         own |= self.rollout.told(own, job.shard.split)
-        block = shards.encode(own, self.dataset.fields, self.dataset.codec, self.dataset.chunk_frames)
+        block = encode(own, self.dataset.fields, self.dataset.codec, self.dataset.chunk_frames)
         _check_finite(block, job.first + rows.start)
         return block
 
@@ -182,12 +183,12 @@ class _Dropped(BaseException):
 class Writers:
     """Writes blocks into shards, each in a thread, so that hashing and syncing one goes on while the next fills."""
 
-    def __init__(self, dataset: Dataset) -> None:
-        self.dataset = dataset
+    def __init__(self, dataset: DatasetSpec) -> None:
+        self.writer = ShardWriter(dataset)
         self.pool = ThreadPoolExecutor(2, "write")
         self.shard: Shard | None = None
         self.line: queue.Queue[Block | _Dropped | None] = queue.Queue()
-        self.futures: deque[Future[dict]] = deque()
+        self.futures: deque[Future[np.ndarray]] = deque()
 
     def put(self, shard: Shard, block: Block) -> None:
         """Adds a block to its shard; blocks come in order, so another shard means that the last one is whole."""
@@ -196,7 +197,7 @@ class Writers:
             while len(self.futures) > 1:
                 self.futures.popleft().result()
             self.shard, self.line = shard, queue.Queue(maxsize=16)
-            self.futures.append(self.pool.submit(shards.write, self.dataset, shard, _drained(self.line)))
+            self.futures.append(self.pool.submit(self.writer.write, shard, _drained(self.line)))
         self._send(block)
 
     def _send(self, entry: Block | _Dropped | None) -> None:
@@ -219,12 +220,14 @@ class Writers:
         for future in self.futures:
             future.result()
         self.pool.shutdown()
+        self.writer.close()
 
     def drop(self) -> None:
         """Leaves the current shard unwritten; those that are whole are finished."""
         if self.shard is not None:
             self._send(_Dropped())
         self.pool.shutdown(wait=True, cancel_futures=True)
+        self.writer.close()
 
 
 def _drained(line: queue.Queue) -> Iterator[Block]:

@@ -20,14 +20,24 @@ SMALLEST = 96  # px: smaller frames are enlarged by whole factors, so that pixel
 
 
 def preview(
-    source: str, out: Path, videos: int = 8, *, seed: int | None = None, sets: Sequence[str] = ()
+    source: str,
+    out: Path,
+    videos: int = 8,
+    *,
+    seed: int | None = None,
+    sets: Sequence[str] = (),
+    trust: Sequence[str] = (),
+    timeout: float = 30.0,
+    deadline: float = 300.0,
 ) -> list[Path]:
-    """The files made in the folder `out`: NAME-sheet.png and NAME.gif."""
+    """The files made in the folder `out`: NAME-sheet.png and NAME.gif. `trust` is that of `render`, for a dataset
+    without frames; `timeout` and `deadline` are those of `open`."""
     check_videos(videos)
     check_folder(out)
     if is_dataset(source):
-        ds = open_dataset(source)
-        name, frames, fps = ds.manifest["name"], _stored(ds, range(min(videos, len(ds)))), ds.manifest["fps"]
+        ds = open_dataset(source, timeout=timeout, deadline=deadline)
+        numbers = range(min(videos, len(ds)))
+        name, frames, fps = ds.manifest.name, _stored(ds, numbers, trust), ds.manifest.fps
     else:
         name, frames, fps = _drawn(source, videos, seed, sets)
     sheet, animation = out / f"{name}-sheet.png", out / f"{name}.gif"
@@ -65,13 +75,13 @@ def writing(out: Path) -> Iterator[None]:
         raise FolderError(f"{out}: pictures cannot be written there ({error.strerror or error})") from None
 
 
-def _stored(ds: Dataset, numbers: Sequence[int]) -> np.ndarray:
+def _stored(ds: Dataset, numbers: Sequence[int], trust: Sequence[str]) -> np.ndarray:
     """The frames of a dataset's videos, drawn again where they are not stored."""
-    if "frames" in ds.manifest["fields"]:
+    if "frames" in ds.manifest.fields:
         return ds.batch(numbers)["frames"]
     from gen2d.redraw import render
 
-    return np.asarray(render(ds, numbers))
+    return np.asarray(render(ds, numbers, trust=trust))
 
 
 def _drawn(source: str, videos: int, seed: int | None, sets: Sequence[str]) -> tuple[str, np.ndarray, float]:

@@ -19,44 +19,55 @@ from gen2d import annotations, drawing, factors, matched, types
 from gen2d.camera import View
 from gen2d.config import AnnotationOptions, Config, load_config, own_files
 from gen2d.core.errors import ConfigError
-from gen2d.dataset.manifest import field_of
-from gen2d.loading import dataset as loader
+from gen2d.dataset.manifest import PLUGIN
 from gen2d.loading.dataset import Dataset
 from gen2d.loading.protocols import Numbers
-from gen2d.options import named
+from gen2d.options import StoredCopies, named
 from gen2d.picture import Plan, Stage, on_cpu
 from gen2d.rollout import Rollout, keep_of, rules_of
 from gen2d.simulate import simulate, substeps
 from gen2d.storage.paths import Place, reading
+from gen2d.storage.sealed import read_bytes
+from gen2d.trust import check_trusted
 from gen2d.types import Array, Joints, Layout, Objects, Scene, State
 
 Columns = Mapping[str, Any]
+Trust = str | Sequence[str]  # sha256 of code that came with a dataset and may run
+SOURCE_BYTES = 2**24  # of a file of code, at most
 POINTS = 8  # of each object, where tracks are asked for that the config does not have
 
 
-def config_of(ds: Dataset, sets: Sequence[str] = ()) -> Config:
-    """The config that a dataset's split was made from, with `sets` changed ('video.height=128')."""
+def config_of(ds: Dataset, sets: Sequence[str] = (), trust: Trust = ()) -> Config:
+    """The config that a dataset's split was made from, with `sets` changed ('video.height=128').
+
+    Raises UntrustedError where that would run code that came with the dataset and is not trusted.
+    """
     if not isinstance(ds, Dataset):
         raise ConfigError(f"ds is of {len(ds.datasets)} folders, but must be of one: give one of ds.datasets")
-    return load_config(config_from(ds.root, ds.manifest).of_split(ds.options.split), sets)
+    return load_config(config_from(ds.root, ds.manifest.identity, trust).of_split(ds.options.split), sets)
 
 
-def config_from(root: Place, identity: Mapping[str, Any], sets: Sequence[str] = ()) -> Config:
-    """The config that the folder's manifest, or its mark, tells of; where a family or look of the user's own is gone or
-    has changed, with the copy in the folder."""
+def config_from(root: Place, identity: Mapping[str, Any], trust: Trust = ()) -> Config:
+    """The config that the folder's manifest, or its mark, tells of.
+
+    A family or look that came with the dataset is the copy in the folder, and no other file of that name.
+    """
     config = identity["config"]
+    copies = _copies(root, config)
+    check_trusted({where: content for where, (_, content) in copies.items()}, trust, root)
     try:
-        return load_config(config | {"seed": identity["seed"]}, sets, _copies(root, config))
+        return load_config(config | {"seed": identity["seed"]}, copies=StoredCopies(copies.values()))
     except ConfigError as error:
         raise ConfigError(f"{root}: its config cannot be used ({error})") from None
 
 
-def _copies(root: Place, config: Mapping[str, Any]) -> dict[str, bytes]:
-    """What the folder holds of files of the user's own, by their names in the config."""
+def _copies(root: Place, config: Mapping[str, Any]) -> dict[str, tuple[str, bytes]]:
+    """What the folder holds of files of its maker's own: the name in the config and the content, by place."""
     found = {}
     for where, name in own_files(config).items():
-        with reading(root), contextlib.suppress(FileNotFoundError):
-            found[name] = (root / where).read_bytes()
+        if PLUGIN.fullmatch(where):
+            with reading(root), contextlib.suppress(FileNotFoundError, IsADirectoryError):
+                found[where] = name, read_bytes(root / where, SOURCE_BYTES)
     return found
 
 
@@ -70,6 +81,7 @@ def render(
     sets: Sequence[str] = (),
     states: Columns | None = None,
     fields: Sequence[str] | None = None,
+    trust: Trust = (),
 ) -> Any:
     """The frames [n, T, H, W, 3] uint8 of these videos, a jax array on jax's default device.
 
@@ -77,10 +89,12 @@ def render(
     (a name, or a mapping with a name and options) and `sets` ('annotations.masks=true', 'image.noise=4') draw them
     otherwise. `states` are those of `simulate_again` instead of the stored ones. With `fields` ("frames",
     "masks/instance") a dictionary of these, the annotations that they belong to switched on.
-    Raises ConfigError (a UserError), DamagedError, and IndexError where there is no such video.
+    A family or look that came with the dataset runs only if it is trusted: this user has generated with it, or `trust`
+    holds its sha256.
+    Raises ConfigError and UntrustedError (UserErrors), DamagedError, and IndexError where there is no such video.
     """
-    base, numbers = config_of(ds), ds.numbers(np.atleast_1d(indices))
-    config = config_of(ds, [*sets, *_changed(height, width), "storage.frames=video"])
+    base, numbers = config_of(ds, (), trust), ds.numbers(np.atleast_1d(indices))
+    config = load_config(base, [*sets, *_changed(height, width), "storage.frames=video"])
     config = load_config(config, _asked(fields, config.annotations))
     if look is not None:
         config = load_config(config.plain() | {"look": named(look)}, copies=config.copies)
@@ -109,22 +123,24 @@ def simulate_again(
     fps: float | None = None,
     frames: int | None = None,
     sets: Sequence[str] = (),
+    trust: Trust = (),
 ) -> dict[str, Array]:
     """The states of these videos at another frame rate or for another number of frames, from their stored scenes.
 
     Jax arrays by their stored names: "states/position" [n, T, K, 2] in m and so on, "time" [T] in s, and the camera's
     fields; with contacts or energy if the config asks for them. `sets` may change the physics ('physics.damping=0.1').
-    At the stored settings the states agree with the stored ones to rounding.
+    At the stored settings the states agree with the stored ones to rounding. `trust` is that of `render`.
     """
     changes = [
         *sets,
         *([] if fps is None else [f"video.fps={fps}"]),
         *([] if frames is None else [f"video.frames={frames}"]),
     ]
-    config, numbers = config_of(ds, changes), ds.numbers(np.atleast_1d(indices))
+    base, numbers = config_of(ds, (), trust), ds.numbers(np.atleast_1d(indices))
+    config = load_config(base, changes)
     if not set(matched.VIOLATIONS).isdisjoint(config.matched.change or ()):
         raise ConfigError(f"{ds.root}: matched.change has violations, which cannot be simulated again from a scene")
-    simulated = _compiled(_simulated, _Settings(config_of(ds), config))
+    simulated = _compiled(_simulated, _Settings(base, config))
     made = simulated(_stored(ds, numbers), _key_words(ds), jnp.asarray(numbers, jnp.uint32))
     return made | {"time": jnp.arange(config.video.frames) / config.video.fps}
 
@@ -160,10 +176,11 @@ def _check_frames(columns: Columns, states: Columns | None) -> None:
 @functools.lru_cache(maxsize=16)
 def _whole(ds: Dataset) -> Dataset:
     """The same dataset with every field but images and text."""
-    fields = {name: field_of(about) for name, about in ds.manifest["fields"].items()}
+    fields = ds.manifest.fields
     names = tuple(name for name, f in fields.items() if f.per_video and not f.is_image and not f.is_text)
-    kept = {key: getattr(ds.options, key) for key in ("split", "verify", "cache_dir", "cache_bytes")}
-    return loader.open(ds.root, fields=names, **kept)
+    whole = dataclasses.replace(ds.options, fields=names, window=None, stride=1, start="first", layout="THWC")
+    frames = ds.manifest.frames[ds.options.split]
+    return Dataset(ds.root, ds.manifest, whole.within(frames, ds.manifest.sizes["T"]))
 
 
 def _stored(ds: Dataset, numbers: np.ndarray) -> dict[str, np.ndarray]:
@@ -183,7 +200,7 @@ def scene_of(columns: Columns) -> Scene:
 
 
 def _key_words(ds: Dataset) -> np.ndarray:
-    return factors.seed_words(ds.manifest["seed"], zlib.crc32(ds.options.split.encode()))
+    return factors.seed_words(ds.manifest.seed, zlib.crc32(ds.options.split.encode()))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -255,7 +272,7 @@ def _compiled(program: Callable, settings: _Settings) -> Callable:
 
 def _again(ds: Dataset, config: Config, numbers: np.ndarray) -> dict[str, Array]:
     """Videos made from their keys again, as they were made: what blurs them is not stored."""
-    lanes = ds.manifest["fingerprint"]["lanes"]
+    lanes = ds.manifest.fingerprint["lanes"]
     found: dict[str, list[Array]] = {}
     order = np.argsort(numbers, kind="stable")
     own_lanes, pictures = (

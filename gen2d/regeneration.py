@@ -1,33 +1,60 @@
 """A stored dataset against its recipe: some of its videos made again and compared, its bad shards made again."""
 
+import contextlib
 import dataclasses
 import functools
+import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from gen2d import devices
+from gen2d.complete import publication
 from gen2d.config import Config
 from gen2d.core.errors import DamagedError, FolderError
-from gen2d.dataset import folder as shards
-from gen2d.dataset.folder import Block, Dataset
-from gen2d.dataset.manifest import SEAL, identity_of, read_manifest
+from gen2d.dataset import folder, hdf5
+from gen2d.dataset.block import Block
+from gen2d.dataset.hdf5_check import faults
+from gen2d.dataset.manifest import MANIFEST, Manifest, identity_of, read_manifest
+from gen2d.dataset.records import Records, read_records, read_tables
+from gen2d.dataset.rows import npy_header, origin, salvaged, shard_type
+from gen2d.dataset.spec import (
+    MARK,
+    RECORDS,
+    STAGED,
+    TABLE_NAME,
+    DatasetSpec,
+    Shard,
+    mark_path,
+    plan,
+    shard_name,
+    shard_path,
+    table_name,
+)
 from gen2d.generation import dataset_of, make, rollouts_of
 from gen2d.loading import dataset as loader
 from gen2d.pipeline import Encoder, Piece, threads_for
-from gen2d.redraw import config_from
+from gen2d.redraw import Trust, config_from
 from gen2d.rollout import Rollout
-from gen2d.storage.atomic import read_sealed
+from gen2d.storage.atomic import publish_changed, sync
 from gen2d.storage.codecs import decode_into
-from gen2d.storage.paths import Place, place
+from gen2d.storage.leases import LOCK, leased, temporary_name
+from gen2d.storage.paths import Network, Place, Url, place, upload
+from gen2d.storage.sealed import file_sha256, read_bytes
 
 Identity = Mapping[str, Any]  # of a dataset; its manifest has the same keys
+# What decides the bytes of a shard, when its values are the same.
+CODECS = ("h5py", "hdf5", "isal", "zstandard", "numpy")
 
 
-def rollout_of(root: Place, identity: Identity) -> Rollout:
-    """The programs that made the dataset in the folder. Raises ConfigError where its config cannot be used here."""
-    return _rollout(config_from(root, identity), identity["fingerprint"]["device"].startswith("cpu"))
+def rollout_of(root: Place, identity: Identity, trust: Trust = ()) -> Rollout:
+    """The programs that made the dataset in the folder. Raises ConfigError where its config cannot be used here, and
+    UntrustedError where that would run code that came with it."""
+    return _rollout(
+        config_from(root, identity, trust), str(identity["fingerprint"].get("device", "")).startswith("cpu")
+    )
 
 
 @functools.lru_cache(maxsize=1)  # a check, a repair and the check that follows compile once
@@ -38,27 +65,24 @@ def _rollout(config: Config, on_cpu: bool) -> Rollout:
 def check_fingerprint(root: Place, rollout: Rollout, identity: Identity) -> None:
     """Raises FolderError where this machine and these versions would make other bits."""
     here = devices.fingerprint(rollout.devices[0], rollout.lanes)
-    differing = list(shards.differences(identity["fingerprint"], here, "fingerprint"))
+    differing = list(folder.differences(identity["fingerprint"], here, "fingerprint"))
     if differing:
         told = " and ".join(differing)
         raise FolderError(f"{root}: its videos can be neither judged nor repaired here, as bits would differ: {told}")
 
 
 def differing(
-    rollout: Rollout, root: Place, manifest: Mapping[str, Any], chosen: Sequence[tuple[str, int]]
+    rollout: Rollout, root: Place, manifest: Manifest, chosen: Sequence[tuple[str, int]]
 ) -> Iterator[tuple[str, str]]:
     """For each field of the videos (split, number) that is another when made again: its shard and a sentence.
 
     Videos that cannot be read are passed over: the level "full" names them.
     """
-    dataset = dataset_of(rollout, root, manifest["splits"])
-    constants = {name: values.tolist() for name, values in dataset.constants.items()}
-    if constants != manifest["constants"]:
-        raise FolderError(f"{root}: its constants {', '.join(constants)} are not those that its recipe gives")
-    try:
-        stored = {split: loader.open(root, split, fields=("*",)) for split in manifest["splits"]}
-    except DamagedError:
-        return
+    dataset = dataset_of(rollout, root, manifest.splits)
+    for name, values in dataset.constants.items():
+        if name not in manifest.constants or not np.array_equal(values, manifest.constants[name]):
+            raise FolderError(f"{root}: its constant {name} is not the one that its recipe gives")
+    stored = {split: loader.open(root, split, fields=("*",)) for split in manifest.splits}
     for own, splits in rollouts_of(rollout, [split for split, _ in chosen]):
         encoder = Encoder(own, dataset, threads_for(devices.cores()))
         try:
@@ -70,11 +94,9 @@ def differing(
             encoder.close()
 
 
-def _work(dataset: Dataset, lanes: int, chosen: Sequence[tuple[str, int]]) -> list[tuple[str, int, list[Piece]]]:
+def _work(dataset: DatasetSpec, lanes: int, chosen: Sequence[tuple[str, int]]) -> list[tuple[str, int, list[Piece]]]:
     """The batches that hold the chosen videos, each video a piece of its own."""
-    owner = {
-        (s.split, s.first // dataset.videos_per_shard): s for s in shards.plan(dataset.splits, dataset.videos_per_shard)
-    }
+    owner = {(shard.split, shard.place): shard for shard in plan(dataset.splits, dataset.videos_per_shard)}
     found: dict[tuple[str, int], list[Piece]] = {}
     for split, number in sorted(chosen):
         shard, lane = owner[split, number // dataset.videos_per_shard], number % lanes
@@ -82,7 +104,7 @@ def _work(dataset: Dataset, lanes: int, chosen: Sequence[tuple[str, int]]) -> li
     return [(split, first, pieces) for (split, first), pieces in found.items()]
 
 
-def _values(block: Block, dataset: Dataset) -> dict[str, np.ndarray]:
+def _values(block: Block, dataset: DatasetSpec) -> dict[str, np.ndarray]:
     """The fields of the block's only video."""
     found = {name: values[0] for name, values in block.arrays.items()}
     for name, chunks in block.chunks.items():
@@ -99,39 +121,201 @@ def _other(stored: loader.Dataset, number: int, made: Mapping[str, np.ndarray]) 
         video = stored[number]
     except DamagedError:
         return []
-    return [name for name, values in made.items() if video[name].tobytes() != values.tobytes()]
+    return [name for name, values in made.items() if name not in video or video[name].tobytes() != values.tobytes()]
 
 
-def repair(root: str | Place, bad: Sequence[str], say: Callable[[str], None] | None = None) -> list[str]:
-    """The names of the shards that were made again: those called `bad`, and all whose record is damaged.
+# ---- Repair
 
-    Afterwards index, cards, config and manifest are written anew. Where the manifest is damaged, the folder's own
-    records say what it held. Raises FolderError, before anything is changed, where a shard cannot be made again here.
+
+def repair(
+    root: str | Place,
+    bad: Sequence[str] = (),
+    say: Callable[[str], None] | None = None,
+    *,
+    trust: Trust = (),
+    timeout: float = 30.0,
+    deadline: float = 300.0,
+) -> list[str]:
+    """The names of the shards that were made again: those called `bad`, and all whose row or file is not whole.
+
+    They are made beside the dataset and verified there. Then they take their places, and tables, cards, config and
+    manifest follow, each if it is not what it should be. At no moment is the dataset worse than it was. Where the
+    manifest is damaged, the tables say what it held.
+
+    Raises FolderError, before anything is changed, where a shard cannot be made again here, and UntrustedError where
+    that would run code that came with the dataset.
     """
-    root = place(root)
-    if not (root / "manifest.json").exists():
-        read_manifest(root)  # says that it is incomplete, or no dataset
-    identity = identity_of(root)
-    if identity is None:
-        raise FolderError(
-            f"{root}: manifest.json and .gen2d/dataset.json are both damaged, so nothing says what it held"
-        )
-    rollout = rollout_of(root, identity)
-    dataset, lost = shards.lost(_as_made(rollout, root, identity), bad)
-    if lost:
-        check_fingerprint(root, rollout, identity)
-    for name in lost:
-        shards.forget(root, name)
-    todo = shards.open_folder(dataset)
-    if todo:
-        make(rollout, dataset, todo, say or (lambda line: None))
-    shards.finish(dataset)
+    root = place(root, Network(timeout, deadline))
+    folder.check_links(root)
+    manifest, identity = _what_it_held(root)
+    rollout = rollout_of(root, identity, trust)
+    spec = _as_made(rollout, root, identity, manifest)
+    kept = read_tables(root, manifest) if manifest else _found_tables(root, spec)
+    counts = manifest.splits if manifest else _found_counts(root)
+    spec = dataclasses.replace(spec, splits=counts)
+    records = Records(spec.videos_per_shard, kept)
+    shards = plan(counts, spec.videos_per_shard)
+    todo = _to_make(root, shards, records, bad, every_byte=manifest is None)
+    with folder.explained(root), _staging(root) as stage:
+        if todo:
+            check_fingerprint(root, rollout, identity)
+            staged = _made_again(rollout, spec, stage, todo, records, manifest, say or (lambda line: None))
+            for shard in todo:
+                _put(stage / shard_name(shard.name), shard_path(root, shard.name))
+            records = _together(spec, shards, records, staged, todo)
+        publish_changed(mark_path(root), folder.mark_content(spec.identity))
+        folder.publish_snapshot(spec, publication(spec, shards, records), records)
     return [shard.name for shard in todo]
 
 
-def _as_made(rollout: Rollout, root: Place, identity: Identity) -> Dataset:
+def _what_it_held(root: Place) -> tuple[Manifest | None, Identity]:
+    """The manifest, if it is whole, and what the dataset was made from."""
+    try:
+        manifest = read_manifest(root)
+    except DamagedError:
+        identity = identity_of(root)
+        if identity is None:
+            raise FolderError(
+                f"{root}: {MANIFEST} and {mark_path(root)} are both damaged, so nothing says what it held"
+            ) from None
+        return None, identity
+    return manifest, manifest.identity
+
+
+def _as_made(rollout: Rollout, root: Place, identity: Identity, manifest: Manifest | None) -> DatasetSpec:
     """What the folder is to hold, by the versions that its manifest names, if that is whole."""
-    manifest = read_sealed(root / "manifest.json", SEAL) or {}
-    dataset = dataset_of(rollout, root, manifest.get("splits", {}))
-    producer = manifest.get("producer", dataset.producer)
-    return dataclasses.replace(dataset, producer={**producer, "fingerprint": identity["fingerprint"]})
+    spec = dataset_of(rollout, root, {})
+    producer = manifest.producer if manifest else spec.producer
+    return dataclasses.replace(spec, producer={**producer, "fingerprint": identity["fingerprint"]})
+
+
+def _found_counts(root: Place) -> dict[str, int]:
+    """How many videos each split has, by the names of its tables."""
+    counts: dict[str, int] = {}
+    for path in (root / "index").glob("*.npy"):
+        match = TABLE_NAME.fullmatch(path.name)
+        if match:
+            counts[match["split"]] = max(counts.get(match["split"], 0), int(match["count"]))
+    if not counts:
+        raise FolderError(
+            f"{root}: {MANIFEST} and the tables in index/ are both damaged, so nothing says how many videos there "
+            "were: run the command that made the dataset again"
+        )
+    return counts
+
+
+def _found_tables(root: Place, spec: DatasetSpec) -> dict[str, np.ndarray]:
+    """The rows of the tables that are what was written, where no manifest says which they are."""
+    kind, found = shard_type(spec.fields), {}
+    for split, count in _found_counts(root).items():
+        rows = -(-count // spec.videos_per_shard)
+        limit = len(npy_header(kind, rows)) + rows * kind.itemsize
+        try:
+            content = read_bytes(root / table_name(split, count), limit)
+        except OSError:
+            content = b""
+        begin = origin(spec.identity_sha256, split)
+        found[split] = salvaged(content, kind, rows, begin, spec.videos_per_shard)
+    return found
+
+
+def _to_make(
+    root: Place, shards: Sequence[Shard], records: Records, bad: Sequence[str], every_byte: bool
+) -> list[Shard]:
+    """The shards that must be made again; where `every_byte` matters, each file is compared with its row."""
+    sizes, missing = folder.Sizes(root), set(bad)
+    for shard in shards:
+        row = records.of(shard)
+        if row is None or not folder.is_done(shard, records, sizes):
+            missing.add(shard.name)
+        elif every_byte and isinstance(root, Path):
+            path = root / shard_name(shard.name)
+            with contextlib.suppress(OSError):
+                if file_sha256(path) == row["sha256"].tobytes().hex():
+                    continue
+            missing.add(shard.name)
+    return [shard for shard in shards if shard.name in missing]
+
+
+@contextlib.contextmanager
+def _staging(root: Place) -> Iterator[Path]:
+    """A folder in which shards are made again, on the disk of the dataset where that is one."""
+    if isinstance(root, Url):
+        with tempfile.TemporaryDirectory(prefix="gen2d-") as home:
+            yield Path(home)
+        return
+    (root / MARK).mkdir(exist_ok=True)
+    stage = root / MARK / temporary_name(STAGED.name)
+    lock = stage.with_name(stage.name + LOCK)
+    with leased(lock), contextlib.ExitStack() as stack:
+        stack.callback(lock.unlink, missing_ok=True)
+        stage.mkdir()
+        stack.callback(folder.remove_tree, stage)
+        yield stage
+
+
+def _made_again(
+    rollout: Rollout,
+    spec: DatasetSpec,
+    stage: Path,
+    todo: Sequence[Shard],
+    records: Records,
+    manifest: Manifest | None,
+    say: Callable[[str], None],
+) -> Records:
+    """The rows of the shards, which lie in the folder `stage` then, each verified."""
+    for name in ("shards", f"{RECORDS}"):
+        (stage / name).mkdir(parents=True)
+    staged_spec = dataclasses.replace(spec, root=stage)
+    make(rollout, staged_spec, list(todo), say)
+    staged = read_records(staged_spec)
+    same_codecs = manifest is None or all(manifest.producer.get(key) == _versions(rollout)[key] for key in CODECS)
+    for shard in todo:
+        path, row, before = stage / shard_name(shard.name), staged.of(shard), records.of(shard)
+        assert row is not None
+        wrong = _faults(path, shard, row, manifest)
+        if not wrong and same_codecs and before is not None and before["sha256"].tobytes() != row["sha256"].tobytes():
+            wrong = ["it has other bytes than the one that was written"]
+        if wrong:
+            raise FolderError(
+                f"{spec.root}: {shard.name}, made again, is not right, so nothing was changed: {wrong[0]}"
+            )
+    return staged
+
+
+def _versions(rollout: Rollout) -> Mapping[str, Any]:
+    return devices.producer(rollout.devices[0], rollout.lanes)
+
+
+def _faults(path: Path, shard: Shard, row: np.void, manifest: Manifest | None) -> list[str]:
+    """What is wrong with a shard that was made again, as the disk now has it."""
+    if file_sha256(path) != row["sha256"].tobytes().hex():
+        return ["the disk does not have what was written"]
+    values = hdf5.read(path)
+    if values["index"].tolist() != list(range(shard.first, shard.first + shard.count)):
+        return ["its videos have other numbers"]
+    return faults(path, shard, manifest) if manifest else []
+
+
+def _put(source: Path, target: Place) -> None:
+    """Returns when the file is at its place, instead of what was there."""
+    if isinstance(target, Url):
+        upload(source, target)
+        return
+    target.parent.mkdir(exist_ok=True)
+    source.replace(target)
+    sync(target.parent)
+
+
+def _together(
+    spec: DatasetSpec, shards: Sequence[Shard], records: Records, staged: Records, todo: Sequence[Shard]
+) -> Records:
+    """The rows of all shards: of those made again the new ones."""
+    again = {shard.name for shard in todo}
+    rows: dict[str, list[Any]] = {}
+    for shard in shards:
+        row = (staged if shard.name in again else records).of(shard)
+        assert row is not None
+        rows.setdefault(shard.split, []).append(row)
+    kind = shard_type(spec.fields)
+    return Records(spec.videos_per_shard, {split: np.array(own, kind) for split, own in rows.items()})

@@ -1,12 +1,13 @@
 """What a dataset holds, and what gen2d knows, as text for a terminal."""
 
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 from gen2d.core.errors import ConfigError
 from gen2d.core.humanize import in_bytes, in_time
-from gen2d.dataset.manifest import read_manifest, statistics
+from gen2d.dataset.manifest import Manifest, read_manifest, statistics
+from gen2d.storage.atomic import size_of
 from gen2d.storage.paths import Place
 
 
@@ -20,51 +21,59 @@ def _table(rows: list[tuple[str, ...]]) -> list[str]:
 def sheet(root: Place) -> str:
     """The data sheet of a dataset: what it holds, field by field, and what made it."""
     manifest = read_manifest(root)
-    splits = ", ".join(f"{name}: {count:,} videos" for name, count in manifest["splits"].items())
-    sizes = ", ".join(f"{name} = {value}" for name, value in manifest["sizes"].items())
+    splits = ", ".join(f"{name}: {count:,} videos" for name, count in manifest.splits.items())
+    sizes = ", ".join(f"{name} = {value}" for name, value in manifest.sizes.items())
     rows = [("field", "type", "axes", "unit", "meaning")]
-    rows += [(name, f["dtype"], f["axes"], f["unit"], f["meaning"]) for name, f in manifest["fields"].items()]
-    versions = ", ".join(f"{key} {value}" for key, value in manifest["producer"].items())
-    fingerprint = ", ".join(f"{key} {value or '-'}" for key, value in manifest["fingerprint"].items())
-    made = [f"python -m gen2d --config config.yaml --n {n} --split {s}" for s, n in manifest["splits"].items()]
+    rows += [(name, f.dtype, f.axes, f.unit, f.meaning) for name, f in manifest.fields.items()]
+    versions = ", ".join(f"{key} {value}" for key, value in manifest.producer.items() if not isinstance(value, dict))
+    fingerprint = ", ".join(f"{key} {value or '-'}" for key, value in _flat(manifest.fingerprint))
+    made = [f"python -m gen2d --config config.yaml --n {n} --split {s}" for s, n in manifest.splits.items()]
     return "\n".join(
         [
-            f"{manifest['name']} ({root})",
-            f"  {splits}; seed {manifest['seed']}, {manifest['fps']:g} frames/s, {_duration(manifest)}",
+            f"{manifest.name} ({root})",
+            f"  {splits}; seed {manifest.seed}, {manifest.fps:g} frames/s, {_duration(manifest)}",
             f"  sizes: {sizes}",
             "",
             *_table(rows),
             "",
-            f"  {manifest['conventions']}",
+            f"  {manifest.conventions}",
             "",
             *_table([("split", "field", "mean", "standard deviation", "least", "largest"), *statistics(manifest)]),
-            f"  of {manifest['stats_sampled']}",
+            f"  of {manifest.stats_sampled}",
             "",
             *_table([("on disk", "files", "size"), *_volumes(root, manifest)]),
-            f"  frames and other images compressed with {manifest['codec']}, up to {manifest['videos_per_shard']:,} "
+            f"  frames and other images compressed with {manifest.codec}, up to {manifest.videos_per_shard:,} "
             "videos a shard",
             "",
-            *(f"  made by {command} --seed {manifest['seed']}" for command in made),
+            *(f"  made by {command} --seed {manifest.seed}" for command in made),
             f"  with {versions}",
             f"  bits fixed by {fingerprint}",
-            f"  config {manifest['config_sha256']}",
-            f"  licence: {manifest['licence'] or 'none was chosen'}",
+            f"  config {manifest.config_sha256}",
+            f"  licence: {manifest.licence or 'none was chosen'}",
         ]
     )
 
 
-def _duration(manifest: dict[str, Any]) -> str:
+def _duration(manifest: Manifest) -> str:
     """How long all videos together are."""
-    return in_time(sum(manifest["splits"].values()) * manifest["sizes"]["T"] / manifest["fps"]) + " in all"
+    return in_time(sum(manifest.splits.values()) * manifest.sizes.get("T", 0) / manifest.fps) + " in all"
 
 
-def _volumes(root: Place, manifest: dict[str, Any]) -> Iterator[tuple[str, ...]]:
+def _volumes(root: Place, manifest: Manifest) -> Iterator[tuple[str, ...]]:
     """What lies on disk: the shards of each split, and all the rest."""
-    for split in manifest["splits"]:
-        own = [shard["bytes"] for shard in manifest["shards"] if shard["split"] == split]
-        yield f"shards of {split}", f"{len(own):,}", in_bytes(sum(own))
-    index = [path.stat().st_size for path in (root / "index").rglob("*.npy")]
-    yield "index", f"{len(index):,}", in_bytes(sum(index))
+    for split, table in manifest.tables.items():
+        yield f"shards of {split}", f"{table.shards:,}", in_bytes(table.bytes)
+    index = [size for table in manifest.tables.values() if (size := size_of(root / table.file)) is not None]
+    yield "tables of shards", f"{len(index):,}", in_bytes(sum(index))
+
+
+def _flat(about: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
+    """The entries of a mapping, those of a mapping in it by both names; hashes are cut."""
+    for key, value in about.items():
+        if isinstance(value, dict):
+            yield from ((f"{key}.{name}", f"{own!s:.16}") for name, own in value.items())
+        else:
+            yield key, value
 
 
 def plugins_text(name: str | None = None) -> str:

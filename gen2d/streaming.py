@@ -23,7 +23,7 @@ from gen2d.config import Config, checked_seed, load_config
 from gen2d.core.errors import ConfigError
 from gen2d.core.schema import Field
 from gen2d.generation import MAX_VIDEOS
-from gen2d.loading.chunks import LAYOUTS
+from gen2d.loading.column import LAYOUTS
 from gen2d.loading.dataloader import without_text
 from gen2d.loading.dataset import Options, chosen_fields
 from gen2d.loading.epochs import Step, Walk, one_of, shuffled

@@ -5,25 +5,28 @@ import contextlib
 import dataclasses
 import os
 import tempfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
 
-import h5py
 import numpy as np
 
-from gen2d.core.errors import ConfigError, DamagedError, FolderError
-from gen2d.dataset.cards import croissant
-from gen2d.dataset.manifest import MARK_SEAL, field_of, read_manifest, read_record
-from gen2d.dataset.spec import IDENTITY, MARK, mark_path, record_path, shard_path, table_path
+from gen2d.core.errors import ConfigError, DamagedError, FolderError, UnreachableError, UserError
+from gen2d.dataset.croissant import croissant
+from gen2d.dataset.folder import is_foreign, mark_content, next_manifest
+from gen2d.dataset.hdf5_check import faults
+from gen2d.dataset.manifest import MANIFEST, PLUGIN, Manifest, as_bytes, read_manifest
+from gen2d.dataset.rows import check_shard, intact, npy_header, origin
+from gen2d.dataset.spec import MARK, Shard, mark_path, plan, shard_name, shard_path
 from gen2d.loading import dataset as loader
 from gen2d.loading.epochs import order
-from gen2d.storage.atomic import as_json, file_sha256, sealed, sha256, size_of
-from gen2d.storage.paths import Place, Url, download, place, reading
+from gen2d.storage.explain import reading_error, reason
+from gen2d.storage.paths import Network, Place, Url, download, place, reading
+from gen2d.storage.sealed import file_sha256, has_sha256, read_bytes, sha256
 
 LEVELS = ("quick", "full", "regen")
 VIDEOS = 8  # made again, unless told otherwise
+FILE_BYTES = 2**26  # of a file beside shards and tables, at most
 
 # Of static bodies these are infinite; in every other field a value that is not finite is an error.
 INFINITE = ("objects/mass", "objects/moment", "joints/stiffness", "joints/lower", "joints/upper")
@@ -46,48 +49,62 @@ class Outcome:
     remade: list[str]  # names of the shards that were made again
 
 
+Repair = Callable[[list[str]], Sequence[str] | None]
+
+
 def verify(
     root: str | Place,
-    level: str = "quick",
-    repair_with: Callable[[list[str]], Sequence[str] | None] | None = None,
+    level: str = "full",
+    repair_with: Repair | None = None,
     videos: int = VIDEOS,
     seed: int = 0,
+    *,
+    trust: Sequence[str] = (),
+    timeout: float = 30.0,
+    deadline: float = 300.0,
 ) -> list[str]:
     """What is wrong with the dataset, a sentence each; empty if nothing is.
 
     At the level "regen", as many `videos` as told are made again, chosen from `seed`; that imports jax, and raises
-    FolderError where this machine would make other bits. `repair_with` is called with the names of the bad shards, if
-    there are problems, and must make these again and finish the dataset, as `gen2d.regeneration.repair` does; what is
-    returned is then what remains wrong.
+    FolderError where this machine would make other bits, and UntrustedError where it would run code that came with the
+    dataset and is not trusted (`trust` holds the sha256 of what is). `repair_with` is called with the names of the bad
+    shards, if there are problems, and must make these again and finish the dataset, as `gen2d.regeneration.repair`
+    does; what is returned is then what remains wrong. `timeout` and `deadline` are those of `open`.
     """
-    return checked(root, level, repair_with, videos, seed).problems
+    return checked(root, level, repair_with, videos, seed, trust=trust, timeout=timeout, deadline=deadline).problems
 
 
 def checked(
     root: str | Place,
-    level: str = "quick",
-    repair_with: Callable[[list[str]], Sequence[str] | None] | None = None,
+    level: str = "full",
+    repair_with: Repair | None = None,
     videos: int = VIDEOS,
     seed: int = 0,
+    *,
+    trust: Sequence[str] = (),
+    timeout: float = 30.0,
+    deadline: float = 300.0,
 ) -> Outcome:
     """What `verify` finds, and what was repaired."""
-    found = list(problems(root, level, videos, seed))
+    root = place(root, Network(timeout, deadline))
+    found = list(problems(root, level, videos, seed, trust))
     if not found or repair_with is None:
         return Outcome([problem.sentence for problem in found], [], [])
     remade = repair_with(sorted({problem.shard for problem in found if problem.shard}))
-    left = [problem.sentence for problem in problems(root, level, videos, seed)]
+    left = [problem.sentence for problem in problems(root, level, videos, seed, trust)]
     repaired = [problem.sentence for problem in found if problem.sentence not in left]
     return Outcome(left, repaired, list(remade or ()))
 
 
-def damaged_shards(root: str | Place, level: str = "quick") -> list[str]:
+def damaged_shards(root: str | Place, level: str = "full") -> list[str]:
     """The names of the shards that must be made again."""
-    return sorted({problem.shard for problem in problems(root, level) if problem.shard})
+    return sorted({problem.shard for problem in problems(place(root), level) if problem.shard})
 
 
-def problems(root: str | Place, level: str = "quick", videos: int = VIDEOS, seed: int = 0) -> Iterator[Problem]:
+def problems(
+    root: Place, level: str = "full", videos: int = VIDEOS, seed: int = 0, trust: Sequence[str] = ()
+) -> Iterator[Problem]:
     """Everything that is wrong, the folder first, then shard by shard, then what made again is another video."""
-    root = place(root)
     if level not in LEVELS:
         raise ConfigError(f"level is {level!r}, but must be one of {', '.join(LEVELS)}")
     if videos < 1:
@@ -97,31 +114,30 @@ def problems(root: str | Place, level: str = "quick", videos: int = VIDEOS, seed
     except (FolderError, DamagedError) as error:
         yield Problem(str(error))
         return
-    remade = _remade(root, manifest, videos, seed) if level == "regen" else iter(())
+    remade = _remade(root, manifest, videos, seed, trust) if level == "regen" else iter(())
     with reading(root):
-        whole = list(_hashed_files(root, manifest))
-        others = [*_cards(root, manifest), *_records(root, manifest)]
-        missized = list(_shard_files(root, manifest))
-    yield from [*whole, *others, *missized]
+        files = list(_files(root, manifest))
+        tables, rows = _tables(root, manifest)
+        shards = plan(manifest.splits, manifest.videos_per_shard)
+        others = [*_mark(root, manifest), *_foreign(root, manifest)]
+        missized = list(_sizes(root, shards, rows))
+    yield from [*files, *tables, *others, *missized]
     if level != "quick":
-        absent = {problem.shard for problem in missized}
-        present = [shard for shard in manifest["shards"] if shard["name"] not in absent]
-        with _nearby(root, manifest) as near, ThreadPoolExecutor(min(os.cpu_count() or 1, 8)) as pool:
-            # Opened here, not in the threads: NumPy parses the headers of the index by `ast`, in which threads of
-            # CPython 3.11 have been seen to disturb each other (SystemError: recursion depth mismatch).
-            opened = {} if whole else {split: loader.open(near, split, ("*",)) for split in manifest["splits"]}
-            for found in pool.map(lambda shard: _contents_near(root, near, manifest, shard, opened), present):
+        absent = {problem.shard for problem in [*tables, *missized]}
+        present = [shard for shard in shards if shard.name not in absent]
+        with _Contents(root, manifest, rows) as contents:
+            for found in contents.check(present):
                 yield from found
     yield from remade
 
 
-def _remade(root: Place, manifest: Mapping[str, Any], videos: int, seed: int) -> Iterator[Problem]:
+def _remade(root: Place, manifest: Manifest, videos: int, seed: int, trust: Sequence[str]) -> Iterator[Problem]:
     """What differs in videos made again; raises FolderError, at once, where that cannot be judged here."""
     from gen2d import regeneration  # imports jax
 
-    rollout = regeneration.rollout_of(root, manifest)
-    regeneration.check_fingerprint(root, rollout, manifest)
-    chosen = chosen_videos(manifest["splits"], videos, seed)
+    rollout = regeneration.rollout_of(root, manifest.identity, trust)
+    regeneration.check_fingerprint(root, rollout, manifest.identity)
+    chosen = chosen_videos(manifest.splits, videos, seed)
     return (
         Problem(f"{shard_path(root, shard)}: {wrong}", shard)
         for shard, wrong in regeneration.differing(rollout, root, manifest, chosen)
@@ -140,135 +156,215 @@ def chosen_videos(splits: Mapping[str, int], videos: int, seed: int) -> list[tup
     ]
 
 
-def _hashed_files(root: Place, manifest: Mapping[str, Any]) -> Iterator[Problem]:
-    for name, expected in manifest["files"].items():
-        yield from map(Problem, _wrong(root / name, expected))
-    for path in sorted([*(root / "index").rglob("*"), *(root / "plugins").rglob("*")], key=str):
-        if path.is_file() and str(path).removeprefix(f"{root}/") not in manifest["files"]:
-            yield Problem(f"{path} does not belong to the dataset")
+# ---- The folder
 
 
-def _wrong(path: Place, expected: str) -> Iterator[str]:
-    """What is wrong with a file that must have this sha256."""
-    try:
-        if not path.is_file():
-            yield f"{path} is missing"
-        elif file_sha256(path) != expected:
-            yield f"{path} is not what was written"
-    except OSError as error:
-        if isinstance(path, Url):  # of what a server does not give, nothing is known
-            raise
-        yield f"{path} cannot be read ({error.strerror or error})"
-
-
-def _cards(root: Place, manifest: Mapping[str, Any]) -> Iterator[Problem]:
-    """README.md is for people, who may write in it, so it only has to be there."""
-    yield from map(Problem, _wrong(root / "croissant.json", sha256(as_json(croissant(manifest)))))
+def _files(root: Place, manifest: Manifest) -> Iterator[Problem]:
+    """What is wrong with config, plug-ins, sheet and cards; README.md is for people, who may write in it."""
+    coming = next_manifest(root)  # of a run that was killed in the middle of publishing it
+    for name, expected in manifest.files.items():
+        also = coming.files.get(name) if coming else None
+        yield from map(Problem, _wrong(root / name, expected, also))
+    also = sha256(croissant(coming)) if coming else None
+    yield from map(Problem, _wrong(root / "croissant.json", sha256(croissant(manifest)), also))
     if not (root / "README.md").is_file():
         yield Problem(f"{root / 'README.md'} is missing")
 
 
-def _records(root: Place, manifest: Mapping[str, Any]) -> Iterator[Problem]:
-    """What is wrong with what a later run needs; a copy may well have been made without it."""
-    if not (root / MARK).is_dir():
-        return
-    identity = {key: manifest[key] for key in IDENTITY}
-    yield from map(Problem, _wrong(mark_path(root), sha256(as_json(sealed(identity, MARK_SEAL)))))
-    with ThreadPoolExecutor(16) as pool:  # a server answers many questions at once
-        for found in pool.map(lambda shard: list(_record(root, shard)), manifest["shards"]):
-            yield from found
-    expected = {f"{shard['name']}.{kind}" for shard in manifest["shards"] for kind in ("json", "npz")}
-    for path in sorted((root / MARK / "done").glob("*"), key=str):
-        if path.name not in expected:
-            yield Problem(f"{path} does not belong to the dataset")
-
-
-def _record(root: Place, shard: Mapping[str, Any]) -> Iterator[Problem]:
-    path, record = record_path(root, shard["name"]), read_record(root, shard["name"])
-    if record is None or any(record[key] != shard[key] for key in shard):
-        yield Problem(f"{path} is {'not what was written' if path.is_file() else 'missing'}", shard["name"])
-    else:
-        tables = _wrong(table_path(root, shard["name"]), record["tables_sha256"])
-        yield from (Problem(sentence, shard["name"]) for sentence in tables)
-
-
-def _shard_files(root: Place, manifest: Mapping[str, Any]) -> Iterator[Problem]:
-    expected = {shard_path(root, shard["name"]): shard for shard in manifest["shards"]}
-    with ThreadPoolExecutor(16) as pool:  # a server answers many questions at once
-        sizes = list(pool.map(size_of, expected))
-    for (path, shard), size in zip(expected.items(), sizes, strict=True):
-        if size is None:
-            yield Problem(f"{path} is missing", shard["name"])
-        elif size != shard["bytes"]:
-            yield Problem(f"{path} has {size} bytes, but was written with {shard['bytes']}", shard["name"])
-    for path in sorted((root / "shards").glob("*")):
-        if path not in expected:
-            yield Problem(f"{path} does not belong to the dataset")
-
-
-@contextlib.contextmanager
-def _nearby(root: Place, manifest: Mapping[str, Any]) -> Iterator[Path]:
-    """The dataset's folder; of a Url one on disk with all its files but the shards."""
-    if isinstance(root, Path):
-        yield root
-        return
-    with tempfile.TemporaryDirectory(prefix="gen2d-") as folder:
-        near = Path(folder)
-        (near / "shards").mkdir()
-        for name in ("manifest.json", *manifest["files"]):
-            (near / name).parent.mkdir(parents=True, exist_ok=True)
-            with contextlib.suppress(OSError):  # what is missing has been told of
-                download(root / name, near / name)
-        yield near
-
-
-Opened = Mapping[str, loader.Dataset]  # by split; nothing where the index cannot be trusted
-
-
-def _contents_near(
-    root: Place, near: Path, manifest: Mapping[str, Any], shard: Mapping[str, Any], opened: Opened
-) -> list[Problem]:
-    """What is wrong within the shard, which is fetched first where it is not on disk."""
-    if root == near:
-        return list(_contents(near, manifest, shard, opened))
-    url, path = shard_path(root, shard["name"]), shard_path(near, shard["name"])
-    assert isinstance(url, Url)
-    assert isinstance(path, Path)
+def _wrong(path: Place, *expected: str | None) -> Iterator[str]:
+    """What is wrong with a file that must have one of these sha256."""
     try:
-        download(url, path, shard["bytes"])
+        if not any(has_sha256(path, one, FILE_BYTES) for one in expected if one):
+            yield f"{path} is not what was written"
+    except FileNotFoundError:
+        yield f"{path} is missing"
     except OSError as error:
-        return [Problem(f"{url} cannot be read ({error.strerror})", shard["name"])]
-    found = list(_contents(near, manifest, shard, opened))
-    os.truncate(path, 0)  # it may still be open
-    return [Problem(problem.sentence.replace(str(near), str(root)), problem.shard) for problem in found]
+        if isinstance(path, Url):  # of what a server does not give, nothing is known
+            raise
+        failure = reading_error(path, error)
+        if isinstance(failure, UserError):
+            raise failure from error
+        yield str(failure)
 
 
-def _contents(root: Path, manifest: Mapping[str, Any], shard: Mapping[str, Any], opened: Opened) -> Iterator[Problem]:
-    path = shard_path(root, shard["name"])
-    try:
-        intact = file_sha256(path) == shard["sha256"]
-    except OSError as error:
-        yield Problem(f"{path} cannot be read ({error})", shard["name"])
-        return
-    if not intact:
-        yield Problem(f"{path} is not what was written: its sha256 differs", shard["name"])
-    wrong = list(_pieces(opened[shard["split"]], shard)) if opened else []
-    if intact:  # else HDF5 has nothing to say that is worth more
-        wrong += _structure(root, manifest, shard)
-    yield from (Problem(f"{path}: {sentence}", shard["name"]) for sentence in wrong)
-
-
-def _pieces(dataset: loader.Dataset, shard: Mapping[str, Any]) -> Iterator[str]:
-    """What is wrong with the stored pieces, each found by the index, checked and decoded as for training."""
-    for number in range(shard["first"], shard["first"] + shard["count"]):
+def _tables(root: Place, manifest: Manifest) -> tuple[list[Problem], dict[str, np.ndarray]]:
+    """What is wrong with the tables of the splits, and the rows of those that are what was written."""
+    found, kept = [], {}
+    kind, per_shard = manifest.shard_type, manifest.videos_per_shard
+    for split, table in manifest.tables.items():
+        path, begin = root / table.file, origin(manifest.identity_sha256, split)
+        header = npy_header(kind, table.shards)
+        expected = len(header) + table.shards * kind.itemsize
         try:
-            values = dataset[number]
-        except DamagedError as error:
-            yield str(error)
+            content = read_bytes(path, expected)
+        except FileNotFoundError:
+            found.append(Problem(f"{path} is missing"))
             continue
-        yield from (f"{name} of video {number} has {wrong}" for name, wrong in _not_finite(values))
-        if "index" in values and values["index"] != number:
-            yield f"index of video {number} is {values['index']}"
+        except OSError as error:
+            failure = reading_error(path, error)
+            if isinstance(path, Url) or isinstance(failure, UserError):
+                raise failure from error
+            found.append(Problem(str(failure)))
+            continue
+        if sha256(content) != table.sha256 or len(content) != expected or content[: len(header)] != header:
+            found.append(Problem(f"{path} is not what was written"))
+            continue
+        rows = np.frombuffer(content, kind, offset=len(header))
+        firsts = range(0, table.shards * per_shard, per_shard)
+        wrong = np.flatnonzero(~intact(rows, begin, firsts)).tolist()
+        own = plan({split: manifest.splits[split]}, per_shard)
+        for shard, row in zip(own, rows, strict=True):
+            try:
+                check_shard(row, shard.first, shard.count, manifest.video_type.itemsize, manifest.row_bytes)
+            except DamagedError as error:
+                found.append(Problem(f"{path} cannot be right in row {shard.place}: {error}", shard.name))
+        found += [Problem(f"{path} is not what was written, in row {place}", own[place].name) for place in wrong]
+        if int(rows["bytes"].sum()) != table.bytes or int(rows["bytes"].max()) != table.largest:
+            found.append(Problem(f"{path} has shards of other sizes than {MANIFEST} says"))
+        kept[split] = rows
+    return found, kept
+
+
+def _mark(root: Place, manifest: Manifest) -> Iterator[Problem]:
+    """What is wrong with what a later run needs; a copy may well have been made without it."""
+    if isinstance(root, Url) and not mark_path(root).exists():
+        return
+    if (root / MARK).is_dir() or isinstance(root, Url):
+        yield from map(Problem, _wrong(mark_path(root), sha256(mark_content(manifest.identity))))
+
+
+def _foreign(root: Place, manifest: Manifest) -> Iterator[Problem]:
+    """Files that no run writes; shards that the manifest does not name yet are another matter."""
+    for folder in ("shards", "index"):
+        for path in sorted((root / folder).glob("*"), key=str):
+            if is_foreign(path.name):
+                yield Problem(f"{path} does not belong to the dataset")
+    for path in sorted((root / "plugins").rglob("*"), key=str):
+        name = str(path).removeprefix(f"{root}/")
+        if path.is_file() and name not in manifest.files and (PLUGIN.fullmatch(name) or isinstance(path, Path)):
+            yield Problem(f"{path} does not belong to the dataset")
+
+
+def _sizes(root: Place, shards: Sequence[Shard], rows: Mapping[str, np.ndarray]) -> Iterator[Problem]:
+    paths = [shard_path(root, shard.name) for shard in shards]
+    if isinstance(root, Url):
+        with ThreadPoolExecutor(16) as pool:  # a server answers many questions at once
+            sizes = list(pool.map(_size, paths))
+    else:
+        sizes = list(map(_size, paths))
+    for shard, path, size in zip(shards, paths, sizes, strict=True):
+        expected = int(rows[shard.split]["bytes"][shard.place]) if shard.split in rows else size
+        if size is None:
+            yield Problem(f"{path} is missing", shard.name)
+        elif size != expected:
+            yield Problem(f"{path} has {size} bytes, but was written with {expected}", shard.name)
+
+
+def _size(path: Place) -> int | None:
+    try:
+        if not path.is_file():
+            return None
+        return path.stat().st_size
+    except FileNotFoundError:
+        return None
+    except OSError as error:
+        raise reading_error(path, error) from error
+
+
+# ---- The shards
+
+
+class _Contents:
+    """Checks shards one by one, by their bytes, by every value, and by what HDF5 says; at a URL each is fetched."""
+
+    def __init__(self, root: Place, manifest: Manifest, rows: Mapping[str, np.ndarray]) -> None:
+        self.root, self.manifest, self.rows = root, manifest, rows
+
+    def __enter__(self) -> "_Contents":
+        self._stack = contextlib.ExitStack()
+        try:
+            self.near = self.root if isinstance(self.root, Path) else self._fetched_frame()
+            opened = {split: loader.open(self.near, split, ("*",)) for split in self.rows}
+        except BaseException:
+            self._stack.close()
+            raise
+        self.opened = opened
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stack.close()
+
+    def _fetched_frame(self) -> Path:
+        """A folder on disk with the manifest and the tables of a remote dataset."""
+        near = Path(self._stack.enter_context(tempfile.TemporaryDirectory(prefix="gen2d-")))
+        for name in ("shards", "index"):
+            (near / name).mkdir()
+        (near / MANIFEST).write_bytes(as_bytes(self.manifest))
+        for split in self.rows:
+            table = self.manifest.tables[split]
+            kind = self.manifest.shard_type
+            rows = self.rows[split]
+            (near / table.file).write_bytes(npy_header(kind, len(rows)) + rows.tobytes())
+        return near
+
+    def check(self, shards: Iterable[Shard]) -> Iterator[list[Problem]]:
+        """What is wrong with each shard, in their order."""
+        with ThreadPoolExecutor(min(os.cpu_count() or 1, 8)) as pool:
+            yield from pool.map(self._checked, shards)
+
+    def _checked(self, shard: Shard) -> list[Problem]:
+        path = self.near / shard_name(shard.name)
+        if self.root == self.near:
+            return list(self._problems(path, shard))
+        url = shard_path(self.root, shard.name)
+        assert isinstance(url, Url)
+        expected = self._row(shard)
+        try:
+            download(url, path, int(expected["bytes"]) if expected is not None else 0)
+        except OSError as error:
+            return [Problem(f"{url} cannot be read ({reason(error)})", shard.name)]
+        found = list(self._problems(path, shard))
+        os.truncate(path, 0)  # it may still be open
+        return [Problem(problem.sentence.replace(str(self.near), str(self.root)), problem.shard) for problem in found]
+
+    def _row(self, shard: Shard) -> np.void | None:
+        return self.rows[shard.split][shard.place] if shard.split in self.rows else None
+
+    def _problems(self, path: Path, shard: Shard) -> Iterator[Problem]:
+        row = self._row(shard)
+        try:
+            digest = file_sha256(path)
+        except OSError as error:
+            failure = reading_error(path, error)
+            if isinstance(failure, UserError):
+                raise failure from error
+            yield Problem(str(failure), shard.name)
+            return
+        if row is None:
+            return  # its table is wrong, which has been said
+        whole = digest == row["sha256"].tobytes().hex()
+        if not whole:
+            yield Problem(f"{path} is not what was written: its sha256 differs", shard.name)
+        for sentence in self._pieces(shard):
+            yield Problem(sentence if sentence.startswith(str(path)) else f"{path}: {sentence}", shard.name)
+        if whole:  # else HDF5 has nothing to say that is worth more
+            yield from (Problem(f"{path}: {said}", shard.name) for said in faults(path, shard, self.manifest))
+
+    def _pieces(self, shard: Shard) -> Iterator[str]:
+        """What is wrong with the stored pieces, each found by the index, checked and decoded as for training."""
+        dataset = self.opened[shard.split]
+        for number in range(shard.first, shard.first + shard.count):
+            try:
+                values = dataset.batch([number])
+            except DamagedError as error:
+                yield str(error)
+                continue
+            except UnreachableError as error:
+                yield str(error)
+                return
+            yield from (f"{name} of video {number} has {wrong}" for name, wrong in _not_finite(values))
+            if "index" in values and values["index"][0] != number:
+                yield f"index of video {number} is {values['index'][0]}"
 
 
 def _not_finite(values: Mapping[str, np.ndarray]) -> Iterator[tuple[str, str]]:
@@ -279,29 +375,3 @@ def _not_finite(values: Mapping[str, np.ndarray]) -> Iterator[tuple[str, str]]:
             yield name, "values that are not a number"
         elif name not in INFINITE and np.isinf(value).any():
             yield name, "infinite values"
-
-
-def _structure(root: Path, manifest: Mapping[str, Any], shard: Mapping[str, Any]) -> Iterator[str]:
-    """What differs between the file as HDF5 sees it and the manifest."""
-    with h5py.File(shard_path(root, shard["name"]), "r") as file:
-        if (file.attrs["split"], file.attrs["first"]) != (shard["split"], shard["first"]):
-            yield f"it says that it begins with {file.attrs['split']} video {file.attrs['first']}"
-        for name, about in manifest["fields"].items():
-            dataset = file.get(name)
-            if not isinstance(dataset, h5py.Dataset):
-                yield f"{name} is missing"
-                continue
-            count = (shard["count"],) if field_of(about).per_video else ()
-            yield from (f"{name} {wrong}" for wrong in _misdescribed(dataset, about, (*count, *about["shape"])))
-            constant = manifest["constants"].get(name)
-            if constant is not None and not np.array_equal(dataset[()], constant):
-                yield f"{name} is not what the manifest says"
-
-
-def _misdescribed(dataset: h5py.Dataset, about: Mapping[str, Any], shape: tuple[int, ...]) -> Iterator[str]:
-    if dataset.shape != shape or dataset.dtype != np.dtype(about["dtype"]):
-        yield f"is {dataset.dtype} {dataset.shape}, but must be {about['dtype']} {shape}"
-    for key in ("axes", "unit", "meaning"):
-        found = dataset.attrs.get(key)
-        if found != about[key]:
-            yield f"has {key} {found!r}, but must have {about[key]!r}"

@@ -36,6 +36,10 @@ from bench_render import Annotated, Drawing
 from bench_storage import Stored
 from timing import timed
 
+from gen2d.complete import complete
+from gen2d.dataset.folder import open_folder
+from gen2d.dataset.shard_writer import ShardWriter
+
 HERE = Path(__file__).resolve()
 CONFIG = "benchmark.yaml"
 FRAMES_BYTES = 64 * 64 * 64 * 3  # of a raw video
@@ -70,7 +74,6 @@ def _parts(folder: Path, sets: Sequence[str], config: str = CONFIG) -> dict[str,
     import jax
 
     from gen2d import devices, pipeline
-    from gen2d.dataset import folder as shards
     from gen2d.generation import dataset_of
 
     rollout = rollout_of(sets, config)
@@ -78,7 +81,7 @@ def _parts(folder: Path, sets: Sequence[str], config: str = CONFIG) -> dict[str,
     start, batch = sample(numbers), rollout.begin("train", [0] * len(rollout.devices))
     whole = rollout.videos_per_shard // rollout.lanes * rollout.lanes
     dataset = dataset_of(rollout, folder / "data", {"train": whole})
-    (shard, *_), columns = shards.open_folder(dataset), rollout.host_columns(batch)[0]
+    (shard, *_), columns = open_folder(dataset), rollout.host_columns(batch)[0]
     encoder = pipeline.Encoder(rollout, dataset, pipeline.threads_for(devices.cores()))
     jobs = pipeline.jobs_of([0], [[(shard, 0, rollout.lanes)]], rollout.lanes, rollout.slice)
     pictures = [jax.block_until_ready(rollout.draw(batch, job.start, rollout.slice))[0] for job in jobs]
@@ -101,7 +104,7 @@ def _parts(folder: Path, sets: Sequence[str], config: str = CONFIG) -> dict[str,
         "render": (draw, rollout.lanes),
         "transfer": (transfer, rollout.lanes),
         "compress": (encode, rollout.lanes),
-        "write": (lambda: shards.write(dataset, shard, blocks), whole),
+        "write": (lambda: ShardWriter(dataset).write(shard, blocks), whole),
     }
 
 
@@ -160,17 +163,16 @@ def steady(folder: Path, videos: int = 4096, turns: int = 3, peer_videos: int = 
 def make(rollout: Any, videos: int, out: Path) -> None:
     """Returns nothing; makes a dataset as `gen2d.generate` does, with programs that are compiled already."""
     from gen2d import devices, pipeline
-    from gen2d.dataset import folder as shards
     from gen2d.generation import dataset_of
 
     dataset = dataset_of(rollout, out, {"train": videos})
     encoder = pipeline.Encoder(rollout, dataset, pipeline.threads_for(devices.cores()))
     writers = pipeline.Writers(dataset)
-    for shard, block in encoder.blocks(pipeline.batches(shards.open_folder(dataset), rollout.lanes)):
+    for shard, block in encoder.blocks(pipeline.batches(open_folder(dataset), rollout.lanes)):
         writers.put(shard, block)
     writers.finish()
     encoder.close()
-    assert shards.finish(dataset)
+    assert complete(dataset)
 
 
 def _cpu_seconds() -> tuple[float, float]:

@@ -15,8 +15,12 @@ import numpy as np
 import synthetic
 from timing import timed
 
+from gen2d.complete import complete
 from gen2d.core.schema import Field
-from gen2d.dataset import folder as shards
+from gen2d.dataset.block import encode
+from gen2d.dataset.folder import open_folder
+from gen2d.dataset.shard_writer import ShardWriter
+from gen2d.dataset.spec import DatasetSpec, plan
 from gen2d.loading import dataset as loader
 from gen2d.storage import codecs
 
@@ -82,7 +86,7 @@ def works(case: Case, folder: Path) -> dict[str, Callable[[], float]]:
     for codec in codecs.CODECS:
         made = _dataset(case, folder / codec, codec)
         _write(made, columns)
-        assert shards.finish(made)
+        assert complete(made)
         ds = loader.open(made.root, fields=tuple(columns))
         shard = folder / codec / "shards" / "train-00000.h5"
         found[f"loader {codec}"] = lambda ds=ds: ds.batch(range(case.videos), out=out)
@@ -94,23 +98,22 @@ def works(case: Case, folder: Path) -> dict[str, Callable[[], float]]:
     return {name: timed(work, ROUNDS if name.startswith("write") else 1) for name, work in found.items()}
 
 
-def _dataset(case: Case, root: Path, codec: str, rounds: int = 1) -> shards.Dataset:
+def _dataset(case: Case, root: Path, codec: str, rounds: int = 1) -> DatasetSpec:
     sizes, count = {"T": case.frames, "H": case.pixels, "W": case.pixels, "K": 8}, rounds * case.videos
     plan = {"splits": {"train": count}, "videos_per_shard": count, "constants": {}}
     made = synthetic.dataset(root, codec=codec, fields=FIELDS, sizes=sizes, **plan)
-    shards.open_folder(made)
+    open_folder(made)
     return made
 
 
-def _write(made: shards.Dataset, columns: Mapping[str, np.ndarray]) -> None:
+def _write(made: DatasetSpec, columns: Mapping[str, np.ndarray]) -> None:
     """Writes the dataset's one shard, which holds the videos once or more."""
-    (shard,) = shards.plan(made.splits, made.videos_per_shard)
+    (shard,) = plan(made.splits, made.videos_per_shard)
     starts = [*range(0, len(columns["frames"]), 4)] * (shard.count // len(columns["frames"]))
     blocks = (
-        shards.encode({name: values[i : i + 4] for name, values in columns.items()}, made.fields, made.codec)
-        for i in starts
+        encode({name: values[i : i + 4] for name, values in columns.items()}, made.fields, made.codec) for i in starts
     )
-    shards.write(made, shard, blocks)
+    ShardWriter(made).write(shard, blocks)
 
 
 def _looped(path: Path, out: Mapping[str, np.ndarray]) -> None:

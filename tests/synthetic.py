@@ -1,14 +1,17 @@
 """Small datasets for the tests of storage: every kind of field, and discs that move so that images compress."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
 
+from gen2d.complete import complete
 from gen2d.core.schema import Field
-from gen2d.dataset import folder as shards
 from gen2d.dataset import hdf5
-from gen2d.dataset.folder import Dataset, Shard
+from gen2d.dataset.block import Block, encode
+from gen2d.dataset.folder import open_folder
+from gen2d.dataset.shard_writer import ShardWriter
+from gen2d.dataset.spec import DatasetSpec, Shard
 from gen2d.storage.paths import Place
 
 FIELDS = {
@@ -26,7 +29,7 @@ FIELDS = {
 }
 
 
-def dataset(root: Place, train: int = 20, codec: str = "gzip", **changes: object) -> Dataset:
+def dataset(root: Place, train: int = 20, codec: str = "gzip", **changes: object) -> DatasetSpec:
     """A dataset of `train` videos and 3 of a split called test, in shards of 8."""
     values: dict[str, object] = {
         "root": root,
@@ -46,10 +49,10 @@ def dataset(root: Place, train: int = 20, codec: str = "gzip", **changes: object
         "command": "gen2d --config toy.yaml",
         "licence": "CC0-1.0",
     }
-    return Dataset(**(values | changes))  # pyright: ignore[reportArgumentType]
+    return DatasetSpec(**(values | changes))  # pyright: ignore[reportArgumentType]
 
 
-def video(made: Dataset, split: str, number: int) -> dict[str, np.ndarray]:
+def video(made: DatasetSpec, split: str, number: int) -> dict[str, np.ndarray]:
     """One video, which depends on (seed, split, number) only."""
     random = np.random.default_rng([made.seed, len(split), number])
     frames, height, width, slots = (made.sizes[axis] for axis in "THWK")
@@ -70,7 +73,7 @@ def video(made: Dataset, split: str, number: int) -> dict[str, np.ndarray]:
     return values
 
 
-def columns(made: Dataset, shard: Shard, rows: range | None = None) -> dict[str, np.ndarray]:
+def columns(made: DatasetSpec, shard: Shard, rows: range | None = None) -> dict[str, np.ndarray]:
     """The shard's videos, or some of them, stacked."""
     rows = range(shard.count) if rows is None else rows
     videos = [video(made, shard.split, shard.first + row) for row in rows]
@@ -78,22 +81,30 @@ def columns(made: Dataset, shard: Shard, rows: range | None = None) -> dict[str,
     return {name: np.stack([values[name] for values in videos]).astype(made.fields[name].dtype) for name in names}
 
 
-def blocks(made: Dataset, shard: Shard, size: int = 3) -> Iterator[shards.Block]:
+def blocks(made: DatasetSpec, shard: Shard, size: int = 3) -> Iterator[Block]:
     """The shard in blocks of `size` videos, made one at a time."""
     for first in range(0, shard.count, size):
         rows = range(first, min(first + size, shard.count))
-        yield shards.encode(columns(made, shard, rows), made.fields, made.codec, made.chunk_frames)
+        yield encode(columns(made, shard, rows), made.fields, made.codec, made.chunk_frames)
 
 
-def make(made: Dataset, size: int = 3, **options: bool) -> Dataset:
+def make(made: DatasetSpec, size: int = 3, **options: bool) -> DatasetSpec:
     """The dataset, complete on disk."""
-    for shard in shards.open_folder(made, **options):
-        shards.write(made, shard, blocks(made, shard, size))
-    assert shards.finish(made)
+    todo = open_folder(made, **options)
+    with ShardWriter(made) as writer:
+        for shard in todo:
+            writer.write(shard, blocks(made, shard, size))
+    assert complete(made)
     return made
 
 
-def folder(made: Dataset) -> Path:
+def write(made: DatasetSpec, shard: Shard, blocks: Iterable[Block]) -> None:
+    """Returns when the shard is done."""
+    with ShardWriter(made) as writer:
+        writer.write(shard, blocks)
+
+
+def folder(made: DatasetSpec) -> Path:
     """Where on this machine the dataset lies."""
     assert isinstance(made.root, Path)
     return made.root

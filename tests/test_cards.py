@@ -16,7 +16,7 @@ from numpy.testing import assert_array_equal
 from gen2d import preview
 from gen2d.dataset.manifest import read_manifest
 from gen2d.storage import codecs
-from gen2d.storage.atomic import file_sha256
+from gen2d.storage.sealed import file_sha256
 from gen2d.verification import verify
 
 
@@ -26,9 +26,10 @@ def test_the_cards_name_every_field_and_file(tmp_path: Path) -> None:
     assert all(f"| {name} | {field.dtype} | {field.axes} |" in readme for name, field in made.fields.items())
     assert all(word in readme for word in (made.command, made.licence, made.conventions))
     croissant = json.loads((tmp_path / "croissant.json").read_text())
-    for part in croissant["distribution"]:
-        assert part["sha256"] == file_sha256(tmp_path / part["contentUrl"])
-        assert part["contentSize"] == f"{(tmp_path / part['contentUrl']).stat().st_size} B"
+    manifest, files = croissant["distribution"]
+    assert manifest["sha256"] == file_sha256(tmp_path / manifest["contentUrl"])
+    assert manifest["contentSize"] == f"{(tmp_path / manifest['contentUrl']).stat().st_size} B"
+    assert len(list(tmp_path.glob(files["includes"]))) == 4
 
 
 def test_the_sheet_shows_the_first_videos_and_is_verified(tmp_path: Path) -> None:
@@ -62,21 +63,23 @@ def test_a_large_frame_is_made_smaller_on_the_sheet() -> None:
 def test_the_readme_tells_the_statistics(tmp_path: Path) -> None:
     synthetic.make(synthetic.dataset(tmp_path))
     readme = (tmp_path / "README.md").read_text()
-    for split, fields in read_manifest(tmp_path)["stats"].items():
+    for split, fields in read_manifest(tmp_path).stats.items():
         for name, about in fields.items():
-            assert f"| {split} | {name} | {', '.join(f'{x:.4g}' for x in about['mean'])} |" in readme
+            mean = about["mean"]
+            assert mean is not None
+            assert f"| {split} | {name} | {', '.join(f'{x:.4g}' for x in mean)} |" in readme
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")  # the validator's own
-def test_croissant_is_valid_and_lists_the_shards(tmp_path: Path) -> None:
+def test_croissant_is_valid_and_lists_the_tables(tmp_path: Path) -> None:
     mlcroissant = pytest.importorskip("mlcroissant")
     synthetic.make(synthetic.dataset(tmp_path))
     described = mlcroissant.Dataset(jsonld=str(tmp_path / "croissant.json"))
     assert not described.metadata.ctx.issues.errors
-    rows = [{key.split("/")[1]: value for key, value in row.items()} for row in described.records("shards")]
-    expected = read_manifest(tmp_path)["shards"]
-    assert [(row["name"].decode(), row["first"], row["count"]) for row in rows] == [
-        (shard["name"], shard["first"], shard["count"]) for shard in expected
+    rows = [{key.split("/")[1]: value for key, value in row.items()} for row in described.records("tables")]
+    expected = read_manifest(tmp_path).tables.values()
+    assert [(row["file"].decode(), row["shards"], row["bytes"]) for row in rows] == [
+        (table.file, table.shards, table.bytes) for table in expected
     ]
 
 

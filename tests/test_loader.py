@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from numpy.testing import assert_array_equal
 
 from gen2d.core.errors import ConfigError, FolderError
-from gen2d.loading import chunks as pieces
+from gen2d.loading import chunks
 from gen2d.loading import dataset as loader
 
 TRAIN = 20
@@ -102,7 +102,7 @@ def test_what_a_dataset_tells_about_itself(toy: Path) -> None:
     assert list(dataset.fields) == ["states/angle", "states/position", "frames"]
     assert dataset.fields["frames"] == synthetic.FIELDS["frames"]
     assert dataset.stats.keys() == dataset.fields.keys()
-    assert dataset.manifest["name"] == "toy"
+    assert dataset.manifest.name == "toy"
     assert_array_equal(dataset.time, np.arange(5) / 10)
 
 
@@ -160,7 +160,7 @@ def test_files_are_closed_when_many_are_open(tmp_path: Path) -> None:
     before = len(list(Path("/proc/self/fd").iterdir()))
     assert dataset[:]["index"].tolist() == list(range(140))
     assert len(list(Path("/proc/self/fd").iterdir())) <= before + 128
-    assert pieces._opened.cache_info().currsize <= 128
+    assert len(chunks._files) <= chunks.OPEN
 
 
 def test_no_jax_is_imported() -> None:

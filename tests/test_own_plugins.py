@@ -16,7 +16,7 @@ from tiny import changed
 import gen2d
 from gen2d.config import load_config
 from gen2d.core.errors import ConfigError, FolderError
-from gen2d.dataset import folder as shards
+from gen2d.dataset.manifest import read_manifest
 from gen2d.generation import generate
 from gen2d.redraw import config_of
 from gen2d.regeneration import repair
@@ -68,7 +68,7 @@ def root(request: pytest.FixtureRequest, home: Path, tmp_path: Path) -> Iterator
 
 
 def test_the_files_lie_in_the_folder_and_in_its_manifest(home: Path) -> None:
-    files = shards.read_manifest(home / "data")["files"]
+    files = read_manifest(home / "data")["files"]
     assert sorted(name for name in files if name.startswith("plugins/")) == COPIES
     for name, kind in zip(COPIES, ("looks", "families"), strict=True):
         assert (home / "data" / name).read_bytes() == (home / kind / "mine.py").read_bytes()

@@ -11,7 +11,7 @@ from test_verification import flip
 from tiny import changed, ran
 
 from gen2d.core.errors import FolderError
-from gen2d.dataset import folder as shards
+from gen2d.dataset.manifest import read_manifest
 from gen2d.generation import generate
 from gen2d.regeneration import repair
 from gen2d.storage import codecs
@@ -43,7 +43,7 @@ def contents(root: Path) -> dict[str, bytes]:
 
 def forge(root: Path, name: str, field: str, row: int) -> None:
     """Another number in a shard, and every checksum as if it had been written so."""
-    about = shards.read_manifest(root)["fields"][field]
+    about = read_manifest(root)["fields"][field]
     size = int(np.prod(about["shape"])) * np.dtype(about["dtype"]).itemsize
     path, record_path = root / "shards" / f"{name}.h5", root / ".gen2d" / "done" / f"{name}.json"
     with h5py.File(path, "r") as file:

@@ -25,8 +25,10 @@ from numpy.testing import assert_array_equal
 
 import gen2d
 from gen2d.core.errors import ConfigError, DamagedError, FolderError, UserError
-from gen2d.dataset import folder as shards
 from gen2d.dataset import hdf5
+from gen2d.dataset.folder import log, open_folder
+from gen2d.dataset.manifest import read_manifest
+from gen2d.dataset.spec import DatasetSpec, mine
 from gen2d.loading import dataset as loader
 from gen2d.loading.dataloader import DataLoader
 from gen2d.storage import paths as remote
@@ -252,7 +254,7 @@ def sizes(folder: Path) -> dict[str, int]:
 def test_a_cache_keeps_to_its_limit_and_drops_what_was_used_longest_ago(
     server: Server, toy: Path, tmp_path: Path
 ) -> None:
-    made = {shard["name"]: shard for shard in shards.read_manifest(toy)["shards"]}
+    made = {shard["name"]: shard for shard in read_manifest(toy)["shards"]}
     hashes = [made[f"train-{i:05d}"]["sha256"] for i in range(3)]
     limit = made["train-00000"]["bytes"] + made["train-00001"]["bytes"] + 20000  # the index, and some
     dataset, expected = gen2d.open(TOY, cache_dir=tmp_path, cache_bytes=limit), gen2d.open(toy)
@@ -355,7 +357,7 @@ def test_reading_a_folder_imports_no_fsspec_and_reading_a_url_no_jax(toy: Path) 
 # ---- Writing
 
 
-def at(url: str, **changes: Any) -> shards.Dataset:
+def at(url: str, **changes: Any) -> DatasetSpec:
     return synthetic.dataset(place(url), **changes)
 
 
@@ -366,9 +368,9 @@ def test_what_is_written_is_what_is_in_the_folder_and_in_order(server: Server, t
     assert written[-1] == "manifest.json"
     for name in ("train-00000", "train-00002", "test-00000"):
         assert written.index(f"shards/{name}.h5") < written.index(f".gen2d/done/{name}.json")
-    assert shards.open_folder(at("s3://bucket/written")) == []
-    shards.log(place("s3://bucket/written"), {"speed": 1})
-    shards.log(place("s3://bucket/written"), {"speed": 2})
+    assert open_folder(at("s3://bucket/written")) == []
+    log(place("s3://bucket/written"), {"speed": 1})
+    log(place("s3://bucket/written"), {"speed": 2})
     lines = (place("s3://bucket/written") / ".gen2d/run.jsonl").read_bytes().splitlines()
     assert [json.loads(line)["speed"] for line in lines] == [1, 2]
 
@@ -396,7 +398,7 @@ def test_an_upload_that_keeps_failing_is_told_and_resumed(server: Server, toy: P
     server.reset()
     with pytest.raises(FolderError, match="is incomplete"):
         gen2d.open(url)
-    assert "train-00001" in [shard.name for shard in shards.open_folder(at(url))]
+    assert "train-00001" in [shard.name for shard in open_folder(at(url))]
     synthetic.make(at(url))
     assert buckets.tree(url) == synthetic.tree(toy)
 
@@ -443,7 +445,7 @@ def test_a_killed_writer_is_resumed(
 
 def test_more_videos_extend_and_equal_one_run(tmp_path: Path) -> None:
     synthetic.make(at("s3://bucket/longer", train=12))
-    assert [shard.name for shard in shards.open_folder(at("s3://bucket/longer", train=30))] == [
+    assert [shard.name for shard in open_folder(at("s3://bucket/longer", train=30))] == [
         "train-00001", "train-00002", "train-00003",
     ]  # fmt: skip
     synthetic.make(at("s3://bucket/longer", train=30))
@@ -453,11 +455,11 @@ def test_more_videos_extend_and_equal_one_run(tmp_path: Path) -> None:
 
 def test_workers_share_a_url(toy: Path) -> None:
     made = at("s3://bucket/shared")
-    shares = [shards.mine(shards.open_folder(made), worker, 2) for worker in range(2)]
+    shares = [mine(open_folder(made), worker, 2) for worker in range(2)]
     for share, complete in zip(shares, (False, True), strict=True):
         for shard in share:
-            shards.write(made, shard, synthetic.blocks(made, shard))
-        assert shards.finish(made) == complete
+            synthetic.write(made, shard, synthetic.blocks(made, shard))
+        assert complete(made) == complete
     assert buckets.tree("s3://bucket/shared") == synthetic.tree(toy)
 
 
@@ -466,7 +468,7 @@ def test_another_dataset_is_refused_or_replaced(tmp_path: Path) -> None:
     synthetic.make(at(url))
     before = buckets.tree(url)
     with pytest.raises(FolderError, match="seed is 7 there and 8 here"):
-        shards.open_folder(at(url, seed=8))
+        open_folder(at(url, seed=8))
     assert buckets.tree(url) == before
     synthetic.make(at(url, train=3, seed=8), overwrite=True)
     synthetic.make(synthetic.dataset(tmp_path, train=3, seed=8))
@@ -478,7 +480,7 @@ def test_what_is_no_dataset_is_left_alone(tmp_path: Path) -> None:
     remote.upload(tmp_path / "thesis.tex", Url("s3://bucket/thesis/thesis.tex"))
     for overwrite in (False, True):
         with pytest.raises(FolderError, match="holds something else"):
-            shards.open_folder(at("s3://bucket/thesis"), overwrite)
+            open_folder(at("s3://bucket/thesis"), overwrite)
     assert list(buckets.tree("s3://bucket/thesis")) == ["thesis.tex"]
 
 
@@ -496,14 +498,14 @@ def test_no_permission_is_told(server: Server, toy: Path, method: str) -> None:
 
 def test_a_full_disk_is_that_of_temporary_files(monkeypatch: pytest.MonkeyPatch) -> None:
     made = at("s3://bucket/full")
-    shard = shards.open_folder(made)[0]
+    shard = open_folder(made)[0]
 
     def write(*_: object) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr(hdf5, "write", write)
     with pytest.raises(FolderError, match=rf"^no space left for {tempfile.gettempdir()}: ") as caught:
-        shards.write(made, shard, synthetic.blocks(made, shard))
+        synthetic.write(made, shard, synthetic.blocks(made, shard))
     assert caught.value.exit_code == 1
 
 

@@ -4,6 +4,7 @@ import dataclasses
 import errno
 import json
 import os
+import re
 import signal
 import socket
 import subprocess
@@ -19,19 +20,23 @@ import pytest
 import synthetic
 from numpy.testing import assert_allclose, assert_array_equal
 
+from gen2d.complete import complete
 from gen2d.core.errors import DamagedError, FolderError
-from gen2d.dataset import folder as shards
 from gen2d.dataset import hdf5
+from gen2d.dataset.block import Block, encode, head
+from gen2d.dataset.folder import free_bytes, log, open_folder
+from gen2d.dataset.manifest import read_manifest
+from gen2d.dataset.spec import mine, plan
 from gen2d.storage import codecs
+from gen2d.storage.leases import leased
 
 CODECS = pytest.mark.parametrize("codec", codecs.CODECS)
-DEAD = 2**22 + 1  # above the largest process number of Linux
 
 
 @pytest.mark.parametrize("count", [0, 1, 7, 8, 9, 100])
 @pytest.mark.parametrize("size", [1, 8])
 def test_a_plan_covers_each_video_once(count: int, size: int) -> None:
-    planned = shards.plan({"train": count, "val": 3}, size)
+    planned = plan({"train": count, "val": 3}, size)
     covered = [(s.split, s.first + row) for s in planned for row in range(s.count)]
     assert covered == [("train", i) for i in range(count)] + [("val", i) for i in range(3)]
     assert len({s.name for s in planned}) == len(planned)
@@ -39,17 +44,17 @@ def test_a_plan_covers_each_video_once(count: int, size: int) -> None:
 
 
 def test_workers_share_the_plan_whatever_is_done() -> None:
-    planned = shards.plan({"train": 50}, 4)
+    planned = plan({"train": 50}, 4)
     remaining = planned[3:]
-    shares = [shards.mine(remaining, worker, 3) for worker in range(3)]
-    assert sorted(s.number for share in shares for s in share) == [s.number for s in remaining]
-    assert shares[1] == [s for s in shards.mine(planned, 1, 3) if s in remaining]
+    shares = [mine(remaining, worker, 3) for worker in range(3)]
+    assert sorted(s.place for share in shares for s in share) == [s.place for s in remaining]
+    assert shares[1] == [s for s in mine(planned, 1, 3) if s in remaining]
 
 
 @CODECS
 def test_every_field_is_read_back(tmp_path: Path, codec: str) -> None:
     made = synthetic.make(synthetic.dataset(tmp_path / "toy", codec=codec))
-    for shard in shards.plan(made.splits, made.videos_per_shard):
+    for shard in plan(made.splits, made.videos_per_shard):
         expected = synthetic.columns(made, shard) | dict(made.constants)
         found = hdf5.read(tmp_path / "toy" / "shards" / f"{shard.name}.h5")
         assert found.keys() == expected.keys()
@@ -61,7 +66,7 @@ def test_every_field_is_read_back(tmp_path: Path, codec: str) -> None:
 @pytest.mark.parametrize("codec", ["gzip", "none"])
 def test_h5py_alone_reads_every_field(tmp_path: Path, codec: str) -> None:
     made = synthetic.make(synthetic.dataset(tmp_path / "toy", codec=codec))
-    shard = shards.plan(made.splits, made.videos_per_shard)[1]
+    shard = plan(made.splits, made.videos_per_shard)[1]
     with h5py.File(tmp_path / "toy" / "shards" / f"{shard.name}.h5") as file:
         for name, values in synthetic.columns(made, shard).items():
             stored = file[name]
@@ -80,17 +85,23 @@ def test_h5py_alone_reads_every_field(tmp_path: Path, codec: str) -> None:
 @CODECS
 def test_the_index_says_where_the_bytes_are(tmp_path: Path, codec: str) -> None:
     made = synthetic.make(synthetic.dataset(tmp_path, codec=codec))
-    names = [shard["name"] for shard in shards.read_manifest(tmp_path)["shards"]]
-    table = np.load(tmp_path / "index" / "masks" / "instance.npy")
-    videos = np.load(tmp_path / "index" / "videos.npy")
-    assert len(table) == len(videos) == 23
-    for (number, offset, size, crc), row in zip(table.tolist(), videos["row"].tolist(), strict=True):
-        data = (tmp_path / "shards" / f"{names[number]}.h5").read_bytes()[offset : offset + size]
-        shard = shards.plan(made.splits, made.videos_per_shard)[number]
-        mask = np.empty((5, 8, 8), np.uint8)
-        codecs.decode_into(codec, data, mask)
-        assert_array_equal(mask, synthetic.video(made, shard.split, shard.first + row)["masks/instance"])
-        assert codecs.crc32(data) == crc
+    tables = {split: np.load(tmp_path / "index" / f"{split}-{count}.npy") for split, count in made.splits.items()}
+    for shard in plan(made.splits, made.videos_per_shard):
+        row, path = tables[shard.split][shard.place], tmp_path / "shards" / f"{shard.name}.h5"
+        content = path.read_bytes()
+        assert (row["first"], row["count"], row["bytes"]) == (shard.first, shard.count, len(content))
+        with h5py.File(path) as file:
+            stored = file["chunk_index"]
+            assert isinstance(stored, h5py.Dataset)
+            index = stored[()]
+            assert stored.id.get_offset() == row["index"]
+        for number, video in enumerate(index, shard.first):
+            ((offset, size, crc),) = video["masks/instance"].tolist()
+            data = content[offset : offset + size]
+            mask = np.empty((5, 8, 8), np.uint8)
+            codecs.decode_into(codec, data, mask)
+            assert_array_equal(mask, synthetic.video(made, shard.split, number)["masks/instance"])
+            assert codecs.crc32(data) == crc
 
 
 @CODECS
@@ -104,9 +115,9 @@ def test_bytes_depend_on_content_only(tmp_path: Path, codec: str) -> None:
 
 def test_head_is_what_encoding_fewer_gives(tmp_path: Path) -> None:
     made = synthetic.dataset(tmp_path)
-    shard = shards.plan(made.splits, 8)[1]
-    some = shards.encode(synthetic.columns(made, shard, range(3)), made.fields, "gzip")
-    first = shards.head(shards.encode(synthetic.columns(made, shard), made.fields, "gzip"), 3)
+    shard = plan(made.splits, 8)[1]
+    some = encode(synthetic.columns(made, shard, range(3)), made.fields, "gzip")
+    first = head(encode(synthetic.columns(made, shard), made.fields, "gzip"), 3)
     for part in ("arrays", "chunks", "crc", "moments"):
         for name, values in getattr(some, part).items():
             assert_array_equal(getattr(first, part)[name], values)
@@ -114,7 +125,7 @@ def test_head_is_what_encoding_fewer_gives(tmp_path: Path) -> None:
 
 def test_statistics_are_of_what_is_stored(tmp_path: Path) -> None:
     made = synthetic.make(synthetic.dataset(tmp_path))
-    stats = shards.read_manifest(tmp_path)["stats"]["train"]
+    stats = read_manifest(tmp_path).stats["train"]
     videos = [synthetic.video(made, "train", number) for number in range(20)]
     frames = np.stack([video["frames"] for video in videos])[:, ::8, ::4, ::4].reshape(-1, 3)
     place = np.concatenate([video["states/position"][:, video["objects/present"]].reshape(-1, 2) for video in videos])
@@ -125,59 +136,73 @@ def test_statistics_are_of_what_is_stored(tmp_path: Path) -> None:
 
 def test_a_column_of_another_type_is_refused(tmp_path: Path) -> None:
     made = synthetic.dataset(tmp_path)
-    columns = synthetic.columns(made, shards.plan(made.splits, 8)[0])
+    columns = synthetic.columns(made, plan(made.splits, 8)[0])
     with pytest.raises(ValueError, match="states/angle is float64, but must be float32"):
-        shards.encode(columns | {"states/angle": columns["states/angle"].astype(float)}, made.fields, "gzip")
+        encode(columns | {"states/angle": columns["states/angle"].astype(float)}, made.fields, "gzip")
 
 
 @pytest.mark.parametrize("videos", [7, 9])
 def test_a_shard_of_another_count_is_refused(tmp_path: Path, videos: int) -> None:
     made = synthetic.dataset(tmp_path)
-    shard = next(s for s in shards.open_folder(made) if s.count == 8)
+    shard = next(s for s in open_folder(made) if s.count == 8)
     blocks = synthetic.blocks(made, dataclasses.replace(shard, count=videos))
     with pytest.raises(ValueError, match="takes 8 videos"):
-        shards.write(made, shard, blocks)
+        synthetic.write(made, shard, blocks)
     assert not list((tmp_path / "shards").iterdir())
 
 
 def test_what_is_done_is_not_made_again(tmp_path: Path) -> None:
     made = synthetic.dataset(tmp_path)
-    todo = shards.open_folder(made)
-    shards.write(made, todo[1], synthetic.blocks(made, todo[1]))
-    assert not shards.finish(made)
-    assert shards.open_folder(made) == [todo[0], *todo[2:]]
+    todo = open_folder(made)
+    synthetic.write(made, todo[1], synthetic.blocks(made, todo[1]))
+    assert not complete(made)
+    assert open_folder(made) == [todo[0], *todo[2:]]
     synthetic.make(made)
-    assert shards.open_folder(made) == []
+    assert open_folder(made) == []
 
 
-@pytest.mark.parametrize("damage", ["shard shorter", "shard gone", "record cut", "record gone", "tables changed"])
+@pytest.mark.parametrize("damage", ["shard shorter", "shard gone", "row changed"])
 def test_what_is_not_whole_is_made_again(tmp_path: Path, damage: str) -> None:
     made = synthetic.make(synthetic.dataset(tmp_path, codec="zstd"))
     before = synthetic.tree(tmp_path)
-    folder = "shards" if damage.startswith("shard") else ".gen2d/done"
-    ending = {"shard": "h5", "record": "json", "tables": "npz"}[damage.split()[0]]
-    path = tmp_path / folder / f"train-00001.{ending}"
-    if damage.endswith("gone"):
+    path = tmp_path / ("index/train-20.npy" if damage == "row changed" else "shards/train-00001.h5")
+    content = bytearray(path.read_bytes())
+    if damage == "shard gone":
         path.unlink()
+    elif damage == "shard shorter":
+        path.write_bytes(content[:-9])
     else:
-        path.write_bytes(path.read_bytes()[:-9] + (b"" if ending != "npz" else b"012345678"))
-    assert [shard.name for shard in shards.open_folder(made)] == ["train-00001"]
-    assert not (tmp_path / "manifest.json").exists()
+        row = np.load(path).itemsize
+        content[len(content) - 2 * row + 100] ^= 4  # in the second of three
+        path.write_bytes(content)
+    assert [shard.name for shard in open_folder(made)] == ["train-00001"]
+    assert (tmp_path / "manifest.json").exists()
     synthetic.make(made)
     assert synthetic.tree(tmp_path) == before
 
 
-def test_a_forgotten_shard_is_made_again(tmp_path: Path) -> None:
-    made = synthetic.make(synthetic.dataset(tmp_path))
-    shards.forget(tmp_path, "test-00000")
-    assert [shard.name for shard in shards.open_folder(made)] == ["test-00000"]
+def test_what_is_recorded_and_not_whole_is_made_again(tmp_path: Path) -> None:
+    """A log that a crash cut in the middle of a row counts for the rows before it."""
+    made = synthetic.dataset(tmp_path)
+    todo = open_folder(made)
+    for shard in todo[1:]:
+        synthetic.write(made, shard, synthetic.blocks(made, shard))
+    cut, longer, _ = sorted((tmp_path / ".gen2d" / "records").glob("train.*"))
+    cut.write_bytes(cut.read_bytes()[:-9])
+    longer.write_bytes(longer.read_bytes() + b"part of another")
+    assert len(open_folder(made)) == 2
+    synthetic.make(made)
+    assert not list((tmp_path / ".gen2d" / "records").iterdir())
+    found = synthetic.tree(tmp_path)
+    synthetic.make(synthetic.dataset(tmp_path / "b"))
+    assert synthetic.tree(tmp_path / "b") == found
 
 
 def test_more_videos_extend_and_equal_one_run(tmp_path: Path) -> None:
     synthetic.make(synthetic.dataset(tmp_path / "a", train=12, codec="zstd"))
     first = (tmp_path / "a" / "shards" / "train-00000.h5").stat().st_mtime_ns
     longer = synthetic.dataset(tmp_path / "a", train=30, codec="zstd")
-    assert [s.name for s in shards.open_folder(longer)] == ["train-00001", "train-00002", "train-00003"]
+    assert [s.name for s in open_folder(longer)] == ["train-00001", "train-00002", "train-00003-n6"]
     synthetic.make(longer)
     synthetic.make(synthetic.dataset(tmp_path / "b", train=30, codec="zstd"))
     assert synthetic.tree(tmp_path / "a") == synthetic.tree(tmp_path / "b")
@@ -188,8 +213,8 @@ def test_fewer_videos_keep_what_is_there(tmp_path: Path) -> None:
     synthetic.make(synthetic.dataset(tmp_path, train=20))
     before = synthetic.tree(tmp_path)
     fewer = synthetic.dataset(tmp_path, train=5)
-    assert shards.open_folder(fewer) == []
-    assert shards.finish(fewer)
+    assert open_folder(fewer) == []
+    assert complete(fewer)
     assert synthetic.tree(tmp_path) == before
 
 
@@ -211,7 +236,7 @@ def test_another_dataset_is_refused(tmp_path: Path, change: dict[str, Any], told
         (tmp_path / ".gen2d").rename(tmp_path.parent / f"{tmp_path.name}-mark")
     before = synthetic.tree(tmp_path)
     with pytest.raises(FolderError, match="--overwrite") as caught:
-        shards.open_folder(synthetic.dataset(tmp_path, train=3, **change))
+        open_folder(synthetic.dataset(tmp_path, train=3, **change))
     assert told in str(caught.value)
     assert synthetic.tree(tmp_path) == before
 
@@ -227,11 +252,11 @@ def test_overwrite_replaces_a_dataset(tmp_path: Path) -> None:
 def test_what_is_no_dataset_is_left_alone(tmp_path: Path, overwrite: bool) -> None:
     (tmp_path / "thesis.tex").write_text("years of work")
     with pytest.raises(FolderError, match="something else"):
-        shards.open_folder(synthetic.dataset(tmp_path), overwrite)
+        open_folder(synthetic.dataset(tmp_path), overwrite)
     with pytest.raises(FolderError, match="is a file, not a folder"):
-        shards.open_folder(synthetic.dataset(tmp_path / "thesis.tex"), overwrite)
+        open_folder(synthetic.dataset(tmp_path / "thesis.tex"), overwrite)
     with pytest.raises(FolderError, match="is a file, not a folder"):
-        shards.open_folder(synthetic.dataset(tmp_path / "thesis.tex" / "toy"), overwrite)
+        open_folder(synthetic.dataset(tmp_path / "thesis.tex" / "toy"), overwrite)
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
 
 
@@ -244,32 +269,34 @@ def test_a_folder_that_cannot_be_made_is_explained(
 
     monkeypatch.setattr(Path, "mkdir", mkdir)
     with pytest.raises(FolderError, match=told):
-        shards.open_folder(synthetic.dataset(tmp_path / "toy"))
+        open_folder(synthetic.dataset(tmp_path / "toy"))
 
 
 def test_leftovers_of_the_dead_go_and_others_stay(tmp_path: Path) -> None:
     synthetic.make(synthetic.dataset(tmp_path, train=3))
-    names = [f"a.h5.tmp.{socket.gethostname()}.{DEAD}", f"b.h5.tmp.{socket.gethostname()}.{os.getppid()}"]
-    names.append(f"c.h5.tmp.other-host.{DEAD}")
-    for name in names:
-        (tmp_path / "shards" / name).touch()
-    shards.open_folder(synthetic.dataset(tmp_path, train=3))
-    assert [(tmp_path / "shards" / name).exists() for name in names] == [False, True, True]
+    names = ["a.h5.tmp.0123456789abcdef", "b.h5.tmp.0123456789abcdef", "c.h5.tmp.host.17"]
+    (tmp_path / "shards" / names[0]).touch()
+    (tmp_path / "shards" / names[2]).touch()
+    with leased(tmp_path / "shards" / names[1]):
+        open_folder(synthetic.dataset(tmp_path, train=3))
+        assert [(tmp_path / "shards" / name).exists() for name in names] == [False, True, True]
+    open_folder(synthetic.dataset(tmp_path, train=3))
+    assert [(tmp_path / "shards" / name).exists() for name in names] == [False, False, True]
 
 
 @pytest.mark.parametrize("raised", [ValueError, KeyboardInterrupt, SystemExit])
 def test_nothing_half_written_stays(tmp_path: Path, raised: type[BaseException]) -> None:
     made = synthetic.dataset(tmp_path)
-    shard = shards.open_folder(made)[1]
+    shard = open_folder(made)[1]
 
-    def failing() -> Iterator[shards.Block]:
+    def failing() -> Iterator[Block]:
         yield next(synthetic.blocks(made, shard))
         raise raised
 
     with pytest.raises(raised):
-        shards.write(made, shard, failing())
+        synthetic.write(made, shard, failing())
     assert not list((tmp_path / "shards").iterdir())
-    assert not list((tmp_path / ".gen2d" / "done").iterdir())
+    assert not list((tmp_path / ".gen2d" / "records").iterdir())
 
 
 # The limit on a file's size stands in for a full disk: HDF5 meets both in the same place.
@@ -278,38 +305,39 @@ import resource, signal, sys
 from pathlib import Path
 sys.path.insert(0, {tests!r})
 import synthetic
-from gen2d.dataset import folder as shards
-from gen2d.core.errors import FolderError
+from gen2d.core.errors import UserError
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 made = synthetic.dataset(Path({root!r}))
-shard = shards.open_folder(made)[1]
+shard = synthetic.open_folder(made)[1]
 resource.setrlimit(resource.RLIMIT_FSIZE, (9000, 9000))
 try:
-    shards.write(made, shard, synthetic.blocks(made, shard))
-except OSError as error:
-    print("refused", error.errno)
+    synthetic.write(made, shard, synthetic.blocks(made, shard))
+except UserError as error:
+    print(error.exit_code, error)
 """
 
 
 def test_a_write_that_the_disk_refuses_leaves_nothing(tmp_path: Path) -> None:
     script = FULL.format(tests=str(Path(__file__).parent), root=str(tmp_path))
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
-    assert done.stdout.startswith(f"refused {errno.EFBIG}"), done.stderr
+    assert re.fullmatch(r"1 .* cannot hold so large a file: .*ulimit -f.*same command again.*\n", done.stdout), done
     assert done.returncode == 0, done.stderr
     assert not list((tmp_path / "shards").iterdir())
 
 
 def test_a_full_disk_is_explained(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     made = synthetic.dataset(tmp_path)
-    shard = shards.open_folder(made)[1]
+    shard = open_folder(made)[1]
 
     def write(path: Path, *_: object) -> None:
         path.write_bytes(b"some")
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr(hdf5, "write", write)
-    with pytest.raises(FolderError, match=r"MB are missing.*same command again") as caught:
-        shards.write(made, shard, synthetic.blocks(made, shard))
+    with pytest.raises(
+        FolderError, match=r"no space left .* needs about .* MB left: make room.*same command again"
+    ) as caught:
+        synthetic.write(made, shard, synthetic.blocks(made, shard))
     assert caught.value.exit_code == 1
     assert not list((tmp_path / "shards").iterdir())
 
@@ -320,16 +348,15 @@ import sys, time
 from pathlib import Path
 sys.path.insert(0, {tests!r})
 import synthetic
-from gen2d.dataset import folder as shards
 made = synthetic.dataset(Path({root!r}), codec={codec!r})
-todo = shards.open_folder(made)
-shards.write(made, todo[1], synthetic.blocks(made, todo[1]))
+todo = synthetic.open_folder(made)
+synthetic.write(made, todo[1], synthetic.blocks(made, todo[1]))
 def slow():
     for block in synthetic.blocks(made, todo[2]):
         yield block
         print("half", flush=True)
         time.sleep(60)
-shards.write(made, todo[2], slow())
+synthetic.write(made, todo[2], slow())
 """
 
 
@@ -354,11 +381,12 @@ import os, random, signal, sys, time
 from pathlib import Path
 sys.path.insert(0, {tests!r})
 import synthetic
-from gen2d.dataset import folder as shards
+from gen2d.dataset.spec import mine
 def work(made, number):
-    for shard in shards.mine(shards.open_folder(made), number, 3):
-        shards.write(made, shard, synthetic.blocks(made, shard))
-    shards.finish(made)
+    with synthetic.ShardWriter(made) as writer:
+        for shard in mine(synthetic.open_folder(made), number, 3):
+            writer.write(shard, synthetic.blocks(made, shard))
+    synthetic.complete(made)
 fields = {{name: synthetic.FIELDS[name] for name in {fields!r}}}
 chance, killed, count = random.Random(5), 0, 24
 while killed < 40:
@@ -397,21 +425,21 @@ def test_forty_kills_leave_no_trace(tmp_path: Path) -> None:
 
 def test_the_manifest_keeps_to_the_schema_and_to_itself(tmp_path: Path) -> None:
     made = synthetic.make(synthetic.dataset(tmp_path))
-    manifest = shards.read_manifest(tmp_path)
-    assert manifest["schema"] == "gen2d.dataset/1"
-    assert manifest["splits"] == {"train": 20, "test": 3}
-    assert manifest["config"] == made.config
-    assert socket.gethostname() not in json.dumps(manifest)
+    manifest = read_manifest(tmp_path)
+    assert manifest.plain["schema"] == "gen2d.dataset/2"
+    assert manifest.splits == {"train": 20, "test": 3}
+    assert manifest.config == made.config
+    assert socket.gethostname() not in json.dumps(manifest.plain)
     text = (tmp_path / "manifest.json").read_text()
     (tmp_path / "manifest.json").write_text(text.replace('"fps": 10.0', '"fps": 11.0'))
     with pytest.raises(DamagedError, match="not what was written"):
-        shards.read_manifest(tmp_path)
+        read_manifest(tmp_path)
 
 
 def test_the_log_takes_one_line_a_time(tmp_path: Path) -> None:
-    shards.open_folder(synthetic.dataset(tmp_path))
-    shards.log(tmp_path, {"speed": 1.5})
-    shards.log(tmp_path, {"speed": 2})
+    open_folder(synthetic.dataset(tmp_path))
+    log(tmp_path, {"speed": 1.5})
+    log(tmp_path, {"speed": 2})
     lines = (tmp_path / ".gen2d" / "run.jsonl").read_text().splitlines()
     assert [json.loads(line)["speed"] for line in lines] == [1.5, 2]
-    assert shards.free_bytes(tmp_path / "not" / "yet") > 0
+    assert free_bytes(tmp_path / "not" / "yet") > 0

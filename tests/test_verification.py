@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 import synthetic
 
+from gen2d.complete import complete
 from gen2d.core.errors import ConfigError, DamagedError, FolderError
-from gen2d.dataset import folder as shards
+from gen2d.dataset.block import encode
+from gen2d.dataset.folder import open_folder
 from gen2d.loading import dataset as loader
 from gen2d.verification import damaged_shards, verify
 
@@ -41,8 +43,8 @@ def test_what_was_written_passes(tmp_path: Path, codec: str, level: str) -> None
 
 
 KINDS = [
-    *("shards/*.h5", "index/**/*.npy", "manifest.json", "config.yaml", "croissant.json", ".gen2d/dataset.json"),
-    *(".gen2d/done/*.json", ".gen2d/done/*.npz"),
+    *("shards/*.h5", "index/*.npy", "manifest.json", "config.yaml", "croissant.json", "sheet.png"),
+    ".gen2d/dataset.json",
 ]
 
 
@@ -82,7 +84,7 @@ def test_a_flipped_bit_anywhere_is_found_and_never_read(root: Path, kind: str) -
 @pytest.mark.parametrize("level", ["quick", "full"])
 def test_files_in_each_others_place_are_found_and_never_read(root: Path, level: str) -> None:
     expected = everything(root)
-    for kind in ("shards/*.h5", "index/*/*.npy", "index/*.npy", ".gen2d/done/*.json", ".gen2d/done/*.npz"):
+    for kind in ("shards/*.h5", "index/*.npy"):
         one, other = sorted(root.glob(kind))[:2]
         contents = one.read_bytes(), other.read_bytes()
         for path, content in zip((one, other), reversed(contents), strict=True):
@@ -120,10 +122,11 @@ def test_a_copy_without_the_programs_own_files_is_whole(root: Path) -> None:
 
 
 def test_a_damaged_piece_is_named_and_not_returned(root: Path) -> None:
-    names = {shard["name"]: number for number, shard in enumerate(shards.read_manifest(root)["shards"])}
-    table = np.load(root / "index" / "frames.npy")
-    (row,) = np.flatnonzero(table["shard"] == names["train-00000"])[5:6]
-    flip(root / "shards" / "train-00000.h5", 8 * int(table["offset"][row] + table["size"][row] // 2))
+    with h5py.File(root / "shards" / "train-00000.h5") as file:
+        stored = file["frames"]
+        assert isinstance(stored, h5py.Dataset)
+        piece = stored.id.get_chunk_info(5)
+    flip(root / "shards" / "train-00000.h5", 8 * (piece.byte_offset + piece.size // 2))
     assert any("frames of train video 5" in sentence for sentence in verify(root, "full"))
     assert damaged_shards(root, "full") == ["train-00000"]
     dataset = loader.open(root)
@@ -133,13 +136,13 @@ def test_a_damaged_piece_is_named_and_not_returned(root: Path) -> None:
 
 
 def test_a_damaged_state_is_named_and_not_returned(root: Path) -> None:
-    with h5py.File(root / "shards" / "train-00001.h5") as file:
+    with h5py.File(root / "shards" / "train-00001-n2.h5") as file:
         stored = file["states/position"]
         assert isinstance(stored, h5py.Dataset)
         offset = stored.id.get_offset()
     assert offset
-    flip(root / "shards" / "train-00001.h5", 8 * offset)
-    with pytest.raises(DamagedError, match=r"train-00001.h5: states/position of train video 8"):
+    flip(root / "shards" / "train-00001-n2.h5", 8 * offset)
+    with pytest.raises(DamagedError, match=r"train-00001-n2.h5: states/position of train video 8"):
         loader.open(root)[8]
     assert loader.open(root, fields=("frames", "states/angle"))[8]
     assert loader.open(root, verify="none")[8]
@@ -148,17 +151,19 @@ def test_a_damaged_state_is_named_and_not_returned(root: Path) -> None:
 @pytest.mark.parametrize("level", ["quick", "full"])
 def test_missing_cut_empty_and_extra_files_are_found(root: Path, level: str) -> None:
     (root / "shards" / "train-00000.h5").unlink()
-    (root / "shards" / "test-00000.h5").write_bytes(b"")
-    path = root / "shards" / "train-00001.h5"
+    (root / "shards" / "test-00000-n3.h5").write_bytes(b"")
+    path = root / "shards" / "train-00001-n2.h5"
     path.write_bytes(path.read_bytes()[:-1])
-    (root / "shards" / "train-00007.h5").write_bytes(b"more")
-    (root / "index" / "videos.npy").unlink()
+    (root / "shards" / "train-00007.h5").write_bytes(b"of a run that goes on")
+    (root / "shards" / "notes.txt").write_bytes(b"more")
     (root / "index" / "extra.npy").write_bytes(b"")
     found = verify(root, level)
-    wrong = ("train-00000.h5 is missing", "test-00000.h5 has 0 bytes", "train-00001.h5 has", "train-00007.h5 does not")
-    for part in (*wrong, "videos.npy is missing", "extra.npy does not belong"):
+    wrong = ("train-00000.h5 is missing", "test-00000-n3.h5 has 0 bytes", "train-00001-n2.h5 has")
+    for part in (*wrong, "notes.txt does not belong", "extra.npy does not belong"):
         assert any(part in sentence for sentence in found), part
-    assert damaged_shards(root, level) == ["test-00000", "train-00000", "train-00001"]
+    assert damaged_shards(root, level) == ["test-00000-n3", "train-00000", "train-00001-n2"]
+    (root / "index" / "train-10.npy").unlink()
+    assert any("train-10.npy is missing" in sentence for sentence in verify(root, level))
 
 
 @pytest.mark.parametrize("level", ["quick", "full"])
@@ -172,15 +177,15 @@ def test_an_incomplete_dataset_says_how_to_go_on(root: Path, level: str) -> None
 
 def test_a_shard_that_lies_is_found_although_its_checksums_fit(tmp_path: Path) -> None:
     made = synthetic.dataset(tmp_path, train=10)
-    for shard in shards.open_folder(made):
+    for shard in open_folder(made):
         columns = synthetic.columns(made, shard)
         if shard.name == "train-00000":
             columns["states/angle"][2, 1, 0] = np.nan
             columns["states/position"][3, 1, 0, 0] = np.inf
             columns["objects/mass"][4, 2] = np.nan
             columns["index"][5] = 99
-        shards.write(made, shard, [shards.encode(columns, made.fields, made.codec)])
-    assert shards.finish(made)
+        synthetic.write(made, shard, [encode(columns, made.fields, made.codec)])
+    assert complete(made)
     assert verify(tmp_path, "quick") == []
     found = verify(tmp_path, "full")
     assert len(found) == 4
@@ -196,13 +201,13 @@ def test_a_shard_that_lies_is_found_although_its_checksums_fit(tmp_path: Path) -
 
 def test_a_repair_makes_the_bad_shards_again(root: Path) -> None:
     before = synthetic.tree(root)
-    flip(root / "shards" / "train-00001.h5", 80000)
-    (root / "shards" / "test-00000.h5").unlink()
+    flip(root / "shards" / "train-00001-n2.h5", 80000)
+    (root / "shards" / "test-00000-n3.h5").unlink()
 
     def repair(names: list[str]) -> None:
-        assert names == ["test-00000", "train-00001"]
+        assert names == ["test-00000-n3", "train-00001-n2"]
         for name in names:
-            shards.forget(root, name)
+            (root / "shards" / f"{name}.h5").unlink(missing_ok=True)
         synthetic.make(synthetic.dataset(root, train=10, codec="zstd"))
 
     assert verify(root, "full", repair) == []

@@ -1,128 +1,108 @@
-"""A dataset folder: how a shard is written so that a crash cannot hurt it, what is left to do, and what completes it.
+"""A dataset's folder while it is made: who may write into it, what is left to do, and how it becomes the next snapshot.
 
-    plan -> open_folder -> (encode -> write) for each shard -> finish
+    plan -> open_folder -> (encode -> write) for each shard -> complete
 
-A shard is written under a temporary name, hashed, and renamed, or uploaded where the folder is a Url; its record under
-``.gen2d/done`` follows. A shard is done if its record fits and its file has the recorded size, so whatever a crash
-leaves is made again. Workers share nothing: each takes its shards by their number, and whoever finds all records writes
-the index, the cards and, last, the manifest.
+A shard is done if there is a row of it and its file has the size that the row says, so whatever a crash leaves is made
+again. Workers share nothing: each takes its shards by their place, and whoever finds all of them done publishes the
+tables and, last, the manifest. Until then readers have the manifest before it, and all that it names.
 """
 
 import contextlib
 import dataclasses
-import errno
-import io
 import json
 import math
+import os
 import shutil
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
-import numpy as np
-
-from gen2d.core.errors import FolderError
-from gen2d.dataset import cards, hdf5
-from gen2d.dataset.block import Block, Places, encode, head, merged, stored_bytes
-from gen2d.dataset.cards import SHEET
+from gen2d.core.errors import DamagedError, FolderError, UnreachableError
 from gen2d.dataset.manifest import (
+    CONFIG,
+    MANIFEST,
     MARK_SEAL,
-    RECORD_SEAL,
-    SEAL,
-    describe,
+    SHEET,
+    Manifest,
+    as_bytes,
     identity_of,
+    parse,
     read_manifest,
-    read_record,
-    write_index,
+    schema_of,
 )
-from gen2d.dataset.spec import MARK, SCHEMA, Dataset, Shard, mark_path, mine, plan, record_path, shard_path, table_path
-from gen2d.storage.atomic import (
-    as_json,
-    file_sha256,
-    publish,
-    publishing,
-    read_json,
-    read_sealed,
-    remove_tree,
-    sealed,
-    sha256,
-    size_of,
-    sweep,
-    work_folder,
+from gen2d.dataset.records import Records, read_records, remove_logs
+from gen2d.dataset.shard_writer import AGAIN
+from gen2d.dataset.spec import (
+    FILE_NAME,
+    MARK,
+    NEXT,
+    RECORDS,
+    SCHEMA,
+    SNAPSHOTS,
+    TABLE_NAME,
+    DatasetSpec,
+    Shard,
+    mark_path,
+    plan,
+    shard_name,
+    shard_of,
+    snapshot_path,
 )
+from gen2d.storage.atomic import is_temporary, publish, publish_changed, remove_tree, sweep
+from gen2d.storage.explain import writing_error
 from gen2d.storage.paths import Place, Url
+from gen2d.storage.sealed import JSON_BYTES, as_json, read_bytes, sealed
 
-__all__ = [
-    "Block", "Dataset", "Shard", "differences", "encode", "finish", "forget", "free_bytes", "head", "log", "lost",
-    "mine", "open_folder", "plan", "read_manifest", "write",
-]  # fmt: skip
+FOLDERS = ("", "shards", "index", f"{MARK}", f"{RECORDS}")  # where temporary files are written
 
 
-# ---- The folder
-
-
-def open_folder(dataset: Dataset, overwrite: bool = False) -> list[Shard]:
+def open_folder(spec: DatasetSpec, overwrite: bool = False) -> list[Shard]:
     """The shards that remain to be made, in a folder that is ready for them.
 
-    Videos that are there already stay, also those beyond what was asked. While shards remain, the folder has no
-    manifest. Raises FolderError for a folder that is not this dataset's, or cannot be written.
+    Videos that are there already stay, also those beyond what was asked. Raises FolderError for a folder that is not
+    this dataset's, or cannot be written.
     """
-    root = dataset.root
-    with _explained(root):
+    root = spec.root
+    with explained(root):
+        check_links(root)
         if overwrite and _is_dataset(root):
             _clear(root)
-        _claim(dataset)
-        sweep(root)
-        records = _records(dataset)
-        planned = _whole_plan(dataset, records)
-        done = _at_once(lambda shard: _is_done(dataset, shard, records), planned)
-        remaining = [shard for shard, is_done in zip(planned, done, strict=True) if not is_done]
+        _claim(spec)
+        sweep(root, FOLDERS)
+        records, sizes = read_records(spec), Sizes(root)
+        remaining = [shard for shard in whole_plan(spec, records) if not is_done(shard, records, sizes)]
         if remaining:
-            (root / "manifest.json").unlink(missing_ok=True)
+            _drop_snapshots(root)
         return remaining
 
 
-def lost(dataset: Dataset, bad: Iterable[str]) -> tuple[Dataset, list[str]]:
-    """The dataset with as many videos as it held, and which shards must be made again: those called `bad`, and all
-    whose record or file is not whole.
-
-    Where the manifest is damaged, the records say how many videos there were and what is in each shard, and every
-    shard is compared. Raises FolderError where they cannot say.
-    """
-    root, records = dataset.root, _records(dataset)
-    known = read_sealed(root / "manifest.json", SEAL)
-    planned = _whole_plan(dataset if known is None else _with_counts(dataset, known["splits"]), records)
-    missing = {shard.name for shard in planned if not _is_done(dataset, shard, records)}
-    if known is None:
-        _check_planned(root, planned)
-        missing |= {name for name in records.keys() - missing if not _has_bytes(shard_path(root, name), records[name])}
-    counts = {shard.split: shard.first + shard.count for shard in planned}
-    return _with_counts(dataset, counts), sorted(missing | set(bad))
+def whole_plan(spec: DatasetSpec, records: Records) -> list[Shard]:
+    """The plan for what was asked and for all that is there."""
+    counts = dict(spec.splits)
+    for split, count in records.counts().items():
+        counts[split] = max(counts.get(split, 0), count)
+    return plan(counts, spec.videos_per_shard)
 
 
-def _with_counts(dataset: Dataset, counts: Mapping[str, int]) -> Dataset:
-    return dataclasses.replace(dataset, splits=counts)
+class Sizes:
+    """The sizes of the shards' files, asked for all at once; at a URL, where none goes missing, those of the rows."""
+
+    def __init__(self, root: Place) -> None:
+        self.known: dict[str, int] | None = None
+        if isinstance(root, Path):
+            with contextlib.suppress(FileNotFoundError), os.scandir(root / "shards") as entries:
+                self.known = {e.name: e.stat().st_size for e in entries if e.is_file()}
+            self.known = self.known or {}
+
+    def fits(self, shard: Shard, size: int) -> bool:
+        """Whether the shard's file has this size."""
+        return self.known is None or self.known.get(f"{shard.name}.h5") == size
 
 
-def _has_bytes(path: Place, record: Mapping[str, Any]) -> bool:
-    return path.is_file() and file_sha256(path) == record["sha256"]
-
-
-def _check_planned(root: Place, planned: Iterable[Shard]) -> None:
-    """Raises FolderError for what a lost record may have been of: the dataset might have been larger."""
-    kinds = (root / "shards").glob("*.h5"), (root / MARK / "done").glob("*.json")
-    there = {path.name.rpartition(".")[0] for paths in kinds for path in paths}
-    for name in sorted(there - {shard.name for shard in planned}):
-        raise FolderError(
-            f"{root / 'manifest.json'} and the record of {name} are both not what was written, so nothing says how "
-            "many videos there were: run the command that made the dataset again"
-        )
-
-
-def forget(root: Place, name: str) -> None:
-    """Returns nothing; the shard called `name` counts as not made, so that the next run makes it again."""
-    record_path(root, name).unlink(missing_ok=True)
+def is_done(shard: Shard, records: Records, sizes: Sizes) -> bool:
+    """Whether the shard is recorded, and its file there."""
+    row = records.of(shard)
+    return row is not None and sizes.fits(shard, int(row["bytes"]))
 
 
 def free_bytes(root: Place) -> float:
@@ -134,43 +114,69 @@ def free_bytes(root: Place) -> float:
 
 
 def log(root: Place, entry: Mapping[str, Any]) -> None:
-    """Returns nothing; adds a line to the folder's run log, which is where times and hosts belong."""
+    """Adds a line to the folder's run log, which is where times and hosts belong."""
     path, line = root / MARK / "run.jsonl", json.dumps(dict(entry), sort_keys=True) + "\n"
-    with _explained(root):
+    with explained(root):
         if isinstance(path, Path):
             with path.open("a") as file:
                 file.write(line)
         else:  # an object is written anew, so of two workers that end at once one may go unnoted
-            publish(path, (path.read_bytes() if path.exists() else b"") + line.encode())
+            publish(path, (path.read_bytes(JSON_BYTES) if path.exists() else b"") + line.encode())
+
+
+# ---- Whose folder it is
 
 
 def _is_dataset(root: Place) -> bool:
-    return (root / MARK).is_dir() or (read_json(root / "manifest.json") or {}).get("schema") == SCHEMA
+    if isinstance(root, Url):
+        return mark_path(root).exists() or schema_of(root) is not None
+    return (root / MARK).is_dir() or (schema_of(root) or "").startswith("gen2d.dataset/")
+
+
+def check_links(root: Place) -> None:
+    """Raises FolderError where what is written would land outside the folder."""
+    if isinstance(root, Path):
+        for name in ("shards", "index", "plugins", f"{MARK}", f"{RECORDS}", f"{SNAPSHOTS}"):
+            if (root / name).is_symlink():
+                raise FolderError(f"{root / name} is a link, but gen2d writes only into the dataset's own folders")
 
 
 def _clear(root: Place) -> None:
-    """Removes what is written here and no more; the mark stays, so that a crash here leaves a dataset's folder."""
+    """Removes what is written here and no more; the mark's folder stays, so that a crash here leaves a dataset's."""
     (root / MARK).mkdir(exist_ok=True)
-    for name in ("manifest.json", "croissant.json", "README.md", SHEET, "config.yaml", MARK / "dataset.json"):
+    for name in (MANIFEST, "croissant.json", "README.md", SHEET, CONFIG, NEXT, MARK / "dataset.json"):
         (root / name).unlink(missing_ok=True)
-    for name in ("shards", "index", "plugins", MARK / "done"):
+    for name in ("shards", "index", "plugins", MARK / "done", RECORDS, SNAPSHOTS):
         remove_tree(root / name)
 
 
-def _claim(dataset: Dataset) -> None:
-    root = dataset.root
+def _claim(spec: DatasetSpec) -> None:
+    root = spec.root
     if root.is_dir() and not _is_dataset(root) and any(root.iterdir()):
         raise FolderError(f"{root} holds something else than a gen2d dataset: choose another --out")
-    for folder in (MARK / "done", "shards", "index"):
+    schema = schema_of(root)
+    if schema is not None and schema != SCHEMA:
+        raise FolderError(
+            f"{root} holds a dataset with the schema {schema}, but this gen2d writes {SCHEMA}: choose another --out, "
+            "or --overwrite to make the dataset anew"
+        )
+    for folder in (RECORDS, "shards", "index"):
         (root / folder).mkdir(parents=True, exist_ok=True)
-    mark, there = mark_path(root), identity_of(root)
+    mark = mark_path(root)
+    try:
+        there = identity_of(root)
+    except DamagedError:
+        there = None
     if there is not None:
-        _compare(root, there, dataset.identity)
+        _compare(root, there, spec.identity)
     elif mark.exists():
         raise FolderError(f"{mark} is damaged: choose another --out, or --overwrite to make the dataset anew")
-    content = as_json(sealed(dataset.identity, MARK_SEAL))
-    if not mark.is_file() or mark.read_bytes() != content:
-        publish(mark, content)
+    publish_changed(mark, mark_content(spec.identity))
+
+
+def mark_content(identity: Mapping[str, Any]) -> bytes:
+    """What stands in the file that says whose folder it is."""
+    return as_json(sealed(identity, MARK_SEAL))
 
 
 def _compare(root: Place, there: Mapping[str, Any], here: Mapping[str, Any]) -> None:
@@ -190,186 +196,147 @@ def differences(there: Any, here: Any, name: str = "") -> Iterator[str]:
 
 
 @contextlib.contextmanager
-def _explained(root: Place) -> Iterator[None]:
+def explained(root: Place) -> Iterator[None]:
+    """A block that writes into a dataset's folder; what goes wrong becomes one sentence."""
     try:
         yield
-    except (FileExistsError, NotADirectoryError) as error:
-        raise FolderError(f"{error.filename} is a file, not a folder: choose another --out") from error
-    except PermissionError as error:
-        raise FolderError(f"you have no permission to write in {error.filename}: choose another --out") from error
+    except UnreachableError as error:
+        raise error if AGAIN in str(error) else UnreachableError(f"{error}: once it can, {AGAIN}") from None
     except OSError as error:
         if isinstance(root, Url):
-            raise _unreached(root, error) from error
-        why = (
-            "is on a disk that is read-only" if error.errno == errno.EROFS else f"cannot be written ({error.strerror})"
-        )
-        raise FolderError(f"{root} {why}: choose another --out") from error
+            told = "permission was denied" if isinstance(error, PermissionError) else error.strerror or str(error)
+            raise FolderError(f"{error.filename or root} cannot be read or written ({told}): {AGAIN}") from None
+        raise writing_error(root, error, AGAIN) from error
 
 
-def _unreached(root: Url, error: OSError) -> FolderError:
-    told = "permission was denied" if isinstance(error, PermissionError) else error.strerror or str(error)
-    again = "run the same command again, and it goes on where it stopped"
-    return FolderError(f"{error.filename or root} cannot be read or written ({told}): once it can, {again}")
+# ---- The next snapshot
 
 
-# ---- One shard
+@dataclasses.dataclass(frozen=True)
+class Publication:
+    """Everything that a snapshot consists of beside its shards and tables."""
+
+    manifest: Manifest
+    files: Mapping[str, bytes]  # config, plug-ins, sheet, cards: by name in the folder
 
 
-def write(dataset: Dataset, shard: Shard, blocks: Iterable[Block]) -> dict[str, Any]:
-    """The record of the shard that `blocks` became; afterwards it is done, whatever happens to the machine.
+def publish_snapshot(spec: DatasetSpec, publication: Publication, records: Records) -> None:
+    """Returns when readers have this snapshot.
 
-    Raises FolderError when the disk is full or a server keeps failing. Whatever is raised, here or by `blocks`, nothing
-    half-written stays.
+    The manifest of the one before goes to `.gen2d/snapshots`, and so does, once the new manifest is there, what that
+    alone names. Killed at any moment, the folder has the one manifest or the other, whole.
     """
-    seen = _Seen()
-    try:
-        return _write(dataset, shard, seen.passing(blocks), seen)
-    except OSError as error:
-        if error.errno in (errno.ENOSPC, errno.EDQUOT):
-            raise _full(dataset, shard, seen) from error
-        if isinstance(dataset.root, Url):
-            raise _unreached(dataset.root, error) from error
-        raise
-
-
-class _Seen:
-    """What is kept of the blocks that pass on their way into a file."""
-
-    def __init__(self) -> None:
-        self.crc: dict[str, list[np.ndarray]] = {}
-        self.moments: dict[str, list[np.ndarray]] = {}
-        self.videos = self.bytes = 0
-
-    def passing(self, blocks: Iterable[Block]) -> Iterator[Block]:
-        for block in blocks:
-            for name, values in block.crc.items():
-                self.crc.setdefault(name, []).append(values)
-            for name, values in block.moments.items():
-                self.moments.setdefault(name, []).append(values)
-            self.videos += len(block)
-            self.bytes += block.nbytes
-            yield block
-
-
-def _write(dataset: Dataset, shard: Shard, blocks: Iterable[Block], seen: _Seen) -> dict[str, Any]:
-    about = {"schema": SCHEMA, "name": dataset.name, "split": shard.split, "first": shard.first}
-    about |= {"fps": dataset.fps, "seed": dataset.seed, "conventions": dataset.conventions}
-    layout = dataset.fields, dataset.sizes, shard.count
-    with publishing(shard_path(dataset.root, shard.name)) as temporary:
-        places = hdf5.write(temporary, *layout, blocks, dataset.codec, dataset.chunk_frames, about, dataset.constants)
-        file = {"bytes": temporary.stat().st_size, "sha256": file_sha256(temporary)}
-    tables = _packed(seen, places)
-    publish(table_path(dataset.root, shard.name), tables)
-    own = {key: getattr(shard, key) for key in ("name", "split", "first", "count")}  # its number changes as splits grow
-    record = _origin(dataset) | own | file | _contents(seen, places)
-    record = sealed(record | {"tables_sha256": sha256(tables)}, RECORD_SEAL)
-    publish(record_path(dataset.root, shard.name), as_json(record))
-    return record
-
-
-def _packed(seen: _Seen, places: Places) -> bytes:
-    """The shard's part of the index, as the bytes of an npz file."""
-    tables = {f"crc/{name}": np.concatenate(values) for name, values in seen.crc.items()}
-    tables |= {f"chunks/{name}": values for name, values in places.chunks.items()}
-    packed = io.BytesIO()
-    np.savez(packed, **tables)  # pyright: ignore[reportArgumentType]
-    return packed.getvalue()
-
-
-def _origin(dataset: Dataset) -> dict[str, Any]:
-    return {
-        "identity": sha256(as_json(dataset.identity)),
-        "config_sha256": sha256(as_json(dataset.config)),
-        "seed": dataset.seed,
-        "fingerprint": dict(dataset.producer["fingerprint"]),
-    }
-
-
-def _contents(seen: _Seen, places: Places) -> dict[str, Any]:
-    moments = {name: merged(np.concatenate(parts)).tolist() for name, parts in seen.moments.items()}
-    return {"data_bytes": seen.bytes, "rows": dict(places.rows), "moments": moments}
-
-
-def _full(dataset: Dataset, shard: Shard, seen: _Seen) -> FolderError:
-    raw = sum(stored_bytes(field, dataset.sizes) for field in dataset.fields.values())
-    need = shard.count * (seen.bytes / seen.videos if seen.videos else raw)
-    disk = work_folder(dataset.root)
-    free = free_bytes(disk)
-    error = FolderError(
-        f"no space left for {disk}: {shard.name} needs about {need / 1e6:.1f} MB and {free / 1e6:.1f} MB are "
-        f"free, so at least {max(need - free, 0) / 1e6:.1f} MB are missing: make room and run the same command again"
-    )
-    error.exit_code = 1
-    return error
-
-
-def _records(dataset: Dataset) -> dict[str, dict[str, Any]]:
-    """The records in the folder that are of this dataset, by shard."""
-    identity = sha256(as_json(dataset.identity))
-    names = [path.name.removesuffix(".json") for path in sorted((dataset.root / MARK / "done").glob("*.json"))]
-    found = zip(names, _at_once(lambda name: read_record(dataset.root, name), names), strict=True)
-    # A record under another's name would be taken for that one.
-    return {name: r for name, r in found if r is not None and (r["name"], r["identity"]) == (name, identity)}
-
-
-T = TypeVar("T")
-R = TypeVar("R")
-
-
-def _at_once(function: Callable[[T], R], items: Iterable[T]) -> list[R]:
-    """The function's value for each item; servers take long to answer, but answer many questions at once."""
-    with ThreadPoolExecutor(16) as pool:
-        return list(pool.map(function, items))
-
-
-def _whole_plan(dataset: Dataset, records: Mapping[str, Mapping[str, Any]]) -> list[Shard]:
-    """The plan for what was asked and for all that is there."""
-    counts = dict(dataset.splits)
-    for record in records.values():
-        counts[record["split"]] = max(counts.get(record["split"], 0), record["first"] + record["count"])
-    return plan(counts, dataset.videos_per_shard)
-
-
-def _is_done(dataset: Dataset, shard: Shard, records: Mapping[str, Mapping[str, Any]]) -> bool:
-    record = records.get(shard.name, {})
-    file, tables = shard_path(dataset.root, shard.name), table_path(dataset.root, shard.name)
-    return (
-        all(record.get(key) == getattr(shard, key) for key in ("split", "first", "count"))
-        and size_of(file) == record["bytes"]
-        and size_of(tables) is not None
-        and file_sha256(tables) == record["tables_sha256"]
-    )
-
-
-# ---- The whole
-
-
-def finish(dataset: Dataset) -> bool:
-    """Whether the dataset is complete; if it is, its index, cards and manifest are written.
-
-    False while shards are missing that other workers still make.
-    """
-    with _explained(dataset.root):
-        records = _records(dataset)
-        shards = _whole_plan(dataset, records)
-        if not all(_at_once(lambda shard: _is_done(dataset, shard, records), shards)):
-            return False
-        _complete(dataset, shards, [records[shard.name] for shard in shards])
-    return True
-
-
-def _complete(dataset: Dataset, shards: list[Shard], records: list[Mapping[str, Any]]) -> None:
-    root, recipe = dataset.root, dataset.config_text.encode()
-    copies = {"config.yaml": recipe, **dataset.copies}
-    for name, content in copies.items():
+    root, new = spec.root, publication.manifest
+    content, old = as_bytes(new), _current(root)
+    if old is not None and old.sha256 != new.sha256:
+        kept = snapshot_path(root, old.sha256)
+        kept.mkdir(parents=True, exist_ok=True)
+        publish_changed(kept / MANIFEST, as_bytes(old))
+    if old is None or old.sha256 != new.sha256:
+        publish(root / NEXT, content)
+    for name, own in publication.files.items():
+        if name == "README.md" and old is not None and old.sha256 == new.sha256 and (root / name).is_file():
+            continue  # people may write in it
         (root / name).parent.mkdir(parents=True, exist_ok=True)
-        publish(root / name, content)
-    hashes = {name: sha256(content) for name, content in copies.items()}
-    files = write_index(dataset, shards, records) | hashes
-    manifest = describe(dataset, shards, records, files)
-    if "frames" in dataset.fields:
-        publish(root / SHEET, cards.picture(root, manifest))
-        manifest = describe(dataset, shards, records, files | {SHEET: file_sha256(root / SHEET)})
-    publish(root / "README.md", cards.readme(manifest, dataset.command).encode())
-    publish(root / "croissant.json", as_json(cards.croissant(manifest)))
-    publish(root / "manifest.json", as_json(manifest))  # last: it says that all is there
+        publish_changed(root / name, own)
+    publish_changed(root / MANIFEST, content)
+    (root / NEXT).unlink(missing_ok=True)
+    for folder in _entries(root / SNAPSHOTS):
+        earlier = _parsed(folder / MANIFEST)
+        if earlier is not None and earlier.sha256 != new.sha256:
+            _retire(root, earlier, new)
+    _remove_replaced(spec, records, new)
+    remove_logs(spec, records)
+
+
+def _current(root: Place) -> Manifest | None:
+    return _parsed(root / MANIFEST)
+
+
+def _parsed(path: Place) -> Manifest | None:
+    """The manifest in the file; None if there is none that is whole."""
+    with contextlib.suppress(FileNotFoundError, NotADirectoryError, FolderError, DamagedError):
+        return parse(read_bytes(path, JSON_BYTES), f"{path}")
+    return None
+
+
+def next_manifest(root: Place) -> Manifest | None:
+    """The manifest that is about to replace the present one, or was when its process was killed."""
+    return _parsed(root / NEXT)
+
+
+def _entries(folder: Place) -> list[Place]:
+    try:
+        return list(folder.iterdir())
+    except (FileNotFoundError, NotADirectoryError):
+        return []
+
+
+def _retire(root: Place, old: Manifest, new: Manifest) -> None:
+    """Moves what only the manifest before names to where its snapshot lies."""
+    target = snapshot_path(root, old.sha256)
+    for split, table in old.tables.items():
+        names = [table.file] if new.tables[split].file != table.file else []
+        last = shard_of(split, (table.shards - 1) * old.videos_per_shard, _rest(old, split), old.videos_per_shard)
+        if names and last.count < old.videos_per_shard:
+            names.append(shard_name(last.name))
+        for name in names:
+            (target / name).parent.mkdir(parents=True, exist_ok=True)
+            with contextlib.suppress(FileNotFoundError):  # another worker did it just now
+                _move(root / name, target / name)
+
+
+def _move(source: Place, target: Place) -> None:
+    if isinstance(source, Url):
+        assert isinstance(target, Url)
+        source.rename(target)
+    else:
+        assert isinstance(target, Path)
+        source.rename(target)
+
+
+def _rest(manifest: Manifest, split: str) -> int:
+    """How many videos the last shard of a split has."""
+    return (manifest.splits[split] - 1) % manifest.videos_per_shard + 1
+
+
+def _remove_replaced(spec: DatasetSpec, records: Records, new: Manifest) -> None:
+    """Removes what runs left that were stopped before they had ended: shards that are part of a larger one which is
+    done, and tables of splits that are larger now."""
+    for path in _entries(spec.root / "index"):
+        match = TABLE_NAME.fullmatch(path.name)
+        if match and int(match["count"]) < new.splits.get(match["split"], 0):
+            path.unlink(missing_ok=True)
+    full = {(shard.split, shard.first): shard.count for shard in sorted(records.shards(), key=lambda s: s.count)}
+    for shard in records.shards():
+        if shard.count < full[shard.split, shard.first]:
+            (spec.root / shard_name(shard.name)).unlink(missing_ok=True)
+
+
+def _drop_snapshots(root: Place, force: bool = False) -> list[Place]:
+    """Removes what earlier growth left, but for the snapshot that present readers may still be led to."""
+    current = _current(root)
+    keep = "" if force or current is None else current.sha256[:16]
+    folders = [path for path in _entries(root / SNAPSHOTS) if path.name != keep]
+    for folder in folders:
+        remove_tree(folder)
+    return folders
+
+
+def clean(root: Place) -> list[str]:
+    """Removes what nobody needs: earlier snapshots, and temporary files that nobody writes any more.
+
+    Returns their names. Where the file system has no locks nobody knows whether a temporary file is written, so call
+    this only while nothing is.
+    """
+    with explained(root):
+        check_links(root)
+        read_manifest(root)  # says if it is no complete dataset
+        removed = _drop_snapshots(root, force=True)
+        removed += sweep(root, FOLDERS, force=True)
+        return sorted(str(path).removeprefix(f"{root}/") for path in removed)
+
+
+def is_foreign(name: str) -> bool:
+    """Whether a file in shards/ or index/ is none that a run writes, be it done or under way."""
+    return not (is_temporary(name) or FILE_NAME.fullmatch(name) or TABLE_NAME.fullmatch(name))

@@ -4,69 +4,88 @@ Any HDF5 program reads them.
 
 The bytes depend on the compressed chunks and values and on nothing else: no times, hosts or users, and not on how the
 videos were grouped into blocks. h5py serves one thread at a time, so compression happens elsewhere and chunks pass
-through it untouched.
+through it untouched. Every file holds its own index (`rows.py`), by which gen2d reads without h5py.
 """
 
 import contextlib
+import dataclasses
 import errno
 import re
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
 
 from gen2d.core.schema import Field
-from gen2d.dataset.block import Block, Places, image_names, row_names
+from gen2d.dataset.block import Block, image_names, row_names
+from gen2d.dataset.rows import sealed_rows, video_type
 from gen2d.storage import codecs
 
+INDEX = "chunk_index"  # the dataset of the videos' rows
 _ZSTD = codecs.HDF5_FILTERS["zstd"][0]
+
+
+@dataclasses.dataclass(frozen=True)
+class Offsets:
+    """Where in the file what is not compressed begins."""
+
+    index: int
+    rows: list[int]  # of each field, in the order of their names
 
 
 def write(
     path: Path,
     fields: Mapping[str, Field],
     sizes: Mapping[str, int],
-    count: int,
+    videos: range,
     blocks: Iterable[Block],
     codec: str,
     chunk_frames: int | None,
     attributes: Mapping[str, str | int | float],
     constants: Mapping[str, np.ndarray],
-) -> Places:
-    """Writes a file of `count` videos and returns where in it each field lies.
+    origin: int,
+) -> Offsets:
+    """Writes a file of these videos of a split and returns where in it each field lies.
 
     `blocks` hold the videos in order; chunks are written as they arrive, so that memory holds one block, never a shard
-    of images. `constants` are the values of the fields that are one for all videos. Raises OSError when the disk does.
+    of images. `constants` are the values of the fields that are one for all videos, `origin` is what the checks of the
+    index begin from. Raises OSError when the disk does.
     """
-    images, rows = image_names(fields), row_names(fields)
+    images, rows, count = image_names(fields), row_names(fields), len(videos)
     with _new(path) as file:
         file.attrs.update(attributes)
         shapes = {name: (count, *fields[name].shape(sizes)) for name in images + rows}
         chunked = {name: _chunked(file, name, fields[name].dtype, shapes[name], codec, chunk_frames) for name in images}
         table = {name: np.zeros(shapes[name], _stored_type(fields[name])) for name in rows}
+        index = np.zeros(count, video_type(fields, sizes["T"] // chunk_frames if chunk_frames else 1))
         for first, block in _numbered(blocks, count, path):
             _write_chunks(chunked, block, first, chunk_frames)
+            own = index[first : first + len(block)]
             for name in rows:
                 _fill(table[name], first, block.arrays[name], name)
+                own[name] = block.crc[name]
+            for name in images:
+                own[name]["crc32"] = block.crc[name].reshape(len(block), -1)
+        for name, dataset in chunked.items():
+            _note_chunks(dataset, index[name])
         for name, values in sorted((table | dict(constants)).items()):
             file.create_dataset(name, data=np.asarray(values, _stored_type(fields[name])))
         for name, field in sorted(fields.items()):
             file[name].attrs.update(axes=field.axes, unit=field.unit, meaning=field.meaning)
-        return Places(
-            chunks={name: _chunk_places(dataset) for name, dataset in chunked.items()},
-            # A dataset without a single byte has no place.
-            rows={name: file[name].id.get_offset() or 0 for name in rows},  # pyright: ignore[reportAttributeAccessIssue]
-        )
+        made = file.create_dataset(INDEX, data=sealed_rows(index, origin, videos))
+        made.attrs.update(axes="n", unit="", meaning="where each video's chunks lie, and CRC-32 of all that is stored")
+        return Offsets(_offset(made), [_offset(file[name]) for name in rows])
 
 
 def read(path: Path) -> dict[str, np.ndarray]:
     """Every field of the file as one array, by h5py; zstd is decoded here, where h5py needs a plugin."""
     found: dict[str, np.ndarray] = {}
-    with h5py.File(path, "r") as file:
+    with h5py.File(path, "r", locking=False) as file:
 
         def visit(name: str, item: h5py.Group | h5py.Dataset) -> None:
-            if isinstance(item, h5py.Dataset):
+            if isinstance(item, h5py.Dataset) and name != INDEX:
                 found[name] = _read_zstd(item) if _has_zstd(item) else item[()]
 
         file.visititems(visit)
@@ -76,18 +95,25 @@ def read(path: Path) -> dict[str, np.ndarray]:
 @contextlib.contextmanager
 def _new(path: Path) -> Iterator[h5py.File]:
     """A new file, closed at the end; what went wrong while writing is raised, not what closing then says of it."""
-    file = h5py.File(path, "w", libver=("v110", "v110"))
+    # HDF5's own lock would meet that of the temporary file.
+    file = h5py.File(path, "w", libver=("v110", "v110"), locking=False)
     try:
         yield file
-    except BaseException:
+    except BaseException as error:
         with contextlib.suppress(RuntimeError, OSError):
             file.close()
+        if isinstance(error, RuntimeError) and "errno = " in str(error):
+            raise _as_oserror(error) from error
         raise
     try:
         file.close()
     except RuntimeError as error:  # HDF5 writes much only now, and h5py then forgets what kind of error it was
-        number = re.search(r"errno = (\d+)", str(error))
-        raise OSError(int(number[1]) if number else errno.EIO, str(error)) from error
+        raise _as_oserror(error) from error
+
+
+def _as_oserror(error: RuntimeError) -> OSError:
+    number = re.search(r"errno = (\d+)", str(error))
+    return OSError(int(number[1]) if number else errno.EIO, str(error))
 
 
 def _chunked(
@@ -154,17 +180,20 @@ def _frames(dataset: h5py.Dataset) -> int:
     return dataset.chunks[1]
 
 
-def _chunk_places(dataset: h5py.Dataset) -> np.ndarray:
+def _note_chunks(dataset: h5py.Dataset, rows: np.ndarray) -> None:
+    """Puts offset and size of every chunk into the videos' rows [videos, chunks]."""
     frames = _frames(dataset)
-    pieces = dataset.shape[1] // frames
-    places = np.zeros((len(dataset) * pieces, 2), np.uint64)
 
     def note(chunk: h5py.h5d.StoreInfo) -> None:
         video, frame = chunk.chunk_offset[:2]
-        places[video * pieces + frame // frames] = chunk.byte_offset, chunk.size
+        place = rows[video, frame // frames]
+        place["offset"], place["size"] = chunk.byte_offset, chunk.size
 
     dataset.id.chunk_iter(note)
-    return places
+
+
+def _offset(dataset: Any) -> int:
+    return dataset.id.get_offset() or 0  # a dataset without a single byte has no place
 
 
 def _has_zstd(dataset: h5py.Dataset) -> bool:

@@ -1,7 +1,8 @@
-"""What a dataset folder is to hold, the shards that it is divided into, and where their files lie."""
+"""What a dataset folder is to hold, the shards that it is divided into, and the names of its files."""
 
 import dataclasses
 import json
+import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
@@ -9,18 +10,28 @@ from typing import Any
 import numpy as np
 
 from gen2d.core.schema import Field
-from gen2d.storage.atomic import as_json
 from gen2d.storage.paths import Place
+from gen2d.storage.sealed import as_json, sha256
 
-SCHEMA = "gen2d.dataset/1"
+SCHEMA = "gen2d.dataset/2"
 MARK = Path(".gen2d")  # the folder, inside a dataset's, of what only the program needs
+RECORDS = MARK / "records"  # shards that are done, and not in the manifest yet
+SNAPSHOTS = MARK / "snapshots"  # what the manifest before the last one names, and this one does not
+NEXT = MARK / "next.json"  # the manifest that is about to replace the present one
+STAGED = MARK / "staged"  # before a temporary name's end: shards made again, yet to be verified
 
 # What must agree before shards of two runs may stand in one folder; the manifest has the same keys.
 IDENTITY = ("config", "seed", "fingerprint", "codec", "chunk_frames", "videos_per_shard", "sizes")
 
+# What datasets and splits may be called, everywhere: such names stand in paths.
+NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
+SPLIT = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
+FILE_NAME = re.compile(r"(?P<split>[A-Za-z0-9][A-Za-z0-9._-]{0,63})-(?P<place>\d{5,10})(-n(?P<count>\d{1,6}))?\.h5")
+TABLE_NAME = re.compile(r"(?P<split>[A-Za-z0-9][A-Za-z0-9._-]{0,63})-(?P<count>\d{1,15})\.npy")
+
 
 @dataclasses.dataclass(frozen=True)
-class Dataset:
+class DatasetSpec:
     """What a folder is to hold."""
 
     root: Place
@@ -49,31 +60,38 @@ class Dataset:
         values = vars(self) | {"fingerprint": self.producer["fingerprint"]}
         return json.loads(as_json({key: values[key] for key in IDENTITY}))
 
+    @property
+    def identity_sha256(self) -> str:
+        """A hash of the identity."""
+        return sha256(as_json(self.identity))
+
 
 @dataclasses.dataclass(frozen=True)
 class Shard:
-    """`count` videos of one split from number `first` on; `number` is the shard's place in the whole plan."""
+    """`count` videos of one split from number `first` on; `place` is its place in the split."""
 
-    name: str
     split: str
+    place: int
     first: int
     count: int
-    number: int
+    name: str  # of its file, without the ending
 
-    @property
-    def place(self) -> int:
-        """Its place within its split, which stays the same when another split grows."""
-        return int(self.name.rpartition("-")[2])
+
+def shard_of(split: str, first: int, count: int, videos_per_shard: int) -> Shard:
+    """The shard with these videos. A part of a shard has its count in its name: when a split grows, another file takes
+    its place, and none is ever written twice."""
+    place = first // videos_per_shard
+    part = "" if count == videos_per_shard else f"-n{count}"
+    return Shard(split, place, first, count, f"{split}-{place:05d}{part}")
 
 
 def plan(counts: Mapping[str, int], videos_per_shard: int) -> list[Shard]:
     """All shards of a dataset with these many videos in each split."""
-    shards: list[Shard] = []
-    for split, count in sorted(counts.items()):
-        for place, first in enumerate(range(0, count, videos_per_shard)):
-            size = min(videos_per_shard, count - first)
-            shards.append(Shard(f"{split}-{place:05d}", split, first, size, number=len(shards)))
-    return shards
+    return [
+        shard_of(split, first, min(videos_per_shard, count - first), videos_per_shard)
+        for split, count in sorted(counts.items())
+        for first in range(0, count, videos_per_shard)
+    ]
 
 
 def mine(shards: Iterable[Shard], worker: int, workers: int) -> list[Shard]:
@@ -81,9 +99,19 @@ def mine(shards: Iterable[Shard], worker: int, workers: int) -> list[Shard]:
     return [shard for shard in shards if shard.place % workers == worker]
 
 
+def shard_name(name: str) -> str:
+    """A shard's file in the folder."""
+    return f"shards/{name}.h5"
+
+
+def table_name(split: str, count: int) -> str:
+    """The table of a split's shards in the folder; its name changes as the split grows."""
+    return f"index/{split}-{count}.npy"
+
+
 def shard_path(root: Place, name: str) -> Place:
     """The file of the shard called `name`."""
-    return root / "shards" / f"{name}.h5"
+    return root / shard_name(name)
 
 
 def mark_path(root: Place) -> Place:
@@ -91,11 +119,6 @@ def mark_path(root: Place) -> Place:
     return root / MARK / "dataset.json"
 
 
-def record_path(root: Place, name: str) -> Place:
-    """What says that the shard is done, and what went into it."""
-    return root / MARK / "done" / f"{name}.json"
-
-
-def table_path(root: Place, name: str) -> Place:
-    """Where in the shard its pieces lie and their checksums, kept until all go into the index."""
-    return root / MARK / "done" / f"{name}.npz"
+def snapshot_path(root: Place, manifest_sha256: str) -> Place:
+    """The folder of what only an earlier manifest names."""
+    return root / SNAPSHOTS / manifest_sha256[:16]

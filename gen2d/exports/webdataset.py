@@ -15,7 +15,7 @@ import numpy as np
 
 from gen2d.exports import Source
 from gen2d.loading.protocols import Batch
-from gen2d.storage.atomic import as_json
+from gen2d.storage.sealed import as_json
 
 LOSS = ""
 FIELDS, FIXED = ("frames", "*"), False
@@ -53,7 +53,7 @@ def _add_video(tar: tarfile.TarFile, source: Source, number: int, video: Batch) 
 
 def _about(source: Source, number: int) -> dict[str, Any]:
     """What a video's JSON says: where it comes from, and what each field is."""
-    about = {key: source.ds.manifest[key] for key in ("name", "seed", "fps")}
+    about = {key: source.ds.manifest.plain[key] for key in ("name", "seed", "fps")}
     fields = {name: dataclasses.asdict(field) for name, field in source.fields.items()}
     return about | {"split": source.ds.options.split, "number": number, "fields": fields}
 

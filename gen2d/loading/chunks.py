@@ -1,161 +1,314 @@
-"""Pieces of files: where each piece of a video lies, how its bytes are read, and what of it goes into a batch.
+"""The files of a dataset, read by offset, without h5py and its one lock per process.
 
-They are read by offset straight from the shards, without h5py and its one lock per process, and decoded where they are
-wanted. No open file outlives a fork. Of a remote dataset the pieces of all videos wanted at once are asked for at once,
-or whole shards are kept in a cache.
+Every row of a table or an index is checked when it is read, and every offset against the file that it is in, so that
+nothing is mapped and no damage can do more than raise an error. No open file outlives a fork, nor the file that had its
+name. What growth has moved to a snapshot is found there. Of a remote dataset the pieces of all videos wanted at once
+are asked for at once, or whole shards are kept in a cache.
 """
 
 import contextlib
+import errno
 import functools
-import io
 import os
-from collections.abc import Callable, Mapping
+import threading
+from collections import OrderedDict
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from gen2d.core.errors import DamagedError, FolderError
-from gen2d.dataset.block import stored_bytes
-from gen2d.dataset.manifest import field_of
-from gen2d.dataset.spec import shard_path
-from gen2d.storage.atomic import file_sha256, sha256
+from gen2d.core.errors import DamagedError, FolderError, UnreachableError, UserError
+from gen2d.dataset.manifest import Manifest
+from gen2d.dataset.rows import check_shard, intact, npy_header, origin
+from gen2d.dataset.spec import Shard, shard_name, shard_of, snapshot_path
+from gen2d.loading.column import Column
 from gen2d.storage.cache import Cache
-from gen2d.storage.paths import Place, Range, Url, read_ranges
+from gen2d.storage.explain import reading_error
+from gen2d.storage.paths import Place, Url
+from gen2d.storage.ranges import Range, read_ranges
+from gen2d.storage.sealed import open_regular
 
-LAYOUTS = {"THWC": (0, 1, 2, 3), "TCHW": (0, 3, 1, 2), "CTHW": (3, 0, 1, 2)}
+BLOCK = 256  # rows of a table that are read together
+INDEX_BLOCK = 1024  # rows of a remote index
+SHARDS = 65536  # rows of shards, of each dataset
+KEPT = 256  # blocks of tables and indices, of each dataset
+OPEN = 128  # files, of a process
 
 
 class Piece(NamedTuple):
-    """Where a piece lies, and the checksum of its bytes; in the order of the index."""
+    """Where a piece lies, and the checksum of its bytes."""
 
-    shard: int
+    shard: int  # its place in the split
     offset: int
     size: int
     crc32: int
 
 
-class Column:
-    """One field on its way from file to batch."""
+class ShardRow(NamedTuple):
+    """A shard as its split's table has it."""
 
-    def __init__(
-        self, name: str, manifest: Mapping[str, Any], layout: str, window: int | None, stride: int, dtype: str
-    ) -> None:
-        field = field_of(manifest["fields"][name])
-        self.name, self.field, self.is_image = name, field, field.is_image
-        self.codec = manifest["fields"][name]["codec"]
-        self.stored = field.shape(manifest["sizes"])
-        self.size = stored_bytes(field, manifest["sizes"])
-        self.frames = manifest["chunk_frames"] if field.is_image else None  # of a piece
-        self.pieces = manifest["sizes"]["T"] // self.frames if self.frames else 1
-        axes = field.axes.split()[1:]
-        self.order = LAYOUTS[layout] if self.is_image and len(axes) == 4 else tuple(range(len(axes)))
-        self.window, self.stride = (window if axes[:1] == ["T"] else None), stride
-        self.to_float = name == "frames" and dtype == "float32"
-        self.dtype = np.dtype("float32" if self.to_float else field.dtype)
-        shape = self.stored if self.window is None else (self.window, *self.stored[1:])
-        self.shape = tuple(shape[axis] for axis in self.order)
-        # Then a piece is read or decoded right where it is wanted.
-        self.is_direct = not self.to_float and self.window is None and self.order == tuple(range(len(axes)))
-
-    def needed(self, first: int) -> range:
-        """The pieces that the window which begins at frame `first` lies in."""
-        if self.window is None or self.frames is None:
-            return range(self.pieces)
-        return range(first // self.frames, (first + (self.window - 1) * self.stride) // self.frames + 1)
-
-    def part(self, whole: np.ndarray, piece: int) -> np.ndarray:
-        """Where in a whole video a piece belongs, both with a leading 1."""
-        return whole if self.frames is None else whole[:, piece * self.frames : (piece + 1) * self.frames]
-
-    def convert(self, whole: np.ndarray, first: int, target: np.ndarray) -> None:
-        """Returns nothing; puts the window that begins at frame `first` into `target`, both with a leading 1."""
-        if self.window is not None:
-            whole = whole[:, first : first + (self.window - 1) * self.stride + 1 : self.stride]
-        whole = whole.transpose(0, *(1 + axis for axis in self.order))
-        if self.to_float:
-            np.divide(whole, np.float32(255), out=target)
-        else:
-            target[...] = whole
+    shard: Shard
+    bytes: int
+    sha256: str
+    rows: int  # where its index begins
+    offsets: np.ndarray
 
 
 Reader = Callable[[Column, Piece, np.ndarray], bytes | memoryview]
 
 
-class Files:
-    """The files of a dataset: the tables of its index, and its shards, read piece by piece."""
+class SplitFiles:
+    """The table of one split of a snapshot, and its shards, read piece by piece."""
 
-    def __init__(self, root: Place, manifest: Mapping[str, Any], cache: Cache | None, checks: bool) -> None:
-        self.root, self.manifest, self.cache, self.checks = root, manifest, cache, checks
+    def __init__(self, root: Place, manifest: Manifest, split: str, cache: Cache | None, checks: bool) -> None:
+        self.root, self.manifest, self.split, self.cache, self.checks = root, manifest, split, cache, checks
+        self._origin = origin(manifest.identity_sha256, split)
+        self._shard_type, self._video_type = manifest.shard_type, manifest.video_type
+        self._row_bytes = manifest.row_bytes
+        self._header = len(npy_header(self._shard_type, manifest.tables[split].shards))
+        self._blocks: OrderedDict[tuple[int, int], np.ndarray] = OrderedDict()
+        self._shards: dict[int, ShardRow] = {}
+        self._lock = threading.Lock()
 
-    def table(self, name: str) -> np.ndarray:
-        """An index file, mapped, not read into memory, unless it is remote and there is no cache.
+    def __getstate__(self) -> dict[str, object]:
+        raise TypeError("the files of a dataset are opened anew in another process")
 
-        Checked first, as wrong places would lead anywhere.
-        """
-        name = f"index/{name}.npy"
-        path, right = self.root / name, self.manifest["files"][name]
+    # ---- The table
+
+    def shard(self, place: int) -> ShardRow:
+        """The shard at this place of the split. Raises DamagedError."""
+        row = self._shards.get(place)
+        if row is None:
+            if len(self._shards) >= SHARDS:
+                self._shards = {}
+            row = self._shards[place] = self._checked_shard(place)
+        return row
+
+    def _checked_shard(self, place: int) -> ShardRow:
+        per_shard, count = self.manifest.videos_per_shard, self.manifest.splits[self.split]
+        first = place * per_shard
+        wanted = shard_of(self.split, first, min(per_shard, count - first), per_shard)
+        row = self._table_block(place // BLOCK)[place % BLOCK]
+        path = f"{self.root / self.manifest.tables[self.split].file}"
+        if self.checks and not intact(row.reshape(1), self._origin, [first]).all():
+            raise DamagedError(f"{path} is not what was written, in row {place}")
         try:
-            if self.cache:
-                path = self._cached(path, right)
-            if isinstance(path, Path):
-                intact = not self.checks or file_sha256(path) == right
-                table = np.load(path, mmap_mode="r") if intact else None
-            else:
-                content = path.read_bytes()
-                intact = not self.checks or sha256(content) == right
-                table = np.load(io.BytesIO(content)) if intact else None
-        except FileNotFoundError:
-            raise DamagedError(f"{path} is missing") from None
-        except OSError as error:
-            raise FolderError(f"{path} cannot be read ({why(error)})") from error
-        if table is None:
-            raise DamagedError(f"{path} is not what was written")
-        return table
+            check_shard(row, first, wanted.count, self._video_type.itemsize, self._row_bytes)
+        except DamagedError as error:
+            raise DamagedError(f"{path} cannot be right in row {place}: {error}") from None
+        return ShardRow(wanted, int(row["bytes"]), row["sha256"].tobytes().hex(), int(row["index"]), row["offsets"])
 
-    def reader(self, places: list[list[list[Piece]]]) -> Reader:
+    def _table_block(self, number: int) -> np.ndarray:
+        table, size = self.manifest.tables[self.split], self._shard_type.itemsize
+        first = number * BLOCK
+        count = min(BLOCK, table.shards - first)
+
+        def read() -> np.ndarray:
+            begin = self._header + first * size
+            data = self._read(table.file, [(begin, begin + count * size)])[0]
+            return np.frombuffer(data, self._shard_type)
+
+        return self._kept((-1, number), read)
+
+    def _kept(self, key: tuple[int, int], read: Callable[[], np.ndarray]) -> np.ndarray:
+        """A block of rows; those used longest ago are forgotten."""
+        with self._lock:
+            if key in self._blocks:
+                self._blocks.move_to_end(key)
+                return self._blocks[key]
+        rows = read()
+        with self._lock:
+            self._blocks[key] = rows
+            while len(self._blocks) > KEPT:
+                self._blocks.popitem(last=False)
+        return rows
+
+    # ---- The index of each shard
+
+    def videos(self, numbers: np.ndarray) -> np.ndarray:
+        """The rows of the videos with these numbers. Raises DamagedError."""
+        places, rows = np.divmod(numbers, self.manifest.videos_per_shard)
+        found = np.empty(len(numbers), self._video_type)
+        if isinstance(self.root, Url) and self.cache is None:
+            wanted = list(zip(places.tolist(), (rows // INDEX_BLOCK).tolist(), strict=True))
+            blocks = self._fetched_blocks(set(wanted))
+            for step, key in enumerate(wanted):
+                found[step] = blocks[key][rows[step] % INDEX_BLOCK]
+        else:
+            for place in np.unique(places):
+                own = np.flatnonzero(places == place)
+                found[own] = self._index_rows(int(place), rows[own])
+        if self.checks:
+            right = intact(found, self._origin, numbers.tolist())
+            if not right.all():
+                wrong = int(np.argmin(right))
+                raise self._bad_index(int(places[wrong]), int(numbers[wrong]))
+        return found
+
+    def _bad_index(self, place: int, number: int) -> DamagedError:
+        path = self.path(shard_name(self.shard(place).shard.name))
+        return DamagedError(f"{path}: the index of {self.split} video {number} is not what was written")
+
+    def _index_rows(self, place: int, rows: np.ndarray) -> np.ndarray:
+        about, size = self.shard(place), self._video_type.itemsize
+        file = self._open(about)
+        parts = [file.read(about.rows + row * size, size) for row in rows.tolist()]
+        return np.frombuffer(b"".join(parts), self._video_type)
+
+    def _fetched_blocks(self, wanted: set[tuple[int, int]]) -> dict[tuple[int, int], np.ndarray]:
+        """Blocks of the indices of remote shards; those that are not known are asked for all at once."""
+        with self._lock:
+            found = {key: self._blocks[key] for key in wanted & self._blocks.keys()}
+        missing, size, ranges = sorted(wanted - found.keys()), self._video_type.itemsize, []
+        for place, block in missing:
+            about = self.shard(place)
+            first, last = block * INDEX_BLOCK, min((block + 1) * INDEX_BLOCK, about.shard.count)
+            ranges.append((shard_name(about.shard.name), about.rows + first * size, about.rows + last * size))
+        for key, (name, *_), content in zip(missing, ranges, self._fetched(ranges), strict=True):
+            if isinstance(content, Exception):
+                raise _reading_error(self.path(name), content)
+            found[key] = self._kept(key, functools.partial(np.frombuffer, content, self._video_type))
+        return found
+
+    # ---- Pieces
+
+    def pieces(
+        self, column: Column, numbers: np.ndarray, videos: np.ndarray, begins: Sequence[int]
+    ) -> list[list[Piece]]:
+        """Where the pieces lie that are needed of each video; `begins` are the first frames of their windows."""
+        places, rows = np.divmod(numbers, self.manifest.videos_per_shard)
+        if column.is_image:
+            found = zip(places.tolist(), videos[column.name].tolist(), begins, strict=True)
+            return [[self._piece(column, place, chunks[i]) for i in column.needed(b)] for place, chunks, b in found]
+        names = self._names
+        offsets = {place: int(self.shard(place).offsets[names[column.name]]) for place in np.unique(places).tolist()}
+        found = zip(places.tolist(), rows.tolist(), videos[column.name].tolist(), strict=True)
+        return [[Piece(place, offsets[place] + row * column.size, column.size, crc)] for place, row, crc in found]
+
+    @functools.cached_property
+    def _names(self) -> dict[str, int]:
+        """The place of each field among those that are not compressed."""
+        names = sorted(n for n, field in self.manifest.fields.items() if field.per_video and not field.is_image)
+        return {name: place for place, name in enumerate(names)}
+
+    def _piece(self, column: Column, place: int, chunk: tuple[int, int, int]) -> Piece:
+        offset, size, crc = chunk
+        whole = column.size // column.pieces
+        if size > 2 * whole + 1024 or offset + size > self.shard(place).bytes:
+            raise DamagedError(f"{column.name} lies outside the file, by its index")
+        return Piece(place, offset, size, crc)
+
+    def reader(self, places: Iterable[Iterable[Iterable[Piece]]]) -> Reader:
         """What gives the bytes of these pieces, by what the shards lie on."""
-        if isinstance(self.root, Path):
-            return lambda column, piece, target: _piece(self._open(piece.shard), column, piece, target)
-        if self.cache:
-            cached = functools.lru_cache(maxsize=16)(self._open_cached)
-            return lambda column, piece, target: _piece(cached(piece.shard), column, piece, target)
-        pieces = {piece for own in places for video in own for piece in video}
-        return functools.partial(_received, dict(zip(pieces, read_ranges(list(map(self._range, pieces))), strict=True)))
+        if isinstance(self.root, Path) or self.cache:
+            opened = functools.lru_cache(maxsize=16)(lambda place: self._open(self.shard(place)))
+            return lambda column, piece, target: _piece_of(opened(piece.shard), column, piece, target)
+        pieces = list({piece for own in places for video in own for piece in video})
+        names = {place: shard_name(self.shard(place).shard.name) for place in {piece.shard for piece in pieces}}
+        data = self._fetched([(names[p.shard], p.offset, p.offset + p.size) for p in pieces])
+        return functools.partial(_received, dict(zip(pieces, data, strict=True)))
 
-    def shard(self, number: int) -> Place:
-        """The file of the shard with this number."""
-        return shard_path(self.root, self.manifest["shards"][number]["name"])
+    # ---- Files
 
-    def _range(self, piece: Piece) -> Range:
-        url = self.shard(piece.shard)
-        assert isinstance(url, Url)
-        return Range(url, piece.offset, piece.offset + piece.size)
+    def path(self, name: str) -> Place:
+        """Where a file lies, or lay when this snapshot was the last."""
+        return self.root / name
 
-    def _open(self, number: int) -> "_File":
-        path = self.shard(number)
-        assert isinstance(path, Path)
-        return _opened(path, self.manifest["shards"][number]["sha256"], os.getpid())
+    def _places(self, name: str) -> tuple[Place, Place]:
+        """Where a file may lie: growth moves what only an earlier manifest names."""
+        return self.root / name, snapshot_path(self.root, self.manifest.sha256) / name
 
-    def _open_cached(self, number: int) -> "_File":
-        shard = self.manifest["shards"][number]
+    def _read(self, name: str, ranges: Sequence[tuple[int, int]]) -> list[bytes]:
+        """Ranges of a file."""
+        if isinstance(self.root, Url):
+            found = self._fetched([(name, begin, end) for begin, end in ranges])
+            for content in found:
+                if isinstance(content, Exception):
+                    raise _reading_error(self.path(name), content)
+            return [content for content in found if isinstance(content, bytes)]
+        file = self._opened(name)
+        return [file.read(begin, end - begin) for begin, end in ranges]
+
+    def _fetched(self, wanted: Sequence[tuple[str, int, int]]) -> list[bytes | Exception]:
+        """The bytes of ranges of remote files, or why there are none."""
+        found: list[bytes | Exception] = []
+        for step in (0, 1):
+            missing = [i for i in range(len(wanted)) if not step or isinstance(found[i], FileNotFoundError)]
+            urls = [self._places(wanted[i][0])[step] for i in missing]
+            ranges = [Range(url, *wanted[i][1:]) for url, i in zip(urls, missing, strict=True) if isinstance(url, Url)]
+            read = read_ranges(ranges) if ranges else []
+            if not step:
+                found = list(read)
+            for i, content in zip(missing, read, strict=True):
+                found[i] = content if not isinstance(content, FileNotFoundError) or not step else found[i]
+        return found
+
+    def _opened(self, name: str) -> "_File":
+        for path in self._places(name):
+            assert isinstance(path, Path)
+            with contextlib.suppress(FileNotFoundError):
+                return open_file(path)
+        raise DamagedError(f"{self.path(name)} is missing")
+
+    def _open(self, about: ShardRow) -> "_File":
+        name = shard_name(about.shard.name)
+        if self.cache is None:
+            return self._opened(name)
         while True:
-            path = self._cached(self.shard(number), shard["sha256"], shard["bytes"])
+            try:
+                url = self.root / name
+                assert isinstance(url, Url)
+                path = self.cache.path(url, about.sha256, about.bytes)
+            except FileNotFoundError:
+                url = self._places(name)[1]
+                assert isinstance(url, Url)
+                path = self.cache.path(url, about.sha256, about.bytes)
             with contextlib.suppress(FileNotFoundError):  # another process made room just now
                 return _File(path)
-
-    def _cached(self, url: Place, sha256: str, size: int | None = None) -> Path:
-        assert self.cache is not None
-        assert isinstance(url, Url)
-        return self.cache.path(url, sha256, size)
 
 
 class _File:
     """A file that is open for reading, closed when nobody uses it any more."""
 
     def __init__(self, path: Path) -> None:
-        self.process = os.getpid()
-        self.descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_CLOEXEC", 0))
+        self.process, self.path = os.getpid(), path
+        try:
+            self.descriptor = open_regular(path)
+        except FileNotFoundError:
+            raise
+        except OSError as error:
+            raise reading_error(path, error) from error
+        self.about = _about(os.fstat(self.descriptor))
+
+    def read(self, offset: int, size: int) -> bytes:
+        """The bytes from an offset on. Raises DamagedError where the file ends too early."""
+        try:
+            data = os.pread(self.descriptor, size, offset) if size else b""
+        except OSError as error:
+            raise reading_error(self.path, error) from error
+        if len(data) != size:
+            data += self._rest(offset + len(data), size - len(data)) if data else b""
+        if len(data) != size:
+            raise DamagedError(f"{self.path} ends too early")
+        return data
+
+    def _rest(self, offset: int, size: int) -> bytes:
+        """What one call did not give: 2 GiB are the most, and a signal may come between."""
+        parts = []
+        while size and (part := os.pread(self.descriptor, size, offset)):
+            parts.append(part)
+            offset, size = offset + len(part), size - len(part)
+        return b"".join(parts)
+
+    def read_into(self, target: memoryview, offset: int) -> None:
+        """Fills `target` with the bytes from an offset on."""
+        try:
+            got = os.preadv(self.descriptor, [target], offset) if target.nbytes else 0
+        except OSError as error:
+            raise reading_error(self.path, error) from error
+        if got != target.nbytes:
+            target.cast("B")[got:] = self.read(offset + got, target.nbytes - got)
 
     def __del__(self) -> None:
         # A forked process has its own copies, and may have given the number to another file since.
@@ -163,41 +316,71 @@ class _File:
             os.close(self.descriptor)
 
 
-def _piece(file: _File, column: Column, place: Piece, target: np.ndarray) -> bytes | memoryview:
+def _about(status: os.stat_result) -> tuple[int, ...]:
+    """What tells a file from another that has taken its name."""
+    return status.st_dev, status.st_ino, status.st_size, status.st_mtime_ns
+
+
+# The files that this process has open, those used longest ago first.
+_files: OrderedDict[Path, _File] = OrderedDict()
+_files_lock = threading.Lock()
+
+
+def open_file(path: Path) -> _File:
+    """The file that now has this name, open; it stays so for others. Raises FileNotFoundError."""
+    about = _about(path.stat())
+    with _files_lock:
+        known = _files.get(path)
+        if known is not None and known.about == about and known.process == os.getpid():
+            _files.move_to_end(path)
+            return known
+    try:
+        file = _File(path)
+    except UserError:
+        with _files_lock:
+            _files.clear()  # too many are open: ours need not be
+        file = _File(path)
+    with _files_lock:
+        _files[path] = file
+        while len(_files) > OPEN:
+            _files.popitem(last=False)
+    return file
+
+
+def _after_fork() -> None:
+    global _files_lock
+    _files_lock = threading.Lock()  # another thread may have held it
+
+
+os.register_at_fork(after_in_child=_after_fork)
+
+
+def _piece_of(file: _File, column: Column, piece: Piece, target: np.ndarray) -> bytes | memoryview:
     """The bytes of a piece; one that is not compressed is read right into `target`."""
-    if column.codec == "none":
-        data = target.data
-        got = os.preadv(file.descriptor, [data], place.offset) if place.size else 0
-    else:
-        data = os.pread(file.descriptor, place.size, place.offset)
-        got = len(data)
-    if got != place.size:
-        raise DamagedError("the file ends too early")
+    if column.codec != "none":
+        return file.read(piece.offset, piece.size)
+    data = target.data
+    if data.nbytes != piece.size:
+        raise DamagedError(f"it has {piece.size} bytes, but must have {data.nbytes}")
+    file.read_into(data, piece.offset)
     return data
 
 
 def _received(
-    found: Mapping[Piece, bytes | OSError], column: Column, piece: Piece, target: np.ndarray
+    found: Mapping[Piece, bytes | Exception], column: Column, piece: Piece, target: np.ndarray
 ) -> bytes | memoryview:
     """The bytes of a piece that has been asked for already."""
     data = found[piece]
-    if isinstance(data, OSError):
+    if isinstance(data, Exception):
         raise data
     return data
 
 
-def why(error: Exception) -> str:
-    """What is wrong, without the file's name."""
-    return str(getattr(error, "strerror", None) or error)
-
-
-def forget() -> None:
-    """Returns nothing; every file is opened anew: a shard that is made again is another under the same name."""
-    _opened.cache_clear()
-
-
-# At the interpreter's end names with an underscore go first: so these files are closed while there still is an `os`.
-@functools.lru_cache(maxsize=128)
-def _opened(path: Path, sha256: str, process: int) -> _File:
-    """The open file; one that was made again since, or opened before a fork, is another."""
-    return _File(path)
+def _reading_error(path: Place, error: Exception) -> Exception:
+    if isinstance(error, UnreachableError):
+        return error
+    if isinstance(error, OSError) and error.errno == errno.ENOENT:
+        return FolderError(
+            f"{path} is not there, though the manifest names it: was the dataset moved, or not copied whole?"
+        )
+    return reading_error(path, error) if isinstance(error, OSError) else error

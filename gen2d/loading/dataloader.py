@@ -83,13 +83,22 @@ class DataLoader:
             self._running.close()
 
     def state_dict(self) -> dict[str, Any]:
-        """Where the iteration stands: what has been delivered, not what was read ahead."""
-        return self.walk.state_dict()
+        """Where the iteration stands, and on which snapshot of the dataset: what has been delivered, not what was read
+        ahead."""
+        return self.walk.state_dict() | {"snapshot": self.dataset.snapshot}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Returns nothing; the next iteration goes on where `state` was taken, on whatever number of ranks."""
+        """The next iteration goes on where `state` was taken, on whatever number of ranks.
+
+        Where the dataset has grown since, that is the snapshot of the state, which is opened again. Raises FolderError
+        where it is no longer there, and ConfigError for the state of another dataset, or in another order.
+        """
         self.close()
-        self.walk.load_state_dict(state)
+        snapshot = state.get("snapshot") if isinstance(state, Mapping) else None  # None: of a stream
+        dataset = self.dataset if snapshot is None else self.dataset.at(snapshot)
+        walk = self.walk.over(len(dataset))
+        walk.load_state_dict(state)
+        self.dataset, self.walk = dataset, walk
 
     def _batches(self) -> Generator[Any, None, None]:
         steps = self.walk.steps()

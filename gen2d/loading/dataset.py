@@ -3,24 +3,30 @@
 Neither jax nor h5py is imported, and no open file outlives a fork, so fork and spawn are both safe.
 """
 
+import contextlib
 import dataclasses
 import difflib
 import fnmatch
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, overload
 
 import numpy as np
 
-from gen2d.core.errors import ConfigError, DamagedError
+from gen2d.core.errors import ConfigError, DamagedError, FolderError, UnreachableError, UserError
+from gen2d.core.humanize import in_bytes
 from gen2d.core.schema import Field
-from gen2d.dataset.manifest import field_of, read_manifest
-from gen2d.loading.chunks import LAYOUTS, Column, Files, Piece, Reader, forget, why
+from gen2d.dataset.manifest import Manifest, read_manifest
+from gen2d.dataset.spec import shard_name
+from gen2d.loading.chunks import Piece, Reader, SplitFiles
+from gen2d.loading.column import LAYOUTS, Column
 from gen2d.loading.epochs import shuffled
 from gen2d.loading.protocols import Batch, Joined, Numbers, checked_numbers, filled, item, taken_apart
 from gen2d.storage import codecs
 from gen2d.storage.cache import Cache
-from gen2d.storage.paths import Place, Url, place
+from gen2d.storage.explain import reason
+from gen2d.storage.paths import Network, Place, Url, place
 
 
 @overload
@@ -36,6 +42,10 @@ def open(
     verify: str = "checksum",
     cache_dir: str | Path | None = None,
     cache_bytes: int | None = None,
+    *,
+    snapshot: str | None = None,
+    timeout: float = 30.0,
+    deadline: float = 300.0,
 ) -> "Dataset": ...
 @overload
 def open(path: list[Any] | tuple[Any, ...], *options: Any, **named: Any) -> Joined: ...
@@ -51,6 +61,10 @@ def open(
     verify: str = "checksum",
     cache_dir: str | Path | None = None,
     cache_bytes: int | None = None,
+    *,
+    snapshot: str | None = None,
+    timeout: float = 30.0,
+    deadline: float = 300.0,
 ) -> "Dataset | Joined":
     """The videos of one split of a complete dataset.
 
@@ -64,19 +78,25 @@ def open(
     one dataset, their videos one after the other. Of a URL `cache_dir` keeps whole shards in a folder, `cache_bytes` at
     most besides those on their way, the ones used longest ago going first; several processes and datasets may share it.
 
-    Raises FolderError, ConfigError, and DamagedError, then and whenever videos are read.
+    A dataset may grow while it is read: what was opened stays as it was. `snapshot` opens it as it was before it grew
+    the last time (`Dataset.snapshot`, as a loader's state has it). Of a URL, `timeout` is how many seconds a server is
+    waited for at a time, and `deadline` how many a request may take in all.
+
+    Raises FolderError, ConfigError, DamagedError, and UnreachableError where a server does not answer, then and
+    whenever videos are read.
     """
     if isinstance(path, list | tuple):
         how = split, fields, window, stride, start, layout, dtype, verify, cache_dir, cache_bytes
-        return _joined([open(one, *how) for one in path])
-    root = place(path)
-    manifest = read_manifest(root)
+        if snapshot is not None:
+            raise ConfigError("snapshot must be None for a list of datasets")
+        return _joined([open(one, *how, timeout=timeout, deadline=deadline) for one in path])
+    root = place(path, Network(timeout, deadline))
+    manifest = read_manifest(root, snapshot)
     split = _chosen_split(root, manifest, split)
-    described = {name: field_of(about) for name, about in manifest["fields"].items()}
-    names = chosen_fields(f"{root}", described, fields)
+    names = chosen_fields(f"{root}", manifest.fields, fields)
     options = Options(split, names, window, stride, start, layout, dtype, verify, cache_dir, cache_bytes)
-    options = options.within(_frames_of(manifest, split), manifest["sizes"].get("T", 0))
-    _check_cache(options, max(shard["bytes"] for shard in manifest["shards"]))
+    options = options.within(manifest.frames[split], manifest.sizes.get("T", 0))
+    _check_cache(options, max(table.largest for table in manifest.tables.values()))
     return Dataset(root, manifest, options)
 
 
@@ -135,33 +155,45 @@ class Options:
             raise ConfigError(f"{need} {self.first + self.span} frames, but the videos have {frames}")
 
 
+_HINT = "gen2d verify finds all such damage"
+
+
 class Dataset:
     """Videos by number, as dictionaries of NumPy arrays; also a map-style dataset for torch and grain."""
 
-    def __init__(self, root: Place, manifest: Mapping[str, Any], options: Options) -> None:
+    def __init__(self, root: Place, manifest: Manifest, options: Options) -> None:
         self.root, self.manifest, self.options = root, manifest, options
-        self.fields = {name: field_of(manifest["fields"][name]) for name in options.fields}
-        self.stats = {name: values for name, values in manifest["stats"][options.split].items() if name in self.fields}
+        self.fields = {name: manifest.fields[name] for name in options.fields}
+        self.stats = {name: values for name, values in manifest.stats[options.split].items() if name in self.fields}
         view = options.layout, options.window, options.stride, options.dtype
         self._columns = [Column(name, manifest, *view) for name in self.fields]
         cache = None
         if isinstance(root, Url) and options.cache_dir is not None:
             cache = Cache(Path(options.cache_dir), options.cache_bytes)
-        self._files = Files(root, manifest, cache, options.verify == "checksum")
-        self._count, self._frames = manifest["splits"][options.split], _frames_of(manifest, options.split)
-        sizes = {split: count for split, count in sorted(manifest["splits"].items()) if split < options.split}
-        self._base = sum(sizes.values())  # the index holds one split after the other
-        self._videos = self._files.table("videos")
-        self._rows = self._files.table("shards")
-        self._chunks = {
-            column.name: self._files.table(column.name).reshape(-1, column.pieces)
-            for column in self._columns
-            if column.is_image
-        }
+        self._files = SplitFiles(root, manifest, options.split, cache, options.verify == "checksum")
+        self._count, self._frames = manifest.splits[options.split], manifest.frames[options.split]
 
     def __reduce__(self) -> tuple[Any, ...]:
-        values = vars(self.options)
-        return open, (self.root, *values.values())
+        return Dataset, (self.root, self.manifest, self.options)
+
+    @property
+    def snapshot(self) -> str:
+        """Which of the states of a dataset that grows this is: the manifest's sha256."""
+        return self.manifest.sha256
+
+    def at(self, snapshot: Any) -> "Dataset":
+        """The dataset as it was at an earlier snapshot, while that is there.
+
+        Raises FolderError where it is not, and ConfigError where the snapshot is of another dataset.
+        """
+        if snapshot == self.snapshot:
+            return self
+        if not isinstance(snapshot, str):
+            raise ConfigError(f"the state is of several datasets, but {self.root} is one")
+        manifest = read_manifest(self.root, snapshot)
+        if manifest.identity != self.manifest.identity or self.options.split not in manifest.splits:
+            raise ConfigError(f"the state is of another dataset than {self.root}")
+        return Dataset(self.root, manifest, self.options)
 
     def __len__(self) -> int:
         return self._count
@@ -180,7 +212,7 @@ class Dataset:
     @property
     def time(self) -> np.ndarray:
         """The time of every frame of a whole video, s, float64 [T]."""
-        return np.array(self.manifest["constants"]["time"])[: self._frames]
+        return self.manifest.constants["time"][: self._frames]
 
     def batch(self, indices: Numbers, starts: Numbers | None = None, out: Batch | None = None) -> Batch:
         """The videos with these numbers, stacked; windows begin at `starts`; `out` is filled if given."""
@@ -188,7 +220,11 @@ class Dataset:
 
     def empty(self, count: int) -> Batch:
         """A batch of `count` videos that is yet to be filled."""
-        return {column.name: np.empty((count, *column.shape), column.dtype) for column in self._columns}
+        try:
+            return {column.name: np.empty((count, *column.shape), column.dtype) for column in self._columns}
+        except (MemoryError, ValueError):  # NumPy's words for more than there is, and for more than can be
+            size = sum(math.prod((count, *column.shape)) * column.dtype.itemsize for column in self._columns)
+            raise UserError(f"{self.root}: {count} videos take {in_bytes(size)}, more than there is memory") from None
 
     def fill(self, out: Batch, rows: Numbers, indices: Numbers, starts: Numbers | None = None) -> None:
         """Returns nothing; puts the videos into these rows of `out`. Threads may fill one batch together."""
@@ -197,10 +233,11 @@ class Dataset:
         last = self._frames - self.options.span
         if first.shape != numbers.shape or ((first < 0) | (first > last)).any():
             raise ConfigError(f"starts must be a frame from 0 to {last} for each video, but are {first.tolist()}")
-        videos = self._videos[self._base + numbers]
         begins, targets = first.tolist(), np.asarray(rows).tolist()
-        places = [self._places(column, numbers, videos, begins) for column in self._columns]
-        read = self._files.reader(places)
+        with self._named(numbers):
+            videos = self._files.videos(numbers)
+            places = [self._files.pieces(column, numbers, videos, begins) for column in self._columns]
+            read = self._files.reader(places)
         for column, own in zip(self._columns, places, strict=True):
             whole = None if column.is_direct else np.empty((1, *column.stored), column.field.dtype)
             for step, pieces in enumerate(own):
@@ -211,15 +248,14 @@ class Dataset:
                 if whole is not None:
                     column.convert(whole, begin, target)
 
-    def _places(self, column: Column, numbers: np.ndarray, videos: np.ndarray, begins: list[int]) -> list[list[Piece]]:
-        """Where the pieces lie that are needed of each video."""
-        if column.is_image:
-            known = self._chunks[column.name][self._base + numbers].tolist()
-            pairs = zip(known, begins, strict=True)
-            return [[Piece._make(pieces[i]) for i in column.needed(begin)] for pieces, begin in pairs]
-        offset = self._rows[column.name][videos["shard"]] + videos["row"].astype(np.uint64) * np.uint64(column.size)
-        parts = videos["shard"], offset, np.full(len(numbers), column.size), videos[column.name]
-        return [[Piece._make(piece)] for piece in zip(*(part.tolist() for part in parts), strict=True)]
+    @contextlib.contextmanager
+    def _named(self, numbers: np.ndarray) -> Iterator[None]:
+        """A block that looks up videos; what goes wrong says of which."""
+        try:
+            yield
+        except DamagedError as error:
+            which = f"video {numbers[0]}" if len(numbers) == 1 else f"videos {numbers.min()} to {numbers.max()}"
+            raise DamagedError(f"{error} (looking up {self.options.split} {which}): {_HINT}") from None
 
     def _read(self, read: Reader, column: Column, piece: Piece, video: int, target: np.ndarray) -> None:
         try:
@@ -228,10 +264,14 @@ class Dataset:
                 raise DamagedError("its checksum differs")
             if isinstance(data, bytes):
                 codecs.decode_into(column.codec, data, target)
-        except (DamagedError, OSError) as error:
-            forget()
-            where = f"{self._files.shard(piece.shard)}: {column.name} of {self.options.split} video {video}"
-            raise DamagedError(f"{where} cannot be read ({why(error)}): gen2d verify finds all such damage") from error
+        except (DamagedError, UserError, UnreachableError, OSError) as error:
+            path = self._files.path(shard_name(self._files.shard(piece.shard).shard.name))
+            where = f"{path}: {column.name} of {self.options.split} video {video} cannot be read ({reason(error)})"
+            if isinstance(error, DamagedError):
+                raise DamagedError(f"{where}: {_HINT}") from error
+            if isinstance(error, UserError | UnreachableError):
+                raise type(error)(where) from error
+            raise (FolderError if isinstance(error, FileNotFoundError) else UnreachableError)(where) from error
 
     def numbers_at(self, positions: np.ndarray, epoch: int = 0, seed: int | None = None) -> np.ndarray:
         """The numbers of the videos at these positions of an epoch: in order, or as the seed shuffles them."""
@@ -263,19 +303,14 @@ def _joined(datasets: Sequence[Dataset]) -> Joined:
 def _facts(ds: Dataset) -> Iterator[tuple[str, Any]]:
     """What datasets that are opened as one must agree in, by name."""
     yield "split", ds.options.split
-    yield "fps", ds.manifest["fps"]
-    yield from ((f"size {axis}", size) for axis, size in ds.manifest["sizes"].items())
+    yield "fps", ds.manifest.fps
+    yield from ((f"size {axis}", size) for axis, size in ds.manifest.sizes.items())
     for name, field in ds.fields.items():
         yield f"field {name}", f"{field.dtype} {field.axes}, {field.unit or 'no unit'}"
 
 
-def _frames_of(manifest: Mapping[str, Any], split: str) -> int:
-    """How many frames of a split's videos are given: all, or as many as the config says of the split."""
-    return manifest["config"].get("splits", {}).get(split, {}).get("frames") or manifest["sizes"].get("T", 0)
-
-
-def _chosen_split(root: Place, manifest: Mapping[str, Any], split: str | None) -> str:
-    splits = manifest["splits"]
+def _chosen_split(root: Place, manifest: Manifest, split: str | None) -> str:
+    splits = manifest.splits
     if split is None and len(splits) != 1 and "train" not in splits:
         raise ConfigError(f"{root} has the splits {', '.join(splits)}: say which, as split=")
     chosen = split if split is not None else "train" if "train" in splits else next(iter(splits))

@@ -4,6 +4,7 @@ Nothing is drawn from a generator that has a state: video and window at each pos
 position, so going on anywhere takes no replay.
 """
 
+import copy
 import os
 from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
@@ -48,8 +49,11 @@ class Walk:
         self.rank, self.world_size, self.global_size = rank, world_size, batch_size * world_size
         self.least = 1 if remainder == "keep" else self.global_size  # how many videos still make a global batch
         self.epoch = self.position = 0
-        if videos < self.least:
-            raise ConfigError(f"{self.global_size} videos make a global batch, but there are only {videos}")
+        self._check_size()
+
+    def _check_size(self) -> None:
+        if self.videos < self.least:
+            raise ConfigError(f"{self.global_size} videos make a global batch, but there are only {self.videos}")
 
     def __len__(self) -> int:
         """The number of global batches in one epoch."""
@@ -62,13 +66,26 @@ class Walk:
         return fixed | {"epoch": self.epoch, "position": self.position}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Returns nothing; goes to where `state` was taken, on whatever number of ranks."""
-        for name, here in self.state_dict().items():
-            if name not in ("epoch", "position") and state[name] != here:
+        """Goes to where `state` was taken, on whatever number of ranks. Raises ConfigError for what is no state."""
+        here = self.state_dict()
+        if not isinstance(state, Mapping) or not here.keys() <= state.keys():
+            raise ConfigError(f"the state must be one that state_dict gave, with {', '.join(here)}")
+        for name, value in here.items():
+            if name not in ("epoch", "position") and state[name] != value:
                 raise ConfigError(
-                    f"the state has {name} {state[name]}, but this loader has {here}: orders would differ"
+                    f"the state has {name} {state[name]}, but this loader has {value}: orders would differ"
                 )
-        self.epoch, self.position = self._settled(state["epoch"], state["position"])
+        place = state["epoch"], state["position"]
+        if not all(isinstance(number, int) and number >= 0 for number in place):
+            raise ConfigError(f"the state has epoch and position {place}, but must have whole numbers")
+        self.epoch, self.position = self._settled(*place)
+
+    def over(self, videos: int) -> "Walk":
+        """The same way through another number of videos, from its beginning."""
+        other = copy.copy(self)
+        other.videos, other.epoch, other.position = videos, 0, 0
+        other._check_size()
+        return other
 
     def steps(self) -> Iterator[Step]:
         """The global batches to come."""

@@ -14,7 +14,17 @@ import numpy as np
 
 from gen2d.core.errors import ConfigError
 from gen2d.loading.epochs import SOURCES, hashed
-from gen2d.loading.protocols import Batch, Joined, Numbers, Source, checked_numbers, item, occurring, taken_apart
+from gen2d.loading.protocols import (
+    Batch,
+    Joined,
+    Numbers,
+    Source,
+    at_snapshots,
+    checked_numbers,
+    item,
+    occurring,
+    taken_apart,
+)
 
 FINEST = 1000  # a weight is taken as the nearest fraction with a denominator up to this
 Weights = Mapping[str, float] | Sequence[float]
@@ -69,6 +79,18 @@ class Mixture:
     def __repr__(self) -> str:
         parts = (f"{share} of {name}" for name, share in zip(self.datasets, self.shares, strict=True))
         return f"<{len(self)} videos, in every {sum(self.shares)} {', '.join(parts)}>"
+
+    @property
+    def snapshot(self) -> list[Any]:
+        """The snapshot of each dataset, in their order."""
+        return self._joined.snapshot
+
+    def at(self, snapshot: Any) -> "Mixture":
+        """The mixture of the same datasets at earlier snapshots, while these are there."""
+        if snapshot == self.snapshot:
+            return self
+        datasets = at_snapshots(list(self.datasets.values()), snapshot)
+        return Mixture(dict(zip(self.datasets, datasets, strict=True)), self.shares)
 
     def batch(self, positions: Numbers) -> Batch:
         """The videos at these positions of the first epoch, not shuffled, stacked."""

@@ -36,6 +36,11 @@ class Source(Protocol):
     @property
     def time(self) -> np.ndarray: ...
 
+    @property
+    def snapshot(self) -> Any: ...
+
+    def at(self, snapshot: Any) -> Any: ...
+
     def empty(self, count: int) -> Batch: ...
 
     def fill(self, out: Batch, rows: Numbers, indices: Numbers, starts: Numbers | None = None) -> None: ...
@@ -129,6 +134,15 @@ class Joined:
         parts = [source.stats for source in self.datasets]
         return {name: _together([part[name] for part in parts], self.sizes) for name in parts[0]}
 
+    @property
+    def snapshot(self) -> list[Any]:
+        """The snapshot of each dataset, in their order."""
+        return [source.snapshot for source in self.datasets]
+
+    def at(self, snapshot: Any) -> "Joined":
+        """The same datasets at earlier snapshots, while these are there."""
+        return self if snapshot == self.snapshot else Joined(at_snapshots(self.datasets, snapshot))
+
     def batch(self, indices: Numbers, starts: Numbers | None = None, out: Batch | None = None) -> Batch:
         """The videos with these numbers, stacked; windows begin at `starts`; `out` is filled if given."""
         return filled(self, checked_numbers(indices, len(self), "the whole"), starts, out)
@@ -161,6 +175,14 @@ class Joined:
     def _shared(self, numbers: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
         """Each dataset that has some of these videos, and which of them."""
         return occurring(np.searchsorted(self.firsts, numbers, side="right") - 1)
+
+
+def at_snapshots(datasets: Sequence[Source], snapshots: Any) -> list[Source]:
+    """Each dataset at its own of these snapshots. Raises ConfigError where they are not of so many datasets."""
+    if not isinstance(snapshots, list) or len(snapshots) != len(datasets):
+        count = len(snapshots) if isinstance(snapshots, list) else 1
+        raise ConfigError(f"the state is of {count} datasets, but there are {len(datasets)}")
+    return [source.at(snapshot) for source, snapshot in zip(datasets, snapshots, strict=True)]
 
 
 def occurring(owners: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:

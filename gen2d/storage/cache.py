@@ -13,8 +13,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from gen2d.core.errors import DamagedError
-from gen2d.storage.atomic import file_sha256
 from gen2d.storage.paths import Url, download
+from gen2d.storage.sealed import file_sha256
 
 _OURS = re.compile(r"[0-9a-f]{64}")
 
@@ -27,7 +27,7 @@ class Cache:
     limit: int | None
     seen: set[str] = dataclasses.field(default_factory=set)  # what this process knows to be right
 
-    def path(self, url: Url, sha256: str, size: int | None = None) -> Path:
+    def path(self, url: Url, sha256: str, size: int) -> Path:
         """Where the file is, fetched if need be; open it soon, as others may make room at any time.
 
         Raises OSError if it cannot be fetched, DamagedError if it is not what was written.

@@ -2,8 +2,11 @@
 
 `place` makes a Path of a folder on disk and a Url of anything else, and what is written for the one then works with the
 other. fsspec knows the protocols; it is imported when the first URL is met. An object appears whole or not at all, so
-nothing is renamed; folders are only what names begin with. What fails is tried again, as networks do fail; what then
-remains is an OSError that names the URL.
+nothing is renamed; folders are only what names begin with.
+
+Every request has a limit on waiting and a deadline. What a server may mend is tried again until then; what remains is
+UnreachableError, or FileNotFoundError and PermissionError where the server says so. No message, repr or log shows the
+user name, password or query of a URL.
 """
 
 import contextlib
@@ -12,33 +15,53 @@ import errno
 import fnmatch
 import functools
 import os
+import re
 import stat
+import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from pathlib import Path, PurePath
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, TypeVar
 
-from gen2d.core.errors import FolderError
+from gen2d.core.errors import ConfigError, FolderError, UnreachableError
 
-ATTEMPTS = 4
 PAUSE = 0.25  # s, before the second attempt; doubled before each that follows
-NEAR = 2**18  # bytes: reading over such a gap takes less time than asking twice
-LONGEST = 2**23  # bytes in one request: longer ones take more time than several at once
+ATTEMPTS = 4
+PIECE = 2**20  # bytes of a file that are received at once
+SLOWEST = 2**20  # bytes/s: a file may take so much longer than the deadline
 
 T = TypeVar("T")
+
+
+@dataclasses.dataclass(frozen=True)
+class Network:
+    """How long a server is waited for."""
+
+    timeout: float = 30.0  # s, to connect, and between two pieces of an answer
+    deadline: float = 300.0  # s, for a request in all, every further attempt included
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value < 1e9:
+                raise ConfigError(f"{name} is {value!r}, but must be a number of seconds above 0")
 
 
 @dataclasses.dataclass(frozen=True, order=True)
 class Url:
     """A file or folder elsewhere; methods do as those of pathlib.Path, and raise OSError as they do."""
 
-    text: str
+    text: str = dataclasses.field(repr=False)  # without the query
+    query: str = dataclasses.field(default="", repr=False)  # with its question mark
+    network: Network = dataclasses.field(default=Network(), compare=False, repr=False)
 
     def __truediv__(self, name: str | PurePath) -> "Url":
-        return Url(f"{self.text}/{PurePath(name).as_posix()}")
+        return dataclasses.replace(self, text=f"{self.text}/{PurePath(name).as_posix()}")
 
     def __str__(self) -> str:
-        return self.text
+        return shown(self.text + self.query)
+
+    def __repr__(self) -> str:
+        return f"Url({str(self)!r})"
 
     @property
     def name(self) -> str:
@@ -46,11 +69,20 @@ class Url:
 
     @property
     def parent(self) -> "Url":
-        return Url(self.text.rpartition("/")[0])
+        return dataclasses.replace(self, text=self.text.rpartition("/")[0])
+
+    @property
+    def is_listed(self) -> bool:
+        """Whether the server tells what is in a folder; plain web servers need not."""
+        return not self.is_web
+
+    @property
+    def is_web(self) -> bool:
+        return self.text.startswith(("http://", "https://"))
 
     def stat(self) -> os.stat_result:
         """Size and kind; the rest is not known."""
-        about = _tried(self, lambda system, path: system.info(path))
+        about = attempt(self, _about)
         kind = stat.S_IFDIR if about["type"] == "directory" else stat.S_IFREG
         return os.stat_result((kind, 0, 0, 1, 0, 0, about["size"] or 0, 0, 0, 0))
 
@@ -73,45 +105,76 @@ class Url:
         """Does nothing: a folder is there when something is in it."""
 
     def iterdir(self) -> "Iterator[Url]":
-        listed = _tried(self, lambda system, path: _listed(system, path, system.ls))
+        listed = attempt(self, lambda system, path: _listed(system, path, system.ls)) if self.is_listed else []
         return (self / name for name in listed)
 
     def glob(self, pattern: str) -> "Iterator[Url]":
         return (path for path in self.iterdir() if fnmatch.fnmatchcase(path.name, pattern))
 
     def rglob(self, pattern: str) -> "Iterator[Url]":
-        listed = _tried(self, lambda system, path: _listed(system, path, system.find))
+        listed = attempt(self, lambda system, path: _listed(system, path, system.find)) if self.is_listed else []
         return (self / name for name in listed if fnmatch.fnmatchcase(PurePath(name).name, pattern))
 
-    def read_bytes(self) -> bytes:
-        return _tried(self, lambda system, path: system.cat_file(path))
+    def read_bytes(self, limit: int) -> bytes:
+        """The whole content, of at most `limit` bytes; OSError(EFBIG) where it has more."""
+        return attempt(self, lambda system, path: _read(self, system, path, limit), limit)
 
     def unlink(self, missing_ok: bool = False) -> None:
         try:
-            _tried(self, lambda system, path: system.rm_file(path))
+            attempt(self, lambda system, path: system.rm_file(path))
         except FileNotFoundError:
             if not missing_ok:
                 raise
+
+    def rename(self, target: "Url") -> None:
+        """Copies the object and removes it under its own name."""
+        attempt(self, lambda system, path: system.cp_file(path, system._strip_protocol(target.text)), 2**33)
+        self.unlink(missing_ok=True)
 
 
 Place = Path | Url
 
 
-def place(path: str | Place) -> Place:
+def place(path: str | Place, network: Network | None = None) -> Place:
     """Where a dataset lies: a Path, or a Url of what has a protocol other than file.
 
     Raises FolderError for a URL of which it is known at once that it cannot be used.
     """
+    if isinstance(path, Url):
+        return path if network is None else dataclasses.replace(path, network=network)
     if not isinstance(path, str) or "://" not in path:
-        return path if isinstance(path, Url) else Path(path)
+        return Path(path)
     protocol, _, rest = path.partition("://")
     if protocol in ("file", "local"):
         return Path(rest)
-    if not rest.strip("/") or "::" in path:
-        raise FolderError(f"{path} must be PROTOCOL://FOLDER, such as s3://bucket/dataset")
-    url = Url(path.rstrip("/"))
+    if not rest.strip("/") or "::" in path or not re.fullmatch(r"[A-Za-z0-9+.-]+", protocol):
+        raise FolderError(f"{shown(path)} must be PROTOCOL://FOLDER, such as s3://bucket/dataset")
+    text, mark, query = path.partition("?") if protocol in ("http", "https", "az", "abfs", "abfss") else (path, "", "")
+    url = Url(text.rstrip("/"), mark + query, network or Network())
     _system(url)
     return url
+
+
+def shown(text: str) -> str:
+    """A URL without what must stay secret: user name and password, and the values of its query."""
+    start, mark, rest = text.partition("://")
+    if not mark:
+        return text
+    rest, question, _ = rest.partition("?")
+    host, slash, path = rest.partition("/")
+    _, at, bare = host.rpartition("@")
+    return f"{start}://{'***@' if at else ''}{bare}{slash}{path}{'?***' if question else ''}"
+
+
+def _without_secrets(sentence: str, url: Url) -> str:
+    """What a library says of a URL, with none of its secrets."""
+    host = url.text.partition("://")[2].partition("/")[0]
+    user = host.rpartition("@")[0]
+    values = [value for pair in url.query.lstrip("?").split("&") for value in (pair.partition("=")[2],)]
+    for secret in (url.query, user, *user.split(":"), *values):
+        if len(secret) > 2:
+            sentence = sentence.replace(secret, "***")
+    return sentence
 
 
 @contextlib.contextmanager
@@ -122,98 +185,80 @@ def reading(root: Place) -> Iterator[None]:
     except OSError as error:
         if isinstance(root, Path):
             raise
-        raise FolderError(f"{error.filename or root} cannot be read ({error.strerror or error})") from error
+        raise FolderError(f"{error.filename or root} cannot be read ({error.strerror or error})") from None
 
 
 def upload(source: Path, url: Url) -> None:
     """Returns when the file is there, whole."""
+    size = source.stat().st_size
 
     def put(system: Any, path: str) -> None:
         system.put_file(str(source), path)
-        _check_size(system.info(path)["size"], source.stat().st_size)
+        _check_size(system.info(path)["size"], size)
 
-    _tried(url, put)
+    attempt(url, put, size)
 
 
-def download(url: Url, target: Path, size: int | None = None) -> None:
-    """Returns when `target` holds the file, all its `size` bytes if that is known."""
+def download(url: Url, target: Path, size: int) -> None:
+    """Returns when `target` holds the file, all its `size` bytes."""
 
     def get(system: Any, path: str) -> None:
-        system.get_file(path, str(target))
-        if size is not None:
-            _check_size(target.stat().st_size, size)
+        if not url.is_web:
+            _check_size(system.info(path)["size"], size)
+            system.get_file(path, str(target))
+            return _check_size(target.stat().st_size, size)
+        got = 0
+        with target.open("wb") as file, _stream(system, path) as source:
+            while got <= size and (piece := source.read(min(PIECE, size + 1 - got))):
+                got += len(piece)
+                file.write(piece)
+        _check_size(got, size)
 
-    _tried(url, get)
-
-
-class Range(NamedTuple):
-    """The bytes of a file from `start` to before `end`."""
-
-    url: Url
-    start: int
-    end: int
-
-
-def read_ranges(ranges: Sequence[Range]) -> list[bytes | OSError]:
-    """The bytes of each range, or why there are none; asked for at once, those near each other together."""
-    spans = _spans(ranges)
-    read = dict(zip(spans, _read(list(spans)), strict=True))
-    found: dict[Range, bytes | OSError] = {}
-    for span, members in spans.items():
-        data = read[span]
-        for one in members:
-            found[one] = data if isinstance(data, OSError) else data[one.start - span.start : one.end - span.start]
-    return [found[one] for one in ranges]
+    attempt(url, get, size)
 
 
-def _spans(ranges: Sequence[Range]) -> dict[Range, list[Range]]:
-    """What to ask for, and which ranges are in it."""
-    spans: dict[Range, list[Range]] = {}
-    span, members = None, []
-    for one in sorted(ranges):
-        if span and one.url == span.url and one.start - span.end <= NEAR and one.end - span.start <= LONGEST:
-            del spans[span]
-            span = Range(span.url, span.start, max(span.end, one.end))
-        else:
-            span, members = one, []
-        members.append(one)
-        spans[span] = members
-    return spans
+def read_range(url: Url, system: Any, path: str, start: int, end: int) -> bytes:
+    """The bytes of a file from `start` to before `end`, and never more, whatever the server sends."""
+    if not url.is_web:
+        return system.cat_file(path, start=start, end=end)
+    with _stream(system, path, Range=f"bytes={start}-{end - 1}") as file:
+        if file.r.status != 206:
+            raise OSError(errno.EOPNOTSUPP, "the server does not give parts of files: say cache_dir=")
+        return _read_at_most(file, end - start)
 
 
-def _read(spans: list[Range]) -> list[bytes | OSError]:
-    found: dict[int, bytes | OSError] = {i: b"" for i, span in enumerate(spans) if span.start == span.end}
-    missing = [i for i in range(len(spans)) if i not in found]
-    for attempt in range(ATTEMPTS):
-        if not missing:
-            break
-        if attempt:
-            time.sleep(PAUSE * 2 ** (attempt - 1))
-        read = _asked([spans[i] for i in missing])
-        found |= zip(missing, read, strict=True)
-        missing = [i for i in missing if isinstance(found[i], OSError) and not isinstance(found[i], _FINAL)]
-    return [found[i] for i in range(len(spans))]
+def _read(url: Url, system: Any, path: str, limit: int) -> bytes:
+    if not url.is_web:
+        size = system.info(path)["size"]
+        if size > limit:
+            raise _too_large(limit)
+        content = system.cat_file(path, start=0, end=size) if size else b""
+        _check_size(len(content), size)
+        return content
+    with _stream(system, path) as file:
+        content, headers = _read_at_most(file, limit), file.r.headers
+    if len(content) > limit:
+        raise _too_large(limit)
+    if "Content-Encoding" not in headers and headers.get("Content-Length", "").isdigit():
+        _check_size(len(content), int(headers["Content-Length"]))
+    return content
 
 
-def _asked(spans: list[Range]) -> list[bytes | OSError]:
-    """One attempt."""
-    system = _system(spans[0].url)
-    paths = [system._strip_protocol(span.url.text) for span in spans]
-    try:
-        read = system.cat_ranges(paths, [s.start for s in spans], [s.end for s in spans], on_error="return")
-    except Exception as error:
-        read = [error] * len(spans)
-    return [_checked(data, span) for data, span in zip(read, spans, strict=True)]
+def _stream(system: Any, path: str, **headers: str) -> Any:
+    """The answer of a web server, to be read as it comes; a request, and not one more to learn the size."""
+    return system.open(path, "rb", block_size=0, size=1, headers={"Accept-Encoding": "identity", **headers})
 
 
-def _checked(data: bytes | BaseException, span: Range) -> bytes | OSError:
-    if isinstance(data, BaseException):
-        return _told(data, span.url)
-    if len(data) > span.end - span.start:
-        return OSError(errno.EOPNOTSUPP, "the server does not give parts of files: say cache_dir=", str(span.url))
-    if len(data) < span.end - span.start:
-        return OSError(errno.EIO, "the file ends too early", str(span.url))
-    return data
+def _read_at_most(file: Any, limit: int) -> bytes:
+    """What comes of a file up to a byte more than `limit`."""
+    content = bytearray()
+    while len(content) <= limit and (piece := file.read(min(PIECE, limit + 1 - len(content)))):
+        content += piece
+    return bytes(content)
+
+
+def _too_large(limit: int) -> OSError:
+    return OSError(errno.EFBIG, f"it has more than {limit} bytes")
 
 
 def _check_size(found: int, expected: int) -> None:
@@ -221,8 +266,17 @@ def _check_size(found: int, expected: int) -> None:
         raise OSError(errno.EIO, f"{found} bytes came of {expected}")
 
 
+def _about(system: Any, path: str) -> dict[str, Any]:
+    try:
+        return system.info(path)
+    except FileNotFoundError as error:
+        if error.__cause__ is not None:  # fsspec calls a file missing also where no server answers
+            raise error.__cause__ from None
+        raise
+
+
 def _listed(system: Any, path: str, call: Callable[..., list[str]]) -> list[str]:
-    """The names under a folder, from it on; a server that lists nothing has none."""
+    """The names under a folder, from it on."""
     try:
         found = call(path, detail=False)
     except (FileNotFoundError, NotADirectoryError):
@@ -232,62 +286,124 @@ def _listed(system: Any, path: str, call: Callable[..., list[str]]) -> list[str]
     return sorted(name.removeprefix(inside) for name in names if name.startswith(inside) and name != inside)
 
 
-def _tried(url: Url, call: Callable[[Any, str], T]) -> T:
-    """What `call` returns for the URL's file system and path there, after as many attempts as it takes."""
+# ---- Attempts
+
+
+def attempt(url: Url, call: Callable[[Any, str], T], size: int = 0) -> T:
+    """What `call` returns for the URL's file system and path there, after as many attempts as it takes.
+
+    `size` are the bytes that move: a large file has more time. Raises OSError for what no other attempt would mend,
+    and UnreachableError.
+    """
     system = _system(url)
-    path = system._strip_protocol(url.text)
-    for attempt in range(ATTEMPTS):
+    path = system._strip_protocol(url.text) + url.query
+    end = time.monotonic() + url.network.deadline + size / SLOWEST
+    for number in range(ATTEMPTS):
         try:
-            return call(system, path)
+            return _within(end - time.monotonic(), lambda: call(system, path))
         except Exception as error:
-            told = _told(error, url)
-            if isinstance(told, _FINAL) or attempt == ATTEMPTS - 1:
-                raise told from error
-        time.sleep(PAUSE * 2**attempt)
+            failure = explained(error, url)
+        left = end - time.monotonic() - PAUSE * 2**number
+        if not isinstance(failure, UnreachableError) or number == ATTEMPTS - 1 or left <= 0:
+            raise failure from None
+        time.sleep(PAUSE * 2**number)
     raise AssertionError("unreachable")
 
 
-# Another attempt would end alike.
+def _within(seconds: float, call: Callable[[], T]) -> T:
+    """What the call returns, if it takes no longer; it is left alone in its thread where it does."""
+    returned: list[T] = []
+    raised: list[BaseException] = []
+
+    def run() -> None:
+        try:
+            returned.append(call())
+        except BaseException as error:
+            raised.append(error)
+
+    thread = threading.Thread(target=run, daemon=True, name="gen2d-request")
+    thread.start()
+    thread.join(max(0.0, seconds))
+    if raised:
+        raise raised[0]
+    if not returned:
+        raise TimeoutError("no answer within the deadline")
+    return returned[0]
+
+
 _FINAL = (FileNotFoundError, PermissionError, IsADirectoryError, NotADirectoryError)
+_LASTING = (errno.EFBIG, errno.EOPNOTSUPP, errno.ENOSPC, errno.EMFILE, errno.ENFILE)  # and these
 
 
-def _told(error: BaseException, url: Url) -> OSError:
-    """The error as one that pathlib could raise."""
-    cause = error.__cause__
-    if isinstance(error, FileNotFoundError) and type(cause).__module__.startswith("aiohttp"):
-        error = cause or error  # fsspec calls a file missing also where no server answers
-    if getattr(error, "status", None) in (401, 403) or "Credentials" in type(error).__name__:
+def explained(error: BaseException, url: Url) -> Exception:
+    """The error as one of ours: OSError for what another attempt would not mend, else UnreachableError."""
+    status = _status(error)
+    if status in (401, 403) or "Credentials" in type(error).__name__:
         error = PermissionError()
+    elif status in (404, 410):
+        error = FileNotFoundError()
     for kind in _FINAL:
         if isinstance(error, kind):
             number = errno.EACCES if kind is PermissionError else errno.ENOENT
             return kind(number, os.strerror(number), str(url))
-    number = getattr(error, "errno", None) or errno.EIO
-    text = getattr(error, "strerror", None) or str(error) or type(error).__name__
-    return OSError(number, " ".join(text.split()), str(url))
+    number = getattr(error, "errno", None)
+    text = getattr(error, "strerror", None) or str(error)
+    text = text or ("no answer in time" if isinstance(error, TimeoutError) else type(error).__name__)
+    text = " ".join(_without_secrets(text, url).split()).rstrip(".")
+    lasting = number in _LASTING or isinstance(error, TypeError | ValueError | NotImplementedError | AttributeError)
+    if lasting or (status is not None and 400 <= status < 500 and status not in (408, 425, 429)):
+        return OSError(number or errno.EIO, text, str(url))
+    return UnreachableError(f"{url} cannot be reached ({text})")
+
+
+def _status(error: BaseException | None) -> int | None:
+    """What a web server, or S3, answered with."""
+    while error is not None:
+        status = getattr(error, "status", None)
+        response = getattr(error, "response", None)
+        if status is None and isinstance(response, dict):
+            status = response.get("ResponseMetadata", {}).get("HTTPStatusCode")
+        if isinstance(status, int):
+            return status
+        error = error.__cause__
+    return None
 
 
 def _system(url: Url) -> Any:
     """The file system that knows the URL; one that was made before a fork is another."""
-    return _made("/".join(url.text.split("/")[:3]), os.getpid())
+    return _made("/".join(url.text.split("/")[:3]), url.network.timeout, os.getpid())
 
 
 @functools.lru_cache(maxsize=32)
-def _made(start: str, process: int) -> Any:
+def _made(start: str, timeout: float, process: int) -> Any:
+    name = shown(start)
     try:
         import fsspec
     except ImportError:
-        raise FolderError(f"{start} needs fsspec: pip install 'gen2d[remote]'") from None
+        raise FolderError(f"{name} needs fsspec: pip install 'gen2d[remote]'") from None
     try:
         # What others write must be seen at once.
-        return fsspec.core.url_to_fs(start, use_listings_cache=False)[0]
+        return fsspec.core.url_to_fs(start, use_listings_cache=False, **_limits(start, timeout))[0]
     except ImportError as error:
         hint = ": pip install 'gen2d[remote]'" if start.startswith(("s3:", "http")) else ""
-        raise FolderError(f"{start} needs another package ({error}){hint}") from None
+        raise FolderError(f"{name} needs another package ({error}){hint}") from None
     except Exception as error:
         known = ", ".join(sorted(name for name in fsspec.available_protocols() if name in _COMMON))
-        told = " ".join(str(error).split())
-        raise FolderError(f"{start} cannot be used ({told}); common protocols are {known}") from None
+        reason = _without_secrets(" ".join(str(error).split()), Url(start))
+        raise FolderError(f"{name} cannot be used ({reason}); common protocols are {known}") from None
+
+
+def _limits(start: str, timeout: float) -> dict[str, Any]:
+    """How a file system is told how long to wait for a server; that of another protocol has its own limits."""
+    if start.startswith(("http://", "https://")):
+        import aiohttp
+
+        limits = aiohttp.ClientTimeout(total=None, sock_connect=timeout, sock_read=timeout)
+        return {"client_kwargs": {"timeout": limits}}
+    if start.startswith(("s3://", "s3a://")):
+        retries = {"max_attempts": 1}  # trying again is for `attempt`
+        return {"config_kwargs": {"connect_timeout": timeout, "read_timeout": timeout, "retries": retries}}
+    return {}
 
 
 _COMMON = ("s3", "gs", "az", "http", "https", "sftp", "memory", "file")

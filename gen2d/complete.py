@@ -1,0 +1,64 @@
+"""From the shards that are done to a dataset that readers open: tables, cards and, last, the manifest."""
+
+import numpy as np
+
+from gen2d import preview
+from gen2d.dataset.croissant import croissant
+from gen2d.dataset.folder import Publication, Sizes, explained, is_done, publish_snapshot, whole_plan
+from gen2d.dataset.manifest import CONFIG, SHEET, Manifest, Table, describe
+from gen2d.dataset.readme import readme, shown_split
+from gen2d.dataset.records import Records, read_records
+from gen2d.dataset.rows import npy
+from gen2d.dataset.spec import DatasetSpec, Shard, table_name
+from gen2d.dataset.statistics import summary
+from gen2d.loading.dataset import Dataset, Options
+from gen2d.storage.atomic import publish_changed
+from gen2d.storage.paths import Place
+from gen2d.storage.sealed import sha256
+
+ROWS = 4  # videos on a sheet
+
+
+def complete(spec: DatasetSpec) -> bool:
+    """Whether the dataset is complete; if it is, its tables, cards and manifest are there.
+
+    False while shards are missing that other workers still make.
+    """
+    with explained(spec.root):
+        records, sizes = read_records(spec), Sizes(spec.root)
+        shards = whole_plan(spec, records)
+        if not all(is_done(shard, records, sizes) for shard in shards):
+            return False
+        publish_snapshot(spec, publication(spec, shards, records), records)
+    return True
+
+
+def publication(spec: DatasetSpec, shards: list[Shard], records: Records) -> Publication:
+    """What a snapshot of these shards consists of beside them; its tables are in the folder then."""
+    tables, rows = {}, {}
+    for split in sorted({shard.split for shard in shards}):
+        own = [shard for shard in shards if shard.split == split]
+        rows[split] = records.table(split, own)
+        content, name = npy(rows[split]), table_name(split, own[-1].first + own[-1].count)
+        publish_changed(spec.root / name, content)
+        sizes = rows[split]["bytes"].tolist()
+        tables[split] = Table(name, sha256(content), len(own), sum(sizes), max(sizes))
+    counts = {shard.split: shard.first + shard.count for shard in shards}
+    stats = {split: summary(own["moments"], spec.fields) for split, own in rows.items()}
+    files = {CONFIG: spec.config_text.encode(), **spec.copies}
+    hashes = {name: sha256(content) for name, content in files.items()}
+    manifest = describe(spec, counts, tables, stats, hashes)
+    if "frames" in spec.fields:
+        files[SHEET] = sheet(spec.root, manifest)
+        manifest = describe(spec, counts, tables, stats, hashes | {SHEET: sha256(files[SHEET])})
+    cards = {"README.md": readme(manifest, spec.command).encode(), "croissant.json": croissant(manifest)}
+    return Publication(manifest, files | cards)
+
+
+def sheet(root: Place, manifest: Manifest) -> bytes:
+    """A contact sheet of the first videos, as a PNG; the manifest need not be in the folder yet."""
+    options = Options(shown_split(manifest), ("frames",), None, 1, "first", "THWC", "uint8", "checksum")
+    ds = Dataset(root, manifest, options)
+    # One video in memory at a time: they may be long and large.
+    videos = (ds[number]["frames"] for number in range(min(ROWS, len(ds))))
+    return preview.png(preview.contact_sheet(np.stack([preview.reduced(video) for video in videos])))

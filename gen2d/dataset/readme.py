@@ -1,0 +1,107 @@
+"""The dataset's card: what people read about it, from the manifest."""
+
+from gen2d.dataset.manifest import SHEET, Manifest, statistics
+from gen2d.dataset.spec import shard_name, shard_of
+
+
+def shown_split(manifest: Manifest) -> str:
+    """The split that cards show and load."""
+    return "train" if "train" in manifest.splits else min(manifest.splits)
+
+
+def readme(manifest: Manifest, command: str) -> str:
+    """The dataset's card; `command` is what made it."""
+    fields, first = manifest.fields, shown_split(manifest)
+    lines = (f"| {name} | {f.dtype} | {f.axes} | {f.unit} | {f.meaning} |" for name, f in fields.items())
+    shard = shard_of(first, 0, min(manifest.splits[first], manifest.videos_per_shard), manifest.videos_per_shard)
+    return _README.format(
+        name=manifest.name,
+        counts=", ".join(f"{count} {split}" for split, count in manifest.splits.items()),
+        fps=manifest.fps,
+        rows="\n".join(lines),
+        sizes=", ".join(f"{axis} = {size}" for axis, size in sorted(manifest.sizes.items())),
+        conventions=manifest.conventions,
+        split=first,
+        shard=shard_name(shard.name),
+        sheet=f"\n![the first videos, time from left to right]({SHEET})\n" if SHEET in manifest.files else "",
+        statistics="\n".join(f"| {' | '.join(row)} |" for row in statistics(manifest)),
+        sampled=manifest.stats_sampled,
+        field="frames" if "frames" in fields else min(fields),
+        plugin=", hdf5plugin" if manifest.codec == "zstd" else "",
+        command="` and `".join(f"{command} --n {n} --split {split}" for split, n in manifest.splits.items()),
+        seed=manifest.seed,
+        licence=manifest.licence or "None was chosen: choose one before publishing.",
+    )
+
+
+# The folder is `.` in the examples: its name may be another where it was copied to.
+_README = """# {name}
+
+Rendered videos of two-dimensional rigid bodies with everything that is true about them: {counts} videos,
+{fps:g} frames per second.
+{sheet}
+## What it holds
+
+| field | dtype | axes | unit | meaning |
+|---|---|---|---|---|
+{rows}
+
+Sizes: n videos, {sizes}. {conventions}
+
+## How to load it
+
+`.` stands for this folder: run the examples in it, or say where it is.
+
+With gen2d, as NumPy arrays:
+
+```python
+import gen2d
+dataset = gen2d.open(".", split="{split}")
+video = dataset[0]
+```
+
+With PyTorch:
+
+```python
+import gen2d, torch
+dataset = gen2d.open(".", split="{split}")
+loader = torch.utils.data.DataLoader(dataset, batch_size=32, shuffle=True)
+batch = next(iter(loader))
+```
+
+With JAX, on its default device (`device=` and `sharding=` name others):
+
+```python
+import gen2d, jax
+dataset = gen2d.open(".", split="{split}")
+loader = gen2d.DataLoader(dataset, batch_size=32, to="jax", epochs=1, remainder="keep")
+for batch in loader:
+    means = jax.tree.map(jax.numpy.mean, batch)
+```
+
+With h5py alone:
+
+```python
+import h5py{plugin}
+file = h5py.File("{shard}")
+video = file["{field}"][0]
+```
+
+`manifest.json` describes every field and file, with checksums; `config.yaml` is the recipe.
+
+## Statistics
+
+| split | field | mean | standard deviation | least | largest |
+|---|---|---|---|---|---|
+{statistics}
+
+One number for each channel or component, of {sampled}.
+
+## How it was made
+
+By `{command}` with seed {seed}. The same recipe, seed and versions make the same videos.
+
+## Licence
+
+{licence}
+"""

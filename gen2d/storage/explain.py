@@ -1,0 +1,94 @@
+"""What an OSError of a disk means for a person, as an error with one true sentence."""
+
+import contextlib
+import errno
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+from gen2d.core.errors import DamagedError, FolderError, UnreachableError, UserError
+
+FULL = (errno.ENOSPC, errno.EDQUOT)
+# The disk, or what connects it, fails; the data may well be whole.
+_FAILING = tuple(
+    getattr(errno, name)
+    for name in ("EIO", "ESTALE", "ETIMEDOUT", "ENOTCONN", "EHOSTDOWN", "EREMOTEIO", "ENODEV")
+    if hasattr(errno, name)  # not every system has all
+)
+_TOO_MANY = (errno.EMFILE, errno.ENFILE)
+_NO_FILE = (errno.ENXIO, errno.EISDIR, errno.ENOTDIR, errno.ELOOP, errno.ENAMETOOLONG, errno.EINVAL)
+
+
+def reason(error: Exception) -> str:
+    """What is wrong, without the file's name."""
+    return str(getattr(error, "strerror", None) or error)
+
+
+def reading_error(path: object, error: OSError) -> Exception:
+    """The error to raise where a file of a dataset could not be read."""
+    if isinstance(error, FileNotFoundError):
+        return DamagedError(f"{path} is missing")
+    if error.errno in _TOO_MANY:
+        return UserError(f"{path} cannot be opened: too many files are open; allow more of them (ulimit -n)")
+    if error.errno == errno.ENOMEM:
+        return UserError(f"{path} cannot be read: the machine has no memory left")
+    if error.errno in (errno.EACCES, errno.EPERM):
+        return FolderError(f"{path} cannot be read: permission denied")
+    if error.errno in _FAILING:
+        return UnreachableError(f"{path} cannot be read: the disk or its network fails ({reason(error)})")
+    if error.errno == errno.EFBIG:
+        return DamagedError(f"{path} is larger than such a file can be")
+    if error.errno in _NO_FILE:
+        return DamagedError(f"{path} is not a regular file")
+    return UnreachableError(f"{path} cannot be read ({reason(error)})")
+
+
+@contextlib.contextmanager
+def explained_reading(path: object) -> Iterator[None]:
+    """A block that reads a file; its OSError becomes one of ours."""
+    try:
+        yield
+    except OSError as error:
+        raise reading_error(path, error) from error
+
+
+def writing_error(where: Path, error: OSError, again: str = "run the same command again", need: str = "") -> UserError:
+    """The error to raise where a file could not be written in the folder `where`; `again` says how to go on, `need`
+    how much room there must be.
+
+    Exit code 2 for what another folder mends, 1 for a disk that is full or fails.
+    """
+    if isinstance(error, FileExistsError | NotADirectoryError):
+        return FolderError(f"{error.filename} is a file, not a folder: choose another --out")
+    if isinstance(error, PermissionError):
+        return FolderError(f"you have no permission to write in {error.filename or where}: choose another --out")
+    if error.errno == errno.EROFS:
+        return FolderError(f"{where} is on a disk that is read-only: choose another --out")
+    if error.errno in _TOO_MANY:
+        return UserError(f"{where} cannot be written: too many files are open; allow more of them (ulimit -n)")
+    if isinstance(error, FileNotFoundError):
+        return FolderError(f"{error.filename or where} is gone: was {where} moved or removed during the run?")
+    if error.errno in FULL:
+        told = (
+            f"no space left for {where}: {need}{', ' if need else ''}the disk has {_left(where)}: make room and {again}"
+        )
+    elif error.errno == errno.EFBIG:
+        told = f"{where} cannot hold so large a file: its file system, or ulimit -f, allows none; allow it and {again}"
+    elif error.errno in _FAILING:
+        told = f"{where} cannot be written, as the disk or its network fails ({reason(error)}): mend it and {again}"
+    else:
+        return FolderError(f"{where} cannot be written ({reason(error)}): choose another --out")
+    failed = FolderError(told)
+    failed.exit_code = 1
+    return failed
+
+
+def _left(where: Path) -> str:
+    """How much a disk can still take."""
+    try:
+        disk = os.statvfs(next(folder for folder in (where, *where.absolute().parents) if folder.exists()))
+    except (OSError, StopIteration):
+        return "none"
+    if disk.f_files and not disk.f_favail:
+        return "no inodes left"
+    return f"{disk.f_bavail * disk.f_frsize / 1e6:.1f} MB left"

@@ -1,0 +1,143 @@
+"""Who owns a temporary file: whoever holds the lock on it, which the system gives back when a process dies.
+
+A name tells nothing: two containers may share a host's name and process numbers. So a temporary file has a random token
+in its name and an exclusive lock (flock) for as long as somebody writes it; a file whose lock is free is abandoned.
+Where a file system has no locks, or none that other machines see, nothing counts as abandoned.
+"""
+
+import contextlib
+import errno
+import fcntl
+import os
+import re
+import secrets
+import shutil
+import time
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+TEMPORARY = re.compile(r"\.tmp\.[0-9a-f]{16}(\.lock)?$")  # the end of a temporary name
+LOCK = ".lock"  # the end of the name of the file that stands for a temporary folder
+
+# File systems whose locks all who can see a file respect; NFS and Lustre may be mounted without.
+_ON_DISK = frozenset(
+    ("ext2", "ext3", "ext4", "xfs", "btrfs", "zfs", "f2fs", "bcachefs", "jfs", "reiserfs", "apfs", "hfs")
+)
+_SHARED = frozenset(("nfs", "nfs4", "ceph", "gpfs", "lustre", "gfs2", "ocfs2"))
+_WITH_LOCKS = _ON_DISK | _SHARED | {"tmpfs", "ramfs", "rootfs", "overlay", "aufs"}
+_WITHOUT = frozenset(("nolock", "local_lock=all", "local_lock=flock", "localflock", "noflock"))
+
+
+def temporary_name(name: str) -> str:
+    """A name that nobody else has, for what is to become `name`."""
+    return f"{name}.tmp.{secrets.token_hex(8)}"
+
+
+@contextlib.contextmanager
+def leased(path: Path) -> Iterator[int]:
+    """A new, empty, locked file with this name, as a descriptor; the lock lasts as long as the block.
+
+    Raises OSError. Where there are no locks the file is made all the same.
+    """
+    while True:
+        descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
+        try:
+            if try_lock(descriptor) is not False and is_at(descriptor, path):
+                yield descriptor
+                return
+        finally:
+            os.close(descriptor)
+        time.sleep(0.001)  # somebody took it for abandoned, in the moment before it was locked
+
+
+def try_lock(descriptor: int) -> bool | None:
+    """Whether this process now has the lock; None where the file system has no locks."""
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except OSError as error:
+        if error.errno in (errno.ENOLCK, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOSYS, errno.EINVAL, errno.EBADF):
+            return None
+        raise
+    return True
+
+
+def is_at(descriptor: int, path: Path) -> bool:
+    """Whether the open file has this name still."""
+    try:
+        return os.path.samestat(os.fstat(descriptor), path.stat())
+    except FileNotFoundError:
+        return False
+
+
+def remove_abandoned(paths: Iterable[Path], force: bool = False) -> list[Path]:
+    """The temporary files and folders among the paths that nobody holds, which are removed.
+
+    With `force` also those of a file system without locks, where nobody knows.
+    """
+    removed = []
+    for path in paths:
+        of_folder = path.name.endswith(LOCK) and path.with_name(path.name.removesuffix(LOCK)).exists()
+        if TEMPORARY.search(path.name) and not of_folder:  # a folder's lock goes with the folder
+            with contextlib.suppress(OSError), abandoned(path, force) as is_abandoned:
+                if is_abandoned:
+                    (shutil.rmtree if path.is_dir() and not path.is_symlink() else os.unlink)(path)
+                    removed.append(path)
+    return removed
+
+
+@contextlib.contextmanager
+def abandoned(path: Path, force: bool = False) -> Iterator[bool]:
+    """Whether nobody holds the file, or the folder; while the block lasts, nobody can."""
+    if not force and not has_locks(path.parent):
+        yield False
+        return
+    is_folder = path.is_dir() and not path.is_symlink()
+    lease = path.with_name(path.name + LOCK) if is_folder else path
+    if is_folder and not lease.exists():
+        yield True
+        return
+    descriptor = os.open(lease, os.O_RDWR | os.O_NONBLOCK | os.O_NOFOLLOW | os.O_CLOEXEC)
+    try:
+        locked = try_lock(descriptor)
+        free = bool(locked or (force and locked is None)) and is_at(descriptor, lease)
+        yield free
+        if free and is_folder:
+            lease.unlink(missing_ok=True)
+    finally:
+        os.close(descriptor)
+
+
+def temporaries(folder: Path, prefix: str = "") -> Iterator[Path]:
+    """The temporary files and folders right in a folder whose names begin so."""
+    with contextlib.suppress(FileNotFoundError, NotADirectoryError), os.scandir(folder) as entries:
+        for entry in entries:
+            if TEMPORARY.search(entry.name) and entry.name.startswith(prefix):
+                yield Path(entry.path)
+
+
+def has_locks(folder: Path) -> bool:
+    """Whether locks in this folder hold for everybody who sees it."""
+    try:
+        mounts = Path("/proc/self/mountinfo").read_text().splitlines()
+    except OSError:
+        return True  # not Linux: a lock holds at least on this machine
+    kind, options = _mount_of(os.path.realpath(folder), mounts)
+    if kind == "lustre" and "flock" not in options:
+        return False
+    return kind in _WITH_LOCKS and options.isdisjoint(_WITHOUT)
+
+
+def _mount_of(path: str, mounts: Iterable[str]) -> tuple[str, frozenset[str]]:
+    """Kind and options of the file system that holds a path (proc(5), mountinfo)."""
+    best, found = "", ("", frozenset[str]())
+    for line in mounts:
+        mounted, _, system = line.partition(" - ")
+        point = mounted.split(" ")[4].encode().decode("unicode_escape")  # a space is written \040
+        inside = path == point or path.startswith(point.rstrip("/") + "/")
+        if inside and len(point) >= len(best):
+            kind, _, options = system.split(" ", 2)
+            best = point
+            found = kind, frozenset((options.split(" ")[-1] + "," + mounted.split(" ")[5]).split(","))
+    return found

@@ -1,0 +1,67 @@
+"""Parts of remote files, asked for all at once, those near each other together."""
+
+import errno
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import NamedTuple
+
+from gen2d.core.errors import UnreachableError
+from gen2d.storage.paths import Url, attempt, read_range
+
+NEAR = 2**18  # bytes: reading over such a gap takes less time than asking twice
+LONGEST = 2**23  # bytes in one request: longer ones take more time than several at once
+AT_ONCE = 32  # requests
+
+
+class Range(NamedTuple):
+    """The bytes of a file from `start` to before `end`."""
+
+    url: Url
+    start: int
+    end: int
+
+
+def read_ranges(ranges: Sequence[Range]) -> list[bytes | Exception]:
+    """The bytes of each range, or why there are none."""
+    spans = _spans(ranges)
+    with ThreadPoolExecutor(min(AT_ONCE, len(spans) or 1), "gen2d-ranges") as pool:
+        read = dict(zip(spans, pool.map(_read, spans), strict=True))
+    found: dict[Range, bytes | Exception] = {}
+    for span, members in spans.items():
+        data = read[span]
+        for one in members:
+            found[one] = data if isinstance(data, Exception) else data[one.start - span.start : one.end - span.start]
+    return [found[one] for one in ranges]
+
+
+def _spans(ranges: Sequence[Range]) -> dict[Range, list[Range]]:
+    """What to ask for, and which ranges are in it."""
+    spans: dict[Range, list[Range]] = {}
+    span, members = None, []
+    for one in sorted(ranges):
+        if span and one.url == span.url and one.start - span.end <= NEAR and one.end - span.start <= LONGEST:
+            del spans[span]
+            span = Range(span.url, span.start, max(span.end, one.end))
+        else:
+            span, members = one, []
+        members.append(one)
+        spans[span] = members
+    return spans
+
+
+def _read(span: Range) -> bytes | Exception:
+    url, start, end = span
+    if start == end:
+        return b""
+    try:
+        return attempt(url, lambda system, path: _whole(read_range(url, system, path, start, end), end - start))
+    except (OSError, UnreachableError) as error:
+        return error
+
+
+def _whole(data: bytes, size: int) -> bytes:
+    if len(data) > size:
+        raise OSError(errno.EOPNOTSUPP, "the server sends more than was asked for: say cache_dir=")
+    if len(data) < size:
+        raise OSError(errno.EIO, "the file ends too early")
+    return data
