@@ -27,7 +27,7 @@ from gen2d.picture import Plan, Stage, on_cpu
 from gen2d.rollout import Rollout, keep_of, rules_of
 from gen2d.simulate import simulate, substeps
 from gen2d.storage.paths import Place, reading
-from gen2d.storage.sealed import read_bytes
+from gen2d.storage.sealed import read_bytes, sha256
 from gen2d.trust import check_trusted
 from gen2d.types import Array, Joints, Layout, Objects, Scene, State
 
@@ -53,12 +53,20 @@ def config_from(root: Place, identity: Mapping[str, Any], trust: Trust = ()) -> 
     A family or look that came with the dataset is the copy in the folder, and no other file of that name.
     """
     config = identity["config"]
-    copies = _copies(root, config)
+    copies = {where: copy for where, copy in _copies(root, config).items() if sha256(copy[1]) in _hashes(config)}
     check_trusted({where: content for where, (_, content) in copies.items()}, trust, root)
     try:
         return load_config(config | {"seed": identity["seed"]}, copies=StoredCopies(copies.values()))
     except ConfigError as error:
         raise ConfigError(f"{root}: its config cannot be used ({error})") from None
+
+
+def _hashes(value: Any) -> set[str]:
+    """Every sha256 that a config names."""
+    if not isinstance(value, Mapping):
+        return set()
+    own = {value["sha256"]} if isinstance(value.get("sha256"), str) else set()
+    return own.union(*(_hashes(part) for part in value.values()))
 
 
 def _copies(root: Place, config: Mapping[str, Any]) -> dict[str, tuple[str, bytes]]:

@@ -49,7 +49,13 @@ def dataset(root: Place, train: int = 20, codec: str = "gzip", **changes: object
         "command": "gen2d --config toy.yaml",
         "licence": "CC0-1.0",
     }
-    return DatasetSpec(**(values | changes))  # pyright: ignore[reportArgumentType]
+    values |= changes
+    sizes, fields = values["sizes"], values["fields"]
+    assert isinstance(sizes, dict)
+    assert isinstance(fields, dict)
+    if "constants" not in changes:
+        values["constants"] = {"time": np.arange(sizes["T"]) / 10} if "time" in fields else {}
+    return DatasetSpec(**values)  # pyright: ignore[reportArgumentType]
 
 
 def video(made: DatasetSpec, split: str, number: int) -> dict[str, np.ndarray]:

@@ -5,22 +5,26 @@ import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
+import forged
 import numpy as np
 import pytest
 import synthetic
 from numpy.testing import assert_array_equal
 from test_regeneration import contents
 from test_verification import flip
-from tiny import changed
+from tiny import changed, ran_here
 
 import gen2d
+from gen2d import plugins
 from gen2d.config import load_config
-from gen2d.core.errors import ConfigError, FolderError
+from gen2d.core.errors import ConfigError, FolderError, UntrustedError
 from gen2d.dataset.manifest import read_manifest
 from gen2d.generation import generate
 from gen2d.redraw import config_of
 from gen2d.regeneration import repair
 from gen2d.scenes import bouncing
+from gen2d.storage.sealed import sha256
+from gen2d.trust import list_path
 from gen2d.verification import verify
 
 flat = importlib.import_module("gen2d.renderers.flat")
@@ -68,7 +72,7 @@ def root(request: pytest.FixtureRequest, home: Path, tmp_path: Path) -> Iterator
 
 
 def test_the_files_lie_in_the_folder_and_in_its_manifest(home: Path) -> None:
-    files = read_manifest(home / "data")["files"]
+    files = read_manifest(home / "data").files
     assert sorted(name for name in files if name.startswith("plugins/")) == COPIES
     for name, kind in zip(COPIES, ("looks", "families"), strict=True):
         assert (home / "data" / name).read_bytes() == (home / kind / "mine.py").read_bytes()
@@ -88,7 +92,7 @@ def test_videos_are_made_again(root: Path) -> None:
 def test_what_is_damaged_is_made_again(home: Path, root: Path) -> None:
     flip(root / "shards" / "train-00000.h5", 80000)
     flip(root / "config.yaml", 80)
-    (root / "index" / "videos.npy").unlink()
+    (root / "index" / "train-6.npy").unlink()
     assert verify(root, "full", lambda names: repair(root, names)) == []
     assert contents(root) == contents(home / "data")
 
@@ -100,14 +104,87 @@ def test_a_damaged_copy_is_found_and_comes_back_where_the_original_is_there(
         flip(root / name, 80)
     found = verify(root, "quick")
     assert [f"{root}/{name} is not what was written" for name in COPIES] == found
-    if request.node.callspec.params["root"] == "there":
-        assert verify(root, "quick", lambda names: repair(root, names)) == []
-        assert contents(root) == contents(home / "data")
-        return
     for call in (lambda: verify(root, "regen"), lambda: repair(root, []), lambda: gen2d.render(gen2d.open(root), [0])):
         with pytest.raises(ConfigError, match=r"mine\.py") as caught:
             call()
         assert "\n" not in str(caught.value)
+    if request.node.callspec.params["root"] == "there":
+        generate(config(home), 6, root)  # which names the originals
+        assert contents(root) == contents(home / "data")
+
+
+SEEN = "seen.txt"  # written by the look below when it runs
+
+
+@pytest.fixture
+def foreign(home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A dataset whose look leaves a trace when it runs, for a user who has never generated with it."""
+    trace = f"import pathlib\npathlib.Path({str(tmp_path / SEEN)!r}).touch()\n"
+    (tmp_path / "mine.py").write_bytes((home / "looks" / "mine.py").read_bytes() + trace.encode())
+    states = changed(video={"frames": 3}, physics={"substeps": 1}, storage={"frames": "none"})
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "of whoever made it"))
+    generate(states | {"look": str(tmp_path / "mine.py")}, 3, tmp_path / "data")
+    assert sha256((tmp_path / "mine.py").read_bytes()) in list_path().read_text()
+    (tmp_path / SEEN).unlink()
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "of another"))
+    plugins._run.cache_clear()
+    return tmp_path / "data"
+
+
+def test_what_came_with_a_dataset_runs_only_if_it_is_trusted(foreign: Path, tmp_path: Path) -> None:
+    ds, digest = gen2d.open(foreign), sha256((foreign / "plugins" / "look" / "mine.py").read_bytes())
+    assert len(ds[:]) == 4
+    assert verify(foreign, "full") == []
+    for words in (
+        ("info", foreign),
+        ("verify", foreign),
+        ("export", foreign, "--to", "npz", "--out", tmp_path / "npz"),
+    ):
+        ran_here(*words)
+    assert not (tmp_path / SEEN).exists()
+    commands = [("preview", foreign, "--out", tmp_path), ("preview", foreign, "--gallery", "--out", tmp_path)]
+    commands += [
+        ("verify", foreign, "--level", "regen"),
+        ("export", foreign, "--to", "mp4", "--out", tmp_path / "films"),
+    ]
+    flip(foreign / "shards" / "train-00000-n3.h5", 80000)
+    commands += [("verify", foreign, "--repair")]
+    for words in commands:
+        done = ran_here(*words)
+        assert done.returncode == 2
+        assert done.stderr.count("\n") == 1
+        assert f"{foreign}/plugins/look/mine.py" in done.stderr
+        assert f"--trust {digest}" in done.stderr
+    for call in (lambda: gen2d.render(ds, [0]), lambda: gen2d.simulate_again(ds, [0]), lambda: repair(foreign)):
+        with pytest.raises(UntrustedError, match=digest):
+            call()
+    with pytest.raises(UntrustedError):
+        gen2d.render(ds, [0], trust="0" * 64)
+    with pytest.raises(ConfigError, match="--trust is 'yes'"):
+        gen2d.render(ds, [0], trust="yes")
+    assert not (tmp_path / SEEN).exists()
+    assert repair(foreign, ["train-00000-n3"], trust=digest) == ["train-00000-n3"]
+    assert (tmp_path / SEEN).exists()
+    gen2d.render(ds, [0], trust=[digest])
+    list_path().parent.mkdir(parents=True)
+    list_path().write_text(f"# read by me\n{digest}\n")
+    gen2d.render(ds, [0])
+    list_path().chmod(0o666)  # then anybody may have written it
+    with pytest.raises(UntrustedError):
+        gen2d.render(ds, [0])
+
+
+def test_a_file_that_lies_here_by_chance_is_never_run(foreign: Path, tmp_path: Path) -> None:
+    """A manifest may name any file of this machine."""
+    shutil.rmtree(foreign / "plugins")
+    digest = sha256((tmp_path / "mine.py").read_bytes())
+    for trust in ((), digest):
+        with pytest.raises(ConfigError, match="holds no copy"):
+            gen2d.render(gen2d.open(foreign), [0], trust=trust)
+    forged.seal(foreign, lambda plain: plain["config"]["scene"].update(name=str(tmp_path / "mine.py")))
+    with pytest.raises(ConfigError, match="holds no copy"):
+        repair(foreign)
+    assert not (tmp_path / SEEN).exists()
 
 
 def test_a_copy_is_of_its_own_file_only(home: Path, root: Path) -> None:

@@ -57,7 +57,7 @@ def test_another_look_and_other_annotations(plain):
 
 def test_states_alone_are_drawn_when_loaded(tmp_path, plain):
     ds = dataset(tmp_path / "ds", ["storage.frames=none", "annotations.masks=false"])
-    assert "frames" not in ds.manifest["fields"]
+    assert "frames" not in ds.manifest.fields
     assert list(ds[0]) == [name for name in sorted(ds[0]) if name.startswith("states/")]
     assert_array_equal(gen2d.render(ds, range(6)), plain[:]["frames"])
     assert gen2d.verify(ds.root, "full") == []

@@ -4,21 +4,15 @@ import json
 import shutil
 from pathlib import Path
 
-import h5py
-import numpy as np
+import forged
 import pytest
 from test_verification import flip
 from tiny import changed, ran
 
 from gen2d.core.errors import FolderError
-from gen2d.dataset.manifest import read_manifest
 from gen2d.generation import generate
 from gen2d.regeneration import repair
-from gen2d.storage import codecs
-from gen2d.storage.atomic import as_json, file_sha256, sealed
 from gen2d.verification import checked, chosen_videos, verify
-
-BY_HAND = ("README.md",)  # what people may have written in, so that only its absence is told
 
 
 @pytest.fixture(scope="module")
@@ -41,27 +35,6 @@ def contents(root: Path) -> dict[str, bytes]:
     return {path.relative_to(root).as_posix(): path.read_bytes() for path in files}
 
 
-def forge(root: Path, name: str, field: str, row: int) -> None:
-    """Another number in a shard, and every checksum as if it had been written so."""
-    about = read_manifest(root)["fields"][field]
-    size = int(np.prod(about["shape"])) * np.dtype(about["dtype"]).itemsize
-    path, record_path = root / "shards" / f"{name}.h5", root / ".gen2d" / "done" / f"{name}.json"
-    with h5py.File(path, "r") as file:
-        stored = file[field]
-        assert isinstance(stored, h5py.Dataset)
-        place = stored.id.get_offset() + row * size
-    flip(path, 8 * place)
-    tables_path = record_path.with_suffix(".npz")
-    with np.load(tables_path) as stored_tables:
-        tables = dict(stored_tables)
-    tables[f"crc/{field}"][row] = codecs.crc32(path.read_bytes()[place : place + size])
-    np.savez(tables_path, allow_pickle=False, **tables)
-    record = json.loads(record_path.read_bytes())
-    record |= {"sha256": file_sha256(path), "tables_sha256": file_sha256(tables_path)}
-    record_path.write_bytes(as_json(sealed(record, "record_sha256")))
-    repair(root, [])  # index, cards and manifest, which follow from the records
-
-
 def test_what_was_made_is_what_is_made_again(pristine: Path) -> None:
     assert verify(pristine, "regen", videos=24) == []
 
@@ -77,7 +50,7 @@ def test_videos_are_chosen_by_the_seed() -> None:
 
 
 def test_a_dataset_with_other_values_but_right_checksums_is_found_and_made_again(pristine: Path, root: Path) -> None:
-    forge(root, "train-00001", "states/position", 2)
+    forged.flip_value(root, "train", 1, "states/position", 2)
     assert verify(root, "full") == []
     outcome = checked(root, "regen", videos=24)
     (sentence,) = outcome.problems
@@ -87,15 +60,16 @@ def test_a_dataset_with_other_values_but_right_checksums_is_found_and_made_again
     assert contents(root) == contents(pristine)
 
 
+LAST, TEST, TABLE = "shards/train-00002-n5.h5", "shards/test-00000-n3.h5", "index/train-21.npy"
 DAMAGES = {
     "shard": ["shards/train-00000.h5"],
-    "index": ["index/frames.npy"],
-    "records": [".gen2d/done/train-00002.json", ".gen2d/done/test-00000.npz"],
+    "table": [TABLE],
     "mark": [".gen2d/dataset.json"],
     "manifest": ["manifest.json"],
-    "manifest and a shard": ["manifest.json", "shards/train-00002.h5"],
-    "manifest and a record": ["manifest.json", ".gen2d/done/train-00000.json"],
-    "many": ["shards/train-00001.h5", "shards/test-00000.h5", "config.yaml", "README.md", "croissant.json"],
+    "manifest and a shard": ["manifest.json", LAST],
+    "manifest and a table": ["manifest.json", TABLE],
+    "manifest, a table and a shard": ["manifest.json", TABLE, LAST],
+    "many": ["shards/train-00001.h5", TEST, "config.yaml", "croissant.json", "sheet.png"],
 }
 
 
@@ -107,17 +81,18 @@ def test_a_repair_restores_every_byte(pristine: Path, root: Path, damage: str) -
     assert outcome.problems == []
     named = "\n".join(outcome.repaired)
     listed = DAMAGES[damage][:1] if damage.startswith("manifest") else DAMAGES[damage]
-    assert all(name in named for name in listed if name not in BY_HAND)
+    assert all(name in named for name in listed)
     assert contents(root) == contents(pristine)
 
 
 def test_missing_and_empty_files_are_restored(pristine: Path, root: Path) -> None:
-    for name in ("index/videos.npy", "shards/train-00000.h5", "README.md", ".gen2d/dataset.json"):
+    for name in (TABLE, "shards/train-00000.h5", "README.md", ".gen2d/dataset.json"):
         (root / name).unlink()
-    for name in ("config.yaml", "shards/test-00000.h5"):
+    for name in ("config.yaml", TEST):
         (root / name).write_bytes(b"")
     outcome = checked(root, "quick", lambda names: repair(root, names))
-    assert (outcome.problems, outcome.remade) == ([], ["test-00000", "train-00000"])
+    assert outcome.problems == []
+    assert outcome.remade == ["test-00000-n3", "train-00000", "train-00001", "train-00002-n5"]
     assert contents(root) == contents(pristine)
 
 
@@ -130,11 +105,12 @@ def test_a_dataset_that_nothing_describes_is_not_guessed(root: Path) -> None:
     assert contents(root) == before
 
 
-def test_a_dataset_that_may_have_been_larger_is_not_made_smaller(root: Path) -> None:
-    for name in ("manifest.json", ".gen2d/done/train-00002.json"):
-        flip(root / name, 1000)
+def test_a_dataset_that_may_have_been_larger_is_not_guessed(root: Path) -> None:
+    flip(root / "manifest.json", 1000)
+    for path in (root / "index").iterdir():
+        path.unlink()
     before = contents(root)
-    with pytest.raises(FolderError, match=r"record of train-00002.*run the command"):
+    with pytest.raises(FolderError, match=r"nothing says how many videos there were: run the command"):
         repair(root, [])
     assert contents(root) == before
 
@@ -148,7 +124,7 @@ def test_other_versions_are_told_and_nothing_is_changed(root: Path, monkeypatch:
             call()
     assert contents(root) == before
     flip(root / "shards" / "train-00000.h5", 80000)
-    flip(root / "index" / "videos.npy", 3000)
+    flip(root / TABLE, 300)  # in its header
     assert verify(root, "full", lambda names: repair(root, names)) == []  # that takes no simulation
 
 

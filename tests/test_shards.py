@@ -131,7 +131,9 @@ def test_statistics_are_of_what_is_stored(tmp_path: Path) -> None:
     place = np.concatenate([video["states/position"][:, video["objects/present"]].reshape(-1, 2) for video in videos])
     for name, values in (("frames", frames), ("states/position", place)):
         for key in ("mean", "std", "min", "max"):
-            assert_allclose(stats[name][key], getattr(values.astype(float), key)(0), rtol=1e-12)
+            found = stats[name][key]
+            assert found is not None
+            assert_allclose(found, getattr(values.astype(float), key)(0), rtol=1e-12)
 
 
 def test_a_column_of_another_type_is_refused(tmp_path: Path) -> None:

@@ -40,7 +40,7 @@ def faults(path: Path, shard: Shard, manifest: Manifest) -> list[str]:
         }
         for name, field in manifest.fields.items()
     }
-    question = {"path": str(path), "split": shard.split, "first": shard.first, "fields": fields}
+    question = {"path": str(path.absolute()), "split": shard.split, "first": shard.first, "fields": fields}
     with _lock:
         return _ask(json.dumps(question).encode() + b"\n")
 

@@ -45,7 +45,7 @@ def check(source: Source) -> None:
 def write(target: Path, source: Source) -> None:
     """Writes the file."""
     videos = source.videos()
-    with h5py.File(target, "w") as file, tempfile.TemporaryDirectory() as folder:
+    with h5py.File(target, "w", locking=False) as file, tempfile.TemporaryDirectory() as folder:
         for first in range(0, len(source), GROUP):
             name, count = f"{first // GROUP:05d}", min(GROUP, len(source) - first)
             held = file.create_dataset(f"video_streams/{name}", (count,), h5py.vlen_dtype(np.uint8))

@@ -106,8 +106,7 @@ class SplitFiles:
 
         def read() -> np.ndarray:
             begin = self._header + first * size
-            data = self._read(table.file, [(begin, begin + count * size)])[0]
-            return np.frombuffer(data, self._shard_type)
+            return np.frombuffer(self._read_table(begin, begin + count * size), self._shard_type)
 
         return self._kept((-1, number), read)
 
@@ -219,16 +218,20 @@ class SplitFiles:
         """Where a file may lie: growth moves what only an earlier manifest names."""
         return self.root / name, snapshot_path(self.root, self.manifest.sha256) / name
 
-    def _read(self, name: str, ranges: Sequence[tuple[int, int]]) -> list[bytes]:
-        """Ranges of a file."""
-        if isinstance(self.root, Url):
-            found = self._fetched([(name, begin, end) for begin, end in ranges])
-            for content in found:
-                if isinstance(content, Exception):
-                    raise _reading_error(self.path(name), content)
-            return [content for content in found if isinstance(content, bytes)]
-        file = self._opened(name)
-        return [file.read(begin, end - begin) for begin, end in ranges]
+    def _read_table(self, begin: int, end: int) -> bytes:
+        """A range of the table's file."""
+        table = self.manifest.tables[self.split]
+        name = table.file
+        if isinstance(self.root, Path):
+            file = self._opened(name)
+        elif self.cache:
+            file = self._cached(name, table.sha256, self._header + table.shards * self._shard_type.itemsize)
+        else:
+            (content,) = self._fetched([(name, begin, end)])
+            if isinstance(content, Exception):
+                raise _reading_error(self.path(name), content)
+            return content
+        return file.read(begin, end - begin)
 
     def _fetched(self, wanted: Sequence[tuple[str, int, int]]) -> list[bytes | Exception]:
         """The bytes of ranges of remote files, or why there are none."""
@@ -253,19 +256,23 @@ class SplitFiles:
 
     def _open(self, about: ShardRow) -> "_File":
         name = shard_name(about.shard.name)
-        if self.cache is None:
-            return self._opened(name)
-        while True:
+        return self._opened(name) if self.cache is None else self._cached(name, about.sha256, about.bytes)
+
+    def _cached(self, name: str, sha256: str, size: int) -> "_File":
+        """A remote file, as the cache has it."""
+        assert self.cache
+        for url in self._places(name):
+            assert isinstance(url, Url)
             try:
-                url = self.root / name
-                assert isinstance(url, Url)
-                path = self.cache.path(url, about.sha256, about.bytes)
+                while True:
+                    path = self.cache.path(url, sha256, size)
+                    with contextlib.suppress(FileNotFoundError):  # another process made room just now
+                        return _File(path)
             except FileNotFoundError:
-                url = self._places(name)[1]
-                assert isinstance(url, Url)
-                path = self.cache.path(url, about.sha256, about.bytes)
-            with contextlib.suppress(FileNotFoundError):  # another process made room just now
-                return _File(path)
+                continue
+            except OSError as error:
+                raise _reading_error(url, error) from error
+        raise _reading_error(self.path(name), FileNotFoundError(errno.ENOENT, "it is not there"))
 
 
 class _File:

@@ -101,6 +101,8 @@ def sweep_beside(path: Path) -> None:
     """Removes what nobody holds any more of what was to become `path`; a folder that was about to be replaced when
     its process was killed comes back."""
     for left in temporaries(path.parent, f"{path.name}{_OLD}."):
+        if not left.is_dir():
+            continue
         with abandoned(left) as is_abandoned:
             if is_abandoned and not path.exists():
                 left.rename(path)

@@ -23,7 +23,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path, PurePath
 from typing import Any, TypeVar
 
-from gen2d.core.errors import ConfigError, FolderError, UnreachableError
+from gen2d.core.errors import ConfigError, DamagedError, FolderError, UnreachableError
 
 PAUSE = 0.25  # s, before the second attempt; doubled before each that follows
 ATTEMPTS = 4
@@ -204,11 +204,12 @@ def download(url: Url, target: Path, size: int) -> None:
 
     def get(system: Any, path: str) -> None:
         if not url.is_web:
-            _check_size(system.info(path)["size"], size)
+            _check_length(system.info(path)["size"], size, url)
             system.get_file(path, str(target))
             return _check_size(target.stat().st_size, size)
         got = 0
         with target.open("wb") as file, _stream(system, path) as source:
+            _check_length(_length(source), size, url)
             while got <= size and (piece := source.read(min(PIECE, size + 1 - got))):
                 got += len(piece)
                 file.write(piece)
@@ -236,12 +237,23 @@ def _read(url: Url, system: Any, path: str, limit: int) -> bytes:
         _check_size(len(content), size)
         return content
     with _stream(system, path) as file:
-        content, headers = _read_at_most(file, limit), file.r.headers
+        content, length = _read_at_most(file, limit), _length(file)
     if len(content) > limit:
         raise _too_large(limit)
-    if "Content-Encoding" not in headers and headers.get("Content-Length", "").isdigit():
-        _check_size(len(content), int(headers["Content-Length"]))
+    if length is not None:
+        _check_size(len(content), length)
     return content
+
+
+def _length(file: Any) -> int | None:
+    """How many bytes a web server says will come; None if it does not say."""
+    said = file.r.headers.get("Content-Length", "")
+    return int(said) if said.isdigit() and "Content-Encoding" not in file.r.headers else None
+
+
+def _check_length(said: int | None, expected: int, url: Url) -> None:
+    if said is not None and said != expected:
+        raise DamagedError(f"{url} has {said} bytes, but must have {expected}")
 
 
 def _stream(system: Any, path: str, **headers: str) -> Any:
@@ -336,12 +348,17 @@ _LASTING = (errno.EFBIG, errno.EOPNOTSUPP, errno.ENOSPC, errno.EMFILE, errno.ENF
 
 
 def explained(error: BaseException, url: Url) -> Exception:
-    """The error as one of ours: OSError for what another attempt would not mend, else UnreachableError."""
+    """The error as one of ours: OSError for what another attempt would not mend, DamagedError for a file of another
+    length, else UnreachableError."""
     status = _status(error)
     if status in (401, 403) or "Credentials" in type(error).__name__:
         error = PermissionError()
     elif status in (404, 410):
         error = FileNotFoundError()
+    elif status == 416:  # range not satisfiable
+        return DamagedError(f"{url} ends too early")
+    if isinstance(error, DamagedError):
+        return error
     for kind in _FINAL:
         if isinstance(error, kind):
             number = errno.EACCES if kind is PermissionError else errno.ENOENT

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
-from gen2d.core.errors import UnreachableError
+from gen2d.core.errors import DamagedError, UnreachableError
 from gen2d.storage.paths import Url, attempt, read_range
 
 NEAR = 2**18  # bytes: reading over such a gap takes less time than asking twice
@@ -54,14 +54,9 @@ def _read(span: Range) -> bytes | Exception:
     if start == end:
         return b""
     try:
-        return attempt(url, lambda system, path: _whole(read_range(url, system, path, start, end), end - start))
-    except (OSError, UnreachableError) as error:
+        data = attempt(url, lambda system, path: read_range(url, system, path, start, end))
+    except (OSError, DamagedError, UnreachableError) as error:
         return error
-
-
-def _whole(data: bytes, size: int) -> bytes:
-    if len(data) > size:
-        raise OSError(errno.EOPNOTSUPP, "the server sends more than was asked for: say cache_dir=")
-    if len(data) < size:
-        raise OSError(errno.EIO, "the file ends too early")
-    return data
+    if len(data) > end - start:
+        return OSError(errno.EOPNOTSUPP, "the server sends more than was asked for: say cache_dir=", str(url))
+    return data if len(data) == end - start else DamagedError(f"{url} ends too early")
