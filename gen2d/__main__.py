@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from gen2d import __version__
-from gen2d.core.errors import DamagedError, UnreachableError, UserError
+from gen2d.core.errors import Error, UserError
 from gen2d.storage.paths import Network, Place, place, reading
 
 VERBS = {
@@ -340,7 +340,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             known = ", ".join(VERBS)
             fail(f"{arguments[0]!r} is not a verb; there are {known}, and without a verb --config and --n", 2)
         return generate(arguments)
-    except (UserError, DamagedError, UnreachableError) as error:
+    except Error as error:
         fail(str(error), error.exit_code)
     except KeyboardInterrupt:
         fail("stopped", 130)

@@ -31,6 +31,8 @@ from gen2d.options import (
 )
 from gen2d.splits import CHANGES, Split, laws_of, with_splits
 from gen2d.storage.codecs import CODECS
+from gen2d.storage.explain import reason
+from gen2d.storage.sealed import read_bytes
 
 MAX_SEED = 2**63 - 1
 MAX_SLOTS = 254  # a slot's mask id is one byte, 0 is the background
@@ -357,10 +359,40 @@ def _mapping(loader: _Loader, node: yaml.MappingNode) -> dict:
 _Loader.add_constructor("tag:yaml.org,2002:map", _mapping)
 
 
+YAML_BYTES = 2**20  # of a config
+YAML_DEPTH, YAML_NODES = 40, 50_000  # of what it stands for, each alias as often as it stands there
+
+
+def _check_bounds(text: str) -> None:
+    """Raises ConfigError for a YAML text that stands for more than a config could be, before it is read."""
+    sizes: dict[str, int] = {}  # of what has an anchor
+    open_nodes: list[tuple[str | None, int]] = []  # anchor, and how many nodes there were before
+    nodes = 0
+    for event in yaml.parse(text, _Loader):
+        if isinstance(event, yaml.AliasEvent):
+            nodes += sizes.get(event.anchor, 1)  # one that is not known, or open still, is an error later
+        elif isinstance(event, yaml.ScalarEvent):
+            nodes += 1
+            sizes |= {event.anchor: 1} if event.anchor else {}
+        elif isinstance(event, yaml.CollectionStartEvent):
+            open_nodes.append((event.anchor, nodes))
+            nodes += 1
+        elif isinstance(event, yaml.CollectionEndEvent):
+            anchor, before = open_nodes.pop()
+            sizes |= {anchor: nodes - before} if anchor else {}
+        if len(open_nodes) > YAML_DEPTH:
+            raise yaml.YAMLError(f"nested more than {YAML_DEPTH} deep")
+        if nodes > YAML_NODES:
+            raise yaml.YAMLError(f"more than {YAML_NODES:,} values")
+
+
 def parse_yaml(text: str, source: str) -> Any:
     """The value that a YAML text stands for."""
     try:
+        _check_bounds(text)
         return yaml.load(text, _Loader)
+    except RecursionError:
+        raise ConfigError(f"{source}: not valid YAML: it holds itself") from None
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
         where = f" in line {mark.line + 1}" if mark else ""
@@ -508,9 +540,9 @@ def load_config(
         return from_mapping(_overridden(dict(config), sets), "config", copies=copies)
     path = plugins.find_config(str(config))
     try:
-        text = path.read_text(encoding="utf-8")
+        text = read_bytes(path, YAML_BYTES).decode("utf-8")
     except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: cannot be read as text ({error})") from None
+        raise ConfigError(f"{path}: cannot be read as text ({reason(error)})") from None
     values = parse_yaml(text, str(path))
     if values is not None and not isinstance(values, Mapping):
         raise ConfigError(f"{path}: holds {type(values).__name__}, but must hold a mapping of sections")

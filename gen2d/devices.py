@@ -88,15 +88,8 @@ def instruction_set() -> str:
     return next((isa for isa in ("avx512f", "avx2", "avx") if isa in flags), platform.machine())
 
 
-def fingerprint(device: Device, lanes: int) -> dict[str, Any]:
-    """What decides the bits of a simulation; a dataset holds videos of one fingerprint only."""
-    kind = device.device_kind if device.platform != "cpu" else f"cpu {instruction_set()}"
-    programs = {name: version(name) for name in ("jax", "jaxlib")} | {"gen2d": __version__}
-    return programs | {"device": kind, "lanes": lanes, "xla_flags": os.environ.get("XLA_FLAGS", "")}
-
-
-def producer(device: Device, lanes: int) -> dict[str, Any]:
-    """The versions that made a dataset, and the fingerprint."""
+def versions() -> dict[str, str]:
+    """The versions of all that makes a dataset."""
     return {
         "gen2d": __version__,
         "python": ".".join(map(str, sys.version_info[:3])),
@@ -108,5 +101,4 @@ def producer(device: Device, lanes: int) -> dict[str, Any]:
         "isal": isal.__version__,
         "zstandard": zstandard.__version__,
         "opencv": cv2.__version__,
-        "fingerprint": fingerprint(device, lanes),
     }

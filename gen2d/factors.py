@@ -25,6 +25,8 @@ COMPOSED = ("mixture", "minus", "intersection")
 FORMS = "a number, [low, high], or one of " + ", ".join(f"{{{kind}: [...]}}" for kind in (*KINDS[1:], *COMPOSED))
 
 
+MOST = 10_000  # numbers in a list
+PARTS = 200  # that a distribution is put together from
 LARGEST = 1e12  # in any unit: the square of a larger number leaves no room in a float32
 
 
@@ -53,8 +55,8 @@ def parse(value: Any, whole: bool = False) -> Distribution:
         kind = "integer" if whole and kind == "uniform" else kind
     else:
         raise ValueError(FORMS)
-    if not isinstance(numbers, list | tuple) or not numbers or not all(map(is_number, numbers)):
-        raise ValueError(f"{kind} of finite numbers in a list")
+    if not isinstance(numbers, list | tuple) or not 0 < len(numbers) <= MOST or not all(map(is_number, numbers)):
+        raise ValueError(f"{kind} of finite numbers in a list, {MOST:,} at most")
     if kind in LENGTHS and len(numbers) not in LENGTHS[kind]:
         raise ValueError(f"{kind} of {' or '.join(map(str, LENGTHS[kind]))} numbers")
     if kind in ("uniform", "log_uniform", "integer") and numbers[0] > numbers[1]:
@@ -79,8 +81,8 @@ def _composed(value: Mapping[str, Any], whole: bool) -> Distribution:
     kind, written = next((kind, value[kind]) for kind in COMPOSED if kind in value)
     if value.keys() - {kind, *(["weights"] if kind == "mixture" else [])}:
         raise ValueError(FORMS)
-    if not isinstance(written, list | tuple) or not written:
-        raise ValueError(f"{kind} of a list of distributions")
+    if not isinstance(written, list | tuple) or not 0 < len(written) <= PARTS:
+        raise ValueError(f"{kind} of a list of distributions, {PARTS} at most")
     parts = [parse(part, whole) for part in written]
     if kind == "mixture":
         return cuts.mixture(list(zip(checked_weights(value.get("weights"), len(parts)), parts, strict=True)))
@@ -90,6 +92,8 @@ def _composed(value: Mapping[str, Any], whole: bool) -> Distribution:
         if not pieces:
             raise ValueError(f"a {kind} that leaves something")
         source = cuts.mixture(pieces)
+        if len(source.weighted) > PARTS:
+            raise ValueError(f"a {kind} that leaves {PARTS} parts at most")
     return source
 
 

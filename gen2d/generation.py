@@ -22,6 +22,7 @@ from gen2d.core.progress import progress, stopping_on_sigterm
 from gen2d.dataset import folder as shards
 from gen2d.dataset.block import Block
 from gen2d.dataset.spec import SPLIT, DatasetSpec, Shard, mine
+from gen2d.fingerprint import fingerprint, sources
 from gen2d.pipeline import Encoder, Job, Writers, batches, jobs_of, threads_for
 from gen2d.rollout import Batch, Rollout, divisor
 from gen2d.storage.paths import Network, Place, place, shown
@@ -146,7 +147,7 @@ def dataset_of(rollout: Rollout, out: Place, counts: Mapping[str, int]) -> Datas
         seed=config.seed,
         config=config.recipe(),
         config_text=config.recipe_text(),
-        producer=devices.producer(rollout.devices[0], rollout.lanes),
+        producer={**devices.versions(), "sources": sources(), "fingerprint": fingerprint(rollout)},
         splits=counts,
         videos_per_shard=rollout.videos_per_shard,
         codec=config.storage.codec,

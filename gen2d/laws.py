@@ -31,6 +31,7 @@ Box = dict[str, tuple[Span, ...]]  # where a coordinate must lie; what is not na
 Read = Callable[[Mapping[str, Any]], Parts]  # from {factor: value} as written; ValueError with what is allowed
 COMPOSED = ("mixture", "minus", "intersection", "condition")
 MOST_PRODUCTS = 1000
+MOST_COMPARED = 20_000_000  # pairs of spans of two laws
 MOST_COMBINATIONS = 1_000_000  # of a grid
 
 
@@ -172,11 +173,18 @@ def _with(product: Product, name: str, pieces: cuts.Pieces) -> list[Product]:
 
 def common(one: Law, other: Law) -> dict[str, float] | None:
     """A point that both laws can give, by coordinate; None if there is none."""
+    spans = [max(len(spans) for p in law.products for spans in _spans_of(p)) for law in (one, other)]
+    if len(one.products) * len(other.products) * spans[0] * spans[1] > MOST_COMPARED:
+        raise ValueError("of fewer and simpler parts, as it would take too long to prove that splits are disjoint")
     for a, b in itertools.product(one.products, other.products):
         found = {name: _common(a.parts[name].spans, b.parts[name].spans) for name in a.parts}
         if all(x is not None for x in found.values()):
             return {name: x for name, x in found.items() if x is not None}
     return None
+
+
+def _spans_of(product: Product) -> list[tuple[Span, ...]]:
+    return [part.spans for part in product.parts.values()] or [()]
 
 
 def _common(one: Sequence[Span], other: Sequence[Span]) -> float | None:

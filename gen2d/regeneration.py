@@ -33,6 +33,7 @@ from gen2d.dataset.spec import (
     shard_path,
     table_name,
 )
+from gen2d.fingerprint import fingerprint, sources
 from gen2d.generation import dataset_of, make, rollouts_of
 from gen2d.loading import dataset as loader
 from gen2d.pipeline import Encoder, Piece, threads_for
@@ -64,10 +65,10 @@ def _rollout(config: Config, on_cpu: bool) -> Rollout:
 
 def check_fingerprint(root: Place, rollout: Rollout, identity: Identity) -> None:
     """Raises FolderError where this machine and these versions would make other bits."""
-    here = devices.fingerprint(rollout.devices[0], rollout.lanes)
-    differing = list(folder.differences(identity["fingerprint"], here, "fingerprint"))
-    if differing:
-        told = " and ".join(differing)
+    here = {"fingerprint": fingerprint(rollout)}
+    there = {"fingerprint": identity["fingerprint"]}
+    told = folder.told_differences(there, here, folder.sources_of(root), sources())
+    if told:
         raise FolderError(f"{root}: its videos can be neither judged nor repaired here, as bits would differ: {told}")
 
 
@@ -163,7 +164,7 @@ def repair(
             for shard in todo:
                 _put(stage / shard_name(shard.name), shard_path(root, shard.name))
             records = _together(spec, shards, records, staged, todo)
-        publish_changed(mark_path(root), folder.mark_content(spec.identity))
+        publish_changed(mark_path(root), folder.mark_content(spec))
         folder.publish_snapshot(spec, publication(spec, shards, records), records)
     return [shard.name for shard in todo]
 
@@ -285,7 +286,7 @@ def _made_again(
 
 
 def _versions(rollout: Rollout) -> Mapping[str, Any]:
-    return devices.producer(rollout.devices[0], rollout.lanes)
+    return devices.versions()
 
 
 def _faults(path: Path, shard: Shard, row: np.void, manifest: Manifest | None) -> list[str]:

@@ -75,7 +75,11 @@ class Rollout:
         self.slice = divisor(self.lanes, max(1, SLICE_BYTES // frame_bytes))
         self.mesh = Mesh(np.array(self.devices), ("videos",))
         self._draws: dict[int, Any] = {}  # by how many videos are drawn together
-        self._simulate: Any = jax.jit(self._shared(self._made, (PartitionSpec(), PartitionSpec(), *[VIDEOS] * 3)))
+        self._drawn: set[int] = set()  # those that have run, and so are compiled
+        of_each = (
+            self._made if len(self.devices) == 1 else self._shared(self._made, (*[PartitionSpec()] * 2, *[VIDEOS] * 3))
+        )
+        self._simulate: Any = jax.jit(of_each)
 
     def _shared(self, function: Any, specs: tuple) -> Any:
         return jax.shard_map(function, mesh=self.mesh, in_specs=specs, out_specs=VIDEOS, check_vma=False)
@@ -193,12 +197,10 @@ class Rollout:
         Each device runs a program of its own: compiled for several at once, another rounding would differ.
         """
         own = [jax.tree.map(lambda array, d=d: _pieces(array)[d].data, batch.stages) for d in range(len(self.devices))]
-        known = count in self._draws
-        if not known:
-            self._draws[count] = self._draw(count)
-        draw = functools.partial(self._draws[count], start=np.int32(start))
-        if known:
+        draw = functools.partial(self._draw(count), start=np.int32(start))
+        if count in self._drawn:
             return [draw(stages) for stages in own]
+        self._drawn.add(count)
         with ThreadPoolExecutor(len(own)) as pool:  # compiles for all devices at once
             return list(pool.map(draw, own))
 
@@ -207,12 +209,24 @@ class Rollout:
         for program in (self._simulate, *self._draws.values()):
             program.clear_cache()
 
+    def lowered(self) -> dict[str, str]:
+        """The text of the programs, each for one device, whatever their number."""
+        lanes, word = jax.ShapeDtypeStruct((self.lanes,), np.uint32), jax.ShapeDtypeStruct((), np.int32)
+        given = jax.ShapeDtypeStruct((self.lanes, len(self.sampler.gridded)), np.float32)
+        simulate = self._simulate if len(self.devices) == 1 else jax.jit(self._made)
+        with jax.default_device(self.devices[0]):
+            made = simulate.lower(jax.ShapeDtypeStruct((3,), np.uint32), word, given, lanes, lanes)
+            drawn = self._draw(self.slice).lower(made.out_info.stages, start=word)
+        return {"simulate": made.as_text(), "draw": drawn.as_text()}
+
     def _draw(self, count: int) -> Any:
         def drawn(stages: Stage, start: Array) -> dict[str, Array]:
             cut = jax.tree.map(lambda x: jax.lax.dynamic_slice_in_dim(x, start, count), stages)
             return drawing.pictures(cut, self.plan, self.config.annotations)
 
-        return jax.jit(drawn)
+        if count not in self._draws:
+            self._draws[count] = jax.jit(drawn)
+        return self._draws[count]
 
     def _made(self, root: Array, row: Array, given: Array, numbers: Array, attempts: Array) -> Batch:
         """One device's share: from numbers to everything but the frames."""

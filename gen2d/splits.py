@@ -15,6 +15,7 @@ from gen2d.core.errors import ConfigError
 from gen2d.laws import Law, Parts, common, hull, law_of
 from gen2d.options import Plugin, check_plugin, coordinates, drawn_options, value_of
 
+MOST = 100  # splits of a config
 CHANGES = ("physics", "camera", "image", "look")  # sections that a split may have its own options of
 
 
@@ -53,6 +54,8 @@ def with_splits(scene: Plugin, written: Any, source: str) -> tuple[Plugin, tuple
     """The splits that a config has, and a scene that can hold all of them. Raises ConfigError with one sentence."""
     if not isinstance(written, Mapping):
         raise ConfigError(f"{source}: splits is {written!r}, but must be a mapping from names to what they are")
+    if len(written) > MOST:
+        raise ConfigError(f"{source}: splits has {len(written)} names, but must have {MOST} at most")
     splits: dict[str, Split] = {}
     for name in sorted(written, key=lambda name: name != "train"):  # so that others may be like it
         training = next(iter(splits.values()), None)
@@ -109,7 +112,10 @@ def _law(scene: Plugin, written: Any, where: str, source: str) -> Law:
 def _check_held_out(training: Split, split: Split, source: str) -> None:
     """Raises ConfigError where a split of other factors has videos that the training split has, too."""
     written = split.plain()
-    shared = common(training.law, split.law) if "factors" in written and not written.get("overlaps") else None
+    try:
+        shared = common(training.law, split.law) if "factors" in written and not written.get("overlaps") else None
+    except ValueError as error:
+        raise ConfigError(f"{source}: splits.{split.name}.factors must be {error}") from None
     if shared is not None:
         point = ", ".join(f"{name} {value:.7g}" for name, value in shared.items() if _differ(training, split, name))
         raise ConfigError(

@@ -13,16 +13,16 @@ import numpy as np
 
 from gen2d.core.errors import ConfigError, DamagedError, FolderError, UnreachableError, UserError
 from gen2d.dataset.croissant import croissant
-from gen2d.dataset.folder import is_foreign, mark_content, next_manifest
+from gen2d.dataset.folder import is_foreign, next_manifest
 from gen2d.dataset.hdf5_check import faults
-from gen2d.dataset.manifest import MANIFEST, PLUGIN, Manifest, as_bytes, read_manifest
+from gen2d.dataset.manifest import MANIFEST, MARK_SEAL, PLUGIN, Manifest, as_bytes, read_manifest
 from gen2d.dataset.rows import check_shard, intact, npy_header, origin
 from gen2d.dataset.spec import MARK, Shard, mark_path, plan, shard_name, shard_path
 from gen2d.loading import dataset as loader
 from gen2d.loading.epochs import order
 from gen2d.storage.explain import reading_error, reason
 from gen2d.storage.paths import Network, Place, Url, download, place, reading
-from gen2d.storage.sealed import file_sha256, has_sha256, read_bytes, sha256
+from gen2d.storage.sealed import file_sha256, has_sha256, read_bytes, read_sealed, sha256
 
 LEVELS = ("quick", "full", "regen")
 VIDEOS = 8  # made again, unless told otherwise
@@ -230,7 +230,10 @@ def _mark(root: Place, manifest: Manifest) -> Iterator[Problem]:
     if isinstance(root, Url) and not mark_path(root).exists():
         return
     if (root / MARK).is_dir() or isinstance(root, Url):
-        yield from map(Problem, _wrong(mark_path(root), sha256(mark_content(manifest.identity))))
+        path = mark_path(root)
+        said = read_sealed(path, MARK_SEAL) or {}
+        if any(said.get(key) != value for key, value in manifest.identity.items()):
+            yield Problem(f"{path} is {'not what was written' if path.exists() else 'missing'}")
 
 
 def _foreign(root: Place, manifest: Manifest) -> Iterator[Problem]:

@@ -63,6 +63,7 @@ class Server(ThreadingHTTPServer):
 
 class _Handler(BaseHTTPRequestHandler):
     protocol_version = "HTTP/1.1"
+    disable_nagle_algorithm = True
 
     def answer(self) -> None:
         proxy = self.server
@@ -118,6 +119,63 @@ class _Handler(BaseHTTPRequestHandler):
 
     def log_message(self, format: str, *args: object) -> None:
         """Says nothing."""
+
+
+class Files(ThreadingHTTPServer):
+    """A plain web server: the files of a folder, by ranges, and nothing about what is in it."""
+
+    daemon_threads = True
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__(("127.0.0.1", 0), _FilesHandler)
+        self.folder = folder
+
+    def url(self, path: Path) -> str:
+        return f"http://127.0.0.1:{self.server_address[1]}/{path.relative_to(self.folder)}"
+
+    def handle_error(self, request: object, client_address: object) -> None:
+        """Says nothing: clients may go away."""
+
+
+class _FilesHandler(BaseHTTPRequestHandler):
+    protocol_version = "HTTP/1.1"
+    disable_nagle_algorithm = True
+
+    def do_GET(self) -> None:
+        server = self.server
+        assert isinstance(server, Files)
+        path = server.folder / self.path.lstrip("/")
+        content = path.read_bytes() if path.is_file() and not path.is_symlink() else None
+        if content is None:
+            return self._answer(404, b"")
+        asked = self.headers.get("Range", "")
+        if not asked:
+            return self._answer(200, content)
+        first, last = map(int, asked.removeprefix("bytes=").split("-"))
+        if first >= len(content):
+            return self._answer(416, b"")
+        self._answer(206, content[first : last + 1])
+
+    do_HEAD = do_GET
+
+    def _answer(self, status: int, content: bytes) -> None:
+        self.send_response_only(status)
+        self.send_header("Content-Length", str(len(content)))
+        self.end_headers()
+        if self.command == "GET":
+            self.wfile.write(content)
+
+    def log_message(self, format: str, *args: object) -> None:
+        """Says nothing."""
+
+
+@contextlib.contextmanager
+def serving_files(folder: Path) -> Iterator[Files]:
+    """A plain web server of the folder."""
+    with Files(folder) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        yield server
+        server.shutdown()
 
 
 @contextlib.contextmanager

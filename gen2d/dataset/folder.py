@@ -51,7 +51,11 @@ from gen2d.dataset.spec import (
 from gen2d.storage.atomic import is_temporary, publish, publish_changed, remove_tree, sweep
 from gen2d.storage.explain import writing_error
 from gen2d.storage.paths import Place, Url
-from gen2d.storage.sealed import JSON_BYTES, as_json, read_bytes, sealed
+from gen2d.storage.sealed import JSON_BYTES, as_json, read_bytes, read_sealed, sealed
+
+# What each program of a fingerprint does.
+PROGRAMS = {"simulate": "samples and simulates", "draw": "draws", "captions": "writes captions"}
+PROGRAMS |= {"grids": "orders the combinations on grids"}
 
 FOLDERS = ("", "shards", "index", f"{MARK}", f"{RECORDS}")  # where temporary files are written
 
@@ -168,31 +172,61 @@ def _claim(spec: DatasetSpec) -> None:
     except DamagedError:
         there = None
     if there is not None:
-        _compare(root, there, spec.identity)
+        _compare(spec, there)
     elif mark.exists():
         raise FolderError(f"{mark} is damaged: choose another --out, or --overwrite to make the dataset anew")
-    publish_changed(mark, mark_content(spec.identity))
+    publish_changed(mark, mark_content(spec))
 
 
-def mark_content(identity: Mapping[str, Any]) -> bytes:
+def mark_content(spec: DatasetSpec) -> bytes:
     """What stands in the file that says whose folder it is."""
-    return as_json(sealed(identity, MARK_SEAL))
+    return as_json(sealed({**spec.identity, "sources": spec.producer.get("sources", {})}, MARK_SEAL))
 
 
-def _compare(root: Place, there: Mapping[str, Any], here: Mapping[str, Any]) -> None:
-    differing = list(differences(there, here))
-    if differing:
-        told = " and ".join(differing[:3])
-        raise FolderError(f"{root} holds another dataset ({told}): choose another --out, or --overwrite to replace it")
+def sources_of(root: Place) -> Mapping[str, str]:
+    """The hashes of gen2d's source files that the dataset was made with, as far as it says."""
+    manifest = _current(root)
+    found = manifest.producer if manifest else read_sealed(mark_path(root), MARK_SEAL) or {}
+    known = found.get("sources")
+    return {str(name): str(digest) for name, digest in known.items()} if isinstance(known, dict) else {}
 
 
-def differences(there: Any, here: Any, name: str = "") -> Iterator[str]:
-    """In which entries two values as JSON has them differ."""
+def _compare(spec: DatasetSpec, there: Mapping[str, Any]) -> None:
+    told = told_differences(there, spec.identity, sources_of(spec.root), spec.producer.get("sources", {}))
+    if told:
+        raise FolderError(
+            f"{spec.root} holds another dataset ({told}): choose another --out, or --overwrite to replace it"
+        )
+
+
+def told_differences(
+    there: Mapping[str, Any], here: Mapping[str, Any], sources_there: Mapping[str, str], sources_here: Mapping[str, str]
+) -> str:
+    """In what two identities differ, for a sentence; empty if in nothing. Sources tell why a program is another."""
+    programs, others = [], []
+    for name, one, other in differences(there, here):
+        kind = name.removeprefix("fingerprint.programs.")
+        if kind == name:
+            others.append(f"{name} is {one} there and {other} here")
+        else:
+            programs.append(PROGRAMS.get(kind.rpartition(".")[2], kind))
+    if not programs:
+        return " and ".join(others[:3])
+    edited = sorted(
+        name for name in sources_there.keys() | sources_here.keys() if sources_there.get(name) != sources_here.get(name)
+    )
+    which = " and ".join(dict.fromkeys(programs))
+    why = f", as these files differ: {', '.join(edited[:5])}{' ...' if len(edited) > 5 else ''}" if edited else ""
+    return " and ".join([*others[:2], f"the program that {which} is another{why}"])
+
+
+def differences(there: Any, here: Any, name: str = "") -> Iterator[tuple[str, Any, Any]]:
+    """The entries in which two values as JSON has them differ: name, and both values."""
     if isinstance(there, dict) and isinstance(here, dict):
         for key in sorted(there.keys() | here.keys()):
             yield from differences(there.get(key), here.get(key), f"{name}.{key}".lstrip("."))
     elif there != here:
-        yield f"{name} is {there} there and {here} here"
+        yield name, there, here
 
 
 @contextlib.contextmanager
@@ -228,7 +262,7 @@ def publish_snapshot(spec: DatasetSpec, publication: Publication, records: Recor
     """
     root, new = spec.root, publication.manifest
     content, old = as_bytes(new), _current(root)
-    if old is not None and old.sha256 != new.sha256:
+    if old is not None and old.splits != new.splits:
         kept = snapshot_path(root, old.sha256)
         kept.mkdir(parents=True, exist_ok=True)
         publish_changed(kept / MANIFEST, as_bytes(old))

@@ -334,8 +334,13 @@ _files_lock = threading.Lock()
 
 
 def open_file(path: Path) -> _File:
-    """The file that now has this name, open; it stays so for others. Raises FileNotFoundError."""
-    about = _about(path.stat())
+    """The file that now has this name, open; it stays so for others. Raises FileNotFoundError, and ours."""
+    try:
+        about = _about(path.stat())
+    except FileNotFoundError:
+        raise
+    except OSError as error:
+        raise reading_error(path, error) from error
     with _files_lock:
         known = _files.get(path)
         if known is not None and known.about == about and known.process == os.getpid():

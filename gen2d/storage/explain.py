@@ -16,7 +16,7 @@ _FAILING = tuple(
     if hasattr(errno, name)  # not every system has all
 )
 _TOO_MANY = (errno.EMFILE, errno.ENFILE)
-_NO_FILE = (errno.ENXIO, errno.EISDIR, errno.ENOTDIR, errno.ELOOP, errno.ENAMETOOLONG)
+_NO_FILE = (errno.ENXIO, errno.EISDIR, errno.ENOTDIR, errno.ELOOP)
 
 
 def reason(error: Exception) -> str:
@@ -38,6 +38,8 @@ def reading_error(path: object, error: OSError) -> Exception:
         return UnreachableError(f"{path} cannot be read: the disk or its network fails ({reason(error)})")
     if error.errno == errno.EFBIG:
         return DamagedError(f"{path} is larger than such a file can be")
+    if error.errno == errno.ENAMETOOLONG:
+        return FolderError(f"{path} cannot be read: its name is too long")
     if error.errno == errno.EOPNOTSUPP:
         return FolderError(f"{path} cannot be read: {reason(error)}")
     if error.errno in _NO_FILE:

@@ -24,8 +24,11 @@ class Range(NamedTuple):
 def read_ranges(ranges: Sequence[Range]) -> list[bytes | Exception]:
     """The bytes of each range, or why there are none."""
     spans = _spans(ranges)
-    with ThreadPoolExecutor(min(AT_ONCE, len(spans) or 1), "gen2d-ranges") as pool:
-        read = dict(zip(spans, pool.map(_read, spans), strict=True))
+    if len(spans) > 1:
+        with ThreadPoolExecutor(min(AT_ONCE, len(spans)), "gen2d-ranges") as pool:
+            read = dict(zip(spans, pool.map(_read, spans), strict=True))
+    else:
+        read = {span: _read(span) for span in spans}
     found: dict[Range, bytes | Exception] = {}
     for span, members in spans.items():
         data = read[span]
