@@ -12,6 +12,7 @@ from typing import Any, NoReturn
 
 from gen2d import __version__
 from gen2d.core.errors import Error, UserError
+from gen2d.storage.explain import reading_error
 from gen2d.storage.paths import Network, Place, place, reading
 
 VERBS = {
@@ -347,6 +348,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except BrokenPipeError:  # the reader of our output went away, as `head` does
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
+    except OSError as error:
+        fail(str(reading_error(error.filename or "a file", error)), 1)
 
 
 if __name__ == "__main__":

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gen2d.core.errors import ConfigError, DamagedError, FolderError, UnreachableError, UserError
+from gen2d.core.errors import ConfigError, DamagedError, IncompleteError, UnreachableError, UserError
 from gen2d.dataset.croissant import croissant
 from gen2d.dataset.folder import is_foreign, next_manifest
 from gen2d.dataset.hdf5_check import faults
@@ -111,7 +111,7 @@ def problems(
         raise ConfigError(f"--videos is {videos}, but must be 1 or more")
     try:
         manifest = read_manifest(root)
-    except (FolderError, DamagedError) as error:
+    except (IncompleteError, DamagedError) as error:
         yield Problem(str(error))
         return
     remade = _remade(root, manifest, videos, seed, trust) if level == "regen" else iter(())

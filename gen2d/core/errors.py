@@ -38,6 +38,10 @@ class FolderError(UserError):
     """A dataset folder that cannot be used as asked."""
 
 
+class IncompleteError(FolderError):
+    """A folder without a whole dataset: none was begun there, or it is not finished."""
+
+
 class UntrustedError(UserError):
     """Code of a dataset's that would have to run, and that this user has not said to trust."""
 

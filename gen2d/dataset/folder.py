@@ -49,7 +49,7 @@ from gen2d.dataset.spec import (
     snapshot_path,
 )
 from gen2d.storage.atomic import is_temporary, publish, publish_changed, remove_tree, sweep
-from gen2d.storage.explain import writing_error
+from gen2d.storage.explain import reading_error, writing_error
 from gen2d.storage.paths import Place, Url
 from gen2d.storage.sealed import JSON_BYTES, as_json, read_bytes, read_sealed, sealed
 
@@ -289,9 +289,15 @@ def _current(root: Place) -> Manifest | None:
 
 def _parsed(path: Place) -> Manifest | None:
     """The manifest in the file; None if there is none that is whole."""
-    with contextlib.suppress(FileNotFoundError, NotADirectoryError, FolderError, DamagedError):
+    try:
         return parse(read_bytes(path, JSON_BYTES), f"{path}")
-    return None
+    except (FolderError, DamagedError):
+        return None
+    except OSError as error:
+        failure = reading_error(path, error)
+        if isinstance(failure, DamagedError):  # missing, or no regular file
+            return None
+        raise failure from error
 
 
 def next_manifest(root: Place) -> Manifest | None:

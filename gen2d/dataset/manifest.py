@@ -14,7 +14,7 @@ from typing import Any, NoReturn
 
 import numpy as np
 
-from gen2d.core.errors import DamagedError, FolderError
+from gen2d.core.errors import DamagedError, FolderError, IncompleteError
 from gen2d.core.schema import Field
 from gen2d.dataset.block import row_names, stored_bytes
 from gen2d.dataset.rows import shard_type, video_type
@@ -139,8 +139,8 @@ def as_bytes(manifest: Manifest) -> bytes:
 def read_manifest(root: Place, snapshot: str | None = None) -> Manifest:
     """The manifest of a complete dataset, or of an earlier snapshot of it.
 
-    Raises FolderError if the folder is no dataset, not complete, or no longer has the snapshot, DamagedError if a byte
-    of the manifest changed or it says what cannot be, UnreachableError.
+    Raises IncompleteError if the folder is no dataset or not complete, FolderError if it no longer has the snapshot or
+    cannot be read, DamagedError if a byte of the manifest changed or it says what cannot be, UnreachableError.
     """
     current = _read(root, root / MANIFEST, snapshot is not None)
     if snapshot is None or (current is not None and current.sha256 == snapshot):
@@ -169,12 +169,12 @@ def _read(root: Place, path: Place, optional: bool) -> Manifest | None:
     return parse(content, f"{path}")
 
 
-def _absent(root: Place) -> FolderError:
+def _absent(root: Place) -> IncompleteError:
     with reading(root):
         begun = mark_path(root).exists() if isinstance(root, Url) else (root / MARK).is_dir()
     if not begun:
-        return FolderError(f"{root} is not a gen2d dataset: it has no {MANIFEST}")
-    return FolderError(f"{root} is incomplete: run the command that made it again, and it goes on where it stopped")
+        return IncompleteError(f"{root} is not a gen2d dataset: it has no {MANIFEST}")
+    return IncompleteError(f"{root} is incomplete: run the command that made it again, and it goes on where it stopped")
 
 
 def parse(content: bytes, source: str) -> Manifest:

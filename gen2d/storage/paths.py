@@ -117,7 +117,7 @@ class Url:
 
     def read_bytes(self, limit: int) -> bytes:
         """The whole content, of at most `limit` bytes; OSError(EFBIG) where it has more."""
-        return attempt(self, lambda system, path: _read(self, system, path, limit), limit)
+        return attempt(self, lambda system, path: _read(self, system, path, limit))
 
     def unlink(self, missing_ok: bool = False) -> None:
         try:
