@@ -6,6 +6,7 @@
     python tests/bench.py --only render   # what drawing costs, and annotations: bench_render.py
     python tests/bench.py --only families # what sampling costs, for every scene family
     python tests/bench.py --only storage  # what writing and reading cost: bench_storage.py
+    python tests/bench.py --only shards   # what a folder of 100,000 shards costs
 
 Machines are noisy, so whatever is compared is measured in turns, and a ratio is the median of the ratios of the turns.
 Every measurement runs in a process of its own, on the cores that it is given, and in folders that vanish.
@@ -395,7 +396,7 @@ def start_section(folder: Path, quick: bool) -> Found:
     for turn in range(4):
         out, began = folder / f"start{turn}", time.time()
         command(64, out, "storage.videos_per_shard=64", cache=folder / "cache")
-        seconds.append((out / ".gen2d" / "done" / "train-00000.json").stat().st_mtime - began)
+        seconds.append((out / "shards" / "train-00000.h5").stat().st_mtime - began)
     yield Promise("7 first shard, warm cache", statistics.median(seconds[1:]), "s", 8, most=True)
     yield Promise("  first shard, cold cache", seconds[0], "s", 40, most=True)
 
@@ -470,6 +471,13 @@ def storage_section(folder: Path, quick: bool) -> Found:
         )
 
 
+def shards_section(folder: Path, quick: bool) -> Found:
+    """What a folder of many shards costs at every worker's start and end, CPU s."""
+    count = 10_000 if quick else 100_000
+    for name, seconds in bench_storage.of_many_shards(folder / "many", count).items():
+        yield Promise(f"{count:,} shards: {name}", seconds, "CPU s", target=5, most=True)
+
+
 def families_section(folder: Path, quick: bool) -> Found:
     """What sampling a scene costs of all that its video does, for every family."""
     from gen2d import plugins
@@ -488,7 +496,7 @@ def families_section(folder: Path, quick: bool) -> Found:
 SECTIONS = {
     "parts": parts_section, "steady": steady_section, "command": command_section, "memory": memory_section,
     "scaling": scaling_section, "start": start_section, "physics": physics_section,
-    "render": render_section, "families": families_section, "storage": storage_section,
+    "render": render_section, "families": families_section, "storage": storage_section, "shards": shards_section,
 }  # fmt: skip
 QUICK = ("parts", "steady")
 

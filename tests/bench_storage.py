@@ -6,6 +6,7 @@ The videos are those of synthetic.discs, about 50 MB of frames, with a state bes
 from files that the system still has in memory, into a batch that is there already. Times are of this process's CPU.
 """
 
+import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -19,8 +20,9 @@ from gen2d.complete import complete
 from gen2d.core.schema import Field
 from gen2d.dataset.block import encode
 from gen2d.dataset.folder import open_folder
+from gen2d.dataset.rows import origin, sealed_rows
 from gen2d.dataset.shard_writer import ShardWriter
-from gen2d.dataset.spec import DatasetSpec, plan
+from gen2d.dataset.spec import RECORDS, DatasetSpec, plan
 from gen2d.loading import dataset as loader
 from gen2d.storage import codecs
 
@@ -114,6 +116,38 @@ def _write(made: DatasetSpec, columns: Mapping[str, np.ndarray]) -> None:
         encode({name: values[i : i + 4] for name, values in columns.items()}, made.fields, made.codec) for i in starts
     )
     ShardWriter(made).write(shard, blocks)
+
+
+def of_many_shards(root: Path, count: int) -> dict[str, float]:
+    """CPU seconds to find out what is left to do in a folder of so many shards, and to complete it.
+
+    Most files hold nothing and have the size of a shard; the last shards are still to be made.
+    """
+    made = synthetic.dataset(root, splits={"train": count}, videos_per_shard=1)
+    todo = open_folder(made)
+    with ShardWriter(made) as writer:
+        row = [writer.write(shard, synthetic.blocks(made, shard)) for shard in todo[:8]][-1]
+    rows = np.repeat(row, count - 16)
+    rows["first"] = np.arange(8, count - 8)
+    sealed_rows(rows, origin(made.identity_sha256, "train"), rows["first"].tolist())
+    (root / RECORDS / "train.0123456789abcdef.1").write_bytes(rows.tobytes())
+    for shard in todo[8:-8]:
+        with (root / "shards" / f"{shard.name}.h5").open("wb") as file:
+            file.truncate(int(row["bytes"][0]))
+    seconds = {"resuming": _cpu_seconds(lambda: open_folder(made))}
+    with ShardWriter(made) as writer:
+        for shard in open_folder(made):
+            writer.write(shard, synthetic.blocks(made, shard))
+    seconds["finishing"] = _cpu_seconds(lambda: complete(made))
+    seconds["resuming when all is done"] = _cpu_seconds(lambda: open_folder(made))
+    seconds["opening and reading a video"] = _cpu_seconds(lambda: loader.open(root)[0])
+    return seconds | {"all of it": sum(seconds.values())}
+
+
+def _cpu_seconds(work: Callable[[], Any]) -> float:
+    began = time.process_time()
+    work()
+    return time.process_time() - began
 
 
 def _looped(path: Path, out: Mapping[str, np.ndarray]) -> None:

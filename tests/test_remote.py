@@ -30,12 +30,13 @@ from gen2d.dataset import hdf5
 from gen2d.dataset.folder import log, open_folder
 from gen2d.dataset.manifest import read_manifest
 from gen2d.dataset.records import read_tables
+from gen2d.dataset.rows import origin, sealed_rows
 from gen2d.dataset.spec import DatasetSpec, mine
 from gen2d.loading import dataset as loader
 from gen2d.loading.dataloader import DataLoader
 from gen2d.storage import paths as remote
 from gen2d.storage import ranges
-from gen2d.storage.atomic import sweep
+from gen2d.storage.atomic import publish, sweep
 from gen2d.storage.paths import Url, place
 from gen2d.storage.ranges import Range
 from gen2d.storage.sealed import read_bytes
@@ -392,6 +393,32 @@ def test_what_is_written_is_what_is_in_the_folder_and_in_order(server: Server, t
     log(place("s3://bucket/written"), {"speed": 2})
     lines = read_bytes(place("s3://bucket/written") / ".gen2d/run.jsonl", 1000).splitlines()
     assert [json.loads(line)["speed"] for line in lines] == [1, 2]
+
+
+def test_many_shards_take_a_handful_of_requests(server: Server) -> None:
+    url = "s3://bucket/many"
+    fields = {name: synthetic.FIELDS[name] for name in ("index", "objects/mass", "time")}
+    made = at(url, fields=fields, splits={"train": 3000}, videos_per_shard=1)
+    todo = open_folder(made)
+    with synthetic.ShardWriter(made) as writer:
+        row = writer.write(todo[0], synthetic.blocks(made, todo[0]))
+    rows = np.repeat(row, 2999)
+    rows["first"] = np.arange(1, 3000)
+    sealed_rows(rows, origin(made.identity_sha256, "train"), rows["first"].tolist())
+    for part in range(3):
+        publish(place(f"{url}/.gen2d/records/train.{part:016x}.1"), rows[part::3].tobytes())
+    server.reset()
+    assert open_folder(made) == []
+    assert len(server.asked) < 20
+    server.reset()
+    assert complete(made)
+    assert len(server.asked) < 60
+    server.reset()
+    assert open_folder(made) == []
+    assert len(server.asked) < 12
+    server.reset()
+    assert gen2d.open(url, fields="*")[0]["index"] == 0
+    assert len(server.asked) < 6
 
 
 def test_memory_takes_a_dataset_too(toy: Path) -> None:

@@ -4,6 +4,7 @@ Those of a Url are written in the system's folder for temporary files, and uploa
 """
 
 import contextlib
+import errno
 import os
 import shutil
 import stat
@@ -129,8 +130,10 @@ def size_of(path: Place) -> int | None:
     """The size of a regular file in bytes; None if there is none."""
     try:
         about = path.stat()
-    except (FileNotFoundError, NotADirectoryError):
-        return None
+    except OSError as error:
+        if error.errno in (errno.ENOENT, errno.ENOTDIR, errno.ELOOP):
+            return None
+        raise
     return about.st_size if stat.S_ISREG(about.st_mode) else None
 
 

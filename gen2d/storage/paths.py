@@ -230,11 +230,9 @@ def read_range(url: Url, system: Any, path: str, start: int, end: int) -> bytes:
 
 def _read(url: Url, system: Any, path: str, limit: int) -> bytes:
     if not url.is_web:
-        size = system.info(path)["size"]
-        if size > limit:
+        content = _all_of(system, path, limit + 1)
+        if len(content) > limit:
             raise _too_large(limit)
-        content = system.cat_file(path, start=0, end=size) if size else b""
-        _check_size(len(content), size)
         return content
     with _stream(system, path) as file:
         content, length = _read_at_most(file, limit), _length(file)
@@ -243,6 +241,16 @@ def _read(url: Url, system: Any, path: str, limit: int) -> bytes:
     if length is not None:
         _check_size(len(content), length)
     return content
+
+
+def _all_of(system: Any, path: str, most: int) -> bytes:
+    """The first `most` bytes of a file, in one request."""
+    try:
+        return system.cat_file(path, start=0, end=most)
+    except Exception as error:
+        if _status(error) == 416:  # it has none
+            return b""
+        raise
 
 
 def _length(file: Any) -> int | None:
