@@ -191,6 +191,7 @@ def _tables(root: Place, manifest: Manifest) -> tuple[list[Problem], dict[str, n
     """What is wrong with the tables of the splits, and the rows of those that are what was written."""
     found, kept = [], {}
     kind, per_shard = manifest.shard_type, manifest.videos_per_shard
+    sizes = manifest.video_type.itemsize, manifest.row_bytes, manifest.raw_bytes
     for split, table in manifest.tables.items():
         path, begin = root / table.file, origin(manifest.identity_sha256, split)
         header = npy_header(kind, table.shards)
@@ -215,7 +216,7 @@ def _tables(root: Place, manifest: Manifest) -> tuple[list[Problem], dict[str, n
         own = plan({split: manifest.splits[split]}, per_shard)
         for shard, row in zip(own, rows, strict=True):
             try:
-                check_shard(row, shard.first, shard.count, manifest.video_type.itemsize, manifest.row_bytes)
+                check_shard(row, shard.first, shard.count, *sizes)
             except DamagedError as error:
                 found.append(Problem(f"{path} cannot be right in row {shard.place}: {error}", shard.name))
         found += [Problem(f"{path} is not what was written, in row {place}", own[place].name) for place in wrong]

@@ -144,26 +144,27 @@ class _FilesHandler(BaseHTTPRequestHandler):
     def do_GET(self) -> None:
         server = self.server
         assert isinstance(server, Files)
-        path = server.folder / self.path.lstrip("/")
-        content = path.read_bytes() if path.is_file() and not path.is_symlink() else None
-        if content is None:
-            return self._answer(404, b"")
-        asked = self.headers.get("Range", "")
-        if not asked:
-            return self._answer(200, content)
-        first, last = map(int, asked.removeprefix("bytes=").split("-"))
-        if first >= len(content):
-            return self._answer(416, b"")
-        self._answer(206, content[first : last + 1])
+        path, asked = server.folder / self.path.lstrip("/"), self.headers.get("Range", "")
+        if not path.is_file() or path.is_symlink():
+            return self._answer(404, 0)
+        size = path.stat().st_size
+        first, last = map(int, asked.removeprefix("bytes=").split("-")) if asked else (0, size - 1)
+        if asked and first >= size:
+            return self._answer(416, 0)
+        last = min(last, size - 1)
+        self._answer(206 if asked else 200, last + 1 - first)
+        if self.command == "GET":
+            with path.open("rb") as file:
+                file.seek(first)
+                while first <= last:
+                    first += self.wfile.write(file.read(min(2**20, last + 1 - first)))
 
     do_HEAD = do_GET
 
-    def _answer(self, status: int, content: bytes) -> None:
+    def _answer(self, status: int, length: int) -> None:
         self.send_response_only(status)
-        self.send_header("Content-Length", str(len(content)))
+        self.send_header("Content-Length", str(length))
         self.end_headers()
-        if self.command == "GET":
-            self.wfile.write(content)
 
     def log_message(self, format: str, *args: object) -> None:
         """Says nothing."""

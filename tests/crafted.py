@@ -425,6 +425,28 @@ def a_file_that_is_none(root: Path, chance: random.Random) -> str:
 
 
 @kind
+def a_file_that_is_huge(root: Path, chance: random.Random) -> str:
+    """A hole takes no room on the disk, and hours to read."""
+    files = [
+        "manifest.json",
+        "config.yaml",
+        "sheet.png",
+        "croissant.json",
+        "index/train-10.npy",
+        "shards/train-00000.h5",
+    ]
+    name, size = chance.choice(files), 2 ** chance.choice([30, 36, 40])
+    os.truncate(root / name, size)
+    if name.startswith("shards"):
+
+        def change(rows: np.ndarray) -> None:
+            rows["bytes"][0] = size
+
+        forged.change_rows(root, "train", change)
+    return f"{name} {size}"
+
+
+@kind
 def a_folder_that_leads_away(root: Path, chance: random.Random) -> str:
     """A repair that follows it would write there."""
     name = chance.choice(["shards", "index", ".gen2d", ".gen2d/records", ".gen2d/snapshots", "plugins"])

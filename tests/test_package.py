@@ -15,7 +15,7 @@ ROOT = Path(gen2d.__file__).parent.parent
 PACKAGE = ROOT / "gen2d"
 # Each module may import those before it; a family or look may import all of a Python file's neighbours but the last.
 ORDER = [
-    *("core", "storage", "dataset", "loading", "preview"),
+    *("core", "storage", "dataset", "loading", "trust", "preview", "complete"),
     *(
         "verification",
         "report",
@@ -63,7 +63,7 @@ ORDER = [
         "extents",
         "annotations",
     ),
-    *("placement", "scenes", "renderers", "drawing", "devices", "rollout", "redraw", "pipeline"),
+    *("placement", "scenes", "renderers", "drawing", "devices", "rollout", "fingerprint", "redraw", "pipeline"),
     *("generation", "streaming", "regeneration", "gallery", "space", "pictures"),
 ]
 WITHOUT_JAX = ORDER[: ORDER.index("exporting") + 1]

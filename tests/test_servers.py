@@ -7,6 +7,7 @@ import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 import synthetic
@@ -180,13 +181,14 @@ def test_what_is_secret_is_never_shown(server: Server, what: str) -> None:
 
 
 def test_limits_are_numbers_above_zero() -> None:
-    for limits in (
+    cases: list[dict[str, Any]] = [
         {"timeout": 0},
         {"deadline": -1},
         {"timeout": float("nan")},
         {"deadline": "soon"},
         {"timeout": True},
-    ):
+    ]
+    for limits in cases:
         with pytest.raises(ConfigError, match="must be a number of seconds above 0"):
             gen2d.open("http://127.0.0.1:9/x", **limits)
     assert place("memory://a/b", Network(1, 2)) == Url("memory://a/b")

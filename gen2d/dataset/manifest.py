@@ -46,7 +46,7 @@ DTYPES = ("bool", *(f"{kind}{bits}" for kind in ("uint", "int") for bits in (8, 
 DTYPES += ("float16", "float32", "float64")
 TEXT_BYTES = 2**20  # of a field that is text
 VIDEO_BYTES = 2**36  # of one video's value of a field, before compression
-FIELDS, SPLITS = 1000, 1000  # at most
+FIELDS, SPLITS, SHARDS = 1000, 1000, 2**22  # at most; shards of a split
 FIELD = re.compile(r"[a-z][a-z0-9_]{0,63}(/[a-z][a-z0-9_]{0,99}){0,2}")
 AXIS = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,63}")
 HASH = re.compile(r"[0-9a-f]{64}")
@@ -122,6 +122,11 @@ class Manifest:
     def row_bytes(self) -> list[int]:
         """What a video takes in each field that is not compressed, in the order of the names."""
         return [stored_bytes(self.fields[name], self.sizes) for name in row_names(self.fields)]
+
+    @property
+    def raw_bytes(self) -> int:
+        """What a video takes in all fields, before compression."""
+        return sum(stored_bytes(field, self.sizes) for field in self.fields.values())
 
     def codec_of(self, name: str) -> str:
         """How a field is compressed."""
@@ -445,6 +450,8 @@ class _Parser:
         where = f"tables.{split}"
         about = _mapping(self.part("tables")[split], where, 5, 5)
         shards = -(-videos // videos_per_shard)
+        if shards > SHARDS:
+            _refuse(f"splits.{split}", videos, f"{SHARDS:,} shards at most, of {videos_per_shard} videos each")
         return Table(
             file=_one_of(about.get("file"), f"{where}.file", (table_name(split, videos),)),
             sha256=_text(about.get("sha256"), f"{where}.sha256", HASH),

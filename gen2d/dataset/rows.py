@@ -23,6 +23,7 @@ from gen2d.dataset.block import image_names, row_names
 from gen2d.dataset.statistics import MOMENTS, measured
 
 CHECK = "check"
+OVERHEAD = 2**26  # bytes of a shard beside its values, at most
 CHUNK = np.dtype([("offset", "<u8"), ("size", "<u8"), ("crc32", "<u4")])
 
 
@@ -98,15 +99,18 @@ def salvaged(content: bytes, kind: np.dtype, count: int, begin: int, videos_per_
     return rows[intact(rows, begin, range(0, len(rows) * videos_per_shard, videos_per_shard))]
 
 
-def check_shard(row: Any, first: int, count: int, row_bytes: int, sizes: Sequence[int]) -> None:
+def check_shard(row: Any, first: int, count: int, row_bytes: int, sizes: Sequence[int], raw: int) -> None:
     """Raises DamagedError for a row that cannot be of the shard with these videos.
 
-    `row_bytes` is the size of a video's row, `sizes` are the bytes of a video in each field that is not compressed.
+    `row_bytes` is the size of a video's row, `sizes` are the bytes of a video in each field that is not compressed,
+    `raw` those in all fields before compression.
     """
     total = int(row["bytes"])
     if (int(row["first"]), int(row["count"])) != (first, count):
         raise DamagedError(f"it begins with video {row['first']} and has {row['count']}")
     ends = [int(row["index"]) + count * row_bytes]
     ends += [int(offset) + count * size for offset, size in zip(row["offsets"], sizes, strict=True)]
-    if max(ends) > total or total > 2**50:
+    if max(ends) > total:
         raise DamagedError(f"a field ends at byte {max(ends)} of a file of {total}")
+    if total > count * 2 * raw + OVERHEAD:
+        raise DamagedError(f"its file has {total} bytes, more than {count} such videos can take")

@@ -65,7 +65,7 @@ class SplitFiles:
         self.root, self.manifest, self.split, self.cache, self.checks = root, manifest, split, cache, checks
         self._origin = origin(manifest.identity_sha256, split)
         self._shard_type, self._video_type = manifest.shard_type, manifest.video_type
-        self._row_bytes = manifest.row_bytes
+        self._row_bytes, self._raw_bytes = manifest.row_bytes, manifest.raw_bytes
         self._header = len(npy_header(self._shard_type, manifest.tables[split].shards))
         self._blocks: OrderedDict[tuple[int, int], np.ndarray] = OrderedDict()
         self._shards: dict[int, ShardRow] = {}
@@ -94,7 +94,7 @@ class SplitFiles:
         if self.checks and not intact(row.reshape(1), self._origin, [first]).all():
             raise DamagedError(f"{path} is not what was written, in row {place}")
         try:
-            check_shard(row, first, wanted.count, self._video_type.itemsize, self._row_bytes)
+            check_shard(row, first, wanted.count, self._video_type.itemsize, self._row_bytes, self._raw_bytes)
         except DamagedError as error:
             raise DamagedError(f"{path} cannot be right in row {place}: {error}") from None
         return ShardRow(wanted, int(row["bytes"]), row["sha256"].tobytes().hex(), int(row["index"]), row["offsets"])

@@ -75,8 +75,13 @@ def file_sha256(path: Path) -> str:
 
 
 def has_sha256(path: Place, expected: str, limit: int) -> bool:
-    """Whether the file, of at most `limit` bytes where it is remote, has this sha256. Raises OSError."""
-    return (sha256(path.read_bytes(limit)) if isinstance(path, Url) else file_sha256(path)) == expected
+    """Whether the file has at most `limit` bytes and this sha256. Raises OSError."""
+    try:
+        return sha256(read_bytes(path, limit)) == expected
+    except OSError as error:
+        if error.errno == errno.EFBIG:
+            return False
+        raise
 
 
 def open_regular(path: Path) -> int:
