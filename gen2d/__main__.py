@@ -2,6 +2,7 @@
 
 import argparse
 import dataclasses
+import io
 import json
 import os
 import secrets
@@ -11,7 +12,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from gen2d import __version__
-from gen2d.core.errors import Error, UserError
+from gen2d.core.errors import Error, UserError, one_line
 from gen2d.storage.explain import reading_error
 from gen2d.storage.paths import Network, Place, place, reading
 
@@ -270,7 +271,7 @@ def clean(arguments: Sequence[str]) -> int:
 
     root = _root(options)
     removed = remove(root)
-    print("\n".join([*(f"removed: {name}" for name in removed), f"{root}: nothing else is left over"]))
+    print("\n".join([*(one_line(f"removed: {name}") for name in removed), f"{root}: nothing else is left over"]))
     return 0
 
 
@@ -328,6 +329,9 @@ def export(arguments: Sequence[str]) -> int:
 def main(arguments: Sequence[str] | None = None) -> int:
     """The exit code: 0, 1 for damaged data or a full disk, 2 for what the user can mend, 3 where a server or a disk
     does not answer, 130 when interrupted."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):  # a terminal may not have every letter
+            stream.reconfigure(errors="backslashreplace")
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     verbs = {"verify": verify, "info": info, "list": listing, "preview": preview, "export": export, "clean": clean}
     verb = verbs.get(arguments[0]) if arguments else None

@@ -3,9 +3,19 @@
 import numpy as np
 
 from gen2d import preview
+from gen2d.core.errors import UnreachableError, UserError
 from gen2d.dataset.croissant import croissant
-from gen2d.dataset.folder import Publication, Sizes, explained, is_done, publish_snapshot, whole_plan
-from gen2d.dataset.manifest import CONFIG, SHEET, Manifest, Table, describe
+from gen2d.dataset.folder import (
+    Publication,
+    Sizes,
+    SupersededError,
+    alone,
+    explained,
+    is_done,
+    publish_snapshot,
+    whole_plan,
+)
+from gen2d.dataset.manifest import CONFIG, FILE_BYTES, SHEET, Manifest, Table, describe
 from gen2d.dataset.readme import readme, shown_split
 from gen2d.dataset.records import Records, read_records
 from gen2d.dataset.rows import npy
@@ -13,8 +23,9 @@ from gen2d.dataset.spec import DatasetSpec, Shard, table_name
 from gen2d.dataset.statistics import summary
 from gen2d.loading.dataset import Dataset, Options
 from gen2d.storage.atomic import publish_changed
+from gen2d.storage.explain import reading_error
 from gen2d.storage.paths import Place
-from gen2d.storage.sealed import sha256
+from gen2d.storage.sealed import has_sha256, sha256
 
 ROWS = 4  # videos on a sheet
 
@@ -24,17 +35,26 @@ def complete(spec: DatasetSpec) -> bool:
 
     False while shards are missing that other workers still make.
     """
-    with explained(spec.root):
-        records, sizes = read_records(spec), Sizes(spec.root)
-        shards = whole_plan(spec, records)
-        if not all(is_done(shard, records, sizes) for shard in shards):
-            return False
-        publish_snapshot(spec, publication(spec, shards, records), records)
-    return True
+    root = spec.root
+    with explained(root), alone(root):
+        while True:
+            records, sizes = read_records(spec, root), Sizes(root)
+            old = records.manifest
+            shards = whole_plan(spec, records)
+            if not all(is_done(shard, records, sizes) for shard in shards):
+                return False
+            try:
+                publish_snapshot(spec, publication(spec, shards, records, old), records, old)
+            except SupersededError:  # where there are no locks, others may be faster: what they have published stays
+                continue
+            return True
 
 
-def publication(spec: DatasetSpec, shards: list[Shard], records: Records) -> Publication:
-    """What a snapshot of these shards consists of beside them; its tables are in the folder then."""
+def publication(spec: DatasetSpec, shards: list[Shard], records: Records, old: Manifest | None) -> Publication:
+    """What a snapshot of these shards consists of beside them; its tables are in the folder then.
+
+    Its manifest is `old` where that describes the same shards, whichever versions of the program made it.
+    """
     tables, rows = {}, {}
     for split in sorted({shard.split for shard in shards}):
         own = [shard for shard in shards if shard.split == split]
@@ -44,6 +64,10 @@ def publication(spec: DatasetSpec, shards: list[Shard], records: Records) -> Pub
         sizes = rows[split]["bytes"].tolist()
         tables[split] = Table(name, sha256(content), len(own), sum(sizes), max(sizes))
     counts = {shard.split: shard.first + shard.count for shard in shards}
+    if old and (old.identity_sha256, old.splits, old.tables) == (spec.identity_sha256, counts, tables):
+        kept = _kept(spec, old)
+        if kept is not None:
+            return kept
     stats = {split: summary(own["moments"], spec.fields) for split, own in rows.items()}
     files = {CONFIG: spec.config_text.encode(), **spec.copies}
     hashes = {name: sha256(content) for name, content in files.items()}
@@ -51,8 +75,30 @@ def publication(spec: DatasetSpec, shards: list[Shard], records: Records) -> Pub
     if "frames" in spec.fields:
         files[SHEET] = sheet(spec.root, manifest)
         manifest = describe(spec, counts, tables, stats, hashes | {SHEET: sha256(files[SHEET])})
-    cards = {"README.md": readme(manifest, spec.command).encode(), "croissant.json": croissant(manifest)}
-    return Publication(manifest, files | cards)
+    return Publication(manifest, files | _cards(spec, manifest))
+
+
+def _cards(spec: DatasetSpec, manifest: Manifest) -> dict[str, bytes]:
+    return {"README.md": readme(manifest, spec.command).encode(), "croissant.json": croissant(manifest)}
+
+
+def _kept(spec: DatasetSpec, old: Manifest) -> Publication | None:
+    """The present manifest, and those of its files that are not what was written; None where one of them would be
+    another now."""
+    files = {}
+    for name, digest in old.files.items():
+        try:
+            if has_sha256(spec.root / name, digest, FILE_BYTES):
+                continue
+        except OSError as error:
+            failure = reading_error(spec.root / name, error)
+            if isinstance(failure, UserError | UnreachableError):
+                raise failure from error
+        own = {CONFIG: spec.config_text.encode(), **spec.copies}.get(name)
+        files[name] = sheet(spec.root, old) if name == SHEET else own or b""
+        if sha256(files[name]) != digest:
+            return None
+    return Publication(old, files | _cards(spec, old))
 
 
 def sheet(root: Place, manifest: Manifest) -> bytes:

@@ -39,11 +39,15 @@ HARMLESS = (
 
 def fingerprint(rollout: Rollout) -> dict[str, Any]:
     """What decides the bits of the config's datasets, whichever split is made and on how many of these devices."""
+    return machine(rollout) | {"programs": _of_splits(rollout)}
+
+
+def machine(rollout: Rollout) -> dict[str, Any]:
+    """The part of the fingerprint that is known before anything is traced."""
     device = rollout.devices[0]
     kind = device.device_kind if device.platform != "cpu" else f"cpu {instruction_set()}"
     flags = sorted(flag for flag in os.environ.get("XLA_FLAGS", "").split() if not flag.startswith(HARMLESS))
-    about = {"jaxlib": version("jaxlib"), "device": kind, "lanes": rollout.lanes, "xla_flags": " ".join(flags)}
-    return about | {"programs": _of_splits(rollout)}
+    return {"jaxlib": version("jaxlib"), "device": kind, "lanes": rollout.lanes, "xla_flags": " ".join(flags)}
 
 
 def _of_splits(rollout: Rollout) -> dict[str, str]:

@@ -84,7 +84,7 @@ def generate(
     config = load_config(config, sets)
     if seed is not None:
         config = dataclasses.replace(config, seed=checked_seed(seed))
-    counts = _counts(config, _check_run(n, split, worker), split)
+    counts = _counts(config, _check_run(n, split, worker, overwrite), split)
     network = Network(timeout, deadline)
     out = place(out, network) if out is not None else Path("datasets") / config.name
     remember(config.copies.values())
@@ -125,12 +125,14 @@ def rollouts_of(rollout: Rollout, splits: Iterable[str]) -> Iterator[tuple[Rollo
                 yield other, lot
 
 
-def _check_run(n: Any, split: str | None, worker: tuple[int, int]) -> int:
+def _check_run(n: Any, split: str | None, worker: tuple[int, int], overwrite: bool) -> int:
     """n as an int, if all of it is possible."""
     if isinstance(n, bool) or not isinstance(n, numbers.Integral) or not 1 <= int(n) <= MAX_VIDEOS:
         raise ConfigError(f"--n is {n!r}, but must be a whole number from 1 to 2**32 - 1")
     if split is not None and not SPLIT.fullmatch(split):
         raise ConfigError(f"--split is {split!r}, but must be letters, digits, '.', '_' and '-', 64 at most")
+    if overwrite and worker[1] > 1:
+        raise ConfigError("--overwrite and --worker cannot go together: a worker would remove what others have made")
     if not 0 <= worker[0] < worker[1]:
         raise ConfigError(f"--worker is {worker[0]}/{worker[1]}, but must be r/W with r from 0 to W - 1")
     return int(n)

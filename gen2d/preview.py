@@ -11,6 +11,7 @@ import numpy as np
 from gen2d.core.errors import FolderError, UserError
 from gen2d.loading.dataset import Dataset
 from gen2d.loading.dataset import open as open_dataset
+from gen2d.storage.atomic import publish
 from gen2d.storage.paths import Url, place
 
 COLUMNS = 10  # frames across the sheet
@@ -148,8 +149,10 @@ def animate(path: Path, frames: np.ndarray, fps: float) -> None:
     movie = cv2.Animation()
     movie.frames = [image[..., ::-1].copy() for image in np.concatenate(rows, axis=1)]
     movie.durations = [max(20, round(1000 / fps))] * len(movie.frames)
-    if not cv2.imwriteanimation(str(path), movie):
-        raise OSError("OpenCV could not write a GIF")
+    done, content = cv2.imencodeanimation(".gif", movie)
+    if not done:
+        raise OSError("OpenCV could not make a GIF")
+    publish(path, content.tobytes())
 
 
 def _tiled(video: np.ndarray) -> np.ndarray:
@@ -158,7 +161,7 @@ def _tiled(video: np.ndarray) -> np.ndarray:
 
 def write(path: Path, image: np.ndarray) -> None:
     """Writes a picture [H, W, 3]."""
-    path.write_bytes(png(image))
+    publish(path, png(image))
 
 
 def png(image: np.ndarray) -> bytes:

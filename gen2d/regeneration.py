@@ -18,22 +18,20 @@ from gen2d.dataset import folder, hdf5
 from gen2d.dataset.block import Block
 from gen2d.dataset.hdf5_check import faults
 from gen2d.dataset.manifest import MANIFEST, Manifest, identity_of, read_manifest
-from gen2d.dataset.records import Records, read_records, read_tables
-from gen2d.dataset.rows import npy_header, origin, salvaged, shard_type
+from gen2d.dataset.records import Records, read_records, read_tables, tables_by_name
+from gen2d.dataset.rows import shard_type
 from gen2d.dataset.spec import (
     MARK,
     RECORDS,
     STAGED,
-    TABLE_NAME,
     DatasetSpec,
     Shard,
     mark_path,
     plan,
     shard_name,
     shard_path,
-    table_name,
 )
-from gen2d.fingerprint import fingerprint, sources
+from gen2d.fingerprint import fingerprint, machine, sources
 from gen2d.generation import dataset_of, make, rollouts_of
 from gen2d.loading import dataset as loader
 from gen2d.pipeline import Encoder, Piece, threads_for
@@ -43,7 +41,7 @@ from gen2d.storage.atomic import publish_changed, sync
 from gen2d.storage.codecs import decode_into
 from gen2d.storage.leases import LOCK, leased, temporary_name
 from gen2d.storage.paths import Network, Place, Url, place, upload
-from gen2d.storage.sealed import file_sha256, read_bytes
+from gen2d.storage.sealed import file_sha256
 
 Identity = Mapping[str, Any]  # of a dataset; its manifest has the same keys
 # What decides the bytes of a shard, when its values are the same.
@@ -65,9 +63,15 @@ def _rollout(config: Config, on_cpu: bool) -> Rollout:
 
 def check_fingerprint(root: Place, rollout: Rollout, identity: Identity) -> None:
     """Raises FolderError where this machine and these versions would make other bits."""
-    here = {"fingerprint": fingerprint(rollout)}
-    there = {"fingerprint": identity["fingerprint"]}
-    told = folder.told_differences(there, here, folder.sources_of(root), sources())
+    there = dict(identity["fingerprint"])
+    programs = there.pop("programs", {})
+    _compare(root, there, machine(rollout))  # at once: tracing the programs takes long
+    _compare(root, {"programs": programs}, {"programs": fingerprint(rollout)["programs"]})
+
+
+def _compare(root: Place, there: Identity, here: Identity) -> None:
+    both = {"fingerprint": there}, {"fingerprint": here}
+    told = folder.told_differences(*both, folder.sources_of(root), sources())
     if told:
         raise FolderError(f"{root}: its videos can be neither judged nor repaired here, as bits would differ: {told}")
 
@@ -151,22 +155,38 @@ def repair(
     manifest, identity = _what_it_held(root)
     rollout = rollout_of(root, identity, trust)
     spec = _as_made(rollout, root, identity, manifest)
-    kept = read_tables(root, manifest) if manifest else _found_tables(root, spec)
-    counts = manifest.splits if manifest else _found_counts(root)
+    counts, kept = (manifest.splits, read_tables(root, manifest)) if manifest else _found_tables(root, spec)
     spec = dataclasses.replace(spec, splits=counts)
     records = Records(spec.videos_per_shard, kept)
     shards = plan(counts, spec.videos_per_shard)
     todo = _to_make(root, shards, records, bad, every_byte=manifest is None)
+    staged = Records(spec.videos_per_shard, {})
     with folder.explained(root), _staging(root) as stage:
         if todo:
             check_fingerprint(root, rollout, identity)
             staged = _made_again(rollout, spec, stage, todo, records, manifest, say or (lambda line: None))
-            for shard in todo:
-                _put(stage / shard_name(shard.name), shard_path(root, shard.name))
-            records = _together(spec, shards, records, staged, todo)
-        publish_changed(mark_path(root), folder.mark_content(spec))
-        folder.publish_snapshot(spec, publication(spec, shards, records), records)
+        try:
+            with folder.alone(root):
+                folder.check_current(root, manifest)
+                for shard in todo:
+                    _put(stage / shard_name(shard.name), shard_path(root, shard.name))
+                records = _together(spec, shards, records, staged, todo)
+                publish_changed(mark_path(root), folder.mark_content(spec))
+                folder.publish_snapshot(spec, publication(spec, shards, records, manifest), records, manifest)
+        except folder.SupersededError:
+            raise FolderError(f"{root} has changed during the repair: run it again") from None
     return [shard.name for shard in todo]
+
+
+def _found_tables(root: Place, spec: DatasetSpec) -> tuple[dict[str, int], dict[str, np.ndarray]]:
+    """How many videos each split has, and the rows that are what was written, where no manifest says which."""
+    counts, rows = tables_by_name(root, shard_type(spec.fields), spec.identity_sha256, spec.videos_per_shard)
+    if not counts:
+        raise FolderError(
+            f"{root}: {MANIFEST} and the tables in index/ are both damaged, so nothing says how many videos there "
+            "were: run the command that made the dataset again"
+        )
+    return counts, rows
 
 
 def _what_it_held(root: Place) -> tuple[Manifest | None, Identity]:
@@ -188,36 +208,6 @@ def _as_made(rollout: Rollout, root: Place, identity: Identity, manifest: Manife
     spec = dataset_of(rollout, root, {})
     producer = manifest.producer if manifest else spec.producer
     return dataclasses.replace(spec, producer={**producer, "fingerprint": identity["fingerprint"]})
-
-
-def _found_counts(root: Place) -> dict[str, int]:
-    """How many videos each split has, by the names of its tables."""
-    counts: dict[str, int] = {}
-    for path in (root / "index").glob("*.npy"):
-        match = TABLE_NAME.fullmatch(path.name)
-        if match:
-            counts[match["split"]] = max(counts.get(match["split"], 0), int(match["count"]))
-    if not counts:
-        raise FolderError(
-            f"{root}: {MANIFEST} and the tables in index/ are both damaged, so nothing says how many videos there "
-            "were: run the command that made the dataset again"
-        )
-    return counts
-
-
-def _found_tables(root: Place, spec: DatasetSpec) -> dict[str, np.ndarray]:
-    """The rows of the tables that are what was written, where no manifest says which they are."""
-    kind, found = shard_type(spec.fields), {}
-    for split, count in _found_counts(root).items():
-        rows = -(-count // spec.videos_per_shard)
-        limit = len(npy_header(kind, rows)) + rows * kind.itemsize
-        try:
-            content = read_bytes(root / table_name(split, count), limit)
-        except OSError:
-            content = b""
-        begin = origin(spec.identity_sha256, split)
-        found[split] = salvaged(content, kind, rows, begin, spec.videos_per_shard)
-    return found
 
 
 def _to_make(
@@ -269,7 +259,7 @@ def _made_again(
         (stage / name).mkdir(parents=True)
     staged_spec = dataclasses.replace(spec, root=stage)
     make(rollout, staged_spec, list(todo), say)
-    staged = read_records(staged_spec)
+    staged = read_records(staged_spec, stage)
     same_codecs = manifest is None or all(manifest.producer.get(key) == _versions(rollout)[key] for key in CODECS)
     for shard in todo:
         path, row, before = stage / shard_name(shard.name), staged.of(shard), records.of(shard)

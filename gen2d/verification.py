@@ -11,11 +11,11 @@ from pathlib import Path
 
 import numpy as np
 
-from gen2d.core.errors import ConfigError, DamagedError, IncompleteError, UnreachableError, UserError
+from gen2d.core.errors import ConfigError, DamagedError, Error, IncompleteError, UnreachableError, UserError, one_line
 from gen2d.dataset.croissant import croissant
 from gen2d.dataset.folder import is_foreign, next_manifest
 from gen2d.dataset.hdf5_check import faults
-from gen2d.dataset.manifest import MANIFEST, MARK_SEAL, PLUGIN, Manifest, as_bytes, read_manifest
+from gen2d.dataset.manifest import FILE_BYTES, MANIFEST, MARK_SEAL, PLUGIN, Manifest, as_bytes, read_manifest
 from gen2d.dataset.rows import check_shard, intact, npy_header, origin
 from gen2d.dataset.spec import MARK, Shard, mark_path, plan, shard_name, shard_path
 from gen2d.loading import dataset as loader
@@ -26,7 +26,6 @@ from gen2d.storage.sealed import file_sha256, has_sha256, read_bytes, read_seale
 
 LEVELS = ("quick", "full", "regen")
 VIDEOS = 8  # made again, unless told otherwise
-FILE_BYTES = 2**26  # of a file beside shards and tables, at most
 
 # Of static bodies these are infinite; in every other field a value that is not finite is an error.
 INFINITE = ("objects/mass", "objects/moment", "joints/stiffness", "joints/lower", "joints/upper")
@@ -38,6 +37,9 @@ class Problem:
 
     sentence: str
     shard: str = ""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "sentence", one_line(self.sentence))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -87,7 +89,7 @@ def checked(
 ) -> Outcome:
     """What `verify` finds, and what was repaired."""
     root = place(root, Network(timeout, deadline))
-    found = list(problems(root, level, videos, seed, trust))
+    found = problems(root, level, videos, seed, trust)
     if not found or repair_with is None:
         return Outcome([problem.sentence for problem in found], [], [])
     remade = repair_with(sorted({problem.shard for problem in found if problem.shard}))
@@ -103,17 +105,41 @@ def damaged_shards(root: str | Place, level: str = "full") -> list[str]:
 
 def problems(
     root: Place, level: str = "full", videos: int = VIDEOS, seed: int = 0, trust: Sequence[str] = ()
-) -> Iterator[Problem]:
-    """Everything that is wrong, the folder first, then shard by shard, then what made again is another video."""
+) -> list[Problem]:
+    """Everything that is wrong, the folder first, then shard by shard, then what made again is another video.
+
+    Where the dataset has grown meanwhile, and something seems wrong, all is checked anew.
+    """
     if level not in LEVELS:
         raise ConfigError(f"level is {level!r}, but must be one of {', '.join(LEVELS)}")
     if videos < 1:
         raise ConfigError(f"--videos is {videos}, but must be 1 or more")
+    while True:
+        try:
+            manifest = read_manifest(root)
+        except (IncompleteError, DamagedError) as error:
+            return [Problem(str(error))]
+        try:
+            found = list(_problems_of(root, manifest, level, videos, seed, trust))
+        except Error:
+            if _has(root, manifest):
+                raise
+            continue
+        if not found or _has(root, manifest):
+            return found
+
+
+def _has(root: Place, manifest: Manifest) -> bool:
+    """Whether the folder still has this manifest, or none that is whole."""
     try:
-        manifest = read_manifest(root)
-    except (IncompleteError, DamagedError) as error:
-        yield Problem(str(error))
-        return
+        return read_manifest(root).sha256 == manifest.sha256
+    except Error:
+        return True
+
+
+def _problems_of(
+    root: Place, manifest: Manifest, level: str, videos: int, seed: int, trust: Sequence[str]
+) -> Iterator[Problem]:
     remade = _remade(root, manifest, videos, seed, trust) if level == "regen" else iter(())
     with reading(root):
         files = list(_files(root, manifest))
@@ -243,6 +269,9 @@ def _foreign(root: Place, manifest: Manifest) -> Iterator[Problem]:
         for path in sorted((root / folder).glob("*"), key=str):
             if is_foreign(path.name):
                 yield Problem(f"{path} does not belong to the dataset")
+    if isinstance(root, Path) and (root / "plugins").is_symlink():
+        yield Problem(f"{root / 'plugins'} is a link, which no run makes")
+        return
     for path in sorted((root / "plugins").rglob("*"), key=str):
         name = str(path).removeprefix(f"{root}/")
         if path.is_file() and name not in manifest.files and (PLUGIN.fullmatch(name) or isinstance(path, Path)):

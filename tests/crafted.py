@@ -1,5 +1,6 @@
 """Datasets that a stranger made to do harm, every checksum in order: what each does is one line, chosen by a seed."""
 
+import contextlib
 import copy
 import hashlib
 import json
@@ -16,6 +17,10 @@ from typing import Any
 import forged
 import h5py
 import numpy as np
+import synthetic
+
+from gen2d.core.errors import DamagedError
+from gen2d.core.schema import Field
 
 HUGE = [0, -1, 1, 2**31, 2**32, 2**40, 2**53, 2**63, 2**64, -(2**63), 10**400, 1e308, 0.5]
 NAMES = [
@@ -498,6 +503,100 @@ def a_file_of_the_manifest(root: Path, chance: random.Random) -> str:
     (root / name).write_bytes(content)
     forged.seal(root, lambda plain: plain["files"].update({name: hashlib.sha256(content).hexdigest()}))
     return name
+
+
+@kind
+def a_folder_that_is_another(root: Path, chance: random.Random) -> str:
+    name, target = (
+        chance.choice(["shards", "index", "plugins", ".gen2d/snapshots"]),
+        chance.choice(["/", "/usr", "/sys"]),
+    )
+    shutil.rmtree(root / name, ignore_errors=True)
+    (root / name).symlink_to(target)
+    return f"{name} {target}"
+
+
+@kind
+def a_name_on_the_disk(root: Path, chance: random.Random) -> str:
+    folder = root / chance.choice(["shards", "index", "plugins", ".gen2d/snapshots", ".gen2d/records", ""])
+    folder.mkdir(parents=True, exist_ok=True)
+    name = chance.choice([b"\xff.h5", b"\x1b]0;owned\x07", b"a\nb", b"train-00009.h5\r", "ünï\u202ecode".encode()])
+    path = folder / os.fsdecode(name)
+    if chance.random() < 0.5:
+        path.mkdir()
+    else:
+        path.touch()
+    return f"{folder.name} {name!r}"
+
+
+@kind
+def a_picture_that_leads_away(root: Path, chance: random.Random) -> str:
+    """Who looks at a preview in the dataset's own folder would write there."""
+    (root.parent / "victim").write_bytes(b"precious")
+    for name in ("toy-sheet.png", "toy.gif"):
+        if chance.random() < 0.2:
+            os.mkfifo(root / name)
+        else:
+            (root / name).symlink_to(root.parent / "victim")
+    return "preview"
+
+
+@kind
+def a_manifest_that_swells(root: Path, chance: random.Random) -> str:
+    """Text becomes an array of as many letters in every place; what is deep is walked by recursion."""
+    depth, how, inner = chance.choice([60, 70, 300, 900, 970, 990]), chance.choice(["text", "dict", "list"]), {}
+    for _ in range(depth):
+        inner = {"a": inner} if how == "dict" else [inner]
+
+    def change(plain: dict[str, Any]) -> None:
+        if how == "text":
+            plain["constants"]["time"] = ["x" * 10**5] + [0] * 16_000
+        else:
+            plain["config"] = {"scene": inner}
+
+    with contextlib.suppress(RecursionError):
+        forged.seal(root, change)
+    return f"{how} {depth}"
+
+
+@kind
+def fields_that_are_others(root: Path, chance: random.Random) -> str:
+    """A dataset that is right but for what its fields are."""
+    which = chance.choice(
+        ["no time", "time of each video", "time alone", "index of pairs", "file", "wide", "many", "T"]
+    )
+    fields: dict[str, Field] = dict(synthetic.FIELDS)
+    if which == "no time":
+        del fields["time"]
+    elif which == "time of each video":
+        fields["time"] = Field("float64", "n", "s", "x")
+    elif which == "time alone":
+        fields["time"] = Field("float64", "", "s", "x")
+    elif which == "index of pairs":
+        fields["index"] = Field("int64", "n 2", "1", "x")
+    elif which == "file":
+        fields["file"] = Field("int32", "n", "1", "x")
+
+    def change(plain: dict[str, Any]) -> None:
+        if which == "wide":
+            about = {"dtype": "int8", "axes": "n 1000000", "unit": "", "meaning": ""}
+            about |= {"shape": [1000000], "codec": "none"}
+            added = {f"states/x{number}": about for number in range(60)}
+            plain["fields"] |= added
+            for stats in plain["stats"].values():
+                stats |= {name: dict.fromkeys(("mean", "std", "min", "max")) for name in added}
+        elif which == "many":
+            plain["chunk_frames"], plain["sizes"]["T"] = 1, 2**31 - 1
+        elif which == "T":
+            plain["chunk_frames"], plain["constants"] = 5, {}
+            del plain["sizes"]["T"]
+            plain["fields"] = {name: about for name, about in plain["fields"].items() if " T" not in about["axes"]}
+
+    shutil.rmtree(root)
+    with contextlib.suppress(DamagedError):  # gen2d makes no such dataset
+        synthetic.make(synthetic.dataset(root, train=10, fields=fields))
+        forged.seal(root, change)
+    return which
 
 
 @kind

@@ -21,7 +21,6 @@ from gen2d.dataset.shard_writer import ShardWriter
 from gen2d.dataset.spec import DatasetSpec, Shard
 from gen2d.verification import verify
 
-pytestmark = pytest.mark.filterwarnings("ignore:.*multi-threaded.*fork.*:DeprecationWarning")
 FIELDS = {name: synthetic.FIELDS[name] for name in ("frames", "index", "objects/mass", "time")}
 
 

@@ -259,8 +259,6 @@ def read_in_process(dataset: loader.Dataset, send: Callable[[Any], None]) -> Non
     send([*numbers(list(DataLoader(dataset, 4, epochs=1))), int(dataset[3]["frames"].sum())])
 
 
-@pytest.mark.filterwarnings("ignore:.*multi-threaded.*fork.*:DeprecationWarning")
-@pytest.mark.filterwarnings("ignore:os.fork.*:RuntimeWarning")
 @pytest.mark.parametrize("method", ["fork", "spawn"])
 def test_processes_read_the_same(toy: Path, method: str) -> None:
     dataset = loader.open(toy, fields=("index", "frames"))

@@ -239,9 +239,12 @@ def two_balls(folder: Path, monkeypatch: pytest.MonkeyPatch, **changes: Any) -> 
         ]
         for name in names
     }
-    monkeypatch.setattr(synthetic, "video", lambda made, split, number: values | (changes if number == 1 else {}))
+    fields |= {name: synthetic.FIELDS[name] for name in ("index", "time")}
+    monkeypatch.setattr(
+        synthetic, "video", lambda made, split, n: {**values, "index": np.array(n), **(changes if n == 1 else {})}
+    )
     sizes = {"T": 2, "H": 64, "W": 48, "K": 4}
-    return synthetic.folder(synthetic.make(synthetic.dataset(folder, 3, fields=fields, sizes=sizes, constants={})))
+    return synthetic.folder(synthetic.make(synthetic.dataset(folder, 3, fields=fields, sizes=sizes)))
 
 
 def test_phyworld_s_frame_is_ten_units_wide(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -35,8 +35,6 @@ def check(batches: Sequence[dict[str, Any]], source: Any, order: Sequence[int]) 
 
 
 @pytest.mark.filterwarnings("ignore:This DataLoader will create:UserWarning")  # more than this process has cores
-@pytest.mark.filterwarnings("ignore:.*multi-threaded.*fork.*:DeprecationWarning")
-@pytest.mark.filterwarnings("ignore:os.fork.*:RuntimeWarning")
 @pytest.mark.parametrize("method", [None, "fork", "spawn"])
 def test_torch_reads_the_same_in_any_number_of_processes(source: Any, method: str | None) -> None:
     torch = pytest.importorskip("torch")
@@ -77,8 +75,6 @@ def test_grain_shuffles_and_batches(source: Any) -> None:
     assert sorted(int(numbers[place]) for place in range(len(source))) == list(range(len(source)))
 
 
-@pytest.mark.filterwarnings("ignore:.*multi-threaded.*fork.*:DeprecationWarning")
-@pytest.mark.filterwarnings("ignore:os.fork.*:RuntimeWarning")
 @pytest.mark.parametrize("workers", [0, 2])
 def test_grains_own_loader_reads_the_same(source: Any, workers: int) -> None:
     pytest.importorskip("grain")

@@ -344,8 +344,6 @@ def first_frames(dataset: loader.Dataset) -> np.ndarray:
     return dataset[[0, 9]]["frames"]
 
 
-@pytest.mark.filterwarnings("ignore:.*multi-threaded.*fork.*:DeprecationWarning")
-@pytest.mark.filterwarnings("ignore:os.fork.*:RuntimeWarning")
 @pytest.mark.parametrize("method", ["fork", "spawn"])
 def test_a_dataset_is_read_after_fork_and_spawn(toy: Path, method: str) -> None:
     dataset = gen2d.open(TOY)

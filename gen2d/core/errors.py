@@ -5,9 +5,7 @@ LONGEST = 800  # characters of a sentence; what is quoted in it may be longer
 
 def one_line(text: str) -> str:
     """The text on one line that a terminal shows as it is, however it was put together."""
-    text = "".join(
-        c if c.isprintable() else " " if c in "\n\r\t" else c.encode("unicode_escape").decode() for c in text
-    )
+    text = "".join(c if c.isprintable() else _escaped(c) for c in text)
     return text if len(text) <= LONGEST else f"{text[: LONGEST // 2]} ... {text[-LONGEST // 2 :]}"
 
 

@@ -4,7 +4,9 @@
 
 A shard is done if there is a row of it and its file has the size that the row says, so whatever a crash leaves is made
 again. Workers share nothing: each takes its shards by their place, and whoever finds all of them done publishes the
-tables and, last, the manifest. Until then readers have the manifest before it, and all that it names.
+tables and, last, the manifest. Until then readers have the manifest before it, and all that it names. Whoever looks
+what is left to do, publishes, repairs or cleans holds the lock of the folder meanwhile. Where there are no locks, as at
+a URL, a manifest is replaced only if it is still the one that the new one was made after.
 """
 
 import contextlib
@@ -13,15 +15,16 @@ import json
 import math
 import os
 import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from gen2d.core.errors import DamagedError, FolderError, UnreachableError
+from gen2d.core.errors import ConfigError, DamagedError, FolderError, UnreachableError
 from gen2d.dataset.manifest import (
     CONFIG,
     MANIFEST,
     MARK_SEAL,
+    SHARDS,
     SHEET,
     Manifest,
     as_bytes,
@@ -34,6 +37,7 @@ from gen2d.dataset.records import Records, read_records, remove_logs
 from gen2d.dataset.shard_writer import AGAIN
 from gen2d.dataset.spec import (
     FILE_NAME,
+    LOCK,
     MARK,
     NEXT,
     RECORDS,
@@ -48,8 +52,9 @@ from gen2d.dataset.spec import (
     shard_of,
     snapshot_path,
 )
-from gen2d.storage.atomic import is_temporary, publish, publish_changed, remove_tree, sweep
+from gen2d.storage.atomic import is_temporary, link_or_copy, publish, publish_changed, remove_tree, sweep
 from gen2d.storage.explain import reading_error, writing_error
+from gen2d.storage.leases import exclusive
 from gen2d.storage.paths import Place, Url
 from gen2d.storage.sealed import JSON_BYTES, as_json, read_bytes, read_sealed, sealed
 
@@ -58,6 +63,7 @@ PROGRAMS = {"simulate": "samples and simulates", "draw": "draws", "captions": "w
 PROGRAMS |= {"grids": "orders the combinations on grids"}
 
 FOLDERS = ("", "shards", "index", f"{MARK}", f"{RECORDS}")  # where temporary files are written
+LOCK_SECONDS = 300.0  # that another process may take to publish
 
 
 def open_folder(spec: DatasetSpec, overwrite: bool = False) -> list[Shard]:
@@ -67,17 +73,55 @@ def open_folder(spec: DatasetSpec, overwrite: bool = False) -> list[Shard]:
     this dataset's, or cannot be written.
     """
     root = spec.root
+    check_count(spec)
     with explained(root):
         check_links(root)
-        if overwrite and _is_dataset(root):
-            _clear(root)
-        _claim(spec)
-        sweep(root, FOLDERS)
-        records, sizes = read_records(spec), Sizes(root)
-        remaining = [shard for shard in whole_plan(spec, records) if not is_done(shard, records, sizes)]
-        if remaining:
-            _drop_snapshots(root)
-        return remaining
+        _check_kind(root)
+        with alone(root):
+            if overwrite and _is_dataset(root):
+                _clear(root)
+            _claim(spec)
+            sweep(root, FOLDERS)
+            records, sizes = read_records(spec, root), Sizes(root)
+            shards = whole_plan(spec, records)
+            remaining = [shard for shard in shards if not is_done(shard, records, sizes)]
+            if remaining and _grows(root, shards):
+                _drop_snapshots(root)
+            return remaining
+
+
+def _grows(root: Place, shards: Sequence[Shard]) -> bool:
+    """Whether the dataset is complete without some of these shards."""
+    manifest = current(root)
+    return manifest is not None and any(s.first + s.count > manifest.splits.get(s.split, 0) for s in shards)
+
+
+@contextlib.contextmanager
+def alone(root: Place) -> Iterator[None]:
+    """A block in which no other process looks what is left to do, publishes, repairs or cleans, where there are locks.
+
+    Raises FolderError where another one is not done with that in time.
+    """
+    if isinstance(root, Url):
+        yield
+        return
+    (root / MARK).mkdir(parents=True, exist_ok=True)
+    with contextlib.ExitStack() as stack:
+        try:
+            stack.enter_context(exclusive(root / LOCK, LOCK_SECONDS))
+        except TimeoutError:
+            raise FolderError(f"{root} is being changed by another process: try again when that has ended") from None
+        yield
+
+
+def check_count(spec: DatasetSpec) -> None:
+    """Raises ConfigError for more shards than a dataset may have."""
+    shards = sum(-(-count // spec.videos_per_shard) for count in spec.splits.values())
+    if shards > SHARDS:
+        raise ConfigError(
+            f"storage.videos_per_shard is {spec.videos_per_shard}, so that there would be {shards:,} shards, but "
+            f"{SHARDS:,} are the most"
+        )
 
 
 def whole_plan(spec: DatasetSpec, records: Records) -> list[Shard]:
@@ -95,12 +139,19 @@ class Sizes:
         self.known: dict[str, int] | None = None
         if isinstance(root, Path):
             with contextlib.suppress(FileNotFoundError), os.scandir(root / "shards") as entries:
-                self.known = {e.name: e.stat().st_size for e in entries if e.is_file()}
+                self.known = {entry.name: size for entry in entries if (size := _size(entry)) is not None}
             self.known = self.known or {}
 
     def fits(self, shard: Shard, size: int) -> bool:
         """Whether the shard's file has this size."""
         return self.known is None or self.known.get(f"{shard.name}.h5") == size
+
+
+def _size(entry: os.DirEntry[str]) -> int | None:
+    try:
+        return entry.stat().st_size if entry.is_file() else None
+    except FileNotFoundError:  # a temporary file, which just got its name
+        return None
 
 
 def is_done(shard: Shard, records: Records, sizes: Sizes) -> bool:
@@ -137,6 +188,12 @@ def _is_dataset(root: Place) -> bool:
     return (root / MARK).is_dir() or (schema_of(root) or "").startswith("gen2d.dataset/")
 
 
+def _check_kind(root: Place) -> None:
+    """Raises FolderError for a folder of something else, before anything is written into it."""
+    if root.is_dir() and not _is_dataset(root) and any(root.iterdir()):
+        raise FolderError(f"{root} holds something else than a gen2d dataset: choose another --out")
+
+
 def check_links(root: Place) -> None:
     """Raises FolderError where what is written would land outside the folder."""
     if isinstance(root, Path):
@@ -146,18 +203,16 @@ def check_links(root: Place) -> None:
 
 
 def _clear(root: Place) -> None:
-    """Removes what is written here and no more; the mark's folder stays, so that a crash here leaves a dataset's."""
-    (root / MARK).mkdir(exist_ok=True)
-    for name in (MANIFEST, "croissant.json", "README.md", SHEET, CONFIG, NEXT, MARK / "dataset.json"):
+    """Removes what is written here and no more; what says that it is a dataset's folder goes last."""
+    for name in (MANIFEST, "croissant.json", "README.md", SHEET, CONFIG, NEXT):
         (root / name).unlink(missing_ok=True)
     for name in ("shards", "index", "plugins", MARK / "done", RECORDS, SNAPSHOTS):
         remove_tree(root / name)
+    mark_path(root).unlink(missing_ok=True)
 
 
 def _claim(spec: DatasetSpec) -> None:
     root = spec.root
-    if root.is_dir() and not _is_dataset(root) and any(root.iterdir()):
-        raise FolderError(f"{root} holds something else than a gen2d dataset: choose another --out")
     schema = schema_of(root)
     if schema is not None and schema != SCHEMA:
         raise FolderError(
@@ -185,7 +240,7 @@ def mark_content(spec: DatasetSpec) -> bytes:
 
 def sources_of(root: Place) -> Mapping[str, str]:
     """The hashes of gen2d's source files that the dataset was made with, as far as it says."""
-    manifest = _current(root)
+    manifest = current(root)
     found = manifest.producer if manifest else read_sealed(mark_path(root), MARK_SEAL) or {}
     known = found.get("sources")
     return {str(name): str(digest) for name, digest in known.items()} if isinstance(known, dict) else {}
@@ -251,17 +306,22 @@ class Publication:
     """Everything that a snapshot consists of beside its shards and tables."""
 
     manifest: Manifest
-    files: Mapping[str, bytes]  # config, plug-ins, sheet, cards: by name in the folder
+    files: Mapping[str, bytes]  # config, plug-ins, sheet, cards: by name in the folder; of the others those there stay
 
 
-def publish_snapshot(spec: DatasetSpec, publication: Publication, records: Records) -> None:
-    """Returns when readers have this snapshot.
+class SupersededError(Exception):
+    """Another process has published a snapshot meanwhile."""
 
-    The manifest of the one before goes to `.gen2d/snapshots`, and so does, once the new manifest is there, what that
-    alone names. Killed at any moment, the folder has the one manifest or the other, whole.
+
+def publish_snapshot(spec: DatasetSpec, publication: Publication, records: Records, old: Manifest | None) -> None:
+    """Returns when readers have this snapshot, which comes after `old`.
+
+    The manifest before goes to `.gen2d/snapshots`, and so does, once the new manifest is there, what that alone names.
+    Killed at any moment, the folder has the one manifest or the other, whole. Raises SupersededError, and readers have
+    what they had, if the folder has another manifest than `old`.
     """
     root, new = spec.root, publication.manifest
-    content, old = as_bytes(new), _current(root)
+    content = as_bytes(new)
     if old is not None and old.splits != new.splits:
         kept = snapshot_path(root, old.sha256)
         kept.mkdir(parents=True, exist_ok=True)
@@ -273,18 +333,24 @@ def publish_snapshot(spec: DatasetSpec, publication: Publication, records: Recor
             continue  # people may write in it
         (root / name).parent.mkdir(parents=True, exist_ok=True)
         publish_changed(root / name, own)
+    check_current(root, old)
     publish_changed(root / MANIFEST, content)
     (root / NEXT).unlink(missing_ok=True)
-    for folder in _entries(root / SNAPSHOTS):
-        earlier = _parsed(folder / MANIFEST)
-        if earlier is not None and earlier.sha256 != new.sha256:
-            _retire(root, earlier, new)
-    _remove_replaced(spec, records, new)
+    _retire(root, new)
+    _remove_replaced(root, new, records)
     remove_logs(spec, records)
 
 
-def _current(root: Place) -> Manifest | None:
+def current(root: Place) -> Manifest | None:
+    """The folder's manifest; None if there is none that is whole."""
     return _parsed(root / MANIFEST)
+
+
+def check_current(root: Place, expected: Manifest | None) -> None:
+    """Raises SupersededError if the folder has another manifest than this one."""
+    found = current(root)
+    if (found and found.sha256) != (expected and expected.sha256):
+        raise SupersededError
 
 
 def _parsed(path: Place) -> Manifest | None:
@@ -312,52 +378,73 @@ def _entries(folder: Place) -> list[Place]:
         return []
 
 
-def _retire(root: Place, old: Manifest, new: Manifest) -> None:
-    """Moves what only the manifest before names to where its snapshot lies."""
-    target = snapshot_path(root, old.sha256)
-    for split, table in old.tables.items():
-        names = [table.file] if new.tables[split].file != table.file else []
-        last = shard_of(split, (table.shards - 1) * old.videos_per_shard, _rest(old, split), old.videos_per_shard)
-        if names and last.count < old.videos_per_shard:
-            names.append(shard_name(last.name))
-        for name in names:
-            (target / name).parent.mkdir(parents=True, exist_ok=True)
-            with contextlib.suppress(FileNotFoundError):  # another worker did it just now
-                _move(root / name, target / name)
+def _retire(root: Place, new: Manifest) -> None:
+    """Moves what only earlier manifests name to where the snapshot of each of them lies."""
+    snapshots: dict[str, list[Place]] = {}
+    for folder in _entries(root / SNAPSHOTS):
+        earlier = _parsed(folder / MANIFEST)
+        if earlier is not None:
+            for name in _growing_files(earlier) - _growing_files(new):
+                snapshots.setdefault(name, []).append(snapshot_path(root, earlier.sha256))
+    for name, folders in snapshots.items():
+        for folder in folders:
+            _copy(root / name, folder / name)
+        (root / name).unlink(missing_ok=True)
 
 
-def _move(source: Place, target: Place) -> None:
-    if isinstance(source, Url):
-        assert isinstance(target, Url)
-        source.rename(target)
-    else:
-        assert isinstance(target, Path)
-        source.rename(target)
+def _growing_files(manifest: Manifest) -> set[str]:
+    """The names of the files that others replace when a split grows: its table, and a last shard that is a part."""
+    names = {table.file for table in manifest.tables.values()}
+    for split, count in manifest.splits.items():
+        rest = count % manifest.videos_per_shard
+        if rest:
+            names.add(shard_name(shard_of(split, count - rest, rest, manifest.videos_per_shard).name))
+    return names
 
 
-def _rest(manifest: Manifest, split: str) -> int:
-    """How many videos the last shard of a split has."""
-    return (manifest.splits[split] - 1) % manifest.videos_per_shard + 1
+def _copy(source: Place, target: Place) -> None:
+    """Returns when the file is also at `target`; one that is no longer there has been moved already."""
+    if target.exists():
+        return
+    target.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        if isinstance(source, Url) and isinstance(target, Url):
+            source.copy(target)
+        elif isinstance(source, Path) and isinstance(target, Path):
+            link_or_copy(source, target)
+    except FileNotFoundError:
+        return
 
 
-def _remove_replaced(spec: DatasetSpec, records: Records, new: Manifest) -> None:
-    """Removes what runs left that were stopped before they had ended: shards that are part of a larger one which is
-    done, and tables of splits that are larger now."""
-    for path in _entries(spec.root / "index"):
+def _remove_replaced(root: Place, new: Manifest, records: Records) -> list[Place]:
+    """Removes what runs left that were stopped before they had ended: shards that are part of a larger one in the
+    manifest, and tables of splits that are larger now."""
+    old: list[Place] = []
+    for path in _entries(root / "index"):
         match = TABLE_NAME.fullmatch(path.name)
         if match and int(match["count"]) < new.splits.get(match["split"], 0):
-            path.unlink(missing_ok=True)
-    full = {(shard.split, shard.first): shard.count for shard in sorted(records.shards(), key=lambda s: s.count)}
-    for shard in records.shards():
-        if shard.count < full[shard.split, shard.first]:
-            (spec.root / shard_name(shard.name)).unlink(missing_ok=True)
+            old.append(path)
+    for path in _partial_shards(root, records):
+        match = FILE_NAME.fullmatch(path.name)
+        if match and match["count"]:
+            end = int(match["place"]) * new.videos_per_shard + int(match["count"])
+            if end < new.splits.get(match["split"], 0):
+                old.append(path)
+    for path in old:
+        path.unlink(missing_ok=True)
+    return old
 
 
-def _drop_snapshots(root: Place, force: bool = False) -> list[Place]:
-    """Removes what earlier growth left, but for the snapshot that present readers may still be led to."""
-    current = _current(root)
-    keep = "" if force or current is None else current.sha256[:16]
-    folders = [path for path in _entries(root / SNAPSHOTS) if path.name != keep]
+def _partial_shards(root: Place, records: Records) -> list[Place]:
+    """Shards that may be part of larger ones; at a URL, where listing is slow, those that are recorded."""
+    if isinstance(root, Path):
+        return _entries(root / "shards")
+    return [root / shard_name(shard.name) for shard in records.shards() if shard.count < records.size]
+
+
+def _drop_snapshots(root: Place) -> list[Place]:
+    """Removes what earlier growth left."""
+    folders = _entries(root / SNAPSHOTS)
     for folder in folders:
         remove_tree(folder)
     return folders
@@ -371,10 +458,23 @@ def clean(root: Place) -> list[str]:
     """
     with explained(root):
         check_links(root)
-        read_manifest(root)  # says if it is no complete dataset
-        removed = _drop_snapshots(root, force=True)
-        removed += sweep(root, FOLDERS, force=True)
+        manifest = read_manifest(root)  # says if it is no complete dataset
+        with alone(root):
+            manifest, records = read_manifest(root), read_records(manifest, root)
+            removed = _remove_replaced(root, manifest, records)
+            removed += _remove_unrecorded(root, records)
+            removed += _drop_snapshots(root)
+            removed += sweep(root, FOLDERS, force=True)
         return sorted(str(path).removeprefix(f"{root}/") for path in removed)
+
+
+def _remove_unrecorded(root: Place, records: Records) -> list[Place]:
+    """Removes shards of which no row is there: their process was killed before it wrote one."""
+    known = {f"{shard.name}.h5" for shard in records.shards()}
+    left = [path for path in _entries(root / "shards") if FILE_NAME.fullmatch(path.name) and path.name not in known]
+    for path in left:
+        path.unlink(missing_ok=True)
+    return left
 
 
 def is_foreign(name: str) -> bool:

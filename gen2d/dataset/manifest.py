@@ -9,15 +9,15 @@ import dataclasses
 import json
 import math
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NoReturn
 
 import numpy as np
 
 from gen2d.core.errors import DamagedError, FolderError, IncompleteError
 from gen2d.core.schema import Field
-from gen2d.dataset.block import row_names, stored_bytes
-from gen2d.dataset.rows import shard_type, video_type
+from gen2d.dataset.block import image_names, row_names, stored_bytes
+from gen2d.dataset.rows import CHUNK, shard_type, video_type
 from gen2d.dataset.spec import (
     IDENTITY,
     MARK,
@@ -29,7 +29,7 @@ from gen2d.dataset.spec import (
     snapshot_path,
     table_name,
 )
-from gen2d.dataset.statistics import SAMPLED, Stats, measured
+from gen2d.dataset.statistics import MOMENTS, SAMPLED, Stats, measured
 from gen2d.storage.codecs import CODECS
 from gen2d.storage.explain import reading_error
 from gen2d.storage.paths import Place, Url, reading
@@ -39,14 +39,18 @@ from gen2d.storage.sealed import JSON_BYTES, as_json, parsed, read_bytes, read_s
 SEAL, MARK_SEAL = "manifest_sha256", "identity_sha256"
 
 MANIFEST, SHEET, CONFIG = "manifest.json", "sheet.png", "config.yaml"
+FILE_BYTES = 2**26  # of a file beside shards and tables, at most
 
 # ---- What may stand in a manifest
 
+REQUIRED = {"index": ("int64", "n"), "time": ("float64", "T")}  # fields that every dataset has
 DTYPES = ("bool", *(f"{kind}{bits}" for kind in ("uint", "int") for bits in (8, 16, 32, 64)))
 DTYPES += ("float16", "float32", "float64")
 TEXT_BYTES = 2**20  # of a field that is text
 VIDEO_BYTES = 2**36  # of one video's value of a field, before compression
-FIELDS, SPLITS, SHARDS = 1000, 1000, 2**22  # at most; shards of a split
+FIELDS, SPLITS, SHARDS = 1000, 1000, 2**20  # at most; shards of all splits together
+ROW_BYTES = 2**24  # of a shard in a table, or of a video in an index
+DEPTH = 64  # levels of a config
 FIELD = re.compile(r"[a-z][a-z0-9_]{0,63}(/[a-z][a-z0-9_]{0,99}){0,2}")
 AXIS = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,63}")
 HASH = re.compile(r"[0-9a-f]{64}")
@@ -274,6 +278,13 @@ def _list(value: Any, where: str, length: int) -> list[Any]:
     return value
 
 
+def _has_shape(value: Any, shape: Sequence[int]) -> bool:
+    """Whether nested lists have this shape, and numbers in them."""
+    if not shape:
+        return isinstance(value, bool | int | float)
+    return isinstance(value, list) and len(value) == shape[0] and all(_has_shape(own, shape[1:]) for own in value)
+
+
 @dataclasses.dataclass
 class _Parser:
     """Reads the parts of a manifest, those first on which others depend."""
@@ -293,11 +304,11 @@ class _Parser:
         chunk = self.part("chunk_frames")
         if chunk is not None:
             _whole(chunk, "chunk_frames", 1, 100_000)
-            if sizes.get("T", 0) % chunk:
-                _refuse("chunk_frames", chunk, f"a divisor of the {sizes.get('T')} frames")
+            if not sizes.get("T") or sizes["T"] % chunk:
+                _refuse("chunk_frames", chunk, f"a divisor of the {sizes.get('T', 0)} frames")
         return {
             "seed": _whole(self.part("seed"), "seed", 0, 2**63 - 1),
-            "config": _mapping(self.part("config"), "config", 1000),
+            "config": self.nested("config"),
             "codec": _one_of(self.part("codec"), "codec", CODECS),
             "chunk_frames": chunk,
             "videos_per_shard": _whole(self.part("videos_per_shard"), "videos_per_shard", 1, 65536),
@@ -312,6 +323,8 @@ class _Parser:
             _text(split, "a split's name", SPLIT): _whole(count, f"splits.{split}", 1, 2**40)
             for split, count in _mapping(self.part("splits"), "splits", SPLITS, 1).items()
         }
+        if sum(-(-count // videos_per_shard) for count in splits.values()) > SHARDS:
+            _refuse("splits", dict(splits), f"{SHARDS:,} shards at most, of {videos_per_shard} videos each")
         fields = self.fields(sizes)
         return Manifest(
             **base,
@@ -333,6 +346,16 @@ class _Parser:
             sha256=self.plain[SEAL],
             plain=self.plain,
         )
+
+    def nested(self, part: str) -> dict[str, Any]:
+        """A mapping of anything, of bounded depth."""
+        level: list[Any] = [_mapping(self.part(part), part, 1000)]
+        for _ in range(DEPTH):
+            level = [v for value in level for v in (value.values() if isinstance(value, dict) else value)]
+            level = [value for value in level if isinstance(value, dict | list)]
+            if not level:
+                return self.plain[part]
+        raise _Wrong(f"{part} is nested deeper than {DEPTH} levels")
 
     def same(self, splits: Mapping[str, int], part: str) -> Mapping[str, int]:
         """The splits, which a part must have, too."""
@@ -373,8 +396,15 @@ class _Parser:
         fields = {
             _text(name, "a field's name", FIELD): self.field(name, value, sizes) for name, value in listed.items()
         }
-        if not row_names(fields):
-            raise _Wrong("fields has none that is not compressed")
+        for name, kind in REQUIRED.items():
+            own = fields.get(name)
+            if own is None or (own.dtype, own.axes) != kind:
+                _refuse(f"fields.{name}", own and f"{own.dtype} {own.axes}", " ".join(kind))
+        pieces = sizes["T"] // (self.part("chunk_frames") or sizes["T"] or 1)
+        video = pieces * len(image_names(fields)) * CHUNK.itemsize
+        shard = 8 * MOMENTS * sum(measured(fields).values())
+        if max(video, shard) > ROW_BYTES:
+            _refuse("the size of an index", max(video, shard), f"{ROW_BYTES} bytes a row at most")
         return fields
 
     def field(self, name: str, value: Any, sizes: Mapping[str, int]) -> Field:
@@ -419,11 +449,12 @@ class _Parser:
         value, dtype = self.plain["constants"][name], np.dtype(field.dtype)
         if dtype.kind not in "biuf" or math.prod(shape) > 10**6:
             _refuse(f"constants.{name}", value, "numbers, a million at most")
-        with contextlib.suppress(ValueError, TypeError, OverflowError, RecursionError):
-            found = np.array(value)
-            fits = found.shape == shape and found.dtype.kind in ("b" if dtype.kind == "b" else "iuf")
-            if fits and (found.astype(dtype) == found).all():
-                return found.astype(dtype)
+        if _has_shape(value, shape):
+            with contextlib.suppress(ValueError, TypeError, OverflowError):
+                found = np.array(value)
+                fits = found.shape == shape and found.dtype.kind in ("b" if dtype.kind == "b" else "iuf")
+                if fits and (found.astype(dtype) == found).all():
+                    return found.astype(dtype)
         _refuse(f"constants.{name}", value, f"{dtype} {list(shape)}")
 
     def stats(self, split: str, fields: Mapping[str, Field]) -> Stats:
@@ -450,8 +481,6 @@ class _Parser:
         where = f"tables.{split}"
         about = _mapping(self.part("tables")[split], where, 5, 5)
         shards = -(-videos // videos_per_shard)
-        if shards > SHARDS:
-            _refuse(f"splits.{split}", videos, f"{SHARDS:,} shards at most, of {videos_per_shard} videos each")
         return Table(
             file=_one_of(about.get("file"), f"{where}.file", (table_name(split, videos),)),
             sha256=_text(about.get("sha256"), f"{where}.sha256", HASH),

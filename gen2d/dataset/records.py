@@ -16,10 +16,10 @@ from pathlib import Path
 
 import numpy as np
 
-from gen2d.core.errors import DamagedError, FolderError
+from gen2d.core.errors import DamagedError, IncompleteError
 from gen2d.dataset.manifest import Manifest, read_manifest
 from gen2d.dataset.rows import intact, npy_header, origin, salvaged, shard_type
-from gen2d.dataset.spec import RECORDS, DatasetSpec, Shard, shard_of
+from gen2d.dataset.spec import RECORDS, TABLE_NAME, DatasetSpec, Shard, shard_of
 from gen2d.storage.atomic import publish, sync
 from gen2d.storage.leases import has_locks, is_at, leased, try_lock
 from gen2d.storage.paths import Place, Url
@@ -33,9 +33,13 @@ _NAME = re.compile(r"(?P<split>.+)\.[0-9a-f]{16}\.\d+")
 class Records:
     """The rows of the shards that are done, by split."""
 
-    def __init__(self, videos_per_shard: int, rows: Mapping[str, np.ndarray]) -> None:
-        """`rows` are what was written; one that no plan has is passed over."""
-        self.size, self.rows = videos_per_shard, {}
+    def __init__(
+        self, videos_per_shard: int, rows: Mapping[str, np.ndarray], videos: Mapping[str, int] | None = None
+    ) -> None:
+        """`rows` are what was written; one that no plan has is passed over. `videos` are how many each split is known
+        to have, whether or not their rows are whole."""
+        self.size, self.rows, self.videos = videos_per_shard, {}, dict(videos or {})
+        self.manifest: Manifest | None = None  # of the folder, when the rows were read
         self.places: dict[str, dict[tuple[int, int], int]] = {}  # of (first video, count) among the rows
         for split, own in rows.items():
             fits = (own["first"] % self.size == 0) & (own["count"] >= 1) & (own["count"] <= self.size)
@@ -54,7 +58,8 @@ class Records:
 
     def counts(self) -> dict[str, int]:
         """How many videos of each split there are, if those before the last are."""
-        return {split: int((rows["first"] + rows["count"]).max()) for split, rows in self.rows.items() if len(rows)}
+        counts = {split: int((rows["first"] + rows["count"]).max()) for split, rows in self.rows.items() if len(rows)}
+        return {split: max(counts.get(split, 0), self.videos.get(split, 0)) for split in counts | self.videos}
 
     def shards(self) -> Iterator[Shard]:
         """Every shard that is done, also those that larger ones have replaced."""
@@ -62,19 +67,26 @@ class Records:
             yield from (shard_of(split, first, count, self.size) for first, count in own)
 
 
-def read_records(spec: DatasetSpec) -> Records:
+def read_records(source: DatasetSpec | Manifest, root: Place) -> Records:
     """What is done of the dataset in the folder: first the logs, then the tables, so that none is missed that another
     worker is just moving from there to here."""
-    kind, identity = shard_type(spec.fields), spec.identity_sha256
+    kind, identity, per_shard = shard_type(source.fields), source.identity_sha256, source.videos_per_shard
     found: dict[str, list[np.ndarray]] = {}
-    for split, content in _logs(spec.root):
+    for split, content in _logs(root):
         found.setdefault(split, []).append(_intact_rows(content, kind, origin(identity, split)))
-    with contextlib.suppress(FolderError, DamagedError):
-        manifest = read_manifest(spec.root)
-        if manifest.identity_sha256 == identity:
-            for split, rows in read_tables(spec.root, manifest).items():
-                found.setdefault(split, []).append(rows)
-    return Records(spec.videos_per_shard, {split: np.concatenate(parts) for split, parts in found.items()})
+    manifest = None
+    try:
+        manifest = read_manifest(root)
+    except (IncompleteError, DamagedError):
+        videos, tables = tables_by_name(root, kind, identity, per_shard)
+    else:
+        same = manifest.identity_sha256 == identity
+        videos, tables = (manifest.splits, read_tables(root, manifest)) if same else ({}, {})
+    for split, rows in tables.items():
+        found.setdefault(split, []).append(rows)
+    records = Records(per_shard, {split: np.concatenate(parts) for split, parts in found.items()}, videos)
+    records.manifest = manifest
+    return records
 
 
 def keys(rows: np.ndarray) -> list[tuple[int, int]]:
@@ -100,6 +112,30 @@ def read_tables(root: Place, manifest: Manifest) -> dict[str, np.ndarray]:
             content = b""
         found[split] = salvaged(content, kind, table.shards, begin, manifest.videos_per_shard)
     return found
+
+
+def tables_by_name(
+    root: Place, kind: np.dtype, identity: str, videos_per_shard: int
+) -> tuple[dict[str, int], dict[str, np.ndarray]]:
+    """What the tables in the folder say where no manifest does: how many videos each split has, by the name of its
+    largest table, and the rows that are what was written."""
+    videos: dict[str, int] = {}
+    tables: dict[str, np.ndarray] = {}
+    for path in _listed(root / "index"):
+        match = TABLE_NAME.fullmatch(path.name)
+        if not match or int(match["count"]) <= videos.get(match["split"], 0):
+            continue
+        split, count = match["split"], int(match["count"])
+        shards = -(-count // videos_per_shard)
+        size = len(npy_header(kind, shards)) + shards * kind.itemsize
+        try:
+            content = read_bytes(path, size)
+        except OSError:
+            continue
+        rows = salvaged(content, kind, shards, origin(identity, split), videos_per_shard)
+        if len(content) == size and len(rows):  # else its name may be anything
+            videos[split], tables[split] = count, rows
+    return videos, tables
 
 
 def _logs(root: Place) -> list[tuple[str, bytes]]:
@@ -166,10 +202,10 @@ class RecordLog:
             self._files[split].add(row.tobytes())
 
     def close(self) -> None:
-        """Ends the logs; their rows stay."""
-        for log in self._files.values():
+        """Ends the logs; their rows stay. Raises UnreachableError."""
+        files, self._files = self._files, {}
+        for log in files.values():
             log.close()
-        self._files = {}
 
 
 class _LocalLog:
@@ -227,11 +263,16 @@ class _RemoteLog:
     def __init__(self, path: Url) -> None:
         self.path, self.number, self.rows, self.count = path, 1, b"", 0
 
+    def _object(self) -> Url:
+        return self.path.parent / f"{self.path.name}.{self.number}"
+
     def add(self, row: bytes) -> None:
-        publish(self.path.parent / f"{self.path.name}.{self.number}", self.rows + row)
+        publish(self._object(), self.rows + row)
         self.rows, self.count = self.rows + row, self.count + 1
         if self.count == ROWS:
             self.number, self.rows, self.count = self.number + 1, b"", 0
 
     def close(self) -> None:
-        pass
+        """Returns when the last rows are there: another worker, which knew fewer, may have removed them."""
+        if self.rows and not self._object().exists():
+            publish(self._object(), self.rows)

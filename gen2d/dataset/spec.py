@@ -17,6 +17,7 @@ SCHEMA = "gen2d.dataset/2"
 MARK = Path(".gen2d")  # the folder, inside a dataset's, of what only the program needs
 RECORDS = MARK / "records"  # shards that are done, and not in the manifest yet
 SNAPSHOTS = MARK / "snapshots"  # what the manifest before the last one names, and this one does not
+LOCK = MARK / "lock"  # held by who changes what the folder holds
 NEXT = MARK / "next.json"  # the manifest that is about to replace the present one
 STAGED = MARK / "staged"  # before a temporary name's end: shards made again, yet to be verified
 

@@ -69,7 +69,6 @@ class SplitFiles:
         self._header = len(npy_header(self._shard_type, manifest.tables[split].shards))
         self._blocks: OrderedDict[tuple[int, int], np.ndarray] = OrderedDict()
         self._shards: dict[int, ShardRow] = {}
-        self._lock = threading.Lock()
 
     def __getstate__(self) -> dict[str, object]:
         raise TypeError("the files of a dataset are opened anew in another process")
@@ -112,12 +111,12 @@ class SplitFiles:
 
     def _kept(self, key: tuple[int, int], read: Callable[[], np.ndarray]) -> np.ndarray:
         """A block of rows; those used longest ago are forgotten."""
-        with self._lock:
+        with _lock:
             if key in self._blocks:
                 self._blocks.move_to_end(key)
                 return self._blocks[key]
         rows = read()
-        with self._lock:
+        with _lock:
             self._blocks[key] = rows
             while len(self._blocks) > KEPT:
                 self._blocks.popitem(last=False)
@@ -157,7 +156,7 @@ class SplitFiles:
 
     def _fetched_blocks(self, wanted: set[tuple[int, int]]) -> dict[tuple[int, int], np.ndarray]:
         """Blocks of the indices of remote shards; those that are not known are asked for all at once."""
-        with self._lock:
+        with _lock:
             found = {key: self._blocks[key] for key in wanted & self._blocks.keys()}
         missing, size, ranges = sorted(wanted - found.keys()), self._video_type.itemsize, []
         for place, block in missing:
@@ -330,7 +329,7 @@ def _about(status: os.stat_result) -> tuple[int, ...]:
 
 # The files that this process has open, those used longest ago first.
 _files: OrderedDict[Path, _File] = OrderedDict()
-_files_lock = threading.Lock()
+_lock = threading.Lock()  # of these, and of the blocks of every dataset; held for moments only
 
 
 def open_file(path: Path) -> _File:
@@ -341,7 +340,7 @@ def open_file(path: Path) -> _File:
         raise
     except OSError as error:
         raise reading_error(path, error) from error
-    with _files_lock:
+    with _lock:
         known = _files.get(path)
         if known is not None and known.about == about and known.process == os.getpid():
             _files.move_to_end(path)
@@ -349,10 +348,10 @@ def open_file(path: Path) -> _File:
     try:
         file = _File(path)
     except UserError:
-        with _files_lock:
+        with _lock:
             _files.clear()  # too many are open: ours need not be
         file = _File(path)
-    with _files_lock:
+    with _lock:
         _files[path] = file
         while len(_files) > OPEN:
             _files.popitem(last=False)
@@ -360,8 +359,8 @@ def open_file(path: Path) -> _File:
 
 
 def _after_fork() -> None:
-    global _files_lock
-    _files_lock = threading.Lock()  # another thread may have held it
+    global _lock
+    _lock = threading.Lock()  # another thread may have held it
 
 
 os.register_at_fork(after_in_child=_after_fork)

@@ -86,6 +86,19 @@ def publish_changed(path: Place, content: bytes) -> None:
     publish(path, content)
 
 
+def link_or_copy(source: Path, target: Path) -> None:
+    """Returns when the file has this name, too; it is copied where a file system gives no second name."""
+    try:
+        os.link(source, target)
+    except FileExistsError:
+        return
+    except FileNotFoundError:
+        raise
+    except OSError:
+        with publishing(target) as temporary:
+            shutil.copyfile(source, temporary)
+
+
 def work_folder(root: Place) -> Path:
     """The folder on disk in which what goes to `root` is written first."""
     return Path(tempfile.gettempdir()) if isinstance(root, Url) else root

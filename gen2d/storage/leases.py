@@ -50,6 +50,25 @@ def leased(path: Path) -> Iterator[int]:
         time.sleep(0.001)  # somebody took it for abandoned, in the moment before it was locked
 
 
+@contextlib.contextmanager
+def exclusive(path: Path, seconds: float) -> Iterator[None]:
+    """A block that one process at a time runs, by a lock on the file `path`, which stays.
+
+    Raises TimeoutError where another process still has the lock after so many seconds. Where there are no locks the
+    block runs all the same.
+    """
+    end = time.monotonic() + seconds
+    descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o666)
+    try:
+        while try_lock(descriptor) is False:
+            if time.monotonic() > end:
+                raise TimeoutError(errno.ETIMEDOUT, os.strerror(errno.ETIMEDOUT), str(path))
+            time.sleep(0.02)
+        yield
+    finally:
+        os.close(descriptor)
+
+
 def try_lock(descriptor: int) -> bool | None:
     """Whether this process now has the lock; None where the file system has no locks."""
     try:

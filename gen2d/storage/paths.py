@@ -126,10 +126,9 @@ class Url:
             if not missing_ok:
                 raise
 
-    def rename(self, target: "Url") -> None:
-        """Copies the object and removes it under its own name."""
+    def copy(self, target: "Url") -> None:
+        """Returns when the object has this name, too."""
         attempt(self, lambda system, path: system.cp_file(path, system._strip_protocol(target.text)), 2**33)
-        self.unlink(missing_ok=True)
 
 
 Place = Path | Url

@@ -103,7 +103,8 @@ def read_bytes(path: Place, limit: int) -> bytes:
     if isinstance(path, Url):
         return path.read_bytes(limit)
     with os.fdopen(open_regular(path), "rb") as file:
-        content = file.read(limit + 1)
+        # As much as there is, and not as `limit` says: that much memory may not be there.
+        content = file.read(min(os.fstat(file.fileno()).st_size, limit) + 1)
     if len(content) > limit:
         raise OSError(errno.EFBIG, f"it has more than {limit} bytes", str(path))
     return content
