@@ -19,7 +19,6 @@ import h5py
 import numpy as np
 import synthetic
 
-from gen2d.core.errors import DamagedError
 from gen2d.core.schema import Field
 
 HUGE = [0, -1, 1, 2**31, 2**32, 2**40, 2**53, 2**63, 2**64, -(2**63), 10**400, 1e308, 0.5]
@@ -565,37 +564,39 @@ def fields_that_are_others(root: Path, chance: random.Random) -> str:
     which = chance.choice(
         ["no time", "time of each video", "time alone", "index of pairs", "file", "wide", "many", "T"]
     )
-    fields: dict[str, Field] = dict(synthetic.FIELDS)
-    if which == "no time":
-        del fields["time"]
-    elif which == "time of each video":
-        fields["time"] = Field("float64", "n", "s", "x")
-    elif which == "time alone":
-        fields["time"] = Field("float64", "", "s", "x")
-    elif which == "index of pairs":
-        fields["index"] = Field("int64", "n 2", "1", "x")
-    elif which == "file":
-        fields["file"] = Field("int32", "n", "1", "x")
+    plain_field = {"dtype": "int8", "axes": "n 1000000", "unit": "", "meaning": "", "shape": [1000000], "codec": "none"}
 
     def change(plain: dict[str, Any]) -> None:
-        if which == "wide":
-            about = {"dtype": "int8", "axes": "n 1000000", "unit": "", "meaning": ""}
-            about |= {"shape": [1000000], "codec": "none"}
-            added = {f"states/x{number}": about for number in range(60)}
-            plain["fields"] |= added
+        fields = plain["fields"]
+        if which == "no time":
+            del fields["time"], plain["constants"]["time"]
+        elif which == "time of each video":
+            fields["time"].update(axes="n", shape=[])
+            del plain["constants"]["time"]
+        elif which == "time alone":
+            fields["time"].update(axes="", shape=[])
+            plain["constants"]["time"] = 1.0
+        elif which == "index of pairs":
+            fields["index"].update(axes="n 2", shape=[2])
+        elif which == "wide":
+            added = {f"states/x{number}": plain_field for number in range(60)}
+            fields |= added
             for stats in plain["stats"].values():
                 stats |= {name: dict.fromkeys(("mean", "std", "min", "max")) for name in added}
         elif which == "many":
             plain["chunk_frames"], plain["sizes"]["T"] = 1, 2**31 - 1
+            for about in fields.values():
+                about["shape"] = [2**31 - 1 if size == 5 else size for size in about["shape"]]
         elif which == "T":
             plain["chunk_frames"], plain["constants"] = 5, {}
             del plain["sizes"]["T"]
-            plain["fields"] = {name: about for name, about in plain["fields"].items() if " T" not in about["axes"]}
+            plain["fields"] = {name: about for name, about in fields.items() if "T" not in about["axes"]}
 
-    shutil.rmtree(root)
-    with contextlib.suppress(DamagedError):  # gen2d makes no such dataset
-        synthetic.make(synthetic.dataset(root, train=10, fields=fields))
-        forged.seal(root, change)
+    if which == "file":  # NumPy's own name for where to write
+        shutil.rmtree(root)
+        more = synthetic.FIELDS | {"file": Field("int32", "n", "1", "x")}
+        synthetic.make(synthetic.dataset(root, train=10, fields=more))
+    forged.seal(root, change)
     return which
 
 

@@ -74,7 +74,12 @@ def video(made: DatasetSpec, split: str, number: int) -> dict[str, np.ndarray]:
         mask[(rows - row % height) ** 2 + (columns - column % width) ** 2 < (height / 6) ** 2] = slot + 1
     colors = random.integers(0, 256, (slots + 1, 3), np.uint8)
     present = np.arange(slots) <= number % slots
-    values |= {"index": np.array(number), "objects/present": present, "masks/instance": mask, "frames": colors[mask]}
+    values |= {
+        "index": np.full(made.fields["index"].shape(made.sizes), number),
+        "objects/present": present,
+        "masks/instance": mask,
+        "frames": colors[mask],
+    }
     values["objects/mass"][0] = np.inf
     return values
 

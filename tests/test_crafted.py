@@ -94,9 +94,9 @@ class Trial:
                 seed = int(line)
                 folder = self.home / f"{seed}"
                 folder.mkdir()
-                told = crafted.craft(self.pristine, folder / "data", seed)
-                fault = ""
+                told = fault = ""
                 try:
+                    told = crafted.craft(self.pristine, folder / "data", seed)
                     for root, writable in ((self.server.url(folder / "data"), False), (str(folder / "data"), True)):
                         for action in tried(root, folder, writable):
                             print(json.dumps({"doing": action, "what": told}), file=out, flush=True)
