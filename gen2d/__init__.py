@@ -15,16 +15,16 @@ import sys
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from gen2d.config import load_config
-    from gen2d.exporting import export
-    from gen2d.generation import generate
+    from gen2d.config.config import load_config
+    from gen2d.exports.export import export
+    from gen2d.generation.run import generate
     from gen2d.loading.dataloader import DataLoader
     from gen2d.loading.dataset import open
     from gen2d.loading.mixture import mix
-    from gen2d.redraw import render, simulate_again
-    from gen2d.space import Space
-    from gen2d.streaming import stream
-    from gen2d.verification import verify
+    from gen2d.programs.redraw import render, simulate_again
+    from gen2d.programs.stream import stream
+    from gen2d.space.space import Space
+    from gen2d.tools.verify import verify
 
 __version__ = "0.1.0"
 __all__ = [
@@ -34,16 +34,16 @@ __all__ = [
 
 _HOME = {
     "DataLoader": "gen2d.loading.dataloader",
-    "Space": "gen2d.space",
-    "export": "gen2d.exporting",
-    "generate": "gen2d.generation",
-    "load_config": "gen2d.config",
+    "Space": "gen2d.space.space",
+    "export": "gen2d.exports.export",
+    "generate": "gen2d.generation.run",
+    "load_config": "gen2d.config.config",
     "mix": "gen2d.loading.mixture",
     "open": "gen2d.loading.dataset",
-    "render": "gen2d.redraw",
-    "simulate_again": "gen2d.redraw",
-    "stream": "gen2d.streaming",
-    "verify": "gen2d.verification",
+    "render": "gen2d.programs.redraw",
+    "simulate_again": "gen2d.programs.redraw",
+    "stream": "gen2d.programs.stream",
+    "verify": "gen2d.tools.verify",
 }
 
 

@@ -1,1 +1,1 @@
-"""Looks: one file each, found by name; a look says what each slot is drawn as, `gen2d.raster` draws it."""
+"""The rasterizer: objects in world units to frames, with exact coverage; looks lie in `looks/`."""

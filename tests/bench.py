@@ -37,9 +37,9 @@ from bench_render import Annotated, Drawing
 from bench_storage import Stored
 from timing import timed
 
-from gen2d.complete import complete
 from gen2d.dataset.folder import open_folder
 from gen2d.dataset.shard_writer import ShardWriter
+from gen2d.generation.complete import complete
 
 HERE = Path(__file__).resolve()
 CONFIG = "benchmark.yaml"
@@ -74,8 +74,9 @@ def _parts(folder: Path, sets: Sequence[str], config: str = CONFIG) -> dict[str,
     """For each stage of gen2d what does it for a batch, and of how many videos."""
     import jax
 
-    from gen2d import devices, pipeline
-    from gen2d.generation import dataset_of
+    from gen2d.generation import encoder as encoder_module
+    from gen2d.generation.run import dataset_of
+    from gen2d.programs import devices
 
     rollout = rollout_of(sets, config)
     sample, simulate, numbers = _physics(rollout)
@@ -83,8 +84,8 @@ def _parts(folder: Path, sets: Sequence[str], config: str = CONFIG) -> dict[str,
     whole = rollout.videos_per_shard // rollout.lanes * rollout.lanes
     dataset = dataset_of(rollout, folder / "data", {"train": whole})
     (shard, *_), columns = open_folder(dataset), rollout.host_columns(batch)[0]
-    encoder = pipeline.Encoder(rollout, dataset, pipeline.threads_for(devices.cores()))
-    jobs = pipeline.jobs_of([0], [[(shard, 0, rollout.lanes)]], rollout.lanes, rollout.slice)
+    encoder = encoder_module.Encoder(rollout, dataset, encoder_module.threads_for(devices.cores()))
+    jobs = encoder_module.jobs_of([0], [[(shard, 0, rollout.lanes)]], rollout.lanes, rollout.slice)
     pictures = [jax.block_until_ready(rollout.draw(batch, job.start, rollout.slice))[0] for job in jobs]
 
     def encode() -> list[Any]:
@@ -111,9 +112,9 @@ def _parts(folder: Path, sets: Sequence[str], config: str = CONFIG) -> dict[str,
 
 def rollout_of(sets: Sequence[str] = (), config: str = CONFIG) -> Any:
     """The compiled programs of the benchmark's or another config, on all devices of this process."""
-    from gen2d import devices
-    from gen2d.config import load_config
-    from gen2d.rollout import Rollout
+    from gen2d.config.config import load_config
+    from gen2d.programs import devices
+    from gen2d.programs.rollout import Rollout
 
     return Rollout(load_config(config, sets), devices.prepare())
 
@@ -123,21 +124,21 @@ def _physics(rollout: Any) -> tuple[Callable, Callable, np.ndarray]:
     import jax
     import jax.numpy as jnp
 
-    from gen2d import factors, types
-    from gen2d.rollout import rules_of
-    from gen2d.simulate import simulate
+    from gen2d.physics.params import rules_of
+    from gen2d.physics.simulate import simulate
+    from gen2d.records import axes, keys
 
     config = rollout.config
-    root, length = factors.seed_words(0, 0), (config.video.frames, rollout.steps)
+    root, length = keys.seed_words(0, 0), (config.video.frames, rollout.steps)
     rules = rules_of(config.physics, config.video.fps, rollout.steps)
 
     def sampled(numbers: Any) -> Any:
-        made = jax.vmap(rollout.sampler.sampled)(factors.video_keys(jnp.asarray(root), numbers))[1]
+        made = jax.vmap(rollout.sampler.sampled)(keys.video_keys(jnp.asarray(root), numbers))[1]
         return made.scene, made.state
 
     def simulated(scene: Any, state: Any) -> Any:
-        device = types.to_device(scene), types.to_device(state)
-        return types.to_stored(simulate(*device, rollout.layout, rules, *length, sparse=True))
+        device = axes.to_device(scene), axes.to_device(state)
+        return axes.to_stored(simulate(*device, rollout.layout, rules, *length, sparse=True))
 
     return jax.jit(sampled), jax.jit(simulated), np.arange(rollout.lanes, dtype=np.uint32)
 
@@ -163,13 +164,15 @@ def steady(folder: Path, videos: int = 4096, turns: int = 3, peer_videos: int = 
 
 def make(rollout: Any, videos: int, out: Path) -> None:
     """Returns nothing; makes a dataset as `gen2d.generate` does, with programs that are compiled already."""
-    from gen2d import devices, pipeline
-    from gen2d.generation import dataset_of
+    from gen2d.generation import encoder as encoder_module
+    from gen2d.generation import writers as writers_module
+    from gen2d.generation.run import dataset_of
+    from gen2d.programs import devices
 
     dataset = dataset_of(rollout, out, {"train": videos})
-    encoder = pipeline.Encoder(rollout, dataset, pipeline.threads_for(devices.cores()))
-    writers = pipeline.Writers(dataset)
-    for shard, block in encoder.blocks(pipeline.batches(open_folder(dataset), rollout.lanes)):
+    encoder = encoder_module.Encoder(rollout, dataset, encoder_module.threads_for(devices.cores()))
+    writers = writers_module.Writers(dataset)
+    for shard, block in encoder.blocks(encoder_module.batches(open_folder(dataset), rollout.lanes)):
         writers.put(shard, block)
     writers.finish()
     encoder.close()
@@ -480,7 +483,7 @@ def shards_section(folder: Path, quick: bool) -> Found:
 
 def families_section(folder: Path, quick: bool) -> Found:
     """What sampling a scene costs of all that its video does, for every family."""
-    from gen2d import plugins
+    from gen2d.config import plugins
 
     for name in plugins.names("scene"):
         own = folder / name

@@ -143,8 +143,10 @@ def gen2d_program(case: Case, everything: bool) -> tuple[Callable, Any, float]:
     import jax
     from worlds import rules
 
-    from gen2d import devices, types
-    from gen2d.simulate import Keep, simulate
+    from gen2d.physics.simulate import Keep, simulate
+    from gen2d.programs import devices
+    from gen2d.records import axes, trajectory
+    from gen2d.records import scene as scene_module
 
     devices.keep_freed_memory()  # as the product does
     jax.config.update("jax_enable_compilation_cache", False)
@@ -153,9 +155,9 @@ def gen2d_program(case: Case, everything: bool) -> tuple[Callable, Any, float]:
     inputs = jax.tree.map(lambda *x: np.stack(x), *(scene[:2] for scene in made))
     keep = Keep(4 * layout.slots * math.ceil(FRAMES / 16), energy=True) if everything else Keep()
 
-    def run(scene: types.Scene, state: types.State) -> types.Trajectory:
-        device = types.to_device(scene), types.to_device(state)
-        return types.to_stored(simulate(*device, layout, rules(STEP), FRAMES, STEPS, keep, sparse=True))
+    def run(scene: scene_module.Scene, state: scene_module.State) -> trajectory.Trajectory:
+        device = axes.to_device(scene), axes.to_device(state)
+        return axes.to_stored(simulate(*device, layout, rules(STEP), FRAMES, STEPS, keep, sparse=True))
 
     began = time.process_time()
     program = jax.jit(run).lower(*inputs).compile()
@@ -164,7 +166,7 @@ def gen2d_program(case: Case, everything: bool) -> tuple[Callable, Any, float]:
 
 def gen2d_scene(start: Start) -> Any:
     """Scene, state and layout."""
-    from gen2d.space import Space
+    from gen2d.space.space import Space
 
     space = Space((0, GRAVITY))
     for place, angle, velocity, size in zip(*start[1:], strict=True):

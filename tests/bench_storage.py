@@ -16,13 +16,13 @@ import numpy as np
 import synthetic
 from timing import timed
 
-from gen2d.complete import complete
 from gen2d.core.schema import Field
 from gen2d.dataset.block import encode
 from gen2d.dataset.folder import open_folder
 from gen2d.dataset.rows import origin, sealed_rows
 from gen2d.dataset.shard_writer import ShardWriter
 from gen2d.dataset.spec import RECORDS, DatasetSpec, plan
+from gen2d.generation.complete import complete
 from gen2d.loading import dataset as loader
 from gen2d.storage import codecs
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import yaml
 
-from gen2d.plugins import config_folder
+from gen2d.config.plugins import config_folder
 
 JUNK: list[Any] = [
     None,

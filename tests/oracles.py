@@ -15,8 +15,9 @@ import numpy as np
 import pymunk
 from worlds import world
 
-from gen2d import space
-from gen2d.types import Layout, Scene, State
+from gen2d.records.layout import Layout
+from gen2d.records.scene import Scene, State
+from gen2d.space import space
 
 with warnings.catch_warnings():  # SWIG's own types, as Python sees them
     warnings.filterwarnings("ignore", r"builtin type (SwigPy\w+|swigvarlink) has no __module__", DeprecationWarning)

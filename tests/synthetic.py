@@ -5,13 +5,13 @@ from pathlib import Path
 
 import numpy as np
 
-from gen2d.complete import complete
 from gen2d.core.schema import Field
 from gen2d.dataset import hdf5
 from gen2d.dataset.block import Block, encode
 from gen2d.dataset.folder import open_folder
 from gen2d.dataset.shard_writer import ShardWriter
 from gen2d.dataset.spec import DatasetSpec, Shard
+from gen2d.generation.complete import complete
 from gen2d.storage.paths import Place
 
 FIELDS = {

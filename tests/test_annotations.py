@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from gen2d import drawing, factors, redraw, types
-from gen2d.config import load_config
-from gen2d.rollout import Rollout, parts
+from gen2d.config.config import load_config
+from gen2d.programs import redraw, render
+from gen2d.programs.rollout import Rollout, parts
+from gen2d.records import keys as keys_module
+from gen2d.records import scene as scene_module
 
 ALL = [f"annotations.{name}=true" for name in ("masks", "amodal", "boxes", "visibility", "flow")]
 SMALL = ["storage.lanes=4", "video.frames=12", "video.height=40", "video.width=56", "annotations.tracks=5", "seed=3"]
@@ -28,8 +30,8 @@ def simulated():
     rollout = Rollout(load_config("bouncing.yaml", SMALL), jax.devices()[:1])
     batch = rollout.begin("train", [0])
     assert parts(batch.placed)[0].all()
-    words = jnp.asarray(factors.seed_words(3, zlib.crc32(b"train")))
-    keys = factors.video_keys(words, jnp.arange(4, dtype=jnp.uint32))
+    words = jnp.asarray(keys_module.seed_words(3, zlib.crc32(b"train")))
+    keys = keys_module.video_keys(words, jnp.arange(4, dtype=jnp.uint32))
     return rollout.host_columns(batch)[0], keys
 
 
@@ -42,12 +44,12 @@ class Made:
         columns, keys = simulated()
 
         def staged(key, scene, states):
-            return drawing.stage_of(key, config, self.rollout.plan, scene, states)
+            return render.stage_of(key, config, self.rollout.plan, scene, states)
 
-        scenes, states = redraw.scene_of(columns), redraw.record_of(types.State, columns)
+        scenes, states = redraw.scene_of(columns), redraw.record_of(scene_module.State, columns)
         stages = jax.jit(jax.vmap(staged))(keys, scenes, states)
-        drawn = jax.jit(lambda stages: drawing.pictures(stages, self.rollout.plan, config.annotations))(stages)
-        seen = drawing.camera_columns(stages.instants.view)
+        drawn = jax.jit(lambda stages: render.pictures(stages, self.rollout.plan, config.annotations))(stages)
+        seen = render.camera_columns(stages.instants.view)
         self.of = columns | {name: np.asarray(a) for name, a in (drawn | seen).items()}
         self.mask, self.slots = self.of["masks/instance"], self.rollout.layout.slots
         self.stages, self.options = stages, config.annotations
@@ -72,7 +74,7 @@ def test_fields_are_as_described(made):
 
 def test_the_form_for_gpus_tells_the_same(made, monkeypatch):
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    told = jax.jit(lambda stages: drawing.pictures(stages, made.rollout.plan, made.options))(made.stages)
+    told = jax.jit(lambda stages: render.pictures(stages, made.rollout.plan, made.options))(made.stages)
     assert_array_equal(told.pop("masks/instance"), made.mask)
     for name, array in told.items():
         here, there = np.asarray(array), made.of[name]

@@ -16,7 +16,7 @@ import numpy as np
 import peer
 import pytest
 
-from gen2d.config import load_config
+from gen2d.config.config import load_config
 
 TINY = ("video.frames=3", "video.height=16", "video.width=16", "scene.balls=2")
 TINY += ("storage.lanes=4", "storage.videos_per_shard=8")

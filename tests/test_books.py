@@ -6,7 +6,7 @@ from laws import DOWN, GRAVITY, doubled, holds
 from test_invariants import gas
 from worlds import STEP, energies, momenta, run, world
 
-from gen2d.simulate import Keep
+from gen2d.physics.simulate import Keep
 
 FRAMES = 241
 EVERYTHING = Keep(contacts=6000, energy=True)

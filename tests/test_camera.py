@@ -10,10 +10,11 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from worlds import flown
 
-from gen2d import raster
-from gen2d.camera import View, filmed, fitted, largest_scale, to_pixels, to_world
-from gen2d.config import load_config
-from gen2d.types import Layout, Run, State
+from gen2d.config.config import load_config
+from gen2d.records.layout import Layout, Run
+from gen2d.records.scene import State
+from gen2d.renderers import rasterizer
+from gen2d.renderers.camera import View, filmed, fitted, largest_scale, to_pixels, to_world
 
 HEIGHT, WIDTH, FPS, FRAMES = 48, 64, 20, 12
 LAYOUT = Layout((Run("circle", 3),), bounds=(0.0, 0.0, 10.0, 6.0))
@@ -23,7 +24,7 @@ BALLS = {
     "look": {"name": "flat", "background": [0, 0, 0], "wall_width": 3},
     "seed": 4,
 }
-draw = jax.jit(raster.draw_patches, static_argnums=1)
+draw = jax.jit(rasterizer.draw_patches, static_argnums=1)
 
 
 def views(rng, count):

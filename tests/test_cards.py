@@ -13,11 +13,11 @@ import pytest
 import synthetic
 from numpy.testing import assert_array_equal
 
-from gen2d import preview
 from gen2d.dataset.manifest import read_manifest
+from gen2d.media import contact_sheet
 from gen2d.storage import codecs
 from gen2d.storage.sealed import file_sha256
-from gen2d.verification import verify
+from gen2d.tools.verify import verify
 
 
 def test_the_cards_name_every_field_and_file(tmp_path: Path) -> None:
@@ -55,9 +55,9 @@ def test_without_frames_there_is_no_sheet(tmp_path: Path) -> None:
 
 def test_a_large_frame_is_made_smaller_on_the_sheet() -> None:
     video = np.random.default_rng(0).integers(0, 256, (30, 300, 400, 3), np.uint8)
-    found = preview.reduced(video)
+    found = contact_sheet.reduced(video)
     assert found.shape == (10, 100, 133, 3)
-    assert abs(found.mean() - video[preview.shown(30)].mean()) < 1
+    assert abs(found.mean() - video[contact_sheet.shown(30)].mean()) < 1
 
 
 def test_the_readme_tells_the_statistics(tmp_path: Path) -> None:

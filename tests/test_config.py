@@ -8,10 +8,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from tiny import CONFIG, changed
 
-from gen2d import plugins
-from gen2d.config import MAX_SEED, load_config, parse_yaml
+from gen2d.config import plugins
+from gen2d.config.config import MAX_SEED, load_config
+from gen2d.config.distribution_syntax import parse
+from gen2d.config.reading import parse_yaml
 from gen2d.core.errors import ConfigError
-from gen2d.factors import parse
 
 BAD = {
     "scene: {balls: 0}": ("scene.balls is 0", "1 or more"),

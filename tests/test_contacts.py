@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from gen2d.contacts import FAR, PAIRS, SLOP, Disc, Hull, Point, Stadium, edge_normals, hull, touches
+from gen2d.physics.collision import FAR, PAIRS, SLOP, Disc, Hull, Point, Stadium, edge_normals, hull, touches
 
 MANY = 2000
 V = 5  # corners of a hull, some of them repeated

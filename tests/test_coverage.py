@@ -17,7 +17,8 @@ import pytest
 from numpy.testing import assert_allclose
 from worlds import disc_areas, outline, polygon_areas
 
-from gen2d import coverage
+from gen2d.renderers.coverage import disc as disc_module
+from gen2d.renderers.coverage import polygon
 
 SIZE, COUNT, CORNERS = 72, 64, 6  # px, shapes at once, corners of each
 EDGES = np.arange(SIZE + 1)
@@ -27,13 +28,13 @@ EDGES = np.arange(SIZE + 1)
 def discs(centre, radius, size=SIZE):
     """The coverage [n, size, size] of discs about centres [n, 2]."""
     edges = jnp.arange(size, dtype=centre.dtype)
-    return coverage.disc_area(coverage.disc_cuts(edges - centre[:, :1], edges - centre[:, 1:], radius), 1e9)
+    return disc_module.disc_area(disc_module.disc_cuts(edges - centre[:, :1], edges - centre[:, 1:], radius), 1e9)
 
 
 def rounded(corners, radius):
     """The coverage [n, SIZE, SIZE] of rounded polygons [n, V, 2]; no radius: sharp ones."""
     edges = jnp.broadcast_to(jnp.arange(SIZE, dtype=corners.dtype), (len(corners), SIZE))
-    return coverage.rounded_area(coverage.rounded_cuts(edges, edges, corners, radius))
+    return polygon.rounded_area(polygon.rounded_cuts(edges, edges, corners, radius))
 
 
 def compared(name, found, exact, mean, most):

@@ -22,7 +22,7 @@ import pytest
 import synthetic
 
 import gen2d
-from gen2d.__main__ import main
+from gen2d.cli.main import main
 from gen2d.core.errors import Error
 from gen2d.storage import paths
 
@@ -148,7 +148,7 @@ def test_a_crafted_dataset_does_no_harm(
     pristine: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, count: int
 ) -> None:
     monkeypatch.setattr(paths, "PAUSE", 0.01)
-    import gen2d.regeneration  # noqa: F401  warms up what a child would import
+    import gen2d.generation.regenerate  # noqa: F401  warms up what a child would import
 
     known = {path.name for path in pristine.rglob("*")}
     with buckets.serving_files(tmp_path) as server:

@@ -13,13 +13,13 @@ from crashes import every_crash
 from numpy.testing import assert_array_equal
 
 import gen2d
-from gen2d import regeneration
 from gen2d.core.errors import FolderError
 from gen2d.dataset import folder
 from gen2d.dataset.manifest import read_manifest
 from gen2d.dataset.shard_writer import ShardWriter
 from gen2d.dataset.spec import DatasetSpec, Shard
-from gen2d.verification import verify
+from gen2d.generation import regenerate
+from gen2d.tools.verify import verify
 
 FIELDS = {name: synthetic.FIELDS[name] for name in ("frames", "index", "objects/mass", "time")}
 
@@ -128,11 +128,11 @@ def repaired(monkeypatch: pytest.MonkeyPatch) -> None:
     def made(rollout: object, root: Path, counts: Mapping[str, int]) -> DatasetSpec:
         return synthetic.dataset(root, fields=FIELDS, splits=dict(counts))
 
-    monkeypatch.setattr(regeneration, "rollout_of", lambda *_: None)
-    monkeypatch.setattr(regeneration, "check_fingerprint", lambda *_: None)
-    monkeypatch.setattr(regeneration, "_versions", lambda *_: dict.fromkeys(regeneration.CODECS))
-    monkeypatch.setattr(regeneration, "dataset_of", made)
-    monkeypatch.setattr(regeneration, "make", make)
+    monkeypatch.setattr(regenerate, "rollout_of", lambda *_: None)
+    monkeypatch.setattr(regenerate, "check_fingerprint", lambda *_: None)
+    monkeypatch.setattr(regenerate, "_versions", lambda *_: dict.fromkeys(regenerate.CODECS))
+    monkeypatch.setattr(regenerate, "dataset_of", made)
+    monkeypatch.setattr(regenerate, "make", make)
 
 
 @pytest.mark.parametrize("damage", DAMAGES)
@@ -153,20 +153,20 @@ def test_while_a_dataset_is_repaired(
 
     restored()
     bad = [Path(name).stem for name in names if name.startswith("shards/")]
-    for _ in every_crash(lambda: regeneration.repair(root, bad)):
+    for _ in every_crash(lambda: regenerate.repair(root, bad)):
         crashes += 1
         for name, content in contents(root).items():
             if ".tmp." not in name and name not in names and not name.startswith(".gen2d/"):
                 assert content == pristine[name], name  # what was whole still is
             elif name in names:
                 assert content == pristine[name] or len(content) == len(pristine[name])
-        regeneration.repair(root, bad)
+        regenerate.repair(root, bad)
         assert verify(root, "full") == []
         folder.clean(root)
         assert contents(root) == pristine
         restored()
     assert crashes > 5
-    regeneration.repair(root, bad)
+    regenerate.repair(root, bad)
     assert contents(root) == pristine
 
 
@@ -198,8 +198,8 @@ def test_a_repair_that_makes_other_bytes_changes_nothing(
             for shard in todo:
                 writer.write(shard, synthetic.blocks(other, shard))
 
-    monkeypatch.setattr(regeneration, "make", wrong)
+    monkeypatch.setattr(regenerate, "make", wrong)
     with pytest.raises(FolderError, match="train-00000, made again, is not right, so nothing was changed"):
-        regeneration.repair(root)
+        regenerate.repair(root)
     assert contents(root) == before
     assert read_manifest(root).splits == {"train": 12, "test": 3}

@@ -23,7 +23,7 @@ from gen2d.dataset.folder import open_folder
 from gen2d.loading import chunks
 from gen2d.storage import explain, leases
 from gen2d.storage.leases import leased, temporary_name
-from gen2d.verification import verify
+from gen2d.tools.verify import verify
 
 TESTS = Path(__file__).parent
 

@@ -12,8 +12,9 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from gen2d.pictures import RED, overlay, picture
-from gen2d.space import Space, Video
+from gen2d.space.plot import RED, overlay, picture
+from gen2d.space.space import Space
+from gen2d.space.video import Video
 
 GRAVITY = 9.8
 HUSL = [(247, 112, 136), (186, 147, 49), (50, 176, 101), (56, 167, 208), (244, 97, 221)]

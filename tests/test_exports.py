@@ -20,9 +20,10 @@ import tiny
 from numpy.testing import assert_allclose, assert_array_equal
 
 import gen2d
-from gen2d import exporting, exports
 from gen2d.core.errors import ConfigError, FolderError, UserError
 from gen2d.core.schema import Field
+from gen2d.exports import export
+from gen2d.exports import source as source_module
 
 SIZES = {"T": 6, "H": 64, "W": 48, "K": 3}
 TRAIN = 10
@@ -129,7 +130,7 @@ def samples(folder: Path) -> Iterator[dict[str, bytes]]:
 
 
 def test_tar_files_have_every_field_bit_by_bit(toy: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("gen2d.exports.webdataset.TAR_VIDEOS", 4)
+    monkeypatch.setattr("gen2d.exports.formats.webdataset.TAR_VIDEOS", 4)
     out, expected = gen2d.export(toy, "webdataset", tmp_path / "tars").out, synthetic.stored(toy)
     assert sorted(path.name for path in out.glob("*.tar")) == [f"train-{number:06d}.tar" for number in range(3)]
     found = list(samples(out))
@@ -188,7 +189,7 @@ def balls(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFacto
 def test_phyworld_has_films_positions_and_what_was_drawn(
     balls: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("gen2d.exports.phyworld.GROUP", 4)
+    monkeypatch.setattr("gen2d.exports.formats.phyworld.GROUP", 4)
     found = arrays(gen2d.export(balls, "phyworld", tmp_path / "train.hdf5").out)
     names = {"init_streams", "position_streams", "video_streams"}
     assert found.keys() == {f"{name}/{group}" for name in names for group in ("00000", "00001")}
@@ -281,7 +282,9 @@ def test_frames_that_are_not_stored_are_drawn(balls: Path, tmp_path: Path, monke
     ds = gen2d.open(balls)
     if "frames" in ds.manifest.fields:
         return  # the case of one ball
-    monkeypatch.setattr("gen2d.exports.DRAWN_BYTES", 4 * 4 * 64 * 96 * 3)  # four videos at a time: the last are two
+    monkeypatch.setattr(
+        "gen2d.exports.source.DRAWN_BYTES", 4 * 4 * 64 * 96 * 3
+    )  # four videos at a time: the last are two
     out, expected = gen2d.export(balls, "npz", tmp_path / "npz").out, np.asarray(gen2d.render(ds, range(6)))
     for number in range(6):
         with np.load(out / f"train-{number:09d}.npz") as archive:
@@ -328,11 +331,11 @@ def test_an_export_that_is_stopped_leaves_what_was_there(
 ) -> None:
     before = tree(gen2d.export(toy, "npz", tmp_path / "out").out)
 
-    def stopped(source: exports.Source) -> Iterator[Any]:
+    def stopped(source: source_module.Source) -> Iterator[Any]:
         yield source.ds[0]
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(exports.Source, "videos", stopped)
+    monkeypatch.setattr(source_module.Source, "videos", stopped)
     with pytest.raises(KeyboardInterrupt):
         gen2d.export(toy, "npz", tmp_path / "out")
     assert list(tmp_path.iterdir()) == [tmp_path / "out"]
@@ -372,8 +375,8 @@ def test_a_file_is_replaced_only_when_asked(balls: Path, tmp_path: Path) -> None
 
 
 def test_every_format_keeps_the_contract() -> None:
-    for name in exporting.formats():
-        module = exporting._module(name)
+    for name in export.formats():
+        module = export._module(name)
         assert (module.__doc__ or "").strip()
         assert isinstance(module.LOSS, str)
         assert isinstance(module.FIXED, bool)

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
-from gen2d.config import load_config
-from gen2d.factors import parse, seed_words, video_keys
-from gen2d.sampling import Sampler
+from gen2d.config.config import load_config
+from gen2d.config.distribution_syntax import parse
+from gen2d.records.keys import seed_words, video_keys
+from gen2d.sampling.sampler import Sampler
 
 COUNT = 20_000
 # Config value -> cumulative distribution function, or None where the counts are compared.

@@ -15,16 +15,21 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gen2d import cuts, gallery, plugins
-from gen2d.config import load_config
-from gen2d.contacts import Disc, Hull, Shape, touches
-from gen2d.distributions import Distribution, Span, after
-from gen2d.forms import form_of, placed
-from gen2d.options import Plugin, drawn_options
-from gen2d.rollout import rules_of
-from gen2d.sampling import Sampler
-from gen2d.simulate import simulate, substeps
-from gen2d.types import DYNAMIC, SHAPES, Layout, Objects, Run, Scene, State, to_device, to_stored
+from gen2d.config import plugins, truncation
+from gen2d.config.config import load_config
+from gen2d.config.distributions import Distribution, Span, after
+from gen2d.config.options import drawn_options
+from gen2d.config.plugin_options import Plugin
+from gen2d.core.enums import DYNAMIC, SHAPES
+from gen2d.physics.collision import Disc, Hull, Shape, touches
+from gen2d.physics.params import rules_of
+from gen2d.physics.shapes import form_of, placed
+from gen2d.physics.simulate import simulate, substeps
+from gen2d.records.axes import to_device, to_stored
+from gen2d.records.layout import Layout, Run
+from gen2d.records.scene import Objects, Scene, State
+from gen2d.sampling.sampler import Sampler
+from gen2d.tools import gallery
 
 FAMILIES = plugins.names("scene")
 KEYS, MANY, LANES = 256, 100_000, 500
@@ -161,7 +166,7 @@ def test_what_moves_begins_in_view(family):
 def distance(source: Distribution, values: np.ndarray) -> float:
     """The largest difference of the share of draws up to a number and of its probability."""
     x, counts = np.unique(values, return_counts=True)
-    expected = [cuts.total(cuts.inside(source, [Span(-np.inf, after(value))])) for value in x]
+    expected = [truncation.total(truncation.inside(source, [Span(-np.inf, after(value))])) for value in x]
     return float(np.abs(np.cumsum(counts) / len(values) - expected).max())
 
 

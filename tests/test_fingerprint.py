@@ -14,7 +14,7 @@ import yaml
 from tiny import changed, command
 
 import gen2d
-from gen2d.fingerprint import canonical, code_hash
+from gen2d.programs.fingerprint import canonical, code_hash
 
 Edit = Callable[[str, str, str], None]
 ROOT = Path(gen2d.__file__).parent.parent

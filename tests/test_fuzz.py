@@ -8,7 +8,8 @@ import fuzz
 import pytest
 from tiny import ran_here
 
-from gen2d.config import Config, from_mapping, load_config, parse_yaml
+from gen2d.config.config import Config, from_mapping, load_config
+from gen2d.config.reading import parse_yaml
 from gen2d.core.errors import LONGEST, ConfigError
 
 SECONDS = 10

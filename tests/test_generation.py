@@ -18,8 +18,8 @@ from tiny import CONFIG, CROWDED, changed, command, everything, ran, ran_here, r
 
 import gen2d
 from gen2d.core.errors import ConfigError, FolderError, UserError
-from gen2d.generation import generate
-from gen2d.rollout import Rollout
+from gen2d.generation.run import generate
+from gen2d.programs.rollout import Rollout
 
 N = 21
 
@@ -106,7 +106,7 @@ def test_a_video_does_not_depend_on_the_number_of_devices(tiny: Path, tmp_path: 
     config.write_text(yaml.safe_dump(CONFIG))
     for devices in {1, 3} - {len(jax.devices())}:  # those of this process made the other
         out = tmp_path / str(devices)
-        run_on(devices, f"from gen2d.generation import generate; generate({str(config)!r}, {N}, {str(out)!r})")
+        run_on(devices, f"from gen2d.generation.run import generate; generate({str(config)!r}, {N}, {str(out)!r})")
         same(everything(tiny), everything(out))
 
 

@@ -17,9 +17,9 @@ from laws import DOWN, FAR, FLOOR, GRAVITY, doubled, holds
 from numpy.testing import assert_array_equal
 from worlds import STEP, rules, turned, world
 
-from gen2d import types
-from gen2d.simulate import simulate
-from gen2d.types import Layout
+from gen2d.physics.simulate import simulate
+from gen2d.records import axes
+from gen2d.records.layout import Layout
 
 SECONDS = 1.0
 EPS = 1e-5
@@ -88,7 +88,7 @@ EVENTS = {
 
 def batch(worlds: list[tuple]) -> tuple:
     """The worlds as one batch in the device's layout: the numbers to differentiate by, scene, state and layout."""
-    scene, state = (types.to_device(jax.tree.map(lambda *x: jnp.stack(x), *(w[i] for w in worlds))) for i in (0, 1))
+    scene, state = (axes.to_device(jax.tree.map(lambda *x: jnp.stack(x), *(w[i] for w in worlds))) for i in (0, 1))
     names = ("radius", "mass", "moment", "elasticity", "friction")
     numbers = {name: getattr(scene.objects, name) for name in names} | {"gravity": scene.gravity}
     return numbers | {f.name: getattr(state, f.name) for f in dataclasses.fields(state)}, scene, state, worlds[0][2]

@@ -20,7 +20,7 @@ from laws import DOWN, FLOOR, GRAVITY, QUARTERS, Case, doubled, holds, posed, wa
 from numpy.testing import assert_array_equal
 from worlds import STEP, box, energies, momenta, rules, run, turned, world
 
-from gen2d.simulate import substeps
+from gen2d.physics.simulate import substeps
 
 SEEDS = st.integers(0, 2**31)
 

@@ -15,8 +15,8 @@ import gen2d
 from gen2d.core.errors import ConfigError, FolderError, UserError
 from gen2d.core.schema import Field
 from gen2d.loading import dataset as loader
-from gen2d.loading.protocols import Joined
-from gen2d.redraw import render
+from gen2d.loading.concat import Joined
+from gen2d.programs.redraw import render
 
 COUNTS = {3: 20, 4: 9, 5: 1}  # videos by seed
 TOTAL = 30

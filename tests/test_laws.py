@@ -10,13 +10,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
-from gen2d import cuts, factors
-from gen2d.config import load_config
+from gen2d.config import truncation
+from gen2d.config.config import load_config
+from gen2d.config.distribution_syntax import parse
+from gen2d.config.distributions import Distribution, Span, after
+from gen2d.config.joint_distribution import common, law_of
 from gen2d.core.errors import ConfigError
-from gen2d.distributions import Distribution, Span, after
-from gen2d.factors import parse
-from gen2d.laws import common, law_of
-from gen2d.sampling import Sampler
+from gen2d.records import keys as keys_module
+from gen2d.sampling.sampler import Sampler
 
 COUNT = 4000
 RED, BLUE = [255, 0, 0], [0, 0, 255]
@@ -43,13 +44,13 @@ def draws(source: Distribution, count: int = COUNT) -> np.ndarray:
 @given(DISTRIBUTIONS, DISTRIBUTIONS)
 def test_what_is_cut_is_inside_or_outside_and_both_are_all(one, other):
     source, region = parse(one), parse(other).spans
-    inside, outside = cuts.inside(source, region), cuts.outside(source, region)
-    assert_allclose(cuts.total(inside) + cuts.total(outside), 1, atol=1e-6)
+    inside, outside = truncation.inside(source, region), truncation.outside(source, region)
+    assert_allclose(truncation.total(inside) + truncation.total(outside), 1, atol=1e-6)
     held = np.any([span.contains(draws(source)) for span in region], axis=0)
-    assert_allclose(held.mean(), cuts.total(inside), atol=4 * 0.5 / np.sqrt(COUNT))
+    assert_allclose(held.mean(), truncation.total(inside), atol=4 * 0.5 / np.sqrt(COUNT))
     for pieces, expected in ((inside, True), (outside, False)):
         if pieces:
-            values = draws(cuts.mixture(pieces), 400)
+            values = draws(truncation.mixture(pieces), 400)
             assert source.contains(values).all()
             assert (np.any([span.contains(values) for span in region], axis=0) == expected).all()
 
@@ -160,9 +161,9 @@ def _drawn(of, keys, row, given):
 
 
 def drawn(config, of, split, count=COUNT):
-    words, numbers = factors.seed_words(3, 7), np.arange(count, dtype=np.uint32)
+    words, numbers = keys_module.seed_words(3, 7), np.arange(count, dtype=np.uint32)
     given = of.combination(config.row(split), words, numbers)
-    found = _drawn(of, factors.video_keys(jnp.asarray(words), jnp.asarray(numbers)), config.row(split), given)
+    found = _drawn(of, keys_module.video_keys(jnp.asarray(words), jnp.asarray(numbers)), config.row(split), given)
     return [{name: np.asarray(values) for name, values in each.items()} for each in found]
 
 

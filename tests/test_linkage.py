@@ -8,9 +8,10 @@ import pytest
 from numpy.testing import assert_allclose
 
 from gen2d import Space
-from gen2d.linkage import factored, plan_of, solved
-from gen2d.space import Video
-from gen2d.types import Tie
+from gen2d.physics.banded import factored, solved
+from gen2d.physics.rigid_joints import plan_of
+from gen2d.records.layout import Tie
+from gen2d.space.video import Video
 
 
 @pytest.mark.parametrize(("rows", "width"), [(1, 1), (2, 2), (3, 1), (7, 3), (20, 4), (6, 6)])

@@ -165,5 +165,5 @@ def test_files_are_closed_when_many_are_open(tmp_path: Path) -> None:
 
 def test_no_jax_is_imported() -> None:
     code = "import sys, gen2d.loading.dataloader; assert 'jax' not in sys.modules and 'h5py' not in sys.modules;"
-    code += "import gen2d.dataset.folder, gen2d.verification; assert 'jax' not in sys.modules"
+    code += "import gen2d.dataset.folder, gen2d.tools.verify; assert 'jax' not in sys.modules"
     subprocess.run([sys.executable, "-c", code], check=True)

@@ -14,15 +14,19 @@ import pytest
 from numpy.testing import assert_array_equal
 from worlds import world
 
-from gen2d import drawing, looks, paint, plugins, raster
-from gen2d.config import load_config
-from gen2d.types import SHAPES, STATIC, Layout, Run
+from gen2d.config import plugins
+from gen2d.config.config import load_config
+from gen2d.core.enums import SHAPES, STATIC
+from gen2d.programs import render
+from gen2d.records.layout import Layout, Run
+from gen2d.renderers import color as color_module
+from gen2d.renderers import look, rasterizer
 
 LOOKS = plugins.names("look")
 RANDOM = [name for name in LOOKS if hasattr(plugins.load("look", name).Options, "palette")]
 FREE = {"palette": "random", "contrast": 150.0}
 HEIGHT, WIDTH = 40, 44
-PATCHES, DENSE = (jax.jit(form, static_argnums=1) for form in (raster.draw_patches, raster.draw_dense))
+PATCHES, DENSE = (jax.jit(form, static_argnums=1) for form in (rasterizer.draw_patches, rasterizer.draw_dense))
 DISCS = Layout((Run("circle", 4),), (0.0, 0.0, 10.0, 10.0), 1.6)
 SHAPES_ALL = Layout(
     (*DISCS.runs, *(Run(shape, 2) for shape in SHAPES[2:]), Run("segment", 4, STATIC)), DISCS.bounds, 1.6
@@ -57,7 +61,7 @@ def keys(count):
 def painter(name, layout, **options):
     """The compiled paints of one scene."""
     config = config_of(name, **options)
-    return jax.jit(jax.vmap(lambda key: drawing.paint_of(key, config, scene_of(layout)[0], layout)))
+    return jax.jit(jax.vmap(lambda key: render.paint_of(key, config, scene_of(layout)[0], layout)))
 
 
 def painted(name, count, layout=DISCS, **options):
@@ -70,8 +74,8 @@ def drawn(name):
     """Two videos in a look as it is without options: stages, plan, and the frames [n, H, W, 3] in the form for CPUs."""
     config, (scene, states) = config_of(name), scene_of(DISCS)
 
-    plan = drawing.plan_of(config, DISCS)
-    stages = jax.vmap(lambda key: drawing.stage_of(key, config, plan, scene, states))(keys(2))
+    plan = render.plan_of(config, DISCS)
+    stages = jax.vmap(lambda key: render.stage_of(key, config, plan, scene, states))(keys(2))
     return stages, plan, np.asarray(PATCHES(stages, plan)[0])[:, 0]
 
 
@@ -105,7 +109,7 @@ def test_a_look_paints_all_that_is_there_and_no_more(name):
     assert_array_equal(made.drawn, np.tile(there, (3, 1)))
     for color in (made.color, made.fill, made.rim_color, made.mark_color, made.background.color):
         assert color is None or ((color >= 0) & (color <= 255)).all()
-    margin = drawing.plan_of(config_of(name), SHAPES_ALL).grow
+    margin = render.plan_of(config_of(name), SHAPES_ALL).grow
     assert made.grow is None or made.grow.max() <= margin
 
 
@@ -113,7 +117,7 @@ def test_a_look_paints_all_that_is_there_and_no_more(name):
 def test_the_colour_that_is_stored_is_painted(name):
     stages, plan, frames = drawn(name)
     scene, states = scene_of(DISCS)
-    stored = np.asarray(jax.vmap(lambda made: drawing.painted_colors(made, scene))(stages.paint))
+    stored = np.asarray(jax.vmap(lambda made: render.painted_colors(made, scene))(stages.paint))
     assert stored.dtype == np.uint8
     assert not stored[:, 3].any()
     rows, columns = np.mgrid[:HEIGHT, :WIDTH] + 0.5
@@ -146,7 +150,7 @@ def test_one_key_paints_the_same_and_another_key_what_is_random(name):
 def test_random_colours_can_be_told_apart(name):
     made = painted(name, 4, **FREE)
     colors = np.asarray(made.color)[:, :3]
-    behind = np.asarray(jax.vmap(looks.shades)(made.background))
+    behind = np.asarray(jax.vmap(look.shades)(made.background))
     for shade in range(behind.shape[1]):
         assert least(np.concatenate([behind[:, shade : shade + 1], colors], 1)).min() >= 150
 
@@ -161,14 +165,14 @@ def test_random_colours_are_the_same_in_all_looks_on_one_background():
 
 def least(colors):
     """The least contrast [n] of two of some colours [n, count, 3]."""
-    apart = np.asarray(paint.contrast(jnp.asarray(colors)[:, :, None], jnp.asarray(colors)[:, None]))
+    apart = np.asarray(color_module.contrast(jnp.asarray(colors)[:, :, None], jnp.asarray(colors)[:, None]))
     return np.where(np.eye(colors.shape[1], dtype=bool), np.inf, apart).min((1, 2))
 
 
 @functools.partial(jax.jit, static_argnums=1)
 @functools.partial(jax.vmap, in_axes=(0, None, None, 0))
 def chosen(key, count, distance, behind):
-    return paint.palette(key, count, distance, behind[None])
+    return color_module.palette(key, count, distance, behind[None])
 
 
 def palettes(count, distance, videos=200):
@@ -197,8 +201,8 @@ def test_a_palette_that_is_asked_for_too_much_gives_colours_far_apart():
 def test_contrast_is_a_distance_of_765_at_most():
     rng = np.random.default_rng(3)
     a, b = np.float32(rng.uniform(0, 255, (2, 1000, 3)))
-    one, other = paint.contrast(a, b), paint.contrast(b, a)
+    one, other = color_module.contrast(a, b), color_module.contrast(b, a)
     assert_array_equal(one, other)
-    assert_array_equal(paint.contrast(a, a), 0)
+    assert_array_equal(color_module.contrast(a, a), 0)
     assert np.max(one) < 765
-    assert 764 < paint.contrast(np.zeros(3, np.float32), np.full(3, 255, np.float32)) < 765
+    assert 764 < color_module.contrast(np.zeros(3, np.float32), np.full(3, 255, np.float32)) < 765

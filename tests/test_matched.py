@@ -11,15 +11,18 @@ from numpy.testing import assert_allclose, assert_array_equal
 from tiny import everything
 
 import gen2d
-from gen2d import matched
-from gen2d.config import load_config
+from gen2d.config import matched
+from gen2d.config.config import load_config
+from gen2d.core.enums import STATIC
 from gen2d.core.errors import ConfigError, FolderError
-from gen2d.parts import assembled, boxes, capsules, discs
-from gen2d.sampling import Sampler
-from gen2d.types import STATIC, Layout
+from gen2d.records.layout import Layout
+from gen2d.sampling.builder import assembled, boxes, capsules, discs
+from gen2d.sampling.matched import counterfactuals, violations
+from gen2d.sampling.matched import sets as sets_module
+from gen2d.sampling.sampler import Sampler
 
 MEMBERS, VIDEOS, FPS = 3, 241, 20  # 80 sets and an original
-CHANGES = [*matched.ACTS, "density", "gravity"]
+CHANGES = [*matched.INTERVENTIONS, "density", "gravity"]
 CONFIG = {
     "name": "sets",
     "video": {"frames": 16, "fps": FPS, "height": 16, "width": 20},
@@ -174,8 +177,8 @@ def drawn(*sets: str) -> tuple[Videos, Videos]:
     key, sampler = jax.random.key(3), Sampler(config)
 
     def factors(number: jax.Array) -> dict[str, jax.Array]:
-        member = matched._member(key, number, config.matched, 8)
-        return sampler.drawn(key, change=lambda *found: matched._other_factors(member, config, *found))
+        member = sets_module._member(key, number, config.matched, 8)
+        return sampler.drawn(key, change=lambda *found: counterfactuals._other_factors(member, config, *found))
 
     found = {name: np.asarray(values) for name, values in jax.jit(jax.vmap(factors))(jnp.arange(256)).items()}
     return {name: values[0] for name, values in found.items()}, {name: values[1:] for name, values in found.items()}
@@ -279,7 +282,7 @@ def test_a_gap_is_that_to_the_rim():
     scene, state = assembled(Layout(tuple(part.run for part in parts)), parts, jnp.zeros(2))
     points = np.random.default_rng(0).uniform(-8, 8, (500, 2))
     gap = np.asarray(
-        jax.vmap(lambda point: matched.gaps(point, scene.objects, state))(jnp.asarray(points, jnp.float32))
+        jax.vmap(lambda point: violations.gaps(point, scene.objects, state))(jnp.asarray(points, jnp.float32))
     )
     assert_allclose(gap[:, 0], np.linalg.norm(points - [2, 1], axis=1) - 0.5, atol=1e-5)
     along = np.clip((points - [6, 5]) @ [np.cos(0.3), np.sin(0.3)], -1, 1)
@@ -289,7 +292,7 @@ def test_a_gap_is_that_to_the_rim():
     outside = np.linalg.norm(np.maximum(local, 0), axis=1)
     assert_allclose(gap[:, 2], local.max(1), atol=1e-5)
     assert (gap[:, 2] <= outside + 1e-5).all()
-    assert_allclose(matched.extent(scene.objects), [0.5, 1.25, np.hypot(1, 0.5)], rtol=1e-6)
+    assert_allclose(violations.extent(scene.objects), [0.5, 1.25, np.hypot(1, 0.5)], rtol=1e-6)
 
 
 # ---- The rest of the program
@@ -372,8 +375,8 @@ def test_without_sets_nothing_is_told_and_keys_are_the_videos_own():
     plain: dict[str, Any] = {name: options for name, options in CONFIG.items() if name != "matched"}
     config = load_config(plain)
     words, numbers = jnp.zeros(3, jnp.uint32), jnp.arange(6, dtype=jnp.uint32)
-    assert matched.fields(config.matched) == {}
-    keys = jax.random.key_data(matched.keys_of(words, numbers, config.matched))
+    assert sets_module.fields(config.matched) == {}
+    keys = jax.random.key_data(sets_module.keys_of(words, numbers, config.matched))
     assert len(np.unique(keys, axis=0)) == 6
-    of_sets = jax.random.key_data(matched.keys_of(words, numbers, load_config(CONFIG).matched))
+    of_sets = jax.random.key_data(sets_module.keys_of(words, numbers, load_config(CONFIG).matched))
     assert_array_equal(of_sets, np.repeat(keys[:2], 3, axis=0))

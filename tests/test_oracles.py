@@ -28,7 +28,7 @@ from oracles import (
 )
 from worlds import STEP, energies, momenta, run, world
 
-from gen2d.simulate import Keep
+from gen2d.physics.simulate import Keep
 
 GRAVITY = 9.81  # m/s^2
 FRAME = 1 / 60  # s

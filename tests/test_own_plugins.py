@@ -15,19 +15,19 @@ from test_verification import flip
 from tiny import changed, ran_here
 
 import gen2d
-from gen2d import plugins
-from gen2d.config import load_config
+from gen2d.config import plugins
+from gen2d.config.config import load_config
+from gen2d.config.trust import list_path
 from gen2d.core.errors import ConfigError, FolderError, UntrustedError
 from gen2d.dataset.manifest import read_manifest
-from gen2d.generation import generate
-from gen2d.redraw import config_of
-from gen2d.regeneration import repair
+from gen2d.generation.regenerate import repair
+from gen2d.generation.run import generate
+from gen2d.programs.recipe import config_of
 from gen2d.scenes import bouncing
 from gen2d.storage.sealed import sha256
-from gen2d.trust import list_path
-from gen2d.verification import verify
+from gen2d.tools.verify import verify
 
-flat = importlib.import_module("gen2d.renderers.flat")
+flat = importlib.import_module("gen2d.renderers.looks.flat")
 COPIES = ["plugins/look/mine.py", "plugins/scene/mine.py"]
 
 

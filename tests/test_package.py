@@ -127,7 +127,7 @@ def test_a_checkout_makes_only_the_two_folders_importable():
 def test_public_names_stay_callable_after_their_modules_are_imported():
     for name in gen2d.__all__:
         assert callable(getattr(gen2d, name))
-    importlib.import_module("gen2d.generation")
-    importlib.import_module("gen2d.verification")
+    importlib.import_module("gen2d.generation.run")
+    importlib.import_module("gen2d.tools.verify")
     for name in gen2d.__all__:
         assert callable(getattr(gen2d, name)), name

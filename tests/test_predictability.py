@@ -9,9 +9,12 @@ import pytest
 from numpy.testing import assert_allclose
 from worlds import STEP, box, rules, world
 
-from gen2d import factors, predictability, types
-from gen2d.predictability import SMALL, direction, last, size
-from gen2d.simulate import simulate
+from gen2d.physics import lyapunov
+from gen2d.physics.lyapunov import SMALL, direction, last, size
+from gen2d.physics.simulate import simulate
+from gen2d.records import axes
+from gen2d.records import keys as keys_module
+from gen2d.records import scene as scene_module
 
 FRAMES, STEPS = 61, 4
 SECONDS = (FRAMES - 1) * STEPS * STEP
@@ -30,19 +33,19 @@ def made() -> tuple:
     discs = [[{"x": (x, 5), "v": v} for x, v in zip(COLUMNS, speeds, strict=True)] for speeds in VELOCITIES.values()]
     worlds = [world(balls, box(10)) for balls in discs]
     scene, state = (jax.tree.map(lambda *x: jnp.stack(x), *(w[i] for w in worlds)) for i in (0, 1))
-    keys = factors.video_keys(jnp.asarray(factors.seed_words(3, 0)), jnp.arange(len(worlds), dtype=jnp.uint32))
+    keys = keys_module.video_keys(jnp.asarray(keys_module.seed_words(3, 0)), jnp.arange(len(worlds), dtype=jnp.uint32))
     run = functools.partial(simulate, layout=worlds[0][2], rules=rules(), frames=FRAMES, steps=STEPS, sparse=True)
-    return keys, types.to_device(scene), types.to_device(state), run
+    return keys, axes.to_device(scene), axes.to_device(state), run
 
 
 @functools.cache
 def growths() -> dict[str, float]:
     keys, scene, state, run = made()
-    found = jax.jit(lambda k, a, b: predictability.growth(k, a, b, run, SECONDS))(keys, scene, state)
+    found = jax.jit(lambda k, a, b: lyapunov.growth(k, a, b, run, SECONDS))(keys, scene, state)
     return dict(zip(VELOCITIES, np.asarray(found, float).tolist(), strict=True))
 
 
-def change() -> types.State:
+def change() -> scene_module.State:
     keys, scene, state, _ = made()
     return jax.tree.map(lambda x: np.asarray(x, float) / SMALL, direction(keys, scene, state))
 

@@ -18,18 +18,17 @@ from crashes import every_crash
 from numpy.testing import assert_array_equal
 
 import gen2d
-from gen2d import complete as completion
-from gen2d import verification
 from gen2d.core.errors import ConfigError, FolderError
 from gen2d.dataset import folder, records
 from gen2d.dataset.folder import clean, open_folder
 from gen2d.dataset.manifest import read_manifest
 from gen2d.dataset.shard_writer import ShardWriter
 from gen2d.dataset.spec import DatasetSpec, Shard, plan
-from gen2d.generation import generate
+from gen2d.generation import complete as completion
+from gen2d.generation.run import generate
 from gen2d.storage import leases
 from gen2d.storage.paths import Place, place
-from gen2d.verification import verify
+from gen2d.tools.verify import verify
 
 FIELDS = {name: synthetic.FIELDS[name] for name in ("frames", "index", "objects/mass", "time")}
 
@@ -290,7 +289,7 @@ def test_verify_while_a_dataset_grows(tmp_path: Path, between: Between, step: st
     run(dataset(root, {"train": 12}))
     growth = dataset(root, {"train": 30})
     work(growth)
-    between(verification, step, lambda: completion.complete(growth))
+    between(verify, step, lambda: completion.complete(growth))
     assert verify(root) == []
     assert splits(root) == {"train": 30}
 

@@ -15,18 +15,19 @@ from numpy.testing import assert_allclose, assert_array_equal
 from tiny import CONFIG
 from worlds import flown, outline, polygon_areas
 
-from gen2d import raster
-from gen2d.camera import View
-from gen2d.config import load_config
-from gen2d.figures import Bodies, Instants
-from gen2d.layers import OCCLUDER
-from gen2d.paint import Background, Paint, Texture
-from gen2d.picture import Occluders, Plan, Stage
-from gen2d.rollout import Batch, Rollout
-from gen2d.types import STATIC, Layout, Run
+from gen2d.config.config import load_config
+from gen2d.core.enums import STATIC
+from gen2d.programs.rollout import Batch, Rollout
+from gen2d.records.layout import Layout, Run
+from gen2d.renderers import rasterizer
+from gen2d.renderers.camera import View
+from gen2d.renderers.compositing import OCCLUDER
+from gen2d.renderers.paint import Background, Paint, Texture
+from gen2d.renderers.plan import Occluders, Plan, Stage
+from gen2d.renderers.primitives import Bodies, Instants
 
-PATCHES, DENSE = (jax.jit(form, static_argnums=1) for form in (raster.draw_patches, raster.draw_dense))
-SOFT = jax.jit(jax.vmap(raster.draw_soft, in_axes=(0, None)), static_argnums=1)
+PATCHES, DENSE = (jax.jit(form, static_argnums=1) for form in (rasterizer.draw_patches, rasterizer.draw_dense))
+SOFT = jax.jit(jax.vmap(rasterizer.draw_soft, in_axes=(0, None)), static_argnums=1)
 REACH = 1.5  # m, of all that moves
 
 
@@ -494,7 +495,7 @@ def test_frames_change_as_their_slopes_say():
         return made._replace(bodies=real["bodies"], instants=real["instants"], paint=paint)
 
     def soft(real):
-        return (np.float32(weight) * raster.draw_soft(staged(real), plan)).sum()
+        return (np.float32(weight) * rasterizer.draw_soft(staged(real), plan)).sum()
 
     def exact(real):
         return sum((weight[t] * exact_frame(staged(real), plan, t)).sum() for t in range(2))

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from tiny import ran
 
-from gen2d.config import load_config
+from gen2d.config.config import load_config
 
 README = Path(__file__).parent.parent / "README.md"
 BLOCKS = re.findall(r"```(\w+)\n(.*?)```", README.read_text(encoding="utf-8"), re.S)

@@ -22,9 +22,9 @@ from test_regeneration import contents
 
 import gen2d
 from gen2d.dataset.folder import clean
-from gen2d.generation import generate
-from gen2d.regeneration import repair
-from gen2d.verification import checked, verify
+from gen2d.generation.regenerate import repair
+from gen2d.generation.run import generate
+from gen2d.tools.verify import checked, verify
 
 CONFIG = tiny.changed(video={"frames": 12, "height": 32, "width": 32}, annotations={"masks": True})
 slow = pytest.mark.slow

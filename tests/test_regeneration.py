@@ -10,9 +10,9 @@ from test_verification import flip
 from tiny import changed, ran
 
 from gen2d.core.errors import FolderError
-from gen2d.generation import generate
-from gen2d.regeneration import repair
-from gen2d.verification import checked, chosen_videos, verify
+from gen2d.generation.regenerate import repair
+from gen2d.generation.run import generate
+from gen2d.tools.verify import checked, chosen_videos, verify
 
 
 @pytest.fixture(scope="module")

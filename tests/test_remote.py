@@ -24,7 +24,6 @@ from buckets import Request, Server
 from numpy.testing import assert_array_equal
 
 import gen2d
-from gen2d.complete import complete
 from gen2d.core.errors import ConfigError, DamagedError, FolderError, UnreachableError, UserError
 from gen2d.dataset import hdf5
 from gen2d.dataset.folder import log, open_folder
@@ -32,6 +31,7 @@ from gen2d.dataset.manifest import read_manifest
 from gen2d.dataset.records import read_tables
 from gen2d.dataset.rows import origin, sealed_rows
 from gen2d.dataset.spec import DatasetSpec, mine
+from gen2d.generation.complete import complete
 from gen2d.loading import dataset as loader
 from gen2d.loading.dataloader import DataLoader
 from gen2d.storage import paths as remote
@@ -579,7 +579,7 @@ def test_a_wrong_url_is_one_sentence(url: str, told: str) -> None:
     ("url", "missing"), [("s3://bucket/toy", "fsspec"), ("s3://bucket/toy", "s3fs"), ("memory://toy", "fsspec")]
 )
 def test_a_missing_package_is_one_sentence(url: str, missing: str) -> None:
-    code = f"import sys; sys.modules[{missing!r}] = None; from gen2d.__main__ import main; main(['info', {url!r}])"
+    code = f"import sys; sys.modules[{missing!r}] = None; from gen2d.cli.main import main; main(['info', {url!r}])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 2
     assert re.fullmatch(r"gen2d: .* needs .*: pip install 'gen2d\[remote\]'\n", done.stderr), done.stderr

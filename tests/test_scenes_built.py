@@ -10,12 +10,14 @@ import pytest
 from laws import holds
 from tiny import ran
 
-from gen2d.config import load_config
+from gen2d.config.config import load_config
 from gen2d.core.errors import ConfigError
-from gen2d.rollout import rules_of
-from gen2d.sampling import Sampler
-from gen2d.simulate import Keep, simulate, substeps
-from gen2d.types import Layout, Scene, State, to_device, to_stored
+from gen2d.physics.params import rules_of
+from gen2d.physics.simulate import Keep, simulate, substeps
+from gen2d.records.axes import to_device, to_stored
+from gen2d.records.layout import Layout
+from gen2d.records.scene import Scene, State
+from gen2d.sampling.sampler import Sampler
 
 GRAVITY = 9.8  # m/s^2, the default
 

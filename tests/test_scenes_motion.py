@@ -16,13 +16,14 @@ from numpy.testing import assert_array_equal
 from tiny import everything
 
 import gen2d
-from gen2d.config import Config, load_config
+from gen2d.config.config import Config, load_config
 from gen2d.core.errors import ConfigError
-from gen2d.generation import generate
-from gen2d.rollout import keep_of, rules_of
-from gen2d.sampling import Sampler
-from gen2d.simulate import simulate, substeps
-from gen2d.types import to_device, to_stored
+from gen2d.generation.run import generate
+from gen2d.physics.params import rules_of
+from gen2d.physics.simulate import simulate, substeps
+from gen2d.programs.rollout import keep_of
+from gen2d.records.axes import to_device, to_stored
+from gen2d.sampling.sampler import Sampler
 
 FAMILIES = ("uniform_motion", "collision", "parabola")
 SIDE, FPS, STAYS = 10.0, 10.0, 2.4  # m, 1/s, s: of the study

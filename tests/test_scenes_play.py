@@ -11,9 +11,9 @@ import pytest
 from laws import holds
 from numpy.testing import assert_array_equal
 
-from gen2d.config import load_config
+from gen2d.config.config import load_config
 from gen2d.core.errors import ConfigError
-from gen2d.rollout import Rollout, parts
+from gen2d.programs.rollout import Rollout, parts
 
 # Of each family what a law needs beside its config.
 LAWS = {

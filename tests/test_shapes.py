@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
-from gen2d.shapes import (
+from gen2d.physics.inertia import (
     box_vertices,
     disc_mass,
     disc_moment,

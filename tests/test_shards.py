@@ -20,13 +20,13 @@ import pytest
 import synthetic
 from numpy.testing import assert_allclose, assert_array_equal
 
-from gen2d.complete import complete
 from gen2d.core.errors import DamagedError, FolderError
 from gen2d.dataset import hdf5
 from gen2d.dataset.block import Block, encode, head
 from gen2d.dataset.folder import free_bytes, log, open_folder
 from gen2d.dataset.manifest import read_manifest
 from gen2d.dataset.spec import mine, plan
+from gen2d.generation.complete import complete
 from gen2d.storage import codecs
 from gen2d.storage.leases import leased
 

@@ -10,11 +10,11 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 import gen2d
-from gen2d import space as space_module
 from gen2d.core.errors import ConfigError
-from gen2d.simulate import simulate
-from gen2d.space import Space
-from gen2d.types import to_device, to_stored
+from gen2d.physics.simulate import simulate
+from gen2d.records.axes import to_device, to_stored
+from gen2d.space import arrange as space_module
+from gen2d.space.space import Space
 
 GRAVITY = 9.8
 

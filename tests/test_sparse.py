@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 from worlds import box, rules, run, world
 
-from gen2d import types
-from gen2d.contacts import Disc, Hull, Stadium, edge_normals, hull
-from gen2d.near import around, bits_in_ring, bits_of, clearance, listed, ring_of, spots
-from gen2d.simulate import Keep, simulate
-from gen2d.space import Space
-from gen2d.tournament import Match, meetings
+from gen2d.physics.broad_phase import around, bits_in_ring, bits_of, clearance, listed, ring_of, spots
+from gen2d.physics.collision import Disc, Hull, Stadium, edge_normals, hull
+from gen2d.physics.schedule import Match, meetings
+from gen2d.physics.simulate import Keep, simulate
+from gen2d.records import axes, trajectory
+from gen2d.records import scene as scene_module
+from gen2d.space.space import Space
 
 EVERYTHING = Keep(contacts=300, energy=True)
 
@@ -28,7 +29,7 @@ def gas(seed: int, discs: int, **more: float) -> tuple:
     return world(rows, box(side, 0.9, 0.2, (side / 2, side / 2)), (0, -9.81))
 
 
-def assert_alike(ours: types.Trajectory, theirs: types.Trajectory, within: float) -> None:
+def assert_alike(ours: trajectory.Trajectory, theirs: trajectory.Trajectory, within: float) -> None:
     """Both trajectories are the same but for what grows out of rounding."""
     for (path, a), b in zip(jax.tree_util.tree_leaves_with_path(ours), jax.tree.leaves(theirs), strict=True):
         name = jax.tree_util.keystr(path)
@@ -67,14 +68,14 @@ def test_both_forms_give_the_same_mixture():
     space.add_circle((-2.1, 1.5), 0.3)
     space.add_circle((0.1, 1.9), 0.3)
     scene, state, layout = space.scene()
-    many = [types.to_device(jax.tree.map(lambda x: jnp.asarray(x)[None], record)) for record in (scene, state)]
+    many = [axes.to_device(jax.tree.map(lambda x: jnp.asarray(x)[None], record)) for record in (scene, state)]
 
-    def wind(state: types.State, time: jax.Array) -> tuple:
+    def wind(state: scene_module.State, time: jax.Array) -> tuple:
         return jnp.stack([jnp.cos(time) - 0.1 * state.velocity[0], 0 * state.angle]), -0.1 * state.angular_velocity
 
-    def made(sparse: bool) -> types.Trajectory:
+    def made(sparse: bool) -> trajectory.Trajectory:
         program = jax.jit(lambda a, b: simulate(a, b, layout, rules(), 31, 4, EVERYTHING, wind, sparse))
-        return jax.tree.map(np.asarray, types.to_stored(program(many[0], many[1])))
+        return jax.tree.map(np.asarray, axes.to_stored(program(many[0], many[1])))
 
     ours, theirs = made(True), made(False)
     assert ours.contacts is not None

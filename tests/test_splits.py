@@ -8,13 +8,15 @@ from numpy.testing import assert_array_equal
 from synthetic import tree
 
 import gen2d
-from gen2d import devices, factors, quality
-from gen2d.config import load_config
+from gen2d.config.config import load_config
+from gen2d.config.joint_distribution import common
 from gen2d.core.errors import ConfigError
-from gen2d.laws import common
-from gen2d.loading.epochs import hashed
-from gen2d.rollout import Batch, Rollout
-from gen2d.sampling import Sampler
+from gen2d.core.permutation import hashed
+from gen2d.programs import devices
+from gen2d.programs.rollout import Batch, Rollout
+from gen2d.records import keys as keys_module
+from gen2d.sampling import rejection
+from gen2d.sampling.sampler import Sampler
 
 CONFIG = {
     "name": "tiny",
@@ -95,7 +97,7 @@ def test_the_study_s_splits_have_nothing_in_common_with_training_and_start_in_vi
     starts = jax.jit(jax.vmap(of.sampled, (0, None)))
     for row, split in enumerate(config.splits):
         assert (common(training.law, split.law) is None) == (split.name not in ("train", "test"))
-        keys = factors.video_keys(jnp.asarray(factors.seed_words(0, row)), jnp.arange(500, dtype=jnp.uint32))
+        keys = keys_module.video_keys(jnp.asarray(keys_module.seed_words(0, row)), jnp.arange(500, dtype=jnp.uint32))
         drawn, made = jax.tree.map(np.asarray, starts(keys, row))
         position, radius = made.state.position, made.scene.objects.radius
         assert np.isfinite(position).all()
@@ -155,7 +157,7 @@ def test_a_video_does_not_depend_on_what_is_made_with_it():
     options = load_config(CONFIG | {"quality": {"contacts_most": 1}}).quality
     for count in (1, 3, 8):
         numbers = np.arange(count)
-        _, chosen = quality.fitting(lambda lanes, attempts: _batch(luck(lanes, attempts)), numbers, options)
+        _, chosen = rejection.fitting(lambda lanes, attempts: _batch(luck(lanes, attempts)), numbers, options)
         for number in numbers:
             tries = luck(np.full(1000, number), np.arange(1000))
             assert chosen[number] == np.argmax(tries <= 1)
@@ -168,7 +170,7 @@ def _batch(values: np.ndarray) -> Batch:
 def test_a_kind_that_there_is_not_is_said(tmp_path):
     asked = {"contacts_least": 500, "attempts": 20}
     with pytest.raises(
-        quality.NoVideoError, match="none of 20 attempts at video 0 has quality/contacts from 500 to inf"
+        rejection.NoVideoError, match="none of 20 attempts at video 0 has quality/contacts from 500 to inf"
     ):
         gen2d.generate(CONFIG | {"quality": asked}, 2, tmp_path / "none")
     for wrong, message in (

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 import synthetic
 
-from gen2d.complete import complete
 from gen2d.core.errors import ConfigError, DamagedError, FolderError
 from gen2d.dataset.block import encode
 from gen2d.dataset.folder import open_folder
+from gen2d.generation.complete import complete
 from gen2d.loading import dataset as loader
-from gen2d.verification import damaged_shards, verify
+from gen2d.tools.verify import damaged_shards, verify
 
 
 @pytest.fixture(scope="module")

@@ -18,8 +18,9 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
 import gen2d
-from gen2d import words
-from gen2d.config import load_config
+from gen2d.captions import caption
+from gen2d.captions import events as events_module
+from gen2d.config.config import load_config
 from gen2d.core.errors import ConfigError
 from gen2d.core.schema import Field
 
@@ -183,7 +184,7 @@ def rows_of(made: dict[str, np.ndarray]) -> list[tuple[int, ...]]:
 @pytest.mark.parametrize("seed", range(20))
 def test_every_impact_is_told_once_unless_the_pair_was_in_touch(seed: int) -> None:
     made = seen(seed)
-    told = [(e.frame, e.about["a"], e.about["b"]) for e in words.events_of(made, VIDEO) if e.kind == "hit"]
+    told = [(e.frame, e.about["a"], e.about["b"]) for e in events_module.events_of(made, VIDEO) if e.kind == "hit"]
     rows, impacts = rows_of(made), []
     for kind, frame, a, b, time in rows:
         before = [r for r in rows if r[1:4] == (frame - 1, a, b)]
@@ -196,7 +197,7 @@ def test_every_impact_is_told_once_unless_the_pair_was_in_touch(seed: int) -> No
 
 @pytest.mark.parametrize("seed", range(20))
 def test_events_are_in_times_order_and_each_lies_in_the_interval_before_its_frame(seed: int) -> None:
-    events = json.loads(words.as_json(words.events_of(seen(seed), VIDEO), 10**6))
+    events = json.loads(events_module.as_json(events_module.events_of(seen(seed), VIDEO), 10**6))
     times, frames = (np.array([event[name] for event in events]) for name in ("time", "frame"))
     assert (np.diff(times) >= 0).all()
     assert (times <= frames / VIDEO.fps + 1e-5).all()
@@ -218,34 +219,34 @@ def test_a_ball_leaves_when_its_rim_crosses_the_edge_and_comes_back_when_it_does
     made["camera/angle"] = np.full(VIDEO.frames, angle, np.float32)
     for direction, side in ((to_right, "right"), (-to_right, "left")):
         made["states/position"][:, 0] = np.array([4, 3]) + way[:, None] * direction
-        left, entered = words.passages(made, VIDEO)
+        left, entered = events_module.passages(made, VIDEO)
         assert (left.kind, entered.kind) == ("leaves", "enters")
         assert left.about == entered.about == {"a": 0, "side": side}
         assert_allclose([left.time, entered.time], [0.25, 0.8 + 3.3 / 6], atol=1e-5)
     made["states/position"][:, 0] = np.array([4, 3]) + (way[:, None] - 1) * up
-    assert [event.about["side"] for event in words.passages(made, VIDEO)] == ["top", "top"]
+    assert [event.about["side"] for event in events_module.passages(made, VIDEO)] == ["top", "top"]
 
 
 def test_rest_is_told_where_all_is_still_to_the_end() -> None:
     made = seen(0)
     made["states/velocity"][11:] = 0
-    assert [(event.frame, event.time) for event in words.rests(made, VIDEO.fps)] == [(11, 0.55)]
+    assert [(event.frame, event.time) for event in events_module.rests(made, VIDEO.fps)] == [(11, 0.55)]
     made["states/velocity"][-1, 1] = 1
-    assert words.rests(made, VIDEO.fps) == []
+    assert events_module.rests(made, VIDEO.fps) == []
     made["states/velocity"][:] = 0  # it never moved
-    assert words.rests(made, VIDEO.fps) == []
+    assert events_module.rests(made, VIDEO.fps) == []
     made["states/angular_velocity"][:5, 2] = 3
-    assert [event.frame for event in words.rests(made, VIDEO.fps)] == [5]
+    assert [event.frame for event in events_module.rests(made, VIDEO.fps)] == [5]
 
 
 @settings(max_examples=50, deadline=None)
 @given(seed=st.integers(0, 1000), width=st.integers(2, 3000))
 def test_events_that_do_not_fit_are_left_out_whole(seed: int, width: int) -> None:
-    events = words.events_of(seen(seed), VIDEO)
-    text = words.as_json(events, width)
+    events = events_module.events_of(seen(seed), VIDEO)
+    text = events_module.as_json(events, width)
     assert len(text) <= width
     found = json.loads(text)
-    assert found == json.loads(words.as_json(events, 10**6))[: len(found)]
+    assert found == json.loads(events_module.as_json(events, 10**6))[: len(found)]
     assert len(found) == len(events) or len(text) + 1 + len(events[len(found)].text) > width
 
 
@@ -258,15 +259,15 @@ def test_a_caption_fits_is_ascii_and_follows_from_the_video_alone(seed: int) -> 
     made, other = seen(seed), seen(seed + 1)
     both = {name: np.stack([other[name], made[name]]) for name in made}
     alone = {name: made[name][None] for name in made}
-    one, two = words.told(alone, VIDEO), words.told(both, VIDEO)
-    for name, field in words.fields(BALLS + 4, VIDEO.frames).items():
+    one, two = caption.told(alone, VIDEO), caption.told(both, VIDEO)
+    for name, field in caption.fields(BALLS + 4, VIDEO.frames).items():
         assert one[name].dtype == two[name].dtype == np.dtype(field.dtype)
         assert one[name][0] == two[name][1]
     text = one["text/caption"][0].decode("ascii")
-    assert len(text) < words.CAPTION_BYTES
+    assert len(text) < events_module.CAPTION_BYTES
     assert text.startswith("Three balls in a box under gravity.")
     assert text.endswith(".")
-    assert one["text/event_count"][0] == len(words.events_of(made, VIDEO))
+    assert one["text/event_count"][0] == len(events_module.events_of(made, VIDEO))
 
 
 def still(**changes: Any) -> dict[str, np.ndarray]:
@@ -278,7 +279,7 @@ def still(**changes: Any) -> dict[str, np.ndarray]:
 
 def test_a_video_without_events() -> None:
     made = still()
-    found = words.told({name: values[None] for name, values in made.items()}, VIDEO)
+    found = caption.told({name: values[None] for name, values in made.items()}, VIDEO)
     assert found["text/events"].tolist() == [b"[]"]
     assert found["text/event_count"].tolist() == [0]
     assert found["text/caption"].tolist() == [b"Three balls in a box under gravity."]
@@ -293,7 +294,7 @@ def test_a_caption_tells_the_first_events_and_how_many_more() -> None:
     for row, (a, b) in enumerate(pairs):
         for name, value in (("kind", 1), ("frame", 2 + 2 * row), ("a", a), ("b", b), ("time", 0.1 * (row + 1))):
             made[f"contacts/{name}"][row] = value
-    text = words.caption(made, words.events_of(made, VIDEO), VIDEO.fps)
+    text = caption.caption(made, events_module.events_of(made, VIDEO), VIDEO.fps)
     assert text == (
         "Three balls in a box under gravity. The red ball hits the floor at 0.10 s, then blue ball 1 at 0.20 s. "
         "Blue ball 1 hits blue ball 2 at 0.30 s. The red ball hits the right wall at 0.40 s. And 2 more events."
@@ -302,9 +303,9 @@ def test_a_caption_tells_the_first_events_and_how_many_more() -> None:
 
 def test_colours_of_the_table_have_their_own_names_and_so_have_slightly_others() -> None:
     rng = np.random.default_rng(0)
-    for name, color in words.COLORS.items():
+    for name, color in caption.COLORS.items():
         for _ in range(20):
-            assert words.color_name(np.clip(np.array(color) + rng.integers(-9, 10, 3), 0, 255)) == name
+            assert caption.color_name(np.clip(np.array(color) + rng.integers(-9, 10, 3), 0, 255)) == name
 
 
 def test_shapes_have_their_nouns() -> None:
@@ -312,12 +313,12 @@ def test_shapes_have_their_nouns() -> None:
     made["objects/shape"][:BALLS] = [2, 3, 3]
     made |= {"objects/vertices": np.zeros((BALLS + 4, 4, 2)), "objects/vertex_count": np.array([0, 4, 3, 0, 0, 0, 0])}
     made["world/gravity"][:] = 0
-    assert words.caption(made, [], VIDEO.fps) == "One capsule, one box and one triangle in a box."
+    assert caption.caption(made, [], VIDEO.fps) == "One capsule, one box and one triangle in a box."
     made["objects/kind"][1] = 1
-    assert words.caption(made, [], VIDEO.fps) == "One capsule and one triangle in a box among one block."
+    assert caption.caption(made, [], VIDEO.fps) == "One capsule and one triangle in a box among one block."
     made["objects/present"][BALLS + 1 :] = False
-    assert words.caption(made, [], VIDEO.fps) == "One capsule and one triangle among one block."
-    assert words.names_of(made)[BALLS] == "the floor"
+    assert caption.caption(made, [], VIDEO.fps) == "One capsule and one triangle among one block."
+    assert caption.names_of(made)[BALLS] == "the floor"
 
 
 # ---- In a dataset
@@ -336,7 +337,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_words_are_stored_and_made_again(made: Path) -> None:
     videos = gen2d.open(made, fields="*")[:]
-    found = words.told(videos, load_config(WORDY).video)
+    found = caption.told(videos, load_config(WORDY).video)
     for name, values in found.items():
         assert_array_equal(videos[name], values)
     assert videos["text/event_count"].sum() > 0

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 import gen2d
-from gen2d.__main__ import main
+from gen2d.cli.main import main
 
 CONFIG = {
     "name": "tiny",

@@ -5,7 +5,7 @@ import sys
 import zipfile
 
 import gen2d
-from gen2d import plugins
+from gen2d.config import plugins
 
 names = zipfile.ZipFile(sys.argv[1]).namelist()
 top = {name.split("/")[0] for name in names}

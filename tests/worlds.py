@@ -12,12 +12,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gen2d import drawing, factors, sampling, types
-from gen2d.config import Config, load_config
-from gen2d.picture import Plan, Stage
-from gen2d.rows import Rules
-from gen2d.simulate import Forces, Keep, simulate
-from gen2d.types import STATIC, Layout, Objects, Run, Scene, State, Trajectory
+from gen2d.config.config import Config, load_config
+from gen2d.core.enums import STATIC
+from gen2d.physics.params import Rules
+from gen2d.physics.simulate import Forces, Keep, simulate
+from gen2d.programs import render
+from gen2d.records import axes
+from gen2d.records import keys as keys_module
+from gen2d.records.layout import Layout, Run
+from gen2d.records.scene import Objects, Scene, State
+from gen2d.records.trajectory import Trajectory
+from gen2d.renderers.plan import Plan, Stage
+from gen2d.sampling import sampler
 
 STEP = 1 / 240
 
@@ -108,8 +114,8 @@ def _program(
     wide: bool,
 ):
     def run(scene: Scene, state: State) -> Trajectory:
-        device = types.to_device(scene), types.to_device(state)
-        return types.to_stored(simulate(*device, layout, numbers, frames, steps, keep, forces, sparse))
+        device = axes.to_device(scene), axes.to_device(state)
+        return axes.to_stored(simulate(*device, layout, numbers, frames, steps, keep, forces, sparse))
 
     return jax.jit(run)
 
@@ -189,9 +195,11 @@ def flown(config: Config | Mapping, count: int) -> tuple[Stage, Plan, Scene, Sta
     puts it everything flies straight on, through walls too."""
     config = load_config(config)
     layout = config.scene.module.layout(config.scene.options)
-    keys = factors.video_keys(jnp.asarray(factors.seed_words(config.seed, 0)), jnp.arange(count, dtype=jnp.uint32))
+    keys = keys_module.video_keys(
+        jnp.asarray(keys_module.seed_words(config.seed, 0)), jnp.arange(count, dtype=jnp.uint32)
+    )
     stages, scenes, states = _all_flown(config, layout, keys)
-    return stages, drawing.plan_of(config, layout), scenes, states
+    return stages, render.plan_of(config, layout), scenes, states
 
 
 @functools.partial(jax.jit, static_argnums=(0, 1))
@@ -201,7 +209,7 @@ def _all_flown(config: Config, layout: Layout, keys: jax.Array) -> tuple[Stage, 
 
 def _flown(config: Config, layout: Layout, key: jax.Array) -> tuple[Stage, Scene, State]:
     video, steps = config.video, 4
-    scene, begin, *_ = sampling.Sampler(config).sampled(key)[1]
+    scene, begin, *_ = sampler.Sampler(config).sampled(key)[1]
 
     def at(time: jax.Array) -> State:
         def moved(start: jax.Array, rate: jax.Array) -> jax.Array:
@@ -216,7 +224,7 @@ def _flown(config: Config, layout: Layout, key: jax.Array) -> tuple[Stage, Scene
 
     frame, step = jnp.arange(video.frames), jnp.arange(1, steps + 1)
     states, between = at(frame / video.fps), at((frame[:-1, None] + step / steps) / video.fps)
-    stage = drawing.stage_of(key, config, drawing.plan_of(config, layout), scene, states, between=between)
+    stage = render.stage_of(key, config, render.plan_of(config, layout), scene, states, between=between)
     return stage, scene, states
 
 

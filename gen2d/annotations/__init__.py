@@ -11,8 +11,8 @@ from types import ModuleType
 from typing import Any
 
 from gen2d.core.schema import Field
-from gen2d.picture import Plan, Stage
-from gen2d.types import Array
+from gen2d.records.axes import Array
+from gen2d.renderers.plan import Plan, Stage
 
 
 def modules() -> dict[str, ModuleType]:

@@ -3,9 +3,10 @@
 import jax.numpy as jnp
 
 from gen2d.core.schema import Field
-from gen2d.picture import Plan, Stage, each_video
-from gen2d.raster import alone
-from gen2d.types import Array
+from gen2d.records.axes import Array
+from gen2d.renderers.plan import Plan, Stage
+from gen2d.renderers.rasterizer import alone
+from gen2d.xla import each_video
 
 OWNERS = False
 FIELDS = {

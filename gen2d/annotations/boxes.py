@@ -6,11 +6,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gen2d import extents
 from gen2d.core.schema import Field
-from gen2d.folds import folded
-from gen2d.picture import Plan, Stage
-from gen2d.types import Array
+from gen2d.records.axes import Array
+from gen2d.renderers import extents
+from gen2d.renderers.plan import Plan, Stage
+from gen2d.xla import folded
 
 OWNERS = True
 FIELDS = {

@@ -7,12 +7,15 @@ flow is valid where its end lies in the picture and in a pixel that shows the sa
 import jax
 import jax.numpy as jnp
 
-from gen2d.camera import pixel_at, to_pixels
+from gen2d.core.enums import STATIC
 from gen2d.core.schema import Field
-from gen2d.figures import Instants, Window
-from gen2d.layers import OCCLUDER
-from gen2d.picture import Plan, Stage, on_cpu, patch_of
-from gen2d.types import STATIC, Array, Run
+from gen2d.records.axes import Array
+from gen2d.records.layout import Run
+from gen2d.renderers.camera import pixel_at, to_pixels
+from gen2d.renderers.compositing import OCCLUDER
+from gen2d.renderers.plan import Plan, Stage, patch_of
+from gen2d.renderers.primitives import Instants, Window
+from gen2d.xla import on_cpu
 
 OWNERS = True
 _VALID = "1 where the flow ends in the frame, at a pixel of the same object"

@@ -1,8 +1,8 @@
 """Which object each pixel shows: the one of which most is seen in it."""
 
 from gen2d.core.schema import Field
-from gen2d.picture import Plan, Stage
-from gen2d.types import Array
+from gen2d.records.axes import Array
+from gen2d.renderers.plan import Plan, Stage
 
 OWNERS = True
 FIELDS = {

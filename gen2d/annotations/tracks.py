@@ -7,11 +7,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gen2d.camera import pixel_at, to_pixels
 from gen2d.core.schema import Field
-from gen2d.paint import fraction, hashed
-from gen2d.picture import Plan, Stage
-from gen2d.types import Array, Run
+from gen2d.records.axes import Array
+from gen2d.records.layout import Run
+from gen2d.renderers.camera import pixel_at, to_pixels
+from gen2d.renderers.noise import fraction, hashed
+from gen2d.renderers.plan import Plan, Stage
 
 OWNERS = True
 FIELDS = {

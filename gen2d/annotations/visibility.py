@@ -6,12 +6,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gen2d import extents
 from gen2d.core.schema import Field
-from gen2d.folds import folded
-from gen2d.looks import are_moving
-from gen2d.picture import Plan, Stage, each_video
-from gen2d.types import Array
+from gen2d.records.axes import Array
+from gen2d.renderers import extents
+from gen2d.renderers.look import are_moving
+from gen2d.renderers.plan import Plan, Stage
+from gen2d.xla import each_video, folded
 
 OWNERS = True
 FIELDS = {

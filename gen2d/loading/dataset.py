@@ -21,8 +21,9 @@ from gen2d.dataset.manifest import Manifest, read_manifest
 from gen2d.dataset.spec import shard_name
 from gen2d.loading.chunks import Piece, Reader, SplitFiles
 from gen2d.loading.column import LAYOUTS, Column
+from gen2d.loading.concat import Joined
 from gen2d.loading.epochs import shuffled
-from gen2d.loading.protocols import Batch, Joined, Numbers, checked_numbers, filled, item, taken_apart
+from gen2d.loading.protocols import Batch, Numbers, checked_numbers, filled, item, taken_apart
 from gen2d.storage import codecs
 from gen2d.storage.cache import Cache
 from gen2d.storage.explain import reason

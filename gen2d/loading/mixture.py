@@ -13,18 +13,10 @@ from typing import Any
 import numpy as np
 
 from gen2d.core.errors import ConfigError
-from gen2d.loading.epochs import SOURCES, hashed
-from gen2d.loading.protocols import (
-    Batch,
-    Joined,
-    Numbers,
-    Source,
-    at_snapshots,
-    checked_numbers,
-    item,
-    occurring,
-    taken_apart,
-)
+from gen2d.core.permutation import hashed
+from gen2d.loading.concat import Joined, at_snapshots, occurring
+from gen2d.loading.epochs import SOURCES
+from gen2d.loading.protocols import Batch, Numbers, Source, checked_numbers, item, taken_apart
 
 FINEST = 1000  # a weight is taken as the nearest fraction with a denominator up to this
 Weights = Mapping[str, float] | Sequence[float]

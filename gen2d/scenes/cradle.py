@@ -4,11 +4,12 @@ import dataclasses
 
 import jax.numpy as jnp
 
+from gen2d.config.distributions import Distribution
+from gen2d.config.options import option
 from gen2d.core.schema import Field
-from gen2d.distributions import Distribution
-from gen2d.options import option
-from gen2d.parts import Sampled, assembled, discs
-from gen2d.types import Array, Layout, Run
+from gen2d.records.axes import Array
+from gen2d.records.layout import Layout, Run
+from gen2d.sampling.builder import Sampled, assembled, discs
 
 DERIVED = {"contact_time": Field("float32", "n", "s", "at which the first of those that move meets one at rest")}
 

@@ -4,10 +4,12 @@ import dataclasses
 
 import jax.numpy as jnp
 
-from gen2d.distributions import Distribution
-from gen2d.options import option
-from gen2d.parts import Sampled, assembled, boxes, discs, segments
-from gen2d.types import STATIC, Array, Layout, Run
+from gen2d.config.distributions import Distribution
+from gen2d.config.options import option
+from gen2d.core.enums import STATIC
+from gen2d.records.axes import Array
+from gen2d.records.layout import Layout, Run
+from gen2d.sampling.builder import Sampled, assembled, boxes, discs, segments
 
 FAR = 2.0  # the floor's length, over the view's width
 

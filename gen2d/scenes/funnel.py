@@ -6,11 +6,13 @@ import math
 import jax
 import jax.numpy as jnp
 
-from gen2d.distributions import Distribution
-from gen2d.options import option
-from gen2d.parts import Sampled, assembled, box_walls, discs, segments
-from gen2d.placement import place
-from gen2d.types import STATIC, Array, Layout, Run
+from gen2d.config.distributions import Distribution
+from gen2d.config.options import option
+from gen2d.core.enums import STATIC
+from gen2d.records.axes import Array
+from gen2d.records.layout import Layout, Run
+from gen2d.sampling.builder import Sampled, assembled, box_walls, discs, segments
+from gen2d.sampling.placement import place
 
 
 @dataclasses.dataclass(frozen=True)

@@ -4,11 +4,13 @@ import dataclasses
 
 import jax.numpy as jnp
 
+from gen2d.config.distributions import Distribution
+from gen2d.config.options import option
+from gen2d.core.enums import STATIC
 from gen2d.core.schema import Field
-from gen2d.distributions import Distribution
-from gen2d.options import option
-from gen2d.parts import Sampled, assembled, box_walls, discs
-from gen2d.types import STATIC, Array, Layout, Run
+from gen2d.records.axes import Array
+from gen2d.records.layout import Layout, Run
+from gen2d.sampling.builder import Sampled, assembled, box_walls, discs
 
 DERIVED = {
     "contact_time": Field("float32", "n pairs", "s", "at which the two of a pair meet, if nothing else does before"),

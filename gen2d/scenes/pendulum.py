@@ -5,11 +5,13 @@ import math
 
 import jax.numpy as jnp
 
+from gen2d.config.distributions import Distribution
+from gen2d.config.options import option
+from gen2d.core.enums import STATIC
 from gen2d.core.schema import Field
-from gen2d.distributions import Distribution
-from gen2d.options import option
-from gen2d.parts import Sampled, assembled, bars, discs, joined
-from gen2d.types import STATIC, Array, Layout, Run, Tie
+from gen2d.records.axes import Array
+from gen2d.records.layout import Layout, Run, Tie
+from gen2d.sampling.builder import Sampled, assembled, bars, discs, joined
 
 PIN = 0.08  # m, radius of the disc that the pendulum hangs from
 ROD = 0.04  # m, radius of a rod

@@ -9,11 +9,13 @@ import math
 
 import jax.numpy as jnp
 
+from gen2d.config.distributions import Distribution
+from gen2d.config.options import option
+from gen2d.core.enums import STATIC
 from gen2d.core.schema import Field
-from gen2d.distributions import Distribution
-from gen2d.options import option
-from gen2d.parts import Sampled, assembled, capsules, discs, segments
-from gen2d.types import STATIC, Array, Layout, Run
+from gen2d.records.axes import Array
+from gen2d.records.layout import Layout, Run
+from gen2d.sampling.builder import Sampled, assembled, capsules, discs, segments
 
 DERIVED = {"length": Field("float32", "n", "m", "of the slope")}
 

@@ -9,11 +9,12 @@ import math
 
 import jax.numpy as jnp
 
-from gen2d.distributions import Distribution
-from gen2d.options import option
-from gen2d.parts import Sampled, assembled, discs
-from gen2d.placement import beginning
-from gen2d.types import Array, Layout, Run
+from gen2d.config.distributions import Distribution
+from gen2d.config.options import option
+from gen2d.records.axes import Array
+from gen2d.records.layout import Layout, Run
+from gen2d.sampling.builder import Sampled, assembled, discs
+from gen2d.sampling.placement import beginning
 
 
 @dataclasses.dataclass(frozen=True)

@@ -1,0 +1,1 @@
+"""English captions and event lists, from stored fields."""

@@ -1,0 +1,128 @@
+"""What a dataset holds, and what gen2d knows, as text for a terminal."""
+
+import dataclasses
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from gen2d.core.errors import ConfigError
+from gen2d.core.humanize import in_bytes, in_time
+from gen2d.dataset.manifest import Manifest, read_manifest, statistics
+from gen2d.storage.atomic import size_of
+from gen2d.storage.paths import Place
+
+
+def _table(rows: list[tuple[str, ...]]) -> list[str]:
+    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
+    return [
+        "  " + "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows
+    ]
+
+
+def sheet(root: Place) -> str:
+    """The data sheet of a dataset: what it holds, field by field, and what made it."""
+    manifest = read_manifest(root)
+    splits = ", ".join(f"{name}: {count:,} videos" for name, count in manifest.splits.items())
+    sizes = ", ".join(f"{name} = {value}" for name, value in manifest.sizes.items())
+    rows = [("field", "type", "axes", "unit", "meaning")]
+    rows += [(name, f.dtype, f.axes, f.unit, f.meaning) for name, f in manifest.fields.items()]
+    versions = ", ".join(f"{key} {value}" for key, value in manifest.producer.items() if not isinstance(value, dict))
+    fingerprint = ", ".join(f"{key} {value or '-'}" for key, value in _flat(manifest.fingerprint))
+    made = [f"python -m gen2d --config config.yaml --n {n} --split {s}" for s, n in manifest.splits.items()]
+    return "\n".join(
+        [
+            f"{manifest.name} ({root})",
+            f"  {splits}; seed {manifest.seed}, {manifest.fps:g} frames/s, {_duration(manifest)}",
+            f"  sizes: {sizes}",
+            "",
+            *_table(rows),
+            "",
+            f"  {manifest.conventions}",
+            "",
+            *_table([("split", "field", "mean", "standard deviation", "least", "largest"), *statistics(manifest)]),
+            f"  of {manifest.stats_sampled}",
+            "",
+            *_table([("on disk", "files", "size"), *_volumes(root, manifest)]),
+            f"  frames and other images compressed with {manifest.codec}, up to {manifest.videos_per_shard:,} "
+            "videos a shard",
+            "",
+            *(f"  made by {command} --seed {manifest.seed}" for command in made),
+            f"  with {versions}",
+            f"  bits fixed by {fingerprint}",
+            f"  config {manifest.config_sha256}",
+            f"  licence: {manifest.licence or 'none was chosen'}",
+        ]
+    )
+
+
+def _duration(manifest: Manifest) -> str:
+    """How long all videos together are."""
+    return in_time(sum(manifest.splits.values()) * manifest.sizes.get("T", 0) / manifest.fps) + " in all"
+
+
+def _volumes(root: Place, manifest: Manifest) -> Iterator[tuple[str, ...]]:
+    """What lies on disk: the shards of each split, and all the rest."""
+    for split, table in manifest.tables.items():
+        yield f"shards of {split}", f"{table.shards:,}", in_bytes(table.bytes)
+    index = [size for table in manifest.tables.values() if (size := size_of(root / table.file)) is not None]
+    yield "tables of shards", f"{len(index):,}", in_bytes(sum(index))
+
+
+def _flat(about: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
+    """The entries of a mapping, those of a mapping in it by both names; hashes are cut."""
+    for key, value in about.items():
+        if isinstance(value, dict):
+            yield from ((f"{key}.{name}", f"{own!s:.16}") for name, own in value.items())
+        else:
+            yield key, value
+
+
+def plugins_text(name: str | None = None) -> str:
+    """Families, looks and configs with their options; only `name` if it is given."""
+    from gen2d.config import (
+        config,  # imports jax
+        plugins,
+    )
+
+    lines: list[str] = []
+    for kind, title in (("scene", "Scene families"), ("look", "Looks")):
+        found = [n for n in plugins.names(kind) if name in (None, n)]
+        lines += [f"{title}:"] if found else []
+        for plugin in found:
+            module = plugins.load(kind, plugin)
+            lines += [
+                f" {plugin}: {(module.__doc__ or '').strip().splitlines()[0]}",
+                *_options(kind, module.Options),
+                "",
+            ]
+    configs = [c for c in plugins.config_names() if name in (None, c, c.removesuffix(".yaml"))]
+    if configs:
+        lines += [f"Configs (in {plugins.config_folder()}):", *(f"  {c}" for c in configs), ""]
+    if name is None:
+        lines.append("Sections that every config has:")
+        for section, options in config.SECTIONS.items():
+            lines += [f" {section}: {(options.__doc__ or '').strip().splitlines()[0]}", *_options(section, options), ""]
+    if not lines:
+        names = [*plugins.names("scene"), *plugins.names("look"), *plugins.config_names()]
+        raise ConfigError(f"{name!r} is not known; {plugins.nearest(name or '', names)}")
+    return "\n".join(lines).rstrip()
+
+
+def _options(where: str, options: type) -> list[str]:
+    rows = []
+    for field in dataclasses.fields(options):
+        spec = field.metadata["option"]
+        unit = f" {spec.unit}" if spec.unit not in ("", "1") else ""
+        about = f"{spec.meaning}; {spec.allowed}" + (", drawn" if spec.draw else "")
+        rows.append((f"{where}.{field.name}", f"{_shown(field.default)}{unit}", about))
+    return _table(rows)
+
+
+def _shown(value: Any) -> str:
+    if isinstance(value, tuple):
+        return "[" + ", ".join(map(_shown, value)) + "]"
+    if hasattr(value, "plain"):
+        plain = value.plain()
+        if isinstance(plain, dict) and set(plain) <= {"uniform", "integer"}:
+            plain = next(iter(plain.values()))
+        return str(plain).replace("'", "")
+    return "null" if value is None else f"{value:.6g}" if isinstance(value, float) else str(value)

@@ -1,0 +1,1 @@
+"""Configs: YAML to checked options, distributions and splits."""

@@ -1,0 +1,100 @@
+"""Every number that a sampler draws, by name: what a config says of it, and the one place where all are drawn.
+
+In a config a number is a constant, `[low, high]` a uniform range (whole numbers with both ends where the option is a
+whole number), `{log_uniform: [low, high]}` and so on a named distribution, `{mixture: [...], weights: [...]}` one of
+several, `{minus: [one, others...]}` what of one lies outside the others' supports, `{intersection: [one, others...]}`
+what lies inside. A vector is a list of such values.
+"""
+
+from collections.abc import Mapping
+from numbers import Integral, Real
+from typing import Any
+
+from gen2d.config import truncation
+from gen2d.config.distributions import Distribution
+
+LENGTHS = {"constant": (1,), "uniform": (2,), "log_uniform": (2,), "integer": (2,), "normal": (2, 4)}
+KINDS = (*LENGTHS, "choice", "grid")
+COMPOSED = ("mixture", "minus", "intersection")
+FORMS = "a number, [low, high], or one of " + ", ".join(f"{{{kind}: [...]}}" for kind in (*KINDS[1:], *COMPOSED))
+
+
+MOST = 10_000  # numbers in a list
+PARTS = 200  # that a distribution is put together from
+LARGEST = 1e12  # in any unit: the square of a larger number leaves no room in a float32
+
+
+def is_number(value: Any) -> bool:
+    """Whether the value is a real number that a simulation can take."""
+    return isinstance(value, Real) and not isinstance(value, bool) and abs(float(value)) <= LARGEST
+
+
+def _far_in_the_tail(mean: float, deviation: float, low: float, high: float) -> bool:
+    """Where float32 has no probabilities left to draw from."""
+    return low > mean + 4 * deviation or high < mean - 4 * deviation
+
+
+def parse(value: Any, whole: bool = False) -> Distribution:
+    """The distribution that a config's value stands for; ValueError with what is allowed where it stands for none."""
+    if isinstance(value, dict) and value.keys() & set(COMPOSED):
+        return _composed(value, whole)
+    kind: str
+    numbers: Any
+    if is_number(value):
+        kind, numbers = "constant", [value]
+    elif isinstance(value, list | tuple):
+        kind, numbers = "integer" if whole else "uniform", value
+    elif isinstance(value, dict) and len(value) == 1 and next(iter(value)) in KINDS:
+        kind, numbers = next(iter(value.items()))
+        kind = "integer" if whole and kind == "uniform" else kind
+    else:
+        raise ValueError(FORMS)
+    if not isinstance(numbers, list | tuple) or not 0 < len(numbers) <= MOST or not all(map(is_number, numbers)):
+        raise ValueError(f"{kind} of finite numbers in a list, {MOST:,} at most")
+    if kind in LENGTHS and len(numbers) not in LENGTHS[kind]:
+        raise ValueError(f"{kind} of {' or '.join(map(str, LENGTHS[kind]))} numbers")
+    if kind in ("uniform", "log_uniform", "integer") and numbers[0] > numbers[1]:
+        raise ValueError("a range with its lower end first")
+    if kind == "log_uniform" and numbers[0] <= 0:
+        raise ValueError("a log_uniform range above 0")
+    if len(numbers) == 4 and kind == "normal" and _far_in_the_tail(*numbers):
+        raise ValueError("a normal cut off within 4 deviations of its mean")
+    if kind == "normal" and (numbers[1] <= 0 or (len(numbers) == 4 and numbers[2] >= numbers[3])):
+        raise ValueError("normal: [mean, deviation above 0] or [mean, deviation, low, high]")
+    if (whole or kind == "integer") and not all(float(x).is_integer() for x in numbers):
+        raise ValueError("whole numbers")
+    if kind == "grid" and len(set(numbers)) < len(numbers):
+        raise ValueError("a grid of different numbers")
+    if whole and kind in ("log_uniform", "normal"):
+        raise ValueError("a whole number, [low, high] or {choice: [...]}")
+    return Distribution(kind, tuple(int(x) if isinstance(x, Integral) else float(x) for x in numbers))
+
+
+def _composed(value: Mapping[str, Any], whole: bool) -> Distribution:
+    """A mixture, or one distribution cut by the supports of others."""
+    kind, written = next((kind, value[kind]) for kind in COMPOSED if kind in value)
+    if value.keys() - {kind, *(["weights"] if kind == "mixture" else [])}:
+        raise ValueError(FORMS)
+    if not isinstance(written, list | tuple) or not 0 < len(written) <= PARTS:
+        raise ValueError(f"{kind} of a list of distributions, {PARTS} at most")
+    parts = [parse(part, whole) for part in written]
+    if kind == "mixture":
+        return truncation.mixture(list(zip(checked_weights(value.get("weights"), len(parts)), parts, strict=True)))
+    cut, source = (truncation.outside if kind == "minus" else truncation.inside), parts[0]
+    for part in parts[1:]:
+        pieces = cut(source, part.spans)
+        if not pieces:
+            raise ValueError(f"a {kind} that leaves something")
+        source = truncation.mixture(pieces)
+        if len(source.weighted) > PARTS:
+            raise ValueError(f"a {kind} that leaves {PARTS} parts at most")
+    return source
+
+
+def checked_weights(weights: Any, count: int) -> list[float]:
+    """The weights of so many things, all equal where none are given; ValueError with what is allowed."""
+    weights = [1] * count if weights is None else weights
+    fits = isinstance(weights, list | tuple) and len(weights) == count and all(map(is_number, weights))
+    if not fits or min(weights) <= 0:
+        raise ValueError(f"a mixture of as many weights as parts, {count} numbers above 0")
+    return [float(weight) for weight in weights]

@@ -1,0 +1,86 @@
+"""Which matched sets are asked for, checked."""
+
+import dataclasses
+import math
+from typing import Any
+
+import numpy as np
+
+from gen2d.config import plugins
+from gen2d.config.distributions import Distribution
+from gen2d.config.options import drawn_options
+from gen2d.core.enums import DYNAMIC
+from gen2d.records.layout import Layout
+
+INTERVENTIONS = ("remove", "teleport", "identity_swap", "gravity_flip", "ghost_contact", "energy_gain")
+VIOLATIONS = INTERVENTIONS[1:]  # they happen in the middle of a video, and are impossible
+
+
+def untied(layout: Layout) -> np.ndarray:
+    """Which slots [K] hold what moves and is on no joint."""
+    free = np.concatenate([np.full(run.count, run.kind == DYNAMIC) for run in layout.runs])
+    free[[slot for tie in layout.joints for slot in (tie.a, tie.b)]] = False
+    return free
+
+
+# ---- What is asked, checked
+
+
+def check(options: Any, default: Any, scene: Any, video: Any, annotations: Any, camera: Any) -> None:
+    """ValueError where these sets cannot be made: one sentence that begins with the option's name."""
+    if not options.change:
+        if options != default:
+            raise ValueError("change is null, but other options are given: name what a set's members differ in")
+        return
+    if len(set(options.change)) < len(options.change):
+        raise ValueError(f"change is {list(options.change)}, but must name each change once")
+    layout = scene.module.layout(scene.options)
+    for name in options.change:
+        if name in INTERVENTIONS:
+            _check_act(name, scene, layout, video, camera)
+        else:
+            _check_factor(name, options, scene, layout)
+    asked = [name for name in ("contacts", "energy", "predictability") if getattr(annotations, name)]
+    violations = [name for name in options.change if name in VIOLATIONS]
+    if asked and violations:
+        raise ValueError(f"change is {violations[0]}, which has no books: annotations.{asked[0]} must be off")
+
+
+def _check_act(name: str, scene: Any, layout: Layout, video: Any, camera: Any) -> None:
+    least = {"gravity_flip": 0, "identity_swap": 2}.get(name, 1)
+    if untied(layout).sum() < least:
+        raise ValueError(f"change is {name}, but the scene has no {least} that move and are on no joint")
+    if name in VIOLATIONS and video.frames < 2:
+        raise ValueError(f"change is {name}, but video.frames is {video.frames}, and that happens on the way")
+    if name == "remove" and camera.follow is not None:
+        raise ValueError("change is remove, but camera.follow may be what is gone: it must be null")
+    gravity = getattr(scene.options, "gravity", ())
+    if name == "gravity_flip" and all(part.support == (0, 0) for part in gravity):
+        raise ValueError("change is gravity_flip, but there is no scene.gravity")
+
+
+def _check_factor(name: str, options: Any, scene: Any, layout: Layout) -> None:
+    specs = drawn_options(scene.module)
+    if name not in specs:
+        raise ValueError(f"change is {name!r}, which is no factor; {plugins.nearest(name, [*INTERVENTIONS, *specs])}")
+    value = getattr(scene.options, name)
+    parts = value if isinstance(value, tuple) else (value,)
+    if options.scale is None:
+        if all(low == high for low, high in (part.support for part in parts)):
+            raise ValueError(f"change is {name}, but scene.{name} is always the same: give it a range, or scale it")
+        return
+    if specs[name].kind is int:
+        raise ValueError(f"scale is for numbers, but scene.{name} is a whole number, which can be drawn anew only")
+    scaled = tuple(_scaled(part, options.scale, specs[name]) for part in parts)
+    widened = dataclasses.replace(scene.options, **{name: scaled if isinstance(value, tuple) else scaled[0]})
+    if hasattr(scene.module, "check"):
+        scene.module.check(widened)
+    if scene.module.layout(widened) != layout:
+        raise ValueError(f"scale is for what the scene is not built around, but scene.{name} is: draw it anew")
+
+
+def _scaled(part: Distribution, scale: Distribution, spec: Any) -> Distribution:
+    """What a part of a factor may be when it is scaled."""
+    ends = [end * factor for end in part.support for factor in scale.support]
+    low, high = (-math.inf if spec.low is None else spec.low), (math.inf if spec.high is None else spec.high)
+    return Distribution("uniform", (max(min(ends), low), min(max(ends), high)))

@@ -1,0 +1,139 @@
+"""A config's splits: names, sizes, the laws that their factors are drawn from, and what else is different in them.
+
+Videos of a split whose factors are others than those of the training split are held out: that no video of one can be a
+video of the other is proved on the supports of the two laws (laws.py).
+"""
+
+import dataclasses
+import json
+import re
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from gen2d.config import plugins
+from gen2d.config.joint_distribution import Law, Parts, common, hull, law_of
+from gen2d.config.options import coordinates, drawn_options, value_of
+from gen2d.config.plugin_options import Plugin, check_plugin
+from gen2d.core.errors import ConfigError
+
+MOST = 100  # splits of a config
+CHANGES = ("physics", "camera", "image", "look")  # sections that a split may have its own options of
+
+
+@dataclasses.dataclass(frozen=True)
+class Split:
+    """Some of a dataset's videos: how many, the law that their factors are drawn from, and what else is different."""
+
+    name: str
+    videos: int | None  # null: as many as are asked for
+    written: str  # the split as in a config, as JSON
+    law: Law = dataclasses.field(compare=False)
+    own: Mapping[str, Any] = dataclasses.field(default_factory=dict, compare=False)  # sections
+
+    @property
+    def frames(self) -> int | None:
+        """How many frames of a video its reader gets, the first ones; None: all."""
+        return self.plain().get("frames")
+
+    def plain(self) -> dict[str, Any]:
+        """The split as YAML and JSON hold it."""
+        return json.loads(self.written)
+
+
+def _base(scene: Plugin) -> Parts:
+    """The distributions that a scene's options say."""
+    own = scene.own or scene.options
+    return {k: v for name in drawn_options(scene.module) for k, v in coordinates(name, getattr(own, name)).items()}
+
+
+def laws_of(scene: Plugin, splits: Sequence[Split]) -> list[Law]:
+    """The laws of the splits in order, or that of the scene alone where there are none."""
+    return [split.law for split in splits] or [law_of({}, _base(scene), lambda written: {})]
+
+
+def with_splits(scene: Plugin, written: Any, source: str) -> tuple[Plugin, tuple[Split, ...]]:
+    """The splits that a config has, and a scene that can hold all of them. Raises ConfigError with one sentence."""
+    if not isinstance(written, Mapping):
+        raise ConfigError(f"{source}: splits is {written!r}, but must be a mapping from names to what they are")
+    if len(written) > MOST:
+        raise ConfigError(f"{source}: splits has {len(written)} names, but must have {MOST} at most")
+    splits: dict[str, Split] = {}
+    for name in sorted(written, key=lambda name: name != "train"):  # so that others may be like it
+        training = next(iter(splits.values()), None)
+        splits[name] = _split(scene, name, written[name], training, source)
+        if training is not None:
+            _check_held_out(training, splits[name], source)
+    ordered = tuple(splits[name] for name in written)
+    scene = dataclasses.replace(scene, options=_hull(scene, ordered), own=scene.options)
+    check_plugin(scene, "scene", source)
+    return scene, ordered
+
+
+def _split(scene: Plugin, name: str, written: Any, training: Split | None, source: str) -> Split:
+    where, known = f"splits.{name}", ("videos", "frames", "factors", "overlaps", *CHANGES)
+    if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}", name):
+        raise ConfigError(f"{source}: {where} must have a name of letters, digits, '.', '_' and '-', 64 at most")
+    written = {} if written is None else written
+    if not isinstance(written, Mapping):
+        raise ConfigError(f"{source}: {where} is {written!r}, but must be a mapping of {', '.join(known)}")
+    for key in written:
+        if key not in known:
+            raise ConfigError(f"{source}: {where}.{key} is not an option; {plugins.nearest(key, list(known))}")
+    for key in ("videos", "frames"):
+        count = written.get(key)
+        if count is not None and (isinstance(count, bool) or not isinstance(count, int) or not 1 <= count < 2**32):
+            raise ConfigError(f"{source}: {where}.{key} is {count!r}, but must be a whole number from 1 to 2**32 - 1")
+    if not isinstance(written.get("overlaps", False), bool):
+        raise ConfigError(f"{source}: {where}.overlaps is {written['overlaps']!r}, but must be true or false")
+    like = None if "factors" in written else training
+    law = like.law if like else _law(scene, written.get("factors", {}), f"{where}.factors", source)
+    return Split(name, written.get("videos"), json.dumps(written), law)
+
+
+def _law(scene: Plugin, written: Any, where: str, source: str) -> Law:
+    specs = drawn_options(scene.module)
+
+    def read(values: Mapping[str, Any]) -> Parts:
+        found: Parts = {}
+        for name, value in values.items():
+            if name not in specs:
+                raise ConfigError(f"{source}: {where}.{name} is not a factor; {plugins.nearest(name, list(specs))}")
+            try:
+                found |= coordinates(name, value_of(specs[name], value))
+            except ValueError as error:
+                raise ConfigError(f"{source}: {where}.{name} is {value!r}, but must be {error}") from None
+        return found
+
+    try:
+        return law_of(written, _base(scene), read)
+    except ValueError as error:
+        raise ConfigError(f"{source}: {where} is {written!r}, but must be {error}") from None
+
+
+def _check_held_out(training: Split, split: Split, source: str) -> None:
+    """Raises ConfigError where a split of other factors has videos that the training split has, too."""
+    written = split.plain()
+    try:
+        shared = common(training.law, split.law) if "factors" in written and not written.get("overlaps") else None
+    except ValueError as error:
+        raise ConfigError(f"{source}: splits.{split.name}.factors must be {error}") from None
+    if shared is not None:
+        point = ", ".join(f"{name} {value:.7g}" for name, value in shared.items() if _differ(training, split, name))
+        raise ConfigError(
+            f"{source}: splits.{split.name} and splits.{training.name} have videos in common, such as one of "
+            f"{point or 'any factors'}; cut one of them, or say overlaps: true"
+        )
+
+
+def _differ(one: Split, other: Split, name: str) -> bool:
+    return one.law.spans(name) != other.law.spans(name)
+
+
+def _hull(scene: Plugin, splits: Sequence[Split]) -> Any:
+    """Options that can give whatever any of the splits may draw."""
+    parts = hull([split.law for split in splits])
+    changes = {}
+    for name, spec in drawn_options(scene.module).items():
+        found = [parts[key] for key in coordinates(name, getattr(scene.options, name))]
+        changes[name] = tuple(found) if spec.parts else found[0]
+    return dataclasses.replace(scene.options, **changes)

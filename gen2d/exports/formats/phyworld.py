@@ -1,0 +1,95 @@
+"""One HDF5 file as the study 'How Far is Video Generation from World Model' (phyworld) has them: one or two balls.
+
+The groups `video_streams`, `position_streams` and `init_streams` hold datasets 00000, 00001, ... of 1000 videos each:
+films as bytes (MPEG-4, as `--to mp4` makes them); positions [n, T, 2], or [n, T, 2, 2] of two balls; and what was
+drawn, [r, v] or [r1, r2, v1, v2], with speeds at the first frame. The frame is 10 units wide, its lower left corner is
+0, 0, y up. Balls are in the order of their slots. What stands still is not told of, but seen.
+"""
+
+import tempfile
+from itertools import islice
+from pathlib import Path
+
+import h5py
+import numpy as np
+
+from gen2d.core.errors import ConfigError
+from gen2d.exports.source import Source
+from gen2d.loading import dataset as loader
+from gen2d.loading.protocols import Batch
+from gen2d.media import films
+
+LOSS = f"{films.LOSS}; positions and first speeds of the balls alone"
+CAMERA = ("camera/center", "camera/scale", "camera/angle")
+OBJECTS = ("objects/present", "objects/kind", "objects/shape")
+FIELDS = ("frames", "states/position", "states/velocity", "objects/radius", *OBJECTS, *CAMERA)
+FIXED = True
+SUFFIX = ".hdf5"
+UNITS = 10.0  # the frame's width
+GROUP = 1000  # videos in a dataset
+STATIC, CIRCLE = 1, 0  # in objects/kind and objects/shape; types.py says the same, but imports jax
+
+
+def check(source: Source) -> None:
+    """ConfigError where a film cannot be, or a video has other than one or two moving balls or a moving camera."""
+    films.check_size("phyworld", source.frame_size)
+    films.check_rate("phyworld", source.fps, films.FASTEST)
+    ds = loader.open(source.ds.root, source.ds.options.split, (*OBJECTS, *CAMERA))
+    usual = len(_balls(ds[0]))
+    for number in range(len(ds)):
+        wrong = _wrong(ds[number], usual)
+        if wrong:
+            raise ConfigError(f"phyworld cannot hold {ds.options.split} video {number} of {ds.root}: {wrong}")
+
+
+def write(target: Path, source: Source) -> None:
+    """Writes the file."""
+    videos = source.videos()
+    with h5py.File(target, "w", locking=False) as file, tempfile.TemporaryDirectory() as folder:
+        for first in range(0, len(source), GROUP):
+            name, count = f"{first // GROUP:05d}", min(GROUP, len(source) - first)
+            held = file.create_dataset(f"video_streams/{name}", (count,), h5py.vlen_dtype(np.uint8))
+            positions, inits = [], []
+            for row, video in enumerate(islice(videos, count)):
+                held[row] = _film(Path(folder) / "film.mp4", video, source.fps)
+                position, init = _motion(video, source.frame_size)
+                positions.append(position)
+                inits.append(init)
+                source.advance(1)
+            file[f"position_streams/{name}"] = np.stack(positions)
+            file[f"init_streams/{name}"] = np.stack(inits)
+
+
+def _balls(video: Batch) -> np.ndarray:
+    """The slots of what moves."""
+    return np.flatnonzero(video["objects/present"] & (video["objects/kind"] != STATIC))
+
+
+def _wrong(video: Batch, usual: int) -> str:
+    """Why a video cannot be held, in words; "" if it can. `usual` is how many balls the first one has."""
+    balls = _balls(video)
+    if (video["objects/shape"][balls] != CIRCLE).any():
+        return "something else than a ball moves in it"
+    if len(balls) not in (1, 2) or len(balls) != usual:
+        allowed = usual if usual in (1, 2) else "1 or 2"
+        return f"the number of balls that move in it is {len(balls)}, but must be {allowed}"
+    if video["camera/angle"].any() or any(np.ptp(video[name], axis=0).any() for name in CAMERA):
+        return "its camera moves or is turned, but must stand still and upright"
+    return ""
+
+
+def _film(path: Path, video: Batch, fps: float) -> np.ndarray:
+    films.mp4v(path, video["frames"], fps)
+    return np.frombuffer(path.read_bytes(), np.uint8)
+
+
+def _motion(video: Batch, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+    """Positions [T, 2] or [T, 2, 2] and [r, v] or [r1, r2, v1, v2], in units of a tenth of the frame's width."""
+    balls, (height, width) = _balls(video), size
+    pixel = UNITS / width
+    metre = float(video["camera/scale"][0]) * pixel
+    from_center = video["states/position"][:, balls].astype(np.float64) - video["camera/center"][0]
+    position = from_center * metre + np.array([width, height]) / 2 * pixel
+    speed = np.linalg.norm(video["states/velocity"][0, balls].astype(np.float64), axis=-1)
+    init = np.concatenate([video["objects/radius"][balls], speed]) * metre
+    return (position[:, 0] if len(balls) == 1 else position), init

@@ -1,0 +1,110 @@
+"""From the shards that are done to a dataset that readers open: tables, cards and, last, the manifest."""
+
+import numpy as np
+
+from gen2d.core.errors import UnreachableError, UserError
+from gen2d.dataset.croissant import croissant
+from gen2d.dataset.folder import (
+    Publication,
+    Sizes,
+    SupersededError,
+    alone,
+    explained,
+    is_done,
+    publish_snapshot,
+    whole_plan,
+)
+from gen2d.dataset.manifest import CONFIG, FILE_BYTES, SHEET, Manifest, Table, describe
+from gen2d.dataset.readme import readme, shown_split
+from gen2d.dataset.records import Records, read_records
+from gen2d.dataset.rows import npy
+from gen2d.dataset.spec import DatasetSpec, Shard, table_name
+from gen2d.dataset.statistics import summary
+from gen2d.loading.dataset import Dataset, Options
+from gen2d.media import contact_sheet, images
+from gen2d.storage.atomic import publish_changed
+from gen2d.storage.explain import reading_error
+from gen2d.storage.paths import Place
+from gen2d.storage.sealed import has_sha256, sha256
+
+ROWS = 4  # videos on a sheet
+
+
+def complete(spec: DatasetSpec) -> bool:
+    """Whether the dataset is complete; if it is, its tables, cards and manifest are there.
+
+    False while shards are missing that other workers still make.
+    """
+    root = spec.root
+    with explained(root), alone(root):
+        while True:
+            records, sizes = read_records(spec, root), Sizes(root)
+            old = records.manifest
+            shards = whole_plan(spec, records)
+            if not all(is_done(shard, records, sizes) for shard in shards):
+                return False
+            try:
+                publish_snapshot(spec, publication(spec, shards, records, old), records, old)
+            except SupersededError:  # where there are no locks, others may be faster: what they have published stays
+                continue
+            return True
+
+
+def publication(spec: DatasetSpec, shards: list[Shard], records: Records, old: Manifest | None) -> Publication:
+    """What a snapshot of these shards consists of beside them; its tables are in the folder then.
+
+    Its manifest is `old` where that describes the same shards, whichever versions of the program made it.
+    """
+    tables, rows = {}, {}
+    for split in sorted({shard.split for shard in shards}):
+        own = [shard for shard in shards if shard.split == split]
+        rows[split] = records.table(split, own)
+        content, name = npy(rows[split]), table_name(split, own[-1].first + own[-1].count)
+        publish_changed(spec.root / name, content)
+        sizes = rows[split]["bytes"].tolist()
+        tables[split] = Table(name, sha256(content), len(own), sum(sizes), max(sizes))
+    counts = {shard.split: shard.first + shard.count for shard in shards}
+    if old and (old.identity_sha256, old.splits, old.tables) == (spec.identity_sha256, counts, tables):
+        kept = _kept(spec, old)
+        if kept is not None:
+            return kept
+    stats = {split: summary(own["moments"], spec.fields) for split, own in rows.items()}
+    files = {CONFIG: spec.config_text.encode(), **spec.copies}
+    hashes = {name: sha256(content) for name, content in files.items()}
+    manifest = describe(spec, counts, tables, stats, hashes)
+    if "frames" in spec.fields:
+        files[SHEET] = sheet(spec.root, manifest)
+        manifest = describe(spec, counts, tables, stats, hashes | {SHEET: sha256(files[SHEET])})
+    return Publication(manifest, files | _cards(spec, manifest))
+
+
+def _cards(spec: DatasetSpec, manifest: Manifest) -> dict[str, bytes]:
+    return {"README.md": readme(manifest, spec.command).encode(), "croissant.json": croissant(manifest)}
+
+
+def _kept(spec: DatasetSpec, old: Manifest) -> Publication | None:
+    """The present manifest, and those of its files that are not what was written; None where one of them would be
+    another now."""
+    files = {}
+    for name, digest in old.files.items():
+        try:
+            if has_sha256(spec.root / name, digest, FILE_BYTES):
+                continue
+        except OSError as error:
+            failure = reading_error(spec.root / name, error)
+            if isinstance(failure, UserError | UnreachableError):
+                raise failure from error
+        own = {CONFIG: spec.config_text.encode(), **spec.copies}.get(name)
+        files[name] = sheet(spec.root, old) if name == SHEET else own or b""
+        if sha256(files[name]) != digest:
+            return None
+    return Publication(old, files | _cards(spec, old))
+
+
+def sheet(root: Place, manifest: Manifest) -> bytes:
+    """A contact sheet of the first videos, as a PNG; the manifest need not be in the folder yet."""
+    options = Options(shown_split(manifest), ("frames",), None, 1, "first", "THWC", "uint8", "checksum")
+    ds = Dataset(root, manifest, options)
+    # One video in memory at a time: they may be long and large.
+    videos = (ds[number]["frames"] for number in range(min(ROWS, len(ds))))
+    return images.png(contact_sheet.contact_sheet(np.stack([contact_sheet.reduced(video) for video in videos])))

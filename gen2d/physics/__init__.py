@@ -1,0 +1,1 @@
+"""The solver: contacts, joints, energy, and the loop over frames."""

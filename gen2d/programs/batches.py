@@ -1,0 +1,31 @@
+"""Slices of batches, and the checks of what they hold."""
+
+import numpy as np
+
+from gen2d.config.plugin_options import Plugin
+from gen2d.core.errors import UserError
+from gen2d.dataset.spec import Shard
+from gen2d.programs.rollout import Batch, Rollout, parts
+
+Piece = tuple[Shard, int, int]  # a shard's videos among those of a batch: lanes from the first to before the second
+
+
+class NoPlaceError(UserError):
+    """A scene in which the objects do not fit."""
+
+
+def _check_placed(rollout: Rollout, batch: Batch, firsts: list[int], pieces: list[list[Piece]]) -> None:
+    for first, own, placed in zip(firsts, pieces, parts(batch.placed), strict=True):
+        for _, start, stop in own:
+            check_placed(rollout.config.scene, placed[start:stop], np.arange(first + start, first + stop))
+
+
+def check_placed(scene: Plugin, placed: np.ndarray, numbers: np.ndarray) -> None:
+    """Returns nothing; raises NoPlaceError if the scene of one of the videos with these numbers did not fit."""
+    if not placed.all():
+        options = [f"scene.{name}" for name in getattr(scene.module, "CROWDED_BY", ())]
+        cause = f": it depends on {', '.join(options)}" if options else ""
+        raise NoPlaceError(
+            f"scene: video {numbers[np.argmin(placed)]} could not be placed without overlap in 100 attempts{cause}; "
+            "ask for fewer or smaller objects, or for more room"
+        )

@@ -1,0 +1,146 @@
+"""From a simulated video to what it is drawn from: its camera, its paint, its occluders, all from the video's key.
+
+Each has a key of its own, so that another look or another camera changes nothing else.
+"""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from gen2d import annotations
+from gen2d.config.config import Config
+from gen2d.config.sections import ImageOptions
+from gen2d.records.axes import Array
+from gen2d.records.keys import key_for
+from gen2d.records.layout import Layout
+from gen2d.records.scene import Scene, State
+from gen2d.renderers import camera
+from gen2d.renderers.camera import View
+from gen2d.renderers.paint import Paint
+from gen2d.renderers.plan import Occluders, Plan, Stage
+from gen2d.renderers.primitives import Bodies, Instants
+from gen2d.renderers.rasterizer import draw
+
+
+def plan_of(config: Config, layout: Layout) -> Plan:
+    """What is known of a config's pictures before anything is drawn."""
+    video, image, look = config.video, config.image, config.look
+    seconds = video.frames / video.fps
+    return Plan(
+        layout=layout,
+        height=video.height,
+        width=video.width,
+        scale=camera.largest_scale(config.camera, layout, video.height, video.width, seconds),
+        grow=getattr(look.options, "margin", 0.0),
+        still=not camera.moves(config.camera),
+        linear=image.blending == "linear",
+        frames=config.storage.frames != "none",
+        owners=annotations.need_owners(config.annotations),
+        exposed=image.exposure_samples if image.exposure else 0,
+    )
+
+
+def paint_of(key: Array, config: Config, scene: Scene, layout: Layout) -> Paint:
+    """One video's paint."""
+    return config.look.module.paint(scene, layout, config.look.options, key_for(key, "look"))
+
+
+def view_of(key: Array, config: Config, layout: Layout, states: State) -> View:
+    """One video's view."""
+    video = config.video
+    return camera.filmed(key_for(key, "camera"), config.camera, layout, states, video.fps, video.height, video.width)
+
+
+def stage_of(
+    key: Array,
+    config: Config,
+    plan: Plan,
+    scene: Scene,
+    states: State,
+    view: View | None = None,
+    between: State | None = None,
+) -> Stage:
+    """All that one video is drawn from; `between` holds its states [T - 1, steps, K ...] at every step. Its view is
+    that of its key, if none is given."""
+    paint = paint_of(key, config, scene, plan.layout)
+    view = view_of(key, config, plan.layout, states) if view is None else view
+    objects, image = scene.objects, config.image
+    bodies = Bodies(objects.radius, objects.half_length, objects.vertices)
+    exposed = None
+    if image.exposure:
+        assert between is not None, "motion blur needs the states between frames"
+        exposed = _exposed(image, config.video.fps, states, between, view)
+    seed = jax.random.bits(key_for(key, "pixels"), (), jnp.uint32)
+    deviation = image.noise.sample(key_for(key, "noise"), ()) if image.noise.support != (0.0, 0.0) else None
+    occluders = _occluders(key_for(key, "occluders"), config, plan) if image.occluders else None
+    return Stage(bodies, Instants(states.position, states.angle, view), exposed, paint, occluders, deviation, seed)
+
+
+def _exposed(image: ImageOptions, fps: float, states: State, between: State, view: View) -> Instants:
+    """Where everything is at the middles of the parts of each exposure, which ends at the frame's instant.
+
+    Between the ends of steps everything moves evenly; before the first frame it has moved as it does then.
+    """
+    steps, samples = between.angle.shape[1], image.exposure_samples
+    before = image.exposure * (1 - (jnp.arange(samples) + 0.5) / samples)  # frames
+
+    def at(now: Array, rate: Array, ends: Array) -> Array:
+        """Of [T, ...] at frames and [T - 1, steps, ...] at the ends of steps, [T, samples, ...]."""
+        early = now[0] - rate[0] / fps  # before the first frame: a straight line
+        share = (jnp.arange(steps + 1) / steps).reshape(-1, *[1] * (now.ndim - 1))
+        line = jnp.concatenate([now[:-1, None], ends], axis=1)
+        line = jnp.concatenate([(early + share * (now[0] - early))[None], line])
+        place = (1 - before) * steps
+        low = jnp.clip(jnp.floor(place).astype(jnp.int32), 0, steps - 1)
+        share = (place - low).reshape(-1, *[1] * (now.ndim - 1))
+        return line[:, low] * (1 - share) + line[:, low + 1] * share
+
+    def even(values: Array) -> Array:
+        """A camera's number, as if it changed evenly between frames."""
+        last = jnp.concatenate([2 * values[:1] - values[1:2] if len(values) > 1 else values[:1], values[:-1]])
+        share = before.reshape(-1, *[1] * (values.ndim - 1))
+        return values[:, None] * (1 - share) + last[:, None] * share
+
+    position = at(states.position, states.velocity, between.position)
+    angle = at(states.angle, states.angular_velocity, between.angle)
+    return Instants(position, angle, View(*map(even, view)))
+
+
+def _occluders(key: Array, config: Config, plan: Plan) -> Occluders:
+    image, video = config.image, config.video
+    count = image.occluders
+    keys = dict(zip(("place", "width", "height", "front", "color"), jax.random.split(key, 5), strict=True))
+    size = jnp.stack(
+        [
+            image.occluder_width.sample(keys["width"], (count,)) * video.width,
+            image.occluder_height.sample(keys["height"], (count,)) * video.height,
+        ],
+        -1,
+    )
+    center = jax.random.uniform(keys["place"], (count, 2)) * jnp.asarray([video.width, video.height])
+    front = image.occluder_front.sample(keys["front"], (count,))
+    rank = jnp.sort(jnp.round(front * plan.moving).astype(jnp.int32))
+    parts = [
+        part.sample(k, (count,)).astype(jnp.float32)
+        for part, k in zip(image.occluder_color, jax.random.split(keys["color"], 3), strict=True)
+    ]
+    return Occluders(jnp.concatenate([center - size / 2, center + size / 2], -1), jnp.stack(parts, -1), rank)
+
+
+def pictures(stages: Stage, plan: Plan, options: Any) -> dict[str, Array]:
+    """Frames and annotations of some videos, by the names that they are stored under."""
+    frames, owners = draw(stages, plan)
+    found = {} if frames is None else {"frames": frames}
+    return found | annotations.annotated(stages, owners, plan, options)
+
+
+def painted_colors(paint: Paint, scene: Scene) -> Array:
+    """The colours [K, 3] uint8 that the slots are painted with; zero where there is nothing."""
+    present = scene.objects.present[:, None]
+    return jnp.where(present, jnp.clip(jnp.round(paint.color), 0, 255), 0).astype(jnp.uint8)
+
+
+def camera_columns(view: View) -> dict[str, Array]:
+    """A view by its stored names."""
+    return {f"camera/{name}": values for name, values in view._asdict().items()}

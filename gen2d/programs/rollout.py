@@ -1,0 +1,331 @@
+"""The device's side of generation: video numbers in, ground truth and frames out, a fixed number of videos at a time.
+
+Two programs. `simulate` samples and simulates `lanes` videos on every device; `draw` draws a slice of them, so small
+that its frames stay in the cache until they are compressed. `lanes` comes from the config, never from the machine, so
+more devices mean more batches, not wider ones, and video i always sits in lane i % lanes of the same program: its bits
+do not depend on how many videos are made, or where.
+"""
+
+import dataclasses
+import functools
+import math
+import zlib
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+
+from gen2d import annotations
+from gen2d.captions import caption
+from gen2d.config import quality
+from gen2d.config.config import Config
+from gen2d.core import enums
+from gen2d.core.schema import Field
+from gen2d.physics import lyapunov
+from gen2d.physics.params import rules_of
+from gen2d.physics.simulate import Keep, simulate, substeps
+from gen2d.programs import render
+from gen2d.records import axes as axes_module
+from gen2d.records import keys as keys_module
+from gen2d.records import layout as layout_module
+from gen2d.records import scene as scene_module
+from gen2d.records import trajectory
+from gen2d.records.axes import Array
+from gen2d.records.scene import Scene, State
+from gen2d.records.trajectory import Trajectory
+from gen2d.renderers.plan import Stage
+from gen2d.sampling import rejection, sampler
+from gen2d.sampling.builder import Sampled
+from gen2d.sampling.matched import sets
+from gen2d.sampling.matched import simulate as simulate_module
+from gen2d.sampling.sampler import Change, Sampler
+
+SLICE_BYTES = 16 * 2**20  # of raw frames drawn at once; larger buffers cost page faults
+SHARD_BYTES = 2**30  # of raw frames in a shard
+SHARD_VIDEOS = 1024  # at most, unless the config says otherwise
+LANES, ROWS = 512, 2**20  # videos simulated at once, and pairs that can meet in all of them; 300 bytes for each
+VIDEOS = PartitionSpec("videos")
+JOINTS = ("distance", "revolute")  # joints/kind is an index into this
+
+
+class Batch(NamedTuple):
+    """`lanes` simulated videos on each device, ready to be drawn."""
+
+    columns: dict[str, Array]  # stored fields but for those that are drawn, [n, ...]
+    stages: Stage
+    placed: Array  # [n] whether the sampler found a scene
+
+
+def _power_of_two(limit: int) -> int:
+    return 1 << max(0, limit.bit_length() - 1)
+
+
+def divisor(number: int, limit: int) -> int:
+    """The largest divisor of a number up to a limit."""
+    return next(d for d in range(min(number, limit), 0, -1) if number % d == 0)
+
+
+class Rollout:
+    """The compiled programs of one config on some devices."""
+
+    def __init__(self, config: Config, devices: Sequence[Any]) -> None:
+        self.config, self.devices = config, list(devices)
+        video = config.video
+        self.layout = config.scene.module.layout(config.scene.options)
+        self.sampler, self.wanted = Sampler(config), quality.ranges(config.quality)
+        self.plan = render.plan_of(config, self.layout)
+        self.steps = substeps(video.fps, config.physics.substeps, config.physics.max_step)
+        self.keep = keep_of(config, self.layout)
+        frame_bytes = video.frames * video.height * video.width * 3
+        auto = min(SHARD_VIDEOS, _power_of_two(SHARD_BYTES // frame_bytes))
+        self.videos_per_shard = config.storage.videos_per_shard or auto
+        moving = sum(run.count for run in self.layout.runs if run.kind == enums.DYNAMIC)
+        rows = moving * (self.layout.slots - moving) + moving * (moving - 1) // 2
+        together = min(LANES, _power_of_two(ROWS // max(rows, 1)))
+        self.lanes = config.storage.lanes or min(together, auto)  # not the shard size: that must not change a video
+        self.slice = divisor(self.lanes, max(1, SLICE_BYTES // frame_bytes))
+        self.mesh = Mesh(np.array(self.devices), ("videos",))
+        self._draws: dict[int, Any] = {}  # by how many videos are drawn together
+        self._drawn: set[int] = set()  # those that have run, and so are compiled
+        of_each = (
+            self._made if len(self.devices) == 1 else self._shared(self._made, (*[PartitionSpec()] * 2, *[VIDEOS] * 3))
+        )
+        self._simulate: Any = jax.jit(of_each)
+
+    def _shared(self, function: Any, specs: tuple) -> Any:
+        return jax.shard_map(function, mesh=self.mesh, in_specs=specs, out_specs=VIDEOS, check_vma=False)
+
+    @property
+    def sizes(self) -> dict[str, int]:
+        """The sizes of the lettered axes of every field."""
+        video = self.config.video
+        own = {"T": video.frames, "K": self.layout.slots, "H": video.height, "W": video.width}
+        own |= {"C": self.keep.contacts} if self.keep.contacts else {}
+        own |= {"J": len(self.layout.joints)} if self.layout.joints else {}
+        corners = max(run.vertices for run in self.layout.runs)
+        own |= {"V": corners} if corners else {}
+        own |= annotations.sizes(self.config.annotations, self.plan)
+        return own | self.sampler.lengths
+
+    @property
+    def fields(self) -> dict[str, Field]:
+        """Every stored field."""
+        scene = jax.eval_shape(self._scene, jax.eval_shape(lambda: jax.random.key(0)))
+        made = [scene_module.State, trajectory.Quality, *([trajectory.Contacts] if self.keep.contacts else [])]
+        made += [trajectory.Energy] if self.keep.energy else []
+        fields = {name: field for record in made for name, (_, field) in axes_module.described(record).items()}
+        fields |= axes_module.fields_of(scene)
+        if not self.keep.energy:
+            del fields["quality/energy_residual"]
+        for name in sets.untold(self.config.matched):
+            del fields[name]
+        if self.plan.frames:
+            fields["frames"] = Field("uint8", "n T H W 3", "sRGB", "the video")
+        fields |= annotations.fields(self.config.annotations) | self.word_fields
+        if self.config.annotations.predictability:
+            fields |= lyapunov.FIELDS
+        fields["index"] = Field("int64", "n", "1", "the video's number in its split")
+        fields["time"] = Field("float64", "T", "s", "of each frame; frame 0 is the initial state")
+        if self.layout.joints:
+            fields["joints/kind"] = Field("uint8", "J", "1", f"index into {', '.join(JOINTS)}")
+            fields |= {f"joints/{side}": Field("int16", "J", "object", f"slot of object {side}") for side in "ab"}
+        fields["quality/rejected_draws"] = Field("int32", "n", "1", "places drawn again as they did not fit")
+        fields |= {"quality/rejected_videos": rejection.FIELD} if self.wanted else {}
+        for name, axes, unit, meaning in CAMERA:
+            fields[f"camera/{name}"] = Field("float32", axes, unit, meaning)
+        fields |= sampler.fields(self.config) | sets.fields(self.config.matched)
+        return dict(sorted(fields.items()))
+
+    @property
+    def constants(self) -> dict[str, np.ndarray]:
+        """The stored fields that are one for all videos."""
+        if not self.layout.joints:
+            return {"time": self.time}
+        ties = self.layout.joints
+        slots = {f"joints/{side}": np.array([getattr(tie, side) for tie in ties], np.int16) for side in "ab"}
+        return {"time": self.time, "joints/kind": np.array([JOINTS.index(tie.kind) for tie in ties], np.uint8), **slots}
+
+    @property
+    def word_fields(self) -> dict[str, Field]:
+        """Those fields that are made on the host."""
+        longest = max((len(split.name) for split in self.config.splits), default=0)
+        found = {"split": Field(f"S{longest}", "n", "", "the split that the video belongs to")} if longest else {}
+        spoken = self.config.annotations.words
+        return found | (caption.fields(self.layout.slots, self.config.video.frames) if spoken else {})
+
+    def told(self, columns: dict[str, np.ndarray], split: str) -> dict[str, np.ndarray]:
+        """The fields of some videos of a split that are made on the host, from their others there."""
+        count = len(columns["objects/present"])
+        fields = self.word_fields
+        named = {"split": np.full(count, split.encode(), fields["split"].dtype)} if self.config.splits else {}
+        return named | (caption.told(columns, self.config.video) if self.config.annotations.words else {})
+
+    @property
+    def time(self) -> np.ndarray:
+        """Of each frame, in seconds: t / fps exactly."""
+        return np.arange(self.config.video.frames, dtype=np.float64) / self.config.video.fps
+
+    def begin(self, split: str, firsts: Sequence[int]) -> Batch:
+        """Starts `lanes` videos on each device, from these numbers on; one number per device."""
+        numbers = np.concatenate([np.arange(first, first + self.lanes, dtype=np.uint32) for first in firsts])
+        return self.begin_with(split, numbers)
+
+    def begin_with(self, split: str, numbers: np.ndarray) -> Batch:
+        """Starts the videos with these numbers, uint32, `lanes` for each device."""
+        root, row = keys_module.seed_words(self.config.seed, zlib.crc32(split.encode())), self.config.row(split)
+        given = self.sampler.combination(row, root, numbers)
+
+        def make(lanes: np.ndarray, attempts: np.ndarray) -> Batch:
+            of_videos = given[lanes], numbers[lanes], attempts.astype(np.uint32)
+            return self._simulate(root, np.int32(row), *self._shares(of_videos))
+
+        if not self.wanted:
+            return make(np.arange(len(numbers)), np.zeros(len(numbers)))
+        if quality.VISIBILITY not in self.wanted:
+            batch, attempts = rejection.fitting(make, numbers, self.config.quality)
+        else:
+            batch, attempts = rejection.fitting(lambda *of: self._seen(make(*of)), numbers, self.config.quality)
+            del batch.columns[quality.VISIBILITY]  # it comes with the pictures
+        return batch._replace(
+            columns=batch.columns | {"quality/rejected_videos": self._shares(attempts.astype(np.int32))}
+        )
+
+    def _shares(self, arrays: Any) -> Any:
+        """Arrays over videos, each device with its part."""
+        return jax.device_put(arrays, NamedSharding(self.mesh, VIDEOS))
+
+    def _seen(self, batch: Batch) -> Batch:
+        """The batch with what is known of its visibility when it is drawn."""
+        drawn = [self.draw(batch, start, self.slice) for start in range(0, self.lanes, self.slice)]
+        of_devices = zip(*drawn, strict=True)
+        seen = np.concatenate([np.asarray(part[quality.VISIBILITY]) for parts in of_devices for part in parts])
+        return batch._replace(columns=batch.columns | {quality.VISIBILITY: self._shares(seen)})
+
+    def draw(self, batch: Batch, start: int, count: int) -> list[dict[str, Array]]:
+        """Starts to draw `count` videos of each device, from lane `start` on: for each device their frames
+        [count, T, H, W, 3] and what is told of their pixels, by their stored names.
+
+        Each device runs a program of its own: compiled for several at once, another rounding would differ.
+        """
+        own = [jax.tree.map(lambda array, d=d: _pieces(array)[d].data, batch.stages) for d in range(len(self.devices))]
+        draw = functools.partial(self._draw(count), start=np.int32(start))
+        if count in self._drawn:
+            return [draw(stages) for stages in own]
+        self._drawn.add(count)
+        with ThreadPoolExecutor(len(own)) as pool:  # compiles for all devices at once
+            return list(pool.map(draw, own))
+
+    def close(self) -> None:
+        """Returns nothing; lets go of the compiled programs, which jax would keep, thousands of memory maps each."""
+        for program in (self._simulate, *self._draws.values()):
+            program.clear_cache()
+
+    def lowered(self) -> dict[str, str]:
+        """The text of the programs, each for one device, whatever their number."""
+        lanes, word = jax.ShapeDtypeStruct((self.lanes,), np.uint32), jax.ShapeDtypeStruct((), np.int32)
+        given = jax.ShapeDtypeStruct((self.lanes, len(self.sampler.gridded)), np.float32)
+        simulate = self._simulate if len(self.devices) == 1 else jax.jit(self._made)
+        with jax.default_device(self.devices[0]):
+            made = simulate.lower(jax.ShapeDtypeStruct((3,), np.uint32), word, given, lanes, lanes)
+            drawn = self._draw(self.slice).lower(made.out_info.stages, start=word)
+        return {"simulate": made.as_text(), "draw": drawn.as_text()}
+
+    def _draw(self, count: int) -> Any:
+        def drawn(stages: Stage, start: Array) -> dict[str, Array]:
+            cut = jax.tree.map(lambda x: jax.lax.dynamic_slice_in_dim(x, start, count), stages)
+            return render.pictures(cut, self.plan, self.config.annotations)
+
+        if count not in self._draws:
+            self._draws[count] = jax.jit(drawn)
+        return self._draws[count]
+
+    def _made(self, root: Array, row: Array, given: Array, numbers: Array, attempts: Array) -> Batch:
+        """One device's share: from numbers to everything but the frames."""
+        config = self.config
+        keys, told = sets.keys_of(root, numbers, config.matched), {}
+        if config.matched.change:
+
+            def member(key: Array, change: Change | None = None) -> tuple[dict[str, Array], Sampled]:
+                return self.sampler.sampled(key, row, change=change)
+
+            drawn, own, made, told = simulate_module.simulated(keys, numbers, config, self.layout, member, self._run)
+        else:
+            own_keys = rejection.attempt_keys(keys, attempts) if self.wanted else keys
+            drawn, own = jax.vmap(self.sampler.sampled, (0, None, 0))(own_keys, row, given)
+            made = self._run(own.scene, own.state)
+        scene, between, made = own.scene, made.between, dataclasses.replace(made, between=None)
+
+        def staged(key: Array, scene: Scene, states: State, between: State | None) -> tuple[Stage, Array]:
+            stage = render.stage_of(key, config, self.plan, scene, states, between=between)
+            return stage, render.painted_colors(stage.paint, scene)
+
+        stages, colors = jax.vmap(staged)(keys, scene, made.states, between)
+        columns = axes_module.columns(scene) | axes_module.columns(made)
+        columns["objects/color"] = colors
+        columns |= render.camera_columns(stages.instants.view)
+        columns |= {f"factors/{name}": values.astype(jnp.float32) for name, values in drawn.items()}
+        columns |= jax.vmap(self.sampler.outside)(drawn)
+        columns["quality/rejected_draws"] = own.rejected
+        if config.annotations.predictability:
+            columns["quality/growth"] = self._growth(keys, own)
+        columns = {name: values for name, values in columns.items() if name not in sets.untold(config.matched)}
+        return Batch(columns | told, stages, own.fits)
+
+    def _simulated(self, scene: Scene, state: State, keep: Keep) -> Trajectory:
+        """What becomes of these starts, in the device's layout."""
+        config, sparse = self.config, self.devices[0].platform == "cpu"
+        rules = rules_of(config.physics, config.video.fps, self.steps)
+        return simulate(scene, state, self.layout, rules, config.video.frames, self.steps, keep, sparse=sparse)
+
+    def _run(self, scene: Scene, state: State) -> Trajectory:
+        """What becomes of these starts; videos first."""
+        made = self._simulated(axes_module.to_device(scene), axes_module.to_device(state), self.keep)
+        between = None if made.between is None else _videos_first(made.between)
+        return dataclasses.replace(axes_module.to_stored(dataclasses.replace(made, between=None)), between=between)
+
+    def _growth(self, keys: Array, own: Sampled) -> Array:
+        again = functools.partial(self._simulated, keep=Keep())
+        starts = axes_module.to_device(own.scene), axes_module.to_device(own.state)
+        return lyapunov.growth(keys, *starts, again, float(self.time[-1]))
+
+    def _scene(self, key: Array) -> Scene:
+        """A scene of a video, for its shape."""
+        return self.sampler.sampled(key, given=jnp.zeros(len(self.sampler.gridded)))[1].scene
+
+    def host_columns(self, batch: Batch) -> list[dict[str, np.ndarray]]:
+        """For each device its columns as NumPy arrays; waits until they are there."""
+        pieces = {name: parts(array) for name, array in batch.columns.items()}
+        if "contacts/time" in pieces:  # a device may have no float64
+            pieces["contacts/time"] = [array.astype(np.float64) for array in pieces["contacts/time"]]
+        return [{name: arrays[d] for name, arrays in pieces.items()} for d in range(len(self.devices))]
+
+
+def _videos_first(between: State) -> State:
+    """States [T - 1, steps, (2,) K, n] as [n, T - 1, steps, K(, 2)]."""
+    return jax.tree.map(lambda x: jnp.moveaxis(jnp.moveaxis(x, -1, 0), -1, 3), between)
+
+
+CAMERA = (
+    ("center", "n T 2", "m", "world point in the middle of the frame"),
+    ("scale", "n T", "px/m", "pixels per metre"),
+    ("angle", "n T", "rad", "of the camera, counter-clockwise"),
+)
+
+
+def _pieces(array: Array) -> list[Any]:
+    return sorted(array.addressable_shards, key=lambda piece: piece.index[0].start or 0)
+
+
+def parts(array: Array) -> list[np.ndarray]:
+    """Each device's part of an array."""
+    return [np.asarray(piece.data) for piece in _pieces(array)]
+
+
+def keep_of(config: Config, layout: layout_module.Layout) -> Keep:
+    """What is kept of a simulation beyond its states."""
+    rows = config.annotations.contacts * math.ceil(config.video.frames / 16) * layout.slots
+    return Keep(rows, config.annotations.energy, between=config.image.exposure > 0)

@@ -1,0 +1,1 @@
+"""Records that travel between sampler, solver, renderer and files; they may import `core` alone."""

@@ -1,0 +1,35 @@
+"""Random keys by name and by video."""
+
+import functools
+import zlib
+from collections.abc import Sequence
+
+import jax
+import numpy as np
+
+from gen2d.records.axes import Array
+
+
+def key_for(key: Array, what: str) -> Array:
+    """The key of one of the things that numbers are drawn for."""
+    return keys_for(key, [what])[0]
+
+
+def keys_for(key: Array, whats: Sequence[str]) -> list[Array]:
+    """The keys of some of the things that numbers are drawn for, all made by one compiled loop."""
+    codes = np.array([zlib.crc32(what.encode()) for what in whats], np.uint32)
+    return list(jax.vmap(functools.partial(jax.random.fold_in, key))(codes))
+
+
+def seed_words(seed: int, split: int) -> np.ndarray:
+    """A seed up to 2**63 - 1 and a split's number as three 32-bit words, so that jax needs no 64-bit mode."""
+    return np.array([seed >> 32, seed & 0xFFFFFFFF, split], np.uint32)
+
+
+def video_keys(words: Array, numbers: Array) -> Array:
+    """A key per video: `fold_in(fold_in(key(seed), split), i)`; `words` as `seed_words` gives them."""
+    root = jax.random.fold_in(jax.random.wrap_key_data(words[:2], impl="threefry2x32"), words[2])
+    return jax.vmap(lambda i: jax.random.fold_in(root, i))(numbers)
+
+
+MAX_VIDEOS = 2**32 - 1

@@ -1,0 +1,1 @@
+"""Scenes sampled from distributions: slots, placement, rejection, matched sets."""

@@ -1,0 +1,1 @@
+"""Matched sets: videos that share a scene and differ in one thing."""

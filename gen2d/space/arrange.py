@@ -1,0 +1,108 @@
+"""Bodies by hand as slots of a scene, and the compiled program of their layout."""
+
+import dataclasses
+import functools
+import math
+import warnings
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from gen2d.core.enums import DYNAMIC
+from gen2d.physics.collision import touches
+from gen2d.physics.params import Rules
+from gen2d.physics.shapes import form_of, placed
+from gen2d.physics.simulate import Forces, Keep, simulate
+from gen2d.records.axes import to_device, to_stored
+from gen2d.records.layout import Layout, Run
+from gen2d.records.scene import Objects, Scene, State
+from gen2d.records.trajectory import Contacts
+from gen2d.space.bodies import GREY, Body
+
+
+def _slots(span: tuple[Run, int]) -> range:
+    return range(span[1], span[1] + span[0].count)
+
+
+def family(body: Body) -> str:
+    """The shape of the run that holds a body: a segment is a capsule, whose radius may be 0."""
+    return "capsule" if body.shape == "segment" else body.shape
+
+
+def _place(body: Body) -> tuple:
+    """By what slots are sorted; bodies alike in it share a run, fixed polygons only if they have as many corners."""
+    corners = 0 if body.kind == DYNAMIC else len(body.vertices)
+    return body.kind, ("circle", "capsule", "polygon").index(family(body)), corners
+
+
+def _filled(vertices: np.ndarray, corners: int) -> np.ndarray:
+    """The corners, the last one repeated up to a number; zeros where there are none."""
+    if not len(vertices):
+        return np.zeros((corners, 2))
+    return np.concatenate([vertices, np.repeat(vertices[-1:], corners - len(vertices), axis=0)])
+
+
+def _world(shape: str) -> Body:
+    zero, none = np.zeros(2), np.zeros((0, 2))
+    return Body(
+        shape=shape, kind=DYNAMIC, position=zero, angle=0.0, velocity=zero, spin=0.0, radius=0.0, half_length=0.0,
+        vertices=none, mass=math.inf, moment=math.inf, elasticity=0.0, friction=0.0, rolling_resistance=0.0, color=GREY,
+        force=zero, torque=0.0,
+    )  # fmt: skip
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _meeting(runs: tuple[Run, Run], objects: Objects, sides: Sequence[jax.Array], places: Sequence) -> list[tuple]:
+    """Gap, place and normal of each point of some pairs: slots of two runs, and where they are."""
+    forms = (form_of(objects, run, side) for run, side in zip(runs, sides, strict=True))
+    a, b = (placed(form, *place) for form, place in zip(forms, places, strict=True))
+    return [(point.gap, a.centre + point.arm_a, point.normal) for point in touches(a, b)]
+
+
+@functools.lru_cache(maxsize=8)  # a program takes up to thousands of memory maps, of which a process has some 60,000
+def _program(layout: Layout, rules: Rules, frames: int, steps: int, keep: Keep, forces: Any) -> Callable:
+    """The compiled program of a layout; scenes, states and trajectories have videos first."""
+    hook = None if forces is None else _by_slot(*forces)
+    sparse = jax.default_backend() == "cpu"
+
+    def run(scene: Scene, state: State) -> Any:
+        device = to_device(scene), to_device(state)
+        return to_stored(simulate(*device, layout, rules, frames, steps, keep, hook, sparse))
+
+    return jax.jit(run)
+
+
+def _by_slot(forces: Callable, slots: tuple[int, ...]) -> Forces:
+    """The hook that the solver takes, from one over bodies by number."""
+    order = np.array(slots)
+
+    def hook(state: State, time: jax.Array) -> tuple[jax.Array, jax.Array]:
+        own = jax.tree.map(lambda x: jnp.moveaxis(x[..., order, 0], 0, -1), state)
+        force, torque = forces(own, time)
+        nothing = jnp.zeros_like(state.position), jnp.zeros_like(state.angle)
+        return nothing[0].at[:, order, 0].set(jnp.asarray(force).T), nothing[1].at[order, 0].set(torque)
+
+    return hook
+
+
+def _numbers(slots: np.ndarray, count: int) -> np.ndarray:
+    """The number of the body in each slot; -1 is the world."""
+    numbers = np.full(count, -1)
+    numbers[slots] = np.arange(len(slots))
+    return numbers
+
+
+def _rows_there(contacts: Contacts, slots: np.ndarray, count: int) -> Contacts:
+    """The rows in use, with bodies by number."""
+    there, room = int(contacts.count), contacts.time.shape[0]
+    if there > room:
+        warnings.warn(
+            f"simulate: there were {there} rows of contacts, but contacts={room} keeps only so many", stacklevel=3
+        )
+    names = [f.name for f in dataclasses.fields(contacts) if f.name != "count"]
+    rows = {name: getattr(contacts, name)[:there] for name in names}
+    numbers = _numbers(slots, count)
+    return Contacts(**rows | {"a": numbers[rows["a"]], "b": numbers[rows["b"]], "count": contacts.count})

@@ -1,0 +1,83 @@
+"""Checks of arguments."""
+
+import colorsys
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from gen2d.core.enums import DYNAMIC
+from gen2d.core.errors import ConfigError
+from gen2d.space.bodies import GREY, MOST_CORNERS
+
+# Checks -------------------------------------------------------------------------------------------------------------
+
+
+def _number(
+    name: str, value: Any, low: float | None = None, above: float | None = None, infinite: bool = False
+) -> float:
+    """The value as a number, or ConfigError; infinite ones are allowed only if it says so."""
+    allowed = " and ".join(
+        [
+            "a number",
+            *([f"{low:g} or more"] if low is not None else []),
+            *([f"above {above:g}"] if above is not None else []),
+        ]
+    )
+    try:
+        number = float(value)
+    except (TypeError, ValueError):
+        number = math.nan
+    fits = (low is None or number >= low) and (above is None or number > above)
+    if math.isnan(number) or (math.isinf(number) and not infinite) or not fits:
+        raise ConfigError(f"{name} is {value!r}, but must be {allowed}")
+    return number
+
+
+def _floats(value: Any) -> np.ndarray:
+    """The value as an array of numbers; an empty one if it is none."""
+    try:
+        return np.asarray(value, float)
+    except (TypeError, ValueError):
+        return np.empty(0)
+
+
+def _pair(name: str, value: Any) -> np.ndarray:
+    pair = _floats(value)
+    if pair.shape != (2,) or not np.isfinite(pair).all():
+        raise ConfigError(f"{name} is {value!r}, but must be two numbers, x and y")
+    return pair
+
+
+def _corners(name: str, value: Any) -> np.ndarray:
+    """Counter-clockwise corners of a convex polygon."""
+    corners = _floats(value)
+    if corners.ndim != 2 or corners.shape[-1] != 2 or not 3 <= len(corners) <= MOST_CORNERS:
+        raise ConfigError(f"{name} has shape {list(corners.shape)}, but must be 3 to {MOST_CORNERS} corners (x, y)")
+    if not np.isfinite(corners).all():
+        raise ConfigError(f"{name} has a corner that is not a number, but all must be finite")
+    edges = np.roll(corners, -1, axis=0) - corners
+    after = np.roll(edges, -1, axis=0)
+    turns = np.arctan2(edges[:, 0] * after[:, 1] - edges[:, 1] * after[:, 0], (edges * after).sum(1))
+    way = np.sign(turns.sum())
+    once = abs(abs(turns.sum()) - 2 * math.pi) < 1e-6  # a star turns twice
+    if not once or (way * turns < 1e-6).any() or (np.hypot(*edges.T) == 0).any():
+        raise ConfigError(f"{name} is {corners.tolist()}, but must be convex, its corners in order and none in line")
+    return corners if way > 0 else corners[::-1].copy()
+
+
+def _color(name: str, value: Any, number: int, kind: int) -> tuple[int, int, int]:
+    if value is None:
+        hue = 0.03 + 0.618034 * number  # the golden section: neighbours differ, and none comes twice
+        red, green, blue = (round(255 * part) for part in colorsys.hls_to_rgb(hue % 1, 0.55, 0.6))
+        return (red, green, blue) if kind == DYNAMIC else GREY
+    parts = tuple(value) if isinstance(value, Sequence | np.ndarray) else ()
+    if len(parts) != 3 or not all(isinstance(p, int | np.integer) and 0 <= p <= 255 for p in parts):
+        raise ConfigError(f"{name} is {value!r}, but must be three whole numbers from 0 to 255: red, green, blue")
+    return int(parts[0]), int(parts[1]), int(parts[2])
+
+
+def _turned(vector: np.ndarray, angle: float) -> np.ndarray:
+    cos, sin = math.cos(angle), math.sin(angle)
+    return np.array([cos * vector[0] - sin * vector[1], sin * vector[0] + cos * vector[1]])

@@ -1,0 +1,196 @@
+"""Pictures of a space for a person, with smooth edges: one instant, all frames over each other, a film.
+
+They show what the physics knows, not what a dataset's look makes of it: marks that turn with the bodies, joints as thin
+lines, contacts as red arrows along their normals.
+"""
+
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from gen2d.core.enums import DYNAMIC
+from gen2d.core.errors import ConfigError
+from gen2d.media import films
+from gen2d.media.images import animate
+from gen2d.space.bodies import Body, Drawable, Film
+
+RED, DARK, WHITE = (220, 30, 30), (60, 60, 60), (255, 255, 255)
+SHIFT = 6  # fractional bits of the coordinates that OpenCV takes
+MARGIN = 0.05  # of the view that is shown where none is asked for, on each side
+FORMATS = (".png", ".gif", ".mp4")
+View = tuple[float, float, float, float]
+
+
+class Canvas:
+    """An image and the part of the world that it shows: left, bottom, right, top in metres."""
+
+    def __init__(self, view: View, size: int) -> None:
+        left, bottom, right, top = view
+        if not (right > left and top > bottom):
+            raise ConfigError(f"view is {view}, but must be left, bottom, right, top, each side longer than 0 m")
+        self.left, self.top, self.scale = left, top, size / max(right - left, top - bottom)
+        height, width = (max(2, round(side * self.scale / 2) * 2) for side in (top - bottom, right - left))
+        self.image = np.full((height, width, 3), WHITE, np.uint8)  # even sizes, as films need them
+        self.thickness = max(1, round(size / 300))
+
+    def at(self, points: Any) -> np.ndarray:
+        """World points [..., 2] in OpenCV's fixed-point pixels; a pixel's centre is whole."""
+        pixels = (np.asarray(points) - (self.left, self.top)) * (self.scale, -self.scale) - 0.5
+        return np.clip(np.round(pixels * 2**SHIFT), -(2**30), 2**30).astype(np.int32)
+
+    def disc(self, centre: Any, radius: float, color: tuple, filled: bool) -> None:
+        """A disc, or its outline."""
+        thickness = -1 if filled else self.thickness
+        pixels = round(radius * self.scale * 2**SHIFT)
+        cv2.circle(self.image, self.at(centre).tolist(), pixels, color, thickness, cv2.LINE_AA, SHIFT)
+
+    def outline(self, points: Any, color: tuple, filled: bool) -> None:
+        """A convex polygon, or its outline."""
+        if filled:
+            cv2.fillConvexPoly(self.image, self.at(points), color, cv2.LINE_AA, SHIFT)
+        else:
+            cv2.polylines(self.image, [self.at(points)], True, color, self.thickness, cv2.LINE_AA, SHIFT)
+
+    def line(self, a: Any, b: Any, color: tuple, thickness: int | None = None) -> None:
+        """A line between two points."""
+        start, end = (self.at(point).tolist() for point in (a, b))
+        cv2.line(self.image, start, end, color, thickness or self.thickness, cv2.LINE_AA, SHIFT)
+
+    def arrow(self, start: Any, along: np.ndarray) -> None:
+        """A red arrow of a fixed length in pixels from a point along a unit vector."""
+        length = 0.07 * max(self.image.shape) / self.scale
+        end, side = start + length * along, 0.15 * length * np.array([-along[1], along[0]])
+        neck = start + 0.6 * length * along
+        self.line(start, neck, RED, self.thickness + 1)
+        self.outline([end, neck + side, neck - side], RED, filled=True)
+
+
+def picture(
+    of: Drawable, frame: int = 0, *, view: View | None = None, size: int = 400, contacts: bool = True
+) -> np.ndarray:
+    """One instant as uint8 [H, W, 3], `size` pixels on its longer side.
+
+    `view` is the part of the world that it shows: (left, bottom, right, top) in m; default: all that is ever visited.
+    """
+    if not -len(of.position) <= frame < len(of.position):
+        raise ConfigError(f"frame is {frame}, but must be from 0 to {len(of.position) - 1}")
+    frame %= len(of.position)
+    canvas = Canvas(view or _seen(of), size)
+    for body, position, angle in sorted(
+        zip(of.bodies, of.position[frame], of.angle[frame], strict=True), key=lambda b: b[0].kind == DYNAMIC
+    ):
+        _body(canvas, body, position, angle, filled=True)
+    _joints(canvas, of, frame)
+    if contacts:
+        _arrows(canvas, of, frame)
+    return canvas.image
+
+
+def overlay(of: Drawable, *, view: View | None = None, size: int = 400, contacts: bool = False) -> np.ndarray:
+    """All frames over each other as uint8 [H, W, 3], moving bodies as outlines; as `picture` else."""
+    canvas = Canvas(view or _seen(of), size)
+    for i, body in enumerate(of.bodies):
+        moves = bool(np.ptp(of.position[:, i], axis=0).any() or np.ptp(of.angle[:, i]))
+        for frame in range(len(of.position) if moves else 1):
+            _body(canvas, body, of.position[frame, i], of.angle[frame, i], filled=body.kind != DYNAMIC)
+    for frame in range(len(of.position) if contacts else 0):
+        _arrows(canvas, of, frame)
+    return canvas.image
+
+
+def save(of: Film, path: str | Path, **options: Any) -> Path:
+    """The path of a file made there: .png all frames over each other, .gif (loops) or .mp4 the film.
+
+    Options are those of `overlay` and of `picture`. ConfigError for another ending, OSError where it cannot be written.
+    """
+    path = Path(path)
+    if path.suffix not in FORMATS:
+        raise ConfigError(f"{path}: ends in {path.suffix or 'nothing'}, but must end in one of {', '.join(FORMATS)}")
+    if path.suffix == ".png":
+        _write(path, overlay(of, **options))
+        return path
+    view = options.pop("view", None) or _seen(of)
+    film = np.stack([picture(of, frame, view=view, **options) for frame in range(len(of.position))])
+    if path.suffix == ".gif":
+        animate(path, film[None], of.fps)
+    else:
+        films.mp4v(path, film, of.fps)
+    return path
+
+
+def _write(path: Path, image: np.ndarray) -> None:
+    if not cv2.imwrite(str(path), image[..., ::-1]):
+        raise OSError(f"{path}: OpenCV could not write a picture")
+
+
+def _placed(points: Any, position: np.ndarray, angle: float) -> np.ndarray:
+    """Points [V, 2] of a body in the world."""
+    cos, sin = np.cos(angle), np.sin(angle)
+    return np.asarray(points) @ np.array([[cos, sin], [-sin, cos]]) + position
+
+
+def _body(canvas: Canvas, body: Body, position: np.ndarray, angle: float, filled: bool) -> None:
+    if body.shape == "polygon":
+        corners = _placed(body.vertices, position, angle)
+        canvas.outline(corners, body.color, filled)
+        if filled and body.kind == DYNAMIC:
+            canvas.outline(corners, DARK, False)
+    elif body.shape == "circle":
+        canvas.disc(position, body.radius, body.color, filled)
+        if filled and body.kind == DYNAMIC:
+            canvas.disc(position, body.radius, DARK, False)
+            canvas.line(position, _placed([(body.radius, 0)], position, angle)[0], DARK)
+    elif body.radius * canvas.scale < canvas.thickness:
+        a, b = _placed([(-body.half_length, 0), (body.half_length, 0)], position, angle)
+        canvas.line(a, b, body.color, canvas.thickness + 1)
+    else:
+        rim = _placed(_stadium(body), position, angle)
+        canvas.outline(rim, body.color, filled)
+        if filled and body.kind == DYNAMIC:
+            canvas.outline(rim, DARK, False)
+
+
+def _stadium(body: Body) -> np.ndarray:
+    turn = np.linspace(-np.pi / 2, np.pi / 2, 17)
+    cap = np.stack([body.half_length + body.radius * np.cos(turn), body.radius * np.sin(turn)], axis=1)
+    return np.concatenate([cap, -cap])
+
+
+def _joints(canvas: Canvas, of: Drawable, frame: int) -> None:
+    for joint in of.joints:
+        ends = [
+            anchor if i < 0 else _placed(anchor, of.position[frame, i], of.angle[frame, i])
+            for i, anchor in ((joint.a, joint.anchor_a), (joint.b, joint.anchor_b))
+        ]
+        canvas.line(ends[0], ends[1], DARK)
+        for end in ends:
+            canvas.disc(end, 1.5 * canvas.thickness / canvas.scale, DARK, True)
+
+
+def _arrows(canvas: Canvas, of: Drawable, frame: int) -> None:
+    found = of.contacts
+    if found is None:
+        return
+    points, normals = np.asarray(found.point), np.asarray(found.normal)
+    here = (np.asarray(found.frame) == frame) & normals.any(axis=1)  # a touch that ended in an earlier frame has none
+    for point, normal in zip(points[here], normals[here], strict=True):
+        canvas.arrow(point, normal)
+
+
+def _seen(of: Drawable) -> View:
+    """The rectangle around all that is ever visited, and some margin."""
+    low, high = [], []
+    for i, body in enumerate(of.bodies):
+        if body.shape == "polygon":
+            corners = body.vertices
+        else:
+            corners = np.array([(-body.half_length, 0.0), (body.half_length, 0.0)])
+        turned = np.stack([_placed(corners, p, a) for p, a in zip(of.position[:, i], of.angle[:, i], strict=True)])
+        low.append(turned.min((0, 1)) - body.radius)
+        high.append(turned.max((0, 1)) + body.radius)
+    anchors = [anchor for j in of.joints for i, anchor in ((j.a, j.anchor_a), (j.b, j.anchor_b)) if i < 0]
+    (left, bottom), (right, top) = np.min([*low, *anchors], axis=0), np.max([*high, *anchors], axis=0)
+    room = MARGIN * max(right - left, top - bottom)
+    return float(left - room), float(bottom - room), float(right + room), float(top + room)

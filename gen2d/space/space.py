@@ -1,0 +1,391 @@
+"""A scene in a few lines of Python, simulated at once:
+
+    space = gen2d.Space(gravity=(0, -9.8))
+    floor = space.add_segment((-5, 0), (5, 0), elasticity=1)
+    ball = space.add_circle((0, 3), radius=0.5, elasticity=0.8)
+    video = space.simulate(seconds=2)
+    video.position[:, ball], video.contacts.time, video.energy.residual
+    video.save("fall.gif")
+
+A body's number is the place in which it was added, and its place in every result. The solver's slots are in another
+order (a layout's runs hold one shape and kind each): `Space.slots` says which is whose.
+"""
+
+import dataclasses
+import itertools
+import math
+from typing import Any, Unpack
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from gen2d.config.options import build
+from gen2d.config.sections import PhysicsOptions
+from gen2d.core.enums import DYNAMIC, SHAPES
+from gen2d.core.errors import ConfigError
+from gen2d.physics import inertia
+from gen2d.physics.params import Rules, rules_of
+from gen2d.physics.simulate import Forces, Keep, substeps
+from gen2d.records.axes import to_device
+from gen2d.records.layout import Layout, Run, Tie
+from gen2d.records.scene import Joints, Objects, Scene, State
+from gen2d.space.arrange import _filled, _meeting, _numbers, _place, _program, _rows_there, _slots, _world, family
+from gen2d.space.bodies import KINDS, Body, BodyOptions, Joint, Overlaps, Pair, Poses
+from gen2d.space.checks import _color, _corners, _number, _pair, _turned
+from gen2d.space.video import Video
+
+# The builder --------------------------------------------------------------------------------------------------------
+
+
+class Space:
+    """Bodies and joints, added one by one, and the rules by which they move. SI units, radians, y up.
+
+    `gravity` is in m/s^2. `physics` are the options of a config's section of that name, with its defaults: damping
+    (1/s), mixing ("product", "mean", "max", "geometric"), bounce_threshold (m/s), max_step (s), substeps,
+    contact_hertz, contact_damping_ratio, push_speed. ConfigError names what cannot be.
+    """
+
+    def __init__(self, gravity: Pair = (0.0, -9.8), **physics: Any) -> None:
+        self.gravity = _pair("Space: gravity", gravity)
+        self.physics: PhysicsOptions = build(PhysicsOptions, physics, "physics", "Space")
+        self.bodies: list[Body] = []
+        self.joints: list[Joint] = []
+
+    def add_circle(self, position: Pair, radius: float, *, angle: float = 0.0, **options: Unpack[BodyOptions]) -> int:
+        """The number of a disc with its centre there (m)."""
+        name = "add_circle"
+        radius = _number(f"{name}: radius", radius, above=0)
+        return self._added(name, "circle", _pair(f"{name}: position", position), angle, radius=radius, **options)
+
+    def add_segment(self, a: Pair, b: Pair, *, radius: float = 0.0, **options: Unpack[BodyOptions]) -> int:
+        """The number of a line from a to b (m), rounded if it has a radius; static unless `kind` says otherwise.
+
+        A dynamic one without radius has no area, so it needs a mass.
+        """
+        radius = _number("add_segment: radius", radius, low=0)
+        return self._added_line("add_segment", a, b, radius, **{"kind": "static", **options})
+
+    def add_capsule(self, a: Pair, b: Pair, radius: float, **options: Unpack[BodyOptions]) -> int:
+        """The number of all points within `radius` (m) of the line from a to b."""
+        return self._added_line("add_capsule", a, b, _number("add_capsule: radius", radius, above=0), **options)
+
+    def add_box(
+        self, position: Pair, width: float, height: float, *, angle: float = 0.0, **options: Unpack[BodyOptions]
+    ) -> int:
+        """The number of a rectangle with its centre there, its width along its own x axis (m)."""
+        name = "add_box"
+        w, h = (_number(f"{name}: {n}", x, above=0) / 2 for n, x in (("width", width), ("height", height)))
+        corners = np.array([(-w, -h), (w, -h), (w, h), (-w, h)])
+        return self._added(name, "polygon", _pair(f"{name}: position", position), angle, vertices=corners, **options)
+
+    def add_polygon(self, vertices: Any, **options: Unpack[BodyOptions]) -> int:
+        """The number of a convex polygon with these 3 to 8 corners [V, 2] in the world (m), in order, either way round.
+
+        Its position is its centre of mass, its angle 0.
+        """
+        corners = _corners("add_polygon: vertices", vertices)
+        with jax.enable_x64(True):
+            centre = np.asarray(inertia.polygon_centroid(jnp.asarray(corners)))
+        return self._added("add_polygon", "polygon", centre, 0.0, vertices=corners - centre, **options)
+
+    def add_joint(
+        self, kind: str, a: int, b: int | None = None, *, anchor_a: Pair | None = None, anchor_b: Pair | None = None,
+        length: float | None = None, stiffness: float = math.inf, damping: float = 0.0,
+        limits: tuple[float, float] | None = None, motor_speed: float = 0.0, motor_torque: float = 0.0,
+        collide: bool = False,
+    ) -> int:  # fmt: skip
+        """The number of a joint between bodies a and b; without b it ties a to the world.
+
+        Anchors are where they are in the world now, in m (default: the centres of mass). "distance" keeps them `length`
+        apart (default: as now): a rod, or with a `stiffness` (N/m) and `damping` (N s/m) a spring. "revolute" is a
+        hinge in anchor_a, with `limits` (rad: of b over a, or of a over the world, beyond now) and a motor that aims at
+        `motor_speed` (rad/s) with `motor_torque` (N m) at most. The two do not collide unless `collide` says so.
+        """
+        name = "add_joint"
+        if kind not in ("distance", "revolute"):
+            raise ConfigError(f"{name}: kind is {kind!r}, but must be one of distance, revolute")
+        ends = [self._known(f"{name}: {n}", i) for n, i in (("a", a), ("b", b)) if i is not None]
+        if len(set(ends)) == 1 and b is not None:
+            raise ConfigError(f"{name}: a and b are both {a}, but must be two bodies")
+        if all(self.bodies[i].kind != DYNAMIC for i in ends):
+            raise ConfigError(f"{name}: neither body is dynamic, but one of them must be")
+        numbers = {
+            "rest": 0.0,
+            "stiffness": _number(f"{name}: stiffness", stiffness, low=0, infinite=True),
+            "damping": _number(f"{name}: damping", damping, low=0),
+            "motor_speed": _number(f"{name}: motor_speed", motor_speed),
+            "motor_torque": _number(f"{name}: motor_torque", motor_torque, low=0),
+        }
+        low, high = (-math.inf, math.inf) if limits is None else limits
+        numbers["lower"] = _number(f"{name}: limits[0]", low, infinite=True)
+        numbers["upper"] = _number(f"{name}: limits[1]", high, low=low, infinite=True)
+        if kind == "distance" and (limits is not None or motor_torque):
+            raise ConfigError(f"{name}: limits and motor are of a revolute joint, but this one is a distance joint")
+        if kind == "revolute":
+            if anchor_a is None or anchor_b is not None or length is not None or stiffness != math.inf or damping:
+                raise ConfigError(f"{name}: a revolute joint needs anchor_a, and has no anchor_b, length or spring")
+            anchor_b = anchor_a
+        elif b is None and anchor_b is None:
+            raise ConfigError(f"{name}: anchor_b is None, but a joint to the world needs a point of it")
+        # The world comes first, so that a hinge's angle is that of the body.
+        pairs = [(a, anchor_a), (b, anchor_b)] if b is not None else [(-1, anchor_b), (a, anchor_a)]
+        points = [self.bodies[i].position if p is None else _pair(f"{name}: anchor", p) for i, p in pairs]
+        (one, two), numbers["rest"] = (i for i, _ in pairs), self._angle(pairs[1][0]) - self._angle(pairs[0][0])
+        if kind == "distance":
+            now = float(np.hypot(*(points[1] - points[0])))
+            numbers["rest"] = now if length is None else _number(f"{name}: length", length, low=0)
+        inside = [self._inside(i, p) for (i, _), p in zip(pairs, points, strict=True)]
+        self.joints.append(Joint(kind, one, two, inside[0], inside[1], bool(collide), numbers))
+        return len(self.joints) - 1
+
+    def _known(self, name: str, number: Any) -> int:
+        if not isinstance(number, int | np.integer) or isinstance(number, bool) or not 0 <= number < len(self.bodies):
+            raise ConfigError(f"{name} is {number!r}, but must be the number of a body, 0 to {len(self.bodies) - 1}")
+        return int(number)
+
+    def _angle(self, number: int) -> float:
+        return 0.0 if number < 0 else self.bodies[number].angle
+
+    def _inside(self, number: int, point: np.ndarray) -> np.ndarray:
+        if number < 0:
+            return point
+        return _turned(point - self.bodies[number].position, -self.bodies[number].angle)
+
+    def _added_line(self, name: str, a: Pair, b: Pair, radius: float, **options: Any) -> int:
+        first, last = _pair(f"{name}: a", a), _pair(f"{name}: b", b)
+        x, y = last - first
+        if x == 0 and y == 0:
+            raise ConfigError(f"{name}: a and b are both {first.tolist()}, but must be two points")
+        shape, half = name.removeprefix("add_"), math.hypot(x, y) / 2
+        return self._added(
+            name, shape, (first + last) / 2, math.atan2(y, x), radius=radius, half_length=half, **options
+        )
+
+    def _added(
+        self, name: str, shape: str, position: np.ndarray, angle: float, *,
+        radius: float = 0.0, half_length: float = 0.0, vertices: np.ndarray | None = None,
+        kind: str = "dynamic", velocity: Pair = (0.0, 0.0), spin: float = 0.0,
+        density: float = 1.0, mass: float | None = None, moment: float | None = None,
+        elasticity: float = 0.0, friction: float = 0.7, rolling_resistance: float = 0.0,
+        color: Any = None, force: Pair | None = None, torque: float | None = None,
+    ) -> int:  # fmt: skip
+        if kind not in KINDS:
+            raise ConfigError(f"{name}: kind is {kind!r}, but must be one of {', '.join(KINDS)}")
+        number, of = len(self.bodies), lambda option: f"{name}: {option}"
+        body = Body(
+            shape=shape,
+            position=position,
+            angle=_number(of("angle"), angle),
+            kind=KINDS[kind],
+            radius=radius,
+            half_length=half_length,
+            vertices=np.zeros((0, 2)) if vertices is None else vertices,
+            velocity=_pair(of("velocity"), velocity),
+            spin=_number(of("spin"), spin),
+            mass=math.inf,
+            moment=math.inf,
+            elasticity=_number(of("elasticity"), elasticity, low=0),
+            friction=_number(of("friction"), friction, low=0),
+            rolling_resistance=_number(of("rolling_resistance"), rolling_resistance, low=0),
+            color=_color(of("color"), color, number, KINDS[kind]),
+            force=_pair(of("force"), (0.0, 0.0) if force is None else force),
+            torque=_number(of("torque"), 0.0 if torque is None else torque),
+        )
+        if body.elasticity > 1:
+            raise ConfigError(f"{name}: elasticity is {elasticity!r}, but must be a number from 0 to 1")
+        if kind == "static" and (body.velocity.any() or body.spin):
+            raise ConfigError(f"{name}: a static body has velocity or spin, but must stand still (kinematic: may move)")
+        if kind == "dynamic":
+            body = dataclasses.replace(body, **_inertia(name, body, density, mass, moment))
+        self.bodies.append(body)
+        return number
+
+    # What the solver takes ------------------------------------------------------------------------------------------
+
+    @property
+    def slots(self) -> np.ndarray:
+        """The slot of each body in `scene()`, [K]."""
+        return self._arranged()[1]
+
+    def scene(self) -> tuple[Scene, State, Layout]:
+        """Scene, initial state and layout of one video ("K 2"), as a sampler gives them; batch them with `jax.vmap`.
+
+        Where a joint holds on to the world, one more slot stands for it: a dynamic one of infinite mass, which nothing
+        moves and nothing touches. ConfigError if nothing can move.
+        """
+        runs, slots, bodies = self._arranged()
+        real = np.dtype(jnp.result_type(float))
+
+        def column(name: str, dtype: Any = real) -> jax.Array:
+            return jnp.asarray(np.array([getattr(body, name) for body in bodies]).astype(dtype))
+
+        corners = max((run.vertices for run in runs), default=0)
+        vertices = np.array([_filled(body.vertices, corners) for body in bodies])
+        counts = np.array([len(body.vertices) for body in bodies], np.uint8)
+        places = {int(slot): number for number, slot in enumerate(slots)}  # in the order of numbers
+        depth = [places.get(slot, 0) for slot in range(len(bodies))]
+        objects = Objects(
+            present=jnp.ones(len(bodies), bool),
+            shape=jnp.asarray([SHAPES.index(body.shape) for body in bodies], jnp.uint8),
+            depth=jnp.asarray(depth, jnp.int16),
+            kind=column("kind", np.uint8),
+            color=column("color", np.uint8),
+            vertices=jnp.asarray(vertices.astype(real)) if corners else None,
+            vertex_count=jnp.asarray(counts) if corners else None,
+            rolling_resistance=column("rolling_resistance") if any(b.rolling_resistance for b in bodies) else None,
+            force=column("force") if any(b.force.any() for b in bodies) else None,
+            torque=column("torque") if any(b.torque for b in bodies) else None,
+            **{name: column(name) for name in ("radius", "half_length", "mass", "moment", "elasticity", "friction")},
+        )
+        state = State(column("position"), column("angle"), column("velocity"), column("spin"))
+        scene = Scene(objects, jnp.asarray(self.gravity, real), self._joints(real))
+        slot = [*places, *(set(range(len(bodies))) - places.keys())]  # the last, -1, is the world's, if there is one
+        ties = tuple(Tie(j.kind, slot[j.a], slot[j.b], j.collide) for j in self.joints)
+        return scene, state, Layout(runs, joints=ties)
+
+    def _joints(self, real: Any) -> Joints | None:
+        if not self.joints:
+            return None
+        anchors = {
+            n: jnp.asarray(np.array([getattr(j, n) for j in self.joints]), real) for n in ("anchor_a", "anchor_b")
+        }
+        return Joints(
+            **anchors, **{n: jnp.asarray([j.numbers[n] for j in self.joints], real) for n in self.joints[0].numbers}
+        )
+
+    def _arranged(self) -> tuple[tuple[Run, ...], np.ndarray, list[Body]]:
+        """The runs, the slot of each body, and the bodies by slot, with one for the world where a joint needs it."""
+        bodies = list(self.bodies)
+        moving = [family(body) for body in bodies if body.kind == DYNAMIC]
+        if not moving:
+            raise ConfigError(f"Space: none of its {len(bodies)} bodies is dynamic, but one or more must be")
+        if any(joint.a < 0 for joint in self.joints):
+            # In a run of odd length, where its place is free: the solver takes an even number.
+            shape = min(dict.fromkeys(moving), key=lambda s: moving.count(s) % 2 == 0)
+            bodies.append(_world(shape))
+        order = sorted(range(len(bodies)), key=lambda i: _place(bodies[i]))
+        runs = []
+        for _, group in itertools.groupby((bodies[i] for i in order), key=_place):
+            some = list(group)
+            corners = max(len(body.vertices) for body in some)
+            runs.append(Run(family(some[0]), len(some), some[0].kind, corners))
+        return tuple(runs), np.argsort(order)[: len(self.bodies)], [bodies[i] for i in order]
+
+    # What happens ---------------------------------------------------------------------------------------------------
+
+    def simulate(
+        self, seconds: float, fps: float = 30.0, *, substeps: int | None = None, contacts: int | None = None,
+        energy: bool = True, forces: Forces | None = None,
+    ) -> Video:  # fmt: skip
+        """The video of round(seconds * fps) + 1 frames; frame 0 is the start.
+
+        `substeps` are steps a frame (default: of 1/240 s at most). `contacts` is how many rows there may be (default: 4
+        for each body and frame, which is more than can touch; 0: none). `forces(state, time)` gives force [K, 2] in N
+        and torque [K] in N m of all bodies from their state [K, 2], [K] and the time in s, in every step; jax traces
+        it, once for each new function. The first call compiles, for seconds; a space that has as many bodies of each
+        shape and the same joints does not again. ConfigError if nothing can move, or for arguments that cannot be.
+        """
+        seconds, fps = (_number(f"simulate: {n}", x, above=0) for n, x in (("seconds", seconds), ("fps", fps)))
+        frames = round(seconds * fps) + 1
+        if frames < 2:
+            raise ConfigError(
+                f"simulate: seconds is {seconds:g}, but must be {0.5 / fps:g} or more at {fps:g} frames/s"
+            )
+        scene, state, layout = self.scene()
+        rows = (
+            4 * layout.slots * (frames - 1) if contacts is None else int(_number("simulate: contacts", contacts, low=0))
+        )
+        rules, steps = self._rules(fps, substeps)
+        slots = self.slots
+        own = None if forces is None else (forces, tuple(int(s) for s in slots))
+        program = _program(layout, rules, frames, steps, Keep(rows, energy), own)
+        made = jax.tree.map(lambda x: np.asarray(x[0]), program(*jax.tree.map(lambda x: x[None], (scene, state))))
+        states = made.states
+        return Video(
+            bodies=tuple(self.bodies),
+            joints=tuple(self.joints),
+            time=np.arange(frames) / fps,
+            position=states.position[:, slots],
+            angle=states.angle[:, slots],
+            velocity=states.velocity[:, slots],
+            angular_velocity=states.angular_velocity[:, slots],
+            contacts=None if made.contacts is None else _rows_there(made.contacts, slots, layout.slots),
+            energy=made.energy,
+            quality=made.quality,
+        )
+
+    def _rules(self, fps: float, asked: int | None) -> tuple[Rules, int]:
+        physics = self.physics
+        if asked is not None:
+            asked = int(_number("simulate: substeps", asked, low=1))
+        steps = substeps(fps, asked or physics.substeps, physics.max_step)
+        return rules_of(physics, fps, steps), steps
+
+    def poses(self, position: np.ndarray | None = None, angle: np.ndarray | None = None) -> Poses:
+        """The bodies at position [T, K, 2] and angle [T, K] (default: as added), and what overlaps there.
+
+        Only detection: nothing moves. Two bodies of which neither is dynamic, or that a joint keeps from colliding, do
+        not count.
+        """
+        count = len(self.bodies)
+        place = np.array([[body.position for body in self.bodies]]) if position is None else np.asarray(position, float)
+        if place.ndim != 3 or place.shape[1:] != (count, 2):
+            raise ConfigError(f"poses: position has shape {list(place.shape)}, but must have [T, {count}, 2]")
+        turn = np.array([body.angle for body in self.bodies]) if angle is None else np.asarray(angle, float)
+        if angle is not None and turn.shape != place.shape[:2]:
+            raise ConfigError(f"poses: angle has shape {list(turn.shape)}, but must have {list(place.shape[:2])}")
+        turn = np.broadcast_to(turn, place.shape[:2])
+        return Poses(tuple(self.bodies), tuple(self.joints), place, turn, self._overlaps(place, turn))
+
+    def overlaps(self) -> Overlaps:
+        """What overlaps at the start."""
+        return self.poses().contacts
+
+    def _overlaps(self, position: np.ndarray, angle: np.ndarray) -> Overlaps:
+        scene, _, layout = self.scene()
+        objects = to_device(jax.tree.map(lambda x: x[None], scene.objects))
+        number = _numbers(self.slots, layout.slots)
+        apart = {frozenset((tie.a, tie.b)) for tie in layout.joints if not tie.collide}
+        places = jnp.asarray(position.transpose(2, 1, 0)), jnp.asarray(angle.T)
+        found = []
+        for one, two in itertools.combinations_with_replacement(layout.spans, 2):
+            pairs = [(i, j) for i in _slots(one) for j in _slots(two) if i < j and number[i] >= 0 <= number[j]]
+            pairs = [pair for pair in pairs if frozenset(pair) not in apart]
+            if not pairs or (one[0].kind != DYNAMIC and two[0].kind != DYNAMIC):
+                continue
+            sides = [np.array(side) for side in zip(*pairs, strict=True)]
+            first, second = (number[side] for side in sides)
+            there = [[x[..., who, :] for x in places] for who in (first, second)]
+            for gap, point, normal in _meeting((one[0], two[0]), objects, sides, there):
+                pair, frame = np.nonzero(np.asarray(gap) < 0)
+                where, way = (np.asarray(x)[:, pair, frame].T for x in (point, normal))
+                found.append(Overlaps(frame, first[pair], second[pair], where, way, -np.asarray(gap)[pair, frame]))
+        if not found:
+            return Overlaps._make([*np.zeros((3, 0), int), *np.zeros((2, 0, 2)), np.zeros(0)])
+        rows = [np.concatenate(parts) for parts in zip(*found, strict=True)]
+        order = np.argsort(rows[0], kind="stable")
+        return Overlaps._make(row[order] for row in rows)
+
+
+def _inertia(name: str, body: Body, density: float, mass: float | None, moment: float | None) -> dict[str, float]:
+    """Mass and moment of a dynamic body."""
+    density = _number(f"{name}: density", density, above=0)
+    mass = None if mass is None else _number(f"{name}: mass", mass, above=0)
+    with jax.enable_x64(True):
+        half, radius, corners, rho = (
+            jnp.asarray(x, float) for x in (body.half_length, body.radius, body.vertices, density)
+        )
+        solid, turning = {
+            "circle": (lambda: inertia.disc_mass(radius, rho), lambda m: inertia.disc_moment(radius, m)),
+            "capsule": (
+                lambda: inertia.stadium_mass(half, radius, rho),
+                lambda m: inertia.stadium_moment(half, radius, m),
+            ),
+            "polygon": (lambda: inertia.polygon_mass(corners, rho), lambda m: inertia.polygon_moment(corners, m)),
+        }[family(body)]
+        mass = float(solid()) if mass is None else mass
+        if mass == 0:
+            raise ConfigError(f"{name}: mass is None, but a dynamic body of radius 0 needs one")
+        moment = float(turning(jnp.asarray(mass))) if moment is None else moment
+    return {"mass": mass, "moment": _number(f"{name}: moment", moment, above=0, infinite=True)}

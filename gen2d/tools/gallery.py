@@ -1,0 +1,157 @@
+"""A gallery for a person: the same videos in every look, then in the flat one with what is told of their pixels; and
+that of every scene family, with a page that has a row of each.
+
+The videos of a config are made in a temporary folder, as states alone; from there on it is one way for all.
+"""
+
+import contextlib
+import tempfile
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from gen2d.config import plugins
+from gen2d.config.config import load_config
+from gen2d.generation.run import generate
+from gen2d.loading.dataset import Dataset
+from gen2d.loading.dataset import open as open_dataset
+from gen2d.media.contact_sheet import GAP, contact_sheet, shown
+from gen2d.media.images import check_folder, write, writing
+from gen2d.media.overlays import Columns, _amodal, _boxes, _flow, _masks, _tracks
+from gen2d.programs.recipe import config_of
+from gen2d.programs.redraw import render
+from gen2d.storage.sealed import sha256
+from gen2d.tools.preview import check_videos, is_dataset
+
+LABEL = 125  # px, of the strip with a row's name
+PAGE = 1000  # px, width of a row without its name, on the page of all families
+TRACKS = 6  # points of an object
+
+
+def gallery(
+    source: str,
+    out: Path,
+    videos: int = 1,
+    *,
+    seed: int | None = None,
+    sets: Sequence[str] = (),
+    trust: Sequence[str] = (),
+    timeout: float = 30.0,
+    deadline: float = 300.0,
+) -> Path:
+    """The file made in the folder `out`, NAME-gallery.png: a row for each look and annotation, or for each of the first
+    `videos` of it. The config's own look has its options, the others their defaults."""
+    check_videos(videos)
+    check_folder(out)
+    if is_dataset(source):
+        ds = open_dataset(source, timeout=timeout, deadline=deadline)
+        looks = _looks(config_of(ds, sets, trust).plain()["look"])
+        picture, name = _sheet(ds, videos, looks, sets, trust), ds.manifest.name
+    else:
+        with _made(source, videos, seed, sets) as (ds, plain, own):
+            picture, name = _sheet(ds, videos, _looks(plain["look"]), (), own), plain["name"]
+    path = out / f"{name}-gallery.png"
+    with writing(out):
+        write(path, picture)
+    return path
+
+
+def families(
+    out: Path, videos: int = 1, *, seed: int | None = None, sets: Sequence[str] = (), **_: object
+) -> list[Path]:
+    """The files made in the folder `out`: families.png with a row for each of the first `videos` of every scene family,
+    in its config's own look, and the gallery of each, FAMILY-gallery.png."""
+    check_videos(videos)
+    check_folder(out)
+    rows, paths = [], []
+    for name in plugins.names("scene"):
+        own = f"{name}.yaml" in plugins.config_names()
+        with _made(name if own else {"name": name, "scene": name}, videos, seed, sets) as (ds, plain, own_files):
+            frames = np.asarray(render(ds, range(videos), look=plain["look"], trust=own_files))
+            rows.append(_labelled(name, _fitted(contact_sheet(frames))))
+            paths.append(out / f"{name}-gallery.png")
+            with writing(out):
+                write(paths[-1], _sheet(ds, videos, _looks(plain["look"]), (), own_files))
+    with writing(out):
+        write(out / "families.png", np.concatenate(rows))
+    return [out / "families.png", *paths]
+
+
+def _fitted(sheet: np.ndarray) -> np.ndarray:
+    """The sheet, as wide as all rows of the page."""
+    return cv2.resize(sheet, (PAGE, round(PAGE * sheet.shape[0] / sheet.shape[1])), interpolation=cv2.INTER_AREA)
+
+
+@contextlib.contextmanager
+def _made(
+    source: str | Mapping[str, Any], videos: int, seed: int | None, sets: Sequence[str]
+) -> Iterator[tuple[Dataset, dict[str, Any], list[str]]]:
+    """A config's first videos, states alone, which last as long as the block, the config, and the sha256 of its own
+    files."""
+    config = load_config(source, sets)
+    plain, split = config.plain(), config.training.name if config.training else "train"
+    bare = plain | {"look": "flat", "annotations": {}, "storage": plain["storage"] | {"frames": "none"}}
+    with tempfile.TemporaryDirectory() as folder:
+        generate(bare, videos, Path(folder) / "states", seed=seed, split=split)
+        yield open_dataset(Path(folder) / "states"), plain, [sha256(own) for own in config.copies.values()]
+
+
+def _looks(own: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
+    """All looks by what they are called in the gallery; `own` has its options."""
+    return {name: {"name": name} for name in plugins.names("look")} | {Path(own["name"]).stem: own}
+
+
+def _sheet(
+    ds: Dataset, videos: int, looks: Mapping[str, Mapping[str, Any]], sets: Sequence[str], trust: Sequence[str]
+) -> np.ndarray:
+    """All rows as one picture [H, W, 3]."""
+    numbers = range(min(videos, len(ds)))
+    rows = [*_look_rows(ds, numbers, looks, sets, trust), *_annotation_rows(ds, numbers, sets, trust)]
+    return np.concatenate([_labelled(name, contact_sheet(frames)) for name, frames in rows])
+
+
+def _labelled(name: str, picture: np.ndarray) -> np.ndarray:
+    strip = np.full((len(picture), LABEL, 3), 255, np.uint8)
+    cv2.putText(strip, name, (2 * GAP, 20), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (0, 0, 0), 1, cv2.LINE_AA)
+    return np.concatenate([strip, picture], axis=1)
+
+
+Rows = Iterator[tuple[str, np.ndarray]]
+
+
+def _look_rows(
+    ds: Dataset,
+    numbers: Sequence[int],
+    looks: Mapping[str, Mapping[str, Any]],
+    sets: Sequence[str],
+    trust: Sequence[str],
+) -> Rows:
+    """Each look's name and frames [n, T, H, W, 3]."""
+    for name, look in looks.items():
+        yield name, np.asarray(render(ds, numbers, look=look, sets=sets, trust=trust))
+
+
+def _annotation_rows(ds: Dataset, numbers: Sequence[int], sets: Sequence[str], trust: Sequence[str]) -> Rows:
+    """Each annotation's name and frames [n, T, H, W, 3] that show it."""
+    sets = [*sets, f"annotations.tracks={TRACKS}"]
+    fields = ["masks/instance", "masks/amodal", "boxes/visible", "boxes/amodal", "flow/forward", "tracks/points"]
+    fields += ["tracks/visible", "frames"]
+    found = render(ds, numbers, look="flat", sets=sets, fields=fields, trust=trust)
+    times = shown(found["frames"].shape[1])
+    columns = {name: np.asarray(array[:, times]) for name, array in found.items()}
+    fastest = np.abs(columns["flow/forward"].astype(np.float32)).max()
+    columns["flow/forward"] = columns["flow/forward"] / max(fastest, 1e-3)
+    for name, draw in DRAWN.items():
+        yield name, np.stack([_film(columns, video, draw) for video in range(len(numbers))])
+
+
+def _film(columns: Columns, video: int, draw: Callable[[Columns], np.ndarray]) -> np.ndarray:
+    """One video's pictures."""
+    times = range(columns["frames"].shape[1])
+    return np.stack([draw({name: array[video, t] for name, array in columns.items()}) for t in times])
+
+
+DRAWN = {"masks": _masks, "amodal": _amodal, "boxes": _boxes, "flow": _flow, "tracks": _tracks}

@@ -1,0 +1,87 @@
+"""Pictures for a person: a contact sheet (videos down, time across) and an animation, of a dataset or of a config."""
+
+import contextlib
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from gen2d.core.errors import UserError
+from gen2d.loading.dataset import Dataset
+from gen2d.loading.dataset import open as open_dataset
+from gen2d.media.contact_sheet import contact_sheet
+from gen2d.media.images import animate, check_folder, write, writing
+from gen2d.storage.paths import Url, place
+
+
+def preview(
+    source: str,
+    out: Path,
+    videos: int = 8,
+    *,
+    seed: int | None = None,
+    sets: Sequence[str] = (),
+    trust: Sequence[str] = (),
+    timeout: float = 30.0,
+    deadline: float = 300.0,
+) -> list[Path]:
+    """The files made in the folder `out`: NAME-sheet.png and NAME.gif. `trust` is that of `render`, for a dataset
+    without frames; `timeout` and `deadline` are those of `open`."""
+    check_videos(videos)
+    check_folder(out)
+    if is_dataset(source):
+        ds = open_dataset(source, timeout=timeout, deadline=deadline)
+        numbers = range(min(videos, len(ds)))
+        name, frames, fps = ds.manifest.name, _stored(ds, numbers, trust), ds.manifest.fps
+    else:
+        name, frames, fps = _drawn(source, videos, seed, sets)
+    sheet, animation = out / f"{name}-sheet.png", out / f"{name}.gif"
+    with writing(out):
+        write(sheet, contact_sheet(frames))
+        animate(animation, frames, fps)
+    return [sheet, animation]
+
+
+def is_dataset(source: str) -> bool:
+    """Whether it is a dataset, at a URL or in a folder, that is to be drawn; all else is a config."""
+    found = place(source)
+    return isinstance(found, Url) or found.is_dir()
+
+
+def check_videos(videos: int) -> None:
+    """Returns nothing; raises UserError where there would be no video."""
+    if videos < 1:
+        raise UserError(f"--videos is {videos}, but must be 1 or more")
+
+
+def _stored(ds: Dataset, numbers: Sequence[int], trust: Sequence[str]) -> np.ndarray:
+    """The frames of a dataset's videos, drawn again where they are not stored."""
+    if "frames" in ds.manifest.fields:
+        return ds.batch(numbers)["frames"]
+    from gen2d.programs.redraw import render
+
+    return np.asarray(render(ds, numbers, trust=trust))
+
+
+def _drawn(source: str, videos: int, seed: int | None, sets: Sequence[str]) -> tuple[str, np.ndarray, float]:
+    """Name, frames and frame rate of a config's first videos, made but not stored."""
+    import dataclasses
+
+    from gen2d.config.config import checked_seed, load_config
+    from gen2d.programs import devices
+    from gen2d.programs.batches import check_placed
+    from gen2d.programs.rollout import Rollout, parts
+
+    config = load_config(source, [*sets, "storage.frames=video"])
+    if seed is not None:
+        config = dataclasses.replace(config, seed=checked_seed(seed))
+    split = config.training.name if config.training else "train"
+    frames = []
+    with contextlib.closing(Rollout(config.of_split(split), devices.prepare()[:1])) as rollout:
+        for first in range(0, videos, rollout.lanes):
+            batch = rollout.begin(split, [first])
+            placed = parts(batch.placed)[0][: videos - first]
+            check_placed(config.scene, placed, np.arange(first, first + len(placed)))
+            for start in range(0, min(rollout.lanes, videos - first), rollout.slice):
+                frames.append(np.asarray(rollout.draw(batch, start, rollout.slice)[0]["frames"]))
+    return config.name, np.concatenate(frames)[:videos], config.video.fps

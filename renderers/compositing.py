@@ -1,0 +1,206 @@
+"""Layers: how one is painted over an image, and those that cover all of it, back to front.
+
+Images are uint8 frames, owners (which object each pixel shows most of), or floats; what paints one is a function
+`paint(image, cover, color, name)`: coverage [I, H, W] from 0 to 1, sRGB colour, and the id of what is painted.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from gen2d.records.axes import Array
+from gen2d.records.layout import Run
+from gen2d.renderers.camera import to_world
+from gen2d.renderers.color import LINEAR, to_linear, to_srgb
+from gen2d.renderers.noise import textured
+from gen2d.renderers.plan import Plan, Stage
+from gen2d.renderers.primitives import Instants, Window, parts_of
+from gen2d.renderers.shading import Cut, cut, inks_of, painted
+
+FULL = 2**15 - 1  # a pixel's coverage is a whole number up to this
+NOBODY = FULL << 8  # owner of the background
+OCCLUDER = 255  # what a mask says of a pixel that shows an occluder
+
+Painter = Callable[[Any, Array, Array, Any], Any]
+
+
+class Canvas(NamedTuple):
+    """Images that are painted on, uint8 [I, H, W, 3] and int32 [I, H, W], if they are wanted."""
+
+    image: Array | None
+    owner: Array | None
+
+
+# ---- One layer
+
+
+def whole(cover: Array) -> Array:
+    """A coverage from 0 to 1 as whole numbers up to FULL, int16."""
+    return (cover * FULL + 0.5).astype(jnp.int32).astype(jnp.int16)
+
+
+def ink(color: Array) -> Array:
+    """A colour as whole numbers, int16."""
+    return (color + 0.5).astype(jnp.int32).astype(jnp.int16)
+
+
+def over(under: Array, cover: Array, color: Array, linear: bool) -> Array:
+    """The uint8 image [..., 3] after a layer of `whole` coverage [...] and of an `ink` that fits it."""
+    cover = cover[..., None]
+    if linear:
+        light = jnp.asarray(LINEAR)[under.astype(jnp.int32)]
+        share = cover.astype(jnp.float32) * (1 / FULL)
+        mixed = light + share * (to_linear(color.astype(jnp.float32)) - light)
+        return (to_srgb(mixed) + 0.5).astype(jnp.uint8)
+    # Fixed point, so that both forms round alike: 5 bits below one, products of 16 bits, of which a vector has many.
+    under = under.astype(jnp.int16)
+    apart = (color - under) << 6
+    product = ((apart.astype(jnp.int32) * cover.astype(jnp.int32)) >> 16).astype(jnp.int16)
+    return (under + ((product + 16) >> 5)).astype(jnp.uint8)
+
+
+def owned(owner: Array, cover: Array, name: Array | int) -> Array:
+    """Who is seen most of in each pixel, after a layer of `whole` coverage.
+
+    An owner is an id and, above its 8 bits, how much of the pixel its object shows, up to FULL; what comes on top
+    leaves the same share of all that was there, so only the best so far has to be known.
+    """
+    cover = cover.astype(jnp.int32)
+    best = ((owner >> 8) * (FULL - cover) + FULL // 2) // FULL
+    return jnp.where(cover > best, (cover << 8) | name, (best << 8) | (owner & 255))
+
+
+def hard(linear: bool) -> Painter:
+    """What paints on a canvas, in whole numbers."""
+
+    def paint(canvas: Canvas, cover: Array, color: Array, name: Any) -> Canvas:
+        image, owner = canvas
+        return Canvas(
+            None if image is None else over(image, whole(cover), ink(color), linear),
+            None if owner is None else owned(owner, whole(cover), name),
+        )
+
+    return paint
+
+
+def soft(linear: bool) -> Painter:
+    """What paints on an image of floats, sRGB or linear light."""
+
+    def paint(image: Array, cover: Array, color: Array, name: Any) -> Array:
+        return image + cover[..., None] * ((to_linear(color) if linear else color) - image)
+
+    return paint
+
+
+# ---- What covers all of an image
+
+
+def ground(stage: Stage, at: Instants, plan: Plan) -> Array:
+    """The background [I, H, W, 3] at some instants, as floats; [1, H, W, 3] where it is the same at all."""
+    background, first = stage.paint.background, stage.instants.view
+    color, height, width = background.color, plan.height, plan.width
+    if background.to_color is None and background.texture is None:
+        return jnp.broadcast_to(color, (1, height, width, 3))
+    rows, columns = (jnp.arange(n, dtype=jnp.float32) + 0.5 for n in (height, width))
+    rows, columns = (a.reshape(-1) for a in jnp.meshgrid(rows, columns, indexing="ij"))
+    x, y = (a.reshape(-1, height, width) for a in to_world(at.view, columns, rows, height, width))
+    if background.to_color is not None and background.direction is not None:
+        # From one end of what the first frame shows to the other.
+        cos, sin = jnp.cos(background.direction), jnp.sin(background.direction)
+        center, scale = first.center[0], first.scale[0]
+        reach = (jnp.abs(cos) * width + jnp.abs(sin) * height) / (2 * scale)
+        along = ((x - center[0]) * cos + (y - center[1]) * sin) / reach
+        color = color + jnp.clip((along[..., None] + 1) / 2, 0, 1) * (background.to_color - color)
+    if background.texture is not None:
+        color = textured(color, background.texture, x, y)
+    return jnp.broadcast_to(color, (*x.shape, 3))
+
+
+def bare(stage: Stage, at: Instants, plan: Plan) -> Canvas:
+    """The background alone at some instants, if its image and owners are wanted; [1, ...] where it is always the
+    same."""
+    return Canvas(
+        (ground(stage, at, plan) + 0.5).astype(jnp.uint8) if plan.frames else None,
+        jnp.full((1, plan.height, plan.width), NOBODY, jnp.int32) if plan.owners else None,
+    )
+
+
+def stills(stage: Stage, plan: Plan) -> Canvas:
+    """What never moves, [1, ...], without the occluders: these stand before what moves."""
+    first = jax.tree.map(lambda a: a[:1], stage.instants)
+    alone = stage._replace(occluders=None)
+    return all_over(bare(stage, first, plan), alone, plan, first, plan.behind, hard(plan.linear))
+
+
+def all_over(canvas: Any, stage: Stage, plan: Plan, at: Instants, runs: list[tuple[Run, int]], paint: Painter) -> Any:
+    """The canvas after some runs' slots and what stands before them were painted over all of it.
+
+    A loop over the slots: what depends on rows or columns alone is then computed before it, once, and not again for
+    every pixel, as it would be where the compiler fused all.
+    """
+    window = Window(0, 0, plan.height, plan.width)
+    rank = 0
+    for run, first in runs:
+        slots = slice(first, first + run.count)
+
+        def all_of(canvas: Any, run: Run = run, first: int = first, slots: slice = slots, rank: int = rank) -> Any:
+            def one(canvas: Any, entry: tuple) -> tuple[Any, None]:
+                cuts, inks, slot, rank = entry
+                canvas = standing(canvas, stage, plan, lambda of: of == rank, paint)
+                return paint(canvas, *painted(cuts, inks, window, plan.largest(run)), slot + 1), None
+
+            numbers = jnp.arange(run.count)
+            entries = cut_of(stage, plan, at, run, first, window), inks_of(stage.paint, slots)
+            return jax.lax.scan(one, canvas, (*entries, first + numbers, rank + numbers))[0]
+
+        some = stage.occluders is not None or stage.paint.drawn[slots].any()
+        canvas = jax.lax.cond(some, all_of, lambda same: same, canvas)
+        rank += run.count
+    return canvas
+
+
+def moving(canvas: Any, stage: Stage, plan: Plan, at: Instants, paint: Painter) -> Any:
+    """The canvas after what moves and the occluders between were painted over all of it."""
+    canvas = all_over(canvas, stage, plan, at, [span for group in plan.groups for span in group.runs], paint)
+    return standing(canvas, stage, plan, lambda rank: rank >= plan.moving, paint)
+
+
+def standing(canvas: Any, stage: Stage, plan: Plan, here: Callable[[Array], Array], paint: Painter) -> Any:
+    """The canvas after those occluders whose rank is `here`."""
+    if stage.occluders is None:
+        return canvas
+    for i, rank in enumerate(stage.occluders.rank):
+        cover, color = occluder(stage, plan, i, here(rank))
+        canvas = paint(canvas, cover, color, OCCLUDER)
+    return canvas
+
+
+def occluder(stage: Stage, plan: Plan, i: int, here: Array) -> tuple[Array, Array]:
+    """Coverage [1, H, W], none unless it is `here`, and colour [3] of an occluder."""
+    assert stage.occluders is not None
+    left, top, right, bottom = stage.occluders.box[i]
+
+    def part(count: int, low: Array, high: Array) -> Array:
+        edge = jnp.arange(count, dtype=jnp.float32)
+        return jnp.clip(jnp.minimum(high, edge + 1) - jnp.maximum(low, edge), 0.0, 1.0)
+
+    cover = part(plan.height, top, bottom)[:, None] * part(plan.width, left, right)
+    return jnp.where(here, cover, 0.0)[None], stage.occluders.color[i]
+
+
+def cut_of(stage: Stage, plan: Plan, at: Instants, run: Run, first: int, window: Window) -> Cut:
+    """The parts of a run's slots at some instants, cut by their windows; arrays [k, I, ...].
+
+    In a loop of its own, for what is the same for all rows and columns to be there before it.
+    """
+    parts = parts_of(run, first, stage.bodies, at, stage.paint, plan.height, plan.width)
+    toned = stage.paint.shade is not None or stage.paint.texture is not None
+    begin = [jnp.broadcast_to(jnp.asarray(edge), parts.turn.column.shape) for edge in (window.top, window.left)]
+
+    def one(entry: tuple) -> Cut:
+        of, top, left = entry
+        return cut(of, Window(top, left, window.rows, window.columns), run.shape == "circle", toned)
+
+    return jax.lax.map(one, (parts, *begin))

@@ -1,0 +1,86 @@
+"""The share of each pixel that a disc covers, in closed form."""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+
+from gen2d.records.axes import Array
+from gen2d.renderers.coverage.arc import LARGE, QUARTER, under_arc
+
+
+def _shift(edges: Array) -> tuple[Array, Array]:
+    return edges, edges + 1
+
+
+# ---- Discs
+
+
+class Edge(NamedTuple):
+    """What a pixel's edge at some distance from a disc's centre brings to the corners on it."""
+
+    at: Array
+    sign: Array
+    area: Array
+    square: Array
+
+
+class Disc(NamedTuple):
+    """A disc cut by the edges of a grid's columns and rows."""
+
+    left: Edge  # [..., columns]
+    right: Edge
+    top: Edge  # [..., rows]
+    bottom: Edge
+    radius: Array  # [..., 1]
+
+
+def disc_cuts(x: Array, y: Array, radius: Array) -> Disc:
+    """The cuts of discs of `radius` [...] px by pixels with left edges x [..., columns] and top edges y [..., rows],
+    both from the disc's centre."""
+    radius = jnp.maximum(radius, 1e-6)[..., None]
+    square = radius * radius
+
+    def of_column(at: Array) -> Edge:
+        return Edge(at, jnp.copysign(1.0, at), under_arc(at, radius), at * at - square)
+
+    def of_row(at: Array) -> Edge:
+        sign = jnp.copysign(1.0, at)
+        return Edge(at, sign, under_arc(at, radius) - sign * (QUARTER * square), at * at)
+
+    (left, right), (top, bottom) = map(_shift, (x, y))
+    return Disc(of_column(left), of_column(right), of_row(top), of_row(bottom), radius)
+
+
+def _corner(x: Edge, y: Edge) -> Array:
+    """The disc's area in the rectangle between its centre and a corner, odd in both."""
+    x, y = Edge(*(a[..., None, :] for a in x)), Edge(*(a[..., :, None] for a in y))
+    return jnp.where(x.square + y.square < 0, x.at * y.at, y.sign * x.area + x.sign * y.area)
+
+
+def disc_area(disc: Disc, largest: float) -> Array:
+    """The coverage [..., rows, columns] of discs of `largest` px at most."""
+    upper = _corner(disc.right, disc.top) - _corner(disc.left, disc.top)
+    area = (_corner(disc.right, disc.bottom) - _corner(disc.left, disc.bottom)) - upper
+    if largest < LARGE:
+        return area
+    radius = disc.radius[..., None]
+    return jnp.where(radius < LARGE, area, _large_disc(disc.left.at + 0.5, disc.top.at + 0.5, radius))
+
+
+def _large_disc(x: Array, y: Array, radius: Array) -> Array:
+    """The same from the centres of pixels, for a rim that is nearly straight in each.
+
+    In a pixel's own coordinates the rim is f = (r^2 - |p|^2) / 2 - (x xi + y eta) - (xi^2 + eta^2) / 2 = 0; the last
+    term is replaced by its mean over the rim's chord, and the square is cut by the line that remains.
+    """
+    x, y = jnp.abs(x)[..., None, :], jnp.abs(y)[..., :, None]
+    small = jnp.maximum(jnp.minimum(x, y), 1e-3)
+    large = jnp.maximum(jnp.maximum(x, y), small)
+    inside = ((radius - x) * (radius + x) - y * y) / 2
+    slope = small / large
+    bend = jnp.minimum(jnp.square(inside / large), 0.7 * jnp.square((1 + slope) / 2)) / 2 + (1 + slope * slope) / 24
+    depth = inside - bend
+    reach = jnp.minimum(jnp.abs(depth), (large + small) / 2)
+    corner = jnp.maximum(reach - (large - small) / 2, 0.0)
+    part = (2 * small * reach - corner * corner) / (2 * small * large)
+    return 0.5 + jnp.copysign(part, depth)

@@ -1,0 +1,32 @@
+"""Plain shapes with a bar from the centre to the rim, so that it can be seen how each has turned."""
+
+import dataclasses
+
+import jax.numpy as jnp
+
+from gen2d.config.options import option
+from gen2d.records.axes import Array
+from gen2d.records.layout import Layout
+from gen2d.records.scene import Scene
+from gen2d.renderers.look import Plain, are_lines, are_moving, contrasting, plain
+from gen2d.renderers.paint import Paint
+
+
+@dataclasses.dataclass(frozen=True)
+class Options(Plain):
+    """Marks, and what plain shapes have."""
+
+    mark_width: float = option(0.3, float, "1", "of an object's bar, over its radius", above=0, high=1)
+    rim_width: float = option(0.0, float, "px", "of a dark line along the inside of a rim; 0: none", low=0)
+    rim_color: tuple = option([16, 16, 16], int, "sRGB", "of that line", parts=3, low=0, high=255)
+
+
+def paint(scene: Scene, layout: Layout, options: Options, key: Array) -> Paint:
+    """What one video's slots are painted with: bars, light or dark, on all that moves."""
+    begun = plain(scene, layout, options, key)
+    mark = jnp.where(are_moving(layout), options.mark_width / 2, 0.0)
+    marked = begun._replace(mark=mark, mark_color=contrasting(begun.color))
+    if not options.rim_width:
+        return marked
+    rim_color = jnp.broadcast_to(jnp.asarray(options.rim_color, jnp.float32), begun.color.shape)
+    return marked._replace(rim=jnp.where(are_lines(scene), 0.0, options.rim_width), rim_color=rim_color)

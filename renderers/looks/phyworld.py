@@ -1,0 +1,33 @@
+"""Red and blue shapes in turn on white, without walls: the look of PhyWorld's videos (Kang et al., arXiv 2411.02385).
+
+Theirs have a rim that is soft over 1.5 % of the radius; here it is sharp.
+"""
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+
+from gen2d.config.options import option
+from gen2d.records.axes import Array
+from gen2d.records.layout import Layout
+from gen2d.records.scene import Scene
+from gen2d.renderers.look import Lines, are_moving, lines_of
+from gen2d.renderers.paint import Background, Paint
+
+WHITE, RED, BLUE = (255.0, 255.0, 255.0), (255.0, 0.0, 0.0), (0.0, 0.0, 255.0)
+
+
+@dataclasses.dataclass(frozen=True)
+class Options(Lines):
+    """Line widths."""
+
+    wall_width: float = option(0.0, float, "px", "of a segment's line, beyond its own radius; 0: not drawn", low=0)
+
+
+def paint(scene: Scene, layout: Layout, options: Options, key: Array) -> Paint:
+    """What one video's slots are painted with; what is static has the scene's colours."""
+    moving = are_moving(layout)
+    turn = jnp.asarray([RED, BLUE])[(np.cumsum(moving) - 1) % 2]
+    colors = jnp.where(moving[:, None], turn, scene.objects.color.astype(jnp.float32))
+    return Paint(Background(jnp.asarray(WHITE)), colors, *lines_of(scene, options))

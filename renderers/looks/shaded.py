@@ -1,0 +1,25 @@
+"""Softly shaded shapes, as if lit from the upper left."""
+
+import dataclasses
+
+import jax.numpy as jnp
+
+from gen2d.config.options import option
+from gen2d.records.axes import Array
+from gen2d.records.layout import Layout
+from gen2d.records.scene import Scene
+from gen2d.renderers.look import Plain, are_lines, plain
+from gen2d.renderers.paint import Paint
+
+
+@dataclasses.dataclass(frozen=True)
+class Options(Plain):
+    """Shade, and what plain shapes have."""
+
+    shade: float = option(0.6, float, "1", "how much darker an object is opposite the light; 0: not", low=0, high=1)
+
+
+def paint(scene: Scene, layout: Layout, options: Options, key: Array) -> Paint:
+    """What one video's slots are painted with; lines have no shade."""
+    shade = jnp.where(are_lines(scene), 0.0, options.shade)
+    return plain(scene, layout, options, key)._replace(shade=shade)

@@ -1,0 +1,37 @@
+"""Shapes with spots of random noise that turn with them, on noise."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+
+from gen2d.config.options import option
+from gen2d.records.axes import Array
+from gen2d.records.layout import Layout
+from gen2d.records.scene import Scene
+from gen2d.renderers.look import Plain, contrasting, mean_color, plain
+from gen2d.renderers.paint import Paint, Texture
+
+
+@dataclasses.dataclass(frozen=True)
+class Options(Plain):
+    """Spots, and what plain shapes have."""
+
+    background_kind: str = option("noise", str, "", "what is behind everything", choices=("plain", "gradient", "noise"))
+    background_to: tuple = option([64, 64, 84], int, "sRGB", "where it ends", parts=3, low=0, high=255)
+    spots: float = option(
+        0.8, float, "1", "how far spots go to black or white, whichever differs more from the background", low=0, high=1
+    )
+    cell: float = option(0.6, float, "1", "size of a spot, over the largest object's reach", above=0)
+
+
+def paint(scene: Scene, layout: Layout, options: Options, key: Array) -> Paint:
+    """What one video's slots are painted with, each with spots of its own."""
+    begun = plain(scene, layout, options, key)
+    far = contrasting(mean_color(begun.background))
+    texture = Texture(
+        seed=jax.random.bits(jax.random.fold_in(key, 2), (layout.slots,), jnp.uint32),
+        cell=jnp.full(layout.slots, options.cell * layout.reach),
+        color=begun.color + options.spots * (far - begun.color),
+    )
+    return begun._replace(texture=texture)

@@ -1,0 +1,53 @@
+"""Hashed noise and textures."""
+
+from typing import Any
+
+import jax.numpy as jnp
+
+from gen2d.records.axes import Array
+from gen2d.renderers.paint import Texture
+
+
+def _hashed(x: Array) -> Array:
+    """A well-mixed 32-bit word of another (the finalizer 'lowbias32' of C. Wellons, 2018)."""
+    x = (x ^ (x >> 16)) * jnp.uint32(0x7FEB352D)
+    x = (x ^ (x >> 15)) * jnp.uint32(0x846CA68B)
+    return x ^ (x >> 16)
+
+
+def hashed(*words: Any) -> Array:
+    """A random 32-bit word for each combination of integers."""
+    total = jnp.uint32(0x9E3779B9)
+    for word in words:
+        total = _hashed(total ^ jnp.asarray(word).astype(jnp.uint32))
+    return total
+
+
+def fraction(word: Array) -> Array:
+    """A word as a number from 0 to below 1: its first 24 bits."""
+    return (word >> 8).astype(jnp.float32) * (1 / 2**24)
+
+
+def noise(x: Array, y: Array, seed: Array) -> Array:
+    """Smooth noise between 0 and 1, with a cell of 1: random values at whole numbers, between them a cubic blend; two
+    octaves."""
+    fine = _octave(2 * x + 0.37, 2 * y + 0.71, hashed(seed, 1))
+    return (2 * _octave(x, y, seed) + fine) / 3
+
+
+def _octave(x: Array, y: Array, seed: Array) -> Array:
+    left, top = jnp.floor(x), jnp.floor(y)
+    u, v = (t * t * (3 - 2 * t) for t in (x - left, y - top))
+    i, j = left.astype(jnp.int32), top.astype(jnp.int32)
+
+    def at(di: int, dj: int) -> Array:
+        return fraction(_hashed(_hashed((i + di).astype(jnp.uint32) ^ seed) ^ (j + dj).astype(jnp.uint32)))
+
+    upper, lower = at(0, 0) * (1 - u) + at(1, 0) * u, at(0, 1) * (1 - u) + at(1, 1) * u
+    return upper * (1 - v) + lower * v
+
+
+def textured(color: Array, texture: Texture, x: Array, y: Array) -> Array:
+    """The colours [..., 3] of a texture at x and y [...] in m, on something of `color` [..., 3] or what fits it."""
+    share = noise(x / texture.cell, y / texture.cell, texture.seed)[..., None]
+    return color + share * (texture.color - color)

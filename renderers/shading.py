@@ -1,0 +1,106 @@
+"""The coverage and colour of an object's parts: fill, rim, mark, shade, texture."""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from gen2d.records.axes import Array
+from gen2d.renderers.coverage import disc as disc_module
+from gen2d.renderers.coverage import polygon
+from gen2d.renderers.noise import textured
+from gen2d.renderers.paint import Paint, Texture
+from gen2d.renderers.primitives import Figure, Parts, Turn, Window
+
+
+class Inks(NamedTuple):
+    """What the parts of some slots are painted with; [...]."""
+
+    color: Array
+    rim: Array | None
+    mark: Array | None
+    shade: Array | None
+    texture: Texture | None
+
+
+def inks_of(paint: Paint, slots: slice) -> Inks:
+    """What some slots are painted with; arrays [k, ...]."""
+    color = paint.color if paint.fill is None else paint.fill
+    inks = Inks(color, paint.rim_color, paint.mark_color, paint.shade, paint.texture)
+    return jax.tree.map(lambda a: a[slots], inks)
+
+
+class Cut(NamedTuple):
+    """The parts of some slots, cut by the edges of their windows' pixels."""
+
+    whole: Any  # coverage.Disc or coverage.Rounded
+    inner: Any
+    mark: Any
+    turn: Turn | None  # from the window's corner, if it matters where in it a pixel is
+
+
+def cut(parts: Parts, window: Window, disc: bool, toned: bool) -> Cut:
+    """The parts cut by a window's rows and columns; `disc` says whether the whole is one, `toned` whether inks differ
+    from place to place."""
+    turn = parts.turn
+    turn = turn._replace(column=turn.column - window.left, row=turn.row - window.top) if toned else None
+    inner = None if parts.inner is None else _cuts_of(parts.inner, window, disc)
+    mark = None if parts.mark is None else _cuts_of(parts.mark, window, disc=False)
+    return Cut(_cuts_of(parts.whole, window, disc), inner, mark, turn)
+
+
+def _cuts_of(figure: Figure, window: Window, disc: bool) -> Any:
+    x, y = jnp.arange(window.columns, dtype=jnp.float32), jnp.arange(window.rows, dtype=jnp.float32)
+    left, top = (jnp.asarray(edge, jnp.float32) for edge in (window.left, window.top))
+    if disc:
+        column, row = figure.corners[..., 0], figure.corners[..., 1]
+        assert figure.radius is not None
+        return disc_module.disc_cuts(x + (left - column)[..., None], y + (top - row)[..., None], figure.radius)
+    origin = jnp.stack(jnp.broadcast_arrays(left, top), -1)
+    return polygon.rounded_cuts(x, y, figure.corners - origin[..., None, :], figure.radius)
+
+
+def _area_of(cuts: Any, largest: float) -> Array:
+    if isinstance(cuts, disc_module.Disc):
+        return jnp.clip(disc_module.disc_area(cuts, largest), 0.0, 1.0)
+    return jnp.clip(polygon.rounded_area(cuts), 0.0, 1.0)
+
+
+def painted(cut: Cut, inks: Inks, window: Window, largest: float) -> tuple[Array, Array]:
+    """The coverage [..., rows, columns], and the mean colour [..., rows, columns, 3] of what is covered;
+    one colour [..., 1, 1, 3] where there is but one. No disc is larger than `largest` px."""
+    whole = _area_of(cut.whole, largest)
+    color = inks.color[..., None, None, :]
+    if cut.turn is not None:
+        color = _toned(color, inks, cut.turn, window)
+    if cut.mark is None and cut.inner is None:
+        return whole, color
+    inner = whole if cut.inner is None else jnp.minimum(_area_of(cut.inner, largest), whole)
+    mark = jnp.zeros_like(whole) if cut.mark is None else jnp.minimum(_area_of(cut.mark, largest), inner)
+    total = (inner - mark)[..., None] * color
+    if inks.mark is not None:
+        total = total + mark[..., None] * inks.mark[..., None, None, :]
+    if inks.rim is not None:
+        total = total + (whole - inner)[..., None] * inks.rim[..., None, None, :]
+    return whole, total / jnp.maximum(whole, 1e-6)[..., None]
+
+
+def _toned(color: Array, inks: Inks, turn: Turn, window: Window) -> Array:
+    """The colours at the pixels' centres of slots that are textured or shaded."""
+    x = jnp.arange(window.columns) + 0.5 - turn.column[..., None]
+    y = (jnp.arange(window.rows) + 0.5 - turn.row[..., None])[..., :, None]
+    x = x[..., None, :]
+    if inks.texture is not None:
+        cos, sin, scale = (a[..., None, None] for a in (turn.cos, turn.sin, turn.scale))
+        texture = inks.texture._replace(
+            seed=inks.texture.seed[..., None, None],
+            cell=inks.texture.cell[..., None, None],
+            color=inks.texture.color[..., None, None, :],
+        )
+        color = textured(color, texture, (x * cos + y * sin) / scale, (y * cos - x * sin) / scale)
+    if inks.shade is not None:
+        reach = jnp.maximum(turn.reach, 1e-3)[..., None, None]
+        # As if lit from the upper left: darkest at the rim that is opposite.
+        far = ((x / reach + 0.35) ** 2 + (y / reach + 0.35) ** 2) / 2.24
+        color = color * (1 - inks.shade[..., None, None] * jnp.minimum(far, 1.0))[..., None]
+    return color

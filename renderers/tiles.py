@@ -1,0 +1,205 @@
+"""The form of drawing for CPUs: each object is drawn into a patch of its own size, one after the other.
+
+A loop over videos, frames and objects, each of which touches little memory; under `vmap` it would become a scatter.
+"""
+
+import functools
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from gen2d.records.axes import Array
+from gen2d.renderers.compositing import OCCLUDER, Canvas, bare, cut_of, ink, occluder, over, owned, stills, whole
+from gen2d.renderers.plan import Group, Plan, Stage, patch_of
+from gen2d.renderers.primitives import Instants, Window
+from gen2d.renderers.sensor import averaged, noisy
+from gen2d.renderers.shading import Cut, inks_of, painted
+
+
+def draw_patches(stages: Stage, plan: Plan) -> tuple[Array | None, Array | None]:
+    """Frames [n, T, H, W, 3] uint8 and owners [n, T, H, W] uint8, each if it is wanted."""
+    videos, frames = stages.instants.angle.shape[:2]
+    backs = jax.lax.map(functools.partial(stills, plan=plan), stages)
+    shape = videos, frames, plan.height, plan.width
+    image = None if backs.image is None else jnp.broadcast_to(backs.image, (*shape, 3)).reshape(-1, *shape[2:], 3)
+    owner = jnp.zeros((videos * frames, *shape[2:]), jnp.uint8) if plan.owners else None
+
+    def video(v: Array, canvas: Canvas) -> Canvas:
+        stage, back = (
+            jax.tree.map(lambda a: jax.lax.dynamic_index_in_dim(a, v, keepdims=False), of) for of in (stages, backs)
+        )
+        draw = _Video(stage, plan, back, v * frames)
+        if plan.still and not plan.exposed and stages.noise is None:
+            return draw.straight(canvas)
+        canvas = draw.apart(canvas) if plan.frames else canvas
+        return draw.owners(canvas) if plan.owners else canvas
+
+    canvas = jax.lax.fori_loop(0, videos, video, Canvas(image, owner))
+    return tuple(jax.tree.map(lambda a: a.reshape(videos, frames, *a.shape[1:]), canvas))
+
+
+class Cuts(NamedTuple):
+    """A group's slots, cut by the pixels of their patches, at all instants; arrays [k, I, ...]."""
+
+    group: Group
+    window: Window
+    of_runs: list[Cut]
+
+
+class Strokes(NamedTuple):
+    """The patches of a group's slots at one instant."""
+
+    cover: Array  # [k, rows, columns] int16
+    color: Array  # [k, rows or 1, columns or 1, 3] int16
+    name: Array  # [k]
+    top: Array  # [k]
+    left: Array
+
+
+class _Video:
+    """Draws one video, frame by frame, from frame `first` of a canvas on."""
+
+    def __init__(self, stage: Stage, plan: Plan, back: Canvas, first: Array) -> None:
+        self.stage, self.plan, self.back, self.first = stage, plan, back, first
+        self.frames = stage.instants.angle.shape[0]
+
+    def straight(self, canvas: Canvas) -> Canvas:
+        """Frames, and owners if wanted, drawn where they belong, on unmoving layers that are there already."""
+        cuts = self._cuts(self.stage.instants)
+
+        def frame(t: Array, canvas: Canvas) -> Canvas:
+            image, owner = self._painted(Canvas(canvas.image, self.back.owner), self.first + t, cuts, t)
+            return Canvas(image, self._kept(canvas.owner, owner, t))
+
+        return jax.lax.fori_loop(0, self.frames, frame, canvas)
+
+    def owners(self, canvas: Canvas) -> Canvas:
+        """Owners alone."""
+        cuts = self._cuts(self.stage.instants)
+
+        def frame(t: Array, canvas: Canvas) -> Canvas:
+            start = self._behind(self.stage.instants, t)._replace(image=None)
+            owner = self._painted(start, jnp.int32(0), cuts, t).owner
+            return Canvas(canvas.image, self._kept(canvas.owner, owner, t))
+
+        return jax.lax.fori_loop(0, self.frames, frame, canvas)
+
+    def _kept(self, owners: Array | None, owner: Array | None, t: Array) -> Array | None:
+        if owners is None or owner is None:
+            return owners
+        return jax.lax.dynamic_update_slice(owners, (owner & 255).astype(jnp.uint8), (self.first + t, 0, 0))
+
+    def apart(self, canvas: Canvas) -> Canvas:
+        """Frames drawn on an image of their own: exposed more than once, with a camera that moves, or noisy."""
+        stage, plan = self.stage, self.plan
+        shown = stage.instants if stage.exposed is None else jax.tree.map(_flat, stage.exposed)
+        samples, cuts = max(plan.exposed, 1), self._cuts(shown)
+
+        def once(i: Array) -> Array:
+            image = self._painted(self._behind(shown, i)._replace(owner=None), jnp.int32(0), cuts, i).image
+            assert image is not None
+            return image
+
+        def exposed(t: Array) -> Array:
+            def add(s: Array, total: Array) -> Array:
+                return total + once(t * samples + s).astype(jnp.uint16)
+
+            total = jnp.zeros((1, plan.height, plan.width, 3), jnp.uint16)
+            return averaged(jax.lax.fori_loop(0, samples, add, total), samples)
+
+        def frame(t: Array, canvas: Canvas) -> Canvas:
+            image = exposed(t) if plan.exposed else once(t)
+            if stage.noise is not None:
+                image = noisy(image, stage.noise, stage.seed, t[None])
+            assert canvas.image is not None
+            return Canvas(jax.lax.dynamic_update_slice(canvas.image, image, (self.first + t, 0, 0, 0)), canvas.owner)
+
+        return jax.lax.fori_loop(0, self.frames, frame, canvas)
+
+    def _behind(self, at: Instants, i: Array) -> Canvas:
+        """What is behind all that moves at instant i."""
+        if self.plan.still:
+            return self.back
+        return bare(self.stage, jax.tree.map(lambda a: jax.lax.dynamic_slice_in_dim(a, i, 1), at), self.plan)
+
+    def _cuts(self, at: Instants) -> list[Cuts]:
+        """What of each group depends on rows or columns alone, for all instants."""
+        found = []
+        for group in self.plan.groups:
+            windows = [patch_of(self.plan, group, at, run, first) for run, first in group.runs]
+            spans = zip(group.runs, windows, strict=True)
+            cuts = [cut_of(self.stage, self.plan, at, run, first, window) for (run, first), window in spans]
+            top, left = (_joined([getattr(w, edge) for w in windows]) for edge in ("top", "left"))
+            found.append(Cuts(group, Window(top, left, windows[0].rows, windows[0].columns), cuts))
+        return found
+
+    def _painted(self, canvas: Canvas, frame: Array, cuts: list[Cuts], i: Array) -> Canvas:
+        """The canvas with instant i of all that moves painted into its frame; owners have but one frame."""
+        rank = 0
+        for of_group in cuts:
+            count = len(of_group.group.slots)
+            stroke = functools.partial(self._stroke, strokes=self._strokes(of_group, i), frame=frame)
+            canvas = self._interleaved(canvas, stroke, rank, count, frame)
+            rank += count
+        return canvas
+
+    def _strokes(self, cuts: Cuts, i: Array) -> Strokes:
+        def pick(a: Array) -> Array:
+            return jax.lax.dynamic_index_in_dim(a, i, 1, keepdims=False)
+
+        covers, colors = [], []
+        for (run, first), of_run in zip(cuts.group.runs, cuts.of_runs, strict=True):
+            inks = inks_of(self.stage.paint, slice(first, first + run.count))
+            cover, color = painted(jax.tree.map(pick, of_run), inks, cuts.window, self.plan.largest(run))
+            covers.append(whole(cover))
+            colors.append(ink(color))
+        shape = jnp.broadcast_shapes(*(color.shape[1:] for color in colors))
+        colors = [jnp.broadcast_to(color, (color.shape[0], *shape)) for color in colors]
+        names = jnp.asarray(cuts.group.slots, jnp.int32) + 1
+        return Strokes(_joined(covers), _joined(colors), names, pick(cuts.window.top), pick(cuts.window.left))
+
+    def _stroke(self, k: Array, canvas: Canvas, strokes: Strokes, frame: Array) -> Canvas:
+        cover, color = (jax.lax.dynamic_index_in_dim(a, k) for a in (strokes.cover, strokes.color))
+        return self._put(canvas, cover, color, strokes.name[k], frame, strokes.top[k], strokes.left[k])
+
+    def _put(
+        self, canvas: Canvas, cover: Array, color: Array, name: Array | int, frame: Array, top: Array, left: Array
+    ) -> Canvas:
+        """The canvas after a layer [1, rows, columns] in whole numbers was painted where it belongs."""
+        image, owner = canvas
+        if image is not None:
+            place = (frame, top, left, 0)
+            under = jax.lax.dynamic_slice(image, place, (*cover.shape, 3))
+            image = jax.lax.dynamic_update_slice(image, over(under, cover, color, self.plan.linear), place)
+        if owner is not None:
+            place = (0, top, left)
+            under = jax.lax.dynamic_slice(owner, place, cover.shape)
+            owner = jax.lax.dynamic_update_slice(owner, owned(under, cover, name), place)
+        return Canvas(image, owner)
+
+    def _interleaved(
+        self, canvas: Canvas, stroke: Callable[[Array, Canvas], Canvas], rank: int, count: int, frame: Array
+    ) -> Canvas:
+        """The canvas after so many strokes, the first of which has a rank, and the occluders between them."""
+        occluders = self.stage.occluders
+        done: Array | int = 0
+        if occluders is not None:
+            ends = rank + count == self.plan.moving  # those after all come with the last
+            for i, of in enumerate(occluders.rank):
+                until = jnp.clip(of - rank, 0, count)
+                canvas = jax.lax.fori_loop(done, until, stroke, canvas)
+                done = until
+                here = (of >= rank) & ((of < rank + count) | ends)
+                cover, color = occluder(self.stage, self.plan, i, here)
+                canvas = self._put(canvas, whole(cover), ink(color), OCCLUDER, frame, jnp.int32(0), jnp.int32(0))
+        return jax.lax.fori_loop(done, count, stroke, canvas)
+
+
+def _flat(a: Array) -> Array:
+    return a.reshape(-1, *a.shape[2:])
+
+
+def _joined(arrays: list[Array]) -> Array:
+    return arrays[0] if len(arrays) == 1 else jnp.concatenate(arrays)
