@@ -45,10 +45,15 @@ def package(tmp_path_factory: pytest.TempPathFactory) -> Path:
 LOOK = "paint = plain(scene, layout, options, key)\n    return paint._replace(color=255 - paint.color)"
 EDITS = {
     "scene": ("gen2d/scenes/bouncing.py", "jnp.zeros(2), box", "jnp.zeros(2) + 0.25, box", "samples and simulates"),
-    "solver": ("gen2d/impacts.py", "elasticity * arrival", "0.99 * elasticity * arrival", "samples and simulates"),
-    "look": ("renderers/flat.py", "return plain(scene, layout, options, key)", LOOK, "samples and simulates"),
-    "rasterizer": ("gen2d/layers.py", "((product + 16) >> 5)", "((product + 15) >> 5)", "draws"),
-    "captions": ("gen2d/words.py", '"ball", "rod"', '"sphere", "rod"', "writes captions"),
+    "solver": (
+        "gen2d/physics/time_of_impact.py",
+        "elasticity * arrival",
+        "0.99 * elasticity * arrival",
+        "samples and simulates",
+    ),
+    "look": ("renderers/looks/flat.py", "return plain(scene, layout, options, key)", LOOK, "samples and simulates"),
+    "rasterizer": ("renderers/compositing.py", "((product + 16) >> 5)", "((product + 15) >> 5)", "draws"),
+    "captions": ("gen2d/captions/caption.py", '"ball", "rod"', '"sphere", "rod"', "writes captions"),
 }
 
 
@@ -86,11 +91,11 @@ def test_an_edited_program_is_refused_by_name(
 
 
 def test_other_names_and_comments_are_not_refused(package: Path, edited: Edit) -> None:
-    edited("gen2d/impacts.py", "plane_arrival", "arrival_at_a_plane")
-    for user in ("gen2d/sweeps.py", "gen2d/joints.py", "gen2d/linkage.py", "gen2d/sparse.py", "gen2d/dense.py"):
+    edited("gen2d/physics/time_of_impact.py", "plane_arrival", "arrival_at_a_plane")
+    for user in ("gen2d/physics/contact_points.py",):
         if "plane_arrival" in (package / user).read_text():
             edited(user, "plane_arrival", "arrival_at_a_plane")
-    edited("gen2d/words.py", "\nNOUNS =", "\n# What they are called\nNOUNS =")
+    edited("gen2d/captions/caption.py", "\nNOUNS =", "\n# What they are called\nNOUNS =")
     flags = "--xla_force_host_platform_device_count=2"
     done = run(package, "--config", "tiny.yaml", "--n", 3, "--out", "data", XLA_FLAGS=flags)
     assert "nothing to do" in done.stdout, done.stderr

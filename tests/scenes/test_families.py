@@ -1,6 +1,6 @@
 """What every scene family keeps, over some hundred keys of its own config: the layout that it tells, no overlap at the
 start, factors within what they are declared to be, and scenes that depend on their keys alone; over 100,000 keys also
-that whole videos are numbers and that nothing gets out of walls (`pytest -m slow tests/test_families.py`).
+that whole videos are numbers and that nothing gets out of walls (`pytest -m slow tests/scenes/test_families.py`).
 
 What moves begins inside the layout's bounds; a family where some of it comes from outside says `BEGINS_OUTSIDE = True`.
 """

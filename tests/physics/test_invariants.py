@@ -374,7 +374,7 @@ def test_a_video_does_not_depend_on_its_place_or_its_neighbours():
 
 PRINT = """
 import hashlib, sys
-sys.path[:0] = [{tests!r}, {root!r}]
+sys.path[:0] = [{here!r}, {support!r}, {root!r}]
 from test_invariants import DOWN, gas, run
 worlds = [gas(seed % 5, 0.9, 0.3, DOWN) for seed in range({lanes})]
 print(hashlib.sha256(run(worlds, 61, 8).states.position[:1].tobytes()).hexdigest())
@@ -383,8 +383,8 @@ print(hashlib.sha256(run(worlds, 61, 8).states.position[:1].tobytes()).hexdigest
 
 def printed(lanes: int, flags: str, cores: int) -> str:
     """The hash of a video made by a fresh process in a batch of that size."""
-    tests = Path(__file__).parent
-    code = PRINT.format(tests=str(tests), root=str(tests.parent), lanes=lanes)
+    here = Path(__file__).parent
+    code = PRINT.format(here=str(here), support=str(here.parent / "support"), root=str(here.parents[1]), lanes=lanes)
     command = ["taskset", "-c", "0" if cores == 1 else f"0-{cores - 1}", sys.executable, "-c", code]
     env = {**os.environ, "XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu"}
     return subprocess.run(command, env=env, capture_output=True, text=True, check=True).stdout.strip()

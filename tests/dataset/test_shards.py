@@ -320,7 +320,7 @@ except UserError as error:
 
 
 def test_a_write_that_the_disk_refuses_leaves_nothing(tmp_path: Path) -> None:
-    script = FULL.format(tests=str(Path(__file__).parent), root=str(tmp_path))
+    script = FULL.format(tests=str(Path(synthetic.__file__).parent), root=str(tmp_path))
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
     assert re.fullmatch(r"1 .* cannot hold so large a file: .*ulimit -f.*same command again.*\n", done.stdout), done
     assert done.returncode == 0, done.stderr
@@ -364,7 +364,7 @@ synthetic.write(made, todo[2], slow())
 
 @CODECS
 def test_a_killed_writer_publishes_nothing_and_is_resumed(tmp_path: Path, codec: str) -> None:
-    script = KILLED.format(tests=str(Path(__file__).parent), root=str(tmp_path / "a"), codec=codec)
+    script = KILLED.format(tests=str(Path(synthetic.__file__).parent), root=str(tmp_path / "a"), codec=codec)
     with subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE) as process:
         assert process.stdout
         assert process.stdout.readline() == b"half\n"
@@ -417,7 +417,7 @@ def test_forty_kills_leave_no_trace(tmp_path: Path) -> None:
         "objects/mass",
         "time",
     )  # one of each kind: less to write, so that more of it is renaming
-    script = KILLING.format(tests=str(Path(__file__).parent), root=str(tmp_path / "a"), fields=names)
+    script = KILLING.format(tests=str(Path(synthetic.__file__).parent), root=str(tmp_path / "a"), fields=names)
     count = int(subprocess.run([sys.executable, "-c", script], capture_output=True, check=True).stdout)
     fields = {name: synthetic.FIELDS[name] for name in names}
     synthetic.make(synthetic.dataset(tmp_path / "a", train=count, fields=fields))

@@ -1,6 +1,6 @@
 """What it costs to write videos and to read them again: gen2d, a plain h5py loop and a plain copy.
 
-    python tests/bench.py --only storage     # about 2 minutes
+    python tests/bench/bench.py --only storage     # about 2 minutes
 
 The videos are those of synthetic.discs, about 50 MB of frames, with a state beside each. They are read in one thread,
 from files that the system still has in memory, into a batch that is there already. Times are of this process's CPU.

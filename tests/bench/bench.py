@@ -1,12 +1,12 @@
 """How fast gen2d is, part by part, beside peer.py, and whether it keeps what it promises.
 
-    python tests/bench.py                 # all, about 10 minutes
-    python tests/bench.py --quick         # only what a change to the code should be tried on
-    python tests/bench.py --only physics  # what it costs against the number of objects: bench_physics.py
-    python tests/bench.py --only render   # what drawing costs, and annotations: bench_render.py
-    python tests/bench.py --only families # what sampling costs, for every scene family
-    python tests/bench.py --only storage  # what writing and reading cost: bench_storage.py
-    python tests/bench.py --only shards   # what a folder of 100,000 shards costs
+    python tests/bench/bench.py                 # all, about 10 minutes
+    python tests/bench/bench.py --quick         # only what a change to the code should be tried on
+    python tests/bench/bench.py --only physics  # what it costs against the number of objects: bench_physics.py
+    python tests/bench/bench.py --only render   # what drawing costs, and annotations: bench_render.py
+    python tests/bench/bench.py --only families # what sampling costs, for every scene family
+    python tests/bench/bench.py --only storage  # what writing and reading cost: bench_storage.py
+    python tests/bench/bench.py --only shards   # what a folder of 100,000 shards costs
 
 Machines are noisy, so whatever is compared is measured in turns, and a ratio is the median of the ratios of the turns.
 Every measurement runs in a process of its own, on the cores that it is given, and in folders that vanish.
@@ -28,6 +28,10 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+HERE = Path(__file__).resolve()
+SUPPORT = HERE.parents[1] / "support"
+sys.path.append(str(SUPPORT))
+
 import bench_physics
 import bench_render
 import bench_storage
@@ -41,7 +45,6 @@ from gen2d.dataset.folder import open_folder
 from gen2d.dataset.shard_writer import ShardWriter
 from gen2d.generation.complete import complete
 
-HERE = Path(__file__).resolve()
 CONFIG = "benchmark.yaml"
 FRAMES_BYTES = 64 * 64 * 64 * 3  # of a raw video
 CORES = sorted(os.sched_getaffinity(0))
@@ -253,7 +256,7 @@ class Ran(NamedTuple):
 
 def run(command: Sequence[object], cores: Sequence[int] = CORES, env: Mapping[str, str] | None = None) -> Ran:
     """Runs a command on these cores to its end; taskset, as a fork of a process that runs jax may hang."""
-    path = os.pathsep.join([str(HERE.parent.parent), os.environ.get("PYTHONPATH", "")])
+    path = os.pathsep.join([str(HERE.parents[2]), str(SUPPORT), os.environ.get("PYTHONPATH", "")])
     env = {**os.environ, "PYTHONPATH": path, **(env or {})}
     line = ["taskset", "-c", ",".join(map(str, cores)), *map(str, command)]
     began = time.perf_counter()

@@ -25,7 +25,7 @@ from gen2d.storage import explain, leases
 from gen2d.storage.leases import leased, temporary_name
 from gen2d.tools.verify import verify
 
-TESTS = Path(__file__).parent
+TESTS = Path(synthetic.__file__).parent
 
 
 @pytest.fixture

@@ -222,7 +222,7 @@ def test_thirty_kills_of_an_upload(server: buckets.Server, tmp_path: Path) -> No
         synthetic.make(synthetic.dataset(gen2d.storage.paths.place(url), train=12))
         old = gen2d.open(url, fields="*")
         videos = old[:]
-        words = [sys.executable, "-c", GROWING, os.fspath(Path(__file__).parent), url, "30"]
+        words = [sys.executable, "-c", GROWING, os.fspath(Path(synthetic.__file__).parent), url, "30"]
         with subprocess.Popen(words, stderr=subprocess.DEVNULL) as process:
             server.fault = killing(process, number + 1, "" if number % 2 else "fail")
             process.wait()

@@ -1,6 +1,6 @@
 """What a user would write today: Chipmunk (pymunk), OpenCV and h5py, one process a core; bench.py's yardstick.
 
-python tests/peer.py --n 512 --out /tmp/peer      # the scene of configs/benchmark.yaml
+python tests/bench/peer.py --n 512 --out /tmp/peer      # the scene of configs/benchmark.yaml
 """
 
 import argparse

@@ -1,6 +1,7 @@
 """The benchmark measures what it says: the peer makes the same scene, and every measurement works."""
 
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -54,7 +55,10 @@ from pathlib import Path
 from bench_storage import Case, works
 print(json.dumps({{name: work() for name, work in works({case}, Path({str(tmp_path)!r})).items()}}))
 """
-    done = subprocess.run([sys.executable, "-c", code], cwd=Path(__file__).parent, capture_output=True, check=True)
+    path = os.pathsep.join([str(bench.HERE.parent), str(bench.SUPPORT)])
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=os.environ | {"PYTHONPATH": path}, capture_output=True, check=True
+    )
     seconds = json.loads(done.stdout)
     ways = {f"{what} {codec}" for what in ("loader", "h5py") for codec in ("gzip", "zstd", "none")}
     assert ways | {"copy", "h5py gzip-4", "codec zstd", "write zstd", "codec gzip", "write gzip"} == seconds.keys()

@@ -465,7 +465,7 @@ def test_a_killed_writer_is_resumed(
     url = f"s3://bucket/killed{part.replace('/', '-')}-{arrives}"
     monkeypatch.setenv("TMPDIR", str(tmp_path))
     monkeypatch.setattr("tempfile.tempdir", None)
-    words = [sys.executable, "-c", WRITING, str(Path(__file__).parent), url]
+    words = [sys.executable, "-c", WRITING, str(Path(synthetic.__file__).parent), url]
     with subprocess.Popen(words, stderr=subprocess.DEVNULL) as process:
 
         def killing(request: Request) -> str:
