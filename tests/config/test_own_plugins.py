@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 import synthetic
 from numpy.testing import assert_array_equal
-from test_regeneration import contents
-from test_verification import flip
+from synthetic import contents, flip
 from tiny import changed, ran_here
 
 import gen2d

@@ -18,7 +18,7 @@ import pytest
 import s3fs
 import tiny
 import yaml
-from test_regeneration import contents
+from synthetic import contents
 
 import gen2d
 from gen2d.dataset.folder import clean

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import forged
 import pytest
-from test_verification import flip
+from synthetic import contents, flip
 from tiny import changed, ran
 
 from gen2d.core.errors import FolderError
@@ -27,12 +27,6 @@ def pristine(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def root(pristine: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(pristine, tmp_path / "data"))
-
-
-def contents(root: Path) -> dict[str, bytes]:
-    """Every file and its bytes, the program's own too, but for the log, which holds times."""
-    files = (path for path in root.rglob("*") if path.is_file() and path.name != "run.jsonl")
-    return {path.relative_to(root).as_posix(): path.read_bytes() for path in files}
 
 
 def test_what_was_made_is_what_is_made_again(pristine: Path) -> None:

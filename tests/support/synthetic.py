@@ -133,6 +133,18 @@ def tree(root: Path) -> Mapping[str, bytes]:
     return {path.relative_to(root).as_posix(): path.read_bytes() for path in files}
 
 
+def flip(path: Path, bit: int) -> None:
+    data = bytearray(path.read_bytes())
+    data[bit // 8 % len(data)] ^= 1 << bit % 8
+    path.write_bytes(data)
+
+
+def contents(root: Path) -> dict[str, bytes]:
+    """Every file and its bytes, the program's own too, but for the log, which holds times."""
+    files = (path for path in root.rglob("*") if path.is_file() and path.name != "run.jsonl")
+    return {path.relative_to(root).as_posix(): path.read_bytes() for path in files}
+
+
 def discs(count: int, frames: int = 64, size: int = 64, bodies: int = 8, seed: int = 0) -> np.ndarray:
     """Videos of moving discs with soft edges, uint8 [count, frames, size, size, 3]; for measuring speed."""
     random = np.random.default_rng(seed)

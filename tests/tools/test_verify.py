@@ -7,6 +7,7 @@ import h5py
 import numpy as np
 import pytest
 import synthetic
+from synthetic import flip
 
 from gen2d.core.errors import ConfigError, DamagedError, FolderError
 from gen2d.dataset.block import encode
@@ -26,12 +27,6 @@ def pristine(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def root(pristine: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(pristine, tmp_path / "toy"))
-
-
-def flip(path: Path, bit: int) -> None:
-    data = bytearray(path.read_bytes())
-    data[bit // 8 % len(data)] ^= 1 << bit % 8
-    path.write_bytes(data)
 
 
 @pytest.mark.parametrize("codec", ["gzip", "zstd", "none"])
