@@ -18,6 +18,7 @@ from crashes import every_crash
 from numpy.testing import assert_array_equal
 
 import gen2d
+import gen2d.tools.verify as verification
 from gen2d.core.errors import ConfigError, FolderError
 from gen2d.dataset import folder, records
 from gen2d.dataset.folder import clean, open_folder
@@ -289,7 +290,7 @@ def test_verify_while_a_dataset_grows(tmp_path: Path, between: Between, step: st
     run(dataset(root, {"train": 12}))
     growth = dataset(root, {"train": 30})
     work(growth)
-    between(verify, step, lambda: completion.complete(growth))
+    between(verification, step, lambda: completion.complete(growth))
     assert verify(root) == []
     assert splits(root) == {"train": 30}
 

@@ -302,15 +302,15 @@ def test_equal_datasets_give_equal_bytes(toy: Path, tmp_path: Path, to: str) -> 
 
 KILLED = """
 import os, signal, sys
-from gen2d import exporting, exports
-videos = exports.Source.videos
+from gen2d.exports import export, source
+videos = source.Source.videos
 def few(source):
     for number, video in enumerate(videos(source)):
         if number == 7:
             os.kill(os.getpid(), int(sys.argv[4]))
         yield video
-exports.Source.videos = few
-exporting.export(*sys.argv[1:4])
+source.Source.videos = few
+export.export(*sys.argv[1:4])
 """
 
 

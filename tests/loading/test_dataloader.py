@@ -229,7 +229,8 @@ def lie_where_they_are_asked_to(root: str) -> None:
 
 
 def test_jax_batches_lie_where_they_are_asked_to(toy: Path) -> None:
-    code = f"import sys; sys.path.insert(0, {str(Path(__file__).parent)!r}); import test_dataloader; test_dataloader.lie_where_they_are_asked_to({str(toy)!r})"
+    code = f"import sys; sys.path.insert(0, {str(Path(__file__).parent)!r});"
+    code += f"import test_dataloader; test_dataloader.lie_where_they_are_asked_to({str(toy)!r})"
     run_on(2, "assert len(jax.devices()) == 2;" + code, JAX_PLATFORMS="cpu")
 
 
