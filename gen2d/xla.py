@@ -13,17 +13,17 @@ def _bodies(values: Array) -> list[Array]:
     return [values[..., i, :] for i in range(values.shape[-2])]
 
 
-def total(values: Array) -> Array:
+def sum_bodies(values: Array) -> Array:
     """The sum [..., n] over the bodies of values [..., N, n]."""
     return functools.reduce(jnp.add, _bodies(values))
 
 
-def largest(values: Array) -> Array:
+def max_bodies(values: Array) -> Array:
     """The maximum [..., n] over the bodies of values [..., N, n]."""
     return functools.reduce(jnp.maximum, _bodies(values))
 
 
-def folded(values: Array, axis: int, combine: Callable[[Array, Array], Array]) -> Array:
+def reduce_halves(values: Array, axis: int, combine: Callable[[Array, Array], Array]) -> Array:
     """The values combined along an axis, which is gone: halves are laid on each other until one is left."""
     while (size := values.shape[axis]) > 1:
         half = size // 2
@@ -36,7 +36,7 @@ def folded(values: Array, axis: int, combine: Callable[[Array, Array], Array]) -
     return jnp.squeeze(values, axis)
 
 
-def settled(values: Any, one: Array | float) -> Any:
+def materialize(values: Any, one: Array | float) -> Any:
     """The same values, each computed once.
 
     XLA's CPU compiler fuses a cheap producer into each of its consumers and would compute a row's whole chain again for

@@ -18,7 +18,7 @@ from gen2d.records.scene import State
 TREMOR = (1.0, 1.37, 2.11)  # frequencies of a shaking hand, over the lowest
 
 
-class View(NamedTuple):
+class CameraView(NamedTuple):
     """What a camera shows in each frame of a video."""
 
     center: Array  # [..., T, 2] m, world point in the middle of the frame
@@ -26,7 +26,7 @@ class View(NamedTuple):
     angle: Array  # [..., T] rad
 
 
-def to_pixels(view: View, points: Array, height: int, width: int) -> Array:
+def to_pixels(view: CameraView, points: Array, height: int, width: int) -> Array:
     """The columns and rows [..., T, P, 2] in px of world points [..., T, P, 2] in m."""
     cos, sin = jnp.cos(view.angle)[..., None], jnp.sin(view.angle)[..., None]
     scale = view.scale[..., None]
@@ -34,7 +34,7 @@ def to_pixels(view: View, points: Array, height: int, width: int) -> Array:
     return jnp.stack([width / 2 + scale * (x * cos + y * sin), height / 2 - scale * (y * cos - x * sin)], -1)
 
 
-def to_world(view: View, columns: Array, rows: Array, height: int, width: int) -> tuple[Array, Array]:
+def to_world(view: CameraView, columns: Array, rows: Array, height: int, width: int) -> tuple[Array, Array]:
     """The world's x and y in m of pixels; columns and rows [..., T, P] in px."""
     cos, sin = jnp.cos(view.angle)[..., None], jnp.sin(view.angle)[..., None]
     across, up = (columns - width / 2) / view.scale[..., None], (height / 2 - rows) / view.scale[..., None]
@@ -80,7 +80,7 @@ def largest_scale(options: Any, layout: Layout, height: int, width: int, seconds
     return base(options, layout, height, width)[1] * math.exp(rate) if rate < 50 else math.inf
 
 
-def filmed(key: Array, options: Any, layout: Layout, states: State, fps: float, height: int, width: int) -> View:
+def filmed(key: Array, options: Any, layout: Layout, states: State, fps: float, height: int, width: int) -> CameraView:
     """One video's view: what the options draw at random, and what is followed."""
     frames = states.position.shape[0]
     time = jnp.arange(frames, dtype=jnp.float32) / fps
@@ -96,7 +96,7 @@ def filmed(key: Array, options: Any, layout: Layout, states: State, fps: float, 
     if options.shake.support != (0.0, 0.0):
         center = center + drawn("shake", options.shake) * _tremor(jax.random.fold_in(key, 1), time, options.shake_hertz)
     zoom, turn, angle = drawn("zoom", options.zoom), drawn("turn", options.turn), drawn("angle", options.angle)
-    return View(center, scale * jnp.exp(zoom * time), angle + turn * time)
+    return CameraView(center, scale * jnp.exp(zoom * time), angle + turn * time)
 
 
 def _tremor(key: Array, time: Array, hertz: float) -> Array:

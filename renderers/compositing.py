@@ -11,13 +11,13 @@ import jax
 import jax.numpy as jnp
 
 from gen2d.records.axes import Array
-from gen2d.records.layout import Run
+from gen2d.records.layout import SlotGroup
 from gen2d.renderers.camera import to_world
 from gen2d.renderers.color import LINEAR, to_linear, to_srgb
 from gen2d.renderers.noise import textured
-from gen2d.renderers.plan import Plan, Stage
-from gen2d.renderers.primitives import Instants, Window, parts_of
-from gen2d.renderers.shading import Cut, cut, inks_of, painted
+from gen2d.renderers.plan import FramePlan, RenderScene
+from gen2d.renderers.primitives import Instants, PixelWindow, object_parts
+from gen2d.renderers.shading import EdgeSamples, covered_color, edge_samples, fills_of
 
 FULL = 2**15 - 1  # a pixel's coverage is a whole number up to this
 NOBODY = FULL << 8  # owner of the background
@@ -26,7 +26,7 @@ OCCLUDER = 255  # what a mask says of a pixel that shows an occluder
 Painter = Callable[[Any, Array, Array, Any], Any]
 
 
-class Canvas(NamedTuple):
+class LayerCanvas(NamedTuple):
     """Images that are painted on, uint8 [I, H, W, 3] and int32 [I, H, W], if they are wanted."""
 
     image: Array | None
@@ -36,18 +36,18 @@ class Canvas(NamedTuple):
 # ---- One layer
 
 
-def whole(cover: Array) -> Array:
+def to_levels(cover: Array) -> Array:
     """A coverage from 0 to 1 as whole numbers up to FULL, int16."""
     return (cover * FULL + 0.5).astype(jnp.int32).astype(jnp.int16)
 
 
-def ink(color: Array) -> Array:
+def to_ink(color: Array) -> Array:
     """A colour as whole numbers, int16."""
     return (color + 0.5).astype(jnp.int32).astype(jnp.int16)
 
 
 def over(under: Array, cover: Array, color: Array, linear: bool) -> Array:
-    """The uint8 image [..., 3] after a layer of `whole` coverage [...] and of an `ink` that fits it."""
+    """The uint8 image [..., 3] after a layer of `to_levels` coverage [...] and of an `to_ink` that fits it."""
     cover = cover[..., None]
     if linear:
         light = jnp.asarray(LINEAR)[under.astype(jnp.int32)]
@@ -61,8 +61,8 @@ def over(under: Array, cover: Array, color: Array, linear: bool) -> Array:
     return (under + ((product + 16) >> 5)).astype(jnp.uint8)
 
 
-def owned(owner: Array, cover: Array, name: Array | int) -> Array:
-    """Who is seen most of in each pixel, after a layer of `whole` coverage.
+def ownership(owner: Array, cover: Array, name: Array | int) -> Array:
+    """Who is seen most of in each pixel, after a layer of `to_levels` coverage.
 
     An owner is an id and, above its 8 bits, how much of the pixel its object shows, up to FULL; what comes on top
     leaves the same share of all that was there, so only the best so far has to be known.
@@ -75,11 +75,11 @@ def owned(owner: Array, cover: Array, name: Array | int) -> Array:
 def hard(linear: bool) -> Painter:
     """What paints on a canvas, in whole numbers."""
 
-    def paint(canvas: Canvas, cover: Array, color: Array, name: Any) -> Canvas:
+    def paint(canvas: LayerCanvas, cover: Array, color: Array, name: Any) -> LayerCanvas:
         image, owner = canvas
-        return Canvas(
-            None if image is None else over(image, whole(cover), ink(color), linear),
-            None if owner is None else owned(owner, whole(cover), name),
+        return LayerCanvas(
+            None if image is None else over(image, to_levels(cover), to_ink(color), linear),
+            None if owner is None else ownership(owner, to_levels(cover), name),
         )
 
     return paint
@@ -97,7 +97,7 @@ def soft(linear: bool) -> Painter:
 # ---- What covers all of an image
 
 
-def ground(stage: Stage, at: Instants, plan: Plan) -> Array:
+def background_image(stage: RenderScene, at: Instants, plan: FramePlan) -> Array:
     """The background [I, H, W, 3] at some instants, as floats; [1, H, W, 3] where it is the same at all."""
     background, first = stage.paint.background, stage.instants.view
     color, height, width = background.color, plan.height, plan.width
@@ -118,41 +118,45 @@ def ground(stage: Stage, at: Instants, plan: Plan) -> Array:
     return jnp.broadcast_to(color, (*x.shape, 3))
 
 
-def bare(stage: Stage, at: Instants, plan: Plan) -> Canvas:
+def background_layer(stage: RenderScene, at: Instants, plan: FramePlan) -> LayerCanvas:
     """The background alone at some instants, if its image and owners are wanted; [1, ...] where it is always the
     same."""
-    return Canvas(
-        (ground(stage, at, plan) + 0.5).astype(jnp.uint8) if plan.frames else None,
+    return LayerCanvas(
+        (background_image(stage, at, plan) + 0.5).astype(jnp.uint8) if plan.frames else None,
         jnp.full((1, plan.height, plan.width), NOBODY, jnp.int32) if plan.owners else None,
     )
 
 
-def stills(stage: Stage, plan: Plan) -> Canvas:
+def static_layer(stage: RenderScene, plan: FramePlan) -> LayerCanvas:
     """What never moves, [1, ...], without the occluders: these stand before what moves."""
     first = jax.tree.map(lambda a: a[:1], stage.instants)
     alone = stage._replace(occluders=None)
-    return all_over(bare(stage, first, plan), alone, plan, first, plan.behind, hard(plan.linear))
+    return all_over(background_layer(stage, first, plan), alone, plan, first, plan.behind, hard(plan.linear))
 
 
-def all_over(canvas: Any, stage: Stage, plan: Plan, at: Instants, runs: list[tuple[Run, int]], paint: Painter) -> Any:
+def all_over(
+    canvas: Any, stage: RenderScene, plan: FramePlan, at: Instants, runs: list[tuple[SlotGroup, int]], paint: Painter
+) -> Any:
     """The canvas after some runs' slots and what stands before them were painted over all of it.
 
     A loop over the slots: what depends on rows or columns alone is then computed before it, once, and not again for
     every pixel, as it would be where the compiler fused all.
     """
-    window = Window(0, 0, plan.height, plan.width)
+    window = PixelWindow(0, 0, plan.height, plan.width)
     rank = 0
     for run, first in runs:
         slots = slice(first, first + run.count)
 
-        def all_of(canvas: Any, run: Run = run, first: int = first, slots: slice = slots, rank: int = rank) -> Any:
+        def all_of(
+            canvas: Any, run: SlotGroup = run, first: int = first, slots: slice = slots, rank: int = rank
+        ) -> Any:
             def one(canvas: Any, entry: tuple) -> tuple[Any, None]:
                 cuts, inks, slot, rank = entry
-                canvas = standing(canvas, stage, plan, lambda of: of == rank, paint)
-                return paint(canvas, *painted(cuts, inks, window, plan.largest(run)), slot + 1), None
+                canvas = static_objects(canvas, stage, plan, lambda of: of == rank, paint)
+                return paint(canvas, *covered_color(cuts, inks, window, plan.largest(run)), slot + 1), None
 
             numbers = jnp.arange(run.count)
-            entries = cut_of(stage, plan, at, run, first, window), inks_of(stage.paint, slots)
+            entries = cut_of(stage, plan, at, run, first, window), fills_of(stage.paint, slots)
             return jax.lax.scan(one, canvas, (*entries, first + numbers, rank + numbers))[0]
 
         some = stage.occluders is not None or stage.paint.drawn[slots].any()
@@ -161,13 +165,15 @@ def all_over(canvas: Any, stage: Stage, plan: Plan, at: Instants, runs: list[tup
     return canvas
 
 
-def moving(canvas: Any, stage: Stage, plan: Plan, at: Instants, paint: Painter) -> Any:
+def moving_objects(canvas: Any, stage: RenderScene, plan: FramePlan, at: Instants, paint: Painter) -> Any:
     """The canvas after what moves and the occluders between were painted over all of it."""
     canvas = all_over(canvas, stage, plan, at, [span for group in plan.groups for span in group.runs], paint)
-    return standing(canvas, stage, plan, lambda rank: rank >= plan.moving, paint)
+    return static_objects(canvas, stage, plan, lambda rank: rank >= plan.moving, paint)
 
 
-def standing(canvas: Any, stage: Stage, plan: Plan, here: Callable[[Array], Array], paint: Painter) -> Any:
+def static_objects(
+    canvas: Any, stage: RenderScene, plan: FramePlan, here: Callable[[Array], Array], paint: Painter
+) -> Any:
     """The canvas after those occluders whose rank is `here`."""
     if stage.occluders is None:
         return canvas
@@ -177,7 +183,7 @@ def standing(canvas: Any, stage: Stage, plan: Plan, here: Callable[[Array], Arra
     return canvas
 
 
-def occluder(stage: Stage, plan: Plan, i: int, here: Array) -> tuple[Array, Array]:
+def occluder(stage: RenderScene, plan: FramePlan, i: int, here: Array) -> tuple[Array, Array]:
     """Coverage [1, H, W], none unless it is `here`, and colour [3] of an occluder."""
     assert stage.occluders is not None
     left, top, right, bottom = stage.occluders.box[i]
@@ -190,17 +196,19 @@ def occluder(stage: Stage, plan: Plan, i: int, here: Array) -> tuple[Array, Arra
     return jnp.where(here, cover, 0.0)[None], stage.occluders.color[i]
 
 
-def cut_of(stage: Stage, plan: Plan, at: Instants, run: Run, first: int, window: Window) -> Cut:
+def cut_of(
+    stage: RenderScene, plan: FramePlan, at: Instants, run: SlotGroup, first: int, window: PixelWindow
+) -> EdgeSamples:
     """The parts of a run's slots at some instants, cut by their windows; arrays [k, I, ...].
 
     In a loop of its own, for what is the same for all rows and columns to be there before it.
     """
-    parts = parts_of(run, first, stage.bodies, at, stage.paint, plan.height, plan.width)
+    parts = object_parts(run, first, stage.bodies, at, stage.paint, plan.height, plan.width)
     toned = stage.paint.shade is not None or stage.paint.texture is not None
     begin = [jnp.broadcast_to(jnp.asarray(edge), parts.turn.column.shape) for edge in (window.top, window.left)]
 
-    def one(entry: tuple) -> Cut:
+    def one(entry: tuple) -> EdgeSamples:
         of, top, left = entry
-        return cut(of, Window(top, left, window.rows, window.columns), run.shape == "circle", toned)
+        return edge_samples(of, PixelWindow(top, left, window.rows, window.columns), run.shape == "circle", toned)
 
     return jax.lax.map(one, (parts, *begin))

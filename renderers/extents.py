@@ -5,14 +5,14 @@ from collections.abc import Callable
 import jax.numpy as jnp
 
 from gen2d.records.axes import Array
-from gen2d.renderers.plan import Plan, Stage
-from gen2d.renderers.primitives import Figure, parts_of
+from gen2d.renderers.plan import FramePlan, RenderScene
+from gen2d.renderers.primitives import Primitive, object_parts
 
 
-def boxes(stage: Stage, plan: Plan) -> Array:
+def bounding_boxes(stage: RenderScene, plan: FramePlan) -> Array:
     """The boxes [T, K, 4] px (x0 y0 x1 y1) around all of each object as it is drawn; 0 where nothing is drawn."""
 
-    def box(figure: Figure, disc: bool) -> Array:
+    def box(figure: Primitive, disc: bool) -> Array:
         corners = figure.corners[..., None, :] if disc else figure.corners
         radius = 0.0 if figure.radius is None else figure.radius[..., None]
         around = jnp.concatenate([corners.min(-2) - radius, corners.max(-2) + radius], -1)
@@ -21,12 +21,12 @@ def boxes(stage: Stage, plan: Plan) -> Array:
     return _of_slots(stage, plan, box)
 
 
-def areas(stage: Stage, plan: Plan) -> Array:
+def areas(stage: RenderScene, plan: FramePlan) -> Array:
     """The area [T, K] px^2 of each object as it is drawn."""
     return _of_slots(stage, plan, area_of)
 
 
-def area_of(figure: Figure, disc: bool) -> Array:
+def area_of(figure: Primitive, disc: bool) -> Array:
     """The area [...] px^2 of figures: core, sides times radius, and a disc."""
     radius = jnp.zeros(()) if figure.radius is None else figure.radius
     round_part = jnp.pi * radius**2
@@ -37,9 +37,9 @@ def area_of(figure: Figure, disc: bool) -> Array:
     return core + radius * jnp.sqrt(((following - corners) ** 2).sum(-1)).sum(-1) + round_part
 
 
-def _of_slots(stage: Stage, plan: Plan, measure: Callable[[Figure, bool], Array]) -> Array:
+def _of_slots(stage: RenderScene, plan: FramePlan, measure: Callable[[Primitive, bool], Array]) -> Array:
     found = []
     for run, first in plan.layout.spans:
-        parts = parts_of(run, first, stage.bodies, stage.instants, stage.paint, plan.height, plan.width)
+        parts = object_parts(run, first, stage.bodies, stage.instants, stage.paint, plan.height, plan.width)
         found.append(measure(parts.whole, run.shape == "circle"))
     return jnp.moveaxis(jnp.concatenate(found), 0, 1)

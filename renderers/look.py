@@ -16,7 +16,7 @@ from gen2d.renderers.paint import Background, Paint, Texture
 
 
 @dataclasses.dataclass(frozen=True)
-class Lines:
+class LineOptions:
     """How segments are drawn."""
 
     wall_width: float = option(1.5, float, "px", "of a segment's line, beyond its own radius; 0: not drawn", low=0)
@@ -28,7 +28,7 @@ class Lines:
 
 
 @dataclasses.dataclass(frozen=True)
-class Plain(Lines):
+class PlainOptions(LineOptions):
     """Background, colours and lines of plain shapes."""
 
     background_kind: str = option("plain", str, "", "what is behind everything", choices=("plain", "gradient", "noise"))
@@ -45,14 +45,14 @@ class Plain(Lines):
     )
 
 
-def plain(scene: Scene, layout: Layout, options: Plain, key: Array) -> Paint:
+def plain(scene: Scene, layout: Layout, options: PlainOptions, key: Array) -> Paint:
     """Every slot in one colour on the background. One key gives the same colours in all looks."""
     background = background_of(options, layout, jax.random.fold_in(key, 1))
     colors = colors_of(scene, layout, options, key, background)
-    return Paint(background, colors, *lines_of(scene, options))
+    return Paint(background, colors, *line_fields(scene, options))
 
 
-def background_of(options: Plain, layout: Layout, key: Array) -> Background:
+def background_of(options: PlainOptions, layout: Layout, key: Array) -> Background:
     """The background that is asked for: plain, a gradient in a random direction, or noise."""
     color, to_color = (jnp.asarray(c, jnp.float32) for c in (options.background, options.background_to))
     if options.background_kind == "plain":
@@ -75,7 +75,7 @@ def mean_color(background: Background) -> Array:
     return shades(background).mean(0)
 
 
-def colors_of(scene: Scene, layout: Layout, options: Plain, key: Array, background: Background) -> Array:
+def colors_of(scene: Scene, layout: Layout, options: PlainOptions, key: Array, background: Background) -> Array:
     """The colours [K, 3] of the slots: the scene's, or random ones for all that moves, which differ from one another
     and from the background's."""
     colors, moving = scene.objects.color.astype(jnp.float32), np.flatnonzero(are_moving(layout))
@@ -84,7 +84,7 @@ def colors_of(scene: Scene, layout: Layout, options: Plain, key: Array, backgrou
     return colors.at[moving].set(palette(key, len(moving), options.contrast, shades(background)))
 
 
-def lines_of(scene: Scene, options: Lines) -> tuple[Array, Array]:
+def line_fields(scene: Scene, options: LineOptions) -> tuple[Array, Array]:
     """Which slots are drawn [K], and what is added to their rims [K] px: segments are lines of a width beyond their own
     radius, and are not drawn if they have neither."""
     line, objects = are_lines(scene), scene.objects

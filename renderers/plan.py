@@ -8,10 +8,10 @@ import jax.numpy as jnp
 
 from gen2d.core.enums import STATIC
 from gen2d.records.axes import Array
-from gen2d.records.layout import Layout, Run
+from gen2d.records.layout import Layout, SlotGroup
 from gen2d.renderers.camera import to_pixels
 from gen2d.renderers.paint import Paint
-from gen2d.renderers.primitives import Bodies, Instants, Window
+from gen2d.renderers.primitives import BodyGeometry, Instants, PixelWindow
 
 LANES = 8  # pixels: a patch's rows are whole SIMD vectors
 
@@ -24,10 +24,10 @@ class Occluders(NamedTuple):
     rank: Array  # [O] how many of the moving slots, in drawing order, they stand before
 
 
-class Stage(NamedTuple):
+class RenderScene(NamedTuple):
     """All that one video is drawn from; any number of them have their axes before these."""
 
-    bodies: Bodies
+    bodies: BodyGeometry
     instants: Instants  # at the T frames
     exposed: Instants | None  # [T, S, ...] at the S instants of each exposure
     paint: Paint
@@ -37,7 +37,7 @@ class Stage(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True)
-class Plan:
+class FramePlan:
     """What is known of a picture before anything is drawn."""
 
     layout: Layout
@@ -52,22 +52,22 @@ class Plan:
     exposed: int = 0  # instants of an exposure; 0: no motion blur
 
     @property
-    def behind(self) -> list[tuple[Run, int]]:
+    def behind(self) -> list[tuple[SlotGroup, int]]:
         """The runs of the unmoving layer, back to front."""
         spans = self.layout.painted
         first = next((i for i, (run, _) in enumerate(spans) if not self.still or run.kind != STATIC), len(spans))
         return list(spans[:first])
 
     @property
-    def groups(self) -> "list[Group]":
+    def groups(self) -> "list[TileGroup]":
         """The others, in groups that share a size of patch."""
-        found: list[Group] = []
+        found: list[TileGroup] = []
         for run, first in self.layout.painted[len(self.behind) :]:
             reach = self._reach(run)
             if found and found[-1].reach == reach:
-                found[-1] = Group((*found[-1].runs, (run, first)), reach)
+                found[-1] = TileGroup((*found[-1].runs, (run, first)), reach)
             else:
-                found.append(Group(((run, first),), reach))
+                found.append(TileGroup(((run, first),), reach))
         return found
 
     @property
@@ -75,20 +75,20 @@ class Plan:
         """How many slots those are."""
         return sum(len(group.slots) for group in self.groups)
 
-    def _reach(self, run: Run) -> float:
+    def _reach(self, run: SlotGroup) -> float:
         """Of an object from its centre, px; as large as the picture where that is not known to be less."""
         reach = self.largest(run)
         return reach if 2 * reach + 2 < max(self.height, self.width) else math.inf
 
-    def largest(self, run: Run) -> float:
+    def largest(self, run: SlotGroup) -> float:
         """No disc of a run is larger, px."""
         return math.inf if run.kind == STATIC else self.layout.reach * self.scale + self.grow
 
 
-class Group(NamedTuple):
+class TileGroup(NamedTuple):
     """Runs that are drawn into patches of one size."""
 
-    runs: tuple[tuple[Run, int], ...]
+    runs: tuple[tuple[SlotGroup, int], ...]
     reach: float  # px
 
     @property
@@ -104,7 +104,7 @@ class Group(NamedTuple):
         return min(side, height), min(-(-side // LANES) * LANES, width)
 
 
-def patch_of(plan: Plan, group: Group, at: Instants, run: Run, first: int) -> Window:
+def tile_windows(plan: FramePlan, group: TileGroup, at: Instants, run: SlotGroup, first: int) -> PixelWindow:
     """The patches of a run's slots at some instants, top and left [k, I]."""
     height, width = plan.height, plan.width
     rows, columns = group.size(height, width)
@@ -115,4 +115,4 @@ def patch_of(plan: Plan, group: Group, at: Instants, run: Run, first: int) -> Wi
             return jnp.zeros(center.T.shape, jnp.int32)
         return jnp.clip(jnp.floor(center.T - group.reach).astype(jnp.int32), 0, whole - size)
 
-    return Window(begin(places[..., 1], rows, height), begin(places[..., 0], columns, width), rows, columns)
+    return PixelWindow(begin(places[..., 1], rows, height), begin(places[..., 0], columns, width), rows, columns)

@@ -1,6 +1,6 @@
 """What the slots of a scene look like in pixels: their figures, the parts that a look paints, and each part's coverage.
 
-Written for one video at some instants. `parts_of` gives arrays that begin with [k, I], the slots of one run and the
+Written for one video at some instants. `object_parts` gives arrays that begin with [k, I], the slots of one run and the
 instants; the rest is the same for any leading axes.
 """
 
@@ -9,12 +9,12 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 
 from gen2d.records.axes import Array
-from gen2d.records.layout import Run
-from gen2d.renderers.camera import View, to_pixels
+from gen2d.records.layout import SlotGroup
+from gen2d.renderers.camera import CameraView, to_pixels
 from gen2d.renderers.paint import Paint
 
 
-class Bodies(NamedTuple):
+class BodyGeometry(NamedTuple):
     """What of a video's objects matters to their figures; [K, ...]."""
 
     radius: Array
@@ -27,26 +27,26 @@ class Instants(NamedTuple):
 
     position: Array  # [I, K, 2] m
     angle: Array  # [I, K] rad
-    view: View
+    view: CameraView
 
 
-class Figure(NamedTuple):
+class Primitive(NamedTuple):
     """Discs (the two numbers of `corners` are a centre), or rounded polygons; without an area, nothing."""
 
     corners: Array  # [..., 2] or [..., V, 2] px, x right and y down
     radius: Array | None  # [...] px
 
 
-class Parts(NamedTuple):
+class ObjectParts(NamedTuple):
     """What is painted of some slots: all of it, what is inside the line along its rim, and its mark."""
 
-    whole: Figure
-    inner: Figure | None
-    mark: Figure | None
-    turn: "Turn"
+    whole: Primitive
+    inner: Primitive | None
+    mark: Primitive | None
+    turn: "BodyTransform"
 
 
-class Turn(NamedTuple):
+class BodyTransform(NamedTuple):
     """From a pixel to a body's own frame."""
 
     column: Array  # [...] px, of the centre
@@ -57,7 +57,9 @@ class Turn(NamedTuple):
     reach: Array  # px, from the centre to the farthest point
 
 
-def parts_of(run: Run, first: int, bodies: Bodies, at: Instants, paint: Paint, height: int, width: int) -> Parts:
+def object_parts(
+    run: SlotGroup, first: int, bodies: BodyGeometry, at: Instants, paint: Paint, height: int, width: int
+) -> ObjectParts:
     """The parts of the slots of a run, in pixels; arrays [k, I, ...]."""
     slots = slice(first, first + run.count)
     scale, drawn = at.view.scale, paint.drawn[slots, None]
@@ -65,24 +67,28 @@ def parts_of(run: Run, first: int, bodies: Bodies, at: Instants, paint: Paint, h
     angle = at.view.angle - at.angle[:, slots].T  # clockwise as seen: y is down
     radius = bodies.radius[slots, None] * scale + (0.0 if paint.grow is None else paint.grow[slots, None])
     own, reach, ahead = _own(run, slots, bodies, scale, radius)
-    turn = Turn(center[..., 0], center[..., 1], jnp.cos(angle), jnp.sin(angle), scale + jnp.zeros_like(angle), reach)
-    whole = _figure(run, turn, own, radius, drawn)
+    turn = BodyTransform(
+        center[..., 0], center[..., 1], jnp.cos(angle), jnp.sin(angle), scale + jnp.zeros_like(angle), reach
+    )
+    whole = _primitive(run, turn, own, radius, drawn)
     inner = mark = None
     if paint.rim is not None:
         rim = paint.rim[slots, None]
         some = drawn & (radius > rim) if run.shape != "polygon" else drawn
-        inner = _figure(run, turn, _inset(run, own, rim, radius), jnp.maximum(radius - rim, 0.0), some)
+        inner = _primitive(run, turn, _inset(run, own, rim, radius), jnp.maximum(radius - rim, 0.0), some)
     if paint.mark is not None:
         # Its round end is beyond the rim, where nothing is painted.
         end = jnp.where(drawn, ahead, 0.0)
         zero = jnp.zeros_like(end)
         bar = jnp.stack([jnp.stack([zero, zero], -1), jnp.stack([end, zero], -1)], -2)
         half = paint.mark[slots, None] * _nearest(run, own, radius)
-        mark = Figure(_placed(bar, turn), jnp.where(drawn, half, 0.0))
-    return Parts(whole, inner, mark, turn)
+        mark = Primitive(_placed(bar, turn), jnp.where(drawn, half, 0.0))
+    return ObjectParts(whole, inner, mark, turn)
 
 
-def _own(run: Run, slots: slice, bodies: Bodies, scale: Array, radius: Array) -> tuple[Array | None, Array, Array]:
+def _own(
+    run: SlotGroup, slots: slice, bodies: BodyGeometry, scale: Array, radius: Array
+) -> tuple[Array | None, Array, Array]:
     """The corners [k, I, V, 2] of the core in the body's own frame (x ahead, y down; a disc has none), its reach, and
     how far it goes ahead of its centre; px."""
     if run.shape == "circle":
@@ -116,12 +122,12 @@ def _ahead(corners: Array) -> Array:
     return jnp.where(facing, distance / jnp.where(facing, normal[..., 0], 1.0), jnp.inf).min(-1)
 
 
-def _nearest(run: Run, corners: Array | None, radius: Array) -> Array:
+def _nearest(run: SlotGroup, corners: Array | None, radius: Array) -> Array:
     """How far the nearest point of the rim is from the centre."""
     return radius if run.shape != "polygon" or corners is None else _sides(corners)[1].min(-1) + radius
 
 
-def _inset(run: Run, corners: Array | None, rim: Array, radius: Array) -> Array | None:
+def _inset(run: SlotGroup, corners: Array | None, rim: Array, radius: Array) -> Array | None:
     """A polygon's corners moved inwards by what a rim takes beyond the radius, at most to its middle."""
     if run.shape != "polygon" or corners is None:
         return corners
@@ -139,22 +145,22 @@ def _inset(run: Run, corners: Array | None, rim: Array, radius: Array) -> Array 
     return corners - by * (one + other) / jnp.maximum(together, 1e-3)
 
 
-def _placed(corners: Array, turn: Turn) -> Array:
+def _placed(corners: Array, turn: BodyTransform) -> Array:
     cos, sin = turn.cos[..., None], turn.sin[..., None]
     x, y = corners[..., 0], corners[..., 1]
     return jnp.stack([turn.column[..., None] + x * cos - y * sin, turn.row[..., None] + x * sin + y * cos], -1)
 
 
-def _figure(run: Run, turn: Turn, corners: Array | None, radius: Array, drawn: Array) -> Figure:
+def _primitive(run: SlotGroup, turn: BodyTransform, corners: Array | None, radius: Array, drawn: Array) -> Primitive:
     """The figure of slots, without an area where it is not drawn."""
     radius = jnp.where(drawn, radius, 0.0)
     if corners is None:
-        return Figure(jnp.stack([turn.column, turn.row], -1), radius)
+        return Primitive(jnp.stack([turn.column, turn.row], -1), radius)
     placed = _placed(jnp.where(drawn[..., None, None], corners, 0.0), turn)
-    return Figure(placed, None if run.shape == "polygon" and not run.rounded else radius)
+    return Primitive(placed, None if run.shape == "polygon" and not run.rounded else radius)
 
 
-class Window(NamedTuple):
+class PixelWindow(NamedTuple):
     """Which pixels are looked at: so many rows and columns from a first one."""
 
     top: Any  # [...]

@@ -19,26 +19,36 @@ import jax.numpy as jnp
 from gen2d.core.enums import STATIC
 from gen2d.records.axes import Array
 from gen2d.renderers.color import to_linear, to_srgb
-from gen2d.renderers.compositing import Canvas, all_over, bare, cut_of, ground, hard, moving, soft, stills
-from gen2d.renderers.plan import Plan, Stage
-from gen2d.renderers.primitives import Instants, Window
-from gen2d.renderers.sensor import averaged, noisy
-from gen2d.renderers.shading import inks_of, painted
-from gen2d.renderers.tiles import draw_patches
+from gen2d.renderers.compositing import (
+    LayerCanvas,
+    all_over,
+    background_image,
+    background_layer,
+    cut_of,
+    hard,
+    moving_objects,
+    soft,
+    static_layer,
+)
+from gen2d.renderers.plan import FramePlan, RenderScene
+from gen2d.renderers.primitives import Instants, PixelWindow
+from gen2d.renderers.sensor import add_noise, exposure_average
+from gen2d.renderers.shading import covered_color, fills_of
+from gen2d.renderers.tiles import draw_tiles
 from gen2d.xla import on_cpu
 
 
-def draw(stages: Stage, plan: Plan) -> tuple[Array | None, Array | None]:
+def draw(stages: RenderScene, plan: FramePlan) -> tuple[Array | None, Array | None]:
     """Frames [n, T, H, W, 3] uint8 and owners [n, T, H, W] uint8, each if it is wanted, in the form for this device."""
-    return (draw_patches if on_cpu() else draw_dense)(stages, plan)
+    return (draw_tiles if on_cpu() else draw_dense)(stages, plan)
 
 
-def draw_dense(stages: Stage, plan: Plan) -> tuple[Array | None, Array | None]:
+def draw_dense(stages: RenderScene, plan: FramePlan) -> tuple[Array | None, Array | None]:
     """The same, every pixel looking at every object. The form for GPUs."""
     return jax.vmap(functools.partial(_dense, plan=plan))(stages)
 
 
-def _dense(stage: Stage, plan: Plan) -> tuple[Array | None, Array | None]:
+def _dense(stage: RenderScene, plan: FramePlan) -> tuple[Array | None, Array | None]:
     now = dataclasses.replace(plan, frames=plan.frames and not plan.exposed)
     frames, owners = _painted(stage, now, stage.instants)
     if plan.frames and stage.exposed is not None:
@@ -51,39 +61,41 @@ def _dense(stage: Stage, plan: Plan) -> tuple[Array | None, Array | None]:
 
         exposed = jax.tree.map(lambda a: jnp.moveaxis(a, 1, 0), stage.exposed)
         zero = jnp.zeros((stage.instants.angle.shape[0], plan.height, plan.width, 3), jnp.uint16)
-        frames = averaged(jax.lax.scan(add, zero, exposed)[0], plan.exposed)
+        frames = exposure_average(jax.lax.scan(add, zero, exposed)[0], plan.exposed)
     if frames is not None and stage.noise is not None:
-        frames = noisy(frames, stage.noise, stage.seed, jnp.arange(frames.shape[0]))
+        frames = add_noise(frames, stage.noise, stage.seed, jnp.arange(frames.shape[0]))
     return frames, None if owners is None else (owners & 255).astype(jnp.uint8)
 
 
-def _painted(stage: Stage, plan: Plan, at: Instants) -> Canvas:
+def _painted(stage: RenderScene, plan: FramePlan, at: Instants) -> LayerCanvas:
     """All that is seen at some instants."""
-    start = stills(stage, plan) if plan.still else bare(stage, at, plan)
+    start = static_layer(stage, plan) if plan.still else background_layer(stage, at, plan)
     canvas = jax.tree.map(lambda a: jnp.broadcast_to(a, (len(at.angle), *a.shape[1:])), start)
-    return moving(canvas, stage, plan, at, hard(plan.linear))
+    return moving_objects(canvas, stage, plan, at, hard(plan.linear))
 
 
-def draw_soft(stage: Stage, plan: Plan) -> Array:
+def draw_soft(stage: RenderScene, plan: FramePlan) -> Array:
     """One video's frames [T, H, W, 3] as floats, 0 to 255, without rounding, noise or motion blur: what the others give
     but for rounding, and differentiable in places, angles, sizes, colours and the camera."""
     at, paint = stage.instants, soft(plan.linear)
-    image = ground(stage, at, plan)
+    image = background_image(stage, at, plan)
     image = jnp.broadcast_to(to_linear(image) if plan.linear else image, (len(at.angle), *image.shape[1:]))
     image = all_over(image, stage._replace(occluders=None), plan, at, plan.behind, paint)
-    image = moving(image, stage, plan, at, paint)
+    image = moving_objects(image, stage, plan, at, paint)
     return to_srgb(image) if plan.linear else image
 
 
-def alone(stage: Stage, plan: Plan, measure: Callable[[Array], Array]) -> Array:
+def alone(stage: RenderScene, plan: FramePlan, measure: Callable[[Array], Array]) -> Array:
     """What `measure` makes of the coverage [T, H, W] of each slot as if it were alone, [T, K, ...]."""
-    window, found = Window(0, 0, plan.height, plan.width), []
+    window, found = PixelWindow(0, 0, plan.height, plan.width), []
     for run, first in plan.layout.spans:
         stands = plan.still and run.kind == STATIC
         at = jax.tree.map(lambda a, stands=stands: a[:1] if stands else a, stage.instants)
         cuts = cut_of(stage, plan, at, run, first, window)
-        inks = inks_of(stage.paint, slice(first, first + run.count))
+        inks = fills_of(stage.paint, slice(first, first + run.count))
         largest = plan.largest(run)
-        made = jax.lax.map(lambda one, most=largest: measure(painted(one[0], one[1], window, most)[0]), (cuts, inks))
+        made = jax.lax.map(
+            lambda one, most=largest: measure(covered_color(one[0], one[1], window, most)[0]), (cuts, inks)
+        )
         found.append(jnp.broadcast_to(made, (run.count, len(stage.instants.angle), *made.shape[2:])))
     return jnp.moveaxis(jnp.concatenate(found), 0, 1)

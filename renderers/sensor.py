@@ -11,12 +11,12 @@ from gen2d.renderers.noise import hashed
 # ---- After all layers
 
 
-def averaged(total: Array, count: int) -> Array:
+def exposure_average(total: Array, count: int) -> Array:
     """The uint8 mean of so many images, of their sum."""
     return ((total + count // 2) // count).astype(jnp.uint8)
 
 
-def noisy(frames: Array, deviation: Array, seed: Array, numbers: Array) -> Array:
+def add_noise(frames: Array, deviation: Array, seed: Array, numbers: Array) -> Array:
     """The frames [T, H, W, 3] with Gaussian noise of a sensor: for each value four random bytes, whose sum has a
     variance of (256^2 - 1) / 3."""
     places = jnp.arange(math.prod(frames.shape[1:]), dtype=jnp.uint32).reshape(frames.shape[1:])

@@ -10,10 +10,10 @@ from gen2d.renderers.coverage import disc as disc_module
 from gen2d.renderers.coverage import polygon
 from gen2d.renderers.noise import textured
 from gen2d.renderers.paint import Paint, Texture
-from gen2d.renderers.primitives import Figure, Parts, Turn, Window
+from gen2d.renderers.primitives import BodyTransform, ObjectParts, PixelWindow, Primitive
 
 
-class Inks(NamedTuple):
+class Fills(NamedTuple):
     """What the parts of some slots are painted with; [...]."""
 
     color: Array
@@ -23,33 +23,33 @@ class Inks(NamedTuple):
     texture: Texture | None
 
 
-def inks_of(paint: Paint, slots: slice) -> Inks:
+def fills_of(paint: Paint, slots: slice) -> Fills:
     """What some slots are painted with; arrays [k, ...]."""
     color = paint.color if paint.fill is None else paint.fill
-    inks = Inks(color, paint.rim_color, paint.mark_color, paint.shade, paint.texture)
+    inks = Fills(color, paint.rim_color, paint.mark_color, paint.shade, paint.texture)
     return jax.tree.map(lambda a: a[slots], inks)
 
 
-class Cut(NamedTuple):
+class EdgeSamples(NamedTuple):
     """The parts of some slots, cut by the edges of their windows' pixels."""
 
     whole: Any  # coverage.Disc or coverage.Rounded
     inner: Any
     mark: Any
-    turn: Turn | None  # from the window's corner, if it matters where in it a pixel is
+    turn: BodyTransform | None  # from the window's corner, if it matters where in it a pixel is
 
 
-def cut(parts: Parts, window: Window, disc: bool, toned: bool) -> Cut:
+def edge_samples(parts: ObjectParts, window: PixelWindow, disc: bool, toned: bool) -> EdgeSamples:
     """The parts cut by a window's rows and columns; `disc` says whether the whole is one, `toned` whether inks differ
     from place to place."""
     turn = parts.turn
     turn = turn._replace(column=turn.column - window.left, row=turn.row - window.top) if toned else None
     inner = None if parts.inner is None else _cuts_of(parts.inner, window, disc)
     mark = None if parts.mark is None else _cuts_of(parts.mark, window, disc=False)
-    return Cut(_cuts_of(parts.whole, window, disc), inner, mark, turn)
+    return EdgeSamples(_cuts_of(parts.whole, window, disc), inner, mark, turn)
 
 
-def _cuts_of(figure: Figure, window: Window, disc: bool) -> Any:
+def _cuts_of(figure: Primitive, window: PixelWindow, disc: bool) -> Any:
     x, y = jnp.arange(window.columns, dtype=jnp.float32), jnp.arange(window.rows, dtype=jnp.float32)
     left, top = (jnp.asarray(edge, jnp.float32) for edge in (window.left, window.top))
     if disc:
@@ -61,12 +61,12 @@ def _cuts_of(figure: Figure, window: Window, disc: bool) -> Any:
 
 
 def _area_of(cuts: Any, largest: float) -> Array:
-    if isinstance(cuts, disc_module.Disc):
+    if isinstance(cuts, disc_module.PixelDisc):
         return jnp.clip(disc_module.disc_area(cuts, largest), 0.0, 1.0)
     return jnp.clip(polygon.rounded_area(cuts), 0.0, 1.0)
 
 
-def painted(cut: Cut, inks: Inks, window: Window, largest: float) -> tuple[Array, Array]:
+def covered_color(cut: EdgeSamples, inks: Fills, window: PixelWindow, largest: float) -> tuple[Array, Array]:
     """The coverage [..., rows, columns], and the mean colour [..., rows, columns, 3] of what is covered;
     one colour [..., 1, 1, 3] where there is but one. No disc is larger than `largest` px."""
     whole = _area_of(cut.whole, largest)
@@ -85,7 +85,7 @@ def painted(cut: Cut, inks: Inks, window: Window, largest: float) -> tuple[Array
     return whole, total / jnp.maximum(whole, 1e-6)[..., None]
 
 
-def _toned(color: Array, inks: Inks, turn: Turn, window: Window) -> Array:
+def _toned(color: Array, inks: Fills, turn: BodyTransform, window: PixelWindow) -> Array:
     """The colours at the pixels' centres of slots that are textured or shaded."""
     x = jnp.arange(window.columns) + 0.5 - turn.column[..., None]
     y = (jnp.arange(window.rows) + 0.5 - turn.row[..., None])[..., :, None]

@@ -11,22 +11,33 @@ import jax
 import jax.numpy as jnp
 
 from gen2d.records.axes import Array
-from gen2d.renderers.compositing import OCCLUDER, Canvas, bare, cut_of, ink, occluder, over, owned, stills, whole
-from gen2d.renderers.plan import Group, Plan, Stage, patch_of
-from gen2d.renderers.primitives import Instants, Window
-from gen2d.renderers.sensor import averaged, noisy
-from gen2d.renderers.shading import Cut, inks_of, painted
+from gen2d.renderers.compositing import (
+    OCCLUDER,
+    LayerCanvas,
+    background_layer,
+    cut_of,
+    occluder,
+    over,
+    ownership,
+    static_layer,
+    to_ink,
+    to_levels,
+)
+from gen2d.renderers.plan import FramePlan, RenderScene, TileGroup, tile_windows
+from gen2d.renderers.primitives import Instants, PixelWindow
+from gen2d.renderers.sensor import add_noise, exposure_average
+from gen2d.renderers.shading import EdgeSamples, covered_color, fills_of
 
 
-def draw_patches(stages: Stage, plan: Plan) -> tuple[Array | None, Array | None]:
+def draw_tiles(stages: RenderScene, plan: FramePlan) -> tuple[Array | None, Array | None]:
     """Frames [n, T, H, W, 3] uint8 and owners [n, T, H, W] uint8, each if it is wanted."""
     videos, frames = stages.instants.angle.shape[:2]
-    backs = jax.lax.map(functools.partial(stills, plan=plan), stages)
+    backs = jax.lax.map(functools.partial(static_layer, plan=plan), stages)
     shape = videos, frames, plan.height, plan.width
     image = None if backs.image is None else jnp.broadcast_to(backs.image, (*shape, 3)).reshape(-1, *shape[2:], 3)
     owner = jnp.zeros((videos * frames, *shape[2:]), jnp.uint8) if plan.owners else None
 
-    def video(v: Array, canvas: Canvas) -> Canvas:
+    def video(v: Array, canvas: LayerCanvas) -> LayerCanvas:
         stage, back = (
             jax.tree.map(lambda a: jax.lax.dynamic_index_in_dim(a, v, keepdims=False), of) for of in (stages, backs)
         )
@@ -36,19 +47,19 @@ def draw_patches(stages: Stage, plan: Plan) -> tuple[Array | None, Array | None]
         canvas = draw.apart(canvas) if plan.frames else canvas
         return draw.owners(canvas) if plan.owners else canvas
 
-    canvas = jax.lax.fori_loop(0, videos, video, Canvas(image, owner))
+    canvas = jax.lax.fori_loop(0, videos, video, LayerCanvas(image, owner))
     return tuple(jax.tree.map(lambda a: a.reshape(videos, frames, *a.shape[1:]), canvas))
 
 
-class Cuts(NamedTuple):
+class TileEdges(NamedTuple):
     """A group's slots, cut by the pixels of their patches, at all instants; arrays [k, I, ...]."""
 
-    group: Group
-    window: Window
-    of_runs: list[Cut]
+    group: TileGroup
+    window: PixelWindow
+    of_runs: list[EdgeSamples]
 
 
-class Strokes(NamedTuple):
+class TileCoverage(NamedTuple):
     """The patches of a group's slots at one instant."""
 
     cover: Array  # [k, rows, columns] int16
@@ -61,28 +72,28 @@ class Strokes(NamedTuple):
 class _Video:
     """Draws one video, frame by frame, from frame `first` of a canvas on."""
 
-    def __init__(self, stage: Stage, plan: Plan, back: Canvas, first: Array) -> None:
+    def __init__(self, stage: RenderScene, plan: FramePlan, back: LayerCanvas, first: Array) -> None:
         self.stage, self.plan, self.back, self.first = stage, plan, back, first
         self.frames = stage.instants.angle.shape[0]
 
-    def straight(self, canvas: Canvas) -> Canvas:
+    def straight(self, canvas: LayerCanvas) -> LayerCanvas:
         """Frames, and owners if wanted, drawn where they belong, on unmoving layers that are there already."""
         cuts = self._cuts(self.stage.instants)
 
-        def frame(t: Array, canvas: Canvas) -> Canvas:
-            image, owner = self._painted(Canvas(canvas.image, self.back.owner), self.first + t, cuts, t)
-            return Canvas(image, self._kept(canvas.owner, owner, t))
+        def frame(t: Array, canvas: LayerCanvas) -> LayerCanvas:
+            image, owner = self._painted(LayerCanvas(canvas.image, self.back.owner), self.first + t, cuts, t)
+            return LayerCanvas(image, self._kept(canvas.owner, owner, t))
 
         return jax.lax.fori_loop(0, self.frames, frame, canvas)
 
-    def owners(self, canvas: Canvas) -> Canvas:
+    def owners(self, canvas: LayerCanvas) -> LayerCanvas:
         """Owners alone."""
         cuts = self._cuts(self.stage.instants)
 
-        def frame(t: Array, canvas: Canvas) -> Canvas:
+        def frame(t: Array, canvas: LayerCanvas) -> LayerCanvas:
             start = self._behind(self.stage.instants, t)._replace(image=None)
             owner = self._painted(start, jnp.int32(0), cuts, t).owner
-            return Canvas(canvas.image, self._kept(canvas.owner, owner, t))
+            return LayerCanvas(canvas.image, self._kept(canvas.owner, owner, t))
 
         return jax.lax.fori_loop(0, self.frames, frame, canvas)
 
@@ -91,7 +102,7 @@ class _Video:
             return owners
         return jax.lax.dynamic_update_slice(owners, (owner & 255).astype(jnp.uint8), (self.first + t, 0, 0))
 
-    def apart(self, canvas: Canvas) -> Canvas:
+    def apart(self, canvas: LayerCanvas) -> LayerCanvas:
         """Frames drawn on an image of their own: exposed more than once, with a camera that moves, or noisy."""
         stage, plan = self.stage, self.plan
         shown = stage.instants if stage.exposed is None else jax.tree.map(_flat, stage.exposed)
@@ -107,35 +118,39 @@ class _Video:
                 return total + once(t * samples + s).astype(jnp.uint16)
 
             total = jnp.zeros((1, plan.height, plan.width, 3), jnp.uint16)
-            return averaged(jax.lax.fori_loop(0, samples, add, total), samples)
+            return exposure_average(jax.lax.fori_loop(0, samples, add, total), samples)
 
-        def frame(t: Array, canvas: Canvas) -> Canvas:
+        def frame(t: Array, canvas: LayerCanvas) -> LayerCanvas:
             image = exposed(t) if plan.exposed else once(t)
             if stage.noise is not None:
-                image = noisy(image, stage.noise, stage.seed, t[None])
+                image = add_noise(image, stage.noise, stage.seed, t[None])
             assert canvas.image is not None
-            return Canvas(jax.lax.dynamic_update_slice(canvas.image, image, (self.first + t, 0, 0, 0)), canvas.owner)
+            return LayerCanvas(
+                jax.lax.dynamic_update_slice(canvas.image, image, (self.first + t, 0, 0, 0)), canvas.owner
+            )
 
         return jax.lax.fori_loop(0, self.frames, frame, canvas)
 
-    def _behind(self, at: Instants, i: Array) -> Canvas:
+    def _behind(self, at: Instants, i: Array) -> LayerCanvas:
         """What is behind all that moves at instant i."""
         if self.plan.still:
             return self.back
-        return bare(self.stage, jax.tree.map(lambda a: jax.lax.dynamic_slice_in_dim(a, i, 1), at), self.plan)
+        return background_layer(
+            self.stage, jax.tree.map(lambda a: jax.lax.dynamic_slice_in_dim(a, i, 1), at), self.plan
+        )
 
-    def _cuts(self, at: Instants) -> list[Cuts]:
+    def _cuts(self, at: Instants) -> list[TileEdges]:
         """What of each group depends on rows or columns alone, for all instants."""
         found = []
         for group in self.plan.groups:
-            windows = [patch_of(self.plan, group, at, run, first) for run, first in group.runs]
+            windows = [tile_windows(self.plan, group, at, run, first) for run, first in group.runs]
             spans = zip(group.runs, windows, strict=True)
             cuts = [cut_of(self.stage, self.plan, at, run, first, window) for (run, first), window in spans]
             top, left = (_joined([getattr(w, edge) for w in windows]) for edge in ("top", "left"))
-            found.append(Cuts(group, Window(top, left, windows[0].rows, windows[0].columns), cuts))
+            found.append(TileEdges(group, PixelWindow(top, left, windows[0].rows, windows[0].columns), cuts))
         return found
 
-    def _painted(self, canvas: Canvas, frame: Array, cuts: list[Cuts], i: Array) -> Canvas:
+    def _painted(self, canvas: LayerCanvas, frame: Array, cuts: list[TileEdges], i: Array) -> LayerCanvas:
         """The canvas with instant i of all that moves painted into its frame; owners have but one frame."""
         rank = 0
         for of_group in cuts:
@@ -145,28 +160,28 @@ class _Video:
             rank += count
         return canvas
 
-    def _strokes(self, cuts: Cuts, i: Array) -> Strokes:
+    def _strokes(self, cuts: TileEdges, i: Array) -> TileCoverage:
         def pick(a: Array) -> Array:
             return jax.lax.dynamic_index_in_dim(a, i, 1, keepdims=False)
 
         covers, colors = [], []
         for (run, first), of_run in zip(cuts.group.runs, cuts.of_runs, strict=True):
-            inks = inks_of(self.stage.paint, slice(first, first + run.count))
-            cover, color = painted(jax.tree.map(pick, of_run), inks, cuts.window, self.plan.largest(run))
-            covers.append(whole(cover))
-            colors.append(ink(color))
+            inks = fills_of(self.stage.paint, slice(first, first + run.count))
+            cover, color = covered_color(jax.tree.map(pick, of_run), inks, cuts.window, self.plan.largest(run))
+            covers.append(to_levels(cover))
+            colors.append(to_ink(color))
         shape = jnp.broadcast_shapes(*(color.shape[1:] for color in colors))
         colors = [jnp.broadcast_to(color, (color.shape[0], *shape)) for color in colors]
         names = jnp.asarray(cuts.group.slots, jnp.int32) + 1
-        return Strokes(_joined(covers), _joined(colors), names, pick(cuts.window.top), pick(cuts.window.left))
+        return TileCoverage(_joined(covers), _joined(colors), names, pick(cuts.window.top), pick(cuts.window.left))
 
-    def _stroke(self, k: Array, canvas: Canvas, strokes: Strokes, frame: Array) -> Canvas:
+    def _stroke(self, k: Array, canvas: LayerCanvas, strokes: TileCoverage, frame: Array) -> LayerCanvas:
         cover, color = (jax.lax.dynamic_index_in_dim(a, k) for a in (strokes.cover, strokes.color))
         return self._put(canvas, cover, color, strokes.name[k], frame, strokes.top[k], strokes.left[k])
 
     def _put(
-        self, canvas: Canvas, cover: Array, color: Array, name: Array | int, frame: Array, top: Array, left: Array
-    ) -> Canvas:
+        self, canvas: LayerCanvas, cover: Array, color: Array, name: Array | int, frame: Array, top: Array, left: Array
+    ) -> LayerCanvas:
         """The canvas after a layer [1, rows, columns] in whole numbers was painted where it belongs."""
         image, owner = canvas
         if image is not None:
@@ -176,12 +191,17 @@ class _Video:
         if owner is not None:
             place = (0, top, left)
             under = jax.lax.dynamic_slice(owner, place, cover.shape)
-            owner = jax.lax.dynamic_update_slice(owner, owned(under, cover, name), place)
-        return Canvas(image, owner)
+            owner = jax.lax.dynamic_update_slice(owner, ownership(under, cover, name), place)
+        return LayerCanvas(image, owner)
 
     def _interleaved(
-        self, canvas: Canvas, stroke: Callable[[Array, Canvas], Canvas], rank: int, count: int, frame: Array
-    ) -> Canvas:
+        self,
+        canvas: LayerCanvas,
+        stroke: Callable[[Array, LayerCanvas], LayerCanvas],
+        rank: int,
+        count: int,
+        frame: Array,
+    ) -> LayerCanvas:
         """The canvas after so many strokes, the first of which has a rank, and the occluders between them."""
         occluders = self.stage.occluders
         done: Array | int = 0
@@ -193,7 +213,7 @@ class _Video:
                 done = until
                 here = (of >= rank) & ((of < rank + count) | ends)
                 cover, color = occluder(self.stage, self.plan, i, here)
-                canvas = self._put(canvas, whole(cover), ink(color), OCCLUDER, frame, jnp.int32(0), jnp.int32(0))
+                canvas = self._put(canvas, to_levels(cover), to_ink(color), OCCLUDER, frame, jnp.int32(0), jnp.int32(0))
         return jax.lax.fori_loop(done, count, stroke, canvas)
 
 

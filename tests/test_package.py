@@ -88,6 +88,33 @@ def test_plugins_do_not_import_each_other(folder: str) -> None:
         assert not imports(MODULES[name]) & plugins, name
 
 
+def definitions(tree: ast.Module) -> set[str]:
+    """The classes and aliases of types of a module."""
+    found = {node.name for node in tree.body if isinstance(node, ast.ClassDef)}
+    for node in tree.body:
+        if isinstance(node, ast.Assign):
+            names = {target.id for target in node.targets if isinstance(target, ast.Name)}
+            found |= {name for name in names if name[0].isupper() and not name.isupper()}
+    return found
+
+
+def test_a_class_has_one_name_and_a_name_one_class() -> None:
+    owners: dict[str, list[str]] = {}
+    for module, path in MODULES.items():
+        for name in definitions(ast.parse(path.read_text())) - {"Options"}:  # every plug-in has its own
+            owners.setdefault(name, []).append(module)
+    assert {name: modules for name, modules in owners.items() if len(modules) > 1} == {}
+
+
+def test_names_are_nouns_of_the_field() -> None:
+    poetry = {"told", "found", "made", "settled", "spots", "posts", "seats", "books"}
+    for module, path in MODULES.items():
+        assert module.rpartition(".")[2] not in poetry
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.FunctionDef | ast.ClassDef):
+                assert node.name.strip("_").lower() not in poetry, f"{module}.{node.name}"
+
+
 def test_few_files_lie_beside_the_rooms() -> None:
     assert len(list(PACKAGE.glob("*.py"))) <= 10
 

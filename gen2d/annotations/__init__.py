@@ -12,7 +12,7 @@ from typing import Any
 
 from gen2d.core.schema import Field
 from gen2d.records.axes import Array
-from gen2d.renderers.plan import Plan, Stage
+from gen2d.renderers.plan import FramePlan, RenderScene
 
 
 def modules() -> dict[str, ModuleType]:
@@ -36,7 +36,7 @@ def fields(options: Any) -> dict[str, Field]:
     return {name: field for module in wanted(options) for name, field in module.FIELDS.items()}
 
 
-def sizes(options: Any, plan: Plan) -> dict[str, int]:
+def sizes(options: Any, plan: FramePlan) -> dict[str, int]:
     """The sizes of the axes that annotations bring with them."""
     found: dict[str, int] = {}
     for module in wanted(options):
@@ -45,7 +45,7 @@ def sizes(options: Any, plan: Plan) -> dict[str, int]:
     return found
 
 
-def annotated(stages: Stage, owners: Array | None, plan: Plan, options: Any) -> dict[str, Array]:
+def annotated(stages: RenderScene, owners: Array | None, plan: FramePlan, options: Any) -> dict[str, Array]:
     """The annotations of some videos, by their stored names; owners [n, T, H, W] uint8 as raster.draw gives them."""
     found: dict[str, Array] = {}
     for module in wanted(options):

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 
 from gen2d.core.schema import Field
 from gen2d.records.axes import Array
-from gen2d.renderers.plan import Plan, Stage
+from gen2d.renderers.plan import FramePlan, RenderScene
 from gen2d.renderers.rasterizer import alone
 from gen2d.xla import each_video
 
@@ -16,12 +16,12 @@ FIELDS = {
 }
 
 
-def sizes(plan: Plan, options: object) -> dict[str, int]:
+def sizes(plan: FramePlan, options: object) -> dict[str, int]:
     """B, the bytes of a mask: numpy.unpackbits(mask)[: H * W].reshape(H, W) is the mask."""
     return {"B": -(-plan.height * plan.width // 8)}
 
 
-def annotate(stages: Stage, owners: Array | None, plan: Plan, options: object) -> dict[str, Array]:
+def annotate(stages: RenderScene, owners: Array | None, plan: FramePlan, options: object) -> dict[str, Array]:
     """The packed masks of every slot."""
     pixels = plan.height * plan.width
     weights = jnp.asarray([128, 64, 32, 16, 8, 4, 2, 1], jnp.uint8)

@@ -9,8 +9,8 @@ import numpy as np
 from gen2d.core.schema import Field
 from gen2d.records.axes import Array
 from gen2d.renderers import extents
-from gen2d.renderers.plan import Plan, Stage
-from gen2d.xla import folded
+from gen2d.renderers.plan import FramePlan, RenderScene
+from gen2d.xla import reduce_halves
 
 OWNERS = True
 FIELDS = {
@@ -24,12 +24,12 @@ FIELDS = {
 WORD = 32  # slots that are looked at together, a bit each
 
 
-def annotate(stages: Stage, owners: Array, plan: Plan, options: object) -> dict[str, Array]:
+def annotate(stages: RenderScene, owners: Array, plan: FramePlan, options: object) -> dict[str, Array]:
     """Both kinds of boxes."""
     seen = seen_boxes(owners.reshape(-1, *owners.shape[2:]), plan.layout.slots)
     return {
         "boxes/visible": seen.reshape(*owners.shape[:2], *seen.shape[1:]),
-        "boxes/amodal": jax.vmap(functools.partial(extents.boxes, plan=plan))(stages),
+        "boxes/amodal": jax.vmap(functools.partial(extents.bounding_boxes, plan=plan))(stages),
     }
 
 
@@ -50,12 +50,12 @@ def _words(owners: Array, first: int) -> tuple[Array, Array]:
     """For each column and row of masks [T, H, W] which of WORD slots are seen there, a bit each."""
     number = owners.astype(jnp.uint32) - (first + 1)  # wraps around below
     bits = jnp.where(number < WORD, jnp.uint32(1) << (number & (WORD - 1)), jnp.uint32(0))
-    return folded(bits, 1, jnp.bitwise_or), folded(bits, 2, jnp.bitwise_or)
+    return reduce_halves(bits, 1, jnp.bitwise_or), reduce_halves(bits, 2, jnp.bitwise_or)
 
 
 def _ends(bit: Array, words: Array) -> tuple[Array, Array]:
     """Of words [L, T], the first place that has a bit and the one after the last, [T], float32."""
     there, place = (words >> bit) & 1 > 0, jnp.arange(len(words), dtype=jnp.float32)[:, None]
-    last = folded(jnp.where(there, place + 1, 0.0), 0, jnp.maximum)
-    first = len(words) - folded(jnp.where(there, len(words) - place, 0.0), 0, jnp.maximum)
+    last = reduce_halves(jnp.where(there, place + 1, 0.0), 0, jnp.maximum)
+    first = len(words) - reduce_halves(jnp.where(there, len(words) - place, 0.0), 0, jnp.maximum)
     return jnp.minimum(first, last), last

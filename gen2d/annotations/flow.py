@@ -10,11 +10,11 @@ import jax.numpy as jnp
 from gen2d.core.enums import STATIC
 from gen2d.core.schema import Field
 from gen2d.records.axes import Array
-from gen2d.records.layout import Run
+from gen2d.records.layout import SlotGroup
 from gen2d.renderers.camera import pixel_at, to_pixels
 from gen2d.renderers.compositing import OCCLUDER
-from gen2d.renderers.plan import Plan, Stage, patch_of
-from gen2d.renderers.primitives import Instants, Window
+from gen2d.renderers.plan import FramePlan, RenderScene, tile_windows
+from gen2d.renderers.primitives import Instants, PixelWindow
 from gen2d.xla import on_cpu
 
 OWNERS = True
@@ -27,7 +27,7 @@ FIELDS = {
 }
 
 
-def annotate(stages: Stage, owners: Array, plan: Plan, options: object) -> dict[str, Array]:
+def annotate(stages: RenderScene, owners: Array, plan: FramePlan, options: object) -> dict[str, Array]:
     """Both flows and where they are valid."""
     found, flow_of = {}, _by_patches if on_cpu() else _by_pixels
     for name, step in (("forward", 1), ("backward", -1)):
@@ -35,7 +35,7 @@ def annotate(stages: Stage, owners: Array, plan: Plan, options: object) -> dict[
     return found
 
 
-def _tables(at: Instants, step: int, plan: Plan) -> Array:
+def _tables(at: Instants, step: int, plan: FramePlan) -> Array:
     """For each frame and id, 0 the background's, the motion of a pixel at (x, y) in so many frames: dx = a x + b y + c,
     dy = d x + e y + f, as [T, K + 1, 6]; beyond the ends nothing moves."""
     other = jnp.clip(jnp.arange(len(at.angle)) + step, 0, len(at.angle) - 1)
@@ -73,13 +73,15 @@ def _ends_of(frames: int, step: int) -> tuple[int, int]:
 # ---- Every pixel looks its motion up
 
 
-def _by_pixels(stages: Stage, owners: Array, plan: Plan, step: int, ground: bool = False) -> tuple[Array, Array]:
+def _by_pixels(
+    stages: RenderScene, owners: Array, plan: FramePlan, step: int, ground: bool = False
+) -> tuple[Array, Array]:
     """The flows [n, T, H, W, 2] and where they are valid [n, T, H, W]; with `ground` as if only the camera moved. The
     form for GPUs."""
     x, y = jnp.arange(plan.width) + 0.5, (jnp.arange(plan.height) + 0.5)[:, None]
     begin, end = _ends_of(owners.shape[1], step)
 
-    def video(stage: Stage, owners: Array) -> tuple[Array, Array]:
+    def video(stage: RenderScene, owners: Array) -> tuple[Array, Array]:
         table = _tables(stage.instants, step, plan)
         table = jnp.broadcast_to(table[:, :1], table.shape) if ground else table
 
@@ -101,7 +103,7 @@ def _by_pixels(stages: Stage, owners: Array, plan: Plan, step: int, ground: bool
 # ---- Each object's motion goes into a patch of its own
 
 
-def _by_patches(stages: Stage, owners: Array, plan: Plan, step: int) -> tuple[Array, Array]:
+def _by_patches(stages: RenderScene, owners: Array, plan: FramePlan, step: int) -> tuple[Array, Array]:
     """The same for a CPU: the background's motion everywhere, then each object's where it is seen in its patch."""
     count, frames = owners.shape[:2]
     begin, end = _ends_of(frames, step)
@@ -115,9 +117,11 @@ def _by_patches(stages: Stage, owners: Array, plan: Plan, step: int) -> tuple[Ar
         at = jax.tree.map(lambda a: jax.lax.dynamic_index_in_dim(a, v, keepdims=False), stages.instants)
         table = _tables(at, step, plan)
         for group, run, first in spans:
-            window = patch_of(plan, group, at, run, first)
+            window = tile_windows(plan, group, at, run, first)
 
-            def frame(t: Array, flows: tuple, window: Window = window, run: Run = run, first: int = first) -> tuple:
+            def frame(
+                t: Array, flows: tuple, window: PixelWindow = window, run: SlotGroup = run, first: int = first
+            ) -> tuple:
                 def stroke(k: Array, flows: tuple) -> tuple:
                     here = window._replace(top=window.top[k, t], left=window.left[k, t])
                     return _stroke(flows, everyone, v * frames + t, step, first + k + 1, table[t, first + k + 1], here)
@@ -131,7 +135,7 @@ def _by_patches(stages: Stage, owners: Array, plan: Plan, step: int) -> tuple[Ar
     return flow.reshape(*owners.shape, 2), valid.reshape(owners.shape)
 
 
-def _behind(stages: Stage, owners: Array, plan: Plan, step: int) -> tuple[Array, Array]:
+def _behind(stages: RenderScene, owners: Array, plan: FramePlan, step: int) -> tuple[Array, Array]:
     """The flows and where they are valid as if only the camera moved."""
     if not plan.still:
         return _by_pixels(stages, owners, plan, step, ground=True)
@@ -141,7 +145,7 @@ def _behind(stages: Stage, owners: Array, plan: Plan, step: int) -> tuple[Array,
 
 
 def _stroke(
-    flows: tuple[Array, Array], owners: Array, frame: Array, step: int, name: Array, number: Array, window: Window
+    flows: tuple[Array, Array], owners: Array, frame: Array, step: int, name: Array, number: Array, window: PixelWindow
 ) -> tuple[Array, Array]:
     """The flows after those of one object were put where a frame shows it."""
     (flow, valid), (_, height, width) = flows, owners.shape

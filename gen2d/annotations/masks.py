@@ -2,7 +2,7 @@
 
 from gen2d.core.schema import Field
 from gen2d.records.axes import Array
-from gen2d.renderers.plan import Plan, Stage
+from gen2d.renderers.plan import FramePlan, RenderScene
 
 OWNERS = True
 FIELDS = {
@@ -12,6 +12,6 @@ FIELDS = {
 }
 
 
-def annotate(stages: Stage, owners: Array, plan: Plan, options: object) -> dict[str, Array]:
+def annotate(stages: RenderScene, owners: Array, plan: FramePlan, options: object) -> dict[str, Array]:
     """The mask itself."""
     return {"masks/instance": owners}

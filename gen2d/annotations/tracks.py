@@ -9,10 +9,10 @@ import numpy as np
 
 from gen2d.core.schema import Field
 from gen2d.records.axes import Array
-from gen2d.records.layout import Run
+from gen2d.records.layout import SlotGroup
 from gen2d.renderers.camera import pixel_at, to_pixels
 from gen2d.renderers.noise import fraction, hashed
-from gen2d.renderers.plan import Plan, Stage
+from gen2d.renderers.plan import FramePlan, RenderScene
 
 OWNERS = True
 FIELDS = {
@@ -24,17 +24,17 @@ FIELDS = {
 }
 
 
-def sizes(plan: Plan, options: Any) -> dict[str, int]:
+def sizes(plan: FramePlan, options: Any) -> dict[str, int]:
     """P, so many points for every slot."""
     return {"P": plan.layout.slots * options.tracks}
 
 
-def annotate(stages: Stage, owners: Array, plan: Plan, options: Any) -> dict[str, Array]:
+def annotate(stages: RenderScene, owners: Array, plan: FramePlan, options: Any) -> dict[str, Array]:
     """The points, where they are seen, and whose they are."""
     return jax.vmap(functools.partial(_followed, plan=plan, count=options.tracks))(stages, owners)
 
 
-def _followed(stage: Stage, owners: Array, plan: Plan, count: int) -> dict[str, Array]:
+def _followed(stage: RenderScene, owners: Array, plan: FramePlan, count: int) -> dict[str, Array]:
     """So many points of each object of a video."""
     own = jnp.concatenate([_inside(stage, run, first, count) for run, first in plan.layout.spans])  # [K, P, 2] m
     at = stage.instants
@@ -54,7 +54,7 @@ def _followed(stage: Stage, owners: Array, plan: Plan, count: int) -> dict[str, 
     }
 
 
-def _inside(stage: Stage, run: Run, first: int, count: int) -> Array:
+def _inside(stage: RenderScene, run: SlotGroup, first: int, count: int) -> Array:
     """Random points [k, P, 2] m in the shapes of a run, in their own frames, even in their area."""
     slots = jnp.arange(first, first + run.count)[:, None]
     words = (hashed(stage.seed, slots, jnp.arange(count), n) for n in range(1, 4))

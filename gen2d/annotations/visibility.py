@@ -10,8 +10,8 @@ from gen2d.core.schema import Field
 from gen2d.records.axes import Array
 from gen2d.renderers import extents
 from gen2d.renderers.look import are_moving
-from gen2d.renderers.plan import Plan, Stage
-from gen2d.xla import each_video, folded
+from gen2d.renderers.plan import FramePlan, RenderScene
+from gen2d.xla import each_video, reduce_halves
 
 OWNERS = True
 FIELDS = {
@@ -21,7 +21,7 @@ FIELDS = {
 }
 
 
-def annotate(stages: Stage, owners: Array, plan: Plan, options: object) -> dict[str, Array]:
+def annotate(stages: RenderScene, owners: Array, plan: FramePlan, options: object) -> dict[str, Array]:
     """The number of pixels and the part seen, and the least of it."""
     pixels = each_video(functools.partial(counts, slots=plan.layout.slots), owners)
     area = jax.vmap(functools.partial(extents.areas, plan=plan))(stages)
@@ -40,7 +40,7 @@ def counts(owners: Array, slots: int) -> Array:
     strips = owners.reshape(frames, height // rows, rows, width)
 
     def of(name: Array) -> Array:
-        columns = folded((strips == name).astype(jnp.uint8), 2, jnp.add).astype(jnp.int32)
-        return folded(columns, 2, jnp.add).sum(1)
+        columns = reduce_halves((strips == name).astype(jnp.uint8), 2, jnp.add).astype(jnp.int32)
+        return reduce_halves(columns, 2, jnp.add).sum(1)
 
     return jax.lax.map(of, np.arange(1, slots + 1, dtype=np.uint8)).T

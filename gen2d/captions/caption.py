@@ -16,14 +16,14 @@ import numpy as np
 from gen2d.captions.events import (
     CAPTION_BYTES,
     EVENT_BYTES,
-    SHOWN,
+    MAX_EVENTS,
     STATIC,
-    Columns,
-    Event,
+    EventColumns,
+    VideoEvent,
     as_json,
-    corners,
     events_of,
-    moving,
+    moving_slots,
+    view_corners,
 )
 from gen2d.core.schema import Field
 
@@ -62,11 +62,11 @@ def fields(slots: int, frames: int) -> dict[str, Field]:
     }
 
 
-def told(columns: Columns, video: Any) -> dict[str, np.ndarray]:
+def caption_fields(columns: EventColumns, video: Any) -> dict[str, np.ndarray]:
     """The fields of some videos, from their others [n, ...]; `video` has frames, fps, and height and width in px."""
     stored = fields(columns["objects/present"].shape[1], video.frames)
     rows = [
-        told_of({name: columns[name][i] for name in NEEDED if name in columns}, video, stored)
+        captions_of({name: columns[name][i] for name in NEEDED if name in columns}, video, stored)
         for i in range(len(columns["objects/present"]))
     ]
     return {name: np.array([row[name] for row in rows], field.dtype) for name, field in stored.items()}
@@ -81,7 +81,7 @@ NEEDED = (
 )
 
 
-def told_of(made: Columns, video: Any, stored: Mapping[str, Field]) -> dict[str, Any]:
+def captions_of(made: EventColumns, video: Any, stored: Mapping[str, Field]) -> dict[str, Any]:
     """One video's fields, from its others."""
     events = events_of(made, video)
     missed = int(made["contacts/count"]) > len(made["contacts/kind"])
@@ -96,7 +96,7 @@ def told_of(made: Columns, video: Any, stored: Mapping[str, Field]) -> dict[str,
 # ---- The caption
 
 
-def caption(made: Columns, events: list[Event], fps: float, missed: bool = False) -> str:
+def caption(made: EventColumns, events: list[VideoEvent], fps: float, missed: bool = False) -> str:
     """What is there and what happens first, in English; `missed`: whether there were more hits than are known."""
     names, decimals = names_of(made), max(2, math.ceil(math.log10(fps)))
 
@@ -105,14 +105,14 @@ def caption(made: Columns, events: list[Event], fps: float, missed: bool = False
         more = [f"{'At least' if missed else 'And'} {left} more event{'s' if left > 1 else ''}."] if left else []
         return " ".join([opening(made, names), *sentences(made, names, events[:shown], decimals), *more])
 
-    texts = (telling(shown) for shown in range(min(SHOWN, len(events)), -1, -1))
+    texts = (telling(shown) for shown in range(min(MAX_EVENTS, len(events)), -1, -1))
     return next(text for text in texts if len(text) <= CAPTION_BYTES)
 
 
-def opening(made: Columns, names: Mapping[int, str]) -> str:
+def opening(made: EventColumns, names: Mapping[int, str]) -> str:
     """The sentence that says what is there."""
     kinds = nouns(made)
-    ours = [kinds[slot] for slot in moving(made)]
+    ours = [kinds[slot] for slot in moving_slots(made)]
     obstacles = [noun for slot, noun in kinds.items() if noun in FIXED_NOUNS and noun != "wall"]
     box = " in a box" if all(f"the {side}" in names.values() for side in BOX) else ""
     among = f" among {counted(obstacles)}" if obstacles else ""
@@ -140,7 +140,7 @@ def pulled(gravity: np.ndarray) -> str:
     return f" under gravity to the {'right' if x > 0 else 'left'}"
 
 
-def nouns(made: Columns) -> dict[int, str]:
+def nouns(made: EventColumns) -> dict[int, str]:
     """What each object is, by slot."""
     found = {}
     for slot in np.flatnonzero(made["objects/present"]).tolist():
@@ -153,7 +153,7 @@ def nouns(made: Columns) -> dict[int, str]:
     return found
 
 
-def names_of(made: Columns) -> dict[int, str]:
+def names_of(made: EventColumns) -> dict[int, str]:
     """What each object is called, by slot: with a colour, and with a number where two are alike."""
     kinds, walls = nouns(made), walls_of(made)
     bare = {
@@ -167,13 +167,13 @@ def names_of(made: Columns) -> dict[int, str]:
     return found
 
 
-def walls_of(made: Columns) -> dict[int, str]:
+def walls_of(made: EventColumns) -> dict[int, str]:
     """What static segments are called, by slot: those level or upright by the side of all of them that they are on."""
     static = made["objects/present"] & (made["objects/kind"] == STATIC) & (made["objects/shape"] == 1)
     slots = np.flatnonzero(static)
     if not len(slots):
         return {}
-    ends = corners(made, slots)[0, :, :2]
+    ends = view_corners(made, slots)[0, :, :2]
     low, high = ends.min((0, 1)), ends.max((0, 1))
     found = {}
     for slot, (a, b) in zip(slots.tolist(), ends, strict=True):
@@ -197,7 +197,7 @@ def color_name(color: np.ndarray) -> str:
     return list(COLORS)[int((apart**2 @ np.array([3, 4, 2])).argmin())]
 
 
-def sentences(made: Columns, names: Mapping[int, str], events: list[Event], decimals: int) -> list[str]:
+def sentences(made: EventColumns, names: Mapping[int, str], events: list[VideoEvent], decimals: int) -> list[str]:
     """The events in English, with times in s; hits of one object in a row are one sentence."""
     found: list[str] = []
     hitting = -1  # the slot that the last sentence is about
@@ -207,22 +207,22 @@ def sentences(made: Columns, names: Mapping[int, str], events: list[Event], deci
             found, hitting = [*found, f"All is at rest {at}."], -1
         elif event.kind != "hit":
             way = f"{event.kind} the view {'at' if event.kind == 'leaves' else 'from'} the {event.about['side']}"
-            found, hitting = [*found, _begun(f"{names[event.about['a']]} {way} {at}.")], -1
+            found, hitting = [*found, _capitalized(f"{names[event.about['a']]} {way} {at}.")], -1
         else:
             who, whom = _who(made, event)
             if who == hitting:
                 found[-1] = f"{found[-1][:-1]}, then {names[whom]} {at}."
             else:
-                found.append(_begun(f"{names[who]} hits {names[whom]} {at}."))
+                found.append(_capitalized(f"{names[who]} hits {names[whom]} {at}."))
             hitting = who
     return found
 
 
-def _begun(sentence: str) -> str:
+def _capitalized(sentence: str) -> str:
     return sentence[0].upper() + sentence[1:]
 
 
-def _who(made: Columns, event: Event) -> tuple[int, int]:
+def _who(made: EventColumns, event: VideoEvent) -> tuple[int, int]:
     """Who hits whom: what was faster in the frame before; what is static hits nothing."""
     a, b = event.about["a"], event.about["b"]
     speed = np.linalg.norm(made["states/velocity"][event.frame - 1, [a, b]], axis=-1)

@@ -6,10 +6,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-Columns = Mapping[str, np.ndarray]
+EventColumns = Mapping[str, np.ndarray]
 
 CAPTION_BYTES, EVENT_BYTES = 512, 128  # the second for each object and 16 frames
-SHOWN = 4  # events that a caption tells at most
+MAX_EVENTS = 4  # events that a caption tells at most
 STATIC = 1  # objects/kind
 IMPACT, END = 1, 4  # contacts/kind
 TOGETHER = 0.1  # s: impacts of a pair in frames that follow one another, and no further apart, are one hit
@@ -18,7 +18,7 @@ DIGITS = 6  # of the numbers in events
 SIDES = ("left", "right", "top", "bottom")
 
 
-class Event(NamedTuple):
+class VideoEvent(NamedTuple):
     """Something that happens, at a time in s; `about` is what else there is to say of it, as JSON has it."""
 
     time: float
@@ -33,7 +33,7 @@ class Event(NamedTuple):
         return json.dumps(found, separators=(",", ":"))
 
 
-def as_json(events: list[Event], width: int) -> str:
+def as_json(events: list[VideoEvent], width: int) -> str:
     """The first of the events as JSON, as many as fit the width in bytes."""
     texts, used = [], 2
     for event in events:
@@ -52,13 +52,13 @@ def rounded(number: float) -> float:
 # ---- Events
 
 
-def events_of(made: Columns, video: Any) -> list[Event]:
+def events_of(made: EventColumns, video: Any) -> list[VideoEvent]:
     """All events of a video, in time's order."""
-    found = [*hits(made), *passages(made, video), *rests(made, video.fps)]
+    found = [*hit_events(made), *view_events(made, video), *rest_events(made, video.fps)]
     return sorted(found, key=lambda event: event.time)  # of equal times as they come
 
 
-def hits(made: Columns) -> list[Event]:
+def hit_events(made: EventColumns) -> list[VideoEvent]:
     """Every impact that begins a touch."""
     rows = zip(*(made[f"contacts/{name}"].tolist() for name in ("kind", "frame", "time", "a", "b")), strict=True)
     last: dict[tuple[int, int], tuple[int, int, float]] = {}  # of each pair its last row
@@ -69,7 +69,7 @@ def hits(made: Columns) -> list[Event]:
         if kind == IMPACT and not _still_touch(last.get((a, b)), frame, time):
             point, speed = made["contacts/point"][row].tolist(), float(made["contacts/approach_speed"][row])
             about = {"a": a, "b": b, "point": [rounded(x) for x in point], "speed": rounded(speed)}
-            found.append(Event(time, "hit", frame, about))
+            found.append(VideoEvent(time, "hit", frame, about))
         last[a, b] = kind, frame, time
     return found
 
@@ -82,14 +82,14 @@ def _still_touch(last: tuple[int, int, float] | None, frame: int, time: float) -
     return last[0] != IMPACT or time - last[2] < TOGETHER
 
 
-def moving(made: Columns) -> np.ndarray:
+def moving_slots(made: EventColumns) -> np.ndarray:
     """The slots of what moves."""
     return np.flatnonzero(made["objects/present"] & (made["objects/kind"] != STATIC))
 
 
-def passages(made: Columns, video: Any) -> list[Event]:
+def view_events(made: EventColumns, video: Any) -> list[VideoEvent]:
     """What leaves the view, or comes into it: the box around it lies outside, or no more."""
-    slots = moving(made)
+    slots = moving_slots(made)
     beyond = _beyond(made, slots, video)  # [4, T, M] px, of the sides in their order
     most = beyond.max(0)
     out = most >= 0
@@ -99,14 +99,14 @@ def passages(made: Columns, video: Any) -> list[Event]:
         time = (frame + before / (before - after)) / video.fps  # as if it moved evenly between frames
         kind, outside = ("leaves", frame + 1) if out[frame + 1, k] else ("enters", frame)
         side = SIDES[int(beyond[:, outside, k].argmax())]
-        found.append(Event(float(time), kind, int(frame) + 1, {"a": int(slots[k]), "side": side}))
+        found.append(VideoEvent(float(time), kind, int(frame) + 1, {"a": int(slots[k]), "side": side}))
     return found
 
 
-def _beyond(made: Columns, slots: np.ndarray, video: Any) -> np.ndarray:
+def _beyond(made: EventColumns, slots: np.ndarray, video: Any) -> np.ndarray:
     """How far each object's box lies beyond each side of the view, px [4, T, M]; negative where it does not."""
     scale, angle = (made[f"camera/{name}"].astype(float)[:, None, None] for name in ("scale", "angle"))
-    away = corners(made, slots) - made["camera/center"].astype(float)[:, None, None]  # [T, M, P, 2]
+    away = view_corners(made, slots) - made["camera/center"].astype(float)[:, None, None]  # [T, M, P, 2]
     cos, sin = np.cos(angle), np.sin(angle)
     column = video.width / 2 + scale * (away[..., 0] * cos + away[..., 1] * sin)
     row = video.height / 2 - scale * (away[..., 1] * cos - away[..., 0] * sin)
@@ -115,7 +115,7 @@ def _beyond(made: Columns, slots: np.ndarray, video: Any) -> np.ndarray:
     return np.stack([-(right + radius), left - radius - video.width, -(bottom + radius), top - radius - video.height])
 
 
-def corners(made: Columns, slots: np.ndarray) -> np.ndarray:
+def view_corners(made: EventColumns, slots: np.ndarray) -> np.ndarray:
     """The corners of the objects' cores, m [T, M, P, 2]: a centre, two ends or a polygon's corners, some repeated."""
     half = made["objects/half_length"][slots].astype(float)
     own = np.stack([np.stack([-half, 0 * half], -1), np.stack([half, 0 * half], -1)], axis=1)
@@ -130,10 +130,10 @@ def corners(made: Columns, slots: np.ndarray) -> np.ndarray:
     return made["states/position"][:, slots, None].astype(float) + turned
 
 
-def rests(made: Columns, fps: float) -> list[Event]:
+def rest_events(made: EventColumns, fps: float) -> list[VideoEvent]:
     """That all has come to rest, if it does so and moved before."""
-    slots = moving(made)
-    reach = np.linalg.norm(corners(made, slots)[0] - made["states/position"][0, slots, None], axis=-1).max(
+    slots = moving_slots(made)
+    reach = np.linalg.norm(view_corners(made, slots)[0] - made["states/position"][0, slots, None], axis=-1).max(
         -1, initial=0
     )
     reach = reach + made["objects/radius"][slots]
@@ -143,4 +143,4 @@ def rests(made: Columns, fps: float) -> list[Event]:
     frame = int(fast[-1]) + 1 if len(fast) else 0
     if frame == 0 or len(speed) - 1 - frame < STILL_SECONDS * fps:
         return []
-    return [Event(frame / fps, "rest", frame, {})]
+    return [VideoEvent(frame / fps, "rest", frame, {})]

@@ -198,11 +198,11 @@ def generate(arguments: Sequence[str]) -> int:
         again = [a for a in arguments if a != "--overwrite"]
         print(f"gen2d: stopped; whole shards are kept. To go on: {job.command(again)}", file=sys.stderr, flush=True)
         os._exit(130)  # everything is closed; jax may still run in the background, and would crash at a normal end
-    print(_told(summary))
+    print(_summary_text(summary))
     return 0
 
 
-def _told(summary: Any) -> str:
+def _summary_text(summary: Any) -> str:
     from gen2d.core.humanize import in_bytes, in_time
 
     if not summary.made:
@@ -216,7 +216,7 @@ def _told(summary: Any) -> str:
 def verify(arguments: Sequence[str]) -> int:
     """0 if the dataset is whole, else 1 and what is wrong."""
     options = _verb_parser("verify").parse_args(arguments)
-    from gen2d.tools.verify import checked
+    from gen2d.tools.verify import verify_and_repair
 
     root = _root(options)
     with reading(root):
@@ -226,7 +226,7 @@ def verify(arguments: Sequence[str]) -> int:
     seed = secrets.randbelow(2**32) if options.seed is None else options.seed
     repair = _repairing(root, options) if options.repair else None
     limits = {"timeout": options.timeout, "deadline": options.deadline}
-    outcome = checked(root, options.level, repair, options.videos, seed, trust=options.trust, **limits)
+    outcome = verify_and_repair(root, options.level, repair, options.videos, seed, trust=options.trust, **limits)
     if options.json:
         about = {"dataset": f"{root}", "level": options.level, **dataclasses.asdict(outcome)}
         print(json.dumps(about | ({"videos": options.videos, "seed": seed} if options.level == "regen" else {})))

@@ -16,7 +16,7 @@ import yaml
 from gen2d.config import matched as matched_module
 from gen2d.config import plugins
 from gen2d.config import quality as quality_module
-from gen2d.config.joint_distribution import Law
+from gen2d.config.joint_distribution import JointDistribution
 from gen2d.config.options import build, coordinates, plain_of
 from gen2d.config.plugin_options import NO_COPIES, Copies, Plugin, StoredCopies, named, plugin_of
 from gen2d.config.reading import YAML_BYTES, _Loader, _mapping, _overridden, parse_yaml
@@ -30,7 +30,7 @@ from gen2d.config.sections import (
     StorageOptions,
     VideoOptions,
 )
-from gen2d.config.splits import CHANGES, Split, laws_of, with_splits
+from gen2d.config.splits import CHANGES, Split, distributions_of_splits, with_splits
 from gen2d.core.errors import ConfigError
 from gen2d.storage.explain import reason
 from gen2d.storage.sealed import read_bytes
@@ -97,9 +97,9 @@ class Config:
         return names.index(split) if names else 0
 
     @property
-    def laws(self) -> list[Law]:
+    def laws(self) -> list[JointDistribution]:
         """The laws of the splits in order, or that of the scene alone."""
-        return laws_of(self.scene, self.splits)
+        return distributions_of_splits(self.scene, self.splits)
 
     def frames_of(self, split: str) -> int:
         """How many frames of a split's videos its reader gets, the first ones."""

@@ -26,9 +26,9 @@ from gen2d.config import truncation
 from gen2d.config.distribution_syntax import checked_weights
 from gen2d.config.distributions import Distribution, Span
 
-Parts = dict[str, Distribution]  # a distribution for each coordinate
-Box = dict[str, tuple[Span, ...]]  # where a coordinate must lie; what is not named may be anything
-Read = Callable[[Mapping[str, Any]], Parts]  # from {factor: value} as written; ValueError with what is allowed
+Weighted = dict[str, Distribution]  # a distribution for each coordinate
+SupportBox = dict[str, tuple[Span, ...]]  # where a coordinate must lie; what is not named may be anything
+ReadValue = Callable[[Mapping[str, Any]], Weighted]  # from {factor: value} as written; ValueError with what is allowed
 COMPOSED = ("mixture", "minus", "intersection", "condition")
 MOST_PRODUCTS = 1000
 MOST_COMPARED = 20_000_000  # pairs of spans of two laws
@@ -36,7 +36,7 @@ MOST_COMBINATIONS = 1_000_000  # of a grid
 
 
 @dataclasses.dataclass(frozen=True)
-class Product:
+class Component:
     """Independent coordinates, and the share of all draws that come from them."""
 
     share: float
@@ -44,10 +44,10 @@ class Product:
 
 
 @dataclasses.dataclass(frozen=True)
-class Law:
+class JointDistribution:
     """A mixture of products, all over the same coordinates."""
 
-    products: tuple[Product, ...]
+    products: tuple[Component, ...]
 
     @property
     def differing(self) -> list[str]:
@@ -81,16 +81,16 @@ def _values(part: Distribution) -> list[float]:
     return [x for _, simple in part.weighted for x in simple.numbers]
 
 
-def law_of(written: Any, base: Parts, read: Read) -> Law:
+def joint_distribution_of(written: Any, base: Weighted, read: ReadValue) -> JointDistribution:
     """The law that a config's value stands for over a base; ValueError with what is allowed if it stands for none."""
     products = _products(written, base, read)
     whole = sum(product.share for product in products)
-    law = Law(tuple(Product(product.share / whole, product.parts) for product in products))
+    law = JointDistribution(tuple(Component(product.share / whole, product.parts) for product in products))
     _check_grid(law)
     return law
 
 
-def _check_grid(law: Law) -> None:
+def _check_grid(law: JointDistribution) -> None:
     names, every = law.combinations()
     if names and set(law.differing) - set(names):
         raise ValueError("of laws whose products differ in nothing but the grid, where there is one")
@@ -98,12 +98,12 @@ def _check_grid(law: Law) -> None:
         raise ValueError(f"a grid of at most {MOST_COMBINATIONS:,} combinations")
 
 
-def _products(written: Any, base: Parts, read: Read) -> list[Product]:
+def _products(written: Any, base: Weighted, read: ReadValue) -> list[Component]:
     if not isinstance(written, Mapping):
         raise ValueError("a mapping of factors, or one of " + ", ".join(f"{{{kind}: [...]}}" for kind in COMPOSED))
     kind = next((kind for kind in COMPOSED if kind in written), None)
     if kind is None:
-        return [Product(1.0, base | read(written))]
+        return [Component(1.0, base | read(written))]
     if written.keys() - {kind, *(["weights"] if kind == "mixture" else [])}:
         raise ValueError(f"{kind} alone, without {', '.join(sorted(written.keys() - {kind}))} beside it")
     operands = written[kind]
@@ -112,7 +112,7 @@ def _products(written: Any, base: Parts, read: Read) -> list[Product]:
     if kind == "mixture":
         weights = checked_weights(written.get("weights"), len(operands))
         each = [_products(operand, base, read) for operand in operands]
-        return [Product(w * p.share, p.parts) for w, products in zip(weights, each, strict=True) for p in products]
+        return [Component(w * p.share, p.parts) for w, products in zip(weights, each, strict=True) for p in products]
     found = _products(operands[0], base, read)
     for operand in operands[1:]:
         found = _changed(kind, found, operand, read)
@@ -123,25 +123,25 @@ def _products(written: Any, base: Parts, read: Read) -> list[Product]:
     return found
 
 
-def _changed(kind: str, products: list[Product], operand: Any, read: Read) -> list[Product]:
+def _changed(kind: str, products: list[Component], operand: Any, read: ReadValue) -> list[Component]:
     """The products without a region, inside it, or otherwise in it."""
     if kind != "condition":
         return _cut(products, _region(operand, read), keep=kind == "intersection")
     if not isinstance(operand, Mapping) or operand.keys() != {"when", "then"}:
         raise ValueError("condition: [law, {when: region, then: {factor: ...}}, ...]")
     region, other = _region(operand["when"], read), read(operand["then"])
-    inside = [Product(p.share, {**p.parts, **other}) for p in _cut(products, region, keep=True)]
+    inside = [Component(p.share, {**p.parts, **other}) for p in _cut(products, region, keep=True)]
     return _cut(products, region, keep=False) + inside
 
 
-def _region(written: Any, read: Read) -> list[Box]:
+def _region(written: Any, read: ReadValue) -> list[SupportBox]:
     """The boxes that a region is the union of."""
     if isinstance(written, Mapping) and written.keys() & (set(COMPOSED) - {"mixture"}):
         raise ValueError("regions that are products, or mixtures of them")
     return [{name: part.spans for name, part in p.parts.items()} for p in _products(written, {}, read)]
 
 
-def _cut(products: list[Product], boxes: list[Box], keep: bool) -> list[Product]:
+def _cut(products: list[Component], boxes: list[SupportBox], keep: bool) -> list[Component]:
     """What of the products lies inside of any of the boxes, or (without `keep`) in none."""
     inside, rest = [], products
     for box in boxes:
@@ -151,7 +151,7 @@ def _cut(products: list[Product], boxes: list[Box], keep: bool) -> list[Product]
     return inside if keep else rest
 
 
-def _split(product: Product, box: Box) -> tuple[list[Product], list[Product]]:
+def _split(product: Component, box: SupportBox) -> tuple[list[Component], list[Component]]:
     """What of a product lies inside a box, and what outside: in the first coordinate, or else in the second, ..."""
     outside, rest = [], product
     for name, spans in box.items():
@@ -164,14 +164,14 @@ def _split(product: Product, box: Box) -> tuple[list[Product], list[Product]]:
     return [rest], outside
 
 
-def _with(product: Product, name: str, pieces: truncation.Pieces) -> list[Product]:
+def _with(product: Component, name: str, pieces: truncation.Intervals) -> list[Component]:
     """The product with one coordinate cut to these pieces; nothing where there are none."""
     if not pieces:
         return []
-    return [Product(product.share * truncation.total(pieces), {**product.parts, name: truncation.mixture(pieces)})]
+    return [Component(product.share * truncation.total(pieces), {**product.parts, name: truncation.mixture(pieces)})]
 
 
-def common(one: Law, other: Law) -> dict[str, float] | None:
+def intersect(one: JointDistribution, other: JointDistribution) -> dict[str, float] | None:
     """A point that both laws can give, by coordinate; None if there is none."""
     spans = [max(len(spans) for p in law.products for spans in _spans_of(p)) for law in (one, other)]
     if len(one.products) * len(other.products) * spans[0] * spans[1] > MOST_COMPARED:
@@ -183,7 +183,7 @@ def common(one: Law, other: Law) -> dict[str, float] | None:
     return None
 
 
-def _spans_of(product: Product) -> list[tuple[Span, ...]]:
+def _spans_of(product: Component) -> list[tuple[Span, ...]]:
     return [part.spans for part in product.parts.values()] or [()]
 
 
@@ -201,7 +201,7 @@ def _of(span: Span) -> float:
     return float(math.ceil(low)) if span.whole else low
 
 
-def hull(laws: Sequence[Law]) -> Parts:
+def union_support(laws: Sequence[JointDistribution]) -> Weighted:
     """For each coordinate a distribution that can give whatever any of the laws can."""
     names = laws[0].products[0].parts
     every = [product for law in laws for product in law.products]

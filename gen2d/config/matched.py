@@ -16,7 +16,7 @@ INTERVENTIONS = ("remove", "teleport", "identity_swap", "gravity_flip", "ghost_c
 VIOLATIONS = INTERVENTIONS[1:]  # they happen in the middle of a video, and are impossible
 
 
-def untied(layout: Layout) -> np.ndarray:
+def free_slots(layout: Layout) -> np.ndarray:
     """Which slots [K] hold what moves and is on no joint."""
     free = np.concatenate([np.full(run.count, run.kind == DYNAMIC) for run in layout.runs])
     free[[slot for tie in layout.joints for slot in (tie.a, tie.b)]] = False
@@ -48,7 +48,7 @@ def check(options: Any, default: Any, scene: Any, video: Any, annotations: Any, 
 
 def _check_act(name: str, scene: Any, layout: Layout, video: Any, camera: Any) -> None:
     least = {"gravity_flip": 0, "identity_swap": 2}.get(name, 1)
-    if untied(layout).sum() < least:
+    if free_slots(layout).sum() < least:
         raise ValueError(f"change is {name}, but the scene has no {least} that move and are on no joint")
     if name in VIOLATIONS and video.frames < 2:
         raise ValueError(f"change is {name}, but video.frames is {video.frames}, and that happens on the way")

@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from gen2d.config import plugins
-from gen2d.config.joint_distribution import Law, Parts, common, hull, law_of
+from gen2d.config.joint_distribution import JointDistribution, Weighted, intersect, joint_distribution_of, union_support
 from gen2d.config.options import coordinates, drawn_options, value_of
 from gen2d.config.plugin_options import Plugin, check_plugin
 from gen2d.core.errors import ConfigError
@@ -27,7 +27,7 @@ class Split:
     name: str
     videos: int | None  # null: as many as are asked for
     written: str  # the split as in a config, as JSON
-    law: Law = dataclasses.field(compare=False)
+    law: JointDistribution = dataclasses.field(compare=False)
     own: Mapping[str, Any] = dataclasses.field(default_factory=dict, compare=False)  # sections
 
     @property
@@ -40,15 +40,15 @@ class Split:
         return json.loads(self.written)
 
 
-def _base(scene: Plugin) -> Parts:
+def _base(scene: Plugin) -> Weighted:
     """The distributions that a scene's options say."""
     own = scene.own or scene.options
     return {k: v for name in drawn_options(scene.module) for k, v in coordinates(name, getattr(own, name)).items()}
 
 
-def laws_of(scene: Plugin, splits: Sequence[Split]) -> list[Law]:
+def distributions_of_splits(scene: Plugin, splits: Sequence[Split]) -> list[JointDistribution]:
     """The laws of the splits in order, or that of the scene alone where there are none."""
-    return [split.law for split in splits] or [law_of({}, _base(scene), lambda written: {})]
+    return [split.law for split in splits] or [joint_distribution_of({}, _base(scene), lambda written: {})]
 
 
 def with_splits(scene: Plugin, written: Any, source: str) -> tuple[Plugin, tuple[Split, ...]]:
@@ -86,15 +86,15 @@ def _split(scene: Plugin, name: str, written: Any, training: Split | None, sourc
     if not isinstance(written.get("overlaps", False), bool):
         raise ConfigError(f"{source}: {where}.overlaps is {written['overlaps']!r}, but must be true or false")
     like = None if "factors" in written else training
-    law = like.law if like else _law(scene, written.get("factors", {}), f"{where}.factors", source)
+    law = like.law if like else _distribution_of(scene, written.get("factors", {}), f"{where}.factors", source)
     return Split(name, written.get("videos"), json.dumps(written), law)
 
 
-def _law(scene: Plugin, written: Any, where: str, source: str) -> Law:
+def _distribution_of(scene: Plugin, written: Any, where: str, source: str) -> JointDistribution:
     specs = drawn_options(scene.module)
 
-    def read(values: Mapping[str, Any]) -> Parts:
-        found: Parts = {}
+    def read(values: Mapping[str, Any]) -> Weighted:
+        found: Weighted = {}
         for name, value in values.items():
             if name not in specs:
                 raise ConfigError(f"{source}: {where}.{name} is not a factor; {plugins.nearest(name, list(specs))}")
@@ -105,7 +105,7 @@ def _law(scene: Plugin, written: Any, where: str, source: str) -> Law:
         return found
 
     try:
-        return law_of(written, _base(scene), read)
+        return joint_distribution_of(written, _base(scene), read)
     except ValueError as error:
         raise ConfigError(f"{source}: {where} is {written!r}, but must be {error}") from None
 
@@ -114,7 +114,7 @@ def _check_held_out(training: Split, split: Split, source: str) -> None:
     """Raises ConfigError where a split of other factors has videos that the training split has, too."""
     written = split.plain()
     try:
-        shared = common(training.law, split.law) if "factors" in written and not written.get("overlaps") else None
+        shared = intersect(training.law, split.law) if "factors" in written and not written.get("overlaps") else None
     except ValueError as error:
         raise ConfigError(f"{source}: splits.{split.name}.factors must be {error}") from None
     if shared is not None:
@@ -131,7 +131,7 @@ def _differ(one: Split, other: Split, name: str) -> bool:
 
 def _hull(scene: Plugin, splits: Sequence[Split]) -> Any:
     """Options that can give whatever any of the splits may draw."""
-    parts = hull([split.law for split in splits])
+    parts = union_support([split.law for split in splits])
     changes = {}
     for name, spec in drawn_options(scene.module).items():
         found = [parts[key] for key in coordinates(name, getattr(scene.options, name))]

@@ -10,7 +10,7 @@ import numpy as np
 
 from gen2d.config.distributions import Distribution, Span
 
-Pieces = list[tuple[float, Distribution]]
+Intervals = list[tuple[float, Distribution]]
 MOST_POINTS = 1000  # whole numbers that are cut out of a range one by one
 FAR = 10.0  # deviations from the mean, beyond which a normal in float32 has nothing
 LEAST = 1e-7  # of a piece that a normal is cut into: less is not drawn
@@ -27,12 +27,12 @@ def mixture(pieces: Sequence[tuple[float, Distribution]]) -> Distribution:
     return Distribution("mixture", tuple(shares.values()), tuple(shares))
 
 
-def total(pieces: Pieces) -> float:
+def total(pieces: Intervals) -> float:
     """The share of all draws that these pieces are."""
     return sum(share for share, _ in pieces)
 
 
-def inside(source: Distribution, spans: Iterable[Span]) -> Pieces:
+def inside(source: Distribution, spans: Iterable[Span]) -> Intervals:
     """What of a distribution lies within any of these spans."""
     found, rest = [], source.weighted
     for span in spans:
@@ -41,7 +41,7 @@ def inside(source: Distribution, spans: Iterable[Span]) -> Pieces:
     return found
 
 
-def outside(source: Distribution, spans: Iterable[Span]) -> Pieces:
+def outside(source: Distribution, spans: Iterable[Span]) -> Intervals:
     """What of a distribution lies within none of these spans."""
     rest = source.weighted
     for span in spans:
@@ -49,11 +49,11 @@ def outside(source: Distribution, spans: Iterable[Span]) -> Pieces:
     return rest
 
 
-def _within(pieces: Pieces, span: Span) -> Pieces:
+def _within(pieces: Intervals, span: Span) -> Intervals:
     return [(share * part, cut) for share, piece in pieces for part, cut in _meeting(piece, span)]
 
 
-def _without(pieces: Pieces, span: Span) -> Pieces:
+def _without(pieces: Intervals, span: Span) -> Intervals:
     """Below the span and above it; also between whole numbers, if it is one of those."""
     found = []
     for share, piece in pieces:
@@ -75,7 +75,7 @@ def _points(span: Span) -> list[Span]:
     ]
 
 
-def _meeting(piece: Distribution, span: Span) -> Pieces:
+def _meeting(piece: Distribution, span: Span) -> Intervals:
     """The part of one piece that lies within a span, if any."""
     if piece.kind in ("constant", "choice", "grid"):
         kept = np.asarray(piece.numbers)[span.contains(piece.numbers)].tolist()

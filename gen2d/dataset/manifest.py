@@ -58,7 +58,7 @@ PLUGIN = re.compile(rf"plugins/(scene|look|splits/{SPLIT.pattern}/look)/[^/\x00-
 
 
 @dataclasses.dataclass(frozen=True)
-class Table:
+class ShardTable:
     """The table of a split's shards."""
 
     file: str  # its name in the folder
@@ -90,7 +90,7 @@ class Manifest:
     licence: str
     stats: Mapping[str, Stats]  # by split
     stats_sampled: str
-    tables: Mapping[str, Table]  # by split
+    tables: Mapping[str, ShardTable]  # by split
     files: Mapping[str, str]  # sha256 of the other files, by name in the folder
     fingerprint: Mapping[str, Any]
     producer: Mapping[str, Any]
@@ -477,11 +477,11 @@ class _Parser:
             return None
         return [_number(value, f"{where}.{key}") for value in _list(about[key], f"{where}.{key}", length)]
 
-    def table(self, split: str, videos: int, videos_per_shard: int) -> Table:
+    def table(self, split: str, videos: int, videos_per_shard: int) -> ShardTable:
         where = f"tables.{split}"
         about = _mapping(self.part("tables")[split], where, 5, 5)
         shards = -(-videos // videos_per_shard)
-        return Table(
+        return ShardTable(
             file=_one_of(about.get("file"), f"{where}.file", (table_name(split, videos),)),
             sha256=_text(about.get("sha256"), f"{where}.sha256", HASH),
             shards=_whole(about.get("shards"), f"{where}.shards", shards, shards),
@@ -504,7 +504,7 @@ class _Parser:
 def describe(
     spec: DatasetSpec,
     splits: Mapping[str, int],
-    tables: Mapping[str, Table],
+    tables: Mapping[str, ShardTable],
     stats: Mapping[str, Stats],
     files: Mapping[str, str],
 ) -> Manifest:

@@ -14,13 +14,13 @@ from gen2d.dataset.folder import (
     publish_snapshot,
     whole_plan,
 )
-from gen2d.dataset.manifest import CONFIG, FILE_BYTES, SHEET, Manifest, Table, describe
+from gen2d.dataset.manifest import CONFIG, FILE_BYTES, SHEET, Manifest, ShardTable, describe
 from gen2d.dataset.readme import readme, shown_split
 from gen2d.dataset.records import Records, read_records
 from gen2d.dataset.rows import npy
 from gen2d.dataset.spec import DatasetSpec, Shard, table_name
 from gen2d.dataset.statistics import summary
-from gen2d.loading.dataset import Dataset, Options
+from gen2d.loading.dataset import Dataset, ViewOptions
 from gen2d.media import contact_sheet, images
 from gen2d.storage.atomic import publish_changed
 from gen2d.storage.explain import reading_error
@@ -62,7 +62,7 @@ def publication(spec: DatasetSpec, shards: list[Shard], records: Records, old: M
         content, name = npy(rows[split]), table_name(split, own[-1].first + own[-1].count)
         publish_changed(spec.root / name, content)
         sizes = rows[split]["bytes"].tolist()
-        tables[split] = Table(name, sha256(content), len(own), sum(sizes), max(sizes))
+        tables[split] = ShardTable(name, sha256(content), len(own), sum(sizes), max(sizes))
     counts = {shard.split: shard.first + shard.count for shard in shards}
     if old and (old.identity_sha256, old.splits, old.tables) == (spec.identity_sha256, counts, tables):
         kept = _kept(spec, old)
@@ -103,7 +103,7 @@ def _kept(spec: DatasetSpec, old: Manifest) -> Publication | None:
 
 def sheet(root: Place, manifest: Manifest) -> bytes:
     """A contact sheet of the first videos, as a PNG; the manifest need not be in the folder yet."""
-    options = Options(shown_split(manifest), ("frames",), None, 1, "first", "THWC", "uint8", "checksum")
+    options = ViewOptions(shown_split(manifest), ("frames",), None, 1, "first", "THWC", "uint8", "checksum")
     ds = Dataset(root, manifest, options)
     # One video in memory at a time: they may be long and large.
     videos = (ds[number]["frames"] for number in range(min(ROWS, len(ds))))

@@ -15,17 +15,17 @@ import numpy as np
 from gen2d.core.errors import UserError
 from gen2d.dataset.block import Block, encode
 from gen2d.dataset.spec import DatasetSpec, Shard
-from gen2d.programs.batches import Piece, _check_placed
-from gen2d.programs.rollout import Batch, Rollout
+from gen2d.programs.batches import ShardSlice, _check_placed
+from gen2d.programs.rollout import DeviceBatch, Rollout
 from gen2d.records.axes import Array
 
 
-def batches(todo: Sequence[Shard], lanes: int) -> list[tuple[str, int, list[Piece]]]:
+def batches(todo: Sequence[Shard], lanes: int) -> list[tuple[str, int, list[ShardSlice]]]:
     """The batches that hold these shards' videos, in order: split, number of the first video, and the shards' pieces.
 
     Batch b holds the videos from b * lanes on, whatever the shards are, so that every video keeps its lane.
     """
-    found: dict[tuple[str, int], list[Piece]] = {}
+    found: dict[tuple[str, int], list[ShardSlice]] = {}
     for shard in todo:
         end = shard.first + shard.count
         for first in range(shard.first // lanes * lanes, end, lanes):
@@ -35,8 +35,8 @@ def batches(todo: Sequence[Shard], lanes: int) -> list[tuple[str, int, list[Piec
 
 
 def groups(
-    work: Sequence[tuple[str, int, list[Piece]]], devices: int
-) -> Iterator[tuple[str, list[int], list[list[Piece]]]]:
+    work: Sequence[tuple[str, int, list[ShardSlice]]], devices: int
+) -> Iterator[tuple[str, list[int], list[list[ShardSlice]]]]:
     """The batches, as many at a time as there are devices; a device left over repeats the last batch for nothing."""
     place = 0
     while place < len(work):
@@ -48,7 +48,7 @@ def groups(
 
 
 @dataclasses.dataclass(eq=False)
-class Job:
+class EncodeTask:
     """Videos of one shard that are drawn and compressed together: lanes `rows` of a device's batch."""
 
     shard: Shard
@@ -59,10 +59,10 @@ class Job:
     future: Future[Block] | None = None
 
 
-def jobs_of(firsts: list[int], pieces: list[list[Piece]], lanes: int, size: int) -> list[Job]:
+def encode_tasks(firsts: list[int], pieces: list[list[ShardSlice]], lanes: int, size: int) -> list[EncodeTask]:
     """The jobs of a group of batches in the order of their videos, in slices of `size` lanes."""
     return [
-        Job(shard, device, firsts[device], start, slice(max(low, start), min(high, start + size)))
+        EncodeTask(shard, device, firsts[device], start, slice(max(low, start), min(high, start + size)))
         for device, own in enumerate(pieces)
         for shard, low, high in own
         for start in range(0, lanes, size)
@@ -79,30 +79,30 @@ class Encoder:
         self.limit = 2 * (len(rollout.devices) + threads)  # jobs in flight
         self.running: deque[Future[Block]] = deque()
 
-    def encode(self, job: Job, columns: dict[str, np.ndarray], drawn: dict[str, Array]) -> Block:
+    def encode(self, job: EncodeTask, columns: dict[str, np.ndarray], drawn: dict[str, Array]) -> Block:
         """The block of a job, from its device's columns and what was drawn of its slice there."""
         rows, start = job.rows, job.start
         own = {name: column[rows] for name, column in columns.items()}
         for name, array in drawn.items():
             own[name] = np.asarray(array)[rows.start - start : rows.stop - start]
         own["index"] = np.arange(job.first + rows.start, job.first + rows.stop, dtype=np.int64)
-        own |= self.rollout.told(own, job.shard.split)
+        own |= self.rollout.host_fields(own, job.shard.split)
         block = encode(own, self.dataset.fields, self.dataset.codec, self.dataset.chunk_frames)
         _check_finite(block, job.first + rows.start)
         return block
 
-    def blocks(self, work: Sequence[tuple[str, int, list[Piece]]]) -> Iterator[tuple[Shard, Block]]:
+    def blocks(self, work: Sequence[tuple[str, int, list[ShardSlice]]]) -> Iterator[tuple[Shard, Block]]:
         """Every block of these batches with its shard, in the order of the videos.
 
         The next batch is begun before the last slices of this one are compressed, so neither waits for the other.
         """
-        line: deque[Job] = deque()
+        line: deque[EncodeTask] = deque()
         waiting = list(groups(work, len(self.rollout.devices)))
         batch = self.rollout.begin(*waiting[0][:2]) if waiting else None
         for place, (_, firsts, pieces) in enumerate(waiting):
             assert batch is not None
             _check_placed(self.rollout, batch, firsts, pieces)
-            jobs = jobs_of(firsts, pieces, self.rollout.lanes, self.rollout.slice)
+            jobs = encode_tasks(firsts, pieces, self.rollout.lanes, self.rollout.slice)
             line.extend(jobs)
             for _ in self._submitted(jobs, batch):
                 while line and line[0].future is not None and line[0].future.done():
@@ -111,7 +111,7 @@ class Encoder:
         while line:
             yield _result(line.popleft())
 
-    def _submitted(self, jobs: list[Job], batch: Batch) -> Iterator[int]:
+    def _submitted(self, jobs: list[EncodeTask], batch: DeviceBatch) -> Iterator[int]:
         columns = self.rollout.host_columns(batch)
         for start in sorted({job.start for job in jobs}):
             drawn = self.rollout.draw(batch, start, self.rollout.slice)
@@ -120,7 +120,7 @@ class Encoder:
                     job.future = self._submit(job, columns[job.device], drawn[job.device])
             yield start
 
-    def _submit(self, job: Job, columns: dict[str, np.ndarray], drawn: dict[str, Array]) -> Future[Block]:
+    def _submit(self, job: EncodeTask, columns: dict[str, np.ndarray], drawn: dict[str, Array]) -> Future[Block]:
         while len(self.running) >= self.limit:
             self.running.popleft().result()
         self.running.append(self.pool.submit(self.encode, job, columns, drawn))
@@ -131,7 +131,7 @@ class Encoder:
         self.pool.shutdown(wait=True, cancel_futures=True)
 
 
-def _result(job: Job) -> tuple[Shard, Block]:
+def _result(job: EncodeTask) -> tuple[Shard, Block]:
     assert job.future is not None
     return job.shard, job.future.result()
 

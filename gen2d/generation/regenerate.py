@@ -34,7 +34,7 @@ from gen2d.generation.encoder import Encoder, threads_for
 from gen2d.generation.run import dataset_of, make, rollouts_of
 from gen2d.loading import dataset as loader
 from gen2d.programs import devices
-from gen2d.programs.batches import Piece
+from gen2d.programs.batches import ShardSlice
 from gen2d.programs.fingerprint import fingerprint, machine, sources
 from gen2d.programs.recipe import Trust, config_from
 from gen2d.programs.rollout import Rollout
@@ -77,7 +77,7 @@ def _compare(root: Place, there: Identity, here: Identity) -> None:
         raise FolderError(f"{root}: its videos can be neither judged nor repaired here, as bits would differ: {told}")
 
 
-def differing(
+def changed_videos(
     rollout: Rollout, root: Place, manifest: Manifest, chosen: Sequence[tuple[str, int]]
 ) -> Iterator[tuple[str, str]]:
     """For each field of the videos (split, number) that is another when made again: its shard and a sentence.
@@ -94,16 +94,18 @@ def differing(
         try:
             for shard, block in encoder.blocks(_work(dataset, own.lanes, [c for c in chosen if c[0] in splits])):
                 number = int(block.arrays["index"][0])
-                for name in _other(stored[shard.split], number, _values(block, dataset)):
+                for name in _changed_fields(stored[shard.split], number, _values(block, dataset)):
                     yield shard.name, f"{name} of {shard.split} video {number} is not what its recipe makes"
         finally:
             encoder.close()
 
 
-def _work(dataset: DatasetSpec, lanes: int, chosen: Sequence[tuple[str, int]]) -> list[tuple[str, int, list[Piece]]]:
+def _work(
+    dataset: DatasetSpec, lanes: int, chosen: Sequence[tuple[str, int]]
+) -> list[tuple[str, int, list[ShardSlice]]]:
     """The batches that hold the chosen videos, each video a piece of its own."""
     owner = {(shard.split, shard.place): shard for shard in plan(dataset.splits, dataset.videos_per_shard)}
-    found: dict[tuple[str, int], list[Piece]] = {}
+    found: dict[tuple[str, int], list[ShardSlice]] = {}
     for split, number in sorted(chosen):
         shard, lane = owner[split, number // dataset.videos_per_shard], number % lanes
         found.setdefault((split, number - lane), []).append((shard, lane, lane + 1))
@@ -121,7 +123,7 @@ def _values(block: Block, dataset: DatasetSpec) -> dict[str, np.ndarray]:
     return found
 
 
-def _other(stored: loader.Dataset, number: int, made: Mapping[str, np.ndarray]) -> list[str]:
+def _changed_fields(stored: loader.Dataset, number: int, made: Mapping[str, np.ndarray]) -> list[str]:
     """The names of the fields that are stored otherwise, to the bit."""
     try:
         video = stored[number]

@@ -19,7 +19,7 @@ from gen2d.dataset.spec import SPLIT, DatasetSpec, Shard, mine
 from gen2d.generation.complete import complete
 from gen2d.generation.encoder import Encoder, batches, threads_for
 from gen2d.generation.warm_up import _prepare
-from gen2d.generation.writers import Writers
+from gen2d.generation.writers import ShardWriters
 from gen2d.programs import devices
 from gen2d.programs.fingerprint import fingerprint, sources
 from gen2d.programs.rollout import Rollout
@@ -162,7 +162,7 @@ def make(rollout: Rollout, dataset: DatasetSpec, todo: list[Shard], say: Callabl
 
 
 def _make(rollout: Rollout, dataset: DatasetSpec, todo: list[Shard], say: Callable[[str], None]) -> int:
-    encoder, writers = Encoder(rollout, dataset, threads_for(devices.cores())), Writers(dataset)
+    encoder, writers = Encoder(rollout, dataset, threads_for(devices.cores())), ShardWriters(dataset)
     work = batches(todo, rollout.lanes)
     size = 0
     with stopping_on_sigterm(say):  # also while it cleans up: then a second signal ends the process

@@ -12,9 +12,9 @@ from gen2d.core.humanize import in_bytes, in_time
 from gen2d.dataset import folder as shards
 from gen2d.dataset.block import Block
 from gen2d.dataset.spec import DatasetSpec
-from gen2d.generation.encoder import Encoder, Job, jobs_of, threads_for
+from gen2d.generation.encoder import Encoder, EncodeTask, encode_tasks, threads_for
 from gen2d.programs import devices
-from gen2d.programs.rollout import Batch, Rollout, divisor
+from gen2d.programs.rollout import DeviceBatch, Rollout, divisor
 
 
 class DeviceMemoryError(UserError):
@@ -31,7 +31,7 @@ def _prepare(rollout: Rollout, encoder: Encoder, work: list, count: int, say: Ca
     batch = _fitted(lambda: jax.block_until_ready(rollout.begin(split, firsts)))
     _fit_slice(rollout, batch)
     compiled = time.perf_counter() - began
-    job = jobs_of(firsts, [pieces, *([] for _ in firsts[1:])], rollout.lanes, rollout.slice)[0]
+    job = encode_tasks(firsts, [pieces, *([] for _ in firsts[1:])], rollout.lanes, rollout.slice)[0]
     block, seconds = _measured(rollout, encoder, batch, split, firsts, job)
     size, duration = block.nbytes / len(block) * count, seconds * count
     say(f"Compiled in {compiled:.1f} s. {count:,} videos will take about {in_bytes(size)} and {in_time(duration)}.")
@@ -44,7 +44,7 @@ def _prepare(rollout: Rollout, encoder: Encoder, work: list, count: int, say: Ca
         )
 
 
-def _fit_slice(rollout: Rollout, batch: Batch) -> None:
+def _fit_slice(rollout: Rollout, batch: DeviceBatch) -> None:
     """Returns nothing; compiles the drawing, of fewer videos at once where the device has no memory for more."""
     while True:
         try:
@@ -57,7 +57,7 @@ def _fit_slice(rollout: Rollout, batch: Batch) -> None:
 
 
 def _measured(
-    rollout: Rollout, encoder: Encoder, batch: Batch, split: str, firsts: list[int], job: Job
+    rollout: Rollout, encoder: Encoder, batch: DeviceBatch, split: str, firsts: list[int], job: EncodeTask
 ) -> tuple[Block, float]:
     """The first block, and about how many seconds a video takes."""
     marks = [time.perf_counter()]

@@ -16,7 +16,7 @@ class _Dropped(BaseException):
     """Ends a writer whose shard is not wanted any more."""
 
 
-class Writers:
+class ShardWriters:
     """Writes blocks into shards, each in a thread, so that hashing and syncing one goes on while the next fills."""
 
     def __init__(self, dataset: DatasetSpec) -> None:

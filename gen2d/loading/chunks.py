@@ -36,7 +36,7 @@ KEPT = 256  # blocks of tables and indices, of each dataset
 OPEN = 128  # files, of a process
 
 
-class Piece(NamedTuple):
+class Chunk(NamedTuple):
     """Where a piece lies, and the checksum of its bytes."""
 
     shard: int  # its place in the split
@@ -55,7 +55,7 @@ class ShardRow(NamedTuple):
     offsets: np.ndarray
 
 
-Reader = Callable[[Column, Piece, np.ndarray], bytes | memoryview]
+Reader = Callable[[Column, Chunk, np.ndarray], bytes | memoryview]
 
 
 class SplitFiles:
@@ -173,7 +173,7 @@ class SplitFiles:
 
     def pieces(
         self, column: Column, numbers: np.ndarray, videos: np.ndarray, begins: Sequence[int]
-    ) -> list[list[Piece]]:
+    ) -> list[list[Chunk]]:
         """Where the pieces lie that are needed of each video; `begins` are the first frames of their windows."""
         places, rows = np.divmod(numbers, self.manifest.videos_per_shard)
         if column.is_image:
@@ -182,7 +182,7 @@ class SplitFiles:
         names = self._names
         offsets = {place: int(self.shard(place).offsets[names[column.name]]) for place in np.unique(places).tolist()}
         found = zip(places.tolist(), rows.tolist(), videos[column.name].tolist(), strict=True)
-        return [[Piece(place, offsets[place] + row * column.size, column.size, crc)] for place, row, crc in found]
+        return [[Chunk(place, offsets[place] + row * column.size, column.size, crc)] for place, row, crc in found]
 
     @functools.cached_property
     def _names(self) -> dict[str, int]:
@@ -190,14 +190,14 @@ class SplitFiles:
         names = sorted(n for n, field in self.manifest.fields.items() if field.per_video and not field.is_image)
         return {name: place for place, name in enumerate(names)}
 
-    def _piece(self, column: Column, place: int, chunk: tuple[int, int, int]) -> Piece:
+    def _piece(self, column: Column, place: int, chunk: tuple[int, int, int]) -> Chunk:
         offset, size, crc = chunk
         whole = column.size // column.pieces
         if size > 2 * whole + 1024 or offset + size > self.shard(place).bytes:
             raise DamagedError(f"{column.name} lies outside the file, by its index")
-        return Piece(place, offset, size, crc)
+        return Chunk(place, offset, size, crc)
 
-    def reader(self, places: Iterable[Iterable[Iterable[Piece]]]) -> Reader:
+    def reader(self, places: Iterable[Iterable[Iterable[Chunk]]]) -> Reader:
         """What gives the bytes of these pieces, by what the shards lie on."""
         if isinstance(self.root, Path) or self.cache:
             opened = functools.lru_cache(maxsize=16)(lambda place: self._open(self.shard(place)))
@@ -366,7 +366,7 @@ def _after_fork() -> None:
 os.register_at_fork(after_in_child=_after_fork)
 
 
-def _piece_of(file: _File, column: Column, piece: Piece, target: np.ndarray) -> bytes | memoryview:
+def _piece_of(file: _File, column: Column, piece: Chunk, target: np.ndarray) -> bytes | memoryview:
     """The bytes of a piece; one that is not compressed is read right into `target`."""
     if column.codec != "none":
         return file.read(piece.offset, piece.size)
@@ -378,7 +378,7 @@ def _piece_of(file: _File, column: Column, piece: Piece, target: np.ndarray) -> 
 
 
 def _received(
-    found: Mapping[Piece, bytes | Exception], column: Column, piece: Piece, target: np.ndarray
+    found: Mapping[Chunk, bytes | Exception], column: Column, piece: Chunk, target: np.ndarray
 ) -> bytes | memoryview:
     """The bytes of a piece that has been asked for already."""
     data = found[piece]

@@ -8,16 +8,16 @@ import numpy as np
 from gen2d.core.errors import ConfigError
 from gen2d.core.schema import Field
 from gen2d.loading.epochs import shuffled
-from gen2d.loading.protocols import Batch, Numbers, Source, Stats, checked_numbers, filled, item, taken_apart
+from gen2d.loading.protocols import Batch, FieldStats, Numbers, VideoReader, checked_numbers, filled, item, unbatch
 
 
-class Joined:
+class ConcatDataset:
     """Several datasets as one, one after the other: numbers are counted on from each to the next.
 
     Also a map-style dataset for torch and grain. The `datasets` must be alike.
     """
 
-    def __init__(self, datasets: Sequence[Source]) -> None:
+    def __init__(self, datasets: Sequence[VideoReader]) -> None:
         self.datasets = list(datasets)
         self.sizes = np.array([len(source) for source in self.datasets])
         self.firsts = np.cumsum(self.sizes) - self.sizes  # the number of each dataset's first video
@@ -31,7 +31,7 @@ class Joined:
 
     def __getitems__(self, indices: Numbers) -> list[Batch]:
         """The videos one by one; torch's DataLoader asks for a whole batch so."""
-        return taken_apart(self.batch(indices))
+        return unbatch(self.batch(indices))
 
     def __repr__(self) -> str:
         return f"<{len(self)} videos, one after the other of {', '.join(map(repr, self.datasets))}>"
@@ -47,7 +47,7 @@ class Joined:
         return self.datasets[0].time
 
     @property
-    def stats(self) -> Stats:
+    def stats(self) -> FieldStats:
         """Those of all datasets together, each of which counts by its number of videos."""
         parts = [source.stats for source in self.datasets]
         return {name: _together([part[name] for part in parts], self.sizes) for name in parts[0]}
@@ -57,9 +57,9 @@ class Joined:
         """The snapshot of each dataset, in their order."""
         return [source.snapshot for source in self.datasets]
 
-    def at(self, snapshot: Any) -> "Joined":
+    def at(self, snapshot: Any) -> "ConcatDataset":
         """The same datasets at earlier snapshots, while these are there."""
-        return self if snapshot == self.snapshot else Joined(at_snapshots(self.datasets, snapshot))
+        return self if snapshot == self.snapshot else ConcatDataset(at_snapshots(self.datasets, snapshot))
 
     def batch(self, indices: Numbers, starts: Numbers | None = None, out: Batch | None = None) -> Batch:
         """The videos with these numbers, stacked; windows begin at `starts`; `out` is filled if given."""
@@ -92,10 +92,10 @@ class Joined:
 
     def _shared(self, numbers: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
         """Each dataset that has some of these videos, and which of them."""
-        return occurring(np.searchsorted(self.firsts, numbers, side="right") - 1)
+        return groups_of(np.searchsorted(self.firsts, numbers, side="right") - 1)
 
 
-def at_snapshots(datasets: Sequence[Source], snapshots: Any) -> list[Source]:
+def at_snapshots(datasets: Sequence[VideoReader], snapshots: Any) -> list[VideoReader]:
     """Each dataset at its own of these snapshots. Raises ConfigError where they are not of so many datasets."""
     if not isinstance(snapshots, list) or len(snapshots) != len(datasets):
         count = len(snapshots) if isinstance(snapshots, list) else 1
@@ -103,7 +103,7 @@ def at_snapshots(datasets: Sequence[Source], snapshots: Any) -> list[Source]:
     return [source.at(snapshot) for source, snapshot in zip(datasets, snapshots, strict=True)]
 
 
-def occurring(owners: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
+def groups_of(owners: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
     """Each owner that occurs, and where."""
     return ((int(owner), np.flatnonzero(owners == owner)) for owner in np.unique(owners))
 

@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 
 from gen2d.core.errors import ConfigError
-from gen2d.loading.epochs import Step, Walk, one_of
+from gen2d.loading.epochs import EpochSampler, GlobalBatch, one_of
 from gen2d.loading.mixture import Mixture
-from gen2d.loading.protocols import Batch, Source
+from gen2d.loading.protocols import Batch, VideoReader
 
 
 class DataLoader:
@@ -37,7 +37,7 @@ class DataLoader:
 
     def __init__(
         self,
-        dataset: Source | Mixture,
+        dataset: VideoReader | Mixture,
         batch_size: int,
         seed: int = 0,
         shuffle: bool | str = "global",
@@ -57,7 +57,7 @@ class DataLoader:
         _check_place(to, device, sharding)
         if min(self.prefetch, self.threads) < 1:
             raise ConfigError("prefetch and num_threads must be 1 or more")
-        self.walk = Walk(len(dataset), batch_size, seed, shuffle, epochs, rank, world_size, remainder)
+        self.walk = EpochSampler(len(dataset), batch_size, seed, shuffle, epochs, rank, world_size, remainder)
         self.dataset, self.transform, self.to = dataset, transform, to
         self.device, self.sharding = device, sharding
         self._running: Generator[Any, None, None] | None = None
@@ -115,7 +115,7 @@ class DataLoader:
         finally:
             pool.shutdown(cancel_futures=True)
 
-    def _submit(self, pool: ThreadPoolExecutor, step: Step) -> Future[Any]:
+    def _submit(self, pool: ThreadPoolExecutor, step: GlobalBatch) -> Future[Any]:
         """This rank's slice of a global batch, being filled by all threads."""
         positions = self.walk.share(step)
         indices = self.dataset.numbers_at(positions, step.epoch, self.walk.shuffled_by)

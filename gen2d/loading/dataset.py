@@ -19,11 +19,11 @@ from gen2d.core.humanize import in_bytes
 from gen2d.core.schema import Field
 from gen2d.dataset.manifest import Manifest, read_manifest
 from gen2d.dataset.spec import shard_name
-from gen2d.loading.chunks import Piece, Reader, SplitFiles
+from gen2d.loading.chunks import Chunk, Reader, SplitFiles
 from gen2d.loading.column import LAYOUTS, Column
-from gen2d.loading.concat import Joined
+from gen2d.loading.concat import ConcatDataset
 from gen2d.loading.epochs import shuffled
-from gen2d.loading.protocols import Batch, Numbers, checked_numbers, filled, item, taken_apart
+from gen2d.loading.protocols import Batch, Numbers, checked_numbers, filled, item, unbatch
 from gen2d.storage import codecs
 from gen2d.storage.cache import Cache
 from gen2d.storage.explain import reason
@@ -49,7 +49,7 @@ def open(
     deadline: float = 300.0,
 ) -> "Dataset": ...
 @overload
-def open(path: list[Any] | tuple[Any, ...], *options: Any, **named: Any) -> Joined: ...
+def open(path: list[Any] | tuple[Any, ...], *options: Any, **named: Any) -> ConcatDataset: ...
 def open(
     path: str | Place | list[Any] | tuple[Any, ...],
     split: str | None = None,
@@ -66,7 +66,7 @@ def open(
     snapshot: str | None = None,
     timeout: float = 30.0,
     deadline: float = 300.0,
-) -> "Dataset | Joined":
+) -> "Dataset | ConcatDataset":
     """The videos of one split of a complete dataset.
 
     `split` may be left out if there is only one, or one called train. `fields` are names or patterns: frames and
@@ -95,14 +95,14 @@ def open(
     manifest = read_manifest(root, snapshot)
     split = _chosen_split(root, manifest, split)
     names = chosen_fields(f"{root}", manifest.fields, fields)
-    options = Options(split, names, window, stride, start, layout, dtype, verify, cache_dir, cache_bytes)
+    options = ViewOptions(split, names, window, stride, start, layout, dtype, verify, cache_dir, cache_bytes)
     options = options.within(manifest.frames[split], manifest.sizes.get("T", 0))
     _check_cache(options, max(table.largest for table in manifest.tables.values()))
     return Dataset(root, manifest, options)
 
 
 @dataclasses.dataclass(frozen=True)
-class Options:
+class ViewOptions:
     """How a dataset was opened."""
 
     split: str
@@ -132,7 +132,7 @@ class Options:
         """How many frames a window reaches over."""
         return 0 if self.window is None else (self.window - 1) * self.stride + 1
 
-    def within(self, frames: int, whole: int) -> "Options":
+    def within(self, frames: int, whole: int) -> "ViewOptions":
         """The same for the first so many frames of whole videos, without a window a window of all of them. Raises
         ConfigError for what cannot be."""
         self._check(frames)
@@ -162,7 +162,7 @@ _HINT = "gen2d verify finds all such damage"
 class Dataset:
     """Videos by number, as dictionaries of NumPy arrays; also a map-style dataset for torch and grain."""
 
-    def __init__(self, root: Place, manifest: Manifest, options: Options) -> None:
+    def __init__(self, root: Place, manifest: Manifest, options: ViewOptions) -> None:
         self.root, self.manifest, self.options = root, manifest, options
         self.fields = {name: manifest.fields[name] for name in options.fields}
         self.stats = {name: values for name, values in manifest.stats[options.split].items() if name in self.fields}
@@ -205,7 +205,7 @@ class Dataset:
 
     def __getitems__(self, indices: Numbers) -> list[Batch]:
         """The videos one by one; torch's DataLoader asks for a whole batch so."""
-        return taken_apart(self.batch(indices))
+        return unbatch(self.batch(indices))
 
     def __repr__(self) -> str:
         return f"<{len(self)} {self.options.split} videos of {self.root}: {', '.join(self.fields)}>"
@@ -258,7 +258,7 @@ class Dataset:
             which = f"video {numbers[0]}" if len(numbers) == 1 else f"videos {numbers.min()} to {numbers.max()}"
             raise DamagedError(f"{error} (looking up {self.options.split} {which}): {_HINT}") from None
 
-    def _read(self, read: Reader, column: Column, piece: Piece, video: int, target: np.ndarray) -> None:
+    def _read(self, read: Reader, column: Column, piece: Chunk, video: int, target: np.ndarray) -> None:
         try:
             data = read(column, piece, target)
             if self.options.verify == "checksum" and codecs.crc32(data) != piece.crc32:
@@ -287,7 +287,7 @@ class Dataset:
         return checked_numbers(indices, len(self), self.options.split)
 
 
-def _joined(datasets: Sequence[Dataset]) -> Joined:
+def _joined(datasets: Sequence[Dataset]) -> ConcatDataset:
     """The datasets as one. Raises ConfigError where they are not of one recipe."""
     if not datasets:
         raise ConfigError("path is an empty list, but must name one dataset or more")
@@ -298,7 +298,7 @@ def _joined(datasets: Sequence[Dataset]) -> Joined:
             if here != first:
                 told = f"{ds.root}: {name} is {here}, but in {datasets[0].root} {first}"
                 raise ConfigError(f"{told}: what is opened as one dataset must agree in split, fields, sizes and fps")
-    return Joined(datasets)
+    return ConcatDataset(datasets)
 
 
 def _facts(ds: Dataset) -> Iterator[tuple[str, Any]]:
@@ -339,7 +339,7 @@ def _nearest(name: str, names: Sequence[str] | Mapping[str, Any]) -> str:
     return f": did you mean {near[0]!r}?" if near else f": it has {', '.join(names)}"
 
 
-def _check_cache(options: Options, largest: int) -> None:
+def _check_cache(options: ViewOptions, largest: int) -> None:
     if options.cache_bytes is None:
         return
     if options.cache_dir is None:

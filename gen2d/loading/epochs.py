@@ -15,7 +15,7 @@ from gen2d.core.errors import ConfigError
 from gen2d.core.permutation import _feistel, hashed
 
 
-class Step(NamedTuple):
+class GlobalBatch(NamedTuple):
     """A global batch: positions from one on in an epoch."""
 
     epoch: int
@@ -23,7 +23,7 @@ class Step(NamedTuple):
     size: int
 
 
-class Walk:
+class EpochSampler:
     """The way through a number of videos, and the place on it: each rank has its slice of every global batch.
 
     The way ends when `epochs` epochs are through, and begins again with those that follow. The last videos of an epoch
@@ -79,33 +79,33 @@ class Walk:
         place = state["epoch"], state["position"]
         if not all(isinstance(number, int) and number >= 0 for number in place):
             raise ConfigError(f"the state has epoch and position {place}, but must have whole numbers")
-        self.epoch, self.position = self._settled(*place)
+        self.epoch, self.position = self._resolved(*place)
 
-    def over(self, videos: int) -> "Walk":
+    def over(self, videos: int) -> "EpochSampler":
         """The same way through another number of videos, from its beginning."""
         other = copy.copy(self)
         other.videos, other.epoch, other.position = videos, 0, 0
         other._check_size()
         return other
 
-    def steps(self) -> Iterator[Step]:
+    def steps(self) -> Iterator[GlobalBatch]:
         """The global batches to come."""
         epoch, position = self.epoch, self.position
         end = None if self.epochs is None else (epoch // self.epochs + 1) * self.epochs
         while end is None or epoch < end:
             size = min(self.global_size, self.videos - position)
-            yield Step(epoch, position, size)
-            epoch, position = self._settled(epoch, position + size)
+            yield GlobalBatch(epoch, position, size)
+            epoch, position = self._resolved(epoch, position + size)
 
-    def passed(self, step: Step) -> None:
+    def passed(self, step: GlobalBatch) -> None:
         """Returns nothing; the place is then after that global batch."""
-        self.epoch, self.position = self._settled(step.epoch, step.position + step.size)
+        self.epoch, self.position = self._resolved(step.epoch, step.position + step.size)
 
-    def _settled(self, epoch: int, position: int) -> tuple[int, int]:
+    def _resolved(self, epoch: int, position: int) -> tuple[int, int]:
         """Where the next global batch begins."""
         return (epoch, position) if self.videos - position >= self.least else (epoch + 1, 0)
 
-    def share(self, step: Step) -> np.ndarray:
+    def share(self, step: GlobalBatch) -> np.ndarray:
         """The positions of this rank's slice of a global batch."""
         begin, end = (step.size * rank // self.world_size for rank in (self.rank, self.rank + 1))
         return step.position + np.arange(begin, end)
@@ -115,7 +115,7 @@ class Walk:
         """The seed that shuffles; None where nothing does."""
         return self.seed if self.shuffle else None
 
-    def bits(self, step: Step, positions: np.ndarray) -> np.ndarray:
+    def bits(self, step: GlobalBatch, positions: np.ndarray) -> np.ndarray:
         """Random bits for the window at each position."""
         return hashed(WINDOWS, self.seed, step.epoch, positions)
 

@@ -14,15 +14,15 @@ import numpy as np
 
 from gen2d.core.errors import ConfigError
 from gen2d.core.permutation import hashed
-from gen2d.loading.concat import Joined, at_snapshots, occurring
+from gen2d.loading.concat import ConcatDataset, at_snapshots, groups_of
 from gen2d.loading.epochs import SOURCES
-from gen2d.loading.protocols import Batch, Numbers, Source, checked_numbers, item, taken_apart
+from gen2d.loading.protocols import Batch, Numbers, VideoReader, checked_numbers, item, unbatch
 
 FINEST = 1000  # a weight is taken as the nearest fraction with a denominator up to this
 Weights = Mapping[str, float] | Sequence[float]
 
 
-def mix(datasets: Mapping[str, Source], weights: Weights | None = None) -> "Mixture":
+def mix(datasets: Mapping[str, VideoReader], weights: Weights | None = None) -> "Mixture":
     """The datasets as one, for DataLoader, torch and grain; `weights` are their shares, equal unless told otherwise.
 
     An epoch is as long as no dataset has to give a video twice, and the next goes on with the videos that follow, so
@@ -43,10 +43,10 @@ class Mixture:
     A position's video has a number, which `fill` takes: the datasets' own, counted on from one dataset to the next.
     """
 
-    def __init__(self, datasets: Mapping[str, Source], shares: Sequence[int]) -> None:
+    def __init__(self, datasets: Mapping[str, VideoReader], shares: Sequence[int]) -> None:
         self.datasets, self.shares = dict(datasets), list(shares)
         self.fields = next(iter(datasets.values())).fields
-        self._joined = Joined(list(datasets.values()))
+        self._joined = ConcatDataset(list(datasets.values()))
         sizes = self._joined.sizes
         self._turns = turns(self.shares, sizes.tolist())
         taken = np.cumsum(self._turns[:, None] == np.arange(len(shares)), axis=0)
@@ -66,7 +66,7 @@ class Mixture:
 
     def __getitems__(self, positions: Numbers) -> list[Batch]:
         """The videos one by one; torch's DataLoader asks for a whole batch so."""
-        return taken_apart(self.batch(positions))
+        return unbatch(self.batch(positions))
 
     def __repr__(self) -> str:
         parts = (f"{share} of {name}" for name, share in zip(self.datasets, self.shares, strict=True))
@@ -104,7 +104,7 @@ class Mixture:
         shuffles them; what an epoch leaves of a dataset comes in the next."""
         periods, turn = np.divmod(positions, len(self._turns))
         owners, numbers = self._turns[turn], np.empty(len(positions), np.int64)
-        for owner, own in occurring(owners):
+        for owner, own in groups_of(owners):
             place = epoch * self._each[owner] + periods[own] * self._taken[-1, owner] + self._taken[turn[own], owner]
             source, rounds = self._joined.datasets[owner], place // self._joined.sizes[owner]
             own_seed = None if seed is None else int(hashed(SOURCES, seed, owner)[0])
@@ -167,7 +167,7 @@ def _fraction(name: str, weight: float) -> Fraction:
     return fraction
 
 
-def _compare(first: str, one: Source, name: str, other: Source) -> None:
+def _compare(first: str, one: VideoReader, name: str, other: VideoReader) -> None:
     """Raises ConfigError where videos of two datasets cannot stand in one batch."""
     here, there = one.empty(1), other.empty(1)
     for field in sorted(here.keys() ^ there.keys()):

@@ -10,10 +10,10 @@ from gen2d.core.schema import Field
 
 Batch = dict[str, np.ndarray]
 Numbers = Sequence[int] | np.ndarray
-Stats = dict[str, dict[str, list[float] | None]]  # of each field: mean, std, min and max of each component
+FieldStats = dict[str, dict[str, list[float] | None]]  # of each field: mean, std, min and max of each component
 
 
-class Videos(Protocol):
+class VideoSequence(Protocol):
     """What gives batches by number."""
 
     def __len__(self) -> int: ...
@@ -21,7 +21,7 @@ class Videos(Protocol):
     def batch(self, indices: Numbers, /) -> Batch: ...
 
 
-class Source(Protocol):
+class VideoReader(Protocol):
     """What fills batches that others have begun: a Dataset, or several."""
 
     def __len__(self) -> int: ...
@@ -30,7 +30,7 @@ class Source(Protocol):
     def fields(self) -> dict[str, Field]: ...
 
     @property
-    def stats(self) -> Stats: ...
+    def stats(self) -> FieldStats: ...
 
     @property
     def time(self) -> np.ndarray: ...
@@ -49,7 +49,7 @@ class Source(Protocol):
     def starts(self, numbers: np.ndarray, bits: np.ndarray) -> np.ndarray | None: ...
 
 
-def item(videos: Videos, key: Any) -> Batch:
+def item(videos: VideoSequence, key: Any) -> Batch:
     """What `videos[key]` is: one video, or for a slice or a sequence of numbers several, stacked."""
     if isinstance(key, slice):
         return videos.batch(range(*key.indices(len(videos))))
@@ -58,7 +58,7 @@ def item(videos: Videos, key: Any) -> Batch:
     return {name: values[0] for name, values in videos.batch([key]).items()}
 
 
-def taken_apart(batch: Batch) -> list[Batch]:
+def unbatch(batch: Batch) -> list[Batch]:
     """The videos of a batch one by one."""
     return [dict(zip(batch, values, strict=True)) for values in zip(*batch.values(), strict=True)]
 
@@ -74,7 +74,7 @@ def checked_numbers(indices: Numbers, count: int, whose: str) -> np.ndarray:
     return np.where(numbers < 0, numbers + count, numbers).astype(np.int64)
 
 
-def filled(source: Source, numbers: np.ndarray, starts: Numbers | None, out: Batch | None) -> Batch:
+def filled(source: VideoReader, numbers: np.ndarray, starts: Numbers | None, out: Batch | None) -> Batch:
     """The source's videos with these numbers, stacked: in `out` if given, which must fit."""
     if out is None:
         out = source.empty(len(numbers))

@@ -10,14 +10,14 @@ from gen2d.records.axes import Array
 UNROLL = 4  # rows in a turn of a loop
 
 
-class Factors(NamedTuple):
+class BandFactors(NamedTuple):
     """L and D of a symmetric band matrix L D L^T, each [R, ...]."""
 
     below: list[Array]  # the diagonals of L after the main one, which is 1
     inverse: Array  # 1 / D
 
 
-def factored(bands: list[Array]) -> Factors:
+def factor(bands: list[Array]) -> BandFactors:
     """The factors of a symmetric positive band matrix, given by its diagonals [R, ...] from the main one on; where
     that is infinite, a row gives zero."""
     width, zero = len(bands), jnp.zeros_like(bands[0][0])
@@ -30,17 +30,17 @@ def factored(bands: list[Array]) -> Factors:
         below = [inverse * x for x in own[1:]]
         older = [[*other, zero] for other in [*others, []]]
         new = [[f * x + y for x, y in zip(own[1 + p :], older[p], strict=True)] for p, f in enumerate(below)]
-        return new, Factors(below, inverse)
+        return new, BandFactors(below, inverse)
 
     start = [[zero] * (width - 1 - p) for p in range(width - 1)]
     return jax.lax.scan(row, start, bands, unroll=UNROLL)[1]
 
 
-def solved(factors: Factors, wanted: Array) -> Array:
+def solve_factored(factors: BandFactors, wanted: Array) -> Array:
     """x [R, ...] of L D L^T x = `wanted`."""
     start = [jnp.zeros_like(wanted[0])] * len(factors.below)
 
-    def down(less: list, row: tuple[Factors, Array]) -> tuple:
+    def down(less: list, row: tuple[BandFactors, Array]) -> tuple:
         (below, inverse), want = row
         value = want - less[0] if less else want
         return [f * value + x for f, x in zip(below, [*less[1:], 0.0], strict=False)], (below, inverse * value)

@@ -1,7 +1,7 @@
 """Which rows are near: a bit for each pair, counted, and found again by its place in the count.
 
-The bits of a round lie in words, one for each scene and `BITS` pairs. A round's rows are solved in chunks; `spots` says
-which bits those of a chunk are. All rows of a chunk are of one round, of any scene, so they share no body.
+The bits of a round lie in words, one for each scene and `BITS` pairs. A round's rows are solved in chunks; `row_lookup`
+says which bits those of a chunk are. All rows of a chunk are of one round, of any scene, so they share no body.
 """
 
 import functools
@@ -14,13 +14,13 @@ import numpy as np
 from gen2d.physics.collision import Disc, Hull, Shape, Stadium, dot, from_core
 from gen2d.physics.packing import SAFE
 from gen2d.records.axes import Array
-from gen2d.xla import settled
+from gen2d.xla import materialize
 
 BITS = 16  # of a word: so few that a float32 holds it exactly
 BLOCK = 32  # words that are searched at once
 
 
-def around(shape: Shape) -> Array:
+def bounding_radius(shape: Shape) -> Array:
     """The radius of a circle around a shape's centre that holds it, m."""
     if isinstance(shape, Disc):
         return shape.radius
@@ -30,7 +30,7 @@ def around(shape: Shape) -> Array:
     return jnp.sqrt(functools.reduce(jnp.maximum, [dot(x, x) for x in offsets])) + shape.radius
 
 
-def clearance(wall: Shape, centre: Array) -> Array:
+def signed_distance(wall: Shape, centre: Array) -> Array:
     """How far a point is from a wall, m; of a hull, from the line through the side that it is beyond most."""
     if isinstance(wall, Hull):
         sides = [dot(n, centre - v) for n, v in zip(wall.normals, wall.vertices, strict=True)]
@@ -39,7 +39,7 @@ def clearance(wall: Shape, centre: Array) -> Array:
     return jnp.sqrt(dot(offset, offset)) - wall.radius
 
 
-class Ring(NamedTuple):
+class RoundRobin(NamedTuple):
     """A tournament of N numbers in R = N - 1 rounds, by the circle method.
 
     In the order of `numbers` the one at t meets, in round k, the one at k - t modulo R; number 0, which has no place
@@ -51,7 +51,7 @@ class Ring(NamedTuple):
     pair: np.ndarray  # [R, N] the pair of a round in which the one at t comes first; last, that of number 0
 
 
-def ring_of(a: np.ndarray, b: np.ndarray) -> Ring:
+def round_robin_of(a: np.ndarray, b: np.ndarray) -> RoundRobin:
     """The ring of a tournament, from who meets in each pair of its rounds [R, P]."""
     rounds = len(a)
     turns = np.arange(rounds)
@@ -66,7 +66,7 @@ def ring_of(a: np.ndarray, b: np.ndarray) -> Ring:
         zero = rounds in (i, j)
         assert zero or (i + j) % rounds == k, "a tournament is played by the circle method"
         pair[k, rounds if zero else min(i, j)] = p
-    return Ring(ring, of_first, pair)
+    return RoundRobin(ring, of_first, pair)
 
 
 def bits_of(near: Array, one: Array) -> Array:
@@ -75,10 +75,10 @@ def bits_of(near: Array, one: Array) -> Array:
     marked = jnp.where(near, bit, np.float32(0))
     columns = [marked[:, p] for p in range(near.shape[1])]
     words = [functools.reduce(jnp.add, columns[i : i + BITS]) for i in range(0, len(columns), BITS)]
-    return jnp.concatenate(settled(words, one), axis=1).astype(jnp.uint32)
+    return jnp.concatenate(materialize(words, one), axis=1).astype(jnp.uint32)
 
 
-def bits_in_ring(centre: Array, reach: Array, ring: Ring, one: Array) -> Array:
+def bits_in_round_robin(centre: Array, reach: Array, ring: RoundRobin, one: Array) -> Array:
     """The bits of a tournament [R, W n]: which of those with centres [2, N, n] and reaches [N, n] overlap, m."""
     rounds = len(ring.numbers)
     everyone = jnp.concatenate([centre, reach[None]])
@@ -95,10 +95,10 @@ def bits_in_ring(centre: Array, reach: Array, ring: Ring, one: Array) -> Array:
         beside = -t % rounds  # whom it meets, from round 0 on
         meet(t, others[:, t : t + 1], twice[:, beside : beside + rounds], (turns - t) % rounds > t)
     meet(rounds, everyone[:, :1], others[:, ring.of_first], turns >= 0)
-    return jnp.concatenate(settled(words, one), axis=1).astype(jnp.uint32)
+    return jnp.concatenate(materialize(words, one), axis=1).astype(jnp.uint32)
 
 
-class Listed(NamedTuple):
+class ActivePairs(NamedTuple):
     """The rows that are near, by round, then word, then bit."""
 
     words: Array  # [R, W n] uint32, and some empty ones
@@ -107,25 +107,25 @@ class Listed(NamedTuple):
     starts: Array  # [R + 1] the first chunk of each round; last, how many chunks there are
 
 
-def counted(words: Array) -> Array:
+def count_active(words: Array) -> Array:
     """How many bits each word has."""
     return jax.lax.population_count(words).astype(jnp.int32)
 
 
-def listed(words: Array, chunk: int) -> Listed:
+def active_pairs(words: Array, chunk: int) -> ActivePairs:
     """The rows with a bit in words [R, W n], in chunks of so many."""
     words = jnp.pad(words, ((0, 0), (0, -words.shape[1] % BLOCK)))
-    counts = counted(words)
+    counts = count_active(words)
     # By blocks, as jnp.cumsum takes time n^2 on a CPU.
     inside = jnp.cumsum(counts.reshape(len(counts), -1, BLOCK), axis=-1, dtype=jnp.int32)
     blocks = jnp.cumsum(inside[..., -1], axis=-1, dtype=jnp.int32)
     upto = (inside + (blocks - inside[..., -1])[..., None]).reshape(counts.shape)
     starts = jnp.cumsum(-(-upto[:, -1] // chunk), dtype=jnp.int32)
-    return Listed(words, upto - counts, upto[:, -1], jnp.pad(starts, (1, 0)))
+    return ActivePairs(words, upto - counts, upto[:, -1], jnp.pad(starts, (1, 0)))
 
 
-class Spots(NamedTuple):
-    """Rows of a chunk, each [C], as `Listed` counts them; anything where there is none."""
+class RowLookup(NamedTuple):
+    """Rows of a chunk, each [C], as `ActivePairs` counts them; anything where there is none."""
 
     round: Array  # one for all
     word: Array
@@ -134,7 +134,7 @@ class Spots(NamedTuple):
     there: Array
 
 
-def spots(rows: Listed, k: Array, chunk: int) -> Spots:
+def row_lookup(rows: ActivePairs, k: Array, chunk: int) -> RowLookup:
     """The rows of chunk k."""
     turn = jnp.sum(rows.starts[1:] <= k, dtype=jnp.int32)
     place = (k - rows.starts[turn]) * chunk + jnp.arange(chunk, dtype=jnp.int32)
@@ -148,8 +148,8 @@ def spots(rows: Listed, k: Array, chunk: int) -> Spots:
     # The bit with as many below it: by halves of the word.
     bits, bit, left = rows.words[turn].at[word].get(mode=SAFE), jnp.zeros(chunk, jnp.int32), rank
     for half in (8, 4, 2, 1):
-        low = counted(bits & jnp.uint32((1 << half) - 1))
+        low = count_active(bits & jnp.uint32((1 << half) - 1))
         above = left >= low
         left, bit = jnp.where(above, left - low, left), jnp.where(above, bit + half, bit)
         bits = jnp.where(above, bits >> half, bits)
-    return Spots(turn, word, bit, rank, there)
+    return RowLookup(turn, word, bit, rank, there)

@@ -20,7 +20,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from gen2d.records.axes import Array
-from gen2d.xla import settled
+from gen2d.xla import materialize
 
 NEAREST = 1e-12  # m^2: squared distances below this have no direction
 SLOP = 1e-5  # m: lengths below this are rounding, and do not decide which features touch
@@ -196,7 +196,7 @@ def stadium_disc(a: Stadium, b: Disc, one: Array | float = 1.0) -> tuple[Point]:
 def hull_disc(a: Hull, b: Disc, one: Array | float = 1.0) -> tuple[Point]:
     """One point; a disc centred inside parts through the face of least penetration."""
     only = Hull(b.centre, (b.centre,), (b.centre,), b.radius)
-    gap, face = settled(widest(a, only), one)
+    gap, face = materialize(widest(a, only), one)
     start, end = facing(a, face)
     tangent = turned(face)
     along = jnp.clip(dot(b.centre - start, tangent), 0.0, dot(end - start, tangent))
@@ -207,11 +207,11 @@ def hull_disc(a: Hull, b: Disc, one: Array | float = 1.0) -> tuple[Point]:
 
 def hull_hull(a: Hull, b: Hull, one: Array | float = 1.0) -> tuple[Point, Point]:
     """Two points, in the order of the normal's tangent; the second is FAR where two corners touch."""
-    (gap_a, face_a), (gap_b, face_b) = settled((widest(a, b), widest(b, a)), one)
+    (gap_a, face_a), (gap_b, face_b) = materialize((widest(a, b), widest(b, a)), one)
     other = gap_b > gap_a + SLOP
     face = jnp.where(other, -face_b, face_a)
     tangent = turned(face)
-    (low_a, high_a), (high_b, low_b) = settled((facing(a, face), facing(b, -face)), one)
+    (low_a, high_a), (high_b, low_b) = materialize((facing(a, face), facing(b, -face)), one)
 
     end_a, end_b, nearest = nearest_ends(low_a, high_a, low_b, high_b)
     # Overlapping hulls may have edges whose nearest points are corners; lines have no inside.

@@ -10,8 +10,8 @@ from typing import NamedTuple, TypeAlias
 import jax.numpy as jnp
 
 from gen2d.physics.collision import FAR, Point, dot, turned
-from gen2d.physics.params import Rules
-from gen2d.physics.time_of_impact import PASSES
+from gen2d.physics.params import SolverParams
+from gen2d.physics.time_of_impact import MISSES
 from gen2d.records.axes import Array
 
 
@@ -36,7 +36,7 @@ class Impulse(NamedTuple):
     tangent: Array  # N s
 
 
-class Grip(NamedTuple):
+class ContactFrame(NamedTuple):
     """How an impulse at a point becomes motion. A lever that is None is zero, always."""
 
     normal_a: Array | None  # m
@@ -49,7 +49,7 @@ class Grip(NamedTuple):
     tangent_mass: Array
 
 
-class Row(NamedTuple):
+class ContactConstraint(NamedTuple):
     """What stays the same of a row for a whole video. Where not both bodies are `present` it has no mass."""
 
     a: Inertia | None  # None: nothing moves it
@@ -58,14 +58,14 @@ class Row(NamedTuple):
     elasticity: Array
     friction: Array
     rolling: Array | None  # m: torque over normal force
-    grip: Grip | None  # of two discs, or of a disc on something fixed; of others it changes with every step
+    grip: ContactFrame | None  # of two discs, or of a disc on something fixed; of others it changes with every step
     firm: bool  # against something fixed: twice as stiff
     # Of a fixed segment, where others go on from its ends: two directions [2, 1, ...], zero where there is none.
     left: tuple[Array, Array] | None = None
     right: tuple[Array, Array] | None = None
 
 
-class Core(NamedTuple):
+class CoreOffset(NamedTuple):
     """What the impact of two round shapes needs to know, or of a disc and the core line of another shape."""
 
     apart: Array  # [2, ...] m: offset of the centres, or of the disc from the core line
@@ -73,22 +73,22 @@ class Core(NamedTuple):
     flat: Array | None  # where the core line's middle, not its end, is nearest; None: two discs
 
 
-class Found(NamedTuple):
+class ContactPoint(NamedTuple):
     """A point of a row as the step begins."""
 
-    grip: Grip
+    grip: ContactFrame
     normal: Array
     gap: Array
     pressed: Array  # N s: normal impulse of the last step
     fall: Array | None  # [2, ...] m/s^2: acceleration of b over a; None where they fall alike
     place: Array | None  # [2, ...] m: of the point, or of b's centre where b is a disc; None where nobody asks
-    core: Core | None = None  # None: of shapes with corners
+    core: CoreOffset | None = None  # None: of shapes with corners
 
 
-class Touch(NamedTuple):
+class ActiveContact(NamedTuple):
     """A point of a row as it stands in this step; tau < 0 where it does not bounce (impacts.py)."""
 
-    grip: Grip
+    grip: ContactFrame
     normal: Array
     gap: Array
     tau: Array
@@ -102,12 +102,14 @@ def reciprocal(x: Array, usable: Array) -> Array:
     return jnp.where(usable, 1 / jnp.where(usable, x, 1.0), 0.0)
 
 
-def mixed(a: Array, b: Array, mixing: str) -> Array:
+def mix_materials(a: Array, b: Array, mixing: str) -> Array:
     """The coefficient of a pair."""
     return {"mean": (a + b) / 2, "product": a * b, "max": jnp.maximum(a, b), "geometric": jnp.sqrt(a * b)}[mixing]
 
 
-def grip_of(row: Row, levers: tuple[Array | None, Array | None, Array | None, Array], near: Array) -> Grip:
+def frame_of(
+    row: ContactConstraint, levers: tuple[Array | None, Array | None, Array | None, Array], near: Array
+) -> ContactFrame:
     """The grip with these levers: normal a, normal b, tangent a, tangent b; no mass where it is not `near`."""
     normal_a, normal_b, tangent_a, tangent_b = levers
     k_mass, moment_a = row.b.mass, 0.0
@@ -119,18 +121,18 @@ def grip_of(row: Row, levers: tuple[Array | None, Array | None, Array | None, Ar
         return k_mass + of_a + (0.0 if b is None else row.b.moment * b**2)
 
     ks = k(normal_a, normal_b), k(tangent_a, tangent_b)
-    return Grip(*levers, *ks, *(reciprocal(k, near) for k in ks))
+    return ContactFrame(*levers, *ks, *(reciprocal(k, near) for k in ks))
 
 
-def grip_at(row: Row, point: Point) -> Grip:
+def frame_at(row: ContactConstraint, point: Point) -> ContactFrame:
     """The grip of a point of contact."""
     (ax, ay), (bx, by), (nx, ny) = point.arm_a, point.arm_b, point.normal
     a = (None, None) if row.a is None else (ax * ny - ay * nx, ax * nx + ay * ny)
     levers = a[0], bx * ny - by * nx, a[1], bx * nx + by * ny
-    return grip_of(row, levers, row.present & (point.gap < FAR / 2))
+    return frame_of(row, levers, row.present & (point.gap < FAR / 2))
 
 
-def relative(grip: Grip, normal: Array, a: Motion | None, b: Motion) -> tuple[Array, Array]:
+def relative(grip: ContactFrame, normal: Array, a: Motion | None, b: Motion) -> tuple[Array, Array]:
     """Normal and tangential speed of b over a at the point, m/s."""
     velocity = b.velocity if a is None else b.velocity - a.velocity
     speed = dot(normal, velocity)
@@ -144,17 +146,17 @@ def relative(grip: Grip, normal: Array, a: Motion | None, b: Motion) -> tuple[Ar
     return speed, slip
 
 
-Parts: TypeAlias = tuple[Array | None, Array | None]  # of an impulse or its levers: normal, tangential; None: zero
+Components: TypeAlias = tuple[Array | None, Array | None]  # of an impulse or its levers: normal, tangential; None: zero
 
 
-def _twist(levers: Parts, impulse: Parts) -> Array | float:
+def _twist(levers: Components, impulse: Components) -> Array | float:
     parts = zip(levers, impulse, strict=True)
     found = [lever * p for lever, p in parts if lever is not None and p is not None]
     return sum(found[1:], found[0]) if found else 0.0
 
 
-def pushed(
-    row: Row, at: Found | Touch, impulse: Impulse | Parts, a: Motion | None, b: Motion
+def apply_impulse(
+    row: ContactConstraint, at: ContactPoint | ActiveContact, impulse: Impulse | Components, a: Motion | None, b: Motion
 ) -> tuple[Motion | None, Motion]:
     """Both motions after the impulse on b and its reaction on a."""
     grip, directions = at.grip, (at.normal, turned(at.normal))
@@ -168,17 +170,19 @@ def pushed(
     return Motion(a.velocity - row.a.mass * push, a.spin - row.a.moment * turn), b
 
 
-def added(new: Impulse, old: Impulse) -> Impulse:
+def add_impulses(new: Impulse, old: Impulse) -> Impulse:
     """What a solve added to an impulse."""
     return Impulse(new.normal - old.normal, new.tangent - old.tangent)
 
 
-def softness(row: Row, rules: Rules) -> tuple[float, float, float]:
+def softness(row: ContactConstraint, rules: SolverParams) -> tuple[float, float, float]:
     """`Rules.softness` of a row's overlaps."""
     return rules.softness(2 * rules.hertz if row.firm else rules.hertz, rules.damping_ratio)
 
 
-def biased(row: Row, touch: Touch, speed: Array, old: Impulse, rules: Rules) -> Array:
+def biased_impulse(
+    row: ContactConstraint, touch: ActiveContact, speed: Array, old: Impulse, rules: SolverParams
+) -> Array:
     """The accumulated normal impulse after the biased solve of a row.
 
     Apart: the gap may be closed, no more. Overlapping: a soft push. Bouncing: its target exactly. Passing: nothing, as
@@ -189,17 +193,19 @@ def biased(row: Row, touch: Touch, speed: Array, old: Impulse, rules: Rules) -> 
     bias = jnp.where(apart, touch.gap / rules.step, jnp.maximum(rate * touch.gap, -rules.push_speed))
     soft = old.normal - jnp.where(apart, 1.0, mass_scale) * mass * (speed + bias)
     soft = jnp.maximum(soft - jnp.where(apart, 0.0, impulse_scale) * old.normal, 0.0)
-    soft = jnp.where(touch.tau == PASSES, 0.0, soft)
+    soft = jnp.where(touch.tau == MISSES, 0.0, soft)
     hard = old.normal + mass * (touch.target - speed)
     return jnp.where(mass > 0, jnp.where(touch.tau >= 0, hard, soft), 0.0)
 
 
-def struck(touch: Touch, speed: Array, threshold: Array) -> Array:
+def impact_impulse(touch: ActiveContact, speed: Array, threshold: Array) -> Array:
     """Where a neighbour's bounce has closed a row that is in contact: it bounces, too."""
     return (speed < -threshold) & (touch.gap <= 0) & (touch.grip.normal_mass > 0)
 
 
-def relaxed(row: Row, touch: Touch, speed: Array, old: Impulse, threshold: Array) -> Array:
+def relaxed_impulse(
+    row: ContactConstraint, touch: ActiveContact, speed: Array, old: Impulse, threshold: Array
+) -> Array:
     """The accumulated normal impulse after the relaxing solve, without bias.
 
     No say has a row that bounced and parts, one that is apart and carried nothing (it would brake a body one step
@@ -209,10 +215,12 @@ def relaxed(row: Row, touch: Touch, speed: Array, old: Impulse, threshold: Array
     pushes = (touch.tau < 0) & ((old.normal > 0) | (touch.gap <= 0)) & (speed >= -threshold) & (mass > 0)
     soft = jnp.where(pushes, jnp.maximum(old.normal - mass * speed, 0.0), old.normal)
     hard = old.normal - (1 + row.elasticity) * mass * speed
-    return jnp.where(struck(touch, speed, threshold), hard, soft)
+    return jnp.where(impact_impulse(touch, speed, threshold), hard, soft)
 
 
-def rubbed(row: Row, touch: Touch, normal_impulse: Array, slip: Array, old: Impulse) -> Array:
+def friction_impulse(
+    row: ContactConstraint, touch: ActiveContact, normal_impulse: Array, slip: Array, old: Impulse
+) -> Array:
     """The accumulated tangential impulse: what stops the slip, within Coulomb's bound of the normal impulse now.
 
     Without a bound there is none; said so, as the gradient of a clip between two zeros is not zero.
@@ -222,7 +230,7 @@ def rubbed(row: Row, touch: Touch, normal_impulse: Array, slip: Array, old: Impu
     return jnp.where(bound > 0, rub, 0.0)
 
 
-def spun(row: Row, roll: Array, a: Motion | None, b: Motion) -> tuple[Motion | None, Motion]:
+def spin_change(row: ContactConstraint, roll: Array, a: Motion | None, b: Motion) -> tuple[Motion | None, Motion]:
     """Both motions after an angular impulse on b and its reaction on a."""
     b = b._replace(spin=b.spin + row.b.moment * roll)
     if row.a is None or a is None:
@@ -235,7 +243,7 @@ def turning(a: Motion | None, b: Motion) -> Array:
     return b.spin if a is None else b.spin - a.spin
 
 
-def resisted(row: Row, normal_impulse: Array, a: Motion | None, b: Motion, old: Array) -> Array:
+def rolling_impulse(row: ContactConstraint, normal_impulse: Array, a: Motion | None, b: Motion, old: Array) -> Array:
     """The accumulated angular impulse that stops rolling, within its bound of the normal impulse now."""
     assert row.rolling is not None, "only rows with rolling resistance have such an impulse"
     k = row.b.moment if row.a is None else row.a.moment + row.b.moment

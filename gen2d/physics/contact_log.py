@@ -5,16 +5,16 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from gen2d.physics.contact_state import Solved
+from gen2d.physics.contact_state import SolvedPair
 from gen2d.records.axes import Array
 from gen2d.records.trajectory import Contacts
-from gen2d.xla import settled
+from gen2d.xla import materialize
 
 NOTHING, IMPACT, BEGIN, PERSIST, END = range(5)  # contacts/kind
 ON, BOUNCED, BEFORE = 1, 2, 4  # flags: touching after the last step, an impact in this frame, touching as it began
 
 
-class Event(NamedTuple):
+class ContactEvent(NamedTuple):
     """What a row has seen since the frame began, each [pairs, ...]."""
 
     time: Array  # s from frame 0, of the first touch; -1: none yet
@@ -26,14 +26,16 @@ class Event(NamedTuple):
     flags: Array
 
 
-def unseen(shape: tuple[int, ...], dtype: jnp.dtype) -> Event:
+def empty_events(shape: tuple[int, ...], dtype: jnp.dtype) -> ContactEvent:
     """A row in which nothing has happened yet."""
     zero = jnp.zeros(shape, dtype)
     vector = jnp.zeros((2, *shape), dtype)
-    return Event(zero - 1, vector, vector, zero, zero, zero, jnp.zeros(shape, jnp.int32))
+    return ContactEvent(zero - 1, vector, vector, zero, zero, zero, jnp.zeros(shape, jnp.int32))
 
 
-def noted(event: Event, solved: Solved, relaxed: Solved, start: Array, one: Array) -> Event:
+def record_event(
+    event: ContactEvent, solved: SolvedPair, relaxed: SolvedPair, start: Array, one: Array
+) -> ContactEvent:
     """The event with one more step, which began at `start`: the row after its biased solve, and after its last one."""
     points = list(zip(solved.touches, solved.impulses, relaxed.impulses, strict=True))
     touching = [(biased.normal > 0) | (last.normal > 0) for _, biased, last in points]
@@ -43,11 +45,11 @@ def noted(event: Event, solved: Solved, relaxed: Solved, start: Array, one: Arra
         second, other = touching[1] & ~on, points[1][0]._replace(grip=None)
         bounced = bounced | (touching[1] & (other.tau >= 0))
         touch, on = jax.tree.map(lambda x, y: jnp.where(second, y, x), touch, other), on | second
-    first = settled(jnp.where(on & (event.time < 0), 1.0, 0.0), one) > 0.5
+    first = materialize(jnp.where(on & (event.time < 0), 1.0, 0.0), one) > 0.5
     assert touch.place is not None, "who keeps events asks for the touches' places"
     news = (start + jnp.maximum(touch.tau, 0.0), touch.place, touch.normal, touch.arrival)
     time, place, normal, approach = (jnp.where(first, new, old) for new, old in zip(news, event[:4], strict=True))
-    return Event(
+    return ContactEvent(
         time,
         place,
         normal,
@@ -58,13 +60,13 @@ def noted(event: Event, solved: Solved, relaxed: Solved, start: Array, one: Arra
     )
 
 
-def begun(event: Event) -> Event:
+def began_touching(event: ContactEvent) -> ContactEvent:
     """The event as the next frame begins."""
-    fresh = unseen(event.time.shape, event.time.dtype)
+    fresh = empty_events(event.time.shape, event.time.dtype)
     return fresh._replace(flags=jnp.where((event.flags & ON) > 0, ON | BEFORE, 0).astype(jnp.int32))
 
 
-class Happening(NamedTuple):
+class PairEvent(NamedTuple):
     """What happened in a row in a frame, each [pairs, ...]; kind 0: nothing."""
 
     kind: Array
@@ -77,15 +79,15 @@ class Happening(NamedTuple):
     tangent_impulse: Array
 
 
-def happening(event: Event, elasticity: Array) -> Happening:
+def pair_event(event: ContactEvent, elasticity: Array) -> PairEvent:
     """What happened, as the frame ends. What bounces leaves with e times the speed that it came with."""
     on, bounced, before = ((event.flags & flag) > 0 for flag in (ON, BOUNCED, BEFORE))
     kind = jnp.where(before, jnp.where(on, PERSIST, END), jnp.where(event.time >= 0, BEGIN, NOTHING))
     separation = jnp.where(bounced, elasticity * event.approach, 0.0)
-    return Happening(jnp.where(bounced, IMPACT, kind).astype(jnp.uint8), *event[:4], separation, *event[4:6])
+    return PairEvent(jnp.where(bounced, IMPACT, kind).astype(jnp.uint8), *event[:4], separation, *event[4:6])
 
 
-def compact(frames: Happening, a: Array, b: Array, fps: float, slots: int) -> Contacts:
+def compact(frames: PairEvent, a: Array, b: Array, fps: float, slots: int) -> Contacts:
     """The rows [T - 1, P, ...] in which something happened, the first `slots` of them, in time's order.
 
     `a` and `b` are the slots of the objects of each of P rows, [P, n].
@@ -118,7 +120,7 @@ def compact(frames: Happening, a: Array, b: Array, fps: float, slots: int) -> Co
     return contacts_of(told, cleared(number), cleared(first), cleared(second), count)
 
 
-def contacts_of(what: Happening, frame: Array, a: Array, b: Array, count: Array) -> Contacts:
+def contacts_of(what: PairEvent, frame: Array, a: Array, b: Array, count: Array) -> Contacts:
     """The rows [C, n] of what happened, in which frame and to which slots, as they are stored."""
     return Contacts(
         time=what.time,

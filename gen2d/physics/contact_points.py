@@ -5,21 +5,31 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 
 from gen2d.physics.collision import FAR, NEAREST, Disc, dot, from_core, inverse_length, touches
-from gen2d.physics.constraint import Core, Found, Grip, Inertia, Motion, Row, Touch, grip_at, relative
-from gen2d.physics.contact_state import Setup
+from gen2d.physics.constraint import (
+    ActiveContact,
+    ContactConstraint,
+    ContactFrame,
+    ContactPoint,
+    CoreOffset,
+    Inertia,
+    Motion,
+    frame_at,
+    relative,
+)
+from gen2d.physics.contact_state import PassSetup
 from gen2d.physics.time_of_impact import (
     SLOWEST,
-    Path,
-    arrival,
-    either,
-    plane_arrival,
+    ApproachPath,
+    approach_speed,
+    plane_approach_speed,
     plane_path,
-    rebound,
+    post_impact_speed,
     round_path,
+    select,
     time_of_impact,
 )
 from gen2d.records.axes import Array
-from gen2d.xla import settled
+from gen2d.xla import materialize
 
 UP = (0.0, 1e-6)  # m: the offset of discs whose centres coincide; any would do
 
@@ -32,7 +42,7 @@ def _apart(offset: Array) -> Array:
 MIDDLE, END, ELSEWHERE = 1.0, 2.0, 3.0  # of a segment: what is nearest to a disc, or that it is another segment's
 
 
-def _offset(row: Row, a: Any, b: Disc) -> tuple[Array, Array | None]:
+def _offset(row: ContactConstraint, a: Any, b: Disc) -> tuple[Array, Array | None]:
     """From a's centre, or from where its core line is nearest, to b's centre; and where that is.
 
     At an end from which another segment goes on, a disc over that one is not this one's: else it would stumble on it.
@@ -48,25 +58,27 @@ def _offset(row: Row, a: Any, b: Disc) -> tuple[Array, Array | None]:
     return offset, jnp.where((where == END) & (jnp.maximum(*onward) > 0), ELSEWHERE, where)
 
 
-def _found(row: Row, a: Any, b: Any, pressed: list[Array], fall: Array | None, setup: Setup) -> list[Found]:
+def _contact_points(
+    row: ContactConstraint, a: Any, b: Any, pressed: list[Array], fall: Array | None, setup: PassSetup
+) -> list[ContactPoint]:
     if row.grip is not None:
         apart, where = _offset(row, a, b)
-        apart, inverse, where = settled((apart, inverse_length(apart), where), setup.one)
+        apart, inverse, where = materialize((apart, inverse_length(apart), where), setup.one)
         gap, flat = 1 / inverse - a.radius - b.radius, None
         if where is not None:
             gap, flat = jnp.where(where == ELSEWHERE, FAR, gap), where == MIDDLE
         place = b.centre if setup.contacts else None
-        normal, core = apart * inverse, Core(apart, a.radius + b.radius, flat)
-        return [Found(row.grip, normal, gap, pressed[0], fall, place, core)]
-    points = settled(touches(a, b, setup.one), setup.one)
+        normal, core = apart * inverse, CoreOffset(apart, a.radius + b.radius, flat)
+        return [ContactPoint(row.grip, normal, gap, pressed[0], fall, place, core)]
+    points = materialize(touches(a, b, setup.one), setup.one)
     places = [b.centre + p.arm_b if setup.contacts else None for p in points]
     return [
-        Found(settled(grip_at(row, p), setup.one), p.normal, p.gap, last, fall, place)
+        ContactPoint(materialize(frame_at(row, p), setup.one), p.normal, p.gap, last, fall, place)
         for p, last, place in zip(points, pressed, places, strict=True)
     ]
 
 
-class Course(NamedTuple):
+class Approach(NamedTuple):
     """How the two bodies of a row come to a point of it."""
 
     a: Motion | None
@@ -75,7 +87,7 @@ class Course(NamedTuple):
     threshold: Array  # m/s: slower impacts do not bounce
 
 
-def _met(row: Row, at: Found, a: tuple, b: tuple, setup: Setup, h: float) -> Touch:
+def _met(row: ContactConstraint, at: ContactPoint, a: tuple, b: tuple, setup: PassSetup, h: float) -> ActiveContact:
     """A point of a row with its impact, if there is one in this step; a and b are motion and drift.
 
     What a body has met before in this step has shifted its path: it comes from there.
@@ -84,37 +96,37 @@ def _met(row: Row, at: Found, a: tuple, b: tuple, setup: Setup, h: float) -> Tou
     speed, pull = _closing(at, at.normal, motion_a, motion_b)
     shift = drift_b.way.velocity if drift_a is None else drift_b.way.velocity - drift_a.way.velocity
     threshold = _threshold(at, at.pressed, None if drift_a is None else drift_a.push, drift_b.push, setup)
-    course, approach = Course(motion_a, motion_b, shift, threshold), -speed - pull * h
+    course, approach = Approach(motion_a, motion_b, shift, threshold), -speed - pull * h
     grip, normal = at.grip, at.normal
     if at.core is None:
         path, approach = _to_plane(at, shift, approach, pull)
-        tau = settled(time_of_impact(path, approach, h, threshold), setup.one)
+        tau = materialize(time_of_impact(path, approach, h, threshold), setup.one)
     else:
         tau, normal = _met_round(at, at.core, course, approach, pull, setup.one, h)
         speed, pull = _closing(at, normal, motion_a, motion_b)
         grip = _levered(row, at, tau)
-    arrived = arrival(speed, pull, tau, h)
-    target = rebound(arrived, pull, row.elasticity, tau, h)
+    arrived = approach_speed(speed, pull, tau, h)
+    target = post_impact_speed(arrived, pull, row.elasticity, tau, h)
     place = at.place
     if place is not None:
         place = place + jnp.maximum(tau, 0.0) * motion_b.velocity
         place = place if row.grip is None else place + grip.tangent_b * normal  # the lever of b is minus its radius
-    return Touch(grip, normal, at.gap, tau, arrived, target, place)
+    return ActiveContact(grip, normal, at.gap, tau, arrived, target, place)
 
 
-def _closing(at: Found, normal: Array, a: Motion | None, b: Motion) -> tuple[Array, Array | float]:
+def _closing(at: ContactPoint, normal: Array, a: Motion | None, b: Motion) -> tuple[Array, Array | float]:
     """Along a normal: the speed of b over a, m/s, and the acceleration of b to a, m/s^2."""
     return relative(at.grip, normal, a, b)[0], 0.0 if at.fall is None else -dot(normal, at.fall)
 
 
-def _to_plane(at: Found, shift: Array, approach: Array, pull: Array | float) -> tuple[Path, Array]:
+def _to_plane(at: ContactPoint, shift: Array, approach: Array, pull: Array | float) -> tuple[ApproachPath, Array]:
     """The path to a plane, and the speed of arrival at it."""
     gap = jnp.maximum(at.gap + dot(at.normal, shift), 0.0)
-    return plane_path(gap, approach, pull), plane_arrival(gap, approach, pull)
+    return plane_path(gap, approach, pull), plane_approach_speed(gap, approach, pull)
 
 
 def _met_round(
-    at: Found, core: Core, course: Course, approach: Array, pull: Array | float, one: Array, h: float
+    at: ContactPoint, core: CoreOffset, course: Approach, approach: Array, pull: Array | float, one: Array, h: float
 ) -> tuple[Array, Array]:
     """Time of impact, and normal, of two round shapes, or of a disc and a core line."""
     plane = None if core.flat is None else (core.flat, *_to_plane(at, course.shift, approach, pull))
@@ -126,16 +138,18 @@ def _met_round(
     path = round_path(apart, gap, core.reach, mean)
     if plane is not None:  # none meets what is not its own
         flat, straight, approach = plane
-        path = either(flat, straight, path._replace(c=jnp.where(at.gap < FAR / 2, path.c, FAR**2)))
+        path = select(flat, straight, path._replace(c=jnp.where(at.gap < FAR / 2, path.c, FAR**2)))
     tau = time_of_impact(path, approach, h, course.threshold)
     # Two round shapes meet in the normal of that time, at which their distance is what both radii make.
     scale = jnp.where((tau >= 0) & (gap > 0), 1 / jnp.maximum(core.reach, SLOWEST), inverse)
-    tau, scale = settled((tau, scale), one)
+    tau, scale = materialize((tau, scale), one)
     met = jnp.where(tau >= 0, (apart + jnp.maximum(tau, 0.0) * mean) * scale, at.normal)
-    return tau, settled(met, one) if core.flat is None else jnp.where(core.flat, at.normal, met)
+    return tau, materialize(met, one) if core.flat is None else jnp.where(core.flat, at.normal, met)
 
 
-def _threshold(at: Found | Touch, pressed: Array, push_a: Array | None, push_b: Array, setup: Setup) -> Array:
+def _threshold(
+    at: ContactPoint | ActiveContact, pressed: Array, push_a: Array | None, push_b: Array, setup: PassSetup
+) -> Array:
     """The approach speed of an impact, m/s.
 
     It is more than pushing overlaps apart adds, and more than the impulse that has pressed the two together gives in a
@@ -145,7 +159,7 @@ def _threshold(at: Found | Touch, pressed: Array, push_a: Array | None, push_b: 
     return setup.threshold + pushes + at.grip.k_normal * pressed
 
 
-def _levered(row: Row, at: Found, tau: Array) -> Grip:
+def _levered(row: ContactConstraint, at: ContactPoint, tau: Array) -> ContactFrame:
     """The grip of discs that do not just touch: both levers together are as long as the centres are apart."""
     grip = at.grip
     if row.a is None or grip.tangent_a is None:
@@ -163,7 +177,7 @@ def _spun_by(inertia: Inertia, lever: Array | None, other: Array | None) -> Arra
     return 0.0 if lever is None or other is None else inertia.moment * lever * other
 
 
-def _both(row: Row, touches: list[Touch], speeds: list[Array]) -> list[Array | None]:
+def _both(row: ContactConstraint, touches: list[ActiveContact], speeds: list[Array]) -> list[Array | None]:
     """Normal impulses that bounce both points at once, which one after the other would turn a flat landing.
 
     The matrix of two impulses to two speeds is inverted; where it cannot be, or a point would be pulled, each point

@@ -11,9 +11,18 @@ from typing import Any, NamedTuple, TypeAlias
 import jax.numpy as jnp
 
 from gen2d.physics.collision import dot
-from gen2d.physics.constraint import Found, Grip, Impulse, Motion, Row, Touch, relative, turning
+from gen2d.physics.constraint import (
+    ActiveContact,
+    ContactConstraint,
+    ContactFrame,
+    ContactPoint,
+    Impulse,
+    Motion,
+    relative,
+    turning,
+)
 from gen2d.records.axes import Array
-from gen2d.xla import total
+from gen2d.xla import sum_bodies
 
 
 class Work(NamedTuple):
@@ -31,7 +40,9 @@ class Ledger(NamedTuple):
     joints: Work | None
 
 
-def spent_by_discs(work: Work | None, grip: Grip, impulse: Impulse, speed: Array, slip: Array) -> Work | None:
+def dissipated_by_discs(
+    work: Work | None, grip: ContactFrame, impulse: Impulse, speed: Array, slip: Array
+) -> Work | None:
     """The work with an impulse at a point where the two directions do not mix; speeds before it."""
     if work is None:
         return None
@@ -40,24 +51,24 @@ def spent_by_discs(work: Work | None, grip: Grip, impulse: Impulse, speed: Array
     return work._replace(lost=work.lost - gained)
 
 
-def _of_surface(grip: Grip, normal: Array, a: Motion) -> tuple[Array, Array]:
+def _of_surface(grip: ContactFrame, normal: Array, a: Motion) -> tuple[Array, Array]:
     """Normal and tangential speed of a's own point."""
     still = Motion(jnp.zeros_like(a.velocity), jnp.zeros_like(a.spin))
     speed, slip = relative(grip, normal, a, still)
     return -speed, -slip
 
 
-Motions: TypeAlias = tuple[Motion | None, Motion]  # of a and b
+MotionPair: TypeAlias = tuple[Motion | None, Motion]  # of a and b
 
 
-def spent(
+def dissipated(
     work: Work | None,
-    row: Row,
-    points: Sequence[Found | Touch],
+    row: ContactConstraint,
+    points: Sequence[ContactPoint | ActiveContact],
     impulses: list[Impulse],
     roll: Array | None,
-    before: Motions,
-    after: Motions,
+    before: MotionPair,
+    after: MotionPair,
 ) -> Work | None:
     """The work with all impulses of a row, which led from motions to others."""
     if work is None:
@@ -86,7 +97,7 @@ def _taken(group: Any, fall: Array, spin_up: Array | float, aside: Motion) -> Ar
     return linear if isinstance(spin_up, float) else linear + group.moment * spin_up * aside.spin
 
 
-def booked(
+def record_energy(
     work: Work,
     group: Any,
     old: Motion,
@@ -116,7 +127,7 @@ def booked(
     return Work(lost, driven, damped)
 
 
-def tallied(work: Work | None, passes: list[Work]) -> Work | None:
+def accumulate(work: Work | None, passes: list[Work]) -> Work | None:
     """The work by all joints after a step's passes."""
     if work is None or not passes:
         return work
@@ -128,11 +139,11 @@ def _sum(old: Array | None, parts: Sequence[Array | None]) -> Array | None:
     return None if old is None else sum((part for part in parts if part is not None), old)
 
 
-def closed(book: Ledger, springs: Array) -> tuple[Array, ...]:
+def close_balance(book: Ledger, springs: Array) -> tuple[Array, ...]:
     """Lost in contact, put in, lost to damping, by now; what springs hold now is not lost."""
     works = book.groups if book.joints is None else [*book.groups, book.joints]
     lost, driven, damped = (
-        sum((total(part) for part in parts if part is not None), jnp.zeros_like(springs))
+        sum((sum_bodies(part) for part in parts if part is not None), jnp.zeros_like(springs))
         for parts in zip(*works, strict=True)
     )
     return lost, driven, damped - springs
@@ -144,9 +155,9 @@ def balance(groups: list[Any], bodies: list[Any], gravity: Array, springs: Array
     linear = jnp.zeros_like(gravity)
     for g, body in zip(groups, bodies, strict=True):
         (x, y), v, spin = body.position, body.motion.velocity, body.motion.spin
-        kinetic = kinetic + total(0.5 * g.mass * dot(v, v))
-        rotational = rotational + total(0.5 * g.moment * spin**2)
-        potential = potential - total(g.mass * dot(gravity[:, None], body.position))
-        linear = linear + total(g.mass * v)
-        angular = angular + total(g.mass * (x * v[1] - y * v[0]) + g.moment * spin)
+        kinetic = kinetic + sum_bodies(0.5 * g.mass * dot(v, v))
+        rotational = rotational + sum_bodies(0.5 * g.moment * spin**2)
+        potential = potential - sum_bodies(g.mass * dot(gravity[:, None], body.position))
+        linear = linear + sum_bodies(g.mass * v)
+        angular = angular + sum_bodies(g.mass * (x * v[1] - y * v[0]) + g.moment * spin)
     return kinetic, rotational, potential + springs, linear, angular

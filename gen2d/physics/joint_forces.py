@@ -19,16 +19,16 @@ import numpy as np
 from gen2d.physics.collision import dot, turned
 from gen2d.physics.constraint import Inertia, Motion, reciprocal
 from gen2d.physics.energy import Work
-from gen2d.physics.params import Rules
+from gen2d.physics.params import SolverParams
 from gen2d.records.axes import Array
-from gen2d.records.layout import Tie
-from gen2d.xla import settled
+from gen2d.records.layout import JointSpec
+from gen2d.xla import materialize
 
 HERTZ, DAMPING_RATIO = 60.0, 5.0  # of limits (E. Catto, 'Solver2D', 2024)
 SHORTEST = 1e-6  # m: a shorter rod has no direction
 
 
-class End(NamedTuple):
+class JointSide(NamedTuple):
     """One of the two bodies of each of some joints."""
 
     lines: np.ndarray  # [P] in the table of bodies
@@ -37,12 +37,12 @@ class End(NamedTuple):
     anchor: Array  # [2, P, ...] m, in the body's frame
 
 
-class Tied(NamedTuple):
+class JointBatch(NamedTuple):
     """What stays the same of some joints, each [P, ...]. A distance joint is a spring where its stiffness is finite."""
 
     kind: str
-    a: End
-    b: End
+    a: JointSide
+    b: JointSide
     there: Array
     rest: Array
     stiffness: Array
@@ -53,10 +53,10 @@ class Tied(NamedTuple):
     motor_torque: Array
 
 
-class Held(NamedTuple):
+class JointState(NamedTuple):
     """The joints of a round in this step."""
 
-    tied: Tied
+    tied: JointBatch
     arm_a: Array  # [2, P, ...] m
     arm_b: Array
     apart: Array  # [2, P, ...] m: from a's anchor to b's
@@ -64,7 +64,7 @@ class Held(NamedTuple):
     impulses: tuple[Array, ...]
 
 
-def rounds(ties: Sequence[Tie], moving: int) -> list[list[int]]:
+def joint_rounds(ties: Sequence[JointSpec], moving: int) -> list[list[int]]:
     """The numbers of the joints of each round: every joint is in the first of its kind in which both of its bodies are
     free. They are named by their lines in the table, of which those below `moving` are moving bodies."""
     found: list[tuple[str, set[int], list[int]]] = []
@@ -79,7 +79,7 @@ def rounds(ties: Sequence[Tie], moving: int) -> list[list[int]]:
     return [numbers for *_, numbers in found]
 
 
-def nothing(tied: Tied) -> tuple[Array, ...]:
+def zero_impulses(tied: JointBatch) -> tuple[Array, ...]:
     """The impulses of joints that have done nothing: of a hinge, at both limits and by the motor."""
     return (jnp.zeros_like(tied.rest),) * (0 if tied.kind == "distance" else 3)
 
@@ -89,7 +89,7 @@ def table_of(groups: Sequence[Any], fixed: Sequence[Any]) -> Any:
     return jax.tree.map(lambda *x: jnp.concatenate(x, axis=-2), *groups, *fixed)
 
 
-def at_lines(table: Any, lines: np.ndarray) -> Any:
+def joint_lines(table: Any, lines: np.ndarray) -> Any:
     """The table's values of these bodies."""
     return jax.tree.map(lambda x: x[..., lines, :], table)
 
@@ -113,14 +113,14 @@ def direction_of(apart: Array) -> tuple[Array, Array]:
     return jnp.where(squared > SHORTEST**2, apart / length, 0.0), jnp.where(squared > SHORTEST**2, length, 0.0)
 
 
-def anchors_of(a: End, b: End, places: Any, one: Array | float) -> tuple[Array, Array, Array]:
+def anchors_of(a: JointSide, b: JointSide, places: Any, one: Array | float) -> tuple[Array, Array, Array]:
     """Both arms, and how far the anchors are apart, m [2, P, ...]; of a table of positions and angles."""
-    (place_a, angle_a), (place_b, angle_b) = (at_lines(places, end.lines) for end in (a, b))
-    arm_a, arm_b = settled((rotated(a.anchor, angle_a), rotated(b.anchor, angle_b)), one)
+    (place_a, angle_a), (place_b, angle_b) = (joint_lines(places, end.lines) for end in (a, b))
+    arm_a, arm_b = materialize((rotated(a.anchor, angle_a), rotated(b.anchor, angle_b)), one)
     return arm_a, arm_b, place_b + arm_b - place_a - arm_a
 
 
-def _with(table: Any, held: Held, a: Any, b: Any) -> Any:
+def _with(table: Any, held: JointState, a: Any, b: Any) -> Any:
     """The table with both bodies of each joint put back into it."""
 
     def put(x: Array, new_a: Array, new_b: Array) -> Array:
@@ -132,7 +132,7 @@ def _with(table: Any, held: Held, a: Any, b: Any) -> Any:
     return jax.tree.map(put, table, a, b)
 
 
-def _pushed(end: End, arm: Array, motion: Motion, push: Array) -> Motion:
+def _pushed(end: JointSide, arm: Array, motion: Motion, push: Array) -> Motion:
     """The motion after an impulse at an arm."""
     turn = end.inertia.moment * dot(turned(arm), push)
     return Motion(motion.velocity + end.inertia.mass * push, motion.spin + turn)
@@ -143,8 +143,8 @@ def _total(x: Array) -> Array:
     return jnp.sum(x, axis=-2, keepdims=True)
 
 
-def warm(
-    ties: list[Tied], bodies: list[Any], fixed: list[Any], motions: list[Motion], memory: list[tuple], one: Array
+def warm_start(
+    ties: list[JointBatch], bodies: list[Any], fixed: list[Any], motions: list[Motion], memory: list[tuple], one: Array
 ) -> tuple:
     """Every round as it stands, the motions with its last impulses, and the work done."""
     if not ties:
@@ -152,9 +152,9 @@ def warm(
     places = table_of(*([(body.position, body.angle) for body in some] for some in (bodies, fixed)))
     now, held, works = table_of(motions, [body.motion for body in fixed]), [], []
     for tied, impulses in zip(ties, memory, strict=True):
-        angle_a, angle_b = (at_lines(places[1], end.lines) for end in (tied.a, tied.b))
+        angle_a, angle_b = (joint_lines(places[1], end.lines) for end in (tied.a, tied.b))
         angle = angle_b - angle_a - tied.rest
-        joint = Held(tied, *anchors_of(tied.a, tied.b, places, one), angle, impulses)
+        joint = JointState(tied, *anchors_of(tied.a, tied.b, places, one), angle, impulses)
         held.append(joint)
         if tied.kind != "distance":
             book = _Turns(joint, now, one)
@@ -166,12 +166,12 @@ def warm(
 
 
 def solve(
-    held: list[Held],
+    held: list[JointState],
     motions: list[Motion],
     ways: list[Motion],
     falls: list[Array],
     fixed: list[Any],
-    rules: Rules,
+    rules: SolverParams,
     one: Array,
     biased: bool,
 ) -> tuple:
@@ -202,9 +202,9 @@ class _Turns:
     compile two hinges.
     """
 
-    def __init__(self, held: Held, motions: Motion, one: Array) -> None:
+    def __init__(self, held: JointState, motions: Motion, one: Array) -> None:
         self.held, self.one = held, one
-        self.a, self.b = at_lines(motions, held.tied.a.lines), at_lines(motions, held.tied.b.lines)
+        self.a, self.b = joint_lines(motions, held.tied.a.lines), joint_lines(motions, held.tied.b.lines)
         self._lost, self._driven = jnp.zeros_like(held.angle), jnp.zeros_like(held.angle)
 
     @property
@@ -220,12 +220,12 @@ class _Turns:
     def apply(self, twist: Array, motor: bool = False) -> None:
         """Applies an angular impulse on b and its reaction on a; books their work."""
         tied, before = self.held.tied, self.speed
-        twist, before = settled((twist, before), self.one)
+        twist, before = materialize((twist, before), self.one)
         spins = (
             self.a.spin - tied.a.inertia.moment * twist,
             self.b.spin + tied.b.inertia.moment * twist,
         )
-        spin_a, spin_b = settled(spins, self.one)
+        spin_a, spin_b = materialize(spins, self.one)
         self.a, self.b = self.a._replace(spin=spin_a), self.b._replace(spin=spin_b)
         gained = 0.5 * twist * (before + self.speed)
         if motor:
@@ -237,7 +237,7 @@ class _Turns:
                 self._driven = self._driven - sign * jnp.where(end.fixed[:, None], motion.spin * twist, 0.0)
 
 
-def _turn(joint: Held, book: _Turns, rules: Rules, biased: bool) -> tuple[Array, ...]:
+def _turn(joint: JointState, book: _Turns, rules: SolverParams, biased: bool) -> tuple[Array, ...]:
     """The impulses of hinges at both limits and by the motor after a pass."""
     tied, (low, high, motor) = joint.tied, joint.impulses
     rate, mass_scale, impulse_scale = rules.softness(HERTZ, DAMPING_RATIO) if biased else (0.0, 1.0, 0.0)
@@ -258,7 +258,9 @@ def _turn(joint: Held, book: _Turns, rules: Rules, biased: bool) -> tuple[Array,
     return *news, new_motor
 
 
-def _spring(joint: Held, now: Motion, way: Motion, fall: Array, h: float, one: Array) -> tuple[Motion, Motion, Work]:
+def _spring(
+    joint: JointState, now: Motion, way: Motion, fall: Array, h: float, one: Array
+) -> tuple[Motion, Motion, Work]:
     """Motions and ways with an impulse at half of the step, and the work that it took from the motion.
 
     What the spring holds of that is taken off when the books are closed.
@@ -268,7 +270,7 @@ def _spring(joint: Held, now: Motion, way: Motion, fall: Array, h: float, one: A
     k, c = (jnp.where(soft, x, 0.0) for x in (tied.stiffness, tied.damping))
     ends = (tied.a, joint.arm_a, -1), (tied.b, joint.arm_b, 1)
     axis, length = direction_of(joint.apart)
-    olds = [at_lines(now, end.lines) for end, *_ in ends]
+    olds = [joint_lines(now, end.lines) for end, *_ in ends]
     inverse = sum(end.inertia.mass + end.inertia.moment * dot(turned(arm), axis) ** 2 for end, arm, _ in ends)
 
     def closing(motions: list[Motion]) -> Array:
@@ -278,7 +280,7 @@ def _spring(joint: Held, now: Motion, way: Motion, fall: Array, h: float, one: A
     speed = closing(olds)
     stretch = length - tied.rest + 0.5 * h * speed
     pushed = -h * (k * stretch + c * speed) / (1 + inverse * h * (0.25 * h * k + 0.5 * c))
-    pushed, axis = settled((pushed, axis), one)
+    pushed, axis = materialize((pushed, axis), one)
     push = pushed * axis
     news = [_pushed(end, arm, old, sign * push) for (end, arm, sign), old in zip(ends, olds, strict=True)]
     lost = -0.5 * pushed * (speed + closing(news))
@@ -290,13 +292,13 @@ def _spring(joint: Held, now: Motion, way: Motion, fall: Array, h: float, one: A
     # What it changes in the fall is its own, not the contacts'.
     aside = jnp.zeros_like(lost)
     for end, _, sign in ends:
-        aside = aside + 0.5 * h * sign * dot(at_lines(fall, end.lines), push)
-    gone = [_pushed(end, arm, at_lines(way, end.lines), -0.5 * h * sign * push) for end, arm, sign in ends]
+        aside = aside + 0.5 * h * sign * dot(joint_lines(fall, end.lines), push)
+    gone = [_pushed(end, arm, joint_lines(way, end.lines), -0.5 * h * sign * push) for end, arm, sign in ends]
     work = Work(_total(-aside), _total(driven), _total(lost + aside))
     return _with(now, joint, *news), _with(way, joint, *gone), work
 
 
-def springs_energy(ties: list[Tied], bodies: list[Any], fixed: list[Any]) -> Array | float:
+def springs_energy(ties: list[JointBatch], bodies: list[Any], fixed: list[Any]) -> Array | float:
     """What all springs hold now, J [...]: k x^2 / 2 each."""
     soft = [tied for tied in ties if tied.kind == "distance"]
     if not soft:

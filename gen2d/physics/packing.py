@@ -8,12 +8,12 @@ import jax
 import jax.numpy as jnp
 
 from gen2d.records.axes import Array
-from gen2d.xla import settled
+from gen2d.xla import materialize
 
 SAFE = "promise_in_bounds"  # of indices; JAX's own check would cost a pass over them
 
 
-class Leaf(NamedTuple):
+class LeafSpec(NamedTuple):
     """Where a leaf's numbers begin, what stands before its last axes, and its type."""
 
     first: int
@@ -21,14 +21,14 @@ class Leaf(NamedTuple):
     dtype: Any
 
 
-class Spec(NamedTuple):
+class TableSpec(NamedTuple):
     """How a tree is made of numbers again; a leaf that is no array is kept as it is."""
 
     tree: Any
     leaves: list[Any]
 
 
-def numbers(tree: Any, shape: tuple[int, ...], dtype: Any, once: bool = False) -> tuple[list[Array], Spec]:
+def pack(tree: Any, shape: tuple[int, ...], dtype: Any, once: bool = False) -> tuple[list[Array], TableSpec]:
     """Every number of the tree, each an array of `shape`, and how to get the tree back.
 
     Leaves are arrays [..., *shape], or broadcast to that; with `once` the same array is taken only once, wherever it
@@ -36,7 +36,7 @@ def numbers(tree: Any, shape: tuple[int, ...], dtype: Any, once: bool = False) -
     """
     leaves, treedef = jax.tree.flatten(tree)
     found: list[Array] = []
-    known: dict[int, Leaf] = {}
+    known: dict[int, LeafSpec] = {}
     parts: list[Any] = []
     for leaf in leaves:
         if isinstance(leaf, bool):
@@ -44,17 +44,17 @@ def numbers(tree: Any, shape: tuple[int, ...], dtype: Any, once: bool = False) -
             continue
         if not once or id(leaf) not in known:
             lead = leaf.shape[: max(leaf.ndim - len(shape), 0)]
-            known[id(leaf)] = Leaf(len(found), lead, leaf.dtype)
+            known[id(leaf)] = LeafSpec(len(found), lead, leaf.dtype)
             found += list(jnp.broadcast_to(leaf, (*lead, *shape)).reshape(-1, *shape).astype(dtype))
         parts.append(known[id(leaf)])
-    return found, Spec(treedef, parts)
+    return found, TableSpec(treedef, parts)
 
 
-def rebuilt(found: Sequence[Array], spec: Spec) -> Any:
+def unpack(found: Sequence[Array], spec: TableSpec) -> Any:
     """The tree of its numbers."""
 
     def leaf(part: Any) -> Any:
-        if not isinstance(part, Leaf):
+        if not isinstance(part, LeafSpec):
             return part
         own = found[part.first : part.first + math.prod(part.lead)]
         whole = jnp.stack(list(own)).reshape(*part.lead, *own[0].shape) if part.lead else own[0]
@@ -63,36 +63,36 @@ def rebuilt(found: Sequence[Array], spec: Spec) -> Any:
     return jax.tree.unflatten(spec.tree, [leaf(part) for part in spec.leaves])
 
 
-class Table(NamedTuple):
+class PackedTable(NamedTuple):
     """The numbers of things, a line each, and a last line that is nobody's."""
 
     lines: Array  # [N n + 1, F]
-    spec: Spec
+    spec: TableSpec
 
     def at(self, where: Array) -> Any:
         """The tree with leaves [..., C] of some lines."""
-        return rebuilt(list(self.lines.at[where].get(mode=SAFE).T), self.spec)
+        return unpack(list(self.lines.at[where].get(mode=SAFE).T), self.spec)
 
-    def put(self, where: Array, tree: Any, one: Array) -> "Table":
+    def put(self, where: Array, tree: Any, one: Array) -> "PackedTable":
         """The table with other lines there; two may be the same only if they are the last."""
-        found, _ = numbers(tree, where.shape, self.lines.dtype)
+        found, _ = pack(tree, where.shape, self.lines.dtype)
         if not found:
             return self
-        return self._replace(lines=self.lines.at[where].set(settled(jnp.stack(found), one).T, mode=SAFE))
+        return self._replace(lines=self.lines.at[where].set(materialize(jnp.stack(found), one).T, mode=SAFE))
 
     def whole(self, shape: tuple[int, ...]) -> Any:
         """The tree with leaves [..., *shape] of all lines but the last."""
-        return rebuilt([column.reshape(shape) for column in self.lines[:-1].T], self.spec)
+        return unpack([column.reshape(shape) for column in self.lines[:-1].T], self.spec)
 
 
-def table(tree: Any, shape: tuple[int, ...], dtype: Any) -> Table:
+def make_table(tree: Any, shape: tuple[int, ...], dtype: Any) -> PackedTable:
     """Leaves [..., *shape] as a table of as many lines, and one of zeros."""
-    found, spec = numbers(tree, shape, dtype)
+    found, spec = pack(tree, shape, dtype)
     columns = [x.reshape(-1) for x in found] or [jnp.zeros(math.prod(shape), dtype)]
-    return Table(jnp.pad(jnp.stack(columns, axis=-1), ((0, 1), (0, 0))), spec)
+    return PackedTable(jnp.pad(jnp.stack(columns, axis=-1), ((0, 1), (0, 0))), spec)
 
 
-def repeated(tree: Any, count: int, dtype: Any) -> Table:
+def repeat_rows(tree: Any, count: int, dtype: Any) -> PackedTable:
     """A table of `count` lines, each of them this tree of leaves [..., 1], and one more."""
-    found, spec = numbers(tree, (1,), dtype)
-    return Table(jnp.broadcast_to(jnp.concatenate(found), (count + 1, len(found))), spec)
+    found, spec = pack(tree, (1,), dtype)
+    return PackedTable(jnp.broadcast_to(jnp.concatenate(found), (count + 1, len(found))), spec)

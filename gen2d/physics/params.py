@@ -7,7 +7,7 @@ from gen2d.config.sections import PhysicsOptions
 
 
 @dataclasses.dataclass(frozen=True)
-class Rules:
+class SolverParams:
     """The numbers of a step; `rollout.rules_of` makes them from the config."""
 
     step: float  # s
@@ -26,10 +26,10 @@ class Rules:
         return omega / a1, a2 / (1 + a2), 1 / (1 + a2)
 
 
-def rules_of(physics: PhysicsOptions, fps: float, steps: int) -> Rules:
+def solver_params(physics: PhysicsOptions, fps: float, steps: int) -> SolverParams:
     """The solver's numbers, from the options of physics and the steps of a frame."""
     step = 1 / (fps * steps)
-    return Rules(
+    return SolverParams(
         step=step,
         bounce_threshold=physics.bounce_threshold,
         hertz=min(physics.contact_hertz, 0.125 / step),

@@ -18,23 +18,23 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gen2d.physics.banded import factored, solved
+from gen2d.physics.banded import factor, solve_factored
 from gen2d.physics.collision import dot, turned
 from gen2d.physics.constraint import Inertia, Motion
 from gen2d.physics.energy import Work
-from gen2d.physics.joint_forces import End, anchors_of, at_lines, direction_of, groups_of, table_of
+from gen2d.physics.joint_forces import JointSide, anchors_of, direction_of, groups_of, joint_lines, table_of
 from gen2d.records.axes import Array
-from gen2d.records.layout import Tie
-from gen2d.xla import settled
+from gen2d.records.layout import JointSpec
+from gen2d.xla import materialize
 
 X, Y, ALONG, ACROSS = range(4)  # the direction of a row
-GIVE = 1e-5  # of a row's own term, as softness: what keeps the impulses of joints bounded that say the same twice
-NEWTON = 2  # times: one leaves a fast double pendulum three times the error of energy
+COMPLIANCE = 1e-5  # of a row's own term, as softness: what keeps the impulses of joints bounded that say the same twice
+NEWTON_ITERATIONS = 2  # times: one leaves a fast double pendulum three times the error of energy
 FASTEST = 10.0  # m/s: anchors that are apart come together no faster
 
 
 @dataclasses.dataclass(frozen=True)
-class Plan:
+class JointSystemPlan:
     """Which rows there are and what they share; R rows of J joints in a table with N moving bodies."""
 
     joint: np.ndarray  # [R] whose row it is
@@ -74,7 +74,7 @@ class Plan:
         return np.stack([np.pad(p, (0, deep - len(p)), constant_values=2 * rows) for p in places], axis=1)
 
 
-def plan_of(ties: Sequence[Tie], moving: int) -> Plan:
+def joint_system_plan(ties: Sequence[JointSpec], moving: int) -> JointSystemPlan:
     """The plan of joints, whose bodies are named by their lines in the table, moving ones first.
 
     Two hinges weld two bodies: the second has a row only across the line between them, a third would say nothing new.
@@ -99,33 +99,33 @@ def plan_of(ties: Sequence[Tie], moving: int) -> Plan:
 
     rows = [row for j in order for row in ways(int(j))]
     joint, way, other = (np.array(x) for x in zip(*rows, strict=True))
-    return Plan(joint, way, other, (a, b), moving)
+    return JointSystemPlan(joint, way, other, (a, b), moving)
 
 
-class Linkage(NamedTuple):
+class JointSystem(NamedTuple):
     """All joints of a scene, each [J, ...]."""
 
-    plan: Plan
-    a: End
-    b: End
+    plan: JointSystemPlan
+    a: JointSide
+    b: JointSide
     inertia: Inertia  # of all bodies in the table; zero of fixed ones
     rigid: Array  # bool: whether it is there, and no spring
     rest: Array  # m, of rods
 
 
-class Rows(NamedTuple):
+class JointRows(NamedTuple):
     """The rows as they stand, each [R, ...]."""
 
     direction: Array  # [2, R, ...]
     levers: tuple[Array, Array]  # m, of both sides: what turns a body
 
 
-def unpushed(linkage: Linkage) -> Array:
+def zero_impulses(linkage: JointSystem) -> Array:
     """The rows' impulses, N s [R, ...], when they have done nothing."""
     return jnp.zeros_like(linkage.rest[..., linkage.plan.joint, :])
 
 
-class Stance(NamedTuple):
+class Anchors(NamedTuple):
     """The joints as they stand, each [2, J, ...] m."""
 
     arm_a: Array
@@ -133,64 +133,66 @@ class Stance(NamedTuple):
     apart: Array  # from a's anchor to b's
 
 
-def _apart(linkage: Linkage, rows: Rows, apart: Array) -> Array:
+def _apart(linkage: JointSystem, rows: JointRows, apart: Array) -> Array:
     """How far the anchors are from where they belong, along each row, m [R, ...]."""
     plan = linkage.plan
     length = direction_of(apart)[1] - linkage.rest
-    beside = dot(at_lines(apart, plan.joint), rows.direction)
-    return jnp.where((plan.way == ALONG)[:, None], at_lines(length, plan.joint), beside)
+    beside = dot(joint_lines(apart, plan.joint), rows.direction)
+    return jnp.where((plan.way == ALONG)[:, None], joint_lines(length, plan.joint), beside)
 
 
-def _rows(linkage: Linkage, stance: Stance, one: Array) -> Rows:
+def _rows(linkage: JointSystem, stance: Anchors, one: Array) -> JointRows:
     plan, dtype = linkage.plan, linkage.rest.dtype
     direction = jnp.asarray(np.stack([plan.way == X, plan.way == Y])[..., None], dtype)
     direction = jnp.broadcast_to(direction, (*direction.shape[:2], *linkage.rest.shape[1:]))
     if (plan.way == ALONG).any():
-        along = at_lines(direction_of(stance.apart)[0], plan.joint)
+        along = joint_lines(direction_of(stance.apart)[0], plan.joint)
         direction = jnp.where((plan.way == ALONG)[:, None], along, direction)
     if (plan.way == ACROSS).any():
-        a, of_other = plan.lines[0], at_lines(stance.arm_a, plan.other)
+        a, of_other = plan.lines[0], joint_lines(stance.arm_a, plan.other)
         same = (a[plan.joint] == a[plan.other])[:, None]
-        between = at_lines(stance.arm_a, plan.joint) - jnp.where(same, of_other, at_lines(stance.arm_b, plan.other))
+        between = joint_lines(stance.arm_a, plan.joint) - jnp.where(
+            same, of_other, joint_lines(stance.arm_b, plan.other)
+        )
         direction = jnp.where((plan.way == ACROSS)[:, None], turned(direction_of(between)[0]), direction)
-    lever_a, lever_b = (dot(turned(at_lines(arm, plan.joint)), direction) for arm in (stance.arm_a, stance.arm_b))
-    return settled(Rows(direction, (lever_a, lever_b)), one)
+    lever_a, lever_b = (dot(turned(joint_lines(arm, plan.joint)), direction) for arm in (stance.arm_a, stance.arm_b))
+    return materialize(JointRows(direction, (lever_a, lever_b)), one)
 
 
-def _pushed(linkage: Linkage, rows: Rows, table: Motion, impulses: Array, one: Array) -> Motion:
+def _pushed(linkage: JointSystem, rows: JointRows, table: Motion, impulses: Array, one: Array) -> Motion:
     """The motions after the rows' impulses."""
     push, (lever_a, lever_b) = impulses * rows.direction, rows.levers
     parts = Motion(
         jnp.concatenate([-push, push, jnp.zeros_like(push[:, :1])], axis=-2),
         jnp.concatenate([-lever_a * impulses, lever_b * impulses, jnp.zeros_like(impulses[:1])], axis=-2),
     )
-    parts, total = settled(parts, one), None
+    parts, total = materialize(parts, one), None
     for places in linkage.plan.pushers():
-        part = at_lines(parts, places)
+        part = joint_lines(parts, places)
         total = part if total is None else jax.tree.map(jnp.add, total, part)
     assert total is not None
     moving = linkage.plan.moving
     mass, moment = (x[:moving] for x in linkage.inertia)
     more = Motion(mass * total.velocity, moment * total.spin)
     new = jax.tree.map(lambda x, y: jnp.concatenate([x[..., :moving, :] + y, x[..., moving:, :]], axis=-2), table, more)
-    return settled(new, one)
+    return materialize(new, one)
 
 
-def _speeds(linkage: Linkage, rows: Rows, table: Motion) -> Array:
+def _speeds(linkage: JointSystem, rows: JointRows, table: Motion) -> Array:
     """How fast the anchors part along each row, m/s."""
     plan, speeds = linkage.plan, []
     for lines, lever in zip(plan.lines, rows.levers, strict=True):
-        motion = at_lines(table, lines[plan.joint])
+        motion = joint_lines(table, lines[plan.joint])
         speeds.append(dot(rows.direction, motion.velocity) + lever * motion.spin)
     return speeds[1] - speeds[0]
 
 
-def _bands(linkage: Linkage, rows: Rows, one: Array) -> list[Array]:
+def _bands(linkage: JointSystem, rows: JointRows, one: Array) -> list[Array]:
     """The diagonals of J M^-1 J^T, 1/kg [R, ...], from the main one on: the speed along the row so many rows later that
     a unit impulse along this one gives."""
     plan, bands = linkage.plan, []
-    usable = at_lines(linkage.rigid, plan.joint)
-    inertias = [at_lines(end.inertia, plan.joint) for end in (linkage.a, linkage.b)]
+    usable = joint_lines(linkage.rigid, plan.joint)
+    inertias = [joint_lines(end.inertia, plan.joint) for end in (linkage.a, linkage.b)]
     count = len(plan.joint)
     for offset in range(plan.width):
         here, there = slice(0, count - offset), slice(offset, count)
@@ -205,11 +207,13 @@ def _bands(linkage: Linkage, rows: Rows, one: Array) -> list[Array]:
     for offset in range(1, plan.width):
         both = usable & jnp.concatenate([usable[offset:], jnp.zeros_like(usable[:offset])], axis=-2)
         bands[offset] = jnp.where(both, bands[offset], 0.0)
-    bands[0] = jnp.where(usable, (1 + GIVE) * bands[0], jnp.inf)
-    return settled(bands, one)
+    bands[0] = jnp.where(usable, (1 + COMPLIANCE) * bands[0], jnp.inf)
+    return materialize(bands, one)
 
 
-def _exchanged(linkage: Linkage, rows: Rows, table: Motion, impulses: Array, one: Array) -> tuple[Motion, Work]:
+def _exchanged(
+    linkage: JointSystem, rows: JointRows, table: Motion, impulses: Array, one: Array
+) -> tuple[Motion, Work]:
     """The motions after impulses, and the work that these do, J [1, ...]."""
     new = _pushed(linkage, rows, table, impulses, one)
     gained = 0.5 * impulses * (_speeds(linkage, rows, table) + _speeds(linkage, rows, new))
@@ -217,27 +221,27 @@ def _exchanged(linkage: Linkage, rows: Rows, table: Motion, impulses: Array, one
     for end, lever, sign in zip((linkage.a, linkage.b), rows.levers, (-1, 1), strict=True):
         of = linkage.plan.joint
         if end.fixed.any():  # what moves as it likes does work where it is held
-            motion = at_lines(new, end.lines[of])
+            motion = joint_lines(new, end.lines[of])
             work = impulses * (dot(rows.direction, motion.velocity) + lever * motion.spin)
             driven = driven - sign * jnp.where(end.fixed[of][:, None], work, 0.0)
     lost, driven = (jnp.sum(x, axis=-2, keepdims=True) for x in (-gained, driven))
     return new, Work(lost, driven, None)
 
 
-def warm(
-    linkage: Linkage, bodies: list[Any], fixed: list[Any], motions: list[Motion], impulses: Array, one: Array
-) -> tuple[Stance, list[Motion], Work]:
+def warm_start(
+    linkage: JointSystem, bodies: list[Any], fixed: list[Any], motions: list[Motion], impulses: Array, one: Array
+) -> tuple[Anchors, list[Motion], Work]:
     """The joints as they stand, the motions with the last step's impulses, and the work done."""
     places = table_of(*([(body.position, body.angle) for body in some] for some in (bodies, fixed)))
-    stance = Stance(*anchors_of(linkage.a, linkage.b, places, one))
+    stance = Anchors(*anchors_of(linkage.a, linkage.b, places, one))
     now = table_of(motions, [body.motion for body in fixed])
     now, work = _exchanged(linkage, _rows(linkage, stance, one), now, impulses, one)
     return stance, groups_of(now, motions), work
 
 
 def solve(
-    linkage: Linkage,
-    stance: Stance,
+    linkage: JointSystem,
+    stance: Anchors,
     motions: list[Motion],
     beyond: list[Motion],
     fixed: list[Any],
@@ -255,7 +259,7 @@ def solve(
     early = _apart(linkage, rows, stance.apart)
     undone = early - jnp.clip(early, -h * FASTEST, h * FASTEST)
     matrix = _Matrix(linkage, rows, one)
-    for _ in range(NEWTON):
+    for _ in range(NEWTON_ITERATIONS):
         way = jax.tree.map(lambda x, y: h * x + y, now, more)
         late = _apart(linkage, rows, _gone(linkage, stance, way, one).apart)
         impulses, now, work = matrix.closed(now, impulses, (late - undone) / h)
@@ -264,8 +268,8 @@ def solve(
 
 
 def relax(
-    linkage: Linkage,
-    stance: Stance,
+    linkage: JointSystem,
+    stance: Anchors,
     motions: list[Motion],
     ways: list[Motion],
     fixed: list[Any],
@@ -281,28 +285,28 @@ def relax(
     return groups_of(now, motions), impulses, work
 
 
-def _gone(linkage: Linkage, stance: Stance, ways: Motion, one: Array) -> Stance:
+def _gone(linkage: JointSystem, stance: Anchors, ways: Motion, one: Array) -> Anchors:
     """The joints as they stand after the bodies have gone their ways."""
     arms, apart = [], stance.apart
     for lines, arm, sign in zip(linkage.plan.lines, stance[:2], (-1, 1), strict=True):
-        way = at_lines(ways, lines)
+        way = joint_lines(ways, lines)
         more = jnp.sin(way.spin) * turned(arm) - 2 * jnp.sin(way.spin / 2) ** 2 * arm
-        arms.append(settled(arm + more, one))
+        arms.append(materialize(arm + more, one))
         apart = apart + sign * (way.velocity + more)
-    return Stance(arms[0], arms[1], apart)
+    return Anchors(arms[0], arms[1], apart)
 
 
 class _Matrix:
     """The system of the rows, factored."""
 
-    def __init__(self, linkage: Linkage, rows: Rows, one: Array) -> None:
+    def __init__(self, linkage: JointSystem, rows: JointRows, one: Array) -> None:
         bands = _bands(linkage, rows, one)
         self._of, self._rows, self._one = linkage, rows, one
-        self._give = jnp.where(jnp.isfinite(bands[0]), GIVE * bands[0], 0.0)
-        self._factors = factored(bands)
+        self._give = jnp.where(jnp.isfinite(bands[0]), COMPLIANCE * bands[0], 0.0)
+        self._factors = factor(bands)
 
     def closed(self, now: Motion, impulses: Array, speeds: Array) -> tuple[Array, Motion, Work]:
         """The impulses that take these speeds from the rows, the motions with them, and the work done."""
-        wanted = settled(speeds + self._give * impulses, self._one)
-        more = -settled(solved(self._factors, wanted), self._one)
+        wanted = materialize(speeds + self._give * impulses, self._one)
+        more = -materialize(solve_factored(self._factors, wanted), self._one)
         return impulses + more, *_exchanged(self._of, self._rows, now, more, self._one)

@@ -1,8 +1,8 @@
 """Every pair that can meet, as many at a time as share no body, without gather or scatter.
 
-Bodies of one group meet each other as in a round-robin tournament, by the circle method (`tournament`); those of two
-groups meet while one group moves past the other (`league`); a fixed body meets all of a group at once. `sweep` plays
-them all, one after the other.
+Bodies of one group meet in a round-robin tournament, by the circle method (`round_robin`). Bodies of two groups meet
+while one group moves past the other (`bipartite_rounds`). A static body meets all of a group at once. `run_schedule`
+plays all rounds, one after the other.
 """
 
 from collections.abc import Callable
@@ -15,18 +15,18 @@ import numpy as np
 from gen2d.records.axes import Array
 
 
-def halves(values: Any) -> tuple[Any, Any]:
+def split_halves(values: Any) -> tuple[Any, Any]:
     """Two half-arrays over the bodies (the axis before the scenes'): each of the first meets one of the second."""
     count = jax.tree.leaves(values)[0].shape[-2] // 2
     return jax.tree.map(lambda x: x[..., :count, :], values), jax.tree.map(lambda x: x[..., count:, :], values)
 
 
-def whole(first: Any, second: Any) -> Any:
-    """The inverse of `halves`."""
+def join_halves(first: Any, second: Any) -> Any:
+    """The inverse of `split_halves`."""
     return jax.tree.map(lambda x, y: jnp.concatenate([x, y], axis=-2), first, second)
 
 
-def moved_on(first: Any, second: Any) -> tuple[Any, Any]:
+def rotate(first: Any, second: Any) -> tuple[Any, Any]:
     """Both halves after one rotation of the circle method; N - 1 of them come back to the start."""
 
     def one_half(x: Array, y: Array) -> Array:
@@ -40,17 +40,17 @@ def moved_on(first: Any, second: Any) -> tuple[Any, Any]:
     return jax.tree.map(one_half, first, second), jax.tree.map(other_half, first, second)
 
 
-def tournament(values: Any, rounds: int, play: Callable) -> tuple[Any, list]:
+def round_robin(values: Any, rounds: int, play: Callable) -> tuple[Any, list]:
     """The bodies after all rounds, and what `play(k, first, second) -> (first, second, out)` gave in each."""
-    first, second, outs = *halves(values), []
+    first, second, outs = *split_halves(values), []
     for k in range(rounds):
         first, second, out = play(k, first, second)
         outs.append(out)
-        first, second = moved_on(first, second)
-    return whole(first, second), outs
+        first, second = rotate(first, second)
+    return join_halves(first, second), outs
 
 
-def league(first: Any, second: Any, play: Callable) -> tuple[Any, Any, list]:
+def bipartite_rounds(first: Any, second: Any, play: Callable) -> tuple[Any, Any, list]:
     """Both groups after every one of the first has met every one of the second, and what each round gave."""
     n, m = (jax.tree.leaves(x)[0].shape[-2] for x in (first, second))
     few, outs = min(n, m), []
@@ -87,12 +87,12 @@ def matches(sizes: list[int], fixed: int) -> list[Match]:
     return found + [Match(f, g, 1, fixed=True) for f in range(fixed) for g in range(len(sizes))]
 
 
-def of_rows(order: list[Match]) -> list[Match]:
+def match_of_rows(order: list[Match]) -> list[Match]:
     """The match of each row: a match has one row a round."""
     return [match for match in order for _ in range(match.rounds)]
 
 
-def meetings(first: int, second: int, match: Match) -> tuple[np.ndarray, np.ndarray]:
+def pairings(first: int, second: int, match: Match) -> tuple[np.ndarray, np.ndarray]:
     """Who meets in each round of a match, [R, P], by their numbers in their groups."""
 
     def play(_: int, a: Array, b: Array) -> tuple[Array, Array, tuple[Array, Array]]:
@@ -100,12 +100,12 @@ def meetings(first: int, second: int, match: Match) -> tuple[np.ndarray, np.ndar
 
     with jax.ensure_compile_time_eval():
         a, b = (jnp.arange(size)[:, None] for size in (first, second))
-        *_, rounds = tournament(a, match.rounds, play) if match.first == match.second else league(a, b, play)
+        *_, rounds = round_robin(a, match.rounds, play) if match.first == match.second else bipartite_rounds(a, b, play)
         a, b = (np.array([np.asarray(side) for side in sides]) for sides in zip(*rounds, strict=True))
     return a, b
 
 
-def sweep(groups: list, fixed: list, order: list[Match], play: Callable) -> tuple[list, list]:
+def run_schedule(groups: list, fixed: list, order: list[Match], play: Callable) -> tuple[list, list]:
     """The groups after all matches, and what `play(row, a, b) -> (a, b, out)` gave for each row, counted from 0."""
     groups, outs = list(groups), []
     for match in order:
@@ -118,8 +118,8 @@ def sweep(groups: list, fixed: list, order: list[Match], play: Callable) -> tupl
             _, groups[j], out = play(begun, fixed[i], groups[j])
             out = [out]
         elif i == j:
-            groups[i], out = tournament(groups[i], match.rounds, one)
+            groups[i], out = round_robin(groups[i], match.rounds, one)
         else:
-            groups[i], groups[j], out = league(groups[i], groups[j], one)
+            groups[i], groups[j], out = bipartite_rounds(groups[i], groups[j], one)
         outs += out
     return groups, outs

@@ -13,22 +13,22 @@ import numpy as np
 
 from gen2d.core.enums import DYNAMIC, KINEMATIC
 from gen2d.physics import joint_forces, rigid_joints
-from gen2d.physics.all_pairs import Dense
-from gen2d.physics.broad_phase import ring_of
+from gen2d.physics.all_pairs import AllPairs
+from gen2d.physics.broad_phase import round_robin_of
 from gen2d.physics.collision import FAR, Stadium, dot, from_core
-from gen2d.physics.constraint import Inertia, Motion, Row, grip_of, mixed, reciprocal
-from gen2d.physics.contact_state import Setup
-from gen2d.physics.nearby_pairs import Kind, Post, Seat, Sparse, chunk_of
-from gen2d.physics.params import Rules
-from gen2d.physics.schedule import matches, meetings, of_rows, sweep
-from gen2d.physics.shapes import DiscForm, Form, StadiumForm, form_of, placed
-from gen2d.physics.state import Fixed, Group, Scenery
+from gen2d.physics.constraint import ContactConstraint, Inertia, Motion, frame_of, mix_materials, reciprocal
+from gen2d.physics.contact_state import PassSetup
+from gen2d.physics.nearby_pairs import DynamicSide, NearbyPairs, PairBatch, StaticSide, chunk_of
+from gen2d.physics.params import SolverParams
+from gen2d.physics.schedule import match_of_rows, matches, pairings, run_schedule
+from gen2d.physics.shapes import BodyShape, CapsuleShape, DiscShape, body_shape_of, to_world
+from gen2d.physics.state import BodyGroupState, Model, StaticBody
 from gen2d.records.axes import Array, Record
-from gen2d.records.layout import Layout, Run, Tie
+from gen2d.records.layout import JointSpec, Layout, SlotGroup
 from gen2d.records.scene import Objects, Scene, State
 
 
-class Side(NamedTuple):
+class GroupSide(NamedTuple):
     """What a row needs to know of one of its sides."""
 
     inverse: Inertia | None
@@ -40,7 +40,7 @@ class Side(NamedTuple):
     slot: Array
 
 
-def cleaned(scene: Scene, state: State) -> tuple[Scene, State]:
+def without_empty(scene: Scene, state: State) -> tuple[Scene, State]:
     """Both with nothing in their empty slots, so that whatever stood there (NaN, too) cannot matter."""
     present = scene.objects.present
 
@@ -50,7 +50,7 @@ def cleaned(scene: Scene, state: State) -> tuple[Scene, State]:
     return Scene(clean(scene.objects), scene.gravity, scene.joints), clean(state)
 
 
-def padded(count: int) -> int:
+def pad_groups(count: int) -> int:
     """How many bodies a group of so many has: a tournament needs an even number."""
     return count + count % 2 if count > 1 else count
 
@@ -65,12 +65,12 @@ def slots_of(value: Any, first: int, count: int, room: int | None = None) -> Any
     return jax.tree.map(some, value)
 
 
-def moving(layout: Layout) -> list[tuple[Run, int]]:
+def moving(layout: Layout) -> list[tuple[SlotGroup, int]]:
     """The runs of dynamic bodies, each a group, and their first slots."""
     return [(run, first) for run, first in layout.spans if run.kind == DYNAMIC]
 
 
-def standing(layout: Layout) -> list[tuple[Run, int]]:
+def standing(layout: Layout) -> list[tuple[SlotGroup, int]]:
     """Every static and kinematic slot, and the run that it is in."""
     runs = [(run, first) for run, first in layout.spans if run.kind != DYNAMIC]
     return [(run, first + i) for run, first in runs for i in range(run.count)]
@@ -80,29 +80,29 @@ def _inverse(value: Array, present: Array) -> Array:
     return reciprocal(value, present & jnp.isfinite(value) & (value > 0))
 
 
-def _group(objects: Objects, layout: Layout, run: Run, first: int) -> Group:
-    some = slots_of(objects, first, run.count, padded(run.count))
+def _group(objects: Objects, layout: Layout, run: SlotGroup, first: int) -> BodyGroupState:
+    some = slots_of(objects, first, run.count, pad_groups(run.count))
     inverse = Inertia(_inverse(some.mass, some.present), _inverse(some.moment, some.present))
     mass, moment = (_inverse(x, x > 0) for x in inverse)
-    return Group(form_of(some, run, slice(None)), inverse, mass, moment, run.collides)
+    return BodyGroupState(body_shape_of(some, run, slice(None)), inverse, mass, moment, run.collides)
 
 
-def _fixed(objects: Objects, state: State, run: Run, slot: int) -> Fixed:
+def _fixed(objects: Objects, state: State, run: SlotGroup, slot: int) -> StaticBody:
     some, place = slots_of(objects, slot, 1), slots_of(state, slot, 1)
     motion = Motion(place.velocity, place.angular_velocity) if run.kind == KINEMATIC else None
-    form = form_of(some, run, slice(None))
-    return Fixed(form, place.position, place.angle, motion, placed(form, place.position, place.angle))
+    form = body_shape_of(some, run, slice(None))
+    return StaticBody(form, place.position, place.angle, motion, to_world(form, place.position, place.angle))
 
 
-def _side(objects: Objects, first: int, count: int, inverse: Inertia | None) -> Side:
-    some = slots_of(objects, first, count, padded(count))
-    slots = jnp.broadcast_to(jnp.arange(first, first + padded(count))[:, None], some.radius.shape)
+def _side(objects: Objects, first: int, count: int, inverse: Inertia | None) -> GroupSide:
+    some = slots_of(objects, first, count, pad_groups(count))
+    slots = jnp.broadcast_to(jnp.arange(first, first + pad_groups(count))[:, None], some.radius.shape)
     resistance = some.rolling_resistance
     rolling = None if resistance is None else resistance * some.radius
-    return Side(inverse, some.present, some.radius, some.elasticity, some.friction, rolling, slots)
+    return GroupSide(inverse, some.present, some.radius, some.elasticity, some.friction, rolling, slots)
 
 
-def _sides(objects: Objects, layout: Layout, groups: list[Group]) -> tuple[list[Side], list[Side]]:
+def _sides(objects: Objects, layout: Layout, groups: list[BodyGroupState]) -> tuple[list[GroupSide], list[GroupSide]]:
     """Of the groups and of the fixed bodies; a kinematic one has an inertia, which is infinite."""
     ours = [_side(objects, s, run.count, g.inverse) for (run, s), g in zip(moving(layout), groups, strict=True)]
     nothing = jnp.zeros_like(objects.radius[:1])
@@ -111,7 +111,7 @@ def _sides(objects: Objects, layout: Layout, groups: list[Group]) -> tuple[list[
     return ours, theirs
 
 
-def _apart(a: Side, b: Side, layout: Layout) -> Array:
+def _apart(a: GroupSide, b: GroupSide, layout: Layout) -> Array:
     """Where two collide: where no joint ties them together, and neither is of a run that nothing touches."""
     tied = [tie for tie in layout.joints if not tie.collide]
     together = jnp.zeros(b.slot.shape, bool)
@@ -124,14 +124,16 @@ def _apart(a: Side, b: Side, layout: Layout) -> Array:
     return ~together
 
 
-def _round(a: Form, b: Form, fixed: bool, still: bool) -> bool:
+def _round(a: BodyShape, b: BodyShape, fixed: bool, still: bool) -> bool:
     """Whether a pair's levers are known beforehand: two discs, or a disc on something that stands still."""
-    if not isinstance(b, DiscForm):
+    if not isinstance(b, DiscShape):
         return False
-    return (isinstance(a, DiscForm) and (not fixed or still)) or (isinstance(a, StadiumForm) and fixed and still)
+    return (isinstance(a, DiscShape) and (not fixed or still)) or (isinstance(a, CapsuleShape) and fixed and still)
 
 
-def _row(a: Side, b: Side, forms: tuple[Form, Form], fixed: bool, layout: Layout, mixing: str) -> Row:
+def _row(
+    a: GroupSide, b: GroupSide, forms: tuple[BodyShape, BodyShape], fixed: bool, layout: Layout, mixing: str
+) -> ContactConstraint:
     rolling = None
     if a.rolling is not None and b.rolling is not None:
         rolling = jnp.maximum(a.rolling, b.rolling) + jnp.zeros_like(b.radius)
@@ -141,12 +143,15 @@ def _row(a: Side, b: Side, forms: tuple[Form, Form], fixed: bool, layout: Layout
     here = a.present & b.present & (b.inverse.mass > 0) & _apart(a, b, layout)
     if a.inverse is not None and not fixed:
         here = here & (a.inverse.mass > 0)
-    elasticity, friction = mixed(a.elasticity, b.elasticity, mixing), mixed(a.friction, b.friction, mixing)
-    row = Row(a.inverse, b.inverse, here, elasticity, friction, rolling, None, fixed)
+    elasticity, friction = (
+        mix_materials(a.elasticity, b.elasticity, mixing),
+        mix_materials(a.friction, b.friction, mixing),
+    )
+    row = ContactConstraint(a.inverse, b.inverse, here, elasticity, friction, rolling, None, fixed)
     if not _round(*forms, fixed, a.inverse is None):
         return row
     levers = None, None, None if a.inverse is None else a.radius, -b.radius
-    return row._replace(grip=grip_of(row, levers, here))
+    return row._replace(grip=frame_of(row, levers, here))
 
 
 TOGETHER = 1e-4  # m: ends that are so near to another segment lie on it
@@ -172,7 +177,7 @@ def _onward(ends: Array, own: np.ndarray, shapes: Stadium) -> tuple[Array, Array
     return jax.lax.scan(on, (nothing, nothing), (shapes, jnp.arange(len(shapes.radius))))[0]
 
 
-def _ways(fixed: list[Fixed]) -> dict[int, list]:
+def _ways(fixed: list[StaticBody]) -> dict[int, list]:
     """Of each fixed segment that stands still what goes on from its two ends; nothing where there is one at most."""
     lines = {i: f.shape for i, f in enumerate(fixed) if isinstance(f.shape, Stadium) and f.motion is None}
     if len(lines) < 2:
@@ -187,53 +192,63 @@ def _ways(fixed: list[Fixed]) -> dict[int, list]:
 
 
 def _dense(
-    objects: Objects, layout: Layout, groups: list[Group], fixed: list[Fixed], setup: Setup, rules: Rules
-) -> Dense:
-    order = matches([padded(run.count) for run, _ in moving(layout)], len(fixed))
-    forms, matched, ways = [g.form for g in groups], of_rows(order), _ways(fixed)
+    objects: Objects,
+    layout: Layout,
+    groups: list[BodyGroupState],
+    fixed: list[StaticBody],
+    setup: PassSetup,
+    rules: SolverParams,
+) -> AllPairs:
+    order = matches([pad_groups(run.count) for run, _ in moving(layout)], len(fixed))
+    forms, matched, ways = [g.form for g in groups], match_of_rows(order), _ways(fixed)
     pairs = [(fixed[m.first].form if m.fixed else forms[m.first], forms[m.second]) for m in matched]
 
-    def play(k: int, a: Side, b: Side) -> tuple[Side, Side, tuple[Row, Array, Array]]:
+    def play(k: int, a: GroupSide, b: GroupSide) -> tuple[GroupSide, GroupSide, tuple[ContactConstraint, Array, Array]]:
         row, m = _row(a, b, pairs[k], matched[k].fixed, layout, rules.mixing), matched[k]
         if row.grip is not None and m.fixed and m.first in ways:
             row = row._replace(left=ways[m.first][0], right=ways[m.first][1])
         return a, b, (row, jnp.broadcast_to(a.slot, b.slot.shape), b.slot)
 
-    _, made = sweep(*_sides(objects, layout, groups), order, play)
+    _, made = run_schedule(*_sides(objects, layout, groups), order, play)
     points = [_points(*of) for of in pairs]
-    return Dense([row for row, *_ in made], points, [(a, b) for _, a, b in made], order, setup, rules)
+    return AllPairs([row for row, *_ in made], points, [(a, b) for _, a, b in made], order, setup, rules)
 
 
-def _points(a: Form, b: Form) -> int:
+def _points(a: BodyShape, b: BodyShape) -> int:
     """How many points of contact two shapes have."""
     return 1 if _is_disc(a) or _is_disc(b) else 2
 
 
 def _sparse(
-    objects: Objects, layout: Layout, groups: list[Group], fixed: list[Fixed], setup: Setup, rules: Rules
-) -> Sparse:
+    objects: Objects,
+    layout: Layout,
+    groups: list[BodyGroupState],
+    fixed: list[StaticBody],
+    setup: PassSetup,
+    rules: SolverParams,
+) -> NearbyPairs:
     ours, theirs = _sides(objects, layout, groups)
     sizes, firsts = [side.slot.shape[0] for side in ours], [first for _, first in moving(layout)]
     solid, firm = ([run.collides for run, _ in of] for of in (moving(layout), standing(layout)))
     fixed_slots, ways, kinds = [slot for _, slot in standing(layout)], _ways(fixed), []
 
-    def add(forms: tuple[Form, Form], of_a: np.ndarray, b: np.ndarray, **more: Any) -> None:
-        def row(a: Side, b: Side) -> Row:
+    def add(forms: tuple[BodyShape, BodyShape], of_a: np.ndarray, b: np.ndarray, **more: Any) -> None:
+        def row(a: GroupSide, b: GroupSide) -> ContactConstraint:
             return _row(a, b, forms, more["first"] is None, layout, rules.mixing)
 
         slots = of_a, b + firsts[more["second"]]
-        kinds.append(Kind(b=b, slots=slots, row=row, points=_points(*forms), **more))
+        kinds.append(PairBatch(b=b, slots=slots, row=row, points=_points(*forms), **more))
 
     for m in matches(sizes, 0):
         if not (solid[m.first] and solid[m.second]):
             continue
-        a, b = meetings(sizes[m.first], sizes[m.second], m)
-        ring = ring_of(a, b) if m.first == m.second else None
+        a, b = pairings(sizes[m.first], sizes[m.second], m)
+        ring = round_robin_of(a, b) if m.first == m.second else None
         forms = groups[m.first].form, groups[m.second].form
         add(forms, a + firsts[m.first], b, first=m.first, second=m.second, a=a, posts={}, ring=ring)
     for g, group in enumerate(groups):
 
-        def like(i: int, form: Form = group.form) -> tuple:
+        def like(i: int, form: BodyShape = group.form) -> tuple:
             """What fixed bodies have in common whose rows with the group are of one kind."""
             of = fixed[i]
             return type(of.form), len(jax.tree.leaves(of.form)), of.motion is None, i in ways and _is_disc(form)
@@ -242,12 +257,12 @@ def _sparse(
         for alike, numbers in itertools.groupby(touching, key=like):
             some = list(numbers)
             onward = {i: ways[i] if alike[-1] else (None, None) for i in some}
-            posts = {i: Post(theirs[i], left, right, theirs[i].present) for i, (left, right) in onward.items()}
+            posts = {i: StaticSide(theirs[i], left, right, theirs[i].present) for i, (left, right) in onward.items()}
             a, b = np.indices((len(some), sizes[g]))
             slots = np.array([fixed_slots[i] for i in some])[a]
             add((fixed[some[0]].form, group.form), slots, b, first=None, second=g, a=a, posts=posts, ring=None)
     seats = [
-        Seat(
+        DynamicSide(
             side,
             jnp.broadcast_to(setup.gravity, (2, *side.slot.shape)),
             jnp.broadcast_to(setup.threshold, side.slot.shape),
@@ -255,53 +270,53 @@ def _sparse(
         for side in ours
     ]
     rolling = objects.rolling_resistance is not None
-    return Sparse(kinds, seats, rolling, setup, rules, chunk_of(setup.threshold.shape[-1]))
+    return NearbyPairs(kinds, seats, rolling, setup, rules, chunk_of(setup.threshold.shape[-1]))
 
 
-def _is_disc(form: Form) -> bool:
-    return isinstance(form, DiscForm)
+def _is_disc(form: BodyShape) -> bool:
+    return isinstance(form, DiscShape)
 
 
 def _ties(
-    scene: Scene, layout: Layout, groups: list[Group]
-) -> tuple[list[joint_forces.Tied], rigid_joints.Linkage | None]:
+    scene: Scene, layout: Layout, groups: list[BodyGroupState]
+) -> tuple[list[joint_forces.JointBatch], rigid_joints.JointSystem | None]:
     """The joints in rounds, and what of them is rigid. A body's line in the solver's table is its place among the
     groups, or behind them."""
     if not layout.joints:
         return [], None
     values, nothing = scene.joints, jnp.zeros_like(scene.objects.mass[:1])
     assert values is not None, "a layout with joints needs scene.joints"
-    sizes, still = [padded(run.count) for run, _ in moving(layout)], [slot for _, slot in standing(layout)]
+    sizes, still = [pad_groups(run.count) for run, _ in moving(layout)], [slot for _, slot in standing(layout)]
     lines = {slot: sum(sizes) + place for place, slot in enumerate(still)}
     for g, (run, first) in enumerate(moving(layout)):
         lines |= {first + i: sum(sizes[:g]) + i for i in range(run.count)}
     unmoved = [Inertia(nothing, nothing)] * len(still)
     inverse = jax.tree.map(lambda *x: jnp.concatenate(x, axis=-2), *(g.inverse for g in groups), *unmoved)
 
-    def end(slots: np.ndarray, anchor: Array) -> joint_forces.End:
+    def end(slots: np.ndarray, anchor: Array) -> joint_forces.JointSide:
         of = np.array([lines[int(slot)] for slot in slots])
-        return joint_forces.End(of, of >= sum(sizes), joint_forces.at_lines(inverse, of), anchor)
+        return joint_forces.JointSide(of, of >= sum(sizes), joint_forces.joint_lines(inverse, of), anchor)
 
-    def tied(numbers: Sequence[int]) -> joint_forces.Tied:
-        ties, of = [layout.joints[j] for j in numbers], joint_forces.at_lines(values, np.array(numbers))
+    def tied(numbers: Sequence[int]) -> joint_forces.JointBatch:
+        ties, of = [layout.joints[j] for j in numbers], joint_forces.joint_lines(values, np.array(numbers))
         a, b = (np.array([getattr(tie, side) for tie in ties]) for side in "ab")
         there = scene.objects.present[a] & scene.objects.present[b]
         ends = end(a, of.anchor_a), end(b, of.anchor_b)
         rest = (of.rest, of.stiffness, of.damping, of.lower, of.upper, of.motor_speed, of.motor_torque)
-        return joint_forces.Tied(ties[0].kind, *ends, there, *rest)
+        return joint_forces.JointBatch(ties[0].kind, *ends, there, *rest)
 
-    named = [Tie(tie.kind, lines[tie.a], lines[tie.b]) for tie in layout.joints]
+    named = [JointSpec(tie.kind, lines[tie.a], lines[tie.b]) for tie in layout.joints]
     every = tied(range(len(named)))
     springs = np.array([tie.kind == "distance" for tie in named])[:, None] & jnp.isfinite(every.stiffness)
-    linked = rigid_joints.Linkage(
-        rigid_joints.plan_of(named, sum(sizes)), every.a, every.b, inverse, every.there & ~springs, every.rest
+    linked = rigid_joints.JointSystem(
+        rigid_joints.joint_system_plan(named, sum(sizes)), every.a, every.b, inverse, every.there & ~springs, every.rest
     )
-    return [tied(numbers) for numbers in joint_forces.rounds(named, sum(sizes))], linked
+    return [tied(numbers) for numbers in joint_forces.joint_rounds(named, sum(sizes))], linked
 
 
-def scenery_of(
-    scene: Scene, state: State, layout: Layout, rules: Rules, forces: Any, contacts: bool, sparse: bool
-) -> Scenery:
+def build_model(
+    scene: Scene, state: State, layout: Layout, rules: SolverParams, forces: Any, contacts: bool, sparse: bool
+) -> Model:
     """What stays the same for a whole video; `contacts` says whether touches shall say where they are, `sparse` which
     form of the solver it is for."""
     objects = scene.objects
@@ -310,17 +325,17 @@ def scenery_of(
     one = 1.0 + jax.lax.stop_gradient(jnp.maximum(-jnp.max(objects.radius), 0.0))  # 1, but the compiler cannot know
     # In a pile at rest, what has to be stopped anew each step is what gravity gave: that must not count as a bounce.
     at_rest = 2 * rules.step * jnp.sqrt(jnp.sum(scene.gravity**2, axis=0))
-    setup = Setup(scene.gravity[:, None], jnp.maximum(rules.bounce_threshold, at_rest), one, contacts)
+    setup = PassSetup(scene.gravity[:, None], jnp.maximum(rules.bounce_threshold, at_rest), one, contacts)
     made = (_sparse if sparse else _dense)(objects, layout, groups, fixed, setup, rules)
     rails = [
         _rail(f, objects.present[s : s + 1]) for f, (r, s) in zip(fixed, standing(layout), strict=True) if r.collides
     ]
-    return Scenery(
+    return Model(
         groups, fixed, [r for r in rails if r is not None], scene.gravity, made, *_ties(scene, layout, groups), forces
     )
 
 
-def _rail(body: Fixed, present: Array) -> Stadium | None:
+def _rail(body: StaticBody, present: Array) -> Stadium | None:
     """A fixed segment that stands still, and None if it is no such thing; of negative length where it is absent."""
     if body.motion is not None or not isinstance(body.shape, Stadium):
         return None

@@ -6,24 +6,24 @@ import jax.numpy as jnp
 
 from gen2d.physics.collision import Disc, Shape, Stadium, edge_normals, hull
 from gen2d.records.axes import Array
-from gen2d.records.layout import Run
+from gen2d.records.layout import SlotGroup
 from gen2d.records.scene import Objects
 
 
-class DiscForm(NamedTuple):
+class DiscShape(NamedTuple):
     """A disc."""
 
     radius: Array  # [N, ...] m
 
 
-class StadiumForm(NamedTuple):
+class CapsuleShape(NamedTuple):
     """A segment or a capsule, along its own x axis."""
 
     half_length: Array  # [N, ...] m
     radius: Array
 
 
-class HullForm(NamedTuple):
+class PolygonShape(NamedTuple):
     """A convex polygon."""
 
     vertices: tuple[Array, ...]  # each [2, N, ...] m, counter-clockwise
@@ -31,29 +31,29 @@ class HullForm(NamedTuple):
     radius: Array
 
 
-Form: TypeAlias = DiscForm | StadiumForm | HullForm
+BodyShape: TypeAlias = DiscShape | CapsuleShape | PolygonShape
 
 
-def form_of(objects: Objects, run: Run, slots: slice | Array) -> Form:
+def body_shape_of(objects: Objects, run: SlotGroup, slots: slice | Array) -> BodyShape:
     """The form of a run's slots; objects in the device's layout."""
     radius = objects.radius[slots]
     if run.shape == "circle":
-        return DiscForm(radius)
+        return DiscShape(radius)
     if run.shape in ("segment", "capsule"):
-        return StadiumForm(objects.half_length[slots], radius)
+        return CapsuleShape(objects.half_length[slots], radius)
     assert objects.vertices is not None, "a layout with polygons needs objects.vertices"
     vertices = tuple(objects.vertices[: run.vertices, :, slots])
-    return HullForm(vertices, edge_normals(vertices), radius)
+    return PolygonShape(vertices, edge_normals(vertices), radius)
 
 
 @overload
-def placed(form: StadiumForm, position: Array, angle: Array) -> Stadium: ...
+def to_world(form: CapsuleShape, position: Array, angle: Array) -> Stadium: ...
 @overload
-def placed(form: Form, position: Array, angle: Array) -> Shape: ...
-def placed(form: Form, position: Array, angle: Array) -> Shape:
+def to_world(form: BodyShape, position: Array, angle: Array) -> Shape: ...
+def to_world(form: BodyShape, position: Array, angle: Array) -> Shape:
     """The shape in the world; position [2, N, ...] in m, angle [N, ...] in rad."""
-    if isinstance(form, DiscForm):
+    if isinstance(form, DiscShape):
         return Disc(position, form.radius)
-    if isinstance(form, StadiumForm):
+    if isinstance(form, CapsuleShape):
         return Stadium(position, jnp.stack([jnp.cos(angle), jnp.sin(angle)]), form.half_length, form.radius)
     return hull(form.vertices, form.normals, position, angle, form.radius)

@@ -13,10 +13,10 @@ from gen2d.core.errors import ConfigError
 from gen2d.physics import energy as energy_module
 from gen2d.physics import joint_forces, rigid_joints
 from gen2d.physics.constraint import Motion
-from gen2d.physics.nearby_pairs import Sparse
-from gen2d.physics.params import Rules
-from gen2d.physics.setup import cleaned, moving, padded, scenery_of, slots_of
-from gen2d.physics.state import Body, Scenery, World
+from gen2d.physics.nearby_pairs import NearbyPairs
+from gen2d.physics.params import SolverParams
+from gen2d.physics.setup import build_model, moving, pad_groups, slots_of, without_empty
+from gen2d.physics.state import BodyState, Model, WorldState
 from gen2d.physics.step import step
 from gen2d.records.axes import Array
 from gen2d.records.layout import Layout
@@ -36,7 +36,7 @@ def substeps(fps: float, asked: int | None, max_step: float) -> int:
 
 
 @dataclasses.dataclass(frozen=True)
-class Keep:
+class SaveAt:
     """What to return beyond the states."""
 
     contacts: int = 0  # slots for rows of contacts; 0: none
@@ -48,10 +48,10 @@ def simulate(
     scene: Scene,
     state: State,
     layout: Layout,
-    rules: Rules,
+    rules: SolverParams,
     frames: int,
     steps: int,
-    keep: Keep = Keep(),
+    keep: SaveAt = SaveAt(),
     forces: Forces | None = None,
     sparse: bool = False,
 ) -> Trajectory:
@@ -65,16 +65,16 @@ def simulate(
     """
     chex.assert_shape(state.position, (2, layout.slots, ...))
     chex.assert_equal_shape([state.angle, state.angular_velocity, scene.objects.present, scene.objects.mass])
-    scene, state = cleaned(scene, state)
+    scene, state = without_empty(scene, state)
     hook = _hook(scene, state, layout, forces)
-    scenery = scenery_of(scene, state, layout, rules, hook, keep.contacts > 0, sparse)
+    scenery = build_model(scene, state, layout, rules, hook, keep.contacts > 0, sparse)
     start, contacts = _start(state, layout, scenery, keep, rules), scenery.contacts
 
-    if isinstance(contacts, Sparse):
+    if isinstance(contacts, NearbyPairs):
         after = jax.eval_shape(lambda world: step(world, scenery, rules).contacts, start)
         start = start._replace(contacts=contacts.with_room(start.contacts, after))
 
-    def frame(world: World, number: Array) -> tuple[World, tuple]:
+    def frame(world: WorldState, number: Array) -> tuple[WorldState, tuple]:
         world = world._replace(time=number * (steps * rules.step), contacts=contacts.frame_begins(world.contacts))
         if keep.between:
             world, way = jax.lax.scan(lambda now, _: _shown(step(now, scenery, rules)), world, length=steps)
@@ -85,7 +85,7 @@ def simulate(
 
     numbers = jnp.arange(frames - 1, dtype=state.angle.dtype)
     last, (bodies, way, sums, happened) = jax.lax.scan(frame, start, numbers)
-    between = None if way is None else _between(state, way, layout, rules.step)
+    between = None if way is None else _substep_states(state, way, layout, rules.step)
     states = _states(state, bodies, layout, numbers * (steps * rules.step) + steps * rules.step)
     first = _sums(start, scenery)
     energy = None if first is None else _energy(first, sums)
@@ -94,12 +94,12 @@ def simulate(
     return Trajectory(states, Quality(depth, begins, residual), rows, energy, between)
 
 
-def _shown(world: World) -> tuple[World, list[Body]]:
+def _shown(world: WorldState) -> tuple[WorldState, list[BodyState]]:
     """The world, and of its bodies what is kept of an instant."""
     return world, [body._replace(rest=None) for body in world.bodies]
 
 
-def _between(start: State, way: list[Body], layout: Layout, step: float) -> State:
+def _substep_states(start: State, way: list[BodyState], layout: Layout, step: float) -> State:
     """The states [T - 1, steps, ...] at the ends of steps, of bodies likewise."""
     frames, steps = way[0].angle.shape[:2]
     bodies = jax.tree.map(lambda x: x.reshape(frames * steps, *x.shape[2:]), way)
@@ -107,7 +107,7 @@ def _between(start: State, way: list[Body], layout: Layout, step: float) -> Stat
     return jax.tree.map(lambda x: x[1:].reshape(frames, steps, *x.shape[1:]), states)
 
 
-def _books(bodies: list[Body], scenery: Scenery, rules: Rules) -> energy_module.Ledger:
+def _energy_budget(bodies: list[BodyState], scenery: Model, rules: SolverParams) -> energy_module.Ledger:
     driven = scenery.forces is not None or any(f.motion is not None for f in scenery.fixed)
 
     def work(like: Array) -> energy_module.Work:
@@ -121,30 +121,30 @@ def _books(bodies: list[Body], scenery: Scenery, rules: Rules) -> energy_module.
     return energy_module.Ledger(groups, energy_module.Work(lost, put_in, damped))
 
 
-def _start(state: State, layout: Layout, scenery: Scenery, keep: Keep, rules: Rules) -> World:
+def _start(state: State, layout: Layout, scenery: Model, keep: SaveAt, rules: SolverParams) -> WorldState:
     bodies = []
     for run, first in moving(layout):
-        of = slots_of(state, first, run.count, padded(run.count))
+        of = slots_of(state, first, run.count, pad_groups(run.count))
         nothing = Motion(jnp.zeros_like(of.position), jnp.zeros_like(of.angle))
-        bodies.append(Body(of.position, of.angle, Motion(of.velocity, of.angular_velocity), nothing))
-    return World(
+        bodies.append(BodyState(of.position, of.angle, Motion(of.velocity, of.angular_velocity), nothing))
+    return WorldState(
         bodies=bodies,
         time=jnp.zeros((), state.angle.dtype),
         contacts=scenery.contacts.start(keep.contacts),
-        ties=[joint_forces.nothing(tied) for tied in scenery.ties],
-        pushes=None if scenery.linkage is None else rigid_joints.unpushed(scenery.linkage),
-        ledger=_books(bodies, scenery, rules) if keep.energy else None,
+        ties=[joint_forces.zero_impulses(tied) for tied in scenery.ties],
+        pushes=None if scenery.linkage is None else rigid_joints.zero_impulses(scenery.linkage),
+        ledger=_energy_budget(bodies, scenery, rules) if keep.energy else None,
     )
 
 
-def _sums(world: World, scenery: Scenery) -> tuple | None:
+def _sums(world: WorldState, scenery: Model) -> tuple | None:
     if world.ledger is None:
         return None
-    fixed = [Body(*f.at(world.time), f.still) for f in scenery.fixed]
+    fixed = [BodyState(*f.at(world.time), f.still) for f in scenery.fixed]
     springs = joint_forces.springs_energy(scenery.ties, world.bodies, fixed)
     springs = springs + jnp.zeros_like(scenery.gravity[0])
     now = energy_module.balance(scenery.groups, world.bodies, scenery.gravity, springs)
-    return now, energy_module.closed(world.ledger, springs)
+    return now, energy_module.close_balance(world.ledger, springs)
 
 
 def _energy(first: tuple, later: tuple) -> Energy:
@@ -156,7 +156,7 @@ def _energy(first: tuple, later: tuple) -> Energy:
     return Energy(kinetic, rotational, potential, contact, damping, driven, residual, linear, angular)
 
 
-def _states(start: State, bodies: list[Body], layout: Layout, times: Array) -> State:
+def _states(start: State, bodies: list[BodyState], layout: Layout, times: Array) -> State:
     """All frames of all slots: what moves from the bodies, the rest from the initial state."""
     groups, parts = iter(bodies), []
     times = times[:, None, None]
@@ -185,12 +185,12 @@ def _hook(scene: Scene, start: State, layout: Layout, forces: Forces | None) -> 
     force = jnp.zeros_like(start.position) if force is None else force
     torque = jnp.zeros_like(start.angle) if torque is None else torque
 
-    def on_groups(bodies: list[Body], time: Array) -> list[tuple[Array, Array]]:
+    def on_groups(bodies: list[BodyState], time: Array) -> list[tuple[Array, Array]]:
         pushes = force, torque
         if forces is not None:
             now = _states(start, jax.tree.map(lambda x: x[None], bodies), layout, time[None])
             more = forces(jax.tree.map(lambda x: x[-1], now), time)
             pushes = force + more[0], torque + more[1]
-        return [slots_of(pushes, first, run.count, padded(run.count)) for run, first in mine]
+        return [slots_of(pushes, first, run.count, pad_groups(run.count)) for run, first in mine]
 
     return on_groups

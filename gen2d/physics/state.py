@@ -9,11 +9,11 @@ from gen2d.physics import joint_forces, rigid_joints
 from gen2d.physics.collision import Shape, Stadium
 from gen2d.physics.constraint import Inertia, Motion
 from gen2d.physics.energy import Ledger
-from gen2d.physics.shapes import Form, placed
+from gen2d.physics.shapes import BodyShape, to_world
 from gen2d.records.axes import Array
 
 
-class Body(NamedTuple):
+class BodyState(NamedTuple):
     """Some moving bodies as they are now."""
 
     position: Array  # [2, N, ...] m
@@ -22,20 +22,20 @@ class Body(NamedTuple):
     rest: Motion | None = None  # m, rad: what rounding has kept back of the ways so far
 
 
-class Group(NamedTuple):
+class BodyGroupState(NamedTuple):
     """What stays the same of the moving bodies of one run; an empty slot has no mass, and no inverse of it."""
 
-    form: Form
+    form: BodyShape
     inverse: Inertia
     mass: Array  # [N, ...] kg
     moment: Array  # [N, ...] kg m^2
     collides: bool = True  # whether they meet anything
 
 
-class Fixed(NamedTuple):
+class StaticBody(NamedTuple):
     """A body that nothing can push, at the start. `motion` is None where it stands still."""
 
-    form: Form
+    form: BodyShape
     position: Array  # [2, 1, ...] m
     angle: Array  # [1, ...] rad
     motion: Motion | None
@@ -52,28 +52,28 @@ class Fixed(NamedTuple):
             return self.position, self.angle
         return self.position + time * self.motion.velocity, self.angle + time * self.motion.spin
 
-    def shape_at(self, now: Body) -> Shape:
+    def shape_at(self, now: BodyState) -> Shape:
         """Its shape where it is now."""
-        return self.shape if self.motion is None else placed(self.form, now.position, now.angle)
+        return self.shape if self.motion is None else to_world(self.form, now.position, now.angle)
 
 
-class Scenery(NamedTuple):
+class Model(NamedTuple):
     """What stays the same for a whole video."""
 
-    groups: list[Group]
-    fixed: list[Fixed]
+    groups: list[BodyGroupState]
+    fixed: list[StaticBody]
     rails: list[Stadium]  # fixed segments that stand still; where there is none, of negative length
     gravity: Array  # [2, ...] m/s^2
     contacts: Any  # how pairs are solved: Dense or Sparse
-    ties: list[joint_forces.Tied]
-    linkage: rigid_joints.Linkage | None
+    ties: list[joint_forces.JointBatch]
+    linkage: rigid_joints.JointSystem | None
     forces: Callable | None  # (bodies, time) -> for each group force [2, N, ...] N and torque [N, ...] N m
 
 
-class World(NamedTuple):
+class WorldState(NamedTuple):
     """All that changes from one step to the next."""
 
-    bodies: list[Body]
+    bodies: list[BodyState]
     time: Array  # s
     contacts: Any  # what the contacts hand on from step to step
     ties: list[Any]  # of each round of joints: its impulses

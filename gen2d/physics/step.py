@@ -30,17 +30,17 @@ import jax.numpy as jnp
 
 from gen2d.physics import joint_forces, rigid_joints
 from gen2d.physics.constraint import Motion
-from gen2d.physics.contact_state import Drift
-from gen2d.physics.energy import Ledger, booked, tallied
-from gen2d.physics.params import Rules
-from gen2d.physics.shapes import placed
-from gen2d.physics.state import Body, Scenery, World
-from gen2d.physics.tunnelling import kept_in
+from gen2d.physics.contact_state import Displacement
+from gen2d.physics.energy import Ledger, accumulate, record_energy
+from gen2d.physics.params import SolverParams
+from gen2d.physics.shapes import to_world
+from gen2d.physics.state import BodyState, Model, WorldState
+from gen2d.physics.tunnelling import clamp_displacement
 from gen2d.records.axes import Array
-from gen2d.xla import settled
+from gen2d.xla import materialize
 
 
-def _accelerations(world: World, scenery: Scenery) -> tuple[list[Array], list[Array] | None]:
+def _accelerations(world: WorldState, scenery: Model) -> tuple[list[Array], list[Array] | None]:
     """Of each group: that of its centres [2, N, ...], and that of its angles [N, ...]; None where there is none."""
     groups, gravity = scenery.groups, scenery.gravity
     falls = [gravity[:, None] * (g.inverse.mass > 0) for g in groups]
@@ -51,7 +51,7 @@ def _accelerations(world: World, scenery: Scenery) -> tuple[list[Array], list[Ar
     return falls, [g.inverse.moment * torque for g, (_, torque) in zip(groups, forces, strict=True)]
 
 
-def _free(body: Body, fall: Array, spin_up: Array | float, rules: Rules) -> tuple[Motion, Motion]:
+def _free(body: BodyState, fall: Array, spin_up: Array | float, rules: SolverParams) -> tuple[Motion, Motion]:
     """How a body moves after a step in which nothing touches it, and by how much more than h times that it goes.
 
     Both are exact for a constant acceleration a and a damping rate c: with s = exp(-c h), p = (1 - s) / c and
@@ -69,7 +69,7 @@ def _free(body: Body, fall: Array, spin_up: Array | float, rules: Rules) -> tupl
     return motion, Motion(velocity, spin)
 
 
-def _beyond(drift: Drift, more: Motion) -> Motion:
+def _beyond(drift: Displacement, more: Motion) -> Motion:
     """By how much more than h times its motion a body goes; free flight is exact for what no contact but an impact
     held."""
     free = jnp.where(drift.push > 0, 0.0, 1.0)
@@ -82,11 +82,11 @@ def _warmth(warmed: Motion, before: Motion) -> Array:
     return x + y
 
 
-def _arrived(body: Body, way: Motion, one: Array) -> tuple[tuple[Array, Array], Motion]:
+def _arrived(body: BodyState, way: Motion, one: Array) -> tuple[tuple[Array, Array], Motion]:
     """Position and angle after a way, and what rounding keeps back of it for the next one (W. Kahan, 1965)."""
     assert body.rest is not None
     old, add = Motion(body.position, body.angle), jax.tree.map(jnp.add, way, body.rest)
-    new = settled(jax.tree.map(jnp.add, old, add), one)
+    new = materialize(jax.tree.map(jnp.add, old, add), one)
     gone = jax.tree.map(lambda n, o, d: jax.lax.stop_gradient(d - (n - o)), new, old, add)
     return (new.velocity, new.spin), gone
 
@@ -95,7 +95,7 @@ class _Rigid:
     """The linkage in a step: its impulses so far and their work; nothing where there is none."""
 
     def __init__(
-        self, linked: rigid_joints.Linkage | None, world: World, fixed: list[Body], h: float, one: Array
+        self, linked: rigid_joints.JointSystem | None, world: WorldState, fixed: list[BodyState], h: float, one: Array
     ) -> None:
         self._of, self._world, self._fixed, self._h, self._one = linked, world, fixed, h, one
         self.pushes, self.works = world.pushes, []
@@ -105,7 +105,9 @@ class _Rigid:
         if self._of is None or self.pushes is None:
             return motions
         bodies = self._world.bodies
-        self._stance, motions, work = rigid_joints.warm(self._of, bodies, self._fixed, motions, self.pushes, self._one)
+        self._stance, motions, work = rigid_joints.warm_start(
+            self._of, bodies, self._fixed, motions, self.pushes, self._one
+        )
         self.works.append(work)
         return motions
 
@@ -126,20 +128,20 @@ class _Rigid:
         return motions
 
 
-def step(world: World, scenery: Scenery, rules: Rules) -> World:
+def step(world: WorldState, scenery: Model, rules: SolverParams) -> WorldState:
     """The world one step later."""
     h, groups, contacts, past = rules.step, scenery.groups, scenery.contacts, world.contacts
     one = contacts.setup.one
     falls, spin_ups = _accelerations(world, scenery)
     turns = spin_ups or [0.0] * len(groups)
     free = [_free(*of, rules) for of in zip(world.bodies, falls, turns, strict=True)]
-    flying, more = settled([motion for motion, _ in free], one), [way for _, way in free]
-    fixed = [Body(*body.at(world.time), body.still) for body in scenery.fixed]
+    flying, more = materialize([motion for motion, _ in free], one), [way for _, way in free]
+    fixed = [BodyState(*body.at(world.time), body.still) for body in scenery.fixed]
 
-    held, motions, tied = joint_forces.warm(scenery.ties, world.bodies, fixed, flying, world.ties, one)
+    held, motions, tied = joint_forces.warm_start(scenery.ties, world.bodies, fixed, flying, world.ties, one)
     rigid = _Rigid(scenery.linkage, world, fixed, h, one)
     joined = rigid.warm(motions)
-    shapes = [placed(g.form, b.position, b.angle) for g, b in zip(groups, world.bodies, strict=True)]
+    shapes = [to_world(g.form, b.position, b.angle) for g, b in zip(groups, world.bodies, strict=True)]
     walls = [(f.shape_at(b), f.motion) for f, b in zip(scenery.fixed, fixed, strict=True)]
     unlike = falls if spin_ups else [None] * len(groups)
     book = world.ledger
@@ -150,13 +152,15 @@ def step(world: World, scenery: Scenery, rules: Rules) -> World:
 
     ways = [Motion(*(jnp.zeros_like(x) for x in m)) for m in motions]
     held, motions, ways, tied_more = joint_forces.solve(held, motions, ways, falls, fixed, rules, one, biased=True)
-    drifts = [Drift(way, push) for way, push in zip(ways, pushes, strict=True)]
+    drifts = [Displacement(way, push) for way, push in zip(ways, pushes, strict=True)]
     motions, drifts, works, rows = contacts.solve(past, found, walls, motions, drifts, works)
     beyond = [_beyond(*of) for of in zip(drifts, more, strict=True)]
     motions = rigid.solve(motions, beyond)
 
     ways = [jax.tree.map(lambda x, y: h * x + y, *of) for of in zip(motions, beyond, strict=True)]
-    ways = kept_in(ways, [s if g.collides else None for s, g in zip(shapes, groups, strict=True)], scenery.rails)
+    ways = clamp_displacement(
+        ways, [s if g.collides else None for s, g in zip(shapes, groups, strict=True)], scenery.rails
+    )
     places = [_arrived(b, way, one) for b, way in zip(world.bodies, ways, strict=True)]
 
     held, motions, _, tied_last = joint_forces.solve(held, motions, ways, falls, fixed, rules, one, biased=False)
@@ -165,10 +169,10 @@ def step(world: World, scenery: Scenery, rules: Rules) -> World:
     if book is not None:
         olds = [body.motion for body in world.bodies]
         done = zip(works, groups, olds, flying, more, ways, falls, turns, strict=True)
-        tally = tallied(book.joints, [*tied, *tied_more, *tied_last, *rigid.works])
-        book = Ledger([booked(*of, gravity=scenery.gravity, h=h) for of in done], tally)
-    return World(
-        bodies=[Body(*place, motion, rest) for (place, rest), motion in zip(places, motions, strict=True)],
+        tally = accumulate(book.joints, [*tied, *tied_more, *tied_last, *rigid.works])
+        book = Ledger([record_energy(*of, gravity=scenery.gravity, h=h) for of in done], tally)
+    return WorldState(
+        bodies=[BodyState(*place, motion, rest) for (place, rest), motion in zip(places, motions, strict=True)],
         time=world.time + h,
         contacts=past,
         ties=[joint.impulses for joint in held],

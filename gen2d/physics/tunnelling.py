@@ -5,12 +5,12 @@ import jax.numpy as jnp
 
 from gen2d.physics.collision import Disc, Stadium, dot, turned
 from gen2d.physics.constraint import Motion
-from gen2d.physics.contact_state import Memory, Solved
+from gen2d.physics.contact_state import SolvedPair, WarmStart
 from gen2d.physics.time_of_impact import SLOWEST
 from gen2d.records.axes import Array
 
 
-def seen(solved: Solved, memory: Memory) -> tuple[Array, Array]:
+def visible_motion(solved: SolvedPair, memory: WarmStart) -> tuple[Array, Array]:
     """A row's deepest overlap, m, and whether a contact began; a bounce begins one."""
     depth = jnp.zeros_like(solved.touches[0].gap)
     for touch in solved.touches:
@@ -19,7 +19,7 @@ def seen(solved: Solved, memory: Memory) -> tuple[Array, Array]:
     return depth, (now > 0) & (before == 0)
 
 
-def kept_in(ways: list[Motion], shapes: list, walls: list[Stadium]) -> list[Motion]:
+def clamp_displacement(ways: list[Motion], shapes: list, walls: list[Stadium]) -> list[Motion]:
     """The ways, none of which takes a disc deeper than half of its radius into a segment that stands still.
 
     A body meets each row once in a step, so one that is very fast, or wedged in, may be thrown back through a wall that

@@ -5,17 +5,19 @@ import numpy as np
 from gen2d.config.plugin_options import Plugin
 from gen2d.core.errors import UserError
 from gen2d.dataset.spec import Shard
-from gen2d.programs.rollout import Batch, Rollout, parts
+from gen2d.programs.rollout import DeviceBatch, Rollout, per_device
 
-Piece = tuple[Shard, int, int]  # a shard's videos among those of a batch: lanes from the first to before the second
+ShardSlice = tuple[
+    Shard, int, int
+]  # a shard's videos among those of a batch: lanes from the first to before the second
 
 
 class NoPlaceError(UserError):
     """A scene in which the objects do not fit."""
 
 
-def _check_placed(rollout: Rollout, batch: Batch, firsts: list[int], pieces: list[list[Piece]]) -> None:
-    for first, own, placed in zip(firsts, pieces, parts(batch.placed), strict=True):
+def _check_placed(rollout: Rollout, batch: DeviceBatch, firsts: list[int], pieces: list[list[ShardSlice]]) -> None:
+    for first, own, placed in zip(firsts, pieces, per_device(batch.placed), strict=True):
         for _, start, stop in own:
             check_placed(rollout.config.scene, placed[start:stop], np.arange(first + start, first + stop))
 

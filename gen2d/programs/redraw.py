@@ -23,22 +23,22 @@ from gen2d.config.sections import AnnotationOptions
 from gen2d.core.errors import ConfigError
 from gen2d.loading.dataset import Dataset
 from gen2d.loading.protocols import Numbers
-from gen2d.physics.params import rules_of
+from gen2d.physics.params import solver_params
 from gen2d.physics.simulate import simulate, substeps
 from gen2d.programs import render as render_module
 from gen2d.programs.recipe import Trust, config_of
-from gen2d.programs.rollout import Rollout, keep_of
+from gen2d.programs.rollout import Rollout, save_at
 from gen2d.records import axes
 from gen2d.records import keys as keys_module
 from gen2d.records.axes import Array
 from gen2d.records.layout import Layout
 from gen2d.records.scene import Joints, Objects, Scene, State
-from gen2d.renderers.camera import View
-from gen2d.renderers.plan import Plan, Stage
+from gen2d.renderers.camera import CameraView
+from gen2d.renderers.plan import FramePlan, RenderScene
 from gen2d.sampling.matched import sets as sets_module
 from gen2d.xla import on_cpu
 
-Columns = Mapping[str, Any]
+FieldColumns = Mapping[str, Any]
 POINTS = 8  # of each object, where tracks are asked for that the config does not have
 
 
@@ -50,7 +50,7 @@ def render(
     width: int | None = None,
     look: str | Mapping[str, Any] | None = None,
     sets: Sequence[str] = (),
-    states: Columns | None = None,
+    states: FieldColumns | None = None,
     fields: Sequence[str] | None = None,
     trust: Trust = (),
 ) -> Any:
@@ -133,7 +133,7 @@ def _asked(fields: Sequence[str] | None, options: AnnotationOptions) -> list[str
     return [f"annotations.{name}={'true' if getattr(options, name) is False else POINTS}" for name in off]
 
 
-def _check_frames(columns: Columns, states: Columns | None) -> None:
+def _check_frames(columns: FieldColumns, states: FieldColumns | None) -> None:
     frames = {
         len(np.shape(columns[name])) and np.shape(columns[name])[1] for name in ("states/position", "camera/scale")
     }
@@ -158,16 +158,16 @@ def _stored(ds: Dataset, numbers: np.ndarray) -> dict[str, np.ndarray]:
     return _whole(ds).batch(numbers)
 
 
-def record_of(cls: type, columns: Columns) -> Any:
+def from_columns(cls: type, columns: FieldColumns) -> Any:
     """The record that holds these fields, arrays by stored name."""
     known = axes.described(cls).items()
     return cls(**{attribute: jnp.asarray(columns[name]) for name, (attribute, _) in known if name in columns})
 
 
-def scene_of(columns: Columns) -> Scene:
+def scene_of(columns: FieldColumns) -> Scene:
     """The scenes that these fields are of."""
-    joints = record_of(Joints, columns) if "joints/rest" in columns else None
-    return Scene(record_of(Objects, columns), jnp.asarray(columns["world/gravity"]), joints)
+    joints = from_columns(Joints, columns) if "joints/rest" in columns else None
+    return Scene(from_columns(Objects, columns), jnp.asarray(columns["world/gravity"]), joints)
 
 
 def _key_words(ds: Dataset) -> np.ndarray:
@@ -196,38 +196,38 @@ class _Settings:
         return self.config.scene.module.layout(self.config.scene.options)
 
     @property
-    def plan(self) -> Plan:
+    def plan(self) -> FramePlan:
         return render_module.plan_of(self.config, self.layout)
 
-    def resized(self, view: View) -> View:
+    def resized(self, view: CameraView) -> CameraView:
         """A stored view for frames of another size: all that was seen is."""
         old, new = self.base.video, self.config.video
         return view._replace(scale=view.scale * min(new.height / old.height, new.width / old.width))
 
 
-def _staged(columns: Columns, words: Array, numbers: Array, settings: _Settings) -> Stage:
+def _staged(columns: FieldColumns, words: Array, numbers: Array, settings: _Settings) -> RenderScene:
     config, plan = settings.config, settings.plan
-    scene, states = scene_of(columns), record_of(State, columns)
-    view = settings.resized(View(*(jnp.asarray(columns[f"camera/{name}"]) for name in View._fields)))
+    scene, states = scene_of(columns), from_columns(State, columns)
+    view = settings.resized(CameraView(*(jnp.asarray(columns[f"camera/{name}"]) for name in CameraView._fields)))
 
-    def staged(key: Array, scene: Scene, states: State, view: View) -> Stage:
-        return render_module.stage_of(key, config, plan, scene, states, view)
+    def staged(key: Array, scene: Scene, states: State, view: CameraView) -> RenderScene:
+        return render_module.render_scene(key, config, plan, scene, states, view)
 
     return jax.vmap(staged)(sets_module.keys_of(words, numbers, settings.base.matched), scene, states, view)
 
 
-def _pictures(stages: Stage, settings: _Settings) -> dict[str, Array]:
+def _pictures(stages: RenderScene, settings: _Settings) -> dict[str, Array]:
     """What a run draws, in a program of its own, as there: so that its rounding is the same."""
-    return render_module.pictures(stages, settings.plan, settings.config.annotations)
+    return render_module.render_frames(stages, settings.plan, settings.config.annotations)
 
 
-def _simulated(columns: Columns, words: Array, numbers: Array, settings: _Settings) -> dict[str, Array]:
+def _simulated(columns: FieldColumns, words: Array, numbers: Array, settings: _Settings) -> dict[str, Array]:
     config, layout = settings.config, settings.layout
     scene = scene_of(columns)
-    first = jax.tree.map(lambda a: a[:, 0], record_of(State, columns))
+    first = jax.tree.map(lambda a: a[:, 0], from_columns(State, columns))
     steps = substeps(config.video.fps, config.physics.substeps, config.physics.max_step)
-    rules = rules_of(config.physics, config.video.fps, steps)
-    keep = dataclasses.replace(keep_of(config, layout), between=False)
+    rules = solver_params(config.physics, config.video.fps, steps)
+    keep = dataclasses.replace(save_at(config, layout), between=False)
     device = axes.to_device(scene), axes.to_device(first)
     made = axes.to_stored(simulate(*device, layout, rules, config.video.frames, steps, keep, sparse=on_cpu()))
     keys = sets_module.keys_of(words, numbers, settings.base.matched)

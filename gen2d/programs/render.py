@@ -16,18 +16,18 @@ from gen2d.records.keys import key_for
 from gen2d.records.layout import Layout
 from gen2d.records.scene import Scene, State
 from gen2d.renderers import camera
-from gen2d.renderers.camera import View
+from gen2d.renderers.camera import CameraView
 from gen2d.renderers.paint import Paint
-from gen2d.renderers.plan import Occluders, Plan, Stage
-from gen2d.renderers.primitives import Bodies, Instants
+from gen2d.renderers.plan import FramePlan, Occluders, RenderScene
+from gen2d.renderers.primitives import BodyGeometry, Instants
 from gen2d.renderers.rasterizer import draw
 
 
-def plan_of(config: Config, layout: Layout) -> Plan:
+def plan_of(config: Config, layout: Layout) -> FramePlan:
     """What is known of a config's pictures before anything is drawn."""
     video, image, look = config.video, config.image, config.look
     seconds = video.frames / video.fps
-    return Plan(
+    return FramePlan(
         layout=layout,
         height=video.height,
         width=video.width,
@@ -46,27 +46,27 @@ def paint_of(key: Array, config: Config, scene: Scene, layout: Layout) -> Paint:
     return config.look.module.paint(scene, layout, config.look.options, key_for(key, "look"))
 
 
-def view_of(key: Array, config: Config, layout: Layout, states: State) -> View:
+def view_of(key: Array, config: Config, layout: Layout, states: State) -> CameraView:
     """One video's view."""
     video = config.video
     return camera.filmed(key_for(key, "camera"), config.camera, layout, states, video.fps, video.height, video.width)
 
 
-def stage_of(
+def render_scene(
     key: Array,
     config: Config,
-    plan: Plan,
+    plan: FramePlan,
     scene: Scene,
     states: State,
-    view: View | None = None,
+    view: CameraView | None = None,
     between: State | None = None,
-) -> Stage:
+) -> RenderScene:
     """All that one video is drawn from; `between` holds its states [T - 1, steps, K ...] at every step. Its view is
     that of its key, if none is given."""
     paint = paint_of(key, config, scene, plan.layout)
     view = view_of(key, config, plan.layout, states) if view is None else view
     objects, image = scene.objects, config.image
-    bodies = Bodies(objects.radius, objects.half_length, objects.vertices)
+    bodies = BodyGeometry(objects.radius, objects.half_length, objects.vertices)
     exposed = None
     if image.exposure:
         assert between is not None, "motion blur needs the states between frames"
@@ -74,10 +74,12 @@ def stage_of(
     seed = jax.random.bits(key_for(key, "pixels"), (), jnp.uint32)
     deviation = image.noise.sample(key_for(key, "noise"), ()) if image.noise.support != (0.0, 0.0) else None
     occluders = _occluders(key_for(key, "occluders"), config, plan) if image.occluders else None
-    return Stage(bodies, Instants(states.position, states.angle, view), exposed, paint, occluders, deviation, seed)
+    return RenderScene(
+        bodies, Instants(states.position, states.angle, view), exposed, paint, occluders, deviation, seed
+    )
 
 
-def _exposed(image: ImageOptions, fps: float, states: State, between: State, view: View) -> Instants:
+def _exposed(image: ImageOptions, fps: float, states: State, between: State, view: CameraView) -> Instants:
     """Where everything is at the middles of the parts of each exposure, which ends at the frame's instant.
 
     Between the ends of steps everything moves evenly; before the first frame it has moved as it does then.
@@ -104,10 +106,10 @@ def _exposed(image: ImageOptions, fps: float, states: State, between: State, vie
 
     position = at(states.position, states.velocity, between.position)
     angle = at(states.angle, states.angular_velocity, between.angle)
-    return Instants(position, angle, View(*map(even, view)))
+    return Instants(position, angle, CameraView(*map(even, view)))
 
 
-def _occluders(key: Array, config: Config, plan: Plan) -> Occluders:
+def _occluders(key: Array, config: Config, plan: FramePlan) -> Occluders:
     image, video = config.image, config.video
     count = image.occluders
     keys = dict(zip(("place", "width", "height", "front", "color"), jax.random.split(key, 5), strict=True))
@@ -128,7 +130,7 @@ def _occluders(key: Array, config: Config, plan: Plan) -> Occluders:
     return Occluders(jnp.concatenate([center - size / 2, center + size / 2], -1), jnp.stack(parts, -1), rank)
 
 
-def pictures(stages: Stage, plan: Plan, options: Any) -> dict[str, Array]:
+def render_frames(stages: RenderScene, plan: FramePlan, options: Any) -> dict[str, Array]:
     """Frames and annotations of some videos, by the names that they are stored under."""
     frames, owners = draw(stages, plan)
     found = {} if frames is None else {"frames": frames}
@@ -141,6 +143,6 @@ def painted_colors(paint: Paint, scene: Scene) -> Array:
     return jnp.where(present, jnp.clip(jnp.round(paint.color), 0, 255), 0).astype(jnp.uint8)
 
 
-def camera_columns(view: View) -> dict[str, Array]:
+def camera_columns(view: CameraView) -> dict[str, Array]:
     """A view by its stored names."""
     return {f"camera/{name}": values for name, values in view._asdict().items()}

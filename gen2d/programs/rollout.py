@@ -26,8 +26,8 @@ from gen2d.config.config import Config
 from gen2d.core import enums
 from gen2d.core.schema import Field
 from gen2d.physics import lyapunov
-from gen2d.physics.params import rules_of
-from gen2d.physics.simulate import Keep, simulate, substeps
+from gen2d.physics.params import solver_params
+from gen2d.physics.simulate import SaveAt, simulate, substeps
 from gen2d.programs import render
 from gen2d.records import axes as axes_module
 from gen2d.records import keys as keys_module
@@ -37,12 +37,12 @@ from gen2d.records import trajectory
 from gen2d.records.axes import Array
 from gen2d.records.scene import Scene, State
 from gen2d.records.trajectory import Trajectory
-from gen2d.renderers.plan import Stage
+from gen2d.renderers.plan import RenderScene
 from gen2d.sampling import rejection, sampler
-from gen2d.sampling.builder import Sampled
+from gen2d.sampling.builder import SampledScene
 from gen2d.sampling.matched import sets
 from gen2d.sampling.matched import simulate as simulate_module
-from gen2d.sampling.sampler import Change, Sampler
+from gen2d.sampling.sampler import FactorChange, Sampler
 
 SLICE_BYTES = 16 * 2**20  # of raw frames drawn at once; larger buffers cost page faults
 SHARD_BYTES = 2**30  # of raw frames in a shard
@@ -52,11 +52,11 @@ VIDEOS = PartitionSpec("videos")
 JOINTS = ("distance", "revolute")  # joints/kind is an index into this
 
 
-class Batch(NamedTuple):
+class DeviceBatch(NamedTuple):
     """`lanes` simulated videos on each device, ready to be drawn."""
 
     columns: dict[str, Array]  # stored fields but for those that are drawn, [n, ...]
-    stages: Stage
+    stages: RenderScene
     placed: Array  # [n] whether the sampler found a scene
 
 
@@ -79,7 +79,7 @@ class Rollout:
         self.sampler, self.wanted = Sampler(config), quality.ranges(config.quality)
         self.plan = render.plan_of(config, self.layout)
         self.steps = substeps(video.fps, config.physics.substeps, config.physics.max_step)
-        self.keep = keep_of(config, self.layout)
+        self.keep = save_at(config, self.layout)
         frame_bytes = video.frames * video.height * video.width * 3
         auto = min(SHARD_VIDEOS, _power_of_two(SHARD_BYTES // frame_bytes))
         self.videos_per_shard = config.storage.videos_per_shard or auto
@@ -92,7 +92,9 @@ class Rollout:
         self._draws: dict[int, Any] = {}  # by how many videos are drawn together
         self._drawn: set[int] = set()  # those that have run, and so are compiled
         of_each = (
-            self._made if len(self.devices) == 1 else self._shared(self._made, (*[PartitionSpec()] * 2, *[VIDEOS] * 3))
+            self._simulated_batch
+            if len(self.devices) == 1
+            else self._shared(self._simulated_batch, (*[PartitionSpec()] * 2, *[VIDEOS] * 3))
         )
         self._simulate: Any = jax.jit(of_each)
 
@@ -121,7 +123,7 @@ class Rollout:
         fields |= axes_module.fields_of(scene)
         if not self.keep.energy:
             del fields["quality/energy_residual"]
-        for name in sets.untold(self.config.matched):
+        for name in sets.omitted_fields(self.config.matched):
             del fields[name]
         if self.plan.frames:
             fields["frames"] = Field("uint8", "n T H W 3", "sRGB", "the video")
@@ -157,38 +159,38 @@ class Rollout:
         spoken = self.config.annotations.words
         return found | (caption.fields(self.layout.slots, self.config.video.frames) if spoken else {})
 
-    def told(self, columns: dict[str, np.ndarray], split: str) -> dict[str, np.ndarray]:
+    def host_fields(self, columns: dict[str, np.ndarray], split: str) -> dict[str, np.ndarray]:
         """The fields of some videos of a split that are made on the host, from their others there."""
         count = len(columns["objects/present"])
         fields = self.word_fields
         named = {"split": np.full(count, split.encode(), fields["split"].dtype)} if self.config.splits else {}
-        return named | (caption.told(columns, self.config.video) if self.config.annotations.words else {})
+        return named | (caption.caption_fields(columns, self.config.video) if self.config.annotations.words else {})
 
     @property
     def time(self) -> np.ndarray:
         """Of each frame, in seconds: t / fps exactly."""
         return np.arange(self.config.video.frames, dtype=np.float64) / self.config.video.fps
 
-    def begin(self, split: str, firsts: Sequence[int]) -> Batch:
+    def begin(self, split: str, firsts: Sequence[int]) -> DeviceBatch:
         """Starts `lanes` videos on each device, from these numbers on; one number per device."""
         numbers = np.concatenate([np.arange(first, first + self.lanes, dtype=np.uint32) for first in firsts])
         return self.begin_with(split, numbers)
 
-    def begin_with(self, split: str, numbers: np.ndarray) -> Batch:
+    def begin_with(self, split: str, numbers: np.ndarray) -> DeviceBatch:
         """Starts the videos with these numbers, uint32, `lanes` for each device."""
         root, row = keys_module.seed_words(self.config.seed, zlib.crc32(split.encode())), self.config.row(split)
         given = self.sampler.combination(row, root, numbers)
 
-        def make(lanes: np.ndarray, attempts: np.ndarray) -> Batch:
+        def make(lanes: np.ndarray, attempts: np.ndarray) -> DeviceBatch:
             of_videos = given[lanes], numbers[lanes], attempts.astype(np.uint32)
             return self._simulate(root, np.int32(row), *self._shares(of_videos))
 
         if not self.wanted:
             return make(np.arange(len(numbers)), np.zeros(len(numbers)))
         if quality.VISIBILITY not in self.wanted:
-            batch, attempts = rejection.fitting(make, numbers, self.config.quality)
+            batch, attempts = rejection.accepted_batch(make, numbers, self.config.quality)
         else:
-            batch, attempts = rejection.fitting(lambda *of: self._seen(make(*of)), numbers, self.config.quality)
+            batch, attempts = rejection.accepted_batch(lambda *of: self._seen(make(*of)), numbers, self.config.quality)
             del batch.columns[quality.VISIBILITY]  # it comes with the pictures
         return batch._replace(
             columns=batch.columns | {"quality/rejected_videos": self._shares(attempts.astype(np.int32))}
@@ -198,14 +200,14 @@ class Rollout:
         """Arrays over videos, each device with its part."""
         return jax.device_put(arrays, NamedSharding(self.mesh, VIDEOS))
 
-    def _seen(self, batch: Batch) -> Batch:
+    def _seen(self, batch: DeviceBatch) -> DeviceBatch:
         """The batch with what is known of its visibility when it is drawn."""
         drawn = [self.draw(batch, start, self.slice) for start in range(0, self.lanes, self.slice)]
         of_devices = zip(*drawn, strict=True)
         seen = np.concatenate([np.asarray(part[quality.VISIBILITY]) for parts in of_devices for part in parts])
         return batch._replace(columns=batch.columns | {quality.VISIBILITY: self._shares(seen)})
 
-    def draw(self, batch: Batch, start: int, count: int) -> list[dict[str, Array]]:
+    def draw(self, batch: DeviceBatch, start: int, count: int) -> list[dict[str, Array]]:
         """Starts to draw `count` videos of each device, from lane `start` on: for each device their frames
         [count, T, H, W, 3] and what is told of their pixels, by their stored names.
 
@@ -228,39 +230,41 @@ class Rollout:
         """The text of the programs, each for one device, whatever their number."""
         lanes, word = jax.ShapeDtypeStruct((self.lanes,), np.uint32), jax.ShapeDtypeStruct((), np.int32)
         given = jax.ShapeDtypeStruct((self.lanes, len(self.sampler.gridded)), np.float32)
-        simulate = self._simulate if len(self.devices) == 1 else jax.jit(self._made)
+        simulate = self._simulate if len(self.devices) == 1 else jax.jit(self._simulated_batch)
         with jax.default_device(self.devices[0]):
             made = simulate.lower(jax.ShapeDtypeStruct((3,), np.uint32), word, given, lanes, lanes)
             drawn = self._draw(self.slice).lower(made.out_info.stages, start=word)
         return {"simulate": made.as_text(), "draw": drawn.as_text()}
 
     def _draw(self, count: int) -> Any:
-        def drawn(stages: Stage, start: Array) -> dict[str, Array]:
+        def drawn(stages: RenderScene, start: Array) -> dict[str, Array]:
             cut = jax.tree.map(lambda x: jax.lax.dynamic_slice_in_dim(x, start, count), stages)
-            return render.pictures(cut, self.plan, self.config.annotations)
+            return render.render_frames(cut, self.plan, self.config.annotations)
 
         if count not in self._draws:
             self._draws[count] = jax.jit(drawn)
         return self._draws[count]
 
-    def _made(self, root: Array, row: Array, given: Array, numbers: Array, attempts: Array) -> Batch:
+    def _simulated_batch(self, root: Array, row: Array, given: Array, numbers: Array, attempts: Array) -> DeviceBatch:
         """One device's share: from numbers to everything but the frames."""
         config = self.config
         keys, told = sets.keys_of(root, numbers, config.matched), {}
         if config.matched.change:
 
-            def member(key: Array, change: Change | None = None) -> tuple[dict[str, Array], Sampled]:
+            def member(key: Array, change: FactorChange | None = None) -> tuple[dict[str, Array], SampledScene]:
                 return self.sampler.sampled(key, row, change=change)
 
-            drawn, own, made, told = simulate_module.simulated(keys, numbers, config, self.layout, member, self._run)
+            drawn, own, made, told = simulate_module.simulate_members(
+                keys, numbers, config, self.layout, member, self._run
+            )
         else:
             own_keys = rejection.attempt_keys(keys, attempts) if self.wanted else keys
             drawn, own = jax.vmap(self.sampler.sampled, (0, None, 0))(own_keys, row, given)
             made = self._run(own.scene, own.state)
         scene, between, made = own.scene, made.between, dataclasses.replace(made, between=None)
 
-        def staged(key: Array, scene: Scene, states: State, between: State | None) -> tuple[Stage, Array]:
-            stage = render.stage_of(key, config, self.plan, scene, states, between=between)
+        def staged(key: Array, scene: Scene, states: State, between: State | None) -> tuple[RenderScene, Array]:
+            stage = render.render_scene(key, config, self.plan, scene, states, between=between)
             return stage, render.painted_colors(stage.paint, scene)
 
         stages, colors = jax.vmap(staged)(keys, scene, made.states, between)
@@ -272,13 +276,13 @@ class Rollout:
         columns["quality/rejected_draws"] = own.rejected
         if config.annotations.predictability:
             columns["quality/growth"] = self._growth(keys, own)
-        columns = {name: values for name, values in columns.items() if name not in sets.untold(config.matched)}
-        return Batch(columns | told, stages, own.fits)
+        columns = {name: values for name, values in columns.items() if name not in sets.omitted_fields(config.matched)}
+        return DeviceBatch(columns | told, stages, own.fits)
 
-    def _simulated(self, scene: Scene, state: State, keep: Keep) -> Trajectory:
+    def _simulated(self, scene: Scene, state: State, keep: SaveAt) -> Trajectory:
         """What becomes of these starts, in the device's layout."""
         config, sparse = self.config, self.devices[0].platform == "cpu"
-        rules = rules_of(config.physics, config.video.fps, self.steps)
+        rules = solver_params(config.physics, config.video.fps, self.steps)
         return simulate(scene, state, self.layout, rules, config.video.frames, self.steps, keep, sparse=sparse)
 
     def _run(self, scene: Scene, state: State) -> Trajectory:
@@ -287,18 +291,18 @@ class Rollout:
         between = None if made.between is None else _videos_first(made.between)
         return dataclasses.replace(axes_module.to_stored(dataclasses.replace(made, between=None)), between=between)
 
-    def _growth(self, keys: Array, own: Sampled) -> Array:
-        again = functools.partial(self._simulated, keep=Keep())
+    def _growth(self, keys: Array, own: SampledScene) -> Array:
+        again = functools.partial(self._simulated, keep=SaveAt())
         starts = axes_module.to_device(own.scene), axes_module.to_device(own.state)
-        return lyapunov.growth(keys, *starts, again, float(self.time[-1]))
+        return lyapunov.lyapunov_exponent(keys, *starts, again, float(self.time[-1]))
 
     def _scene(self, key: Array) -> Scene:
         """A scene of a video, for its shape."""
         return self.sampler.sampled(key, given=jnp.zeros(len(self.sampler.gridded)))[1].scene
 
-    def host_columns(self, batch: Batch) -> list[dict[str, np.ndarray]]:
+    def host_columns(self, batch: DeviceBatch) -> list[dict[str, np.ndarray]]:
         """For each device its columns as NumPy arrays; waits until they are there."""
-        pieces = {name: parts(array) for name, array in batch.columns.items()}
+        pieces = {name: per_device(array) for name, array in batch.columns.items()}
         if "contacts/time" in pieces:  # a device may have no float64
             pieces["contacts/time"] = [array.astype(np.float64) for array in pieces["contacts/time"]]
         return [{name: arrays[d] for name, arrays in pieces.items()} for d in range(len(self.devices))]
@@ -320,12 +324,12 @@ def _pieces(array: Array) -> list[Any]:
     return sorted(array.addressable_shards, key=lambda piece: piece.index[0].start or 0)
 
 
-def parts(array: Array) -> list[np.ndarray]:
+def per_device(array: Array) -> list[np.ndarray]:
     """Each device's part of an array."""
     return [np.asarray(piece.data) for piece in _pieces(array)]
 
 
-def keep_of(config: Config, layout: layout_module.Layout) -> Keep:
+def save_at(config: Config, layout: layout_module.Layout) -> SaveAt:
     """What is kept of a simulation beyond its states."""
     rows = config.annotations.contacts * math.ceil(config.video.frames / 16) * layout.slots
-    return Keep(rows, config.annotations.energy, between=config.image.exposure > 0)
+    return SaveAt(rows, config.annotations.energy, between=config.image.exposure > 0)

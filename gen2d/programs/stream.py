@@ -23,11 +23,11 @@ from gen2d.core.errors import ConfigError
 from gen2d.core.schema import Field
 from gen2d.loading.column import LAYOUTS
 from gen2d.loading.dataloader import without_text
-from gen2d.loading.dataset import Options, chosen_fields
-from gen2d.loading.epochs import Step, Walk, one_of, shuffled
+from gen2d.loading.dataset import ViewOptions, chosen_fields
+from gen2d.loading.epochs import EpochSampler, GlobalBatch, one_of, shuffled
 from gen2d.programs import devices
 from gen2d.programs.batches import check_placed
-from gen2d.programs.rollout import Batch, Rollout, divisor
+from gen2d.programs.rollout import DeviceBatch, Rollout, divisor
 from gen2d.records.axes import Array
 from gen2d.records.keys import MAX_VIDEOS
 
@@ -73,11 +73,13 @@ def stream(
     rollout = _rollout(config.of_split(split), device)
     names = chosen_fields(config.name, rollout.fields, fields)
     frames = config.frames_of(split)
-    options = Options(split, names, window, stride, start, layout, dtype, "none").within(frames, config.video.frames)
+    options = ViewOptions(split, names, window, stride, start, layout, dtype, "none").within(
+        frames, config.video.frames
+    )
     if n is not None and not 1 <= n <= MAX_VIDEOS:
         raise ConfigError(f"n is {n}, but must be from 1 to 2**32 - 1, or None")
     count = MAX_VIDEOS if n is None else n
-    walk = Walk(count, batch_size, order_seed, shuffle, epochs, rank, world_size, remainder)
+    walk = EpochSampler(count, batch_size, order_seed, shuffle, epochs, rank, world_size, remainder)
     return Stream(rollout, options, walk, batch_size, to, frames)
 
 
@@ -90,7 +92,7 @@ def _rollout(config: Config, device: str) -> Rollout:
 class _Cell(NamedTuple):
     """Videos that are drawn together; if they are fewer than fit, the last is repeated."""
 
-    step: Step
+    step: GlobalBatch
     videos: int
     numbers: np.ndarray  # uint32
     starts: np.ndarray  # frame at which each video's window begins
@@ -100,7 +102,9 @@ class _Cell(NamedTuple):
 class Stream:
     """Batches without end, or of some epochs, from wherever the state says."""
 
-    def __init__(self, rollout: Rollout, options: Options, walk: Walk, batch_size: int, to: str, frames: int) -> None:
+    def __init__(
+        self, rollout: Rollout, options: ViewOptions, walk: EpochSampler, batch_size: int, to: str, frames: int
+    ) -> None:
         self.rollout, self.options, self.walk, self.to, self._frames = rollout, options, walk, to, frames
         self.fields = {name: rollout.fields[name] for name in options.fields}
         self.cell = cell_size(batch_size, rollout.lanes)
@@ -145,7 +149,7 @@ class Stream:
                 held = np.minimum(held, len(numbers) - 1)
                 yield _Cell(step, end - begin, numbers[held].astype(np.uint32), first[held], end == real)
 
-    def _simulated(self) -> Iterator[tuple[list[_Cell], Batch]]:
+    def _simulated(self) -> Iterator[tuple[list[_Cell], DeviceBatch]]:
         """The cells in groups that are simulated together; the next is begun before one is drawn."""
         cells, number = self._cells(), self.rollout.lanes // self.cell
         before = None
@@ -159,11 +163,11 @@ class Stream:
         if before is not None:
             yield self._checked(*before)
 
-    def _checked(self, cells: list[_Cell], numbers: np.ndarray, batch: Batch) -> tuple[list[_Cell], Batch]:
+    def _checked(self, cells: list[_Cell], numbers: np.ndarray, batch: DeviceBatch) -> tuple[list[_Cell], DeviceBatch]:
         check_placed(self.rollout.config.scene, np.asarray(batch.placed), numbers)
         return cells, batch
 
-    def _drawn(self, batch: Batch, lane: int, cell: _Cell) -> Arrays:
+    def _drawn(self, batch: DeviceBatch, lane: int, cell: _Cell) -> Arrays:
         """A cell's videos as they are delivered."""
         found = {name: batch.columns[name] for name in self.fields if name in batch.columns}
         told = self.fields.keys() & self.rollout.word_fields.keys()
@@ -174,14 +178,14 @@ class Stream:
         made |= self._words(batch, lane, told) if told else {}
         return made if cell.videos == self.cell else {name: array[: cell.videos] for name, array in made.items()}
 
-    def _words(self, batch: Batch, lane: int, wanted: Set[str]) -> Arrays:
+    def _words(self, batch: DeviceBatch, lane: int, wanted: Set[str]) -> Arrays:
         """What is told of a cell, on the host; text stays there."""
         columns = self.rollout.host_columns(batch)[0]
         own = {name: column[lane : lane + self.cell] for name, column in columns.items()}
-        told = self.rollout.told(own, self.options.split)
+        told = self.rollout.host_fields(own, self.options.split)
         return {name: v if self.fields[name].is_text else jnp.asarray(v) for name, v in told.items() if name in wanted}
 
-    def _pictures(self, batch: Batch, lane: int) -> Arrays:
+    def _pictures(self, batch: DeviceBatch, lane: int) -> Arrays:
         """What is drawn of a cell, in slices that fit the cache."""
         size = divisor(self.cell, self.rollout.slice)
         parts = [self.rollout.draw(batch, start, size)[0] for start in range(lane, lane + self.cell, size)]
@@ -211,7 +215,7 @@ def _joined(parts: list[Any]) -> Any:
     return np.concatenate(parts) if isinstance(parts[0], np.ndarray) else jnp.concatenate(parts)
 
 
-def _as_asked(name: str, field: Field, values: Array, starts: Array, options: Options) -> Array:
+def _as_asked(name: str, field: Field, values: Array, starts: Array, options: ViewOptions) -> Array:
     """Videos [m, ...] with windows, layout and type as asked for."""
     axes = field.axes.split()[1:]
     if options.window is not None and axes[:1] == ["T"]:

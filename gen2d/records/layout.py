@@ -9,7 +9,7 @@ from gen2d.core.enums import DYNAMIC, STATIC
 
 
 @dataclasses.dataclass(frozen=True)
-class Run:
+class SlotGroup:
     """Some slots in a row that hold one shape: "circle", "segment", "capsule" or "polygon"."""
 
     shape: str
@@ -27,7 +27,7 @@ class Run:
 
 
 @dataclasses.dataclass(frozen=True)
-class Tie:
+class JointSpec:
     """A joint between two slots: "distance" or "revolute"; the two do not collide unless they shall."""
 
     kind: str
@@ -44,10 +44,10 @@ class Layout:
     `reach` is the largest distance from the centre of a moving object to its rim, in metres.
     """
 
-    runs: tuple[Run, ...]
+    runs: tuple[SlotGroup, ...]
     bounds: tuple[float, float, float, float] = (0.0, 0.0, 1.0, 1.0)
     reach: float = 1.0
-    joints: tuple[Tie, ...] = ()
+    joints: tuple[JointSpec, ...] = ()
 
     @property
     def slots(self) -> int:
@@ -55,13 +55,13 @@ class Layout:
         return sum(run.count for run in self.runs)
 
     @property
-    def spans(self) -> tuple[tuple[Run, int], ...]:
+    def spans(self) -> tuple[tuple[SlotGroup, int], ...]:
         """Each run and its first slot."""
         starts = itertools.accumulate((run.count for run in self.runs), initial=0)
         return tuple(zip(self.runs, starts, strict=False))
 
     @property
-    def painted(self) -> tuple[tuple[Run, int], ...]:
+    def painted(self) -> tuple[tuple[SlotGroup, int], ...]:
         """The same from back to front: lower layers first, slots of one layer in their order."""
         return tuple(sorted(self.spans, key=lambda span: (span[0].painted, span[1])))
 

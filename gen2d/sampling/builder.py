@@ -25,14 +25,14 @@ from gen2d.physics.inertia import (
     stadium_moment,
 )
 from gen2d.records.axes import Array
-from gen2d.records.layout import Layout, Run
+from gen2d.records.layout import Layout, SlotGroup
 from gen2d.records.scene import Joints, Objects, Scene, State
 
 GREY = (128.0, 128.0, 128.0)
 OPTIONAL = ("vertices", "vertex_count", "rolling_resistance", "force", "torque")  # what a scene may lack
 
 
-class Sampled(NamedTuple):
+class SampledScene(NamedTuple):
     """What a family makes of its factors, for one video."""
 
     scene: Scene
@@ -42,10 +42,10 @@ class Sampled(NamedTuple):
     derived: Mapping[str, Array] = MappingProxyType({})  # what follows from the drawn numbers; the family's DERIVED
 
 
-class Part(NamedTuple):
+class BodyGroup(NamedTuple):
     """A run, and what its slots hold: `objects` without their depth."""
 
-    run: Run
+    run: SlotGroup
     objects: dict[str, Array]
     state: State
 
@@ -68,21 +68,23 @@ MATERIAL = {
 }
 
 
-def discs(position: Array, radius: Any, present: Any = True, *, angle: Any = 0.0, **material: Any) -> Part:
+def discs(position: Array, radius: Any, present: Any = True, *, angle: Any = 0.0, **material: Any) -> BodyGroup:
     """Discs at these centres [K, 2] m, with this radius in m."""
     radius = jnp.broadcast_to(radius, position.shape[:1]).astype(jnp.float32)
     mass = disc_mass(radius, material.get("density", 1.0))
     return _part("circle", position, angle, present, material, mass, disc_moment(radius, jnp.ones(())), radius=radius)
 
 
-def capsules(position: Array, angle: Any, half_length: Any, radius: Any, present: Any = True, **material: Any) -> Part:
+def capsules(
+    position: Array, angle: Any, half_length: Any, radius: Any, present: Any = True, **material: Any
+) -> BodyGroup:
     """Capsules at these centres [K, 2] m; `half_length` m is half the distance between the centres of their ends."""
     half, radius = (jnp.broadcast_to(x, position.shape[:1]).astype(jnp.float32) for x in (half_length, radius))
     mass, moment = stadium_mass(half, radius, material.get("density", 1.0)), stadium_moment(half, radius, jnp.ones(()))
     return _part("capsule", position, angle, present, material, mass, moment, radius=radius, half_length=half)
 
 
-def bars(a: Any, b: Any, radius: Any, present: Any = True, **material: Any) -> Part:
+def capsules_between(a: Any, b: Any, radius: Any, present: Any = True, **material: Any) -> BodyGroup:
     """Capsules whose ends have their centres at these points [K, 2] m and those."""
     a, b = (jnp.asarray(x, jnp.float32) for x in (a, b))
     way = b - a
@@ -90,7 +92,7 @@ def bars(a: Any, b: Any, radius: Any, present: Any = True, **material: Any) -> P
     return capsules((a + b) / 2, angle, half, radius, present, **material)
 
 
-def segments(a: Any, b: Any, present: Any = True, **material: Any) -> Part:
+def segments(a: Any, b: Any, present: Any = True, **material: Any) -> BodyGroup:
     """Segments from these points [K, 2] m to those; static unless `kind` says otherwise, and then with a mass."""
     a, b = (jnp.asarray(x, jnp.float32) for x in (a, b))
     way = b - a
@@ -102,7 +104,7 @@ def segments(a: Any, b: Any, present: Any = True, **material: Any) -> Part:
     )  # fmt: skip
 
 
-def boxes(position: Array, angle: Any, width: Any, height: Any, present: Any = True, **material: Any) -> Part:
+def boxes(position: Array, angle: Any, width: Any, height: Any, present: Any = True, **material: Any) -> BodyGroup:
     """Rectangles at these centres [K, 2] m, with these sides in m."""
     count = position.shape[0]
     corners = box_vertices(*(jnp.broadcast_to(x, (count,)).astype(jnp.float32) for x in (width, height)))
@@ -117,7 +119,7 @@ def polygons(
     *,
     count: Any = None,
     **material: Any,
-) -> Part:
+) -> BodyGroup:
     """Convex polygons with their centres of mass at these points [K, 2] m; `vertices` [K, V, 2] m counter-clockwise
     from there. `count` [K] of them are a polygon's own, the rest repeat its last; default: all."""
     mass, moment = polygon_mass(vertices, material.get("density", 1.0)), polygon_moment(vertices, jnp.ones(()))
@@ -126,7 +128,7 @@ def polygons(
     return _part("polygon", position, angle, present, material, mass, moment, **shape)
 
 
-def box_walls(width: float, height: float, **material: Any) -> Part:
+def box_walls(width: float, height: float, **material: Any) -> BodyGroup:
     """The floor, right wall, ceiling and left wall of a box from 0, 0 to width, height m; each faces inwards."""
     corners = jnp.asarray([[0, 0], [width, 0], [width, height], [0, height]], jnp.float32)
     return segments(corners, jnp.roll(corners, -1, axis=0), **material)
@@ -141,13 +143,13 @@ def _part(
     mass: Array,
     moment: Array,
     **sizes: Array,
-) -> Part:
+) -> BodyGroup:
     """`mass` is that of the density, `moment` that of one kilogram."""
     assert material.keys() <= MATERIAL.keys(), f"{material.keys() - MATERIAL.keys()} are not of {list(MATERIAL)}"
     count, kind = position.shape[0], material.get("kind", DYNAMIC)
     present = jnp.broadcast_to(present, (count,))
     vertices = sizes["vertices"].shape[1] if "vertices" in sizes else 0
-    run = Run(shape, count, kind, vertices, layer=material.get("layer"), collides=material.get("collides", True))
+    run = SlotGroup(shape, count, kind, vertices, layer=material.get("layer"), collides=material.get("collides", True))
 
     def slots(value: Any, *more: int, dtype: Any = jnp.float32) -> Array:
         values = jnp.broadcast_to(jnp.asarray(value, jnp.float32), (count, *more))
@@ -173,11 +175,11 @@ def _part(
     more = {"rolling_resistance": (), "force": (2,), "torque": ()}
     objects |= {name: slots(material[name], *axes) for name, axes in more.items() if name in material}
     moves = slots(material.get("velocity", 0.0), 2), slots(material.get("spin", 0.0))
-    return Part(run, objects, State(slots(position, 2), slots(angle), *moves))
+    return BodyGroup(run, objects, State(slots(position, 2), slots(angle), *moves))
 
 
-def assembled(
-    layout: Layout, parts: Sequence[Part], gravity: Array, joints: Joints | None = None
+def assemble(
+    layout: Layout, parts: Sequence[BodyGroup], gravity: Array, joints: Joints | None = None
 ) -> tuple[Scene, State]:
     """Scene and initial state of these parts, whose runs are the layout's; `gravity` [2] m/s^2.
 
@@ -193,7 +195,7 @@ def assembled(
     return Scene(Objects(depth=depth, **found), jnp.asarray(gravity, jnp.float32), joints), state
 
 
-def _held(part: Part, name: str, corners: int) -> Array:
+def _held(part: BodyGroup, name: str, corners: int) -> Array:
     """A part's values of one of the objects' fields; zero where it has none."""
     count = part.run.count
     empty = {
@@ -209,7 +211,7 @@ def _held(part: Part, name: str, corners: int) -> Array:
     return values
 
 
-def joined(anchor_a: Any, anchor_b: Any, **numbers: Any) -> Joints:
+def distance_joints(anchor_a: Any, anchor_b: Any, **numbers: Any) -> Joints:
     """A scene's joints, in the order of its layout's: anchors [J, 2] m in the frames of their objects, and what else
     `Joints` has, each a number or one for each joint; default: rigid, without limits and motors."""
     anchors = [jnp.asarray(x, jnp.float32) for x in (anchor_a, anchor_b)]
@@ -223,7 +225,7 @@ def joined(anchor_a: Any, anchor_b: Any, **numbers: Any) -> Joints:
     return Joints(*anchors, **values)
 
 
-def hinged(links: Part, tail: bool, **numbers: Any) -> Joints:
+def hinge_chain(links: BodyGroup, tail: bool, **numbers: Any) -> Joints:
     """The revolute joints of bars in a row: where each begins, in the middle of an object or at the end of the bar
     before, and with a `tail` where the last ends, in the middle of another object, which is that joint's `a`."""
     half = links.objects["half_length"]
@@ -231,4 +233,4 @@ def hinged(links: Part, tail: bool, **numbers: Any) -> Joints:
     above, below = jnp.concatenate([middle, ends[:-1]]), -ends
     if tail:
         above, below = jnp.concatenate([above, middle]), jnp.concatenate([below, ends[-1:]])
-    return joined(above, below, **numbers)
+    return distance_joints(above, below, **numbers)

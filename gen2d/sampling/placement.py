@@ -15,7 +15,7 @@ RESTARTS = 100  # after which the scene is given up
 CLEARANCE = 1e-3  # m between objects at the start
 
 
-def beginning(share: Array, low: Any, high: Any, way: Array, entry: float) -> Array:
+def start_position(share: Array, low: Any, high: Any, way: Array, entry: float) -> Array:
     """Where on a line something starts that goes `way` m and shall then still be between `low` and `high` m: at this
     share, in [0, 1], of the places that are possible, from the lowest on.
 

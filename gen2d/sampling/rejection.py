@@ -36,7 +36,9 @@ def attempt_keys(keys: Array, attempts: Array) -> Array:
     return jax.vmap(of_video)(keys, attempts)
 
 
-def fitting(make: Callable[[np.ndarray, np.ndarray], Any], numbers: np.ndarray, options: Any) -> tuple[Any, np.ndarray]:
+def accepted_batch(
+    make: Callable[[np.ndarray, np.ndarray], Any], numbers: np.ndarray, options: Any
+) -> tuple[Any, np.ndarray]:
     """A batch of videos that are all of the kind that is asked for, and which attempt each is.
 
     `make(lanes, attempts)` makes those attempts of the videos in these lanes, a batch with `columns` whose arrays have

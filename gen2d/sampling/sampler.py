@@ -16,7 +16,7 @@ import numpy as np
 
 from gen2d.config.config import Config
 from gen2d.config.distributions import Span
-from gen2d.config.joint_distribution import Law
+from gen2d.config.joint_distribution import JointDistribution
 from gen2d.config.options import Option, coordinates, drawn_options
 from gen2d.config.plugin_options import Plugin
 from gen2d.core.permutation import hashed
@@ -24,10 +24,10 @@ from gen2d.core.schema import Field
 from gen2d.loading.epochs import order
 from gen2d.records.axes import Array
 from gen2d.records.keys import key_for, keys_for
-from gen2d.sampling.builder import Sampled
+from gen2d.sampling.builder import SampledScene
 
-Factors = dict[str, Array]
-Change = Callable[[Factors, Callable[[Array], Factors]], Factors]
+SampledFactors = dict[str, Array]
+FactorChange = Callable[[SampledFactors, Callable[[Array], SampledFactors]], SampledFactors]
 
 
 def sizes(scene: Plugin) -> dict[str, int]:
@@ -80,8 +80,8 @@ class Sampler:
         return found
 
     def sampled(
-        self, key: Array, row: Any = 0, given: Any = (), change: Change | None = None
-    ) -> tuple[Factors, Sampled]:
+        self, key: Array, row: Any = 0, given: Any = (), change: FactorChange | None = None
+    ) -> tuple[SampledFactors, SampledScene]:
         """A video's factors, those that follow from others included, and its scene and start.
 
         `row` is that of the split, `given` [G] what `combination` says of the video. `change(found, draw)` makes other
@@ -93,13 +93,13 @@ class Sampler:
         rejected, fits = jnp.asarray(made.rejected, jnp.int32), jnp.asarray(made.fits, bool)
         return {**drawn, **made.derived}, made._replace(rejected=rejected, fits=fits, derived={})
 
-    def drawn(self, key: Array, row: Any = 0, given: Any = (), change: Change | None = None) -> Factors:
+    def drawn(self, key: Array, row: Any = 0, given: Any = (), change: FactorChange | None = None) -> SampledFactors:
         """A video's factors by name; zero for what is beyond the number there is."""
-        found = self._found(key, row, given)
-        found = change(found, lambda other: self._found(other, row, given)) if change else found
+        found = self._sampled_factors(key, row, given)
+        found = change(found, lambda other: self._sampled_factors(other, row, given)) if change else found
         return {name: self._counted(name, values, found) for name, values in found.items()}
 
-    def _found(self, key: Array, row: Any, given: Any) -> Factors:
+    def _sampled_factors(self, key: Array, row: Any, given: Any) -> SampledFactors:
         """All factors by name. Each has a key of its own, so that its draws do not depend on which others there are."""
         components = self._components(key, row)
         found = {}
@@ -156,24 +156,24 @@ class Sampler:
             found[axis] = jnp.where(each, pick(key_for(own, axis), (length,)), common)
         return found
 
-    def _axis(self, law: Law) -> str:
+    def _axis(self, law: JointDistribution) -> str:
         found = {self.options[name.partition("[")[0]].each for name in law.differing}
         return found.pop() if len(found) == 1 else ""
 
-    def _counted(self, name: str, values: Array, found: Factors) -> Array:
+    def _counted(self, name: str, values: Array, found: SampledFactors) -> Array:
         each = self.options[name].each
         return values if each not in found else jnp.where(_there(each, values, found), values, 0)
 
     # ---- How far from the training split
 
-    def outside(self, drawn: Factors) -> dict[str, Array]:
+    def outside(self, drawn: SampledFactors) -> dict[str, Array]:
         """By stored name how far each factor lies from what the training split can give, and whether all of them do."""
         if self.training is None:
             return {}
         found = {f"outside/{name}": self._distance(name, drawn) for name in self.options}
         return found | {"outside/training": ~self._inside(self.training, drawn)}
 
-    def _distance(self, name: str, drawn: Factors) -> Array:
+    def _distance(self, name: str, drawn: SampledFactors) -> Array:
         assert self.training is not None
         values, names = drawn[name], self._coordinates(name)
         parts = jnp.moveaxis(values, -1, 0) if self.options[name].parts else values[None]
@@ -181,7 +181,7 @@ class Sampler:
         distance = jnp.stack(far, axis=-1) if self.options[name].parts else far[0]
         return self._counted(name, distance, drawn)
 
-    def _inside(self, law: Law, drawn: Factors) -> Array:
+    def _inside(self, law: JointDistribution, drawn: SampledFactors) -> Array:
         """Whether a law can give these factors: all of them from one product, or each thing's from one of its own."""
         axis = self._axis(law)
         fits = []
@@ -196,18 +196,18 @@ class Sampler:
             fits.append(of_video & of_each)
         return jnp.all(functools.reduce(jnp.logical_or, fits))
 
-    def _held(self, parts: Any, name: str, drawn: Factors) -> Array:
+    def _held(self, parts: Any, name: str, drawn: SampledFactors) -> Array:
         """Whether each of a factor's values lies in a product, all parts of a vector together."""
         values = drawn[name]
         each = jnp.moveaxis(values, -1, 0) if self.options[name].parts else values[None]
         far = [_far(part, parts[own].spans) for part, own in zip(each, self._coordinates(name), strict=True)]
         return functools.reduce(jnp.logical_and, [distance == 0 for distance in far])
 
-    def _present(self, spec: Option, inside: Array, drawn: Factors) -> Array:
+    def _present(self, spec: Option, inside: Array, drawn: SampledFactors) -> Array:
         return _there(spec.each, inside, drawn) if spec.each in drawn else jnp.ones_like(inside)
 
 
-def _there(each: str, values: Array, found: Factors) -> Array:
+def _there(each: str, values: Array, found: SampledFactors) -> Array:
     """Which of the counted things [K, ...] there are, like these values of them."""
     return (jnp.arange(values.shape[0]) < found[each]).reshape(-1, *[1] * (values.ndim - 1))
 

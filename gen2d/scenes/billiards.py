@@ -13,8 +13,8 @@ from gen2d.config.distributions import Distribution
 from gen2d.config.options import option
 from gen2d.core.enums import STATIC
 from gen2d.records.axes import Array
-from gen2d.records.layout import Layout, Run
-from gen2d.sampling.builder import Sampled, assembled, box_walls, discs
+from gen2d.records.layout import Layout, SlotGroup
+from gen2d.sampling.builder import SampledScene, assemble, box_walls, discs
 
 
 @dataclasses.dataclass(frozen=True)
@@ -77,11 +77,11 @@ def sizes(options: Options) -> dict[str, int]:
 
 def layout(options: Options) -> Layout:
     """The cue ball and the rack's, then floor, right, ceiling and left cushion."""
-    runs = Run("circle", 1 + sizes(options)["rack"]), Run("segment", 4, STATIC)
+    runs = SlotGroup("circle", 1 + sizes(options)["rack"]), SlotGroup("segment", 4, STATIC)
     return Layout(runs, (0.0, 0.0, options.width, options.height), options.radius.support[1])
 
 
-def sample(key: Array, factors: dict[str, Array], options: Options) -> Sampled:
+def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledScene:
     """One video's scene and start: the rack at its spot, and the cue ball on its way there."""
     radius, rows = factors["radius"], factors["rows"]
     nearest, farthest = jnp.stack([radius, radius]), jnp.stack([options.head, options.height - radius])
@@ -102,7 +102,7 @@ def sample(key: Array, factors: dict[str, Array], options: Options) -> Sampled:
         options.width, options.height, elasticity=factors["cushion_elasticity"], friction=factors["cushion_friction"],
         color=factors["cushion_color"],
     )  # fmt: skip
-    return Sampled(*assembled(layout(options), [balls, cushions], jnp.zeros(2)))
+    return SampledScene(*assemble(layout(options), [balls, cushions], jnp.zeros(2)))
 
 
 def _triangle(rows: int) -> np.ndarray:

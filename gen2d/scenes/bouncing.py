@@ -9,8 +9,8 @@ from gen2d.config.distributions import Distribution
 from gen2d.config.options import option
 from gen2d.core.enums import STATIC
 from gen2d.records.axes import Array
-from gen2d.records.layout import Layout, Run
-from gen2d.sampling.builder import Sampled, assembled, box_walls, discs
+from gen2d.records.layout import Layout, SlotGroup
+from gen2d.sampling.builder import SampledScene, assemble, box_walls, discs
 from gen2d.sampling.placement import place
 
 
@@ -54,11 +54,11 @@ def check(options: Options) -> None:
 
 def layout(options: Options) -> Layout:
     """The balls, then floor, right wall, ceiling, left wall."""
-    runs = Run("circle", int(options.balls.support[1])), Run("segment", 4, STATIC)
+    runs = SlotGroup("circle", int(options.balls.support[1])), SlotGroup("segment", 4, STATIC)
     return Layout(runs, (0.0, 0.0, options.width, options.height), options.radius.support[1])
 
 
-def sample(key: Array, factors: dict[str, Array], options: Options) -> Sampled:
+def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledScene:
     """One video's scene and start: balls at random places that do not overlap."""
     radius, box = factors["radius"], jnp.asarray([options.width, options.height])
     present = jnp.arange(len(radius)) < factors["balls"]
@@ -68,4 +68,4 @@ def sample(key: Array, factors: dict[str, Array], options: Options) -> Sampled:
         options.width, options.height, elasticity=factors["wall_elasticity"], friction=factors["wall_friction"]
     )
     parts = [discs(places, radius, present, **material), walls]
-    return Sampled(*assembled(layout(options), parts, factors["gravity"]), rejected, fits)
+    return SampledScene(*assemble(layout(options), parts, factors["gravity"]), rejected, fits)

@@ -13,8 +13,8 @@ from gen2d.config.options import option
 from gen2d.core.enums import STATIC
 from gen2d.core.schema import Field
 from gen2d.records.axes import Array
-from gen2d.records.layout import Layout, Run, Tie
-from gen2d.sampling.builder import Sampled, assembled, bars, discs, hinged
+from gen2d.records.layout import JointSpec, Layout, SlotGroup
+from gen2d.sampling.builder import SampledScene, assemble, capsules_between, discs, hinge_chain
 
 DERIVED = {"kink": Field("float32", "n", "1", "joint that it is pulled by at the start, counted from the left pin")}
 
@@ -67,9 +67,9 @@ def check(options: Options) -> None:
 def layout(options: Options) -> Layout:
     """The pins, then the links, each hung from the one before."""
     n, pins, radius = options.links, options.ends, options.radius.support[1]
-    ties = [Tie("revolute", pins + i - 1 if i else 0, pins + i) for i in range(n)]
-    ties += [Tie("revolute", 1, pins + n - 1)] if pins == 2 else []
-    runs = Run("circle", pins, STATIC, layer=2, collides=False), Run("capsule", n, collides=False)
+    ties = [JointSpec("revolute", pins + i - 1 if i else 0, pins + i) for i in range(n)]
+    ties += [JointSpec("revolute", 1, pins + n - 1)] if pins == 2 else []
+    runs = SlotGroup("circle", pins, STATIC, layer=2, collides=False), SlotGroup("capsule", n, collides=False)
     length = options.length.support[1]
     return Layout(runs, _bounds(options, n * length), length / 2 + radius, tuple(ties))
 
@@ -87,16 +87,16 @@ def _bounds(options: Options, whole: float) -> tuple[float, float, float, float]
     return -whole / 2 - rim, -depth - tilt - rim, whole / 2 + rim, top + tilt + rim
 
 
-def sample(key: Array, factors: dict[str, Array], options: Options) -> Sampled:
+def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledScene:
     """One video's scene and start: the chain at rest, taut."""
     n, radius = options.links, factors["radius"]
     corners, kink = _straight(factors, n) if options.ends == 1 else _pulled(factors, n)
     pins = discs(corners[:: n if options.ends == 2 else n + 1], 1.5 * radius, kind=STATIC, layer=2, collides=False)
     material = {"density": factors["density"], "color": factors["color"], "collides": False}
-    links = bars(corners[:-1], corners[1:], radius, **material)
-    joints = hinged(links, options.ends == 2, motor_torque=factors["friction"])
-    scene, state = assembled(layout(options), [pins, links], factors["gravity"], joints)
-    return Sampled(scene, state, derived={"kink": kink})
+    links = capsules_between(corners[:-1], corners[1:], radius, **material)
+    joints = hinge_chain(links, options.ends == 2, motor_torque=factors["friction"])
+    scene, state = assemble(layout(options), [pins, links], factors["gravity"], joints)
+    return SampledScene(scene, state, derived={"kink": kink})
 
 
 def _straight(factors: dict[str, Array], n: int) -> tuple[Array, Array]:

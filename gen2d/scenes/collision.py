@@ -15,8 +15,8 @@ from gen2d.config.distributions import Distribution
 from gen2d.config.options import option
 from gen2d.core.schema import Field
 from gen2d.records.axes import Array
-from gen2d.records.layout import Layout, Run
-from gen2d.sampling.builder import Sampled, assembled, discs
+from gen2d.records.layout import Layout, SlotGroup
+from gen2d.sampling.builder import SampledScene, assemble, discs
 from gen2d.sampling.placement import CLEARANCE
 
 NEVER = -1.0  # the contact frame of balls that do not approach
@@ -84,10 +84,10 @@ def sizes(options: Options) -> dict[str, int]:
 def layout(options: Options) -> Layout:
     """The first ball and the second."""
     reach = max(options.radius_1.support[1], options.radius_2.support[1])
-    return Layout((Run("circle", 2),), (0.0, 0.0, options.width, options.height), reach)
+    return Layout((SlotGroup("circle", 2),), (0.0, 0.0, options.width, options.height), reach)
 
 
-def sample(key: Array, factors: dict[str, Array], options: Options) -> Sampled:
+def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledScene:
     """One video's scene and start: the balls on one line, as far apart as the time of their contact asks for."""
     radius = jnp.stack([factors["radius_1"], factors["radius_2"]])
     speed = jnp.stack([factors["speed_1"], factors["speed_2"]])
@@ -102,7 +102,7 @@ def sample(key: Array, factors: dict[str, Array], options: Options) -> Sampled:
         **{name: factors[name] for name in ("density", "elasticity", "friction", "color")},
     )  # fmt: skip
     derived = {"contact_frame": jnp.where(speed.sum() > 0, time / options.frame, NEVER)}
-    return Sampled(*assembled(layout(options), [balls], jnp.zeros(2)), derived=derived)
+    return SampledScene(*assemble(layout(options), [balls], jnp.zeros(2)), derived=derived)
 
 
 def _contact(share: Array, closing: Array, room: Array, options: Options) -> tuple[Array, Array]:

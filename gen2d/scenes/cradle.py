@@ -8,8 +8,8 @@ from gen2d.config.distributions import Distribution
 from gen2d.config.options import option
 from gen2d.core.schema import Field
 from gen2d.records.axes import Array
-from gen2d.records.layout import Layout, Run
-from gen2d.sampling.builder import Sampled, assembled, discs
+from gen2d.records.layout import Layout, SlotGroup
+from gen2d.sampling.builder import SampledScene, assemble, discs
 
 DERIVED = {"contact_time": Field("float32", "n", "s", "at which the first of those that move meets one at rest")}
 
@@ -54,10 +54,12 @@ def check(options: Options) -> None:
 def layout(options: Options) -> Layout:
     """The balls, from left to right."""
     largest = options.radius.support[1]
-    return Layout((Run("circle", int(options.balls.support[1])),), (0.0, 0.0, options.width, options.height), largest)
+    return Layout(
+        (SlotGroup("circle", int(options.balls.support[1])),), (0.0, 0.0, options.width, options.height), largest
+    )
 
 
-def sample(key: Array, factors: dict[str, Array], options: Options) -> Sampled:
+def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledScene:
     """One video's scene and start: those at rest in the middle, the others to the left of them."""
     number, moving, radius, gap = (
         jnp.arange(len(factors["density"])),
@@ -74,4 +76,4 @@ def sample(key: Array, factors: dict[str, Array], options: Options) -> Sampled:
     velocity = jnp.stack([speed, jnp.zeros_like(speed)], axis=-1)
     balls = discs(places, radius, number < factors["balls"], velocity=velocity, **material)
     derived = {"contact_time": factors["approach"] / factors["speed"]}
-    return Sampled(*assembled(layout(options), [balls], jnp.zeros(2)), derived=derived)
+    return SampledScene(*assemble(layout(options), [balls], jnp.zeros(2)), derived=derived)

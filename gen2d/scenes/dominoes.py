@@ -8,8 +8,8 @@ from gen2d.config.distributions import Distribution
 from gen2d.config.options import option
 from gen2d.core.enums import STATIC
 from gen2d.records.axes import Array
-from gen2d.records.layout import Layout, Run
-from gen2d.sampling.builder import Sampled, assembled, boxes, discs, segments
+from gen2d.records.layout import Layout, SlotGroup
+from gen2d.sampling.builder import SampledScene, assemble, boxes, discs, segments
 
 FAR = 2.0  # the floor's length, over the view's width
 
@@ -62,13 +62,13 @@ def layout(options: Options) -> Layout:
     ends = {name: getattr(options, name).support[1] for name in ("height", "thickness", "gap", "radius", "way", "aim")}
     row = most * ends["thickness"] + (most - 1) * ends["gap"]
     width = 2 * ends["radius"] + ends["way"] + row + ends["height"]  # the last one's fall
-    runs = Run("segment", 1, STATIC), Run("circle", 1), Run("polygon", most, vertices=4)
+    runs = SlotGroup("segment", 1, STATIC), SlotGroup("circle", 1), SlotGroup("polygon", most, vertices=4)
     top = max(1.2 * ends["height"], ends["aim"] * ends["height"] + ends["radius"])
     reach = max((ends["height"] ** 2 + ends["thickness"] ** 2) ** 0.5 / 2, ends["radius"])
     return Layout(runs, (0.0, 0.0, width, top), reach)
 
 
-def sample(key: Array, factors: dict[str, Array], options: Options) -> Sampled:
+def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledScene:
     """One video's scene and start: ball, row and the last one's fall are in the middle of the view."""
     layers = layout(options)
     count, most = factors["dominoes"], int(options.dominoes.support[1])
@@ -91,4 +91,4 @@ def sample(key: Array, factors: dict[str, Array], options: Options) -> Sampled:
     )  # fmt: skip
     wide = FAR * layers.bounds[2]
     floor = segments([(-wide, 0.0)], [(wide, 0.0)], friction=factors["floor_friction"])
-    return Sampled(*assembled(layers, [floor, ball, row], factors["gravity"]))
+    return SampledScene(*assemble(layers, [floor, ball, row], factors["gravity"]))

@@ -10,8 +10,8 @@ from gen2d.config.distributions import Distribution
 from gen2d.config.options import option
 from gen2d.core.enums import STATIC
 from gen2d.records.axes import Array
-from gen2d.records.layout import Layout, Run
-from gen2d.sampling.builder import Sampled, assembled, box_walls, discs, segments
+from gen2d.records.layout import Layout, SlotGroup
+from gen2d.sampling.builder import SampledScene, assemble, box_walls, discs, segments
 from gen2d.sampling.placement import place
 
 
@@ -61,11 +61,15 @@ def check(options: Options) -> None:
 
 def layout(options: Options) -> Layout:
     """The balls, then floor, right wall, ceiling, left wall, then the left and the right slope."""
-    runs = Run("circle", int(options.balls.support[1])), Run("segment", 4, STATIC), Run("segment", 2, STATIC)
+    runs = (
+        SlotGroup("circle", int(options.balls.support[1])),
+        SlotGroup("segment", 4, STATIC),
+        SlotGroup("segment", 2, STATIC),
+    )
     return Layout(runs, (0.0, 0.0, options.width, options.height), options.radius.support[1])
 
 
-def sample(key: Array, factors: dict[str, Array], options: Options) -> Sampled:
+def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledScene:
     """One video's scene and start: balls at rest at random places above the slopes."""
     radius, middle = factors["radius"], options.width / 2
     rim = options.neck + jnp.tan(factors["angle"]) * (middle - factors["gap"] / 2)
@@ -82,4 +86,4 @@ def sample(key: Array, factors: dict[str, Array], options: Options) -> Sampled:
         box_walls(options.width, options.height, **walls),
         segments(upper, lower, **walls),
     ]
-    return Sampled(*assembled(layout(options), parts, factors["gravity"]), rejected, fits)
+    return SampledScene(*assemble(layout(options), parts, factors["gravity"]), rejected, fits)

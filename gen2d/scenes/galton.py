@@ -9,8 +9,8 @@ from gen2d.config.distributions import Distribution
 from gen2d.config.options import option
 from gen2d.core.enums import STATIC
 from gen2d.records.axes import Array
-from gen2d.records.layout import Layout, Run
-from gen2d.sampling.builder import Sampled, assembled, box_walls, discs, segments
+from gen2d.records.layout import Layout, SlotGroup
+from gen2d.sampling.builder import SampledScene, assemble, box_walls, discs, segments
 
 
 @dataclasses.dataclass(frozen=True)
@@ -84,16 +84,16 @@ def layout(options: Options) -> Layout:
     """The balls, the pegs from the top, the walls between bins from the left, then floor, right wall, ceiling, left."""
     largest, most = options.radius.support[1], int(options.balls.support[1])
     runs = (
-        Run("circle", most),
-        Run("circle", len(pegs(options)), STATIC),
-        Run("segment", options.rows, STATIC),
-        Run("segment", 4, STATIC),
+        SlotGroup("circle", most),
+        SlotGroup("circle", len(pegs(options)), STATIC),
+        SlotGroup("segment", options.rows, STATIC),
+        SlotGroup("segment", 4, STATIC),
     )
     top = top_peg(options) + options.spacing + (most - 1) * options.apart + 2 * largest
     return Layout(runs, (0.0, 0.0, width(options), top), largest)
 
 
-def sample(key: Array, factors: dict[str, Array], options: Options) -> Sampled:
+def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledScene:
     """One video's scene and start: balls at rest above the first peg, each a little aside."""
     here, (_, _, right, top) = layout(options), layout(options).bounds
     number = jnp.arange(len(factors["radius"]))
@@ -108,4 +108,4 @@ def sample(key: Array, factors: dict[str, Array], options: Options) -> Sampled:
     feet = jnp.stack([at, jnp.zeros_like(at)], axis=-1)
     bins = segments(feet, feet + jnp.asarray([0.0, options.bin_height]), **board)
     parts = [balls, lattice, bins, box_walls(right, top, **board)]
-    return Sampled(*assembled(here, parts, factors["gravity"]))
+    return SampledScene(*assemble(here, parts, factors["gravity"]))

@@ -9,8 +9,8 @@ from gen2d.config.options import option
 from gen2d.core.enums import STATIC
 from gen2d.core.schema import Field
 from gen2d.records.axes import Array
-from gen2d.records.layout import Layout, Run
-from gen2d.sampling.builder import Sampled, assembled, box_walls, discs
+from gen2d.records.layout import Layout, SlotGroup
+from gen2d.sampling.builder import SampledScene, assemble, box_walls, discs
 
 DERIVED = {
     "contact_time": Field("float32", "n pairs", "s", "at which the two of a pair meet, if nothing else does before"),
@@ -74,11 +74,11 @@ def check(options: Options) -> None:
 
 def layout(options: Options) -> Layout:
     """The left and right ball of each pair in turn, then floor, right wall, ceiling, left wall."""
-    runs = Run("circle", 2 * int(options.pairs.support[1])), Run("segment", 4, STATIC)
+    runs = SlotGroup("circle", 2 * int(options.pairs.support[1])), SlotGroup("segment", 4, STATIC)
     return Layout(runs, (0.0, 0.0, options.width, options.height), options.radius.support[1])
 
 
-def sample(key: Array, factors: dict[str, Array], options: Options) -> Sampled:
+def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledScene:
     """One video's scene and start: every pair in its lane, one from the left and one from the right."""
     radius, density, pairs = factors["radius"], factors["density"], factors["pairs"]
     number, sides = jnp.arange(len(density)), jnp.asarray([1.0, -1.0])
@@ -106,4 +106,4 @@ def sample(key: Array, factors: dict[str, Array], options: Options) -> Sampled:
         "contact_time": jnp.where(present, way / jnp.where(present, closing, 1.0), 0.0),
         "mass_ratio": jnp.where(present, density[:, 0] / jnp.where(present, density[:, 1], 1.0), 0.0),
     }
-    return Sampled(*assembled(layout(options), [balls, walls], jnp.zeros(2)), derived=derived)
+    return SampledScene(*assemble(layout(options), [balls, walls], jnp.zeros(2)), derived=derived)

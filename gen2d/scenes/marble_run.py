@@ -9,8 +9,8 @@ from gen2d.config.distributions import Distribution
 from gen2d.config.options import option
 from gen2d.core.enums import STATIC
 from gen2d.records.axes import Array
-from gen2d.records.layout import Layout, Run
-from gen2d.sampling.builder import Sampled, assembled, box_walls, discs, segments
+from gen2d.records.layout import Layout, SlotGroup
+from gen2d.sampling.builder import SampledScene, assemble, box_walls, discs, segments
 
 CLEARANCE = 0.02  # m: how much more room than it needs the ball has between two ramps, at least
 
@@ -79,11 +79,15 @@ def headroom(options: Options) -> float:
 
 def layout(options: Options) -> Layout:
     """The ball, the ramps from top to bottom, then floor, right wall, ceiling, left wall."""
-    runs = Run("circle", 1), Run("segment", int(options.ramps.support[1]), STATIC), Run("segment", 4, STATIC)
+    runs = (
+        SlotGroup("circle", 1),
+        SlotGroup("segment", int(options.ramps.support[1]), STATIC),
+        SlotGroup("segment", 4, STATIC),
+    )
     return Layout(runs, (0.0, 0.0, options.width, options.height), options.radius.support[1])
 
 
-def sample(key: Array, factors: dict[str, Array], options: Options) -> Sampled:
+def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledScene:
     """One video's scene and start: ramps as far below each other as the height allows, and the ball over the first.
 
     The first begins at the left wall, the next at the right one, and so on.
@@ -111,4 +115,4 @@ def sample(key: Array, factors: dict[str, Array], options: Options) -> Sampled:
         segments(starts, stops, present, color=factors["ramp_color"], **board),
         box_walls(options.width, options.height, **board),
     ]
-    return Sampled(*assembled(layout(options), parts, factors["gravity"]))
+    return SampledScene(*assemble(layout(options), parts, factors["gravity"]))

@@ -9,8 +9,8 @@ from gen2d.config.options import option
 from gen2d.core.enums import STATIC
 from gen2d.core.schema import Field
 from gen2d.records.axes import Array
-from gen2d.records.layout import Layout, Run
-from gen2d.sampling.builder import Sampled, assembled, box_walls, boxes, discs
+from gen2d.records.layout import Layout, SlotGroup
+from gen2d.sampling.builder import SampledScene, assemble, box_walls, boxes, discs
 
 DERIVED = {
     "hidden_from": Field(
@@ -88,13 +88,13 @@ def check(options: Options) -> None:
 def layout(options: Options) -> Layout:
     """The balls, then floor, right wall, ceiling, left wall if there are walls, then the screen."""
     largest = options.radius.support[1]
-    box = (Run("segment", 4, STATIC),) if options.walls else ()
-    screen = Run("polygon", 1, STATIC, vertices=4, layer=2, collides=False)
-    runs = (Run("circle", int(options.balls.support[1])), *box, screen)
+    box = (SlotGroup("segment", 4, STATIC),) if options.walls else ()
+    screen = SlotGroup("polygon", 1, STATIC, vertices=4, layer=2, collides=False)
+    runs = (SlotGroup("circle", int(options.balls.support[1])), *box, screen)
     return Layout(runs, (0.0, 0.0, options.width, options.height), largest)
 
 
-def sample(key: Array, factors: dict[str, Array], options: Options) -> Sampled:
+def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledScene:
     """One video's scene and start: balls on their way to the screen, each in its own part of the screen's height."""
     radius, side, speed = factors["radius"], factors["side"], factors["speed"]
     number, largest = jnp.arange(len(radius)), options.radius.support[1]
@@ -120,4 +120,4 @@ def sample(key: Array, factors: dict[str, Array], options: Options) -> Sampled:
     hidden_from = (jnp.where(side < 0, left, right) - across + radius) / there
     derived = {"hidden_from": hidden_from, "hidden_for": (size[0] - 2 * radius) / there}
     derived = {name: jnp.where(present, values, 0.0) for name, values in derived.items()}
-    return Sampled(*assembled(layout(options), [balls, *walls, screen], factors["gravity"]), derived=derived)
+    return SampledScene(*assemble(layout(options), [balls, *walls, screen], factors["gravity"]), derived=derived)

@@ -10,8 +10,8 @@ from gen2d.config.options import option
 from gen2d.core.enums import STATIC
 from gen2d.core.schema import Field
 from gen2d.records.axes import Array
-from gen2d.records.layout import Layout, Run, Tie
-from gen2d.sampling.builder import Sampled, assembled, bars, discs, joined
+from gen2d.records.layout import JointSpec, Layout, SlotGroup
+from gen2d.sampling.builder import SampledScene, assemble, capsules_between, discs, distance_joints
 
 PIN = 0.08  # m, radius of the disc that the pendulum hangs from
 ROD = 0.04  # m, radius of a rod
@@ -46,10 +46,13 @@ def sizes(options: Options) -> dict[str, int]:
 def layout(options: Options) -> Layout:
     """The pin, the rods and the bobs; each bob hangs on its rod from what is above it."""
     n, length, radius = options.links, options.length.support[1], options.radius.support[1]
-    rods, bobs = Run("capsule", n, layer=1, collides=False), Run("circle", n, layer=2, collides=False)
-    pin = Run("circle", 1, STATIC, layer=3, collides=False)
+    rods, bobs = SlotGroup("capsule", n, layer=1, collides=False), SlotGroup("circle", n, layer=2, collides=False)
+    pin = SlotGroup("circle", 1, STATIC, layer=3, collides=False)
     # A bob turns with its rod, about what is above it; the rod, which is light, is fixed to it at both ends.
-    ties = [(Tie("revolute", n + i if i else 0, 1 + n + i), *[Tie("revolute", 1 + i, 1 + n + i)] * 2) for i in range(n)]
+    ties = [
+        (JointSpec("revolute", n + i if i else 0, 1 + n + i), *[JointSpec("revolute", 1 + i, 1 + n + i)] * 2)
+        for i in range(n)
+    ]
     room, widest = n * length + radius, max(map(abs, options.angle.support))
     low = n == 1 and options.swing.support == (0.0, 0.0) and widest < math.pi / 2
     bounds = (-room, -room, room, radius - math.cos(widest) * options.length.support[0] if low else room)
@@ -57,14 +60,14 @@ def layout(options: Options) -> Layout:
     return Layout((pin, rods, bobs), (*bounds[:3], max(bounds[3], PIN)), max(length / 2 + ROD, radius), joints)
 
 
-def sample(key: Array, factors: dict[str, Array], options: Options) -> Sampled:
+def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledScene:
     """One video's scene and start: every link at its angle."""
     length, angle, n = factors["length"], factors["angle"], options.links
     ways = length[:, None] * jnp.stack([jnp.sin(angle), -jnp.cos(angle)], -1)
     speeds = factors["swing"][:, None] * jnp.stack([-ways[:, 1], ways[:, 0]], -1)
     ends, end_speeds = jnp.cumsum(ways, 0), jnp.cumsum(speeds, 0)
     pin = discs(jnp.zeros((1, 2)), PIN, kind=STATIC, layer=3, collides=False)
-    rods = bars(
+    rods = capsules_between(
         ends - ways, ends, ROD, density=factors["rod_density"], velocity=end_speeds - speeds / 2, spin=factors["swing"],
         layer=1, collides=False,
     )  # fmt: skip
@@ -76,8 +79,10 @@ def sample(key: Array, factors: dict[str, Array], options: Options) -> Sampled:
     nothing = jnp.zeros((n, 2))
     # In the frame of a bob `up` is where it hangs; a rod goes from its left end to its right.
     above, below = (jnp.stack(x, 1).reshape(-1, 2) for x in ((nothing, -half, half), (up, up, nothing)))
-    scene, state = assembled(layout(options), [pin, rods, bobs], factors["gravity"], joined(above, below))
-    return Sampled(scene, state, derived={"period": _period(rods.objects, bobs.objects, length, factors["gravity"])})
+    scene, state = assemble(layout(options), [pin, rods, bobs], factors["gravity"], distance_joints(above, below))
+    return SampledScene(
+        scene, state, derived={"period": _period(rods.objects, bobs.objects, length, factors["gravity"])}
+    )
 
 
 def _period(rods: dict[str, Array], bobs: dict[str, Array], length: Array, gravity: Array) -> Array:

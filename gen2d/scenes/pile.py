@@ -10,8 +10,8 @@ from gen2d.config.distributions import Distribution
 from gen2d.config.options import option
 from gen2d.core.enums import STATIC
 from gen2d.records.axes import Array
-from gen2d.records.layout import Layout, Run
-from gen2d.sampling.builder import Sampled, assembled, box_walls, boxes, capsules, discs
+from gen2d.records.layout import Layout, SlotGroup
+from gen2d.sampling.builder import SampledScene, assemble, box_walls, boxes, capsules, discs
 from gen2d.sampling.placement import place
 
 COLOR = [[90, 254]] * 3
@@ -81,15 +81,15 @@ def layout(options: Options) -> Layout:
     """The discs, the boxes, the capsules, then floor, right wall, ceiling, left wall."""
     most = [int(counted.support[1]) for counted in (options.discs, options.boxes, options.capsules)]
     runs = (
-        Run("circle", most[0]),
-        Run("polygon", most[1], vertices=4),
-        Run("capsule", most[2]),
-        Run("segment", 4, STATIC),
+        SlotGroup("circle", most[0]),
+        SlotGroup("polygon", most[1], vertices=4),
+        SlotGroup("capsule", most[2]),
+        SlotGroup("segment", 4, STATIC),
     )
     return Layout(runs, (0.0, 0.0, options.width, options.height), reach(options))
 
 
-def sample(key: Array, factors: dict[str, Array], options: Options) -> Sampled:
+def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledScene:
     """One video's scene and start: everything at rest in the air, so far apart that it may be turned as it likes."""
     radius, size, half = factors["disc_radius"], factors["box_size"], factors["capsule_half_length"]
     kinds = ("discs", "boxes", "capsules")
@@ -111,4 +111,4 @@ def sample(key: Array, factors: dict[str, Array], options: Options) -> Sampled:
         ),
         box_walls(options.width, options.height, **walls),
     ]  # fmt: skip
-    return Sampled(*assembled(layout(options), parts, factors["gravity"]), rejected, fits)
+    return SampledScene(*assemble(layout(options), parts, factors["gravity"]), rejected, fits)

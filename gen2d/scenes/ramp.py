@@ -14,8 +14,8 @@ from gen2d.config.options import option
 from gen2d.core.enums import STATIC
 from gen2d.core.schema import Field
 from gen2d.records.axes import Array
-from gen2d.records.layout import Layout, Run
-from gen2d.sampling.builder import Sampled, assembled, capsules, discs, segments
+from gen2d.records.layout import Layout, SlotGroup
+from gen2d.sampling.builder import SampledScene, assemble, capsules, discs, segments
 
 DERIVED = {"length": Field("float32", "n", "m", "of the slope")}
 
@@ -71,11 +71,11 @@ def check(options: Options) -> None:
 def layout(options: Options) -> Layout:
     """What is on the slope; slope, floor and wall."""
     long = options.half_length.support[1] if options.shape == "capsule" else 0.0
-    runs = Run("circle" if options.shape == "ball" else "capsule", 1), Run("segment", 3, STATIC)
+    runs = SlotGroup("circle" if options.shape == "ball" else "capsule", 1), SlotGroup("segment", 3, STATIC)
     return Layout(runs, (0.0, 0.0, options.width, options.height), options.radius.support[1] + long)
 
 
-def sample(key: Array, factors: dict[str, Array], options: Options) -> Sampled:
+def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledScene:
     """One video's scene and start: a ball or capsule at rest that touches the slope."""
     slope, radius = factors["slope"], factors["radius"]
     half = factors["half_length"] if options.shape == "capsule" else jnp.zeros(())
@@ -95,4 +95,4 @@ def sample(key: Array, factors: dict[str, Array], options: Options) -> Sampled:
         ends[:-1], ends[1:], friction=factors["ground_friction"], elasticity=factors["ground_elasticity"],
         color=factors["ground_color"],
     )  # fmt: skip
-    return Sampled(*assembled(layout(options), [body, ground], factors["gravity"]), derived={"length": length})
+    return SampledScene(*assemble(layout(options), [body, ground], factors["gravity"]), derived={"length": length})

@@ -9,8 +9,8 @@ from gen2d.config.options import option
 from gen2d.core.enums import STATIC
 from gen2d.core.schema import Field
 from gen2d.records.axes import Array
-from gen2d.records.layout import Layout, Run, Tie
-from gen2d.sampling.builder import Sampled, assembled, boxes, joined, polygons, segments
+from gen2d.records.layout import JointSpec, Layout, SlotGroup
+from gen2d.sampling.builder import SampledScene, assemble, boxes, distance_joints, polygons, segments
 
 FAR = 4.0  # the floor's length, over the view's width
 
@@ -69,18 +69,18 @@ def layout(options: Options) -> Layout:
     most = int(options.weights.support[1])
     length, width, height = (getattr(options, name).support[1] for name in ("length", "width", "height"))
     runs = (
-        Run("segment", 1, STATIC),
-        Run("polygon", 1, STATIC, vertices=3),
-        Run("polygon", 1, vertices=4, layer=1),
-        Run("polygon", most, vertices=4, layer=1),
+        SlotGroup("segment", 1, STATIC),
+        SlotGroup("polygon", 1, STATIC, vertices=3),
+        SlotGroup("polygon", 1, vertices=4, layer=1),
+        SlotGroup("polygon", most, vertices=4, layer=1),
     )
     top = options.pivot.support[1] + options.thickness.support[1] / 2 + options.drop.support[1] + height
     half = length / 2 + max(width, height)  # what slides off lies beside it
     reach = max(length**2 + options.thickness.support[1] ** 2, width**2 + height**2) ** 0.5 / 2
-    return Layout(runs, (-half, 0.0, half, max(top, length / 2)), reach, (Tie("revolute", 1, 2),))
+    return Layout(runs, (-half, 0.0, half, max(top, length / 2)), reach, (JointSpec("revolute", 1, 2),))
 
 
-def sample(key: Array, factors: dict[str, Array], options: Options) -> Sampled:
+def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledScene:
     """One video's scene and start: the plank level, its weights on it or above it."""
     layers, pivot, length, thickness = layout(options), factors["pivot"], factors["length"], factors["thickness"]
     solid = {name: factors[name] for name in ("elasticity", "friction")}
@@ -101,7 +101,7 @@ def sample(key: Array, factors: dict[str, Array], options: Options) -> Sampled:
         density=factors["density"], color=factors["color"], layer=1, **solid,
     )  # fmt: skip
     nowhere = jnp.zeros((1, 2))
-    joint = joined(jnp.asarray([[0.0, 2 / 3]]) * pivot, nowhere)
-    scene, state = assembled(layers, [floor, stand, plank, weights], factors["gravity"], joint)
+    joint = distance_joints(jnp.asarray([[0.0, 2 / 3]]) * pivot, nowhere)
+    scene, state = assemble(layers, [floor, stand, plank, weights], factors["gravity"], joint)
     torque = factors["gravity"][1] * jnp.sum(weights.objects["mass"] * x)
-    return Sampled(scene, state, derived={"torque": torque})
+    return SampledScene(scene, state, derived={"torque": torque})

@@ -12,8 +12,8 @@ from gen2d.config.distributions import Distribution
 from gen2d.config.options import option
 from gen2d.core.enums import STATIC
 from gen2d.records.axes import Array
-from gen2d.records.layout import Layout, Run
-from gen2d.sampling.builder import Sampled, assembled, discs, segments
+from gen2d.records.layout import Layout, SlotGroup
+from gen2d.sampling.builder import SampledScene, assemble, discs, segments
 
 
 @dataclasses.dataclass(frozen=True)
@@ -56,11 +56,11 @@ def check(options: Options) -> None:
 def layout(options: Options) -> Layout:
     """The balls, and as many floors, each from the lowest on."""
     most = int(options.balls.support[1])
-    runs = Run("circle", most), Run("segment", most, STATIC)
+    runs = SlotGroup("circle", most), SlotGroup("segment", most, STATIC)
     return Layout(runs, (0.0, 0.0, options.width, most * options.storey), options.radius.support[1])
 
 
-def sample(key: Array, factors: dict[str, Array], options: Options) -> Sampled:
+def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledScene:
     """One video's scene and start: each ball on its floor, at its speed and spin."""
     radius, most = factors["radius"], len(factors["radius"])
     present, floor = jnp.arange(most) < factors["balls"], options.storey * jnp.arange(most)
@@ -73,4 +73,4 @@ def sample(key: Array, factors: dict[str, Array], options: Options) -> Sampled:
     # A ball that leaves the view is far away when it comes to the end of its floor.
     left, right = (jnp.stack([jnp.full(most, end * options.width), floor], 1) for end in (-9.0, 10.0))
     floors = segments(left, right, present, friction=factors["floor_friction"], color=factors["floor_color"])
-    return Sampled(*assembled(layout(options), [balls, floors], factors["gravity"]))
+    return SampledScene(*assemble(layout(options), [balls, floors], factors["gravity"]))

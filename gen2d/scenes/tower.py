@@ -9,8 +9,8 @@ from gen2d.config.options import option
 from gen2d.core.enums import STATIC
 from gen2d.core.schema import Field
 from gen2d.records.axes import Array
-from gen2d.records.layout import Layout, Run
-from gen2d.sampling.builder import Sampled, assembled, boxes, segments
+from gen2d.records.layout import Layout, SlotGroup
+from gen2d.sampling.builder import SampledScene, assemble, boxes, segments
 
 FAR = 4.0  # the floor's length, over the view's width
 AROUND = 0.75  # of the tower's height: how much is seen on either side, for what falls
@@ -50,11 +50,11 @@ def layout(options: Options) -> Layout:
     most, width, height = int(options.blocks.support[1]), options.width.support[1], options.height.support[1]
     aside = max(map(abs, options.offset.support))
     half = max(AROUND * most * height, width / 2 * (1 + aside * (most - 1) / 2)) + width / 2
-    runs = Run("segment", 1, STATIC), Run("polygon", most, vertices=4)
+    runs = SlotGroup("segment", 1, STATIC), SlotGroup("polygon", most, vertices=4)
     return Layout(runs, (-half, 0.0, half, most * height), (width**2 + height**2) ** 0.5 / 2)
 
 
-def sample(key: Array, factors: dict[str, Array], options: Options) -> Sampled:
+def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledScene:
     """One video's scene and start: the tower at rest in the middle of the view."""
     width, height = factors["width"], factors["height"]
     present = jnp.arange(len(width)) < factors["blocks"]
@@ -69,7 +69,7 @@ def sample(key: Array, factors: dict[str, Array], options: Options) -> Sampled:
     blocks = boxes(jnp.stack([x, y], -1), 0.0, width, height, present, **material)
     margin = _margin(x, width, blocks.objects["mass"], present)
     derived = {"stable": (margin > 0).astype(jnp.float32), "margin": margin}
-    return Sampled(*assembled(layers, [floor, blocks], factors["gravity"]), derived=derived)
+    return SampledScene(*assemble(layers, [floor, blocks], factors["gravity"]), derived=derived)
 
 
 def _margin(x: Array, width: Array, mass: Array, present: Array) -> Array:

@@ -12,9 +12,9 @@ import jax.numpy as jnp
 from gen2d.config.distributions import Distribution
 from gen2d.config.options import option
 from gen2d.records.axes import Array
-from gen2d.records.layout import Layout, Run
-from gen2d.sampling.builder import Sampled, assembled, discs
-from gen2d.sampling.placement import beginning
+from gen2d.records.layout import Layout, SlotGroup
+from gen2d.sampling.builder import SampledScene, assemble, discs
+from gen2d.sampling.placement import start_position
 
 
 @dataclasses.dataclass(frozen=True)
@@ -53,17 +53,17 @@ def check(options: Options) -> None:
 
 def layout(options: Options) -> Layout:
     """The ball."""
-    return Layout((Run("circle", 1),), (0.0, 0.0, options.width, options.height), options.radius.support[1])
+    return Layout((SlotGroup("circle", 1),), (0.0, 0.0, options.width, options.height), options.radius.support[1])
 
 
-def sample(key: Array, factors: dict[str, Array], options: Options) -> Sampled:
+def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledScene:
     """One video's scene and start: the ball where it stays in view long enough, if there is such a place."""
     radius, direction = factors["radius"], factors["direction"]
     velocity = factors["speed"] * jnp.stack([jnp.cos(direction), jnp.sin(direction)])
     room = jnp.asarray([options.width, options.height])
     nearest = radius + jnp.asarray([0.0, options.margin])
-    start = beginning(factors["place"], nearest, room - nearest, options.seconds * velocity, options.entry)
+    start = start_position(factors["place"], nearest, room - nearest, options.seconds * velocity, options.entry)
     ball = discs(
         start[None], radius, density=factors["density"], velocity=velocity, elasticity=1.0, color=factors["color"]
     )
-    return Sampled(*assembled(layout(options), [ball], jnp.zeros(2)))
+    return SampledScene(*assemble(layout(options), [ball], jnp.zeros(2)))

@@ -8,8 +8,8 @@ from gen2d.config.distributions import Distribution
 from gen2d.config.options import option
 from gen2d.core.enums import STATIC
 from gen2d.records.axes import Array
-from gen2d.records.layout import Layout, Run, Tie
-from gen2d.sampling.builder import Sampled, assembled, bars, boxes, discs, hinged, segments
+from gen2d.records.layout import JointSpec, Layout, SlotGroup
+from gen2d.sampling.builder import SampledScene, assemble, boxes, capsules_between, discs, hinge_chain, segments
 
 FAR = 4.0  # the floor's length, over the view's width
 PIN, LINK = 0.12, 0.06  # m: radii of the disc that the chain hangs from, and of a link
@@ -63,13 +63,13 @@ def layout(options: Options) -> Layout:
     n, most = options.links, int(options.blocks.support[1])
     width, height, radius, chain = (getattr(options, x).support[1] for x in ("width", "height", "radius", "chain"))
     runs = (
-        Run("segment", 1, STATIC),
-        Run("circle", 1, STATIC, layer=3, collides=False),
-        Run("capsule", n, layer=2, collides=False),
-        Run("circle", 1, layer=3),
-        Run("polygon", most, vertices=4),
+        SlotGroup("segment", 1, STATIC),
+        SlotGroup("circle", 1, STATIC, layer=3, collides=False),
+        SlotGroup("capsule", n, layer=2, collides=False),
+        SlotGroup("circle", 1, layer=3),
+        SlotGroup("polygon", most, vertices=4),
     )
-    ties = [Tie("revolute", 1 + i, 2 + i) for i in range(n)] + [Tie("revolute", 2 + n, 1 + n)]
+    ties = [JointSpec("revolute", 1 + i, 2 + i) for i in range(n)] + [JointSpec("revolute", 2 + n, 1 + n)]
     tower = most * height
     left = -2 * radius - options.gap.support[1] - chain
     top = max(options.aim.support[1] * tower + chain + PIN, tower)
@@ -77,7 +77,7 @@ def layout(options: Options) -> Layout:
     return Layout(runs, (left, 0.0, width + DEBRIS * tower, top), reach, tuple(ties))
 
 
-def sample(key: Array, factors: dict[str, Array], options: Options) -> Sampled:
+def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledScene:
     """One video's scene and start: the tower's left side at 0, the ball at rest on its taut chain."""
     layers, n, most = layout(options), options.links, int(options.blocks.support[1])
     width, height, radius, chain, angle = (factors[x] for x in ("width", "height", "radius", "chain", "angle"))
@@ -90,7 +90,7 @@ def sample(key: Array, factors: dict[str, Array], options: Options) -> Sampled:
     way = chain * jnp.stack([-jnp.sin(angle), -jnp.cos(angle)])
     corners = top + (jnp.arange(n + 1.0) / n)[:, None] * way
     heavy = factors["ball_density"]
-    links = bars(corners[:-1], corners[1:], LINK, density=heavy, layer=2, collides=False)
+    links = capsules_between(corners[:-1], corners[1:], LINK, density=heavy, layer=2, collides=False)
     ball = discs(corners[-1:], radius, density=heavy, color=factors["ball_color"], layer=3, **surface)
     numbers = jnp.arange(most)
     places = jnp.stack([jnp.full(most, 0.5) * width, (numbers + 0.5) * height], -1)
@@ -99,4 +99,4 @@ def sample(key: Array, factors: dict[str, Array], options: Options) -> Sampled:
         **surface,
     )  # fmt: skip
     parts = [floor, pin, links, ball, blocks]
-    return Sampled(*assembled(layers, parts, factors["gravity"], hinged(links, tail=True)))
+    return SampledScene(*assemble(layers, parts, factors["gravity"], hinge_chain(links, tail=True)))

@@ -13,17 +13,17 @@ import numpy as np
 
 from gen2d.core.enums import DYNAMIC
 from gen2d.physics.collision import touches
-from gen2d.physics.params import Rules
-from gen2d.physics.shapes import form_of, placed
-from gen2d.physics.simulate import Forces, Keep, simulate
+from gen2d.physics.params import SolverParams
+from gen2d.physics.shapes import body_shape_of, to_world
+from gen2d.physics.simulate import Forces, SaveAt, simulate
 from gen2d.records.axes import to_device, to_stored
-from gen2d.records.layout import Layout, Run
+from gen2d.records.layout import Layout, SlotGroup
 from gen2d.records.scene import Objects, Scene, State
 from gen2d.records.trajectory import Contacts
 from gen2d.space.bodies import GREY, Body
 
 
-def _slots(span: tuple[Run, int]) -> range:
+def _slots(span: tuple[SlotGroup, int]) -> range:
     return range(span[1], span[1] + span[0].count)
 
 
@@ -55,15 +55,17 @@ def _world(shape: str) -> Body:
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def _meeting(runs: tuple[Run, Run], objects: Objects, sides: Sequence[jax.Array], places: Sequence) -> list[tuple]:
+def _meeting(
+    runs: tuple[SlotGroup, SlotGroup], objects: Objects, sides: Sequence[jax.Array], places: Sequence
+) -> list[tuple]:
     """Gap, place and normal of each point of some pairs: slots of two runs, and where they are."""
-    forms = (form_of(objects, run, side) for run, side in zip(runs, sides, strict=True))
-    a, b = (placed(form, *place) for form, place in zip(forms, places, strict=True))
+    forms = (body_shape_of(objects, run, side) for run, side in zip(runs, sides, strict=True))
+    a, b = (to_world(form, *place) for form, place in zip(forms, places, strict=True))
     return [(point.gap, a.centre + point.arm_a, point.normal) for point in touches(a, b)]
 
 
 @functools.lru_cache(maxsize=8)  # a program takes up to thousands of memory maps, of which a process has some 60,000
-def _program(layout: Layout, rules: Rules, frames: int, steps: int, keep: Keep, forces: Any) -> Callable:
+def _program(layout: Layout, rules: SolverParams, frames: int, steps: int, keep: SaveAt, forces: Any) -> Callable:
     """The compiled program of a layout; scenes, states and trajectories have videos first."""
     hook = None if forces is None else _by_slot(*forces)
     sparse = jax.default_backend() == "cpu"

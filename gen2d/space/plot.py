@@ -20,13 +20,13 @@ RED, DARK, WHITE = (220, 30, 30), (60, 60, 60), (255, 255, 255)
 SHIFT = 6  # fractional bits of the coordinates that OpenCV takes
 MARGIN = 0.05  # of the view that is shown where none is asked for, on each side
 FORMATS = (".png", ".gif", ".mp4")
-View = tuple[float, float, float, float]
+ViewBounds = tuple[float, float, float, float]
 
 
-class Canvas:
+class PlotCanvas:
     """An image and the part of the world that it shows: left, bottom, right, top in metres."""
 
-    def __init__(self, view: View, size: int) -> None:
+    def __init__(self, view: ViewBounds, size: int) -> None:
         left, bottom, right, top = view
         if not (right > left and top > bottom):
             raise ConfigError(f"view is {view}, but must be left, bottom, right, top, each side longer than 0 m")
@@ -68,7 +68,7 @@ class Canvas:
 
 
 def picture(
-    of: Drawable, frame: int = 0, *, view: View | None = None, size: int = 400, contacts: bool = True
+    of: Drawable, frame: int = 0, *, view: ViewBounds | None = None, size: int = 400, contacts: bool = True
 ) -> np.ndarray:
     """One instant as uint8 [H, W, 3], `size` pixels on its longer side.
 
@@ -77,7 +77,7 @@ def picture(
     if not -len(of.position) <= frame < len(of.position):
         raise ConfigError(f"frame is {frame}, but must be from 0 to {len(of.position) - 1}")
     frame %= len(of.position)
-    canvas = Canvas(view or _seen(of), size)
+    canvas = PlotCanvas(view or _seen(of), size)
     for body, position, angle in sorted(
         zip(of.bodies, of.position[frame], of.angle[frame], strict=True), key=lambda b: b[0].kind == DYNAMIC
     ):
@@ -88,9 +88,9 @@ def picture(
     return canvas.image
 
 
-def overlay(of: Drawable, *, view: View | None = None, size: int = 400, contacts: bool = False) -> np.ndarray:
+def overlay(of: Drawable, *, view: ViewBounds | None = None, size: int = 400, contacts: bool = False) -> np.ndarray:
     """All frames over each other as uint8 [H, W, 3], moving bodies as outlines; as `picture` else."""
-    canvas = Canvas(view or _seen(of), size)
+    canvas = PlotCanvas(view or _seen(of), size)
     for i, body in enumerate(of.bodies):
         moves = bool(np.ptp(of.position[:, i], axis=0).any() or np.ptp(of.angle[:, i]))
         for frame in range(len(of.position) if moves else 1):
@@ -131,7 +131,7 @@ def _placed(points: Any, position: np.ndarray, angle: float) -> np.ndarray:
     return np.asarray(points) @ np.array([[cos, sin], [-sin, cos]]) + position
 
 
-def _body(canvas: Canvas, body: Body, position: np.ndarray, angle: float, filled: bool) -> None:
+def _body(canvas: PlotCanvas, body: Body, position: np.ndarray, angle: float, filled: bool) -> None:
     if body.shape == "polygon":
         corners = _placed(body.vertices, position, angle)
         canvas.outline(corners, body.color, filled)
@@ -158,7 +158,7 @@ def _stadium(body: Body) -> np.ndarray:
     return np.concatenate([cap, -cap])
 
 
-def _joints(canvas: Canvas, of: Drawable, frame: int) -> None:
+def _joints(canvas: PlotCanvas, of: Drawable, frame: int) -> None:
     for joint in of.joints:
         ends = [
             anchor if i < 0 else _placed(anchor, of.position[frame, i], of.angle[frame, i])
@@ -169,7 +169,7 @@ def _joints(canvas: Canvas, of: Drawable, frame: int) -> None:
             canvas.disc(end, 1.5 * canvas.thickness / canvas.scale, DARK, True)
 
 
-def _arrows(canvas: Canvas, of: Drawable, frame: int) -> None:
+def _arrows(canvas: PlotCanvas, of: Drawable, frame: int) -> None:
     found = of.contacts
     if found is None:
         return
@@ -179,7 +179,7 @@ def _arrows(canvas: Canvas, of: Drawable, frame: int) -> None:
         canvas.arrow(point, normal)
 
 
-def _seen(of: Drawable) -> View:
+def _seen(of: Drawable) -> ViewBounds:
     """The rectangle around all that is ever visited, and some margin."""
     low, high = [], []
     for i, body in enumerate(of.bodies):

@@ -25,10 +25,10 @@ from gen2d.config.sections import PhysicsOptions
 from gen2d.core.enums import DYNAMIC, SHAPES
 from gen2d.core.errors import ConfigError
 from gen2d.physics import inertia
-from gen2d.physics.params import Rules, rules_of
-from gen2d.physics.simulate import Forces, Keep, substeps
+from gen2d.physics.params import SolverParams, solver_params
+from gen2d.physics.simulate import Forces, SaveAt, substeps
 from gen2d.records.axes import to_device
-from gen2d.records.layout import Layout, Run, Tie
+from gen2d.records.layout import JointSpec, Layout, SlotGroup
 from gen2d.records.scene import Joints, Objects, Scene, State
 from gen2d.space.arrange import _filled, _meeting, _numbers, _place, _program, _rows_there, _slots, _world, family
 from gen2d.space.bodies import KINDS, Body, BodyOptions, Joint, Overlaps, Pair, Poses
@@ -241,7 +241,7 @@ class Space:
         state = State(column("position"), column("angle"), column("velocity"), column("spin"))
         scene = Scene(objects, jnp.asarray(self.gravity, real), self._joints(real))
         slot = [*places, *(set(range(len(bodies))) - places.keys())]  # the last, -1, is the world's, if there is one
-        ties = tuple(Tie(j.kind, slot[j.a], slot[j.b], j.collide) for j in self.joints)
+        ties = tuple(JointSpec(j.kind, slot[j.a], slot[j.b], j.collide) for j in self.joints)
         return scene, state, Layout(runs, joints=ties)
 
     def _joints(self, real: Any) -> Joints | None:
@@ -254,7 +254,7 @@ class Space:
             **anchors, **{n: jnp.asarray([j.numbers[n] for j in self.joints], real) for n in self.joints[0].numbers}
         )
 
-    def _arranged(self) -> tuple[tuple[Run, ...], np.ndarray, list[Body]]:
+    def _arranged(self) -> tuple[tuple[SlotGroup, ...], np.ndarray, list[Body]]:
         """The runs, the slot of each body, and the bodies by slot, with one for the world where a joint needs it."""
         bodies = list(self.bodies)
         moving = [family(body) for body in bodies if body.kind == DYNAMIC]
@@ -269,7 +269,7 @@ class Space:
         for _, group in itertools.groupby((bodies[i] for i in order), key=_place):
             some = list(group)
             corners = max(len(body.vertices) for body in some)
-            runs.append(Run(family(some[0]), len(some), some[0].kind, corners))
+            runs.append(SlotGroup(family(some[0]), len(some), some[0].kind, corners))
         return tuple(runs), np.argsort(order)[: len(self.bodies)], [bodies[i] for i in order]
 
     # What happens ---------------------------------------------------------------------------------------------------
@@ -299,7 +299,7 @@ class Space:
         rules, steps = self._rules(fps, substeps)
         slots = self.slots
         own = None if forces is None else (forces, tuple(int(s) for s in slots))
-        program = _program(layout, rules, frames, steps, Keep(rows, energy), own)
+        program = _program(layout, rules, frames, steps, SaveAt(rows, energy), own)
         made = jax.tree.map(lambda x: np.asarray(x[0]), program(*jax.tree.map(lambda x: x[None], (scene, state))))
         states = made.states
         return Video(
@@ -315,12 +315,12 @@ class Space:
             quality=made.quality,
         )
 
-    def _rules(self, fps: float, asked: int | None) -> tuple[Rules, int]:
+    def _rules(self, fps: float, asked: int | None) -> tuple[SolverParams, int]:
         physics = self.physics
         if asked is not None:
             asked = int(_number("simulate: substeps", asked, low=1))
         steps = substeps(fps, asked or physics.substeps, physics.max_step)
-        return rules_of(physics, fps, steps), steps
+        return solver_params(physics, fps, steps), steps
 
     def poses(self, position: np.ndarray | None = None, angle: np.ndarray | None = None) -> Poses:
         """The bodies at position [T, K, 2] and angle [T, K] (default: as added), and what overlaps there.

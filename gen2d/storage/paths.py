@@ -395,11 +395,11 @@ def _status(error: BaseException | None) -> int | None:
 
 def _system(url: Url) -> Any:
     """The file system that knows the URL; one that was made before a fork is another."""
-    return _made("/".join(url.text.split("/")[:3]), url.network.timeout, os.getpid())
+    return _file_system("/".join(url.text.split("/")[:3]), url.network.timeout, os.getpid())
 
 
 @functools.lru_cache(maxsize=32)
-def _made(start: str, timeout: float, process: int) -> Any:
+def _file_system(start: str, timeout: float, process: int) -> Any:
     name = shown(start)
     try:
         import fsspec

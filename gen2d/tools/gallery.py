@@ -20,7 +20,7 @@ from gen2d.loading.dataset import Dataset
 from gen2d.loading.dataset import open as open_dataset
 from gen2d.media.contact_sheet import GAP, contact_sheet, shown
 from gen2d.media.images import check_folder, write, writing
-from gen2d.media.overlays import Columns, _amodal, _boxes, _flow, _masks, _tracks
+from gen2d.media.overlays import VideoFields, _amodal, _boxes, _flow, _masks, _tracks
 from gen2d.programs.recipe import config_of
 from gen2d.programs.redraw import render
 from gen2d.storage.sealed import sha256
@@ -51,7 +51,7 @@ def gallery(
         looks = _looks(config_of(ds, sets, trust).plain()["look"])
         picture, name = _sheet(ds, videos, looks, sets, trust), ds.manifest.name
     else:
-        with _made(source, videos, seed, sets) as (ds, plain, own):
+        with _annotated_video(source, videos, seed, sets) as (ds, plain, own):
             picture, name = _sheet(ds, videos, _looks(plain["look"]), (), own), plain["name"]
     path = out / f"{name}-gallery.png"
     with writing(out):
@@ -69,7 +69,11 @@ def families(
     rows, paths = [], []
     for name in plugins.names("scene"):
         own = f"{name}.yaml" in plugins.config_names()
-        with _made(name if own else {"name": name, "scene": name}, videos, seed, sets) as (ds, plain, own_files):
+        with _annotated_video(name if own else {"name": name, "scene": name}, videos, seed, sets) as (
+            ds,
+            plain,
+            own_files,
+        ):
             frames = np.asarray(render(ds, range(videos), look=plain["look"], trust=own_files))
             rows.append(_labelled(name, _fitted(contact_sheet(frames))))
             paths.append(out / f"{name}-gallery.png")
@@ -86,7 +90,7 @@ def _fitted(sheet: np.ndarray) -> np.ndarray:
 
 
 @contextlib.contextmanager
-def _made(
+def _annotated_video(
     source: str | Mapping[str, Any], videos: int, seed: int | None, sets: Sequence[str]
 ) -> Iterator[tuple[Dataset, dict[str, Any], list[str]]]:
     """A config's first videos, states alone, which last as long as the block, the config, and the sha256 of its own
@@ -148,7 +152,7 @@ def _annotation_rows(ds: Dataset, numbers: Sequence[int], sets: Sequence[str], t
         yield name, np.stack([_film(columns, video, draw) for video in range(len(numbers))])
 
 
-def _film(columns: Columns, video: int, draw: Callable[[Columns], np.ndarray]) -> np.ndarray:
+def _film(columns: VideoFields, video: int, draw: Callable[[VideoFields], np.ndarray]) -> np.ndarray:
     """One video's pictures."""
     times = range(columns["frames"].shape[1])
     return np.stack([draw({name: array[video, t] for name, array in columns.items()}) for t in times])

@@ -70,7 +70,7 @@ def _drawn(source: str, videos: int, seed: int | None, sets: Sequence[str]) -> t
     from gen2d.config.config import checked_seed, load_config
     from gen2d.programs import devices
     from gen2d.programs.batches import check_placed
-    from gen2d.programs.rollout import Rollout, parts
+    from gen2d.programs.rollout import Rollout, per_device
 
     config = load_config(source, [*sets, "storage.frames=video"])
     if seed is not None:
@@ -80,7 +80,7 @@ def _drawn(source: str, videos: int, seed: int | None, sets: Sequence[str]) -> t
     with contextlib.closing(Rollout(config.of_split(split), devices.prepare()[:1])) as rollout:
         for first in range(0, videos, rollout.lanes):
             batch = rollout.begin(split, [first])
-            placed = parts(batch.placed)[0][: videos - first]
+            placed = per_device(batch.placed)[0][: videos - first]
             check_placed(config.scene, placed, np.arange(first, first + len(placed)))
             for start in range(0, min(rollout.lanes, videos - first), rollout.slice):
                 frames.append(np.asarray(rollout.draw(batch, start, rollout.slice)[0]["frames"]))

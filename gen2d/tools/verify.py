@@ -73,10 +73,12 @@ def verify(
     shards, if there are problems, and must make these again and finish the dataset, as `regenerate.repair`
     does; what is returned is then what remains wrong. `timeout` and `deadline` are those of `open`.
     """
-    return checked(root, level, repair_with, videos, seed, trust=trust, timeout=timeout, deadline=deadline).problems
+    return verify_and_repair(
+        root, level, repair_with, videos, seed, trust=trust, timeout=timeout, deadline=deadline
+    ).problems
 
 
-def checked(
+def verify_and_repair(
     root: str | Place,
     level: str = "full",
     repair_with: Repair | None = None,
@@ -166,7 +168,7 @@ def _remade(root: Place, manifest: Manifest, videos: int, seed: int, trust: Sequ
     chosen = chosen_videos(manifest.splits, videos, seed)
     return (
         Problem(f"{shard_path(root, shard)}: {wrong}", shard)
-        for shard, wrong in regenerate.differing(rollout, root, manifest, chosen)
+        for shard, wrong in regenerate.changed_videos(rollout, root, manifest, chosen)
     )
 
 

@@ -15,7 +15,7 @@ def _shift(edges: Array) -> tuple[Array, Array]:
 # ---- Discs
 
 
-class Edge(NamedTuple):
+class DiscEdge(NamedTuple):
     """What a pixel's edge at some distance from a disc's centre brings to the corners on it."""
 
     at: Array
@@ -24,40 +24,40 @@ class Edge(NamedTuple):
     square: Array
 
 
-class Disc(NamedTuple):
+class PixelDisc(NamedTuple):
     """A disc cut by the edges of a grid's columns and rows."""
 
-    left: Edge  # [..., columns]
-    right: Edge
-    top: Edge  # [..., rows]
-    bottom: Edge
+    left: DiscEdge  # [..., columns]
+    right: DiscEdge
+    top: DiscEdge  # [..., rows]
+    bottom: DiscEdge
     radius: Array  # [..., 1]
 
 
-def disc_cuts(x: Array, y: Array, radius: Array) -> Disc:
+def disc_cuts(x: Array, y: Array, radius: Array) -> PixelDisc:
     """The cuts of discs of `radius` [...] px by pixels with left edges x [..., columns] and top edges y [..., rows],
     both from the disc's centre."""
     radius = jnp.maximum(radius, 1e-6)[..., None]
     square = radius * radius
 
-    def of_column(at: Array) -> Edge:
-        return Edge(at, jnp.copysign(1.0, at), under_arc(at, radius), at * at - square)
+    def of_column(at: Array) -> DiscEdge:
+        return DiscEdge(at, jnp.copysign(1.0, at), under_arc(at, radius), at * at - square)
 
-    def of_row(at: Array) -> Edge:
+    def of_row(at: Array) -> DiscEdge:
         sign = jnp.copysign(1.0, at)
-        return Edge(at, sign, under_arc(at, radius) - sign * (QUARTER * square), at * at)
+        return DiscEdge(at, sign, under_arc(at, radius) - sign * (QUARTER * square), at * at)
 
     (left, right), (top, bottom) = map(_shift, (x, y))
-    return Disc(of_column(left), of_column(right), of_row(top), of_row(bottom), radius)
+    return PixelDisc(of_column(left), of_column(right), of_row(top), of_row(bottom), radius)
 
 
-def _corner(x: Edge, y: Edge) -> Array:
+def _corner(x: DiscEdge, y: DiscEdge) -> Array:
     """The disc's area in the rectangle between its centre and a corner, odd in both."""
-    x, y = Edge(*(a[..., None, :] for a in x)), Edge(*(a[..., :, None] for a in y))
+    x, y = DiscEdge(*(a[..., None, :] for a in x)), DiscEdge(*(a[..., :, None] for a in y))
     return jnp.where(x.square + y.square < 0, x.at * y.at, y.sign * x.area + x.sign * y.area)
 
 
-def disc_area(disc: Disc, largest: float) -> Array:
+def disc_area(disc: PixelDisc, largest: float) -> Array:
     """The coverage [..., rows, columns] of discs of `largest` px at most."""
     upper = _corner(disc.right, disc.top) - _corner(disc.left, disc.top)
     area = (_corner(disc.right, disc.bottom) - _corner(disc.left, disc.bottom)) - upper

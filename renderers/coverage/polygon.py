@@ -29,7 +29,7 @@ from gen2d.renderers.coverage.disc import _shift
 # ---- Convex shapes with straight sides, their corners rounded
 
 
-class Line(NamedTuple):
+class PolygonSide(NamedTuple):
     """A side in each row: how far it goes down there, and between which x."""
 
     down: Array  # [..., rows]
@@ -37,7 +37,7 @@ class Line(NamedTuple):
     width: Array
 
 
-class Arc(NamedTuple):
+class CornerArc(NamedTuple):
     """One half, right or left, of a rounded corner: where it runs in each row, and where each column leaves it."""
 
     begin: Array  # [..., rows] y from the centre, and U of it
@@ -49,16 +49,16 @@ class Arc(NamedTuple):
     leave_area: tuple[Array, Array]
 
 
-class Rounded(NamedTuple):
+class RoundedPolygon(NamedTuple):
     """A rounded polygon cut by the edges of a grid's columns and rows."""
 
     x: Array  # [..., columns]
-    lines: list[Line]
-    rights: list[Arc]
-    lefts: list[Arc]
+    lines: list[PolygonSide]
+    rights: list[CornerArc]
+    lefts: list[CornerArc]
 
 
-def rounded_cuts(x: Array, y: Array, vertices: Array, radius: Array | None) -> Rounded:
+def rounded_cuts(x: Array, y: Array, vertices: Array, radius: Array | None) -> RoundedPolygon:
     """The cuts of convex polygons `vertices` [..., V, 2] px, grown by `radius` [...] px with round corners (None: not),
     by pixels with left edges x [..., columns] and top edges y [..., rows]. Vertices may be repeated, and two are a
     segment, with a radius a capsule; without an area there is nothing."""
@@ -74,7 +74,7 @@ def rounded_cuts(x: Array, y: Array, vertices: Array, radius: Array | None) -> R
             u, v = x - corner[i][..., :1], y - corner[i][..., 1:]
             rights.append(_arc(u, v, radius, *arc[0], side=1))
             lefts.append(_arc(u, v, radius, *arc[1], side=-1))
-    return Rounded(x + jnp.zeros_like(corner[0][..., :1]), lines, rights, lefts)
+    return RoundedPolygon(x + jnp.zeros_like(corner[0][..., :1]), lines, rights, lefts)
 
 
 def _normals(corner: list[Array]) -> list[Array]:
@@ -97,7 +97,7 @@ def _normals(corner: list[Array]) -> list[Array]:
     return normal
 
 
-def _line(y: Array, begin: Array, end: Array) -> Line:
+def _line(y: Array, begin: Array, end: Array) -> PolygonSide:
     side = end - begin
     rise = side[..., 1:]
     flat = jnp.abs(rise) < 1e-9
@@ -110,7 +110,7 @@ def _line(y: Array, begin: Array, end: Array) -> Line:
     (first, second), across = map(part, _shift(y)), side[..., :1]
     one, other = begin[..., :1] + first * across, begin[..., :1] + second * across
     low = jnp.minimum(one, other)
-    return Line(jnp.abs(second - first) * rise, low, jnp.maximum(jnp.abs(one - other), THIN))
+    return PolygonSide(jnp.abs(second - first) * rise, low, jnp.maximum(jnp.abs(one - other), THIN))
 
 
 def _arc_ends(before: Array, after: Array) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
@@ -130,7 +130,7 @@ def _arc_ends(before: Array, after: Array) -> tuple[tuple[Array, Array], tuple[A
     return half(1.0), half(-1.0)
 
 
-def _arc(x: Array, y: Array, radius: Array, begin: Array, end: Array, side: int) -> Arc:
+def _arc(x: Array, y: Array, radius: Array, begin: Array, end: Array, side: int) -> CornerArc:
     radius = jnp.maximum(radius, 1e-6)[..., None]
     low, high = (radius * sine[..., None] for sine in ((begin, end) if side > 0 else (end, begin)))
     (top, bottom) = (jnp.clip(edge, low, high) for edge in _shift(y))
@@ -143,14 +143,14 @@ def _arc(x: Array, y: Array, radius: Array, begin: Array, end: Array, side: int)
     leave = [jnp.where(at > 0, value, FAR) for at, value in zip(away, leave, strict=True)]
     begin, end = (top, bottom) if side > 0 else (bottom, top)
     ends = begin, under_arc(begin, radius), end, under_arc(end, radius)
-    return Arc(*ends, (columns[0], columns[1]), (leave[0], leave[1]), (areas[0], areas[1]))
+    return CornerArc(*ends, (columns[0], columns[1]), (leave[0], leave[1]), (areas[0], areas[1]))
 
 
 def _grid(rows: Array) -> Array:
     return rows[..., :, None]
 
 
-def rounded_area(cuts: Rounded) -> Array:
+def rounded_area(cuts: RoundedPolygon) -> Array:
     """The coverage [..., rows, columns] of rounded polygons."""
     area: Any = 0.0
     for line in cuts.lines:
@@ -182,7 +182,7 @@ def _within_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
     return _within(value, end), jnp.where(jnp.abs(value) < end, moved, jnp.sign(value) * stretched)
 
 
-def _beyond_right(arc: Arc, edge: int) -> Array:
+def _beyond_right(arc: CornerArc, edge: int) -> Array:
     """The integral of max(x - sqrt(r^2 - y^2), 0) dy along an arc."""
     at, leave, area = (a[edge][..., None, :] for a in (arc.at, arc.leave, arc.leave_area))
 
@@ -193,7 +193,7 @@ def _beyond_right(arc: Arc, edge: int) -> Array:
     return to(arc.end, arc.end_area) - to(arc.begin, arc.begin_area)
 
 
-def _beyond_left(arc: Arc, edge: int) -> Array:
+def _beyond_left(arc: CornerArc, edge: int) -> Array:
     """The integral of max(x + sqrt(r^2 - y^2), 0) dy along an arc."""
     at, leave, area = (a[edge][..., None, :] for a in (arc.at, arc.leave, arc.leave_area))
 

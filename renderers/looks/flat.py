@@ -5,12 +5,12 @@ import dataclasses
 from gen2d.records.axes import Array
 from gen2d.records.layout import Layout
 from gen2d.records.scene import Scene
-from gen2d.renderers.look import Plain, plain
+from gen2d.renderers.look import PlainOptions, plain
 from gen2d.renderers.paint import Paint
 
 
 @dataclasses.dataclass(frozen=True)
-class Options(Plain):
+class Options(PlainOptions):
     """What plain shapes have."""
 
 

@@ -8,12 +8,12 @@ from gen2d.config.options import option
 from gen2d.records.axes import Array
 from gen2d.records.layout import Layout
 from gen2d.records.scene import Scene
-from gen2d.renderers.look import Plain, are_lines, are_moving, contrasting, plain
+from gen2d.renderers.look import PlainOptions, are_lines, are_moving, contrasting, plain
 from gen2d.renderers.paint import Paint
 
 
 @dataclasses.dataclass(frozen=True)
-class Options(Plain):
+class Options(PlainOptions):
     """Marks, and what plain shapes have."""
 
     mark_width: float = option(0.3, float, "1", "of an object's bar, over its radius", above=0, high=1)

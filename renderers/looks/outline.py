@@ -8,12 +8,12 @@ from gen2d.config.options import option
 from gen2d.records.axes import Array
 from gen2d.records.layout import Layout
 from gen2d.records.scene import Scene
-from gen2d.renderers.look import Plain, are_lines, mean_color, plain
+from gen2d.renderers.look import PlainOptions, are_lines, mean_color, plain
 from gen2d.renderers.paint import Paint
 
 
 @dataclasses.dataclass(frozen=True)
-class Options(Plain):
+class Options(PlainOptions):
     """Outlines, and what plain shapes have."""
 
     width: float = option(1.5, float, "px", "of the line along the inside of a rim", above=0)

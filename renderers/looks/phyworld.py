@@ -12,14 +12,14 @@ from gen2d.config.options import option
 from gen2d.records.axes import Array
 from gen2d.records.layout import Layout
 from gen2d.records.scene import Scene
-from gen2d.renderers.look import Lines, are_moving, lines_of
+from gen2d.renderers.look import LineOptions, are_moving, line_fields
 from gen2d.renderers.paint import Background, Paint
 
 WHITE, RED, BLUE = (255.0, 255.0, 255.0), (255.0, 0.0, 0.0), (0.0, 0.0, 255.0)
 
 
 @dataclasses.dataclass(frozen=True)
-class Options(Lines):
+class Options(LineOptions):
     """Line widths."""
 
     wall_width: float = option(0.0, float, "px", "of a segment's line, beyond its own radius; 0: not drawn", low=0)
@@ -30,4 +30,4 @@ def paint(scene: Scene, layout: Layout, options: Options, key: Array) -> Paint:
     moving = are_moving(layout)
     turn = jnp.asarray([RED, BLUE])[(np.cumsum(moving) - 1) % 2]
     colors = jnp.where(moving[:, None], turn, scene.objects.color.astype(jnp.float32))
-    return Paint(Background(jnp.asarray(WHITE)), colors, *lines_of(scene, options))
+    return Paint(Background(jnp.asarray(WHITE)), colors, *line_fields(scene, options))

@@ -8,12 +8,12 @@ from gen2d.config.options import option
 from gen2d.records.axes import Array
 from gen2d.records.layout import Layout
 from gen2d.records.scene import Scene
-from gen2d.renderers.look import Plain, are_lines, plain
+from gen2d.renderers.look import PlainOptions, are_lines, plain
 from gen2d.renderers.paint import Paint
 
 
 @dataclasses.dataclass(frozen=True)
-class Options(Plain):
+class Options(PlainOptions):
     """Shade, and what plain shapes have."""
 
     shade: float = option(0.6, float, "1", "how much darker an object is opposite the light; 0: not", low=0, high=1)

@@ -9,12 +9,12 @@ from gen2d.config.options import option
 from gen2d.records.axes import Array
 from gen2d.records.layout import Layout
 from gen2d.records.scene import Scene
-from gen2d.renderers.look import Plain, contrasting, mean_color, plain
+from gen2d.renderers.look import PlainOptions, contrasting, mean_color, plain
 from gen2d.renderers.paint import Paint, Texture
 
 
 @dataclasses.dataclass(frozen=True)
-class Options(Plain):
+class Options(PlainOptions):
     """Spots, and what plain shapes have."""
 
     background_kind: str = option("noise", str, "", "what is behind everything", choices=("plain", "gradient", "noise"))

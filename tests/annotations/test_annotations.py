@@ -11,7 +11,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from gen2d.config.config import load_config
 from gen2d.programs import redraw, render
-from gen2d.programs.rollout import Rollout, parts
+from gen2d.programs.rollout import Rollout, per_device
 from gen2d.records import keys as keys_module
 from gen2d.records import scene as scene_module
 
@@ -29,7 +29,7 @@ def simulated():
     """Some videos' fields, and the keys of the videos; their pictures are drawn in several ways."""
     rollout = Rollout(load_config("bouncing.yaml", SMALL), jax.devices()[:1])
     batch = rollout.begin("train", [0])
-    assert parts(batch.placed)[0].all()
+    assert per_device(batch.placed)[0].all()
     words = jnp.asarray(keys_module.seed_words(3, zlib.crc32(b"train")))
     keys = keys_module.video_keys(words, jnp.arange(4, dtype=jnp.uint32))
     return rollout.host_columns(batch)[0], keys
@@ -44,11 +44,11 @@ class Made:
         columns, keys = simulated()
 
         def staged(key, scene, states):
-            return render.stage_of(key, config, self.rollout.plan, scene, states)
+            return render.render_scene(key, config, self.rollout.plan, scene, states)
 
-        scenes, states = redraw.scene_of(columns), redraw.record_of(scene_module.State, columns)
+        scenes, states = redraw.scene_of(columns), redraw.from_columns(scene_module.State, columns)
         stages = jax.jit(jax.vmap(staged))(keys, scenes, states)
-        drawn = jax.jit(lambda stages: render.pictures(stages, self.rollout.plan, config.annotations))(stages)
+        drawn = jax.jit(lambda stages: render.render_frames(stages, self.rollout.plan, config.annotations))(stages)
         seen = render.camera_columns(stages.instants.view)
         self.of = columns | {name: np.asarray(a) for name, a in (drawn | seen).items()}
         self.mask, self.slots = self.of["masks/instance"], self.rollout.layout.slots
@@ -74,7 +74,7 @@ def test_fields_are_as_described(made):
 
 def test_the_form_for_gpus_tells_the_same(made, monkeypatch):
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    told = jax.jit(lambda stages: render.pictures(stages, made.rollout.plan, made.options))(made.stages)
+    told = jax.jit(lambda stages: render.render_frames(stages, made.rollout.plan, made.options))(made.stages)
     assert_array_equal(told.pop("masks/instance"), made.mask)
     for name, array in told.items():
         here, there = np.asarray(array), made.of[name]

@@ -88,7 +88,7 @@ def _parts(folder: Path, sets: Sequence[str], config: str = CONFIG) -> dict[str,
     dataset = dataset_of(rollout, folder / "data", {"train": whole})
     (shard, *_), columns = open_folder(dataset), rollout.host_columns(batch)[0]
     encoder = encoder_module.Encoder(rollout, dataset, encoder_module.threads_for(devices.cores()))
-    jobs = encoder_module.jobs_of([0], [[(shard, 0, rollout.lanes)]], rollout.lanes, rollout.slice)
+    jobs = encoder_module.encode_tasks([0], [[(shard, 0, rollout.lanes)]], rollout.lanes, rollout.slice)
     pictures = [jax.block_until_ready(rollout.draw(batch, job.start, rollout.slice))[0] for job in jobs]
 
     def encode() -> list[Any]:
@@ -127,13 +127,13 @@ def _physics(rollout: Any) -> tuple[Callable, Callable, np.ndarray]:
     import jax
     import jax.numpy as jnp
 
-    from gen2d.physics.params import rules_of
+    from gen2d.physics.params import solver_params
     from gen2d.physics.simulate import simulate
     from gen2d.records import axes, keys
 
     config = rollout.config
     root, length = keys.seed_words(0, 0), (config.video.frames, rollout.steps)
-    rules = rules_of(config.physics, config.video.fps, rollout.steps)
+    rules = solver_params(config.physics, config.video.fps, rollout.steps)
 
     def sampled(numbers: Any) -> Any:
         made = jax.vmap(rollout.sampler.sampled)(keys.video_keys(jnp.asarray(root), numbers))[1]
@@ -174,7 +174,7 @@ def make(rollout: Any, videos: int, out: Path) -> None:
 
     dataset = dataset_of(rollout, out, {"train": videos})
     encoder = encoder_module.Encoder(rollout, dataset, encoder_module.threads_for(devices.cores()))
-    writers = writers_module.Writers(dataset)
+    writers = writers_module.ShardWriters(dataset)
     for shard, block in encoder.blocks(encoder_module.batches(open_folder(dataset), rollout.lanes)):
         writers.put(shard, block)
     writers.finish()

@@ -143,7 +143,7 @@ def gen2d_program(case: Case, everything: bool) -> tuple[Callable, Any, float]:
     import jax
     from worlds import rules
 
-    from gen2d.physics.simulate import Keep, simulate
+    from gen2d.physics.simulate import SaveAt, simulate
     from gen2d.programs import devices
     from gen2d.records import axes, trajectory
     from gen2d.records import scene as scene_module
@@ -153,7 +153,7 @@ def gen2d_program(case: Case, everything: bool) -> tuple[Callable, Any, float]:
     made = [gen2d_scene(sampled(case, number)) for number in range(case.lanes)]
     layout = made[0][2]
     inputs = jax.tree.map(lambda *x: np.stack(x), *(scene[:2] for scene in made))
-    keep = Keep(4 * layout.slots * math.ceil(FRAMES / 16), energy=True) if everything else Keep()
+    keep = SaveAt(4 * layout.slots * math.ceil(FRAMES / 16), energy=True) if everything else SaveAt()
 
     def run(scene: scene_module.Scene, state: scene_module.State) -> trajectory.Trajectory:
         device = axes.to_device(scene), axes.to_device(state)

@@ -219,24 +219,24 @@ def test_a_ball_leaves_when_its_rim_crosses_the_edge_and_comes_back_when_it_does
     made["camera/angle"] = np.full(VIDEO.frames, angle, np.float32)
     for direction, side in ((to_right, "right"), (-to_right, "left")):
         made["states/position"][:, 0] = np.array([4, 3]) + way[:, None] * direction
-        left, entered = events_module.passages(made, VIDEO)
+        left, entered = events_module.view_events(made, VIDEO)
         assert (left.kind, entered.kind) == ("leaves", "enters")
         assert left.about == entered.about == {"a": 0, "side": side}
         assert_allclose([left.time, entered.time], [0.25, 0.8 + 3.3 / 6], atol=1e-5)
     made["states/position"][:, 0] = np.array([4, 3]) + (way[:, None] - 1) * up
-    assert [event.about["side"] for event in events_module.passages(made, VIDEO)] == ["top", "top"]
+    assert [event.about["side"] for event in events_module.view_events(made, VIDEO)] == ["top", "top"]
 
 
 def test_rest_is_told_where_all_is_still_to_the_end() -> None:
     made = seen(0)
     made["states/velocity"][11:] = 0
-    assert [(event.frame, event.time) for event in events_module.rests(made, VIDEO.fps)] == [(11, 0.55)]
+    assert [(event.frame, event.time) for event in events_module.rest_events(made, VIDEO.fps)] == [(11, 0.55)]
     made["states/velocity"][-1, 1] = 1
-    assert events_module.rests(made, VIDEO.fps) == []
+    assert events_module.rest_events(made, VIDEO.fps) == []
     made["states/velocity"][:] = 0  # it never moved
-    assert events_module.rests(made, VIDEO.fps) == []
+    assert events_module.rest_events(made, VIDEO.fps) == []
     made["states/angular_velocity"][:5, 2] = 3
-    assert [event.frame for event in events_module.rests(made, VIDEO.fps)] == [5]
+    assert [event.frame for event in events_module.rest_events(made, VIDEO.fps)] == [5]
 
 
 @settings(max_examples=50, deadline=None)
@@ -259,7 +259,7 @@ def test_a_caption_fits_is_ascii_and_follows_from_the_video_alone(seed: int) -> 
     made, other = seen(seed), seen(seed + 1)
     both = {name: np.stack([other[name], made[name]]) for name in made}
     alone = {name: made[name][None] for name in made}
-    one, two = caption.told(alone, VIDEO), caption.told(both, VIDEO)
+    one, two = caption.caption_fields(alone, VIDEO), caption.caption_fields(both, VIDEO)
     for name, field in caption.fields(BALLS + 4, VIDEO.frames).items():
         assert one[name].dtype == two[name].dtype == np.dtype(field.dtype)
         assert one[name][0] == two[name][1]
@@ -279,7 +279,7 @@ def still(**changes: Any) -> dict[str, np.ndarray]:
 
 def test_a_video_without_events() -> None:
     made = still()
-    found = caption.told({name: values[None] for name, values in made.items()}, VIDEO)
+    found = caption.caption_fields({name: values[None] for name, values in made.items()}, VIDEO)
     assert found["text/events"].tolist() == [b"[]"]
     assert found["text/event_count"].tolist() == [0]
     assert found["text/caption"].tolist() == [b"Three balls in a box under gravity."]
@@ -337,7 +337,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_words_are_stored_and_made_again(made: Path) -> None:
     videos = gen2d.open(made, fields="*")[:]
-    found = caption.told(videos, load_config(WORDY).video)
+    found = caption.caption_fields(videos, load_config(WORDY).video)
     for name, values in found.items():
         assert_array_equal(videos[name], values)
     assert videos["text/event_count"].sum() > 0

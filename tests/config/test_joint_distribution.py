@@ -14,7 +14,7 @@ from gen2d.config import truncation
 from gen2d.config.config import load_config
 from gen2d.config.distribution_syntax import parse
 from gen2d.config.distributions import Distribution, Span, after
-from gen2d.config.joint_distribution import common, law_of
+from gen2d.config.joint_distribution import intersect, joint_distribution_of
 from gen2d.core.errors import ConfigError
 from gen2d.records import keys as keys_module
 from gen2d.sampling.sampler import Sampler
@@ -103,29 +103,37 @@ BASE = {"a": parse([0, 4]), "b": parse({"integer": [1, 6]}), "c": parse({"normal
 
 def test_a_law_without_a_box_and_the_box_have_nothing_in_common_and_are_all():
     box = {"a": [1, 2], "b": {"choice": [2, 5]}}
-    rest, held = law_of({"minus": [{}, box]}, BASE, read), law_of({"intersection": [{}, box]}, BASE, read)
-    assert common(rest, held) is None
+    rest, held = (
+        joint_distribution_of({"minus": [{}, box]}, BASE, read),
+        joint_distribution_of({"intersection": [{}, box]}, BASE, read),
+    )
+    assert intersect(rest, held) is None
     a, b, c = (draws(BASE[name]) for name in "abc")
     one, other = (law.contains({"a": a, "b": b, "c": c}) for law in (rest, held))
     assert (one ^ other).all()
     assert_array_equal(other, (a >= 1) & (a < 2) & np.isin(b, [2, 5]))
-    assert common(rest, law_of(box, BASE, read)) is None
-    point = common(law_of({}, BASE, read), law_of(box, BASE, read))
+    assert intersect(rest, joint_distribution_of(box, BASE, read)) is None
+    point = intersect(joint_distribution_of({}, BASE, read), joint_distribution_of(box, BASE, read))
     assert point is not None
-    assert law_of(box, BASE, read).contains(point)
+    assert joint_distribution_of(box, BASE, read).contains(point)
 
 
 def test_held_out_combinations_are_of_both_and_not_of_one():
     corners = [{"a": [0, 1], "b": {"choice": [1]}}, {"a": [3, 4], "b": {"choice": [6]}}]
-    train, test = law_of({"minus": [{}, *corners]}, BASE, read), law_of({"mixture": corners}, BASE, read)
-    assert common(train, test) is None
+    train, test = (
+        joint_distribution_of({"minus": [{}, *corners]}, BASE, read),
+        joint_distribution_of({"mixture": corners}, BASE, read),
+    )
+    assert intersect(train, test) is None
     assert train.contains({"a": 0.5, "b": 6})
     assert not train.contains({"a": 0.5, "b": 1})
-    assert common(train, law_of({"a": [0.5, 1]}, BASE, read)) is not None  # b may be another
+    assert intersect(train, joint_distribution_of({"a": [0.5, 1]}, BASE, read)) is not None  # b may be another
 
 
 def test_a_condition_changes_other_factors_where_it_holds():
-    law = law_of({"condition": [{}, {"when": {"b": {"choice": [1, 2]}}, "then": {"a": [10, 11]}}]}, BASE, read)
+    law = joint_distribution_of(
+        {"condition": [{}, {"when": {"b": {"choice": [1, 2]}}, "then": {"a": [10, 11]}}]}, BASE, read
+    )
     assert law.contains({"a": 10.5, "b": 2})
     assert not law.contains({"a": 10.5, "b": 3})
     assert not law.contains({"a": 3, "b": 2})
@@ -136,8 +144,8 @@ def test_a_condition_changes_other_factors_where_it_holds():
 @given(st.lists(st.tuples(DISTRIBUTIONS, DISTRIBUTIONS), min_size=2, max_size=2))
 def test_two_laws_are_disjoint_just_if_no_draw_is_in_both(written):
     base = {"a": parse(0), "b": parse(0)}
-    one, other = (law_of({"a": a, "b": b}, base, read) for a, b in written)
-    point = common(one, other)
+    one, other = (joint_distribution_of({"a": a, "b": b}, base, read) for a, b in written)
+    point = intersect(one, other)
     if point is not None:
         assert one.contains(point)
         assert other.contains(point)

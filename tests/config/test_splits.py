@@ -9,11 +9,11 @@ from synthetic import tree
 
 import gen2d
 from gen2d.config.config import load_config
-from gen2d.config.joint_distribution import common
+from gen2d.config.joint_distribution import intersect
 from gen2d.core.errors import ConfigError
 from gen2d.core.permutation import hashed
 from gen2d.programs import devices
-from gen2d.programs.rollout import Batch, Rollout
+from gen2d.programs.rollout import DeviceBatch, Rollout
 from gen2d.records import keys as keys_module
 from gen2d.sampling import rejection
 from gen2d.sampling.sampler import Sampler
@@ -96,7 +96,7 @@ def test_the_study_s_splits_have_nothing_in_common_with_training_and_start_in_vi
     assert training is not None
     starts = jax.jit(jax.vmap(of.sampled, (0, None)))
     for row, split in enumerate(config.splits):
-        assert (common(training.law, split.law) is None) == (split.name not in ("train", "test"))
+        assert (intersect(training.law, split.law) is None) == (split.name not in ("train", "test"))
         keys = keys_module.video_keys(jnp.asarray(keys_module.seed_words(0, row)), jnp.arange(500, dtype=jnp.uint32))
         drawn, made = jax.tree.map(np.asarray, starts(keys, row))
         position, radius = made.state.position, made.scene.objects.radius
@@ -157,14 +157,14 @@ def test_a_video_does_not_depend_on_what_is_made_with_it():
     options = load_config(CONFIG | {"quality": {"contacts_most": 1}}).quality
     for count in (1, 3, 8):
         numbers = np.arange(count)
-        _, chosen = rejection.fitting(lambda lanes, attempts: _batch(luck(lanes, attempts)), numbers, options)
+        _, chosen = rejection.accepted_batch(lambda lanes, attempts: _batch(luck(lanes, attempts)), numbers, options)
         for number in numbers:
             tries = luck(np.full(1000, number), np.arange(1000))
             assert chosen[number] == np.argmax(tries <= 1)
 
 
-def _batch(values: np.ndarray) -> Batch:
-    return Batch({"quality/contacts": jnp.asarray(values)}, (), jnp.ones(len(values), bool))  # type: ignore[arg-type]
+def _batch(values: np.ndarray) -> DeviceBatch:
+    return DeviceBatch({"quality/contacts": jnp.asarray(values)}, (), jnp.ones(len(values), bool))  # type: ignore[arg-type]
 
 
 def test_a_kind_that_there_is_not_is_said(tmp_path):

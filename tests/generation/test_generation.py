@@ -113,7 +113,7 @@ def test_a_video_does_not_depend_on_the_number_of_devices(tiny: Path, tmp_path: 
 def test_a_run_leaves_none_of_its_compiled_programs_behind(tmp_path: Path):
     def kept() -> list[str]:
         names = [each.hlo_modules()[0].name for each in jax.devices()[0].client.live_executables()]
-        return sorted(name for name in names if name in ("jit__made", "jit_drawn"))
+        return sorted(name for name in names if name in ("jit__simulated_batch", "jit_drawn"))
 
     before = kept()
     for balls in (1, 2):

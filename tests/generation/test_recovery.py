@@ -24,7 +24,7 @@ import gen2d
 from gen2d.dataset.folder import clean
 from gen2d.generation.regenerate import repair
 from gen2d.generation.run import generate
-from gen2d.tools.verify import checked, verify
+from gen2d.tools.verify import verify, verify_and_repair
 
 CONFIG = tiny.changed(video={"frames": 12, "height": 32, "width": 32}, annotations={"masks": True})
 slow = pytest.mark.slow
@@ -65,7 +65,7 @@ def test_a_flipped_bit_is_repaired_to_the_byte(pristine: Path, tmp_path: Path, s
     shutil.copytree(pristine, root)
     for name, bit in (place for place in every if chance.random() < share):
         flip(root, name, bit)
-        outcome = checked(root, "full", lambda names: repair(root, names))
+        outcome = verify_and_repair(root, "full", lambda names: repair(root, names))
         assert outcome.problems == [], (name, bit)
         assert outcome.repaired, (name, bit)
         assert contents(root) == before, (name, bit)
@@ -172,7 +172,7 @@ def test_thirty_kills_of_a_repair(pristine: Path, tmp_path: Path) -> None:
         for name, content in before.items():
             if name != "shards/train-00000.h5":
                 assert (root / name).read_bytes() == content, name
-        assert checked(root, "full", lambda names: repair(root, names)).problems == []
+        assert verify_and_repair(root, "full", lambda names: repair(root, names)).problems == []
         clean(root)
         assert contents(root) == before
 

@@ -12,7 +12,7 @@ from tiny import changed, ran
 from gen2d.core.errors import FolderError
 from gen2d.generation.regenerate import repair
 from gen2d.generation.run import generate
-from gen2d.tools.verify import checked, chosen_videos, verify
+from gen2d.tools.verify import chosen_videos, verify, verify_and_repair
 
 
 @pytest.fixture(scope="module")
@@ -46,10 +46,10 @@ def test_videos_are_chosen_by_the_seed() -> None:
 def test_a_dataset_with_other_values_but_right_checksums_is_found_and_made_again(pristine: Path, root: Path) -> None:
     forged.flip_value(root, "train", 1, "states/position", 2)
     assert verify(root, "full") == []
-    outcome = checked(root, "regen", videos=24)
+    outcome = verify_and_repair(root, "regen", videos=24)
     (sentence,) = outcome.problems
     assert "train-00001.h5: states/position of train video 10 is not what its recipe makes" in sentence
-    outcome = checked(root, "regen", lambda names: repair(root, names), videos=24)
+    outcome = verify_and_repair(root, "regen", lambda names: repair(root, names), videos=24)
     assert (outcome.problems, outcome.repaired, outcome.remade) == ([], [sentence], ["train-00001"])
     assert contents(root) == contents(pristine)
 
@@ -71,7 +71,7 @@ DAMAGES = {
 def test_a_repair_restores_every_byte(pristine: Path, root: Path, damage: str) -> None:
     for name in DAMAGES[damage]:
         flip(root / name, 8 * ((root / name).stat().st_size // 2) + 3)
-    outcome = checked(root, "full", lambda names: repair(root, names))
+    outcome = verify_and_repair(root, "full", lambda names: repair(root, names))
     assert outcome.problems == []
     named = "\n".join(outcome.repaired)
     listed = DAMAGES[damage][:1] if damage.startswith("manifest") else DAMAGES[damage]
@@ -84,7 +84,7 @@ def test_missing_and_empty_files_are_restored(pristine: Path, root: Path) -> Non
         (root / name).unlink()
     for name in ("config.yaml", TEST):
         (root / name).write_bytes(b"")
-    outcome = checked(root, "quick", lambda names: repair(root, names))
+    outcome = verify_and_repair(root, "quick", lambda names: repair(root, names))
     assert outcome.problems == []
     assert outcome.remade == ["test-00000-n3", "train-00000", "train-00001", "train-00002-n5"]
     assert contents(root) == contents(pristine)

@@ -15,7 +15,7 @@ import gen2d
 from gen2d.core.errors import ConfigError, FolderError, UserError
 from gen2d.core.schema import Field
 from gen2d.loading import dataset as loader
-from gen2d.loading.concat import Joined
+from gen2d.loading.concat import ConcatDataset
 from gen2d.programs.redraw import render
 
 COUNTS = {3: 20, 4: 9, 5: 1}  # videos by seed
@@ -183,7 +183,7 @@ def test_what_is_no_list_of_datasets_is_told(roots: list[Path], tmp_path: Path) 
         loader.open([])
     with pytest.raises(FolderError, match="not a gen2d dataset"):
         loader.open([roots[0], tmp_path])
-    assert isinstance(loader.open(roots), Joined)
+    assert isinstance(loader.open(roots), ConcatDataset)
     joined: Any = loader.open(roots)
     with pytest.raises(UserError, match="ds is of 3 folders, but must be of one"):
         render(joined, [0])

@@ -6,10 +6,10 @@ from laws import DOWN, GRAVITY, doubled, holds
 from test_invariants import gas
 from worlds import STEP, energies, momenta, run, world
 
-from gen2d.physics.simulate import Keep
+from gen2d.physics.simulate import SaveAt
 
 FRAMES = 241
-EVERYTHING = Keep(contacts=6000, energy=True)
+EVERYTHING = SaveAt(contacts=6000, energy=True)
 
 
 def made() -> tuple:

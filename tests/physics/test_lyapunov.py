@@ -10,7 +10,7 @@ from numpy.testing import assert_allclose
 from worlds import STEP, box, rules, world
 
 from gen2d.physics import lyapunov
-from gen2d.physics.lyapunov import SMALL, direction, last, size
+from gen2d.physics.lyapunov import SMALL, last_state, perturbation, perturbation_size
 from gen2d.physics.simulate import simulate
 from gen2d.records import axes
 from gen2d.records import keys as keys_module
@@ -41,13 +41,13 @@ def made() -> tuple:
 @functools.cache
 def growths() -> dict[str, float]:
     keys, scene, state, run = made()
-    found = jax.jit(lambda k, a, b: lyapunov.growth(k, a, b, run, SECONDS))(keys, scene, state)
+    found = jax.jit(lambda k, a, b: lyapunov.lyapunov_exponent(k, a, b, run, SECONDS))(keys, scene, state)
     return dict(zip(VELOCITIES, np.asarray(found, float).tolist(), strict=True))
 
 
 def change() -> scene_module.State:
     keys, scene, state, _ = made()
-    return jax.tree.map(lambda x: np.asarray(x, float) / SMALL, direction(keys, scene, state))
+    return jax.tree.map(lambda x: np.asarray(x, float) / SMALL, perturbation(keys, scene, state))
 
 
 def test_a_change_has_the_size_one_and_is_of_what_moves() -> None:
@@ -79,9 +79,9 @@ def test_it_is_the_difference_of_two_simulations() -> None:
     moved = [
         jax.tree.map(lambda x, d, sign=sign: x + jnp.asarray(sign * step * d, x.dtype), state, way) for sign in (1, -1)
     ]
-    program = jax.jit(lambda start: last(run(scene, start).states))
+    program = jax.jit(lambda start: last_state(run(scene, start).states))
     above, below = (program(start) for start in moved)
-    apart = size(jax.tree.map(lambda a, b: (a - b) / (2 * step), above, below))
+    apart = perturbation_size(jax.tree.map(lambda a, b: (a - b) / (2 * step), above, below))
     for i, name in enumerate(VELOCITIES):
         if name != "meet":  # there two simulations differ too soon
             assert_allclose(np.log10(apart[i]) / SECONDS, growths()[name], atol=0.01)
@@ -89,6 +89,6 @@ def test_it_is_the_difference_of_two_simulations() -> None:
 
 def test_sizes_beyond_the_range_of_squares() -> None:
     parts = jnp.asarray([3e-30, 0])[None, :, None], jnp.asarray([0, 4e-30])[None, :, None]
-    assert_allclose(size(parts), 5e-30, rtol=1e-6)
-    assert_allclose(size((parts[0] * 1e35, parts[1] * 1e35)) / 1e5, 5, rtol=1e-5)
-    assert size((parts[0] * 0, parts[1] * 0)) == 0
+    assert_allclose(perturbation_size(parts), 5e-30, rtol=1e-6)
+    assert_allclose(perturbation_size((parts[0] * 1e35, parts[1] * 1e35)) / 1e5, 5, rtol=1e-5)
+    assert perturbation_size((parts[0] * 0, parts[1] * 0)) == 0

@@ -6,15 +6,23 @@ import numpy as np
 import pytest
 from worlds import box, rules, run, world
 
-from gen2d.physics.broad_phase import around, bits_in_ring, bits_of, clearance, listed, ring_of, spots
+from gen2d.physics.broad_phase import (
+    active_pairs,
+    bits_in_round_robin,
+    bits_of,
+    bounding_radius,
+    round_robin_of,
+    row_lookup,
+    signed_distance,
+)
 from gen2d.physics.collision import Disc, Hull, Stadium, edge_normals, hull
-from gen2d.physics.schedule import Match, meetings
-from gen2d.physics.simulate import Keep, simulate
+from gen2d.physics.schedule import Match, pairings
+from gen2d.physics.simulate import SaveAt, simulate
 from gen2d.records import axes, trajectory
 from gen2d.records import scene as scene_module
 from gen2d.space.space import Space
 
-EVERYTHING = Keep(contacts=300, energy=True)
+EVERYTHING = SaveAt(contacts=300, energy=True)
 
 
 def gas(seed: int, discs: int, **more: float) -> tuple:
@@ -85,9 +93,9 @@ def test_both_forms_give_the_same_mixture():
 
 def _visited(words: np.ndarray, chunk: int) -> list[tuple[int, int, int]]:
     """Round, word and bit of all rows, in the order in which they are solved."""
-    rows, found = listed(jnp.asarray(words), chunk), []
+    rows, found = active_pairs(jnp.asarray(words), chunk), []
     for k in range(int(rows.starts[-1])):
-        spot = jax.tree.map(np.asarray, spots(rows, jnp.asarray(k), chunk))
+        spot = jax.tree.map(np.asarray, row_lookup(rows, jnp.asarray(k), chunk))
         found += [
             (int(spot.round), int(w), int(b)) for w, b in zip(spot.word[spot.there], spot.bit[spot.there], strict=True)
         ]
@@ -107,9 +115,9 @@ def test_a_ring_finds_each_near_pair_once(count):
     rng, lanes = np.random.default_rng(count), 3
     centre, reach = rng.uniform(0, 5, (2, count, lanes)), rng.uniform(0.2, 0.8, (count, lanes))
     reach[0, 0] = np.nan  # is not there
-    a, b = meetings(count, count, Match(0, 0, count - 1))
-    ring = ring_of(a, b)
-    words = np.asarray(bits_in_ring(jnp.asarray(centre), jnp.asarray(reach), ring, jnp.ones(())))
+    a, b = pairings(count, count, Match(0, 0, count - 1))
+    ring = round_robin_of(a, b)
+    words = np.asarray(bits_in_round_robin(jnp.asarray(centre), jnp.asarray(reach), ring, jnp.ones(())))
     found = []
     for turn, word, bit in _visited(words, 16):
         pair = ring.pair[turn, word // lanes * 16 + bit]
@@ -140,9 +148,9 @@ def test_a_shape_is_nowhere_nearer_than_its_clearance_nor_beyond_its_circle():
     for shape, core, radius in shapes:
         outline = _outline(shape) if core is None else np.array(core).T
         apart = np.sqrt(((points[:, :, None] - outline[:, None]) ** 2).sum(0)).min(1) - radius
-        assert (np.asarray(clearance(shape, jnp.asarray(points))) <= apart + 1e-5).all()
+        assert (np.asarray(signed_distance(shape, jnp.asarray(points))) <= apart + 1e-5).all()
         furthest = np.hypot(*(outline - np.asarray(at))).max() + radius
-        assert float(around(shape)[0]) >= furthest - 1e-5
+        assert float(bounding_radius(shape)[0]) >= furthest - 1e-5
 
 
 def _along(at: jax.Array, half_length: float) -> list[np.ndarray]:

@@ -28,7 +28,7 @@ from oracles import (
 )
 from worlds import STEP, energies, momenta, run, world
 
-from gen2d.physics.simulate import Keep
+from gen2d.physics.simulate import SaveAt
 
 GRAVITY = 9.81  # m/s^2
 FRAME = 1 / 60  # s
@@ -71,7 +71,7 @@ def firsts(events: Events, elasticity: float) -> list:
 def flights(elasticity: float) -> tuple[list[Setting], list[list[Impact]], list[Path]]:
     """200 smooth scenes, their exact paths, and gen2d's, all in one batch; one program for any elasticity."""
     settings = [Setting(discs(seed, 4), box(SIDE), elasticity=elasticity) for seed in range(SCENES)]
-    made = run([gen2d_world(s, 8) for s in settings], SECONDS * 60 + 1, 4, keep=Keep(contacts=256))
+    made = run([gen2d_world(s, 8) for s in settings], SECONDS * 60 + 1, 4, keep=SaveAt(contacts=256))
     paths = [p._replace(events=firsts(p.events, elasticity)) for p in gen2d_paths(made, settings)]
     return settings, [firsts(exact_path(s, 8), elasticity) for s in settings], paths
 

@@ -8,9 +8,9 @@ import pytest
 from numpy.testing import assert_allclose
 
 from gen2d import Space
-from gen2d.physics.banded import factored, solved
-from gen2d.physics.rigid_joints import plan_of
-from gen2d.records.layout import Tie
+from gen2d.physics.banded import factor, solve_factored
+from gen2d.physics.rigid_joints import joint_system_plan
+from gen2d.records.layout import JointSpec
 from gen2d.space.video import Video
 
 
@@ -21,15 +21,17 @@ def test_a_band_is_solved_as_the_whole_matrix_is(rows, width):
     half = random.normal(size=(5, rows, rows)) * (i >= j) * (i - j < width) + 5 * np.eye(rows)
     matrix, wanted = half @ half.swapaxes(1, 2), random.normal(size=(5, rows))
     bands = [jnp.asarray(np.pad(np.diagonal(matrix, o, 1, 2), ((0, 0), (0, o))).T) for o in range(width)]
-    found = np.asarray(solved(factored(bands), jnp.asarray(wanted.T))).T
+    found = np.asarray(solve_factored(factor(bands), jnp.asarray(wanted.T))).T
     assert_allclose(found, np.linalg.solve(matrix, wanted[..., None])[..., 0], rtol=1e-4, atol=1e-5)
 
 
 def test_chains_are_narrow_bands_and_hinges_that_say_nothing_new_have_no_row():
-    links = [Tie("revolute", 30, 0), *(Tie("revolute", i, i + 1) for i in range(29))]
+    links = [JointSpec("revolute", 30, 0), *(JointSpec("revolute", i, i + 1) for i in range(29))]
     shuffled = [links[i] for i in np.random.default_rng(0).permutation(30)]
-    assert (plan_of(shuffled, 30).width, len(plan_of(shuffled, 30).joint)) == (4, 60)
-    welded = plan_of([Tie("revolute", 0, 1), Tie("revolute", 1, 0), Tie("revolute", 0, 1)], 2)
+    assert (joint_system_plan(shuffled, 30).width, len(joint_system_plan(shuffled, 30).joint)) == (4, 60)
+    welded = joint_system_plan(
+        [JointSpec("revolute", 0, 1), JointSpec("revolute", 1, 0), JointSpec("revolute", 0, 1)], 2
+    )
     assert welded.joint.tolist().count(0) == 2
     assert len(welded.joint) == 3
 

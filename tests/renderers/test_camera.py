@@ -11,13 +11,13 @@ from numpy.testing import assert_allclose, assert_array_equal
 from worlds import flown
 
 from gen2d.config.config import load_config
-from gen2d.records.layout import Layout, Run
+from gen2d.records.layout import Layout, SlotGroup
 from gen2d.records.scene import State
 from gen2d.renderers import rasterizer
-from gen2d.renderers.camera import View, filmed, fitted, largest_scale, to_pixels, to_world
+from gen2d.renderers.camera import CameraView, filmed, fitted, largest_scale, to_pixels, to_world
 
 HEIGHT, WIDTH, FPS, FRAMES = 48, 64, 20, 12
-LAYOUT = Layout((Run("circle", 3),), bounds=(0.0, 0.0, 10.0, 6.0))
+LAYOUT = Layout((SlotGroup("circle", 3),), bounds=(0.0, 0.0, 10.0, 6.0))
 BALLS = {
     "video": {"frames": FRAMES, "fps": FPS, "height": HEIGHT, "width": WIDTH},
     "scene": {"name": "bouncing", "balls": 2, "radius": 1.0, "gravity": [0, 0], "color": [255, 255, 255]},
@@ -30,7 +30,7 @@ draw = jax.jit(rasterizer.draw_patches, static_argnums=1)
 def views(rng, count):
     """Random ones."""
     center, scale = rng.uniform(-5, 5, (count, 2)), np.exp(rng.uniform(0, 4, count))
-    return View(*map(np.float32, (center, scale, rng.uniform(-7, 7, count))))
+    return CameraView(*map(np.float32, (center, scale, rng.uniform(-7, 7, count))))
 
 
 def watched(seed=0, states=None, **options):
@@ -39,7 +39,7 @@ def watched(seed=0, states=None, **options):
     if states is None:
         states = State(*(np.zeros((FRAMES, 3, *shape), np.float32) for shape in ((2,), (), (2,), ())))
     view = filmed(jax.random.key(seed), config.camera, LAYOUT, states, FPS, HEIGHT, WIDTH)
-    return View(*(np.asarray(part, float) for part in view))
+    return CameraView(*(np.asarray(part, float) for part in view))
 
 
 # ---- Pixels and metres
@@ -55,7 +55,7 @@ def test_from_the_world_to_pixels_and_back():
 
 def test_up_is_up_and_the_picture_turns_against_the_camera():
     def at(angle, x, y):
-        view = View(*(np.float32(part) for part in ([[2, 1]], [10], [angle])))
+        view = CameraView(*(np.float32(part) for part in ([[2, 1]], [10], [angle])))
         return np.asarray(to_pixels(view, np.float32([[[x, y]]]), HEIGHT, WIDTH))[0, 0]
 
     assert_allclose(at(0, 2, 1), [32, 24])
@@ -69,7 +69,7 @@ def test_up_is_up_and_the_picture_turns_against_the_camera():
 @pytest.mark.parametrize("margin", [0, 0.7])
 def test_a_fitted_camera_just_shows_the_bounds(bounds, height, width, margin):
     center, scale = fitted(bounds, height, width, margin)
-    view = View(*(np.float32(part) for part in ([center], [scale], [0])))
+    view = CameraView(*(np.float32(part) for part in ([center], [scale], [0])))
     corners = np.float32([[bounds[:2], bounds[2:]]])
     (left, bottom), (right, top) = np.asarray(to_pixels(view, corners, height, width), float)[0]
     room = np.array([left, top, width - right, height - bottom])
@@ -167,7 +167,7 @@ def test_a_moving_camera_shows_what_a_moved_world_does():
     moved = at._replace(
         position=np.stack([x * cos + y * sin, y * cos - x * sin], -1),
         angle=at.angle - at.view.angle[..., None],
-        view=View(0 * at.view.center, at.view.scale, 0 * at.view.angle),
+        view=CameraView(0 * at.view.center, at.view.scale, 0 * at.view.angle),
     )
     other = np.asarray(draw(stages._replace(instants=moved), plan)[0])[..., 0].astype(float)
     assert light.std() > 20

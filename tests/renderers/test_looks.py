@@ -18,7 +18,7 @@ from gen2d.config import plugins
 from gen2d.config.config import load_config
 from gen2d.core.enums import SHAPES, STATIC
 from gen2d.programs import render
-from gen2d.records.layout import Layout, Run
+from gen2d.records.layout import Layout, SlotGroup
 from gen2d.renderers import color as color_module
 from gen2d.renderers import look, rasterizer
 
@@ -27,9 +27,9 @@ RANDOM = [name for name in LOOKS if hasattr(plugins.load("look", name).Options, 
 FREE = {"palette": "random", "contrast": 150.0}
 HEIGHT, WIDTH = 40, 44
 PATCHES, DENSE = (jax.jit(form, static_argnums=1) for form in (rasterizer.draw_patches, rasterizer.draw_dense))
-DISCS = Layout((Run("circle", 4),), (0.0, 0.0, 10.0, 10.0), 1.6)
+DISCS = Layout((SlotGroup("circle", 4),), (0.0, 0.0, 10.0, 10.0), 1.6)
 SHAPES_ALL = Layout(
-    (*DISCS.runs, *(Run(shape, 2) for shape in SHAPES[2:]), Run("segment", 4, STATIC)), DISCS.bounds, 1.6
+    (*DISCS.runs, *(SlotGroup(shape, 2) for shape in SHAPES[2:]), SlotGroup("segment", 4, STATIC)), DISCS.bounds, 1.6
 )
 
 
@@ -75,7 +75,7 @@ def drawn(name):
     config, (scene, states) = config_of(name), scene_of(DISCS)
 
     plan = render.plan_of(config, DISCS)
-    stages = jax.vmap(lambda key: render.stage_of(key, config, plan, scene, states))(keys(2))
+    stages = jax.vmap(lambda key: render.render_scene(key, config, plan, scene, states))(keys(2))
     return stages, plan, np.asarray(PATCHES(stages, plan)[0])[:, 0]
 
 

@@ -17,14 +17,14 @@ from worlds import flown, outline, polygon_areas
 
 from gen2d.config.config import load_config
 from gen2d.core.enums import STATIC
-from gen2d.programs.rollout import Batch, Rollout
-from gen2d.records.layout import Layout, Run
+from gen2d.programs.rollout import DeviceBatch, Rollout
+from gen2d.records.layout import Layout, SlotGroup
 from gen2d.renderers import rasterizer
-from gen2d.renderers.camera import View
+from gen2d.renderers.camera import CameraView
 from gen2d.renderers.compositing import OCCLUDER
 from gen2d.renderers.paint import Background, Paint, Texture
-from gen2d.renderers.plan import Occluders, Plan, Stage
-from gen2d.renderers.primitives import Bodies, Instants
+from gen2d.renderers.plan import FramePlan, Occluders, RenderScene
+from gen2d.renderers.primitives import BodyGeometry, Instants
 
 PATCHES, DENSE = (jax.jit(form, static_argnums=1) for form in (rasterizer.draw_patches, rasterizer.draw_dense))
 SOFT = jax.jit(jax.vmap(rasterizer.draw_soft, in_axes=(0, None)), static_argnums=1)
@@ -51,7 +51,7 @@ def shapes(rng, layout):
                 half[slot], radius[slot] = 4.0, (0.0 if run.shape == "segment" else 150.0)
         if run.shape == "polygon" and not run.rounded:
             radius[first : first + run.count] = 0
-    return Bodies(radius, half, vertices)
+    return BodyGeometry(radius, half, vertices)
 
 
 def painted(rng, layout, plan, features):
@@ -94,8 +94,10 @@ def instants(rng, layout, plan, shape):
             places[..., slots, :], angles[..., slots] = [0.6, 0.3], np.arange(run.count) * np.pi / 2
     still = np.zeros(shape)
     if plan.still:
-        return Instants(places, angles, View(np.zeros((*shape, 2)), still + plan.scale, still))
-    view = View(rng.uniform(-1, 1, (*shape, 2)), rng.uniform(0.6, 1, shape) * plan.scale, rng.uniform(-3, 3, shape))
+        return Instants(places, angles, CameraView(np.zeros((*shape, 2)), still + plan.scale, still))
+    view = CameraView(
+        rng.uniform(-1, 1, (*shape, 2)), rng.uniform(0.6, 1, shape) * plan.scale, rng.uniform(-3, 3, shape)
+    )
     return Instants(places, angles, view)
 
 
@@ -112,7 +114,7 @@ def stages(plan, videos, frames, features=(), occluders=0, noise=None, seed=0):
         )
         exposed = instants(rng, plan.layout, plan, (frames, plan.exposed)) if plan.exposed else None
         made.append(
-            Stage(
+            RenderScene(
                 shapes(rng, plan.layout),
                 instants(rng, plan.layout, plan, (frames,)),
                 exposed,
@@ -209,32 +211,32 @@ def video(stages, i):
 
 # ---- Both forms, and exact areas
 
-ROUNDED = Run("polygon", 2, vertices=4, rounded=True)
+ROUNDED = SlotGroup("polygon", 2, vertices=4, rounded=True)
 MIXED = (
-    Run("circle", 2, layer=3),  # drawn last
-    Run("circle", 1, STATIC),
-    Run("capsule", 2),
-    Run("polygon", 2, vertices=5),
+    SlotGroup("circle", 2, layer=3),  # drawn last
+    SlotGroup("circle", 1, STATIC),
+    SlotGroup("capsule", 2),
+    SlotGroup("polygon", 2, vertices=5),
 )
 ALL = ("gradient", "rim", "mark", "shade", "texture")
 
 
 def plan_for(runs, height, width, **options):
-    return Plan(Layout(runs, reach=REACH), height, width, 3.7, grow=0.75, **options)
+    return FramePlan(Layout(runs, reach=REACH), height, width, 3.7, grow=0.75, **options)
 
 
 CASES = {
     "plain": (plan_for(MIXED, 24, 40, owners=True), {"videos": 6, "occluders": 2}),
     "painted": (
-        plan_for((Run("circle", 6),), 6, 50, still=False, owners=True),
+        plan_for((SlotGroup("circle", 6),), 6, 50, still=False, owners=True),
         {"videos": 3, "features": ALL, "occluders": 3},
     ),
     "blurred": (
-        plan_for((Run("circle", 2), Run("circle", 1, STATIC)), 33, 29, still=False, linear=True, exposed=3),
+        plan_for((SlotGroup("circle", 2), SlotGroup("circle", 1, STATIC)), 33, 29, still=False, linear=True, exposed=3),
         {"videos": 3, "features": ("gradient", "noise"), "noise": 5.0},
     ),
     "everything": (
-        plan_for((*MIXED, Run("segment", 2, STATIC), ROUNDED), 33, 40, still=False, linear=True, owners=True),
+        plan_for((*MIXED, SlotGroup("segment", 2, STATIC), ROUNDED), 33, 40, still=False, linear=True, owners=True),
         {"videos": 4, "features": (*ALL, "noise"), "occluders": 3},
     ),
 }
@@ -312,8 +314,8 @@ def inset(corners, width):
     return kept, width > 0.99 * middle or len(kept) < len(corners)
 
 
-RIMMED = {"circle": Run("circle", 1), "polygon": Run("polygon", 1, vertices=4)}
-RIMMED |= {"capsule": Run("capsule", 1), "rounded polygon": Run("polygon", 1, vertices=4, rounded=True)}
+RIMMED = {"circle": SlotGroup("circle", 1), "polygon": SlotGroup("polygon", 1, vertices=4)}
+RIMMED |= {"capsule": SlotGroup("capsule", 1), "rounded polygon": SlotGroup("polygon", 1, vertices=4, rounded=True)}
 
 
 @pytest.mark.parametrize(
@@ -353,7 +355,7 @@ def test_a_rim_is_what_lies_within_a_width_of_the_edge(shape):
 @pytest.mark.parametrize("form", ["patches", "dense"])
 @pytest.mark.parametrize(("linear", "half", "light"), [(False, 128, 64), (True, 188, 137)])
 def test_a_pixel_half_of_white_is_half_of_its_values_or_half_of_its_light(form, linear, half, light):
-    plan = plan_for((Run("polygon", 1, vertices=4),), 16, 16, linear=linear)
+    plan = plan_for((SlotGroup("polygon", 1, vertices=4),), 16, 16, linear=linear)
     corners = np.array([[-1, -1], [0.5, -1], [0.5, 1], [-1, 1]]) / plan.scale  # its right side in the middle of a pixel
     some = video(stages(plan, 1, 1), 0)
     some = some._replace(
@@ -373,7 +375,7 @@ def test_a_pixel_half_of_white_is_half_of_its_values_or_half_of_its_light(form, 
 
 
 def test_noise_is_as_strong_as_asked_and_another_in_each_frame():
-    plan = plan_for((Run("circle", 1),), 48, 64)
+    plan = plan_for((SlotGroup("circle", 1),), 48, 64)
     some = stages(plan, 4, 3, noise=6.0)
     some = some._replace(
         paint=some.paint._replace(
@@ -472,7 +474,9 @@ def test_batches_share_one_program():
     lanes = config.storage.lanes
     every, *_ = flown(config, 3 * lanes)
     for first in range(0, 3 * lanes, lanes):
-        batch = Batch({}, jax.tree.map(lambda a, first=first: a[first : first + lanes], every), jnp.ones(lanes, bool))
+        batch = DeviceBatch(
+            {}, jax.tree.map(lambda a, first=first: a[first : first + lanes], every), jnp.ones(lanes, bool)
+        )
         for start in (0, 2):
             (made,) = rollout.draw(batch, start, 2)
             assert made["frames"].shape[0] == 2
@@ -483,7 +487,7 @@ def test_batches_share_one_program():
 
 
 def test_frames_change_as_their_slopes_say():
-    plan = plan_for((Run("circle", 1), Run("polygon", 1, vertices=4)), 20, 24, still=False)
+    plan = plan_for((SlotGroup("circle", 1), SlotGroup("polygon", 1, vertices=4)), 20, 24, still=False)
     made, weight = stages(plan, 1, 2, seed=5), np.random.default_rng(6).uniform(-1, 1, (2, 20, 24, 3))
     made = video(made, 0)._replace(seed=None)
     made = made._replace(paint=made.paint._replace(drawn=np.ones(2, bool)))

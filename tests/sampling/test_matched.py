@@ -16,7 +16,7 @@ from gen2d.config.config import load_config
 from gen2d.core.enums import STATIC
 from gen2d.core.errors import ConfigError, FolderError
 from gen2d.records.layout import Layout
-from gen2d.sampling.builder import assembled, boxes, capsules, discs
+from gen2d.sampling.builder import assemble, boxes, capsules, discs
 from gen2d.sampling.matched import counterfactuals, violations
 from gen2d.sampling.matched import sets as sets_module
 from gen2d.sampling.sampler import Sampler
@@ -279,7 +279,7 @@ def test_an_object_gains_energy(videos: Videos):
 def test_a_gap_is_that_to_the_rim():
     places = jnp.asarray([[2.0, 1.0]])
     parts = [discs(places, 0.5), capsules(places + 4, 0.3, 1.0, 0.25), boxes(places - 5, 0.7, 2.0, 1.0, kind=STATIC)]
-    scene, state = assembled(Layout(tuple(part.run for part in parts)), parts, jnp.zeros(2))
+    scene, state = assemble(Layout(tuple(part.run for part in parts)), parts, jnp.zeros(2))
     points = np.random.default_rng(0).uniform(-8, 8, (500, 2))
     gap = np.asarray(
         jax.vmap(lambda point: violations.gaps(point, scene.objects, state))(jnp.asarray(points, jnp.float32))

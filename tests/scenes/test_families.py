@@ -22,11 +22,11 @@ from gen2d.config.options import drawn_options
 from gen2d.config.plugin_options import Plugin
 from gen2d.core.enums import DYNAMIC, SHAPES
 from gen2d.physics.collision import Disc, Hull, Shape, touches
-from gen2d.physics.params import rules_of
-from gen2d.physics.shapes import form_of, placed
+from gen2d.physics.params import solver_params
+from gen2d.physics.shapes import body_shape_of, to_world
 from gen2d.physics.simulate import simulate, substeps
 from gen2d.records.axes import to_device, to_stored
-from gen2d.records.layout import Layout, Run
+from gen2d.records.layout import Layout, SlotGroup
 from gen2d.records.scene import Objects, Scene, State
 from gen2d.sampling.sampler import Sampler
 from gen2d.tools import gallery
@@ -80,11 +80,11 @@ def made(family: str) -> Made:
 def shapes_of(layout: Layout, objects: Objects, state: State) -> list[Any]:
     """The shape of each run at the start: from numbers of its slots."""
 
-    def of(run: Run, first: int) -> Any:
+    def of(run: SlotGroup, first: int) -> Any:
         def some(numbers: np.ndarray) -> Shape:
             slots = first + numbers
-            form = form_of(objects, run, jnp.asarray(slots))
-            return placed(form, state.position[:, slots], state.angle[slots])
+            form = body_shape_of(objects, run, jnp.asarray(slots))
+            return to_world(form, state.position[:, slots], state.angle[slots])
 
         return some
 
@@ -209,7 +209,7 @@ def test_a_hundred_thousand_videos_are_numbers_begin_apart_and_stay_within_walls
     config = load_config(f"{family}.yaml")
     scene, video, physics = config.scene, config.video, config.physics
     layout, steps = scene.module.layout(scene.options), substeps(video.fps, physics.substeps, physics.max_step)
-    rules = rules_of(physics, video.fps, steps)
+    rules = solver_params(physics, video.fps, steps)
 
     @jax.jit
     def run(scene: Scene, state: State) -> tuple[jax.Array, jax.Array, jax.Array]:

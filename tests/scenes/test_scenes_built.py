@@ -12,8 +12,8 @@ from tiny import ran
 
 from gen2d.config.config import load_config
 from gen2d.core.errors import ConfigError
-from gen2d.physics.params import rules_of
-from gen2d.physics.simulate import Keep, simulate, substeps
+from gen2d.physics.params import solver_params
+from gen2d.physics.simulate import SaveAt, simulate, substeps
 from gen2d.records.axes import to_device, to_stored
 from gen2d.records.layout import Layout
 from gen2d.records.scene import Scene, State
@@ -39,13 +39,13 @@ def film(family: str, lanes: int, seconds: float, fps: float, *sets: str, energy
     config = load_config(f"{family}.yaml", [*sets, f"video.fps={fps}"])
     scene, physics, frames = config.scene, config.physics, round(seconds * fps) + 1
     layout, steps = scene.module.layout(scene.options), substeps(fps, physics.substeps, physics.max_step)
-    rules = rules_of(physics, fps, steps)
+    rules = solver_params(physics, fps, steps)
 
     @jax.jit
     def run(keys: jax.Array) -> tuple:
         factors, (things, state, *_) = jax.vmap(Sampler(config).sampled)(keys)
         device = to_device(things), to_device(state)
-        made = simulate(*device, layout, rules, frames, steps, Keep(energy=energy), sparse=True)
+        made = simulate(*device, layout, rules, frames, steps, SaveAt(energy=energy), sparse=True)
         return factors, things, to_stored(made)
 
     factors, things, made = jax.tree.map(np.asarray, run(jax.random.split(jax.random.key(1), lanes)))

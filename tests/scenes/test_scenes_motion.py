@@ -19,9 +19,9 @@ import gen2d
 from gen2d.config.config import Config, load_config
 from gen2d.core.errors import ConfigError
 from gen2d.generation.run import generate
-from gen2d.physics.params import rules_of
+from gen2d.physics.params import solver_params
 from gen2d.physics.simulate import simulate, substeps
-from gen2d.programs.rollout import keep_of
+from gen2d.programs.rollout import save_at
 from gen2d.records.axes import to_device, to_stored
 from gen2d.sampling.sampler import Sampler
 
@@ -62,11 +62,11 @@ def played(config: Config, n: int, given: dict[str, Any] | None = None) -> Playe
     """n videos, simulated."""
     start, layout = begun(config, n, given), config.scene.module.layout(config.scene.options)
     steps = substeps(config.video.fps, config.physics.substeps, config.physics.max_step)
-    rules = rules_of(config.physics, config.video.fps, steps)
+    rules = solver_params(config.physics, config.video.fps, steps)
 
     def run(scene: Any, state: Any) -> Any:
         device = to_device(scene), to_device(state)
-        keep = keep_of(config, layout)
+        keep = save_at(config, layout)
         return to_stored(simulate(*device, layout, rules, config.video.frames, steps, keep, sparse=True))
 
     kinds = jax.eval_shape(lambda: Sampler(config).sampled(jax.random.key(0))[1])

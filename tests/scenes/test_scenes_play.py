@@ -13,7 +13,7 @@ from numpy.testing import assert_array_equal
 
 from gen2d.config.config import load_config
 from gen2d.core.errors import ConfigError
-from gen2d.programs.rollout import Rollout, parts
+from gen2d.programs.rollout import Rollout, per_device
 
 # Of each family what a law needs beside its config.
 LAWS = {
@@ -46,7 +46,7 @@ def made(name: str) -> dict[str, np.ndarray]:
     """All that is stored of a batch of a family's videos, and what is seen of each object; [n, ...]."""
     rollout = rollout_of(name)
     batch = rollout.begin("train", [0])
-    assert parts(batch.placed)[0].all()
+    assert per_device(batch.placed)[0].all()
     columns = rollout.host_columns(batch)[0] | {"time": rollout.time}
     if rollout.config.annotations.visibility:
         columns |= rollout.draw(batch, 0, rollout.lanes)[0]

@@ -50,7 +50,7 @@ def running() -> Iterator[Server]:
         for name, value in buckets.environment(server).items():
             patch.setenv(name, value)
         yield server
-        remote._made.cache_clear()
+        remote._file_system.cache_clear()
         s3fs.S3FileSystem.clear_instance_cache()
         gc.collect()  # closes connections
 

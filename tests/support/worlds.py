@@ -14,21 +14,21 @@ import numpy as np
 
 from gen2d.config.config import Config, load_config
 from gen2d.core.enums import STATIC
-from gen2d.physics.params import Rules
-from gen2d.physics.simulate import Forces, Keep, simulate
+from gen2d.physics.params import SolverParams
+from gen2d.physics.simulate import Forces, SaveAt, simulate
 from gen2d.programs import render
 from gen2d.records import axes
 from gen2d.records import keys as keys_module
-from gen2d.records.layout import Layout, Run
+from gen2d.records.layout import Layout, SlotGroup
 from gen2d.records.scene import Objects, Scene, State
 from gen2d.records.trajectory import Trajectory
-from gen2d.renderers.plan import Plan, Stage
+from gen2d.renderers.plan import FramePlan, RenderScene
 from gen2d.sampling import sampler
 
 STEP = 1 / 240
 
 
-def rules(step: float = STEP, **changes: Any) -> Rules:
+def rules(step: float = STEP, **changes: Any) -> SolverParams:
     """The solver's default numbers at a step, but for the changes."""
     numbers: dict[str, Any] = {
         "bounce_threshold": 0.01,
@@ -38,7 +38,7 @@ def rules(step: float = STEP, **changes: Any) -> Rules:
         "damping": 0.0,
         "mixing": "product",
     }
-    return Rules(step=step, **(numbers | changes))
+    return SolverParams(step=step, **(numbers | changes))
 
 
 def world(
@@ -98,17 +98,17 @@ def world(
         velocity=both([r["v"] for r in rows], np.zeros((len(walls), 2))),
         angular_velocity=both([r["spin"] for r in rows], nothing),
     )
-    layout = Layout((Run("circle", count), Run("segment", len(walls), STATIC)))
+    layout = Layout((SlotGroup("circle", count), SlotGroup("segment", len(walls), STATIC)))
     return Scene(objects, jnp.asarray(gravity, real)), state, layout
 
 
 @functools.lru_cache(maxsize=64)
 def _program(
     layout: Layout,
-    numbers: Rules,
+    numbers: SolverParams,
     frames: int,
     steps: int,
-    keep: Keep,
+    keep: SaveAt,
     forces: Forces | None,
     sparse: bool,
     wide: bool,
@@ -124,8 +124,8 @@ def run(
     worlds: Sequence[tuple[Scene, State, Layout]],
     frames: int,
     steps: int,
-    numbers: Rules | None = None,
-    keep: Keep | None = None,
+    numbers: SolverParams | None = None,
+    keep: SaveAt | None = None,
     forces: Forces | None = None,
     sparse: bool = True,
 ) -> Any:
@@ -133,7 +133,7 @@ def run(
     layout = worlds[0][2]
     scene, state = (jax.tree.map(lambda *x: jnp.asarray(np.stack(x)), *(w[i] for w in worlds)) for i in (0, 1))
     wide = state.position.dtype == np.float64
-    made = _program(layout, numbers or rules(), frames, steps, keep or Keep(), forces, sparse, wide)(scene, state)
+    made = _program(layout, numbers or rules(), frames, steps, keep or SaveAt(), forces, sparse, wide)(scene, state)
     return jax.tree.map(np.asarray, made)
 
 
@@ -190,7 +190,7 @@ def momenta(worlds: Sequence[tuple[Scene, State, Layout]], made: Trajectory) -> 
 # ---- Videos that no solver makes, to be drawn
 
 
-def flown(config: Config | Mapping, count: int) -> tuple[Stage, Plan, Scene, State]:
+def flown(config: Config | Mapping, count: int) -> tuple[RenderScene, FramePlan, Scene, State]:
     """What `count` videos of a config are drawn from, their plan, scenes and states [n, T, ...]; from where the sampler
     puts it everything flies straight on, through walls too."""
     config = load_config(config)
@@ -203,11 +203,11 @@ def flown(config: Config | Mapping, count: int) -> tuple[Stage, Plan, Scene, Sta
 
 
 @functools.partial(jax.jit, static_argnums=(0, 1))
-def _all_flown(config: Config, layout: Layout, keys: jax.Array) -> tuple[Stage, Scene, State]:
+def _all_flown(config: Config, layout: Layout, keys: jax.Array) -> tuple[RenderScene, Scene, State]:
     return jax.vmap(functools.partial(_flown, config, layout))(keys)
 
 
-def _flown(config: Config, layout: Layout, key: jax.Array) -> tuple[Stage, Scene, State]:
+def _flown(config: Config, layout: Layout, key: jax.Array) -> tuple[RenderScene, Scene, State]:
     video, steps = config.video, 4
     scene, begin, *_ = sampler.Sampler(config).sampled(key)[1]
 
@@ -224,7 +224,7 @@ def _flown(config: Config, layout: Layout, key: jax.Array) -> tuple[Stage, Scene
 
     frame, step = jnp.arange(video.frames), jnp.arange(1, steps + 1)
     states, between = at(frame / video.fps), at((frame[:-1, None] + step / steps) / video.fps)
-    stage = render.stage_of(key, config, render.plan_of(config, layout), scene, states, between=between)
+    stage = render.render_scene(key, config, render.plan_of(config, layout), scene, states, between=between)
     return stage, scene, states
 
 

@@ -11,12 +11,12 @@ from gen2d.config.options import drawn_options
 from gen2d.records.axes import Array
 from gen2d.records.keys import key_for
 from gen2d.records.scene import Objects, State
-from gen2d.sampling.matched.sets import Member, _along
+from gen2d.sampling.matched.sets import SetMember, _along
 
 # ---- Counterfactuals: other factors
 
 
-def _other_factors(member: Member, config: Any, found: dict[str, Array], draw: Callable) -> dict[str, Array]:
+def _other_factors(member: SetMember, config: Any, found: dict[str, Array], draw: Callable) -> dict[str, Array]:
     """The factors, with the one that the set is about drawn anew or scaled; `draw(key)` draws all."""
     specs, matched, again, made = drawn_options(config.scene.module), config.matched, draw(member.own_key), dict(found)
     for place, name in enumerate(matched.change):

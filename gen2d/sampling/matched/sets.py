@@ -14,7 +14,7 @@ from gen2d.records.keys import key_for
 # ---- Which video is which, and which is changed how
 
 
-class Member(NamedTuple):
+class SetMember(NamedTuple):
     """One video's part in its set."""
 
     number: Array  # in the set
@@ -30,12 +30,12 @@ def keys_of(words: Array, numbers: Array, options: Any) -> Array:
     return keys.video_keys(words, numbers // options.members if options.change else numbers)
 
 
-def _member(key: Array, number: Array, options: Any, frames: int) -> Member:
+def _member(key: Array, number: Array, options: Any, frames: int) -> SetMember:
     set_key = key_for(key, "matched")
     kind = jax.random.randint(key_for(set_key, "change"), (), 0, len(options.change))
     share = options.onset.sample(key_for(set_key, "onset"), ())
     frame = jnp.clip(jnp.round(share * frames).astype(jnp.int32), 1, frames - 1)
-    return Member(number, number > 0, kind, frame, set_key, jax.random.fold_in(set_key, number))
+    return SetMember(number, number > 0, kind, frame, set_key, jax.random.fold_in(set_key, number))
 
 
 def _along(values: Array, like: Array) -> Array:
@@ -67,7 +67,7 @@ def fields(options: Any) -> dict[str, Field]:
     }
 
 
-def untold(options: Any) -> tuple[str, ...]:
+def omitted_fields(options: Any) -> tuple[str, ...]:
     """What is not stored: of a video put together from two, neither tells."""
     parts = "quality/max_penetration", "quality/contacts"
     return parts if set(options.change or ()) & set(VIOLATIONS) else ()

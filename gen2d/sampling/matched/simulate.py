@@ -15,30 +15,32 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from gen2d.config.matched import INTERVENTIONS, VIOLATIONS, untied
+from gen2d.config.matched import INTERVENTIONS, VIOLATIONS, free_slots
 from gen2d.config.options import drawn_options
 from gen2d.records.axes import Array
 from gen2d.records.layout import Layout
 from gen2d.records.scene import Scene, State
 from gen2d.records.trajectory import Trajectory
-from gen2d.sampling.builder import Sampled
+from gen2d.sampling.builder import SampledScene
 from gen2d.sampling.matched.counterfactuals import _other_factors, _other_slot
-from gen2d.sampling.matched.sets import Member, _along, _codes, _member, fields
-from gen2d.sampling.matched.violations import ACTS, Act, Moment, _inside
+from gen2d.sampling.matched.sets import SetMember, _along, _codes, _member, fields
+from gen2d.sampling.matched.violations import INTERVENTION_FUNCTIONS, Intervention, SceneInstant, _inside
 
 # ---- Both together
 
 
-class Videos(NamedTuple):
-    """Some videos before they are drawn, and what is told of their sets; videos come first."""
+class MemberVideos(NamedTuple):
+    """Videos before they are rendered, and the record of their sets; videos come first."""
 
     drawn: dict[str, Array]
-    sampled: Sampled
+    sampled: SampledScene
     made: Trajectory
-    told: dict[str, Array]
+    record: dict[str, Array]
 
 
-def simulated(keys: Array, numbers: Array, config: Any, layout: Layout, sample: Callable, run: Callable) -> Videos:
+def simulate_members(
+    keys: Array, numbers: Array, config: Any, layout: Layout, sample: Callable, run: Callable
+) -> MemberVideos:
     """The videos with these numbers, and their sets' keys.
 
     `sample(key, change)` gives a video's factors and what its family makes of them (sampling.py), `run(scenes, states)`
@@ -49,58 +51,62 @@ def simulated(keys: Array, numbers: Array, config: Any, layout: Layout, sample: 
     member_of = functools.partial(_member, options=options, frames=config.video.frames)
     members = jax.vmap(member_of)(keys, numbers % options.members)
 
-    def own(key: Array, member: Member) -> tuple[dict[str, Array], Sampled]:
+    def own(key: Array, member: SetMember) -> tuple[dict[str, Array], SampledScene]:
         return sample(key, functools.partial(_other_factors, member, config))
 
-    def once(turn: Array, before: Videos) -> Videos:
+    def once(turn: Array, before: MemberVideos) -> MemberVideos:
         now = members._replace(changed=members.changed & (turn > 0))
         drawn, found = jax.vmap(own)(keys, now)
-        act = functools.partial(_acted, options=options, layout=layout)
-        stored, scene, start, frame, told = jax.vmap(act)(now, found.scene, found.state, before.made.states)
+        act = functools.partial(_intervene, options=options, layout=layout)
+        stored, scene, start, frame, record = jax.vmap(act)(now, found.scene, found.state, before.made.states)
         made = run(scene, start)
         ways = {"states": made.states} | ({} if made.between is None else {"between": made.between})
-        joined = {name: _joined(frame, getattr(before.made, name), way) for name, way in ways.items()}
-        after = Videos(drawn, found._replace(scene=stored), dataclasses.replace(made, **joined), told)
-        return after._replace(told=jax.vmap(functools.partial(_told, config=config))(now, before, after))
+        joined = {name: _spliced(frame, getattr(before.made, name), way) for name, way in ways.items()}
+        after = MemberVideos(drawn, found._replace(scene=stored), dataclasses.replace(made, **joined), record)
+        return after._replace(record=jax.vmap(functools.partial(_record_change, config=config))(now, before, after))
 
     made = jax.lax.fori_loop(0, 2, once, _blank(keys, sample, run))
     kind = jnp.asarray(_codes(options))[members.kind]
-    told = {"set": numbers // options.members, "member": members.number, "kind": kind, **made.told}
-    stored = {name: told[name.removeprefix("matched/")].astype(field.dtype) for name, field in fields(options).items()}
-    return made._replace(told=stored)
+    record = {"set": numbers // options.members, "member": members.number, "kind": kind, **made.record}
+    stored = {
+        name: record[name.removeprefix("matched/")].astype(field.dtype) for name, field in fields(options).items()
+    }
+    return made._replace(record=stored)
 
 
-def _blank(keys: Array, sample: Callable, run: Callable) -> Videos:
+def _blank(keys: Array, sample: Callable, run: Callable) -> MemberVideos:
     """Videos of zeros, to begin with."""
 
-    def made(keys: Array) -> Videos:
+    def sampled(keys: Array) -> MemberVideos:
         drawn, found = jax.vmap(sample)(keys)
         counts = {name: jnp.zeros(len(keys), jnp.int32) for name in ("object", "partner", "onset")}
-        return Videos(drawn, found, run(found.scene, found.state), counts | {"size": jnp.zeros(len(keys))})
+        return MemberVideos(drawn, found, run(found.scene, found.state), counts | {"size": jnp.zeros(len(keys))})
 
-    return jax.tree.map(lambda like: jnp.zeros(like.shape, like.dtype), jax.eval_shape(made, keys))
+    return jax.tree.map(lambda like: jnp.zeros(like.shape, like.dtype), jax.eval_shape(sampled, keys))
 
 
-def _acted(
-    member: Member, scene: Scene, state: State, states: State, options: Any, layout: Layout
+def _intervene(
+    member: SetMember, scene: Scene, state: State, states: State, options: Any, layout: Layout
 ) -> tuple[Scene, Scene, State, Array, dict[str, Array]]:
-    """One video's scene as it is stored, the scene, state and frame to simulate it from, and what is told of that."""
-    free = jnp.asarray(untied(layout)) & scene.objects.present
+    """One video's scene as stored; the scene, state and frame to simulate from; the record of the intervention."""
+    free = jnp.asarray(free_slots(layout)) & scene.objects.present
     here = jax.tree.map(lambda values: values[member.frame], states)
-    later = Moment(scene, here, free & _inside(here.position, layout))
-    chosen, frame = Act(scene, state, jnp.zeros(()), jnp.int32(-1), jnp.int32(-1)), jnp.int32(0)
+    later = SceneInstant(scene, here, free & _inside(here.position, layout))
+    chosen, frame = Intervention(scene, state, jnp.zeros(()), jnp.int32(-1), jnp.int32(-1)), jnp.int32(0)
     for place, name in enumerate(options.change):
         if name in INTERVENTIONS:
-            act = ACTS[name](member, later if name in VIOLATIONS else Moment(scene, state, free), options, layout)
+            act = INTERVENTION_FUNCTIONS[name](
+                member, later if name in VIOLATIONS else SceneInstant(scene, state, free), options, layout
+            )
             on = member.changed & (member.kind == place) & (act.size > 0)
             chosen = jax.tree.map(lambda new, old, on=on: jnp.where(on, new, old), act, chosen)
             frame = jnp.where(on, member.frame, frame) if name in VIOLATIONS else frame
     stored = dataclasses.replace(chosen.scene, gravity=scene.gravity)
-    told = {"object": chosen.object, "partner": chosen.partner, "size": chosen.size}
-    return stored, chosen.scene, chosen.state, frame, told
+    record = {"object": chosen.object, "partner": chosen.partner, "size": chosen.size}
+    return stored, chosen.scene, chosen.state, frame, record
 
 
-def _joined(frame: Array, before: State, after: State) -> State:
+def _spliced(frame: Array, before: State, after: State) -> State:
     """Videos [n, T, ...] that go on with the first frame of others at a frame [n] of their own."""
 
     def joined(frame: Array, old: Array, new: Array) -> Array:
@@ -111,21 +117,21 @@ def _joined(frame: Array, before: State, after: State) -> State:
     return jax.tree.map(functools.partial(jax.vmap(joined), frame), before, after)
 
 
-def _told(member: Member, before: Videos, after: Videos, config: Any) -> dict[str, Array]:
-    """What is told of one video's change, of a factor's too, and the first frame that shows it."""
+def _record_change(member: SetMember, before: MemberVideos, after: MemberVideos, config: Any) -> dict[str, Array]:
+    """The record of one video's change, also of a factor's, with the first frame that shows it."""
     one, other = before.sampled, after.sampled
-    told, both = dict(after.told), one.scene.objects.present & other.scene.objects.present
+    record, both = dict(after.record), one.scene.objects.present & other.scene.objects.present
     for place, name in enumerate(config.matched.change):
         if name not in INTERVENTIONS:
             on = member.changed & (member.kind == place)
             slot = _other_slot((one.scene.objects, one.state), (other.scene.objects, other.state))
-            told["object"] = jnp.where(on, slot, told["object"])
+            record["object"] = jnp.where(on, slot, record["object"])
             change = (after.drawn[name] - before.drawn[name]).astype(jnp.float32)
             size = (
                 jnp.linalg.norm(change, axis=-1) if drawn_options(config.scene.module)[name].parts else jnp.abs(change)
             )
-            told["size"] = jnp.where(on, jnp.max(size), told["size"])
+            record["size"] = jnp.where(on, jnp.max(size), record["size"])
     differ = jnp.zeros(len(after.made.states.angle), bool)
     for a, b in zip(jax.tree.leaves(before.made.states), jax.tree.leaves(after.made.states), strict=True):
         differ |= ((a != b).reshape(*a.shape[:2], -1).any(axis=-1) & both).any(axis=-1)
-    return told | {"onset": jnp.where(differ.any(), jnp.argmax(differ), -1).astype(jnp.int32)}
+    return record | {"onset": jnp.where(differ.any(), jnp.argmax(differ), -1).astype(jnp.int32)}

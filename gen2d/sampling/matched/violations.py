@@ -11,7 +11,7 @@ from gen2d.records.axes import Array
 from gen2d.records.keys import key_for
 from gen2d.records.layout import Layout
 from gen2d.records.scene import Objects, Scene, State
-from gen2d.sampling.matched.sets import Member, _along
+from gen2d.sampling.matched.sets import SetMember, _along
 
 CLEARANCE = 1e-3  # m around an object that has jumped
 DIRECTIONS = 32  # in which a jump is tried
@@ -22,7 +22,7 @@ ALIKE = 0.25  # by which share the sizes of two objects may differ that swap pla
 # ---- What else may happen to a scene
 
 
-class Moment(NamedTuple):
+class SceneInstant(NamedTuple):
     """A scene at one instant."""
 
     scene: Scene
@@ -30,7 +30,7 @@ class Moment(NamedTuple):
     free: Array  # [K] what moves in view and is on no joint
 
 
-class Act(NamedTuple):
+class Intervention(NamedTuple):
     """A scene and a state after a change; of size 0 where none was possible."""
 
     scene: Scene
@@ -40,7 +40,7 @@ class Act(NamedTuple):
     partner: Array | int = -1
 
 
-def _removed(member: Member, now: Moment, options: Any, layout: Layout) -> Act:
+def _removed(member: SetMember, now: SceneInstant, options: Any, layout: Layout) -> Intervention:
     """One object is gone, another one in each member. Size: its mass, kg."""
     scene, state = now.scene, now.state
     slot, some = _nth(key_for(member.set_key, "object"), now.free, member.number - 1)
@@ -49,10 +49,10 @@ def _removed(member: Member, now: Moment, options: Any, layout: Layout) -> Act:
         return jnp.where(_along(jnp.arange(len(values)) == slot, values), jnp.zeros_like(values), values)
 
     objects, state = jax.tree.map(emptied, (scene.objects, state))
-    return Act(dataclasses.replace(scene, objects=objects), state, some * scene.objects.mass[slot], slot)
+    return Intervention(dataclasses.replace(scene, objects=objects), state, some * scene.objects.mass[slot], slot)
 
 
-def _teleported(member: Member, now: Moment, options: Any, layout: Layout) -> Act:
+def _teleported(member: SetMember, now: SceneInstant, options: Any, layout: Layout) -> Intervention:
     """One object jumps to where there is room. Size: how far, m."""
     state = now.state
     slot, some = _nth(key_for(member.set_key, "object"), now.free)
@@ -63,10 +63,10 @@ def _teleported(member: Member, now: Moment, options: Any, layout: Layout) -> Ac
     clear = jax.vmap(lambda place: _clear(place, slot, now, layout))(state.position[slot] + way)
     chosen = jnp.argmax(jnp.where(clear, luck, -1))
     position = state.position.at[slot].add(way[chosen])
-    return Act(now.scene, dataclasses.replace(state, position=position), some * clear[chosen] * distance, slot)
+    return Intervention(now.scene, dataclasses.replace(state, position=position), some * clear[chosen] * distance, slot)
 
 
-def _swapped(member: Member, now: Moment, options: Any, layout: Layout) -> Act:
+def _swapped(member: SetMember, now: SceneInstant, options: Any, layout: Layout) -> Intervention:
     """Two objects of one shape, as similar in size as there are, change places and motions. Size: how far apart, m."""
     free, objects, slots = now.free, now.scene.objects, jnp.arange(len(now.free))
     size = extent(objects)
@@ -78,16 +78,16 @@ def _swapped(member: Member, now: Moment, options: Any, layout: Layout) -> Act:
     a, b = jnp.divmod(jnp.argmax(jnp.where(nearest, luck, -1)), len(free))
     turned = slots.at[a].set(b).at[b].set(a)
     apart = jnp.linalg.norm(now.state.position[a] - now.state.position[b])
-    return Act(now.scene, jax.tree.map(lambda values: values[turned], now.state), nearest.any() * apart, a, b)
+    return Intervention(now.scene, jax.tree.map(lambda values: values[turned], now.state), nearest.any() * apart, a, b)
 
 
-def _flipped(member: Member, now: Moment, options: Any, layout: Layout) -> Act:
+def _flipped(member: SetMember, now: SceneInstant, options: Any, layout: Layout) -> Intervention:
     """Gravity turns round. Size: its change, m/s^2."""
     flipped = dataclasses.replace(now.scene, gravity=-now.scene.gravity)
-    return Act(flipped, now.state, 2 * jnp.linalg.norm(now.scene.gravity))
+    return Intervention(flipped, now.state, 2 * jnp.linalg.norm(now.scene.gravity))
 
 
-def _bounced(member: Member, now: Moment, options: Any, layout: Layout) -> Act:
+def _bounced(member: SetMember, now: SceneInstant, options: Any, layout: Layout) -> Intervention:
     """One object bounces off nothing. Size: the angle by which its velocity turns, rad."""
     state = now.state
     slot, some = _nth(key_for(member.set_key, "object"), _fast(now))
@@ -97,20 +97,22 @@ def _bounced(member: Member, now: Moment, options: Any, layout: Layout) -> Act:
     square = jnp.maximum((normal**2).sum(), 1e-12)
     mirrored = velocity - 2 * (velocity @ normal) / square * normal
     state = dataclasses.replace(state, velocity=state.velocity.at[slot].set(mirrored))
-    return Act(now.scene, state, some * (jnp.pi - 2 * jnp.abs(skew)), slot)
+    return Intervention(now.scene, state, some * (jnp.pi - 2 * jnp.abs(skew)), slot)
 
 
-def _sped_up(member: Member, now: Moment, options: Any, layout: Layout) -> Act:
+def _sped_up(member: SetMember, now: SceneInstant, options: Any, layout: Layout) -> Intervention:
     """One object moves and spins faster than it did. Size: how many times as fast."""
     state = now.state
     slot, some = _nth(key_for(member.set_key, "object"), _fast(now))
     gain = options.gain.sample(key_for(member.own_key, "gain"), ())
     velocity, spin = (rate.at[slot].multiply(gain) for rate in (state.velocity, state.angular_velocity))
-    return Act(now.scene, dataclasses.replace(state, velocity=velocity, angular_velocity=spin), some * gain, slot)
+    return Intervention(
+        now.scene, dataclasses.replace(state, velocity=velocity, angular_velocity=spin), some * gain, slot
+    )
 
 
 # What the names in matched.change that are no factors do; codes of matched/kind are their places here.
-ACTS = {
+INTERVENTION_FUNCTIONS = {
     "remove": _removed,
     "teleport": _teleported,
     "identity_swap": _swapped,
@@ -126,7 +128,7 @@ def _nth(key: Array, eligible: Array, number: Any = 0) -> tuple[Array, Array]:
     return order[number % jnp.maximum(eligible.sum(), 1)], eligible.any()
 
 
-def _fast(now: Moment) -> Array:
+def _fast(now: SceneInstant) -> Array:
     """Which of the objects [K] are at least half as fast as the fastest: others would show little."""
     speed = jnp.where(now.free, jnp.linalg.norm(now.state.velocity, axis=-1), 0)
     return now.free & (speed > 0) & (speed >= jnp.max(speed) / 2)
@@ -166,7 +168,7 @@ def _inside(place: Array, layout: Layout, reach: Any = 0.0) -> Array:
     return ((place >= low) & (place <= high)).all(axis=-1)
 
 
-def _clear(place: Array, slot: Array, now: Moment, layout: Layout) -> Array:
+def _clear(place: Array, slot: Array, now: SceneInstant, layout: Layout) -> Array:
     """Whether an object has room at a place: in view, and overlapping nothing."""
     objects = now.scene.objects
     reach, others = extent(objects)[slot] + CLEARANCE, objects.present & (jnp.arange(len(now.free)) != slot)
