@@ -2,11 +2,7 @@
 
 import jax.numpy as jnp
 
-from gen2d.core.schema import Field
-from gen2d.records.axes import Array
-from gen2d.renderers.plan import FramePlan, RenderScene
-from gen2d.renderers.rasterizer import alone
-from gen2d.xla import each_video
+from gen2d.plugin import Array, Field, FramePlan, RenderScene, alone, each_video
 
 OWNERS = False
 FIELDS = {

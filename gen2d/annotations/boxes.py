@@ -6,11 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gen2d.core.schema import Field
-from gen2d.records.axes import Array
-from gen2d.renderers import extents
-from gen2d.renderers.plan import FramePlan, RenderScene
-from gen2d.xla import reduce_halves
+from gen2d.plugin import Array, Field, FramePlan, RenderScene, extents, reduce_halves
 
 OWNERS = True
 FIELDS = {

@@ -7,15 +7,21 @@ flow is valid where its end lies in the picture and in a pixel that shows the sa
 import jax
 import jax.numpy as jnp
 
-from gen2d.core.enums import STATIC
-from gen2d.core.schema import Field
-from gen2d.records.axes import Array
-from gen2d.records.layout import SlotGroup
-from gen2d.renderers.camera import pixel_at, to_pixels
-from gen2d.renderers.compositing import OCCLUDER
-from gen2d.renderers.plan import FramePlan, RenderScene, tile_windows
-from gen2d.renderers.primitives import Instants, PixelWindow
-from gen2d.xla import on_cpu
+from gen2d.plugin import (
+    OCCLUDER,
+    STATIC,
+    Array,
+    Field,
+    FramePlan,
+    Instants,
+    PixelWindow,
+    RenderScene,
+    SlotGroup,
+    on_cpu,
+    pixel_at,
+    tile_windows,
+    to_pixels,
+)
 
 OWNERS = True
 _VALID = "1 where the flow ends in the frame, at a pixel of the same object"

@@ -1,8 +1,6 @@
 """Which object each pixel shows: the one of which most is seen in it."""
 
-from gen2d.core.schema import Field
-from gen2d.records.axes import Array
-from gen2d.renderers.plan import FramePlan, RenderScene
+from gen2d.plugin import Array, Field, FramePlan, RenderScene
 
 OWNERS = True
 FIELDS = {

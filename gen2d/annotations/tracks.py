@@ -7,12 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gen2d.core.schema import Field
-from gen2d.records.axes import Array
-from gen2d.records.layout import SlotGroup
-from gen2d.renderers.camera import pixel_at, to_pixels
-from gen2d.renderers.noise import fraction, hashed
-from gen2d.renderers.plan import FramePlan, RenderScene
+from gen2d.plugin import Array, Field, FramePlan, RenderScene, SlotGroup, fraction, hashed, pixel_at, to_pixels
 
 OWNERS = True
 FIELDS = {

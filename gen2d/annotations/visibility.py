@@ -6,12 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gen2d.core.schema import Field
-from gen2d.records.axes import Array
-from gen2d.renderers import extents
-from gen2d.renderers.look import are_moving
-from gen2d.renderers.plan import FramePlan, RenderScene
-from gen2d.xla import each_video, reduce_halves
+from gen2d.plugin import Array, Field, FramePlan, RenderScene, are_moving, each_video, extents, reduce_halves
 
 OWNERS = True
 FIELDS = {

@@ -9,12 +9,18 @@ import math
 import jax.numpy as jnp
 import numpy as np
 
-from gen2d.config.distributions import Distribution
-from gen2d.config.options import option
-from gen2d.core.enums import STATIC
-from gen2d.records.axes import Array
-from gen2d.records.layout import Layout, SlotGroup
-from gen2d.sampling.builder import SampledScene, assemble, box_walls, discs
+from gen2d.plugin import (
+    STATIC,
+    Array,
+    Distribution,
+    Layout,
+    SampledScene,
+    SlotGroup,
+    assemble,
+    box_walls,
+    discs,
+    option,
+)
 
 
 @dataclasses.dataclass(frozen=True)

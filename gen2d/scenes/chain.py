@@ -8,13 +8,21 @@ import math
 
 import jax.numpy as jnp
 
-from gen2d.config.distributions import Distribution
-from gen2d.config.options import option
-from gen2d.core.enums import STATIC
-from gen2d.core.schema import Field
-from gen2d.records.axes import Array
-from gen2d.records.layout import JointSpec, Layout, SlotGroup
-from gen2d.sampling.builder import SampledScene, assemble, capsules_between, discs, hinge_chain
+from gen2d.plugin import (
+    STATIC,
+    Array,
+    Distribution,
+    Field,
+    JointSpec,
+    Layout,
+    SampledScene,
+    SlotGroup,
+    assemble,
+    capsules_between,
+    discs,
+    hinge_chain,
+    option,
+)
 
 DERIVED = {"kink": Field("float32", "n", "1", "joint that it is pulled by at the start, counted from the left pin")}
 

@@ -11,13 +11,7 @@ import dataclasses
 
 import jax.numpy as jnp
 
-from gen2d.config.distributions import Distribution
-from gen2d.config.options import option
-from gen2d.core.schema import Field
-from gen2d.records.axes import Array
-from gen2d.records.layout import Layout, SlotGroup
-from gen2d.sampling.builder import SampledScene, assemble, discs
-from gen2d.sampling.placement import CLEARANCE
+from gen2d.plugin import CLEARANCE, Array, Distribution, Field, Layout, SampledScene, SlotGroup, assemble, discs, option
 
 NEVER = -1.0  # the contact frame of balls that do not approach
 DERIVED = {

@@ -4,12 +4,7 @@ import dataclasses
 
 import jax.numpy as jnp
 
-from gen2d.config.distributions import Distribution
-from gen2d.config.options import option
-from gen2d.core.schema import Field
-from gen2d.records.axes import Array
-from gen2d.records.layout import Layout, SlotGroup
-from gen2d.sampling.builder import SampledScene, assemble, discs
+from gen2d.plugin import Array, Distribution, Field, Layout, SampledScene, SlotGroup, assemble, discs, option
 
 DERIVED = {"contact_time": Field("float32", "n", "s", "at which the first of those that move meets one at rest")}
 

@@ -4,12 +4,19 @@ import dataclasses
 
 import jax.numpy as jnp
 
-from gen2d.config.distributions import Distribution
-from gen2d.config.options import option
-from gen2d.core.enums import STATIC
-from gen2d.records.axes import Array
-from gen2d.records.layout import Layout, SlotGroup
-from gen2d.sampling.builder import SampledScene, assemble, boxes, discs, segments
+from gen2d.plugin import (
+    STATIC,
+    Array,
+    Distribution,
+    Layout,
+    SampledScene,
+    SlotGroup,
+    assemble,
+    boxes,
+    discs,
+    option,
+    segments,
+)
 
 FAR = 2.0  # the floor's length, over the view's width
 

@@ -6,13 +6,20 @@ import math
 import jax
 import jax.numpy as jnp
 
-from gen2d.config.distributions import Distribution
-from gen2d.config.options import option
-from gen2d.core.enums import STATIC
-from gen2d.records.axes import Array
-from gen2d.records.layout import Layout, SlotGroup
-from gen2d.sampling.builder import SampledScene, assemble, box_walls, discs, segments
-from gen2d.sampling.placement import place
+from gen2d.plugin import (
+    STATIC,
+    Array,
+    Distribution,
+    Layout,
+    SampledScene,
+    SlotGroup,
+    assemble,
+    box_walls,
+    discs,
+    option,
+    place,
+    segments,
+)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -4,13 +4,19 @@ import dataclasses
 
 import jax.numpy as jnp
 
-from gen2d.config.distributions import Distribution
-from gen2d.config.options import option
-from gen2d.core.enums import STATIC
-from gen2d.core.schema import Field
-from gen2d.records.axes import Array
-from gen2d.records.layout import Layout, SlotGroup
-from gen2d.sampling.builder import SampledScene, assemble, box_walls, discs
+from gen2d.plugin import (
+    STATIC,
+    Array,
+    Distribution,
+    Field,
+    Layout,
+    SampledScene,
+    SlotGroup,
+    assemble,
+    box_walls,
+    discs,
+    option,
+)
 
 DERIVED = {
     "contact_time": Field("float32", "n pairs", "s", "at which the two of a pair meet, if nothing else does before"),

@@ -9,13 +9,20 @@ import math
 
 import jax.numpy as jnp
 
-from gen2d.config.distributions import Distribution
-from gen2d.config.options import option
-from gen2d.core.enums import STATIC
-from gen2d.core.schema import Field
-from gen2d.records.axes import Array
-from gen2d.records.layout import Layout, SlotGroup
-from gen2d.sampling.builder import SampledScene, assemble, capsules, discs, segments
+from gen2d.plugin import (
+    STATIC,
+    Array,
+    Distribution,
+    Field,
+    Layout,
+    SampledScene,
+    SlotGroup,
+    assemble,
+    capsules,
+    discs,
+    option,
+    segments,
+)
 
 DERIVED = {"length": Field("float32", "n", "m", "of the slope")}
 

@@ -4,13 +4,22 @@ import dataclasses
 
 import jax.numpy as jnp
 
-from gen2d.config.distributions import Distribution
-from gen2d.config.options import option
-from gen2d.core.enums import STATIC
-from gen2d.core.schema import Field
-from gen2d.records.axes import Array
-from gen2d.records.layout import JointSpec, Layout, SlotGroup
-from gen2d.sampling.builder import SampledScene, assemble, boxes, distance_joints, polygons, segments
+from gen2d.plugin import (
+    STATIC,
+    Array,
+    Distribution,
+    Field,
+    JointSpec,
+    Layout,
+    SampledScene,
+    SlotGroup,
+    assemble,
+    boxes,
+    distance_joints,
+    option,
+    polygons,
+    segments,
+)
 
 FAR = 4.0  # the floor's length, over the view's width
 

@@ -8,12 +8,7 @@ import dataclasses
 
 import jax.numpy as jnp
 
-from gen2d.config.distributions import Distribution
-from gen2d.config.options import option
-from gen2d.core.enums import STATIC
-from gen2d.records.axes import Array
-from gen2d.records.layout import Layout, SlotGroup
-from gen2d.sampling.builder import SampledScene, assemble, discs, segments
+from gen2d.plugin import STATIC, Array, Distribution, Layout, SampledScene, SlotGroup, assemble, discs, option, segments
 
 
 @dataclasses.dataclass(frozen=True)

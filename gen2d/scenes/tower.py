@@ -4,13 +4,19 @@ import dataclasses
 
 import jax.numpy as jnp
 
-from gen2d.config.distributions import Distribution
-from gen2d.config.options import option
-from gen2d.core.enums import STATIC
-from gen2d.core.schema import Field
-from gen2d.records.axes import Array
-from gen2d.records.layout import Layout, SlotGroup
-from gen2d.sampling.builder import SampledScene, assemble, boxes, segments
+from gen2d.plugin import (
+    STATIC,
+    Array,
+    Distribution,
+    Field,
+    Layout,
+    SampledScene,
+    SlotGroup,
+    assemble,
+    boxes,
+    option,
+    segments,
+)
 
 FAR = 4.0  # the floor's length, over the view's width
 AROUND = 0.75  # of the tower's height: how much is seen on either side, for what falls

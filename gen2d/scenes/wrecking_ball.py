@@ -4,12 +4,22 @@ import dataclasses
 
 import jax.numpy as jnp
 
-from gen2d.config.distributions import Distribution
-from gen2d.config.options import option
-from gen2d.core.enums import STATIC
-from gen2d.records.axes import Array
-from gen2d.records.layout import JointSpec, Layout, SlotGroup
-from gen2d.sampling.builder import SampledScene, assemble, boxes, capsules_between, discs, hinge_chain, segments
+from gen2d.plugin import (
+    STATIC,
+    Array,
+    Distribution,
+    JointSpec,
+    Layout,
+    SampledScene,
+    SlotGroup,
+    assemble,
+    boxes,
+    capsules_between,
+    discs,
+    hinge_chain,
+    option,
+    segments,
+)
 
 FAR = 4.0  # the floor's length, over the view's width
 PIN, LINK = 0.12, 0.06  # m: radii of the disc that the chain hangs from, and of a link

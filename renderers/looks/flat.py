@@ -2,11 +2,7 @@
 
 import dataclasses
 
-from gen2d.records.axes import Array
-from gen2d.records.layout import Layout
-from gen2d.records.scene import Scene
-from gen2d.renderers.look import PlainOptions, plain
-from gen2d.renderers.paint import Paint
+from gen2d.plugin import Array, Layout, Paint, PlainOptions, Scene, plain
 
 
 @dataclasses.dataclass(frozen=True)

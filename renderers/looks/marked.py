@@ -4,12 +4,7 @@ import dataclasses
 
 import jax.numpy as jnp
 
-from gen2d.config.options import option
-from gen2d.records.axes import Array
-from gen2d.records.layout import Layout
-from gen2d.records.scene import Scene
-from gen2d.renderers.look import PlainOptions, are_lines, are_moving, contrasting, plain
-from gen2d.renderers.paint import Paint
+from gen2d.plugin import Array, Layout, Paint, PlainOptions, Scene, are_lines, are_moving, contrasting, option, plain
 
 
 @dataclasses.dataclass(frozen=True)

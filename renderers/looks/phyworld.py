@@ -8,12 +8,7 @@ import dataclasses
 import jax.numpy as jnp
 import numpy as np
 
-from gen2d.config.options import option
-from gen2d.records.axes import Array
-from gen2d.records.layout import Layout
-from gen2d.records.scene import Scene
-from gen2d.renderers.look import LineOptions, are_moving, line_fields
-from gen2d.renderers.paint import Background, Paint
+from gen2d.plugin import Array, Background, Layout, LineOptions, Paint, Scene, are_moving, line_fields, option
 
 WHITE, RED, BLUE = (255.0, 255.0, 255.0), (255.0, 0.0, 0.0), (0.0, 0.0, 255.0)
 

@@ -5,12 +5,7 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 
-from gen2d.config.options import option
-from gen2d.records.axes import Array
-from gen2d.records.layout import Layout
-from gen2d.records.scene import Scene
-from gen2d.renderers.look import PlainOptions, contrasting, mean_color, plain
-from gen2d.renderers.paint import Paint, Texture
+from gen2d.plugin import Array, Layout, Paint, PlainOptions, Scene, Texture, contrasting, mean_color, option, plain
 
 
 @dataclasses.dataclass(frozen=True)

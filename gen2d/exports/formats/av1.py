@@ -2,8 +2,7 @@
 
 from pathlib import Path
 
-from gen2d.exports.source import Source
-from gen2d.media import films
+from gen2d.plugin import Source, films
 
 LOSS = films.LOSS
 FIELDS, FIXED = ("frames",), True

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gen2d.exports.source import Source
+from gen2d.plugin import Source
 
 LOSS = ""
 FIELDS, FIXED = ("frames", "*"), False

@@ -13,11 +13,8 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from gen2d.core.errors import ConfigError
-from gen2d.exports.source import Source
-from gen2d.loading import dataset as loader
-from gen2d.loading.protocols import Batch
-from gen2d.media import films
+from gen2d.plugin import Batch, ConfigError, Source, films
+from gen2d.plugin import dataset as loader
 
 LOSS = f"{films.LOSS}; positions and first speeds of the balls alone"
 CAMERA = ("camera/center", "camera/scale", "camera/angle")

@@ -13,9 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from gen2d.exports.source import Source
-from gen2d.loading.protocols import Batch
-from gen2d.storage.sealed import as_json
+from gen2d.plugin import Batch, Source, as_json
 
 LOSS = ""
 FIELDS, FIXED = ("frames", "*"), False

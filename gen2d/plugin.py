@@ -1,0 +1,154 @@
+"""The names that a plug-in needs: a scene family, a look, an annotation or an export imports this module and no other.
+
+They stay here wherever they move behind it. Each is imported on first use, so that an export imports no jax.
+"""
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from gen2d.config.distributions import Distribution
+    from gen2d.config.options import option
+    from gen2d.core.enums import DYNAMIC, KINEMATIC, STATIC
+    from gen2d.core.errors import ConfigError
+    from gen2d.core.schema import Field
+    from gen2d.exports.source import Source
+    from gen2d.loading import dataset
+    from gen2d.loading.protocols import Batch
+    from gen2d.media import films
+    from gen2d.records.axes import Array
+    from gen2d.records.layout import JointSpec, Layout, SlotGroup
+    from gen2d.records.scene import Scene
+    from gen2d.renderers import extents
+    from gen2d.renderers.camera import pixel_at, to_pixels
+    from gen2d.renderers.compositing import OCCLUDER
+    from gen2d.renderers.look import (
+        LineOptions,
+        PlainOptions,
+        are_lines,
+        are_moving,
+        contrasting,
+        line_fields,
+        mean_color,
+        plain,
+    )
+    from gen2d.renderers.noise import fraction, hashed
+    from gen2d.renderers.paint import Background, Paint, Texture
+    from gen2d.renderers.plan import FramePlan, RenderScene, tile_windows
+    from gen2d.renderers.primitives import Instants, PixelWindow
+    from gen2d.renderers.rasterizer import alone
+    from gen2d.sampling.builder import (
+        SampledScene,
+        assemble,
+        box_walls,
+        boxes,
+        capsules,
+        capsules_between,
+        discs,
+        distance_joints,
+        hinge_chain,
+        polygons,
+        segments,
+    )
+    from gen2d.sampling.placement import CLEARANCE, place, start_position
+    from gen2d.storage.sealed import as_json
+    from gen2d.xla import each_video, on_cpu, reduce_halves
+
+_HOMES = {
+    "gen2d.config.distributions": "Distribution",
+    "gen2d.config.options": "option",
+    "gen2d.core.enums": "DYNAMIC KINEMATIC STATIC",
+    "gen2d.core.errors": "ConfigError",
+    "gen2d.core.schema": "Field",
+    "gen2d.exports.source": "Source",
+    "gen2d.loading": "dataset",
+    "gen2d.loading.protocols": "Batch",
+    "gen2d.media": "films",
+    "gen2d.records.axes": "Array",
+    "gen2d.records.layout": "JointSpec Layout SlotGroup",
+    "gen2d.records.scene": "Scene",
+    "gen2d.renderers": "extents",
+    "gen2d.renderers.camera": "pixel_at to_pixels",
+    "gen2d.renderers.compositing": "OCCLUDER",
+    "gen2d.renderers.look": "LineOptions PlainOptions are_lines are_moving contrasting line_fields mean_color plain",
+    "gen2d.renderers.noise": "fraction hashed",
+    "gen2d.renderers.paint": "Background Paint Texture",
+    "gen2d.renderers.plan": "FramePlan RenderScene tile_windows",
+    "gen2d.renderers.primitives": "Instants PixelWindow",
+    "gen2d.renderers.rasterizer": "alone",
+    "gen2d.sampling.builder": (
+        "SampledScene assemble box_walls boxes capsules capsules_between discs distance_joints hinge_chain "
+        "polygons segments"
+    ),
+    "gen2d.sampling.placement": "CLEARANCE place start_position",
+    "gen2d.storage.sealed": "as_json",
+    "gen2d.xla": "each_video on_cpu reduce_halves",
+}
+_HOME = {name: home for home, names in _HOMES.items() for name in names.split()}
+
+__all__ = [
+    "CLEARANCE",
+    "DYNAMIC",
+    "KINEMATIC",
+    "OCCLUDER",
+    "STATIC",
+    "Array",
+    "Background",
+    "Batch",
+    "ConfigError",
+    "Distribution",
+    "Field",
+    "FramePlan",
+    "Instants",
+    "JointSpec",
+    "Layout",
+    "LineOptions",
+    "Paint",
+    "PixelWindow",
+    "PlainOptions",
+    "RenderScene",
+    "SampledScene",
+    "Scene",
+    "SlotGroup",
+    "Source",
+    "Texture",
+    "alone",
+    "are_lines",
+    "are_moving",
+    "as_json",
+    "assemble",
+    "box_walls",
+    "boxes",
+    "capsules",
+    "capsules_between",
+    "contrasting",
+    "dataset",
+    "discs",
+    "distance_joints",
+    "each_video",
+    "extents",
+    "films",
+    "fraction",
+    "hashed",
+    "hinge_chain",
+    "line_fields",
+    "mean_color",
+    "on_cpu",
+    "option",
+    "pixel_at",
+    "place",
+    "plain",
+    "polygons",
+    "reduce_halves",
+    "segments",
+    "start_position",
+    "tile_windows",
+    "to_pixels"
+]  # fmt: skip
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME:
+        raise AttributeError(f"module 'gen2d.plugin' has no attribute {name!r}")
+    home = importlib.import_module(_HOME[name])
+    return getattr(home, name) if hasattr(home, name) else importlib.import_module(f"{_HOME[name]}.{name}")
