@@ -1,6 +1,6 @@
 """What physics costs against the number of objects: gen2d, Chipmunk (pymunk) and phyjax2d on the same scenes.
 
-    python tests/bench/bench.py --only physics --plot gen2d/physics_cost.png     # about 5 minutes
+    python tests/bench/bench.py --only physics --plot gen2d/physics/physics_cost.png     # about 5 minutes
 
 A scene is a box of constant density: N discs of random radii, or 8 rectangles, that fall and bounce for 64 frames at
 60 Hz, of 4 steps each. Every engine has its own default number of iterations and makes the same states of every

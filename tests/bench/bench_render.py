@@ -1,6 +1,6 @@
 """What drawing costs against the size of the picture and the number of objects: gen2d, OpenCV and a plain copy.
 
-    python tests/bench/bench.py --only render --plot gen2d/render_cost.png   # about 2 minutes, 5 if nothing is compiled
+    python tests/bench/bench.py --only render --plot renderers/render_cost.png  # 2 minutes, 5 with nothing compiled
 
 The scene is that of configs/benchmark.yaml: N discs in a box of 10 m, 64 frames a video. It is simulated before any
 time is taken. gen2d draws in slices as a run does; OpenCV is called from Python for every disc, as in peer.py, on the
