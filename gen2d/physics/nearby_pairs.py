@@ -518,7 +518,7 @@ class NearbyPairs:
         spec = pack(_empty_contact_rows(self._dtype), (1,), self._dtype)[1]
         contact_rows, count = PackedTable(past.written, spec).whole((slots, self._lanes)), past.contact_rows[:-1]
         filled = jnp.arange(slots)[:, None] < count
-        order = order_of(jnp.where(filled, contact_rows.happening.time, jnp.inf))
+        order = order_of(jnp.where(filled, contact_rows.pair_event.time, jnp.inf))
 
         def in_order(x: Array) -> Array:
             x = jnp.where(filled, x, jnp.zeros_like(x))

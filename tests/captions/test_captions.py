@@ -71,7 +71,7 @@ def test_text_is_what_was_written_for_the_loader_and_for_plain_h5py(toy: Path) -
 def test_a_damaged_letter_is_found(toy: Path, tmp_path: Path) -> None:
     assert gen2d.verify(toy, "full") == []
     made = synthetic.dataset(tmp_path, train=3, fields=synthetic.FIELDS | TEXT)
-    path = synthetic.folder(synthetic.make(made)) / "shards" / "train-00000.h5"
+    path = synthetic.folder(synthetic.make(made)) / "shards" / "train-00000-n3.h5"
     with h5py.File(path, "r+") as file:
         file["text/name"][1] = b"another"  # pyright: ignore[reportIndexIssue]
     assert any("text/name of train video 1" in sentence for sentence in gen2d.verify(tmp_path, "full"))
