@@ -14,37 +14,56 @@ import pathlib
 import sys
 from typing import TYPE_CHECKING, Any
 
+from gen2d._version import __version__ as __version__
+
 if TYPE_CHECKING:
-    from gen2d.config.config import load_config
+    from gen2d.cli.report import info
+    from gen2d.config.config import Config, load_config
+    from gen2d.core.errors import (
+        ConfigError,
+        DamagedError,
+        Error,
+        FolderError,
+        IncompleteError,
+        UnreachableError,
+        UntrustedError,
+        UserError,
+    )
     from gen2d.exports.export import export
     from gen2d.generation.run import generate
     from gen2d.loading.dataloader import DataLoader
-    from gen2d.loading.dataset import open
+    from gen2d.loading.dataset import Dataset, open
     from gen2d.loading.mixture import mix
     from gen2d.programs.redraw import render, simulate_again
     from gen2d.programs.stream import stream
     from gen2d.space.space import Space
+    from gen2d.tools.preview import preview
     from gen2d.tools.verify import verify
 
-__version__ = "0.1.0"
-__all__ = [
-    "DataLoader", "Space", "export", "generate", "load_config", "mix", "open", "render", "simulate_again", "stream",
-    "verify",
-]  # fmt: skip
-
-_HOME = {
-    "DataLoader": "gen2d.loading.dataloader",
-    "Space": "gen2d.space.space",
-    "export": "gen2d.exports.export",
-    "generate": "gen2d.generation.run",
-    "load_config": "gen2d.config.config",
-    "mix": "gen2d.loading.mixture",
-    "open": "gen2d.loading.dataset",
-    "render": "gen2d.programs.redraw",
-    "simulate_again": "gen2d.programs.redraw",
-    "stream": "gen2d.programs.stream",
-    "verify": "gen2d.tools.verify",
+_HOMES = {
+    "gen2d.cli.report": "info",
+    "gen2d.config.config": "Config load_config",
+    "gen2d.core.errors": (
+        "ConfigError DamagedError Error FolderError IncompleteError UnreachableError UntrustedError UserError"
+    ),
+    "gen2d.exports.export": "export",
+    "gen2d.generation.run": "generate",
+    "gen2d.loading.dataloader": "DataLoader",
+    "gen2d.loading.dataset": "Dataset open",
+    "gen2d.loading.mixture": "mix",
+    "gen2d.programs.redraw": "render simulate_again",
+    "gen2d.programs.stream": "stream",
+    "gen2d.space.space": "Space",
+    "gen2d.tools.preview": "preview",
+    "gen2d.tools.verify": "verify",
 }
+_HOME = {name: home for home, names in _HOMES.items() for name in names.split()}
+
+__all__ = [
+    "Config", "ConfigError", "DamagedError", "DataLoader", "Dataset", "Error", "FolderError", "IncompleteError",
+    "Space", "UnreachableError", "UntrustedError", "UserError", "export", "generate", "info", "load_config",
+    "mix", "open", "preview", "render", "simulate_again", "stream", "verify",
+]  # fmt: skip
 
 
 def __getattr__(name: str) -> Any:

@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
-from gen2d import __version__
+from gen2d._version import __version__
 from gen2d.core.errors import Error, UserError, one_line
 from gen2d.storage.explain import reading_error
 from gen2d.storage.paths import Network, Place, place, reading
@@ -258,9 +258,9 @@ def _repairing(root: Place, options: argparse.Namespace) -> Callable[[list[str]]
 def info(arguments: Sequence[str]) -> int:
     """0, and a data sheet."""
     options = _verb_parser("info").parse_args(arguments)
-    from gen2d.cli.report import sheet
+    from gen2d.cli import report
 
-    print(sheet(_root(options)))
+    print(report.info(options.dataset, timeout=options.timeout, deadline=options.deadline))
     return 0
 
 

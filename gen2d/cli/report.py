@@ -8,7 +8,7 @@ from gen2d.core.errors import ConfigError
 from gen2d.core.humanize import in_bytes, in_time
 from gen2d.dataset.manifest import Manifest, read_manifest, statistics
 from gen2d.storage.atomic import size_of
-from gen2d.storage.paths import Place
+from gen2d.storage.paths import Network, Place, place
 
 
 def _table(rows: list[tuple[str, ...]]) -> list[str]:
@@ -18,8 +18,13 @@ def _table(rows: list[tuple[str, ...]]) -> list[str]:
     ]
 
 
-def sheet(root: Place) -> str:
-    """The data sheet of a dataset: what it holds, field by field, and what made it."""
+def info(root: str | Place, *, timeout: float = 30.0, deadline: float = 300.0) -> str:
+    """Data sheet of a dataset as text: splits, sizes, every field with its unit, statistics, versions.
+
+    `root` is a folder or a URL; `timeout` and `deadline` are those of `open`. Raises IncompleteError, DamagedError or
+    UnreachableError.
+    """
+    root = place(root, Network(timeout, deadline))
     manifest = read_manifest(root)
     splits = ", ".join(f"{name}: {count:,} videos" for name, count in manifest.splits.items())
     sizes = ", ".join(f"{name} = {value}" for name, value in manifest.sizes.items())

@@ -169,7 +169,6 @@ class MatchedOptions:
 class StorageOptions:
     """How videos lie on disk."""
 
-    format: str = option("hdf5", str, "", "file format of a shard", choices=("hdf5",))
     frames: str = option(
         "video",
         str,

@@ -16,7 +16,7 @@ import jax
 import numpy as np
 import zstandard
 
-from gen2d import __version__
+from gen2d._version import __version__
 from gen2d.core.errors import UserError
 
 DEVICES = ("auto", "cpu", "gpu")

@@ -15,8 +15,8 @@ from gen2d.storage.paths import Url, place
 
 
 def preview(
-    source: str,
-    out: Path,
+    source: str | Path | Url,
+    out: str | Path = ".",
     videos: int = 8,
     *,
     seed: int | None = None,
@@ -25,8 +25,13 @@ def preview(
     timeout: float = 30.0,
     deadline: float = 300.0,
 ) -> list[Path]:
-    """The files made in the folder `out`: NAME-sheet.png and NAME.gif. `trust` is that of `render`, for a dataset
-    without frames; `timeout` and `deadline` are those of `open`."""
+    """Paths of a contact sheet, NAME-sheet.png, and of an animation, NAME.gif, written into the folder `out`.
+
+    `source` is a dataset's folder or URL, or a config; `seed` and `sets` ('video.height=128') change a config. `trust`
+    is that of `render`, for a dataset without frames; `timeout` and `deadline` are those of `open`, in seconds.
+    Raises UserError for a source or options that cannot be, DamagedError, UnreachableError.
+    """
+    source, out = str(source) if isinstance(source, Path) else source, Path(out)
     check_videos(videos)
     check_folder(out)
     if is_dataset(source):
@@ -34,7 +39,7 @@ def preview(
         numbers = range(min(videos, len(ds)))
         name, frames, fps = ds.manifest.name, _stored(ds, numbers, trust), ds.manifest.fps
     else:
-        name, frames, fps = _drawn(source, videos, seed, sets)
+        name, frames, fps = _drawn(str(source), videos, seed, sets)
     sheet, animation = out / f"{name}-sheet.png", out / f"{name}.gif"
     with writing(out):
         write(sheet, contact_sheet(frames))
@@ -42,7 +47,7 @@ def preview(
     return [sheet, animation]
 
 
-def is_dataset(source: str) -> bool:
+def is_dataset(source: str | Url) -> bool:
     """Whether it is a dataset, at a URL or in a folder, that is to be drawn; all else is a config."""
     found = place(source)
     return isinstance(found, Url) or found.is_dir()
