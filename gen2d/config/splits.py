@@ -71,7 +71,7 @@ def with_splits(scene: Plugin, written: Any, source: str) -> tuple[Plugin, tuple
 
 def _split(scene: Plugin, name: str, written: Any, training: Split | None, source: str) -> Split:
     where, known = f"splits.{name}", ("videos", "frames", "factors", "overlaps", *CHANGES)
-    if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}", name):
+    if not isinstance(name, str) or not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}", name):
         raise ConfigError(f"{source}: {where} must have a name of letters, digits, '.', '_' and '-', 64 at most")
     written = {} if written is None else written
     if not isinstance(written, Mapping):
