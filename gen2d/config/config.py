@@ -19,7 +19,7 @@ from gen2d.config import quality as quality_module
 from gen2d.config.joint_distribution import JointDistribution
 from gen2d.config.options import build, coordinates, plain_of
 from gen2d.config.plugin_options import NO_COPIES, Copies, Plugin, StoredCopies, named, plugin_of
-from gen2d.config.reading import YAML_BYTES, _Loader, _mapping, _overridden, parse_yaml
+from gen2d.config.reading import YAML_BYTES, overridden, parse_yaml
 from gen2d.config.sections import (
     AnnotationOptions,
     CameraOptions,
@@ -134,14 +134,6 @@ def _merged(own: Mapping[str, Any], other: Any) -> Any:
     if not isinstance(other, Mapping):
         return other  # reading it says what is wrong
     return dict(other) if other.get("name", own.get("name")) != own.get("name") else {**own, **other}
-
-
-_Loader.add_implicit_resolver(
-    "tag:yaml.org,2002:float", re.compile(r"^[-+]?(\d[\d_]*)(\.[\d_]*)?[eE][-+]?\d+$"), list("-+0123456789")
-)
-
-
-_Loader.add_constructor("tag:yaml.org,2002:map", _mapping)
 
 
 def checked_seed(value: Any, what: str = "--seed") -> int:
@@ -262,7 +254,7 @@ def load_config(
     if isinstance(config, Config):
         return load_config(config.plain(), sets, config.copies) if sets else config
     if isinstance(config, Mapping):
-        return from_mapping(_overridden(dict(config), sets), "config", copies=copies)
+        return from_mapping(overridden(dict(config), sets), "config", copies=copies)
     path = plugins.find_config(str(config))
     try:
         text = read_bytes(path, YAML_BYTES).decode("utf-8")
@@ -272,4 +264,4 @@ def load_config(
     if values is not None and not isinstance(values, Mapping):
         raise ConfigError(f"{path}: holds {type(values).__name__}, but must hold a mapping of sections")
     stem = re.sub(r"[^A-Za-z0-9._-]+", "-", path.stem).lstrip("._-")[:100] or "dataset"
-    return from_mapping(_overridden(dict(values or {}), sets), str(path), stem)
+    return from_mapping(overridden(dict(values or {}), sets), str(path), stem)

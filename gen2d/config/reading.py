@@ -1,5 +1,6 @@
 """YAML and `--set` as plain values, of bounded size."""
 
+import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -25,6 +26,13 @@ def _mapping(loader: _Loader, node: yaml.MappingNode) -> dict:
         seen.add(key.value)
     return loader.construct_mapping(node, deep=True)
 
+
+_Loader.add_implicit_resolver(
+    "tag:yaml.org,2002:float", re.compile(r"^[-+]?(\d[\d_]*)(\.[\d_]*)?[eE][-+]?\d+$"), list("-+0123456789")
+)
+
+
+_Loader.add_constructor("tag:yaml.org,2002:map", _mapping)
 
 YAML_BYTES = 2**20  # of a config
 YAML_DEPTH, YAML_NODES = 40, 50_000  # of what it stands for, each alias as often as it stands there
@@ -68,7 +76,7 @@ def parse_yaml(text: str, source: str) -> Any:
         raise ConfigError(f"{source}: not valid YAML: {error}") from None
 
 
-def _overridden(values: dict, sets: Sequence[str]) -> dict:
+def overridden(values: dict, sets: Sequence[str]) -> dict:
     """The mapping with each `a.b=value` put in its place."""
     for text in sets:
         path, equals, value = text.partition("=")

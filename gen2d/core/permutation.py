@@ -3,11 +3,11 @@
 import numpy as np
 
 
-def _feistel(values: np.ndarray, keys: list[np.ndarray], half: np.uint64) -> np.ndarray:
+def feistel(values: np.ndarray, keys: list[np.ndarray], half: np.uint64) -> np.ndarray:
     mask = (np.uint64(1) << half) - np.uint64(1)
     left, right = values >> half, values & mask
     for key in keys:
-        left, right = right, left ^ (_mixed(right ^ key) & mask)
+        left, right = right, left ^ (splitmix64(right ^ key) & mask)
     return (left << half) | right
 
 
@@ -15,11 +15,11 @@ def hashed(*parts: int | np.ndarray) -> np.ndarray:
     """64 random bits that the parts decide, uint64, for each element of the parts."""
     bits = np.zeros(1, np.uint64)
     for part in parts:
-        bits = _mixed(bits ^ np.asarray(part).astype(np.uint64))
+        bits = splitmix64(bits ^ np.asarray(part).astype(np.uint64))
     return bits
 
 
-def _mixed(bits: np.ndarray) -> np.ndarray:
+def splitmix64(bits: np.ndarray) -> np.ndarray:
     """The next output of SplitMix64 (Steele, Lea and Flood, OOPSLA 2014), for each element."""
     bits = bits + np.uint64(0x9E3779B97F4A7C15)
     bits = (bits ^ (bits >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)

@@ -15,7 +15,7 @@ import numpy as np
 from gen2d.core.errors import UserError
 from gen2d.dataset.block import Block, encode
 from gen2d.dataset.spec import DatasetSpec, Shard
-from gen2d.programs.batches import ShardSlice, _check_placed
+from gen2d.programs.batches import ShardSlice, check_block_placed
 from gen2d.programs.rollout import DeviceBatch, Rollout
 from gen2d.records.axes import Array
 
@@ -101,7 +101,7 @@ class Encoder:
         batch = self.rollout.begin(*waiting[0][:2]) if waiting else None
         for place, (_, firsts, pieces) in enumerate(waiting):
             assert batch is not None
-            _check_placed(self.rollout, batch, firsts, pieces)
+            check_block_placed(self.rollout, batch, firsts, pieces)
             jobs = encode_tasks(firsts, pieces, self.rollout.lanes, self.rollout.slice)
             line.extend(jobs)
             for _ in self._submitted(jobs, batch):

@@ -18,7 +18,7 @@ from gen2d.dataset import folder as shards
 from gen2d.dataset.spec import SPLIT, DatasetSpec, Shard, mine
 from gen2d.generation.complete import complete
 from gen2d.generation.encoder import Encoder, batches, threads_for
-from gen2d.generation.warm_up import _prepare
+from gen2d.generation.warm_up import warm_up
 from gen2d.generation.writers import ShardWriters
 from gen2d.programs import devices
 from gen2d.programs.fingerprint import fingerprint, sources
@@ -168,7 +168,7 @@ def _make(rollout: Rollout, dataset: DatasetSpec, todo: list[Shard], say: Callab
     with stopping_on_sigterm(say):  # also while it cleans up: then a second signal ends the process
         try:
             count = sum(shard.count for shard in todo)
-            _prepare(rollout, encoder, work, count, say)
+            warm_up(rollout, encoder, work, count, say)
             with progress(count, say) as advance:
                 for shard, block in encoder.blocks(work):
                     writers.put(shard, block)

@@ -21,7 +21,7 @@ class DeviceMemoryError(UserError):
     """A batch that does not fit the device."""
 
 
-def _prepare(rollout: Rollout, encoder: Encoder, work: list, count: int, say: Callable[[str], None]) -> None:
+def warm_up(rollout: Rollout, encoder: Encoder, work: list, count: int, say: Callable[[str], None]) -> None:
     """Compiles, measures a slice, says how much and how long it will be, and refuses what the disk cannot hold."""
     name = f"{len(rollout.devices)} {rollout.devices[0].platform} device{'s' if len(rollout.devices) > 1 else ''}"
     say(f"Compiling for {name} (seconds; up to a minute for dozens of objects; kept for the next run) ...")

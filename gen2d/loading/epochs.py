@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gen2d.core.errors import ConfigError
-from gen2d.core.permutation import _feistel, hashed
+from gen2d.core.permutation import feistel, hashed
 
 
 class GlobalBatch(NamedTuple):
@@ -156,6 +156,6 @@ def order(seed: int, epoch: int, positions: np.ndarray, count: int) -> np.ndarra
     values = positions.astype(np.uint64)
     outside = np.ones(values.shape, bool)
     while outside.any():
-        values[outside] = _feistel(values[outside], keys, half)
+        values[outside] = feistel(values[outside], keys, half)
         outside = values >= count
     return values.astype(np.int64)

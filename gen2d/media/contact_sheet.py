@@ -16,7 +16,7 @@ def shown(frames: int) -> np.ndarray:
 
 def contact_sheet(frames: np.ndarray) -> np.ndarray:
     """One picture [H, W, 3]: a row for each of the videos [n, T, H, W, 3], first to last frame from left to right."""
-    rows = [np.concatenate([_framed(video[t]) for t in shown(len(video))], axis=1) for video in frames]
+    rows = [np.concatenate([framed(video[t]) for t in shown(len(video))], axis=1) for video in frames]
     return np.concatenate(rows)
 
 
@@ -36,5 +36,5 @@ def enlarged(image: np.ndarray) -> np.ndarray:
     return np.repeat(np.repeat(image, factor, axis=0), factor, axis=1)
 
 
-def _framed(frame: np.ndarray) -> np.ndarray:
+def framed(frame: np.ndarray) -> np.ndarray:
     return np.pad(enlarged(frame), [(GAP, GAP), (GAP, GAP), (0, 0)], constant_values=GREY)

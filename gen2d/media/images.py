@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from gen2d.core.errors import FolderError
-from gen2d.media.contact_sheet import _framed
+from gen2d.media.contact_sheet import framed
 from gen2d.storage.atomic import publish
 
 
@@ -45,7 +45,7 @@ def animate(path: Path, frames: np.ndarray, fps: float) -> None:
 
 
 def _tiled(video: np.ndarray) -> np.ndarray:
-    return np.stack([_framed(frame) for frame in video])
+    return np.stack([framed(frame) for frame in video])
 
 
 def write(path: Path, image: np.ndarray) -> None:

@@ -23,12 +23,12 @@ def colors(count: int) -> np.ndarray:
     return made
 
 
-def _masks(frame: VideoFields) -> np.ndarray:
+def masks_overlay(frame: VideoFields) -> np.ndarray:
     """The instance mask in false colours."""
     return colors(256)[frame["masks/instance"]]
 
 
-def _amodal(frame: VideoFields) -> np.ndarray:
+def amodal_overlay(frame: VideoFields) -> np.ndarray:
     """The outline of all of each object."""
     image = enlarged(frame["frames"])
     height, width = frame["frames"].shape[:2]
@@ -38,7 +38,7 @@ def _amodal(frame: VideoFields) -> np.ndarray:
     return image
 
 
-def _boxes(frame: VideoFields) -> np.ndarray:
+def boxes_overlay(frame: VideoFields) -> np.ndarray:
     """What is seen of each object in a white box, all of it in an orange one."""
     image = enlarged(frame["frames"])
     factor = len(image) // len(frame["frames"])
@@ -49,7 +49,7 @@ def _boxes(frame: VideoFields) -> np.ndarray:
     return image
 
 
-def _flow(frame: VideoFields) -> np.ndarray:
+def flow_overlay(frame: VideoFields) -> np.ndarray:
     """The flow to the next frame: its direction as a hue, its speed as saturation."""
     x, y = np.moveaxis(frame["flow/forward"], -1, 0)
     hue = np.degrees(np.arctan2(y, x)) % 360 / 2
@@ -57,7 +57,7 @@ def _flow(frame: VideoFields) -> np.ndarray:
     return cv2.cvtColor(hsv.astype(np.uint8), cv2.COLOR_HSV2RGB)
 
 
-def _tracks(frame: VideoFields) -> np.ndarray:
+def tracks_overlay(frame: VideoFields) -> np.ndarray:
     """Points that are fixed to objects, where they are seen."""
     image = enlarged(frame["frames"])
     factor = len(image) // len(frame["frames"])

@@ -8,7 +8,7 @@ A stadium meets a hull, or another stadium, as the hull of its two ends. Two hul
 `b2CollidePolygons`): the face that separates them most gives the normal, the edges that look at each other along
 it are clipped to each other, and only if two corners are nearest, the line between them is the normal.
 
-`one` is 1.0 in a way that the compiler cannot know (`tournament.settled`): without it a CPU computes the faces and
+`one` is 1.0 in a way that the compiler cannot know (`xla.materialize`): without it a CPU computes the faces and
 edges of two hulls again for each of the results (measured for two boxes: 10 times slower).
 """
 

@@ -25,7 +25,7 @@ from gen2d.physics.constraint import (
     softness,
     spin_change,
 )
-from gen2d.physics.contact_points import _both, _contact_points, _met, _threshold
+from gen2d.physics.contact_points import both_points, bounce_threshold, contact_points, impact_of
 from gen2d.physics.contact_state import Displacement, PassSetup, SolvedPair, WarmStart
 from gen2d.physics.energy import Work, dissipated, dissipated_by_discs
 from gen2d.physics.params import SolverParams
@@ -85,7 +85,7 @@ def warm_start(
     fall = setup.gravity if row.firm else None
     if fall_b is not None:
         fall = fall_b if row.firm else fall_b - fall_a
-    points = _contact_points(row, shape_a, shape_b, [jnp.abs(old.normal) for old in memory.impulses], fall, setup)
+    points = contact_points(row, shape_a, shape_b, [jnp.abs(old.normal) for old in memory.impulses], fall, setup)
     new_a, new_b = motion_a, motion_b
     for at, old in zip(points, olds, strict=True):
         new_a, new_b = apply_impulse(row, at, old, new_a, new_b)
@@ -146,8 +146,8 @@ def solve(
 ) -> tuple[tuple, tuple, SolvedPair]:
     """Both sides after the biased solve, and the row. A side is its motion, drift and work."""
     (motion_a, drift_a, _), (motion_b, drift_b, work) = a, b
-    points = [_met(row, at, a[:2], b[:2], setup, rules.step) for at in found]
-    both = _both(row, points, [relative(p.grip, p.normal, motion_a, motion_b)[0] for p in points])
+    points = [impact_of(row, at, a[:2], b[:2], setup, rules.step) for at in found]
+    both = both_points(row, points, [relative(p.grip, p.normal, motion_a, motion_b)[0] for p in points])
 
     def press(i: int, touch: ActiveContact, speed: Array, old: Impulse) -> Array:
         alone = biased_impulse(row, touch, speed, old, rules)
@@ -193,7 +193,7 @@ def relax(
     (motion_a, push_a, _), (motion_b, push_b, work), again = a, b, []
 
     def press(_: int, touch: ActiveContact, speed: Array, old: Impulse) -> Array:
-        threshold = _threshold(touch, jnp.where(touch.tau < 0, old.normal, 0.0), push_a, push_b, setup)
+        threshold = bounce_threshold(touch, jnp.where(touch.tau < 0, old.normal, 0.0), push_a, push_b, setup)
         again.append(impact_impulse(touch, speed, threshold))
         return relaxed_impulse(row, touch, speed, old, threshold)
 

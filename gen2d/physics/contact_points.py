@@ -58,7 +58,7 @@ def _offset(row: ContactConstraint, a: Any, b: Disc) -> tuple[Array, Array | Non
     return offset, jnp.where((where == END) & (jnp.maximum(*onward) > 0), ELSEWHERE, where)
 
 
-def _contact_points(
+def contact_points(
     row: ContactConstraint, a: Any, b: Any, pressed: list[Array], fall: Array | None, setup: PassSetup
 ) -> list[ContactPoint]:
     if row.grip is not None:
@@ -87,7 +87,9 @@ class Approach(NamedTuple):
     threshold: Array  # m/s: slower impacts do not bounce
 
 
-def _met(row: ContactConstraint, at: ContactPoint, a: tuple, b: tuple, setup: PassSetup, h: float) -> ActiveContact:
+def impact_of(
+    row: ContactConstraint, at: ContactPoint, a: tuple, b: tuple, setup: PassSetup, h: float
+) -> ActiveContact:
     """A point of a row with its impact, if there is one in this step; a and b are motion and drift.
 
     What a body has met before in this step has shifted its path: it comes from there.
@@ -95,7 +97,7 @@ def _met(row: ContactConstraint, at: ContactPoint, a: tuple, b: tuple, setup: Pa
     (motion_a, drift_a), (motion_b, drift_b) = a, b
     speed, pull = _closing(at, at.normal, motion_a, motion_b)
     shift = drift_b.way.velocity if drift_a is None else drift_b.way.velocity - drift_a.way.velocity
-    threshold = _threshold(at, at.pressed, None if drift_a is None else drift_a.push, drift_b.push, setup)
+    threshold = bounce_threshold(at, at.pressed, None if drift_a is None else drift_a.push, drift_b.push, setup)
     course, approach = Approach(motion_a, motion_b, shift, threshold), -speed - pull * h
     grip, normal = at.grip, at.normal
     if at.core is None:
@@ -147,7 +149,7 @@ def _met_round(
     return tau, materialize(met, one) if core.flat is None else jnp.where(core.flat, at.normal, met)
 
 
-def _threshold(
+def bounce_threshold(
     at: ContactPoint | ActiveContact, pressed: Array, push_a: Array | None, push_b: Array, setup: PassSetup
 ) -> Array:
     """The approach speed of an impact, m/s.
@@ -177,7 +179,7 @@ def _spun_by(inertia: Inertia, lever: Array | None, other: Array | None) -> Arra
     return 0.0 if lever is None or other is None else inertia.moment * lever * other
 
 
-def _both(row: ContactConstraint, touches: list[ActiveContact], speeds: list[Array]) -> list[Array | None]:
+def both_points(row: ContactConstraint, touches: list[ActiveContact], speeds: list[Array]) -> list[Array | None]:
     """Normal impulses that bounce both points at once, which one after the other would turn a flat landing.
 
     The matrix of two impulses to two speeds is inverted; where it cannot be, or a point would be pulled, each point

@@ -8,7 +8,7 @@ from gen2d.config.sections import PhysicsOptions
 
 @dataclasses.dataclass(frozen=True)
 class SolverParams:
-    """The numbers of a step; `rollout.rules_of` makes them from the config."""
+    """Numbers of a solver step; `solver_params` makes them from a config."""
 
     step: float  # s
     bounce_threshold: float  # m/s: slower impacts do not bounce, nor do those that gravity makes in two steps

@@ -16,7 +16,7 @@ class NoPlaceError(UserError):
     """A scene in which the objects do not fit."""
 
 
-def _check_placed(rollout: Rollout, batch: DeviceBatch, firsts: list[int], pieces: list[list[ShardSlice]]) -> None:
+def check_block_placed(rollout: Rollout, batch: DeviceBatch, firsts: list[int], pieces: list[list[ShardSlice]]) -> None:
     for first, own, placed in zip(firsts, pieces, per_device(batch.placed), strict=True):
         for _, start, stop in own:
             check_placed(rollout.config.scene, placed[start:stop], np.arange(first + start, first + stop))

@@ -99,7 +99,7 @@ def _hashes(rollout: Rollout) -> dict[str, str]:
         found["captions"] = code_hash(caption)
     if rollout.sampler.gridded:
         found["grids"] = code_hash(
-            Sampler.combination, epochs.order, permutation.hashed, permutation._feistel, permutation._mixed
+            Sampler.combination, epochs.order, permutation.hashed, permutation.feistel, permutation.splitmix64
         )
     return found
 

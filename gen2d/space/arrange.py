@@ -23,29 +23,29 @@ from gen2d.records.trajectory import Contacts
 from gen2d.space.bodies import GREY, Body
 
 
-def _slots(span: tuple[SlotGroup, int]) -> range:
+def slots_of_span(span: tuple[SlotGroup, int]) -> range:
     return range(span[1], span[1] + span[0].count)
 
 
-def family(body: Body) -> str:
+def shape_family(body: Body) -> str:
     """The shape of the run that holds a body: a segment is a capsule, whose radius may be 0."""
     return "capsule" if body.shape == "segment" else body.shape
 
 
-def _place(body: Body) -> tuple:
+def slot_order(body: Body) -> tuple:
     """By what slots are sorted; bodies alike in it share a run, fixed polygons only if they have as many corners."""
     corners = 0 if body.kind == DYNAMIC else len(body.vertices)
-    return body.kind, ("circle", "capsule", "polygon").index(family(body)), corners
+    return body.kind, ("circle", "capsule", "polygon").index(shape_family(body)), corners
 
 
-def _filled(vertices: np.ndarray, corners: int) -> np.ndarray:
+def fill_vertices(vertices: np.ndarray, corners: int) -> np.ndarray:
     """The corners, the last one repeated up to a number; zeros where there are none."""
     if not len(vertices):
         return np.zeros((corners, 2))
     return np.concatenate([vertices, np.repeat(vertices[-1:], corners - len(vertices), axis=0)])
 
 
-def _world(shape: str) -> Body:
+def world_anchor(shape: str) -> Body:
     zero, none = np.zeros(2), np.zeros((0, 2))
     return Body(
         shape=shape, kind=DYNAMIC, position=zero, angle=0.0, velocity=zero, spin=0.0, radius=0.0, half_length=0.0,
@@ -55,7 +55,7 @@ def _world(shape: str) -> Body:
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def _meeting(
+def touching_points(
     runs: tuple[SlotGroup, SlotGroup], objects: Objects, sides: Sequence[jax.Array], places: Sequence
 ) -> list[tuple]:
     """Gap, place and normal of each point of some pairs: slots of two runs, and where they are."""
@@ -65,7 +65,9 @@ def _meeting(
 
 
 @functools.lru_cache(maxsize=8)  # a program takes up to thousands of memory maps, of which a process has some 60,000
-def _program(layout: Layout, rules: SolverParams, frames: int, steps: int, keep: SaveAt, forces: Any) -> Callable:
+def compiled_program(
+    layout: Layout, rules: SolverParams, frames: int, steps: int, keep: SaveAt, forces: Any
+) -> Callable:
     """The compiled program of a layout; scenes, states and trajectories have videos first."""
     hook = None if forces is None else _by_slot(*forces)
     sparse = jax.default_backend() == "cpu"
@@ -90,14 +92,14 @@ def _by_slot(forces: Callable, slots: tuple[int, ...]) -> Forces:
     return hook
 
 
-def _numbers(slots: np.ndarray, count: int) -> np.ndarray:
+def body_numbers(slots: np.ndarray, count: int) -> np.ndarray:
     """The number of the body in each slot; -1 is the world."""
     numbers = np.full(count, -1)
     numbers[slots] = np.arange(len(slots))
     return numbers
 
 
-def _rows_there(contacts: Contacts, slots: np.ndarray, count: int) -> Contacts:
+def filled_contacts(contacts: Contacts, slots: np.ndarray, count: int) -> Contacts:
     """The rows in use, with bodies by number."""
     there, room = int(contacts.count), contacts.time.shape[0]
     if there > room:
@@ -106,5 +108,5 @@ def _rows_there(contacts: Contacts, slots: np.ndarray, count: int) -> Contacts:
         )
     names = [f.name for f in dataclasses.fields(contacts) if f.name != "count"]
     rows = {name: getattr(contacts, name)[:there] for name in names}
-    numbers = _numbers(slots, count)
+    numbers = body_numbers(slots, count)
     return Contacts(**rows | {"a": numbers[rows["a"]], "b": numbers[rows["b"]], "count": contacts.count})

@@ -14,7 +14,7 @@ from gen2d.space.bodies import GREY, MOST_CORNERS
 # Checks -------------------------------------------------------------------------------------------------------------
 
 
-def _number(
+def checked_number(
     name: str, value: Any, low: float | None = None, above: float | None = None, infinite: bool = False
 ) -> float:
     """The value as a number, or ConfigError; infinite ones are allowed only if it says so."""
@@ -43,14 +43,14 @@ def _floats(value: Any) -> np.ndarray:
         return np.empty(0)
 
 
-def _pair(name: str, value: Any) -> np.ndarray:
+def checked_pair(name: str, value: Any) -> np.ndarray:
     pair = _floats(value)
     if pair.shape != (2,) or not np.isfinite(pair).all():
         raise ConfigError(f"{name} is {value!r}, but must be two numbers, x and y")
     return pair
 
 
-def _corners(name: str, value: Any) -> np.ndarray:
+def checked_corners(name: str, value: Any) -> np.ndarray:
     """Counter-clockwise corners of a convex polygon."""
     corners = _floats(value)
     if corners.ndim != 2 or corners.shape[-1] != 2 or not 3 <= len(corners) <= MOST_CORNERS:
@@ -67,7 +67,7 @@ def _corners(name: str, value: Any) -> np.ndarray:
     return corners if way > 0 else corners[::-1].copy()
 
 
-def _color(name: str, value: Any, number: int, kind: int) -> tuple[int, int, int]:
+def checked_color(name: str, value: Any, number: int, kind: int) -> tuple[int, int, int]:
     if value is None:
         hue = 0.03 + 0.618034 * number  # the golden section: neighbours differ, and none comes twice
         red, green, blue = (round(255 * part) for part in colorsys.hls_to_rgb(hue % 1, 0.55, 0.6))
@@ -78,6 +78,6 @@ def _color(name: str, value: Any, number: int, kind: int) -> tuple[int, int, int
     return int(parts[0]), int(parts[1]), int(parts[2])
 
 
-def _turned(vector: np.ndarray, angle: float) -> np.ndarray:
+def rotate(vector: np.ndarray, angle: float) -> np.ndarray:
     cos, sin = math.cos(angle), math.sin(angle)
     return np.array([cos * vector[0] - sin * vector[1], sin * vector[0] + cos * vector[1]])

@@ -30,9 +30,19 @@ from gen2d.physics.simulate import Forces, SaveAt, substeps
 from gen2d.records.axes import to_device
 from gen2d.records.layout import JointSpec, Layout, SlotGroup
 from gen2d.records.scene import Joints, Objects, Scene, State
-from gen2d.space.arrange import _filled, _meeting, _numbers, _place, _program, _rows_there, _slots, _world, family
+from gen2d.space.arrange import (
+    body_numbers,
+    compiled_program,
+    fill_vertices,
+    filled_contacts,
+    shape_family,
+    slot_order,
+    slots_of_span,
+    touching_points,
+    world_anchor,
+)
 from gen2d.space.bodies import KINDS, Body, BodyOptions, Joint, Overlaps, Pair, Poses
-from gen2d.space.checks import _color, _corners, _number, _pair, _turned
+from gen2d.space.checks import checked_color, checked_corners, checked_number, checked_pair, rotate
 from gen2d.space.video import Video
 
 # The builder --------------------------------------------------------------------------------------------------------
@@ -47,7 +57,7 @@ class Space:
     """
 
     def __init__(self, gravity: Pair = (0.0, -9.8), **physics: Any) -> None:
-        self.gravity = _pair("Space: gravity", gravity)
+        self.gravity = checked_pair("Space: gravity", gravity)
         self.physics: PhysicsOptions = build(PhysicsOptions, physics, "physics", "Space")
         self.bodies: list[Body] = []
         self.joints: list[Joint] = []
@@ -55,36 +65,38 @@ class Space:
     def add_circle(self, position: Pair, radius: float, *, angle: float = 0.0, **options: Unpack[BodyOptions]) -> int:
         """The number of a disc with its centre there (m)."""
         name = "add_circle"
-        radius = _number(f"{name}: radius", radius, above=0)
-        return self._added(name, "circle", _pair(f"{name}: position", position), angle, radius=radius, **options)
+        radius = checked_number(f"{name}: radius", radius, above=0)
+        return self._added(name, "circle", checked_pair(f"{name}: position", position), angle, radius=radius, **options)
 
     def add_segment(self, a: Pair, b: Pair, *, radius: float = 0.0, **options: Unpack[BodyOptions]) -> int:
         """The number of a line from a to b (m), rounded if it has a radius; static unless `kind` says otherwise.
 
         A dynamic one without radius has no area, so it needs a mass.
         """
-        radius = _number("add_segment: radius", radius, low=0)
+        radius = checked_number("add_segment: radius", radius, low=0)
         return self._added_line("add_segment", a, b, radius, **{"kind": "static", **options})
 
     def add_capsule(self, a: Pair, b: Pair, radius: float, **options: Unpack[BodyOptions]) -> int:
         """The number of all points within `radius` (m) of the line from a to b."""
-        return self._added_line("add_capsule", a, b, _number("add_capsule: radius", radius, above=0), **options)
+        return self._added_line("add_capsule", a, b, checked_number("add_capsule: radius", radius, above=0), **options)
 
     def add_box(
         self, position: Pair, width: float, height: float, *, angle: float = 0.0, **options: Unpack[BodyOptions]
     ) -> int:
         """The number of a rectangle with its centre there, its width along its own x axis (m)."""
         name = "add_box"
-        w, h = (_number(f"{name}: {n}", x, above=0) / 2 for n, x in (("width", width), ("height", height)))
+        w, h = (checked_number(f"{name}: {n}", x, above=0) / 2 for n, x in (("width", width), ("height", height)))
         corners = np.array([(-w, -h), (w, -h), (w, h), (-w, h)])
-        return self._added(name, "polygon", _pair(f"{name}: position", position), angle, vertices=corners, **options)
+        return self._added(
+            name, "polygon", checked_pair(f"{name}: position", position), angle, vertices=corners, **options
+        )
 
     def add_polygon(self, vertices: Any, **options: Unpack[BodyOptions]) -> int:
         """The number of a convex polygon with these 3 to 8 corners [V, 2] in the world (m), in order, either way round.
 
         Its position is its centre of mass, its angle 0.
         """
-        corners = _corners("add_polygon: vertices", vertices)
+        corners = checked_corners("add_polygon: vertices", vertices)
         with jax.enable_x64(True):
             centre = np.asarray(inertia.polygon_centroid(jnp.asarray(corners)))
         return self._added("add_polygon", "polygon", centre, 0.0, vertices=corners - centre, **options)
@@ -112,14 +124,14 @@ class Space:
             raise ConfigError(f"{name}: neither body is dynamic, but one of them must be")
         numbers = {
             "rest": 0.0,
-            "stiffness": _number(f"{name}: stiffness", stiffness, low=0, infinite=True),
-            "damping": _number(f"{name}: damping", damping, low=0),
-            "motor_speed": _number(f"{name}: motor_speed", motor_speed),
-            "motor_torque": _number(f"{name}: motor_torque", motor_torque, low=0),
+            "stiffness": checked_number(f"{name}: stiffness", stiffness, low=0, infinite=True),
+            "damping": checked_number(f"{name}: damping", damping, low=0),
+            "motor_speed": checked_number(f"{name}: motor_speed", motor_speed),
+            "motor_torque": checked_number(f"{name}: motor_torque", motor_torque, low=0),
         }
         low, high = (-math.inf, math.inf) if limits is None else limits
-        numbers["lower"] = _number(f"{name}: limits[0]", low, infinite=True)
-        numbers["upper"] = _number(f"{name}: limits[1]", high, low=low, infinite=True)
+        numbers["lower"] = checked_number(f"{name}: limits[0]", low, infinite=True)
+        numbers["upper"] = checked_number(f"{name}: limits[1]", high, low=low, infinite=True)
         if kind == "distance" and (limits is not None or motor_torque):
             raise ConfigError(f"{name}: limits and motor are of a revolute joint, but this one is a distance joint")
         if kind == "revolute":
@@ -130,11 +142,11 @@ class Space:
             raise ConfigError(f"{name}: anchor_b is None, but a joint to the world needs a point of it")
         # The world comes first, so that a hinge's angle is that of the body.
         pairs = [(a, anchor_a), (b, anchor_b)] if b is not None else [(-1, anchor_b), (a, anchor_a)]
-        points = [self.bodies[i].position if p is None else _pair(f"{name}: anchor", p) for i, p in pairs]
+        points = [self.bodies[i].position if p is None else checked_pair(f"{name}: anchor", p) for i, p in pairs]
         (one, two), numbers["rest"] = (i for i, _ in pairs), self._angle(pairs[1][0]) - self._angle(pairs[0][0])
         if kind == "distance":
             now = float(np.hypot(*(points[1] - points[0])))
-            numbers["rest"] = now if length is None else _number(f"{name}: length", length, low=0)
+            numbers["rest"] = now if length is None else checked_number(f"{name}: length", length, low=0)
         inside = [self._inside(i, p) for (i, _), p in zip(pairs, points, strict=True)]
         self.joints.append(Joint(kind, one, two, inside[0], inside[1], bool(collide), numbers))
         return len(self.joints) - 1
@@ -150,10 +162,10 @@ class Space:
     def _inside(self, number: int, point: np.ndarray) -> np.ndarray:
         if number < 0:
             return point
-        return _turned(point - self.bodies[number].position, -self.bodies[number].angle)
+        return rotate(point - self.bodies[number].position, -self.bodies[number].angle)
 
     def _added_line(self, name: str, a: Pair, b: Pair, radius: float, **options: Any) -> int:
-        first, last = _pair(f"{name}: a", a), _pair(f"{name}: b", b)
+        first, last = checked_pair(f"{name}: a", a), checked_pair(f"{name}: b", b)
         x, y = last - first
         if x == 0 and y == 0:
             raise ConfigError(f"{name}: a and b are both {first.tolist()}, but must be two points")
@@ -176,21 +188,21 @@ class Space:
         body = Body(
             shape=shape,
             position=position,
-            angle=_number(of("angle"), angle),
+            angle=checked_number(of("angle"), angle),
             kind=KINDS[kind],
             radius=radius,
             half_length=half_length,
             vertices=np.zeros((0, 2)) if vertices is None else vertices,
-            velocity=_pair(of("velocity"), velocity),
-            spin=_number(of("spin"), spin),
+            velocity=checked_pair(of("velocity"), velocity),
+            spin=checked_number(of("spin"), spin),
             mass=math.inf,
             moment=math.inf,
-            elasticity=_number(of("elasticity"), elasticity, low=0),
-            friction=_number(of("friction"), friction, low=0),
-            rolling_resistance=_number(of("rolling_resistance"), rolling_resistance, low=0),
-            color=_color(of("color"), color, number, KINDS[kind]),
-            force=_pair(of("force"), (0.0, 0.0) if force is None else force),
-            torque=_number(of("torque"), 0.0 if torque is None else torque),
+            elasticity=checked_number(of("elasticity"), elasticity, low=0),
+            friction=checked_number(of("friction"), friction, low=0),
+            rolling_resistance=checked_number(of("rolling_resistance"), rolling_resistance, low=0),
+            color=checked_color(of("color"), color, number, KINDS[kind]),
+            force=checked_pair(of("force"), (0.0, 0.0) if force is None else force),
+            torque=checked_number(of("torque"), 0.0 if torque is None else torque),
         )
         if body.elasticity > 1:
             raise ConfigError(f"{name}: elasticity is {elasticity!r}, but must be a number from 0 to 1")
@@ -221,7 +233,7 @@ class Space:
             return jnp.asarray(np.array([getattr(body, name) for body in bodies]).astype(dtype))
 
         corners = max((run.vertices for run in runs), default=0)
-        vertices = np.array([_filled(body.vertices, corners) for body in bodies])
+        vertices = np.array([fill_vertices(body.vertices, corners) for body in bodies])
         counts = np.array([len(body.vertices) for body in bodies], np.uint8)
         places = {int(slot): number for number, slot in enumerate(slots)}  # in the order of numbers
         depth = [places.get(slot, 0) for slot in range(len(bodies))]
@@ -257,19 +269,19 @@ class Space:
     def _arranged(self) -> tuple[tuple[SlotGroup, ...], np.ndarray, list[Body]]:
         """The runs, the slot of each body, and the bodies by slot, with one for the world where a joint needs it."""
         bodies = list(self.bodies)
-        moving = [family(body) for body in bodies if body.kind == DYNAMIC]
+        moving = [shape_family(body) for body in bodies if body.kind == DYNAMIC]
         if not moving:
             raise ConfigError(f"Space: none of its {len(bodies)} bodies is dynamic, but one or more must be")
         if any(joint.a < 0 for joint in self.joints):
             # In a run of odd length, where its place is free: the solver takes an even number.
             shape = min(dict.fromkeys(moving), key=lambda s: moving.count(s) % 2 == 0)
-            bodies.append(_world(shape))
-        order = sorted(range(len(bodies)), key=lambda i: _place(bodies[i]))
+            bodies.append(world_anchor(shape))
+        order = sorted(range(len(bodies)), key=lambda i: slot_order(bodies[i]))
         runs = []
-        for _, group in itertools.groupby((bodies[i] for i in order), key=_place):
+        for _, group in itertools.groupby((bodies[i] for i in order), key=slot_order):
             some = list(group)
             corners = max(len(body.vertices) for body in some)
-            runs.append(SlotGroup(family(some[0]), len(some), some[0].kind, corners))
+            runs.append(SlotGroup(shape_family(some[0]), len(some), some[0].kind, corners))
         return tuple(runs), np.argsort(order)[: len(self.bodies)], [bodies[i] for i in order]
 
     # What happens ---------------------------------------------------------------------------------------------------
@@ -286,7 +298,7 @@ class Space:
         it, once for each new function. The first call compiles, for seconds; a space that has as many bodies of each
         shape and the same joints does not again. ConfigError if nothing can move, or for arguments that cannot be.
         """
-        seconds, fps = (_number(f"simulate: {n}", x, above=0) for n, x in (("seconds", seconds), ("fps", fps)))
+        seconds, fps = (checked_number(f"simulate: {n}", x, above=0) for n, x in (("seconds", seconds), ("fps", fps)))
         frames = round(seconds * fps) + 1
         if frames < 2:
             raise ConfigError(
@@ -294,12 +306,14 @@ class Space:
             )
         scene, state, layout = self.scene()
         rows = (
-            4 * layout.slots * (frames - 1) if contacts is None else int(_number("simulate: contacts", contacts, low=0))
+            4 * layout.slots * (frames - 1)
+            if contacts is None
+            else int(checked_number("simulate: contacts", contacts, low=0))
         )
         rules, steps = self._rules(fps, substeps)
         slots = self.slots
         own = None if forces is None else (forces, tuple(int(s) for s in slots))
-        program = _program(layout, rules, frames, steps, SaveAt(rows, energy), own)
+        program = compiled_program(layout, rules, frames, steps, SaveAt(rows, energy), own)
         made = jax.tree.map(lambda x: np.asarray(x[0]), program(*jax.tree.map(lambda x: x[None], (scene, state))))
         states = made.states
         return Video(
@@ -310,7 +324,7 @@ class Space:
             angle=states.angle[:, slots],
             velocity=states.velocity[:, slots],
             angular_velocity=states.angular_velocity[:, slots],
-            contacts=None if made.contacts is None else _rows_there(made.contacts, slots, layout.slots),
+            contacts=None if made.contacts is None else filled_contacts(made.contacts, slots, layout.slots),
             energy=made.energy,
             quality=made.quality,
         )
@@ -318,7 +332,7 @@ class Space:
     def _rules(self, fps: float, asked: int | None) -> tuple[SolverParams, int]:
         physics = self.physics
         if asked is not None:
-            asked = int(_number("simulate: substeps", asked, low=1))
+            asked = int(checked_number("simulate: substeps", asked, low=1))
         steps = substeps(fps, asked or physics.substeps, physics.max_step)
         return solver_params(physics, fps, steps), steps
 
@@ -345,19 +359,21 @@ class Space:
     def _overlaps(self, position: np.ndarray, angle: np.ndarray) -> Overlaps:
         scene, _, layout = self.scene()
         objects = to_device(jax.tree.map(lambda x: x[None], scene.objects))
-        number = _numbers(self.slots, layout.slots)
+        number = body_numbers(self.slots, layout.slots)
         apart = {frozenset((tie.a, tie.b)) for tie in layout.joints if not tie.collide}
         places = jnp.asarray(position.transpose(2, 1, 0)), jnp.asarray(angle.T)
         found = []
         for one, two in itertools.combinations_with_replacement(layout.spans, 2):
-            pairs = [(i, j) for i in _slots(one) for j in _slots(two) if i < j and number[i] >= 0 <= number[j]]
+            pairs = [
+                (i, j) for i in slots_of_span(one) for j in slots_of_span(two) if i < j and number[i] >= 0 <= number[j]
+            ]
             pairs = [pair for pair in pairs if frozenset(pair) not in apart]
             if not pairs or (one[0].kind != DYNAMIC and two[0].kind != DYNAMIC):
                 continue
             sides = [np.array(side) for side in zip(*pairs, strict=True)]
             first, second = (number[side] for side in sides)
             there = [[x[..., who, :] for x in places] for who in (first, second)]
-            for gap, point, normal in _meeting((one[0], two[0]), objects, sides, there):
+            for gap, point, normal in touching_points((one[0], two[0]), objects, sides, there):
                 pair, frame = np.nonzero(np.asarray(gap) < 0)
                 where, way = (np.asarray(x)[:, pair, frame].T for x in (point, normal))
                 found.append(Overlaps(frame, first[pair], second[pair], where, way, -np.asarray(gap)[pair, frame]))
@@ -370,8 +386,8 @@ class Space:
 
 def _inertia(name: str, body: Body, density: float, mass: float | None, moment: float | None) -> dict[str, float]:
     """Mass and moment of a dynamic body."""
-    density = _number(f"{name}: density", density, above=0)
-    mass = None if mass is None else _number(f"{name}: mass", mass, above=0)
+    density = checked_number(f"{name}: density", density, above=0)
+    mass = None if mass is None else checked_number(f"{name}: mass", mass, above=0)
     with jax.enable_x64(True):
         half, radius, corners, rho = (
             jnp.asarray(x, float) for x in (body.half_length, body.radius, body.vertices, density)
@@ -383,9 +399,9 @@ def _inertia(name: str, body: Body, density: float, mass: float | None, moment: 
                 lambda m: inertia.stadium_moment(half, radius, m),
             ),
             "polygon": (lambda: inertia.polygon_mass(corners, rho), lambda m: inertia.polygon_moment(corners, m)),
-        }[family(body)]
+        }[shape_family(body)]
         mass = float(solid()) if mass is None else mass
         if mass == 0:
             raise ConfigError(f"{name}: mass is None, but a dynamic body of radius 0 needs one")
         moment = float(turning(jnp.asarray(mass))) if moment is None else moment
-    return {"mass": mass, "moment": _number(f"{name}: moment", moment, above=0, infinite=True)}
+    return {"mass": mass, "moment": checked_number(f"{name}: moment", moment, above=0, infinite=True)}

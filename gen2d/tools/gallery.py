@@ -20,7 +20,7 @@ from gen2d.loading.dataset import Dataset
 from gen2d.loading.dataset import open as open_dataset
 from gen2d.media.contact_sheet import GAP, contact_sheet, shown
 from gen2d.media.images import check_folder, write, writing
-from gen2d.media.overlays import VideoFields, _amodal, _boxes, _flow, _masks, _tracks
+from gen2d.media.overlays import VideoFields, amodal_overlay, boxes_overlay, flow_overlay, masks_overlay, tracks_overlay
 from gen2d.programs.recipe import config_of
 from gen2d.programs.redraw import render
 from gen2d.storage.sealed import sha256
@@ -158,4 +158,10 @@ def _film(columns: VideoFields, video: int, draw: Callable[[VideoFields], np.nda
     return np.stack([draw({name: array[video, t] for name, array in columns.items()}) for t in times])
 
 
-DRAWN = {"masks": _masks, "amodal": _amodal, "boxes": _boxes, "flow": _flow, "tracks": _tracks}
+DRAWN = {
+    "masks": masks_overlay,
+    "amodal": amodal_overlay,
+    "boxes": boxes_overlay,
+    "flow": flow_overlay,
+    "tracks": tracks_overlay,
+}

@@ -8,7 +8,7 @@ from gen2d.records.axes import Array
 from gen2d.renderers.coverage.arc import LARGE, QUARTER, under_arc
 
 
-def _shift(edges: Array) -> tuple[Array, Array]:
+def shift(edges: Array) -> tuple[Array, Array]:
     return edges, edges + 1
 
 
@@ -47,7 +47,7 @@ def disc_cuts(x: Array, y: Array, radius: Array) -> PixelDisc:
         sign = jnp.copysign(1.0, at)
         return DiscEdge(at, sign, under_arc(at, radius) - sign * (QUARTER * square), at * at)
 
-    (left, right), (top, bottom) = map(_shift, (x, y))
+    (left, right), (top, bottom) = map(shift, (x, y))
     return PixelDisc(of_column(left), of_column(right), of_row(top), of_row(bottom), radius)
 
 

@@ -24,7 +24,7 @@ import jax.numpy as jnp
 
 from gen2d.records.axes import Array
 from gen2d.renderers.coverage.arc import FAR, THIN, under_arc
-from gen2d.renderers.coverage.disc import _shift
+from gen2d.renderers.coverage.disc import shift
 
 # ---- Convex shapes with straight sides, their corners rounded
 
@@ -107,7 +107,7 @@ def _line(y: Array, begin: Array, end: Array) -> PolygonSide:
         along = jnp.clip((edge - begin[..., 1:]) / jnp.where(flat, 1.0, rise), 0.0, 1.0)
         return jnp.where(flat, (edge > begin[..., 1:]).astype(along.dtype), along)
 
-    (first, second), across = map(part, _shift(y)), side[..., :1]
+    (first, second), across = map(part, shift(y)), side[..., :1]
     one, other = begin[..., :1] + first * across, begin[..., :1] + second * across
     low = jnp.minimum(one, other)
     return PolygonSide(jnp.abs(second - first) * rise, low, jnp.maximum(jnp.abs(one - other), THIN))
@@ -133,8 +133,8 @@ def _arc_ends(before: Array, after: Array) -> tuple[tuple[Array, Array], tuple[A
 def _arc(x: Array, y: Array, radius: Array, begin: Array, end: Array, side: int) -> CornerArc:
     radius = jnp.maximum(radius, 1e-6)[..., None]
     low, high = (radius * sine[..., None] for sine in ((begin, end) if side > 0 else (end, begin)))
-    (top, bottom) = (jnp.clip(edge, low, high) for edge in _shift(y))
-    columns = _shift(x)
+    (top, bottom) = (jnp.clip(edge, low, high) for edge in shift(y))
+    columns = shift(x)
     # Where a column leaves the arc does not matter to first order. One on the other side of the centre never does: a
     # bound that is never met, as halves of slopes would be lost where it is just met.
     away = [jnp.maximum(side * at, 0.0) for at in columns]
@@ -155,7 +155,7 @@ def rounded_area(cuts: RoundedPolygon) -> Array:
     area: Any = 0.0
     for line in cuts.lines:
         low, width = _grid(line.low), _grid(line.width)
-        left, right = (jnp.maximum(edge[..., None, :] - low, 0.0) for edge in _shift(cuts.x))
+        left, right = (jnp.maximum(edge[..., None, :] - low, 0.0) for edge in shift(cuts.x))
         area = area + _grid(line.down) * (_below(left, width) - _below(right, width))
     for arcs, beyond in ((cuts.rights, _beyond_right), (cuts.lefts, _beyond_left)):
         for arc in arcs:

@@ -56,11 +56,11 @@ def test_momentum_and_energy_are_kept_in_books(fallen):
 
 
 def test_the_same_layout_compiles_once(fallen):
-    before = space_module._program.cache_info().misses
+    before = space_module.compiled_program.cache_info().misses
     again = falling()
     again.bodies[2] = dataclasses.replace(again.bodies[2], radius=0.4)
     again.simulate(1, fps=10, contacts=0)
-    assert space_module._program.cache_info().misses == before
+    assert space_module.compiled_program.cache_info().misses == before
 
 
 def test_a_scene_can_be_batched():

@@ -11,12 +11,12 @@ from gen2d.config.options import drawn_options
 from gen2d.records.axes import Array
 from gen2d.records.keys import key_for
 from gen2d.records.scene import Objects, State
-from gen2d.sampling.matched.sets import SetMember, _along
+from gen2d.sampling.matched.sets import SetMember, along_slots
 
 # ---- Counterfactuals: other factors
 
 
-def _other_factors(member: SetMember, config: Any, found: dict[str, Array], draw: Callable) -> dict[str, Array]:
+def changed_factors(member: SetMember, config: Any, found: dict[str, Array], draw: Callable) -> dict[str, Array]:
     """The factors, with the one that the set is about drawn anew or scaled; `draw(key)` draws all."""
     specs, matched, again, made = drawn_options(config.scene.module), config.matched, draw(member.own_key), dict(found)
     for place, name in enumerate(matched.change):
@@ -29,12 +29,12 @@ def _other_factors(member: SetMember, config: Any, found: dict[str, Array], draw
         if spec.each and matched.objects == "one":
             count = jnp.maximum(found.get(spec.each, len(new)), 1)
             one = jax.random.randint(key_for(member.set_key, "one"), (), 0, count)
-            new = jnp.where(_along(jnp.arange(len(new)) == one, new), new, found[name])
+            new = jnp.where(along_slots(jnp.arange(len(new)) == one, new), new, found[name])
         made[name] = jnp.where(member.changed & (member.kind == place), new, found[name])
     return made
 
 
-def _other_slot(one: tuple[Objects, State], other: tuple[Objects, State]) -> Array:
+def changed_slot(one: tuple[Objects, State], other: tuple[Objects, State]) -> Array:
     """The only slot that holds something else in two scenes at their start; -1 where there are none or several."""
     differ = jnp.zeros(one[0].present.shape, bool)
     for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True):

@@ -30,7 +30,7 @@ def keys_of(words: Array, numbers: Array, options: Any) -> Array:
     return keys.video_keys(words, numbers // options.members if options.change else numbers)
 
 
-def _member(key: Array, number: Array, options: Any, frames: int) -> SetMember:
+def member_of(key: Array, number: Array, options: Any, frames: int) -> SetMember:
     set_key = key_for(key, "matched")
     kind = jax.random.randint(key_for(set_key, "change"), (), 0, len(options.change))
     share = options.onset.sample(key_for(set_key, "onset"), ())
@@ -38,7 +38,7 @@ def _member(key: Array, number: Array, options: Any, frames: int) -> SetMember:
     return SetMember(number, number > 0, kind, frame, set_key, jax.random.fold_in(set_key, number))
 
 
-def _along(values: Array, like: Array) -> Array:
+def along_slots(values: Array, like: Array) -> Array:
     """Values [K] that broadcast to those of `like` [K, ...]."""
     return values.reshape(-1, *[1] * (like.ndim - 1))
 
@@ -53,7 +53,7 @@ def fields(options: Any) -> dict[str, Field]:
     """What is stored of sets."""
     if not options.change:
         return {}
-    codes = ", ".join(f"{code} {name}" for name, code in zip(options.change, _codes(options), strict=True))
+    codes = ", ".join(f"{code} {name}" for name, code in zip(options.change, change_codes(options), strict=True))
     return {
         "matched/set": Field("int32", "n", "1", f"its members are {options.members} videos in a row"),
         "matched/member": Field("uint8", "n", "1", "the video's place in its set; 0: the original"),
@@ -73,7 +73,7 @@ def omitted_fields(options: Any) -> tuple[str, ...]:
     return parts if set(options.change or ()) & set(VIOLATIONS) else ()
 
 
-def _codes(options: Any) -> list[int]:
+def change_codes(options: Any) -> list[int]:
     """The number that stands for each of the changes: factors come after all else."""
     named, own = list(INTERVENTIONS), iter(range(len(INTERVENTIONS), 256))
     return [named.index(name) if name in named else next(own) for name in options.change]

@@ -1,11 +1,4 @@
-"""Matched sets: videos that share a scene and differ in one thing, and what that is.
-
-Video i is member i % members of set i // members. All members have the set's key, so the same factors, places, look,
-camera and noise; member 0 is the original. The others are counterfactuals (an object is gone, or a factor is another
-one from the start) or violations (something impossible happens on the way). Every video is simulated twice, by one
-loop: as the original, and as itself from where it is changed on. What comes before is the original's to the bit, and so
-is all that the change does not reach.
-"""
+"""Members of matched sets simulated: the original and the changed member by one compiled program."""
 
 import dataclasses
 import functools
@@ -22,9 +15,9 @@ from gen2d.records.layout import Layout
 from gen2d.records.scene import Scene, State
 from gen2d.records.trajectory import Trajectory
 from gen2d.sampling.builder import SampledScene
-from gen2d.sampling.matched.counterfactuals import _other_factors, _other_slot
-from gen2d.sampling.matched.sets import SetMember, _along, _codes, _member, fields
-from gen2d.sampling.matched.violations import INTERVENTION_FUNCTIONS, Intervention, SceneInstant, _inside
+from gen2d.sampling.matched.counterfactuals import changed_factors, changed_slot
+from gen2d.sampling.matched.sets import SetMember, along_slots, change_codes, fields, member_of
+from gen2d.sampling.matched.violations import INTERVENTION_FUNCTIONS, Intervention, SceneInstant, inside_view
 
 # ---- Both together
 
@@ -48,11 +41,11 @@ def simulate_members(
     round differently.
     """
     options, run = config.matched, jax.jit(run)  # so that it is traced once
-    member_of = functools.partial(_member, options=options, frames=config.video.frames)
-    members = jax.vmap(member_of)(keys, numbers % options.members)
+    numbered = functools.partial(member_of, options=options, frames=config.video.frames)
+    members = jax.vmap(numbered)(keys, numbers % options.members)
 
     def own(key: Array, member: SetMember) -> tuple[dict[str, Array], SampledScene]:
-        return sample(key, functools.partial(_other_factors, member, config))
+        return sample(key, functools.partial(changed_factors, member, config))
 
     def once(turn: Array, before: MemberVideos) -> MemberVideos:
         now = members._replace(changed=members.changed & (turn > 0))
@@ -66,7 +59,7 @@ def simulate_members(
         return after._replace(record=jax.vmap(functools.partial(_record_change, config=config))(now, before, after))
 
     made = jax.lax.fori_loop(0, 2, once, _blank(keys, sample, run))
-    kind = jnp.asarray(_codes(options))[members.kind]
+    kind = jnp.asarray(change_codes(options))[members.kind]
     record = {"set": numbers // options.members, "member": members.number, "kind": kind, **made.record}
     stored = {
         name: record[name.removeprefix("matched/")].astype(field.dtype) for name, field in fields(options).items()
@@ -91,7 +84,7 @@ def _intervene(
     """One video's scene as stored; the scene, state and frame to simulate from; the record of the intervention."""
     free = jnp.asarray(free_slots(layout)) & scene.objects.present
     here = jax.tree.map(lambda values: values[member.frame], states)
-    later = SceneInstant(scene, here, free & _inside(here.position, layout))
+    later = SceneInstant(scene, here, free & inside_view(here.position, layout))
     chosen, frame = Intervention(scene, state, jnp.zeros(()), jnp.int32(-1), jnp.int32(-1)), jnp.int32(0)
     for place, name in enumerate(options.change):
         if name in INTERVENTIONS:
@@ -111,7 +104,7 @@ def _spliced(frame: Array, before: State, after: State) -> State:
 
     def joined(frame: Array, old: Array, new: Array) -> Array:
         number = jnp.arange(len(old))
-        late = _along(number >= frame, old)
+        late = along_slots(number >= frame, old)
         return jnp.where(late, new[jnp.maximum(number - frame, 0)], old)
 
     return jax.tree.map(functools.partial(jax.vmap(joined), frame), before, after)
@@ -124,7 +117,7 @@ def _record_change(member: SetMember, before: MemberVideos, after: MemberVideos,
     for place, name in enumerate(config.matched.change):
         if name not in INTERVENTIONS:
             on = member.changed & (member.kind == place)
-            slot = _other_slot((one.scene.objects, one.state), (other.scene.objects, other.state))
+            slot = changed_slot((one.scene.objects, one.state), (other.scene.objects, other.state))
             record["object"] = jnp.where(on, slot, record["object"])
             change = (after.drawn[name] - before.drawn[name]).astype(jnp.float32)
             size = (

@@ -11,7 +11,7 @@ from gen2d.records.axes import Array
 from gen2d.records.keys import key_for
 from gen2d.records.layout import Layout
 from gen2d.records.scene import Objects, Scene, State
-from gen2d.sampling.matched.sets import SetMember, _along
+from gen2d.sampling.matched.sets import SetMember, along_slots
 
 CLEARANCE = 1e-3  # m around an object that has jumped
 DIRECTIONS = 32  # in which a jump is tried
@@ -46,7 +46,7 @@ def _removed(member: SetMember, now: SceneInstant, options: Any, layout: Layout)
     slot, some = _nth(key_for(member.set_key, "object"), now.free, member.number - 1)
 
     def emptied(values: Array) -> Array:
-        return jnp.where(_along(jnp.arange(len(values)) == slot, values), jnp.zeros_like(values), values)
+        return jnp.where(along_slots(jnp.arange(len(values)) == slot, values), jnp.zeros_like(values), values)
 
     objects, state = jax.tree.map(emptied, (scene.objects, state))
     return Intervention(dataclasses.replace(scene, objects=objects), state, some * scene.objects.mass[slot], slot)
@@ -161,7 +161,7 @@ def gaps(point: Array, objects: Objects, state: State) -> Array:
     return distance - objects.radius
 
 
-def _inside(place: Array, layout: Layout, reach: Any = 0.0) -> Array:
+def inside_view(place: Array, layout: Layout, reach: Any = 0.0) -> Array:
     """Whether discs of this reach at places [..., 2] are within what is worth seeing."""
     left, bottom, right, top = layout.bounds
     low, high = jnp.asarray([left, bottom]) + reach, jnp.asarray([right, top]) - reach
@@ -172,4 +172,4 @@ def _clear(place: Array, slot: Array, now: SceneInstant, layout: Layout) -> Arra
     """Whether an object has room at a place: in view, and overlapping nothing."""
     objects = now.scene.objects
     reach, others = extent(objects)[slot] + CLEARANCE, objects.present & (jnp.arange(len(now.free)) != slot)
-    return _inside(place, layout, reach) & (~others | (gaps(place, objects, now.state) >= reach)).all()
+    return inside_view(place, layout, reach) & (~others | (gaps(place, objects, now.state) >= reach)).all()
