@@ -57,7 +57,7 @@ if TYPE_CHECKING:
 _HOMES = {
     "gen2d.config.distributions": "Distribution",
     "gen2d.config.options": "option",
-    "gen2d.core.enums": "DYNAMIC KINEMATIC STATIC",
+    "gen2d.core.enums": "CIRCLE DYNAMIC KINEMATIC STATIC",
     "gen2d.core.errors": "ConfigError",
     "gen2d.core.schema": "Field",
     "gen2d.exports.source": "Source",
@@ -87,6 +87,7 @@ _HOMES = {
 _HOME = {name: home for home, names in _HOMES.items() for name in names.split()}
 
 __all__ = [
+    "CIRCLE",
     "CLEARANCE",
     "DYNAMIC",
     "KINEMATIC",

@@ -17,7 +17,6 @@ from gen2d.captions.events import (
     CAPTION_BYTES,
     EVENT_BYTES,
     MAX_EVENTS,
-    STATIC,
     EventColumns,
     VideoEvent,
     as_json,
@@ -25,6 +24,7 @@ from gen2d.captions.events import (
     moving_slots,
     view_corners,
 )
+from gen2d.core.enums import SEGMENT, STATIC
 from gen2d.core.schema import Field
 
 COLORS = {
@@ -169,7 +169,7 @@ def names_of(made: EventColumns) -> dict[int, str]:
 
 def walls_of(made: EventColumns) -> dict[int, str]:
     """What static segments are called, by slot: those level or upright by the side of all of them that they are on."""
-    static = made["objects/present"] & (made["objects/kind"] == STATIC) & (made["objects/shape"] == 1)
+    static = made["objects/present"] & (made["objects/kind"] == STATIC) & (made["objects/shape"] == SEGMENT)
     slots = np.flatnonzero(static)
     if not len(slots):
         return {}

@@ -6,12 +6,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from gen2d.core.enums import END, IMPACT, STATIC
+
 EventColumns = Mapping[str, np.ndarray]
 
 CAPTION_BYTES, EVENT_BYTES = 512, 128  # the second for each object and 16 frames
 MAX_EVENTS = 4  # events that a caption tells at most
-STATIC = 1  # objects/kind
-IMPACT, END = 1, 4  # contacts/kind
 TOGETHER = 0.1  # s: impacts of a pair in frames that follow one another, and no further apart, are one hit
 STILL, STILL_SECONDS = 0.02, 0.1  # m/s of the fastest point; all is at rest if it stays below, for so long at least
 DIGITS = 6  # of the numbers in events

@@ -5,12 +5,12 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
+from gen2d.core.enums import BEGIN, END, IMPACT, NO_CONTACT, PERSIST
 from gen2d.physics.contact_state import SolvedPair
 from gen2d.records.axes import Array
 from gen2d.records.trajectory import Contacts
 from gen2d.xla import materialize
 
-NOTHING, IMPACT, BEGIN, PERSIST, END = range(5)  # contacts/kind
 ON, BOUNCED, BEFORE = 1, 2, 4  # flags: touching after the last step, an impact in this frame, touching as it began
 
 
@@ -82,7 +82,7 @@ class PairEvent(NamedTuple):
 def pair_event(event: ContactEvent, elasticity: Array) -> PairEvent:
     """What happened, as the frame ends. What bounces leaves with e times the speed that it came with."""
     on, bounced, before = ((event.flags & flag) > 0 for flag in (ON, BOUNCED, BEFORE))
-    kind = jnp.where(before, jnp.where(on, PERSIST, END), jnp.where(event.time >= 0, BEGIN, NOTHING))
+    kind = jnp.where(before, jnp.where(on, PERSIST, END), jnp.where(event.time >= 0, BEGIN, NO_CONTACT))
     separation = jnp.where(bounced, elasticity * event.approach, 0.0)
     return PairEvent(jnp.where(bounced, IMPACT, kind).astype(jnp.uint8), *event[:4], separation, *event[4:6])
 

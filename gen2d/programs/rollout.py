@@ -24,6 +24,7 @@ from gen2d.captions import caption
 from gen2d.config import quality
 from gen2d.config.config import Config
 from gen2d.core import enums
+from gen2d.core.enums import JOINT_KINDS
 from gen2d.core.schema import Field
 from gen2d.physics import lyapunov
 from gen2d.physics.params import solver_params
@@ -49,7 +50,6 @@ SHARD_BYTES = 2**30  # of raw frames in a shard
 SHARD_VIDEOS = 1024  # at most, unless the config says otherwise
 LANES, ROWS = 512, 2**20  # videos simulated at once, and pairs that can meet in all of them; 300 bytes for each
 VIDEOS = PartitionSpec("videos")
-JOINTS = ("distance", "revolute")  # joints/kind is an index into this
 
 
 class DeviceBatch(NamedTuple):
@@ -133,7 +133,7 @@ class Rollout:
         fields["index"] = Field("int64", "n", "1", "the video's number in its split")
         fields["time"] = Field("float64", "T", "s", "of each frame; frame 0 is the initial state")
         if self.layout.joints:
-            fields["joints/kind"] = Field("uint8", "J", "1", f"index into {', '.join(JOINTS)}")
+            fields["joints/kind"] = Field("uint8", "J", "1", f"index into {', '.join(JOINT_KINDS)}")
             fields |= {f"joints/{side}": Field("int16", "J", "object", f"slot of object {side}") for side in "ab"}
         fields["quality/rejected_draws"] = Field("int32", "n", "1", "places drawn again as they did not fit")
         fields |= {"quality/rejected_videos": rejection.FIELD} if self.wanted else {}
@@ -149,7 +149,11 @@ class Rollout:
             return {"time": self.time}
         ties = self.layout.joints
         slots = {f"joints/{side}": np.array([getattr(tie, side) for tie in ties], np.int16) for side in "ab"}
-        return {"time": self.time, "joints/kind": np.array([JOINTS.index(tie.kind) for tie in ties], np.uint8), **slots}
+        return {
+            "time": self.time,
+            "joints/kind": np.array([JOINT_KINDS.index(tie.kind) for tie in ties], np.uint8),
+            **slots,
+        }
 
     @property
     def word_fields(self) -> dict[str, Field]:

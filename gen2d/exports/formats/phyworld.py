@@ -13,7 +13,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from gen2d.plugin import Batch, ConfigError, Source, films
+from gen2d.plugin import CIRCLE, STATIC, Batch, ConfigError, Source, films
 from gen2d.plugin import dataset as loader
 
 LOSS = f"{films.LOSS}; positions and first speeds of the balls alone"
@@ -24,7 +24,6 @@ FIXED = True
 SUFFIX = ".hdf5"
 UNITS = 10.0  # the frame's width
 GROUP = 1000  # videos in a dataset
-STATIC, CIRCLE = 1, 0  # in objects/kind and objects/shape; types.py says the same, but imports jax
 
 
 def check(source: Source) -> None:
