@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from gen2d.config.distributions import Distribution
     from gen2d.config.options import option
-    from gen2d.core.enums import DYNAMIC, KINEMATIC, STATIC
+    from gen2d.core.enums import CIRCLE, DYNAMIC, KINEMATIC, STATIC
     from gen2d.core.errors import ConfigError
     from gen2d.core.schema import Field
     from gen2d.exports.source import Source
