@@ -24,7 +24,7 @@ BALLS = {
     "look": {"name": "flat", "background": [0, 0, 0], "wall_width": 3},
     "seed": 4,
 }
-draw = jax.jit(rasterizer.draw_patches, static_argnums=1)
+draw = jax.jit(rasterizer.draw_tiles, static_argnums=1)
 
 
 def views(rng, count):

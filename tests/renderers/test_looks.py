@@ -26,7 +26,7 @@ LOOKS = plugins.names("look")
 RANDOM = [name for name in LOOKS if hasattr(plugins.load("look", name).Options, "palette")]
 FREE = {"palette": "random", "contrast": 150.0}
 HEIGHT, WIDTH = 40, 44
-PATCHES, DENSE = (jax.jit(form, static_argnums=1) for form in (rasterizer.draw_patches, rasterizer.draw_dense))
+PATCHES, DENSE = (jax.jit(form, static_argnums=1) for form in (rasterizer.draw_tiles, rasterizer.draw_dense))
 DISCS = Layout((SlotGroup("circle", 4),), (0.0, 0.0, 10.0, 10.0), 1.6)
 SHAPES_ALL = Layout(
     (*DISCS.runs, *(SlotGroup(shape, 2) for shape in SHAPES[2:]), SlotGroup("segment", 4, STATIC)), DISCS.bounds, 1.6

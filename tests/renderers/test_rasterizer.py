@@ -26,7 +26,7 @@ from gen2d.renderers.paint import Background, Paint, Texture
 from gen2d.renderers.plan import FramePlan, Occluders, RenderScene
 from gen2d.renderers.primitives import BodyGeometry, Instants
 
-PATCHES, DENSE = (jax.jit(form, static_argnums=1) for form in (rasterizer.draw_patches, rasterizer.draw_dense))
+PATCHES, DENSE = (jax.jit(form, static_argnums=1) for form in (rasterizer.draw_tiles, rasterizer.draw_dense))
 SOFT = jax.jit(jax.vmap(rasterizer.draw_soft, in_axes=(0, None)), static_argnums=1)
 REACH = 1.5  # m, of all that moves
 
