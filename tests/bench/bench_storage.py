@@ -29,6 +29,8 @@ from gen2d.storage import codecs
 FIELDS = {
     "frames": Field("uint8", "n T H W 3", "sRGB", "what is seen"),
     "states/position": Field("float32", "n T K 2", "m", "of the centre of mass"),
+    "index": synthetic.FIELDS["index"],
+    "time": synthetic.FIELDS["time"],
 }
 
 
@@ -102,7 +104,7 @@ def works(case: Case, folder: Path) -> dict[str, Callable[[], float]]:
 
 def _dataset(case: Case, root: Path, codec: str, rounds: int = 1) -> DatasetSpec:
     sizes, count = {"T": case.frames, "H": case.pixels, "W": case.pixels, "K": 8}, rounds * case.videos
-    plan = {"splits": {"train": count}, "videos_per_shard": count, "constants": {}}
+    plan = {"splits": {"train": count}, "videos_per_shard": count}
     made = synthetic.dataset(root, codec=codec, fields=FIELDS, sizes=sizes, **plan)
     open_folder(made)
     return made
@@ -112,8 +114,14 @@ def _write(made: DatasetSpec, columns: Mapping[str, np.ndarray]) -> None:
     """Writes the dataset's one shard, which holds the videos once or more."""
     (shard,) = plan(made.splits, made.videos_per_shard)
     starts = [*range(0, len(columns["frames"]), 4)] * (shard.count // len(columns["frames"]))
+    numbers = np.arange(shard.count)
     blocks = (
-        encode({name: values[i : i + 4] for name, values in columns.items()}, made.fields, made.codec) for i in starts
+        encode(
+            {name: values[i : i + 4] for name, values in columns.items()} | {"index": numbers[4 * k : 4 * k + 4]},
+            made.fields,
+            made.codec,
+        )
+        for k, i in enumerate(starts)
     )
     ShardWriter(made).write(shard, blocks)
 
