@@ -262,7 +262,7 @@ def told_differences(
     for name, one, other in differences(there, here):
         kind = name.removeprefix("fingerprint.programs.")
         if kind == name:
-            others.append(f"{name} is {one} there and {other} here")
+            others.append(f"{name} is {one!s:.60} there and {other!s:.60} here")
         else:
             programs.append(PROGRAMS.get(kind.rpartition(".")[2], kind))
     if not programs:

@@ -84,7 +84,7 @@ def changed_videos(
 
     Videos that cannot be read are passed over: the level "full" names them.
     """
-    dataset = dataset_of(rollout, root, manifest.splits)
+    dataset = dataset_of(rollout, root, manifest.splits, manifest.identity["fingerprint"])
     for name, values in dataset.constants.items():
         if name not in manifest.constants or not np.array_equal(values, manifest.constants[name]):
             raise FolderError(f"{root}: its constant {name} is not the one that its recipe gives")
@@ -207,10 +207,16 @@ def _what_it_held(root: Place) -> tuple[Manifest | None, Identity]:
 
 
 def _as_made(rollout: Rollout, root: Place, identity: Identity, manifest: Manifest | None) -> DatasetSpec:
-    """What the folder is to hold, by the versions that its manifest names, if that is whole."""
-    spec = dataset_of(rollout, root, {})
-    producer = manifest.producer if manifest else spec.producer
-    return dataclasses.replace(spec, producer={**producer, "fingerprint": identity["fingerprint"]})
+    """What the folder is to hold, by the versions that its manifest names, if that is whole.
+
+    Raises FolderError where its config gives another dataset here.
+    """
+    spec = dataset_of(rollout, root, {}, identity["fingerprint"])
+    told = folder.told_differences(identity, spec.identity, {}, {})
+    if told or (manifest and manifest.fields != spec.fields):
+        raise FolderError(f"{root}: its config gives other videos here than it holds: {told or 'their fields differ'}")
+    producer = {**manifest.producer, "fingerprint": identity["fingerprint"]} if manifest else spec.producer
+    return dataclasses.replace(spec, producer=producer)
 
 
 def _to_make(
@@ -263,7 +269,8 @@ def _made_again(
     staged_spec = dataclasses.replace(spec, root=stage)
     make(rollout, staged_spec, list(todo), say)
     staged = read_records(staged_spec, stage)
-    same_codecs = manifest is None or all(manifest.producer.get(key) == _versions(rollout)[key] for key in CODECS)
+    versions = devices.versions()
+    same_codecs = manifest is None or all(manifest.producer.get(key) == versions[key] for key in CODECS)
     for shard in todo:
         path, row, before = stage / shard_name(shard.name), staged.of(shard), records.of(shard)
         assert row is not None
@@ -276,10 +283,6 @@ def _made_again(
                 f"{spec.root}: {shard.name}, made again, is not right, so nothing was changed: {wrong[0]}"
             )
     return staged
-
-
-def _versions(rollout: Rollout) -> Mapping[str, Any]:
-    return devices.versions()
 
 
 def _faults(path: Path, shard: Shard, row: np.void, manifest: Manifest | None) -> list[str]:

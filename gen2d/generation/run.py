@@ -83,7 +83,7 @@ def generate(
     remember(config.copies.values())
     on = devices.prepare(device)
     with contextlib.closing(Rollout(config, on)) as rollout:
-        dataset = dataset_of(rollout, out, counts)
+        dataset = dataset_of(rollout, out, counts, fingerprint(rollout))
         remaining = [shard for shard in shards.open_folder(dataset, overwrite) if shard.split in counts]
         todo = mine(remaining, *worker)
         began, made = time.perf_counter(), sum(shard.count for shard in todo)
@@ -131,8 +131,10 @@ def _check_run(n: Any, split: str | None, worker: tuple[int, int], overwrite: bo
     return int(n)
 
 
-def dataset_of(rollout: Rollout, out: Place, counts: Mapping[str, int]) -> DatasetSpec:
-    """What the folder `out` is to hold."""
+def dataset_of(
+    rollout: Rollout, out: Place, counts: Mapping[str, int], fingerprint: Mapping[str, Any]
+) -> DatasetSpec:
+    """What the folder `out` is to hold, of videos that programs with this fingerprint make."""
     config = rollout.config
     return DatasetSpec(
         root=out,
@@ -142,7 +144,7 @@ def dataset_of(rollout: Rollout, out: Place, counts: Mapping[str, int]) -> Datas
         seed=config.seed,
         config=config.recipe(),
         config_text=config.recipe_text(),
-        producer={**devices.versions(), "sources": sources(), "fingerprint": fingerprint(rollout)},
+        producer={**devices.versions(), "sources": sources(), "fingerprint": fingerprint},
         splits=counts,
         videos_per_shard=rollout.videos_per_shard,
         codec=config.storage.codec,

@@ -85,7 +85,7 @@ def _parts(folder: Path, sets: Sequence[str], config: str = CONFIG) -> dict[str,
     sample, simulate, numbers = _physics(rollout)
     start, batch = sample(numbers), rollout.begin("train", [0] * len(rollout.devices))
     whole = rollout.videos_per_shard // rollout.lanes * rollout.lanes
-    dataset = dataset_of(rollout, folder / "data", {"train": whole})
+    dataset = dataset_of(rollout, folder / "data", {"train": whole}, {})
     (shard, *_), columns = open_folder(dataset), rollout.host_columns(batch)[0]
     encoder = encoder_module.Encoder(rollout, dataset, encoder_module.threads_for(devices.cores()))
     jobs = encoder_module.encode_tasks([0], [[(shard, 0, rollout.lanes)]], rollout.lanes, rollout.slice)
@@ -172,7 +172,7 @@ def make(rollout: Any, videos: int, out: Path) -> None:
     from gen2d.generation.run import dataset_of
     from gen2d.programs import devices
 
-    dataset = dataset_of(rollout, out, {"train": videos})
+    dataset = dataset_of(rollout, out, {"train": videos}, {})
     encoder = encoder_module.Encoder(rollout, dataset, encoder_module.threads_for(devices.cores()))
     writers = writers_module.ShardWriters(dataset)
     for shard, block in encoder.blocks(encoder_module.batches(open_folder(dataset), rollout.lanes)):

@@ -125,12 +125,12 @@ def repaired(monkeypatch: pytest.MonkeyPatch) -> None:
             for shard in todo:
                 writer.write(shard, synthetic.blocks(spec, shard))
 
-    def made(rollout: object, root: Path, counts: Mapping[str, int]) -> DatasetSpec:
+    def made(rollout: object, root: Path, counts: Mapping[str, int], fingerprint: object) -> DatasetSpec:
         return synthetic.dataset(root, fields=FIELDS, splits=dict(counts))
 
     monkeypatch.setattr(regenerate, "rollout_of", lambda *_: None)
     monkeypatch.setattr(regenerate, "check_fingerprint", lambda *_: None)
-    monkeypatch.setattr(regenerate, "_versions", lambda *_: dict.fromkeys(regenerate.CODECS))
+    monkeypatch.setattr(regenerate.devices, "versions", lambda: dict.fromkeys(regenerate.CODECS))
     monkeypatch.setattr(regenerate, "dataset_of", made)
     monkeypatch.setattr(regenerate, "make", make)
 
