@@ -131,9 +131,7 @@ def _check_run(n: Any, split: str | None, worker: tuple[int, int], overwrite: bo
     return int(n)
 
 
-def dataset_of(
-    rollout: Rollout, out: Place, counts: Mapping[str, int], fingerprint: Mapping[str, Any]
-) -> DatasetSpec:
+def dataset_of(rollout: Rollout, out: Place, counts: Mapping[str, int], fingerprint: Mapping[str, Any]) -> DatasetSpec:
     """What the folder `out` is to hold, of videos that programs with this fingerprint make."""
     config = rollout.config
     return DatasetSpec(
