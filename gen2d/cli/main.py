@@ -80,7 +80,7 @@ def generating() -> Parser:
         action="append",
         default=[],
         metavar="A.B=V",
-        dest="sets",
+        dest="overrides",
         help="override one option, such as physics.substeps=8",
     )
     parser.add_argument(
@@ -136,7 +136,12 @@ def _verb_parser(verb: str) -> Parser:
         parser.add_argument("--gallery", action="store_true", help="instead, the same videos in every look, annotated")
         parser.add_argument("--seed", type=int, default=None, help="of a config")
         parser.add_argument(
-            "--set", action="append", default=[], dest="sets", metavar="A.B=V", help="override an option of a config"
+            "--set",
+            action="append",
+            default=[],
+            dest="overrides",
+            metavar="A.B=V",
+            help="override an option of a config",
         )
     return parser
 
@@ -186,7 +191,7 @@ def generate(arguments: Sequence[str]) -> int:
             options.out,
             seed=options.seed,
             split=options.split,
-            sets=options.sets,
+            overrides=options.overrides,
             device=options.device,
             worker=_worker(options.worker),
             overwrite=options.overwrite,
@@ -287,7 +292,7 @@ def listing(arguments: Sequence[str]) -> int:
 def preview(arguments: Sequence[str]) -> int:
     """0, and the names of the pictures made."""
     options = _verb_parser("preview").parse_args(arguments)
-    changes = {"seed": options.seed, "sets": options.sets, "trust": options.trust}
+    changes = {"seed": options.seed, "overrides": options.overrides, "trust": options.trust}
     changes |= {"timeout": options.timeout, "deadline": options.deadline}
     changes |= {} if options.videos is None else {"videos": options.videos}
     if options.gallery:
