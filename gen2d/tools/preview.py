@@ -27,7 +27,7 @@ def preview(
 ) -> list[Path]:
     """Paths of a contact sheet, NAME-sheet.png, and of an animation, NAME.gif, written into the folder `out`.
 
-    `source` is a dataset's folder or URL, or a config, changed by `seed` and `overrides` ('video.height=128'). `trust` is
+    `source` is a dataset's folder or URL, or a config, with `seed` and `overrides`. `trust` is
     that of `render`, for a dataset without frames; `timeout` and `deadline` are those of `open`, in seconds.
     Raises UserError for a source or options that cannot be, DamagedError, UnreachableError.
     """
