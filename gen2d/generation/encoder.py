@@ -4,126 +4,53 @@ The device is never waited for by the threads that write, nor they by it, beyond
 memory is bounded by a batch and not by the number of videos.
 """
 
-import dataclasses
 import os
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from typing import Any
 
 import numpy as np
 
 from gen2d.core.errors import UserError
 from gen2d.dataset.block import Block, encode
 from gen2d.dataset.spec import DatasetSpec, Shard
-from gen2d.programs.batches import ShardSlice, check_block_placed
-from gen2d.programs.rollout import DeviceBatch, Rollout
-from gen2d.records.axes import Array
-
-
-def batches(todo: Sequence[Shard], batch_size: int) -> list[tuple[str, int, list[ShardSlice]]]:
-    """The batches that hold these shards' videos, in order: split, number of the first video, and the shards' pieces.
-
-    Batch b holds the videos from b * batch_size on, whatever the shards are, so that every video keeps its row.
-    """
-    found: dict[tuple[str, int], list[ShardSlice]] = {}
-    for shard in todo:
-        end = shard.first + shard.count
-        for first in range(shard.first // batch_size * batch_size, end, batch_size):
-            piece = shard, max(shard.first - first, 0), min(end - first, batch_size)
-            found.setdefault((shard.split, first), []).append(piece)
-    return [(split, first, pieces) for (split, first), pieces in found.items()]
-
-
-def groups(
-    work: Sequence[tuple[str, int, list[ShardSlice]]], devices: int
-) -> Iterator[tuple[str, list[int], list[list[ShardSlice]]]]:
-    """The batches, as many at a time as there are devices; a device left over repeats the last batch for nothing."""
-    place = 0
-    while place < len(work):
-        split = work[place][0]
-        taken = [entry for entry in work[place : place + devices] if entry[0] == split]
-        place += len(taken)
-        idle = devices - len(taken)
-        yield split, [e[1] for e in taken] + [taken[-1][1]] * idle, [e[2] for e in taken] + [[]] * idle
-
-
-@dataclasses.dataclass(eq=False)
-class EncodeTask:
-    """Videos of one shard that are drawn and compressed together: `rows` of a device's batch."""
-
-    shard: Shard
-    device: int
-    first: int  # number of the video in the batch's row 0
-    start: int  # row of the slice's first video
-    rows: slice
-    future: Future[Block] | None = None
-
-
-def encode_tasks(firsts: list[int], pieces: list[list[ShardSlice]], batch_size: int, size: int) -> list[EncodeTask]:
-    """The jobs of a group of batches in the order of their videos, in slices of `size` batch_size."""
-    return [
-        EncodeTask(shard, device, firsts[device], start, slice(max(low, start), min(high, start + size)))
-        for device, own in enumerate(pieces)
-        for shard, low, high in own
-        for start in range(0, batch_size, size)
-        if max(low, start) < min(high, start + size)
-    ]
+from gen2d.programs.source import VideoRange, VideoSlice, VideoSource
 
 
 class Encoder:
-    """Draws batches slice by slice and compresses them in threads; `blocks` gives them back in order."""
+    """Compresses videos in threads, as they are rendered; `blocks` gives them in order."""
 
-    def __init__(self, rollout: Rollout, dataset: DatasetSpec, threads: int) -> None:
-        self.rollout, self.dataset = rollout, dataset
+    def __init__(self, source: VideoSource, dataset: DatasetSpec, threads: int) -> None:
+        self.source, self.dataset = source, dataset
         self.pool = ThreadPoolExecutor(threads, "encode")
-        self.limit = 2 * (len(rollout.devices) + threads)  # jobs in flight
+        self.limit = 2 * (len(source.rollout.devices) + threads)  # slices in flight
         self.running: deque[Future[Block]] = deque()
 
-    def encode(self, job: EncodeTask, columns: dict[str, np.ndarray], drawn: dict[str, Array]) -> Block:
-        """The block of a job, from its device's columns and what was drawn of its slice there."""
-        rows, start = job.rows, job.start
-        own = {name: column[rows] for name, column in columns.items()}
-        for name, array in drawn.items():
-            own[name] = np.asarray(array)[rows.start - start : rows.stop - start]
-        own["index"] = np.arange(job.first + rows.start, job.first + rows.stop, dtype=np.int64)
-        own |= self.rollout.host_fields(own, job.shard.split)
-        block = encode(own, self.dataset.fields, self.dataset.codec, self.dataset.chunk_frames)
-        _check_finite(block, job.first + rows.start)
+    def encode(self, videos: VideoSlice) -> Block:
+        """The block of some videos; waits until they are rendered."""
+        block = encode(videos.fields(), self.dataset.fields, self.dataset.codec, self.dataset.chunk_frames)
+        _check_finite(block, int(videos.part.numbers[0]))
         return block
 
-    def blocks(self, work: Sequence[tuple[str, int, list[ShardSlice]]]) -> Iterator[tuple[Shard, Block]]:
-        """Every block of these batches with its shard, in the order of the videos.
+    def blocks(self, ranges: Sequence[VideoRange]) -> Iterator[tuple[Any, Block]]:
+        """Every block of these ranges with the range's tag, in the order of the videos."""
+        waiting: dict[int, tuple[Any, Future[Block]]] = {}
+        following = 0
+        for videos in self.source.slices(ranges):
+            waiting[videos.part.order] = videos.part.range.tag, self._submit(videos)
+            while following in waiting and waiting[following][1].done():
+                tag, future = waiting.pop(following)
+                following += 1
+                yield tag, future.result()
+        for order in sorted(waiting):
+            tag, future = waiting.pop(order)
+            yield tag, future.result()
 
-        The next batch is begun before the last slices of this one are compressed, so neither waits for the other.
-        """
-        line: deque[EncodeTask] = deque()
-        waiting = list(groups(work, len(self.rollout.devices)))
-        batch = self.rollout.begin(*waiting[0][:2]) if waiting else None
-        for place, (_, firsts, pieces) in enumerate(waiting):
-            assert batch is not None
-            check_block_placed(self.rollout, batch, firsts, pieces)
-            jobs = encode_tasks(firsts, pieces, self.rollout.batch_size, self.rollout.slice)
-            line.extend(jobs)
-            for _ in self._submitted(jobs, batch):
-                while line and line[0].future is not None and line[0].future.done():
-                    yield _result(line.popleft())
-            batch = self.rollout.begin(*waiting[place + 1][:2]) if place + 1 < len(waiting) else None
-        while line:
-            yield _result(line.popleft())
-
-    def _submitted(self, jobs: list[EncodeTask], batch: DeviceBatch) -> Iterator[int]:
-        columns = self.rollout.host_columns(batch)
-        for start in sorted({job.start for job in jobs}):
-            drawn = self.rollout.draw(batch, start, self.rollout.slice)
-            for job in jobs:
-                if job.start == start:
-                    job.future = self._submit(job, columns[job.device], drawn[job.device])
-            yield start
-
-    def _submit(self, job: EncodeTask, columns: dict[str, np.ndarray], drawn: dict[str, Array]) -> Future[Block]:
+    def _submit(self, videos: VideoSlice) -> Future[Block]:
         while len(self.running) >= self.limit:
             self.running.popleft().result()
-        self.running.append(self.pool.submit(self.encode, job, columns, drawn))
+        self.running.append(self.pool.submit(self.encode, videos))
         return self.running[-1]
 
     def close(self) -> None:
@@ -131,13 +58,13 @@ class Encoder:
         self.pool.shutdown(wait=True, cancel_futures=True)
 
 
-def _result(job: EncodeTask) -> tuple[Shard, Block]:
-    assert job.future is not None
-    return job.shard, job.future.result()
+def shard_ranges(shards: Iterable[Shard]) -> list[VideoRange]:
+    """The videos of each shard, which is their tag."""
+    return [VideoRange(shard.split, shard.first, shard.first + shard.count, shard) for shard in shards]
 
 
 def _check_finite(block: Block, first: int) -> None:
-    """Returns nothing; raises where the sums of a state's values, which the block holds anyway, are not numbers."""
+    """Raises NotFiniteError where the sums of a field's values, which the block holds anyway, are not finite."""
     for name, moments in block.moments.items():
         finite = np.isfinite(moments[:, 1]).all(axis=-1)
         if not finite.all():

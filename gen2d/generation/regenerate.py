@@ -13,7 +13,6 @@ import numpy as np
 from gen2d.config.config import Config
 from gen2d.core.errors import DamagedError, FolderError
 from gen2d.dataset import folder, hdf5
-from gen2d.dataset.block import Block
 from gen2d.dataset.hdf5_check import faults
 from gen2d.dataset.manifest import MANIFEST, Manifest, identity_of, read_manifest
 from gen2d.dataset.records import Records, read_records, read_tables, tables_by_name
@@ -27,19 +26,17 @@ from gen2d.dataset.spec import (
     mark_path,
     plan,
     shard_name,
+    shard_of,
     shard_path,
 )
 from gen2d.generation.complete import publication
-from gen2d.generation.encoder import Encoder, threads_for
-from gen2d.generation.run import dataset_of, make, rollouts_of
+from gen2d.generation.run import dataset_of, make
 from gen2d.loading import dataset as loader
 from gen2d.programs import devices
-from gen2d.programs.batches import ShardSlice
 from gen2d.programs.fingerprint import fingerprint, machine, sources
 from gen2d.programs.recipe import Trust, config_from
-from gen2d.programs.rollout import Rollout
+from gen2d.programs.source import VideoRange, VideoSource
 from gen2d.storage.atomic import publish_changed, sync
-from gen2d.storage.codecs import decode_into
 from gen2d.storage.leases import LOCK, leased, temporary_name
 from gen2d.storage.paths import Network, Place, Url, place, upload
 from gen2d.storage.sealed import file_sha256
@@ -49,25 +46,26 @@ Identity = Mapping[str, Any]  # of a dataset; its manifest has the same keys
 CODECS = ("h5py", "hdf5", "isal", "zstandard", "numpy")
 
 
-def rollout_of(root: Place, identity: Identity, trust: Trust = ()) -> Rollout:
-    """The programs that made the dataset in the folder. Raises ConfigError where its config cannot be used here, and
-    UntrustedError where that would run code that came with it."""
-    return _rollout(
-        config_from(root, identity, trust), str(identity["fingerprint"].get("device", "")).startswith("cpu")
-    )
+def source_of(root: Place, identity: Identity, trust: Trust = ()) -> VideoSource:
+    """The videos of the recipe of the dataset in the folder.
+
+    Raises ConfigError where its config cannot be used here, and UntrustedError where that would run code that came with
+    it.
+    """
+    return _source(config_from(root, identity, trust), str(identity["fingerprint"].get("device", "")).startswith("cpu"))
 
 
 @functools.lru_cache(maxsize=1)  # a check, a repair and the check that follows compile once
-def _rollout(config: Config, on_cpu: bool) -> Rollout:
-    return Rollout(config, devices.prepare("cpu" if on_cpu else "auto"))
+def _source(config: Config, on_cpu: bool) -> VideoSource:
+    return VideoSource(config, devices.prepare("cpu" if on_cpu else "auto"))
 
 
-def check_fingerprint(root: Place, rollout: Rollout, identity: Identity) -> None:
+def check_fingerprint(root: Place, source: VideoSource, identity: Identity) -> None:
     """Raises FolderError where this machine and these versions would make other bits."""
     there = dict(identity["fingerprint"])
     programs = there.pop("programs", {})
-    _compare(root, there, machine(rollout))  # at once: tracing the programs takes long
-    _compare(root, {"programs": programs}, {"programs": fingerprint(rollout)["programs"]})
+    _compare(root, there, machine(source.rollout))  # at once: tracing the programs takes long
+    _compare(root, {"programs": programs}, {"programs": fingerprint(source.rollout)["programs"]})
 
 
 def _compare(root: Place, there: Identity, here: Identity) -> None:
@@ -78,49 +76,34 @@ def _compare(root: Place, there: Identity, here: Identity) -> None:
 
 
 def changed_videos(
-    rollout: Rollout, root: Place, manifest: Manifest, chosen: Sequence[tuple[str, int]]
+    source: VideoSource, root: Place, manifest: Manifest, chosen: Sequence[tuple[str, int]]
 ) -> Iterator[tuple[str, str]]:
     """For each field of the videos (split, number) that is another when made again: its shard and a sentence.
 
     Videos that cannot be read are passed over: the level "full" names them.
     """
-    dataset = dataset_of(rollout, root, manifest.splits, manifest.identity["fingerprint"])
-    for name, values in dataset.constants.items():
+    for name, values in source.schema.constants.items():
         if name not in manifest.constants or not np.array_equal(values, manifest.constants[name]):
             raise FolderError(f"{root}: its constant {name} is not the one that its recipe gives")
     stored = {split: loader.open(root, split, fields=("*",)) for split in manifest.splits}
-    for own, splits in rollouts_of(rollout, [split for split, _ in chosen]):
-        encoder = Encoder(own, dataset, threads_for(devices.cores()))
-        try:
-            for shard, block in encoder.blocks(_work(dataset, own.batch_size, [c for c in chosen if c[0] in splits])):
-                number = int(block.arrays["index"][0])
-                for name in _changed_fields(stored[shard.split], number, _values(block, dataset)):
-                    yield shard.name, f"{name} of {shard.split} video {number} is not what its recipe makes"
-        finally:
-            encoder.close()
+    for own, splits in source.of_splits(split for split, _ in chosen):
+        ranges = [
+            VideoRange(split, number, number + 1, _shard_name(manifest, split, number))
+            for split, number in sorted(chosen)
+            if split in splits
+        ]
+        for videos in own.slices(ranges):
+            split, number, _, shard = videos.part.range
+            fields = {name: column[0] for name, column in videos.fields().items() if name in own.schema.fields}
+            for name in _changed_fields(stored[split], number, fields):
+                yield shard, f"{name} of {split} video {number} is not what its recipe makes"
 
 
-def _work(
-    dataset: DatasetSpec, batch_size: int, chosen: Sequence[tuple[str, int]]
-) -> list[tuple[str, int, list[ShardSlice]]]:
-    """The batches that hold the chosen videos, each video a piece of its own."""
-    owner = {(shard.split, shard.place): shard for shard in plan(dataset.splits, dataset.videos_per_shard)}
-    found: dict[tuple[str, int], list[ShardSlice]] = {}
-    for split, number in sorted(chosen):
-        shard, lane = owner[split, number // dataset.videos_per_shard], number % batch_size
-        found.setdefault((split, number - lane), []).append((shard, lane, lane + 1))
-    return [(split, first, pieces) for (split, first), pieces in found.items()]
-
-
-def _values(block: Block, dataset: DatasetSpec) -> dict[str, np.ndarray]:
-    """The fields of the block's only video."""
-    found = {name: values[0] for name, values in block.arrays.items()}
-    for name, chunks in block.chunks.items():
-        field = dataset.fields[name]
-        found[name] = np.empty(field.shape(dataset.sizes), field.dtype)
-        for piece, chunk in zip(np.split(found[name], len(chunks)), chunks, strict=True):
-            decode_into(dataset.codec, chunk, piece)
-    return found
+def _shard_name(manifest: Manifest, split: str, number: int) -> str:
+    """The name of the shard that holds a video."""
+    size = manifest.videos_per_shard
+    first = number // size * size
+    return shard_of(split, first, min(size, manifest.splits[split] - first), size).name
 
 
 def _changed_fields(stored: loader.Dataset, number: int, made: Mapping[str, np.ndarray]) -> list[str]:
@@ -156,8 +139,8 @@ def repair(
     root = place(root, Network(timeout, deadline))
     folder.check_links(root)
     manifest, identity = _what_it_held(root)
-    rollout = rollout_of(root, identity, trust)
-    spec = _as_made(rollout, root, identity, manifest)
+    source = source_of(root, identity, trust)
+    spec = _as_made(source, root, identity, manifest)
     counts, kept = (manifest.splits, read_tables(root, manifest)) if manifest else _found_tables(root, spec)
     spec = dataclasses.replace(spec, splits=counts)
     records = Records(spec.videos_per_shard, kept)
@@ -166,8 +149,8 @@ def repair(
     staged = Records(spec.videos_per_shard, {})
     with folder.explained(root), _staging(root) as stage:
         if todo:
-            check_fingerprint(root, rollout, identity)
-            staged = _made_again(rollout, spec, stage, todo, records, manifest, say or (lambda line: None))
+            check_fingerprint(root, source, identity)
+            staged = _made_again(source, spec, stage, todo, records, manifest, say or (lambda line: None))
         try:
             with folder.alone(root):
                 folder.check_current(root, manifest)
@@ -206,12 +189,12 @@ def _what_it_held(root: Place) -> tuple[Manifest | None, Identity]:
     return manifest, manifest.identity
 
 
-def _as_made(rollout: Rollout, root: Place, identity: Identity, manifest: Manifest | None) -> DatasetSpec:
+def _as_made(source: VideoSource, root: Place, identity: Identity, manifest: Manifest | None) -> DatasetSpec:
     """What the folder is to hold, by the versions that its manifest names, if that is whole.
 
     Raises FolderError where its config gives another dataset here.
     """
-    spec = dataset_of(rollout, root, {}, identity["fingerprint"])
+    spec = dataset_of(source, root, {}, identity["fingerprint"])
     told = folder.told_differences(identity, spec.identity, {}, {})
     if told or (manifest and manifest.fields != spec.fields):
         raise FolderError(f"{root}: its config gives other videos here than it holds: {told or 'their fields differ'}")
@@ -255,7 +238,7 @@ def _staging(root: Place) -> Iterator[Path]:
 
 
 def _made_again(
-    rollout: Rollout,
+    source: VideoSource,
     spec: DatasetSpec,
     stage: Path,
     todo: Sequence[Shard],
@@ -267,7 +250,7 @@ def _made_again(
     for name in ("shards", f"{RECORDS}"):
         (stage / name).mkdir(parents=True)
     staged_spec = dataclasses.replace(spec, root=stage)
-    make(rollout, staged_spec, list(todo), say)
+    make(source, staged_spec, list(todo), say)
     staged = read_records(staged_spec, stage)
     versions = devices.versions()
     same_codecs = manifest is None or all(manifest.producer.get(key) == versions[key] for key in CODECS)

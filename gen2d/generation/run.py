@@ -6,7 +6,7 @@ import numbers
 import os
 import shlex
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,12 +17,12 @@ from gen2d.core.progress import progress, stopping_on_sigterm
 from gen2d.dataset import folder as shards
 from gen2d.dataset.spec import SPLIT, DatasetSpec, Shard, mine
 from gen2d.generation.complete import complete
-from gen2d.generation.encoder import Encoder, batches, threads_for
+from gen2d.generation.encoder import Encoder, shard_ranges, threads_for
 from gen2d.generation.warm_up import warm_up
 from gen2d.generation.writers import ShardWriters
 from gen2d.programs import devices
 from gen2d.programs.fingerprint import fingerprint, sources
-from gen2d.programs.rollout import Rollout
+from gen2d.programs.source import VideoSource
 from gen2d.records.keys import MAX_VIDEOS
 from gen2d.storage.paths import Network, Place, place, shown
 
@@ -82,12 +82,12 @@ def generate(
     out = place(out, network) if out is not None else Path("datasets") / config.name
     remember(config.copies.values())
     on = devices.prepare(device)
-    with contextlib.closing(Rollout(config, on)) as rollout:
-        dataset = dataset_of(rollout, out, counts, fingerprint(rollout))
+    with contextlib.closing(VideoSource(config, on)) as source:
+        dataset = dataset_of(source, out, counts, fingerprint(source.rollout))
         remaining = [shard for shard in shards.open_folder(dataset, overwrite) if shard.split in counts]
         todo = mine(remaining, *worker)
         began, made = time.perf_counter(), sum(shard.count for shard in todo)
-        size = make(rollout, dataset, todo, say)
+        size = make(source, dataset, todo, say)
     is_complete = complete(dataset)
     seconds = time.perf_counter() - began
     if todo:
@@ -104,20 +104,6 @@ def _counts(config: Config, n: int, split: str | None) -> dict[str, int]:
     return {own.name: own.videos or n for own in config.splits} or {"train": n}
 
 
-def rollouts_of(rollout: Rollout, splits: Iterable[str]) -> Iterator[tuple[Rollout, set[str]]]:
-    """The programs that make these splits, each with its splits: one may have a look of its own, whose programs last
-    until the next."""
-    lots: dict[Config, set[str]] = {}
-    for split in splits:
-        lots.setdefault(rollout.config.of_split(split), set()).add(split)
-    for own, lot in lots.items():
-        if own == rollout.config:
-            yield rollout, lot
-        else:
-            with contextlib.closing(Rollout(own, rollout.devices)) as other:
-                yield other, lot
-
-
 def _check_run(n: Any, split: str | None, worker: tuple[int, int], overwrite: bool) -> int:
     """n as an int, if all of it is possible."""
     if isinstance(n, bool) or not isinstance(n, numbers.Integral) or not 1 <= int(n) <= MAX_VIDEOS:
@@ -131,46 +117,47 @@ def _check_run(n: Any, split: str | None, worker: tuple[int, int], overwrite: bo
     return int(n)
 
 
-def dataset_of(rollout: Rollout, out: Place, counts: Mapping[str, int], fingerprint: Mapping[str, Any]) -> DatasetSpec:
+def dataset_of(
+    source: VideoSource, out: Place, counts: Mapping[str, int], fingerprint: Mapping[str, Any]
+) -> DatasetSpec:
     """What the folder `out` is to hold, of videos that programs with this fingerprint make."""
-    config = rollout.config
+    config, schema = source.config, source.schema
     return DatasetSpec(
         root=out,
         name=config.name,
-        fields=rollout.fields,
-        sizes=rollout.sizes,
+        fields=schema.fields,
+        sizes=schema.sizes,
         seed=config.seed,
         config=config.recipe(),
         config_text=config.recipe_text(),
         producer={**devices.versions(), "sources": sources(), "fingerprint": fingerprint},
         splits=counts,
-        videos_per_shard=rollout.videos_per_shard,
+        videos_per_shard=source.rollout.videos_per_shard,
         codec=config.storage.codec,
         chunk_frames=config.storage.chunk_frames,
         fps=config.video.fps,
-        constants=rollout.constants,
+        constants=schema.constants,
         conventions=CONVENTIONS,
         command="python -m gen2d --config config.yaml",
         copies={place: config.copies[name] for place, name in own_files(config.plain()).items()},
     )
 
 
-def make(rollout: Rollout, dataset: DatasetSpec, todo: list[Shard], say: Callable[[str], None]) -> int:
+def make(source: VideoSource, dataset: DatasetSpec, todo: list[Shard], say: Callable[[str], None]) -> int:
     """The bytes written for these shards, which are done then."""
-    lots = rollouts_of(rollout, [shard.split for shard in todo])
-    return sum(_make(own, dataset, [shard for shard in todo if shard.split in lot], say) for own, lot in lots)
+    sources = source.of_splits(shard.split for shard in todo)
+    return sum(_make(own, dataset, [shard for shard in todo if shard.split in splits], say) for own, splits in sources)
 
 
-def _make(rollout: Rollout, dataset: DatasetSpec, todo: list[Shard], say: Callable[[str], None]) -> int:
-    encoder, writers = Encoder(rollout, dataset, threads_for(devices.cores())), ShardWriters(dataset)
-    work = batches(todo, rollout.batch_size)
-    size = 0
+def _make(source: VideoSource, dataset: DatasetSpec, todo: list[Shard], say: Callable[[str], None]) -> int:
+    encoder, writers = Encoder(source, dataset, threads_for(devices.cores())), ShardWriters(dataset)
+    ranges, size = shard_ranges(todo), 0
     with stopping_on_sigterm(say):  # also while it cleans up: then a second signal ends the process
         try:
             count = sum(shard.count for shard in todo)
-            warm_up(rollout, encoder, work, count, say)
+            warm_up(source, encoder, ranges, count, say)
             with progress(count, say) as advance:
-                for shard, block in encoder.blocks(work):
+                for shard, block in encoder.blocks(ranges):
                     writers.put(shard, block)
                     size += block.nbytes
                     advance(len(block))

@@ -1,7 +1,7 @@
 """Before a run: compile, measure a slice, estimate, and refuse what cannot be."""
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -12,27 +12,29 @@ from gen2d.core.humanize import in_bytes, in_time
 from gen2d.dataset import folder as shards
 from gen2d.dataset.block import Block
 from gen2d.dataset.spec import DatasetSpec
-from gen2d.generation.encoder import Encoder, EncodeTask, encode_tasks, threads_for
+from gen2d.generation.encoder import Encoder, threads_for
 from gen2d.programs import devices
 from gen2d.programs.rollout import DeviceBatch, Rollout, divisor
+from gen2d.programs.source import Request, VideoRange, VideoSlice, VideoSource
 
 
 class DeviceMemoryError(UserError):
     """A batch that does not fit the device."""
 
 
-def warm_up(rollout: Rollout, encoder: Encoder, work: list, count: int, say: Callable[[str], None]) -> None:
+def warm_up(
+    source: VideoSource, encoder: Encoder, ranges: Sequence[VideoRange], count: int, say: Callable[[str], None]
+) -> None:
     """Compiles, measures a slice, says how much and how long it will be, and refuses what the disk cannot hold."""
+    rollout = source.rollout
     name = f"{len(rollout.devices)} {rollout.devices[0].platform} device{'s' if len(rollout.devices) > 1 else ''}"
     say(f"Compiling for {name} (seconds; up to a minute for dozens of objects; kept for the next run) ...")
     began = time.perf_counter()
-    split, first, pieces = work[0]
-    firsts = [first] * len(rollout.devices)
-    batch = _fitted(lambda: jax.block_until_ready(rollout.begin(split, firsts)))
+    request = next(source.requests(ranges))
+    batch = _fitted(lambda: jax.block_until_ready(rollout.start(request.split, request.numbers)))
     _fit_slice(rollout, batch)
     compiled = time.perf_counter() - began
-    job = encode_tasks(firsts, [pieces, *([] for _ in firsts[1:])], rollout.batch_size, rollout.slice)[0]
-    block, seconds = _measured(rollout, encoder, batch, split, firsts, job)
+    block, seconds = _measured(source, encoder, batch, next(source.requests(ranges)))
     size, duration = block.nbytes / len(block) * count, seconds * count
     say(f"Compiled in {compiled:.1f} s. {count:,} videos will take about {in_bytes(size)} and {in_time(duration)}.")
     _warn_of_ratio(encoder.dataset, block, say)
@@ -45,7 +47,7 @@ def warm_up(rollout: Rollout, encoder: Encoder, work: list, count: int, say: Cal
 
 
 def _fit_slice(rollout: Rollout, batch: DeviceBatch) -> None:
-    """Returns nothing; compiles the drawing, of fewer videos at once where the device has no memory for more."""
+    """Compiles the rendering, of fewer videos at once where the device has no memory for more."""
     while True:
         try:
             jax.block_until_ready(rollout.draw(batch, 0, rollout.slice))
@@ -56,16 +58,15 @@ def _fit_slice(rollout: Rollout, batch: DeviceBatch) -> None:
             rollout.slice = divisor(rollout.batch_size, rollout.slice // 2)
 
 
-def _measured(
-    rollout: Rollout, encoder: Encoder, batch: DeviceBatch, split: str, firsts: list[int], job: EncodeTask
-) -> tuple[Block, float]:
+def _measured(source: VideoSource, encoder: Encoder, batch: DeviceBatch, request: Request) -> tuple[Block, float]:
     """The first block, and about how many seconds a video takes."""
-    marks = [time.perf_counter()]
-    jax.block_until_ready(rollout.begin(split, firsts))
+    rollout, part, marks = source.rollout, request.parts[0], [time.perf_counter()]
+    jax.block_until_ready(rollout.start(request.split, request.numbers))
     marks.append(time.perf_counter())
-    drawn = jax.block_until_ready(rollout.draw(batch, job.start, rollout.slice))
+    rendered = jax.block_until_ready(rollout.draw(batch, part.start, rollout.slice))
     marks.append(time.perf_counter())
-    block = encoder.encode(job, rollout.host_columns(batch)[0], drawn[0])
+    columns = rollout.host_columns(batch)
+    block = encoder.encode(VideoSlice(part, columns[part.device], rendered[part.device], source.schema.host_columns))
     marks.append(time.perf_counter())
     count, threads = len(rollout.devices), threads_for(devices.cores())
     videos = rollout.batch_size * count, rollout.slice * count, len(block) * threads

@@ -27,7 +27,8 @@ from gen2d.physics.params import solver_params
 from gen2d.physics.simulate import simulate, substeps
 from gen2d.programs import render as render_module
 from gen2d.programs.recipe import Trust, config_of
-from gen2d.programs.rollout import Rollout, save_at
+from gen2d.programs.rollout import save_at
+from gen2d.programs.source import VideoSource
 from gen2d.records import axes
 from gen2d.records import keys as keys_module
 from gen2d.records.axes import Array
@@ -243,19 +244,8 @@ def _compiled(program: Callable, settings: _Settings) -> Callable:
 
 
 def _again(ds: Dataset, config: Config, numbers: np.ndarray) -> dict[str, Array]:
-    """Videos made from their keys again, as they were made: what blurs them is not stored."""
-    batch_size = ds.manifest.fingerprint["batch_size"]
-    found: dict[str, list[Array]] = {}
-    order = np.argsort(numbers, kind="stable")
-    own_lanes, pictures = (
-        load_config(config, [f"storage.batch_size={batch_size}"]),
-        _compiled(_pictures, _Settings(config, config)),
-    )
-    with contextlib.closing(Rollout(own_lanes, jax.devices()[:1])) as rollout:
-        for first in sorted({int(number) // batch_size * batch_size for number in numbers}):
-            batch = rollout.begin(ds.options.split, [first])
-            own = numbers[order][(numbers[order] >= first) & (numbers[order] < first + batch_size)] - first
-            stages = jax.tree.map(lambda a, own=own: a[own], batch.stages)
-            for name, array in pictures(stages).items():
-                found.setdefault(name, []).append(array)
-    return {name: jnp.concatenate(parts)[np.argsort(order)] for name, parts in found.items()}
+    """Videos simulated from their keys again, as they were: what blurs them is not stored."""
+    config = load_config(config, [f"storage.batch_size={ds.manifest.fingerprint['batch_size']}"])
+    with contextlib.closing(VideoSource(config, jax.devices()[:1])) as source:
+        names = ["frames", *annotations.fields(config.annotations)]
+        return {name: jnp.asarray(values) for name, values in source.videos(ds.options.split, numbers, names).items()}

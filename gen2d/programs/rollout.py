@@ -19,27 +19,22 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-from gen2d import annotations
-from gen2d.captions import caption
 from gen2d.config import quality
 from gen2d.config.config import Config
 from gen2d.core import enums
-from gen2d.core.enums import JOINT_KINDS
-from gen2d.core.schema import Field
 from gen2d.physics import lyapunov
 from gen2d.physics.params import solver_params
 from gen2d.physics.simulate import SaveAt, simulate, substeps
 from gen2d.programs import render
+from gen2d.programs.schema import VideoSchema
 from gen2d.records import axes as axes_module
 from gen2d.records import keys as keys_module
 from gen2d.records import layout as layout_module
-from gen2d.records import scene as scene_module
-from gen2d.records import trajectory
 from gen2d.records.axes import Array
 from gen2d.records.scene import Scene, State
 from gen2d.records.trajectory import Trajectory
 from gen2d.renderers.plan import RenderScene
-from gen2d.sampling import rejection, sampler
+from gen2d.sampling import rejection
 from gen2d.sampling.builder import SampledScene
 from gen2d.sampling.matched import sets
 from gen2d.sampling.matched import simulate as simulate_module
@@ -48,7 +43,7 @@ from gen2d.sampling.sampler import FactorChange, Sampler
 SLICE_BYTES = 16 * 2**20  # of raw frames drawn at once; larger buffers cost page faults
 SHARD_BYTES = 2**30  # of raw frames in a shard
 SHARD_VIDEOS = 1024  # at most, unless the config says otherwise
-LANES, ROWS = 512, 2**20  # videos simulated at once, and pairs that can meet in all of them; 300 bytes for each
+BATCH_SIZE, PAIRS = 512, 2**20  # videos simulated at once, and pairs that can meet in all of them; 300 bytes for each
 VIDEOS = PartitionSpec("videos")
 
 
@@ -79,16 +74,16 @@ class Rollout:
         self.sampler, self.wanted = Sampler(config), quality.ranges(config.quality)
         self.plan = render.plan_of(config, self.layout)
         self.steps = substeps(video.fps, config.physics.substeps, config.physics.max_step)
-        self.keep = save_at(config, self.layout)
+        self.save_at = save_at(config, self.layout)
+        self.schema = VideoSchema(config, self.layout, self.plan, self.save_at, self.sampler)
         frame_bytes = video.frames * video.height * video.width * 3
         auto = min(SHARD_VIDEOS, _power_of_two(SHARD_BYTES // frame_bytes))
         self.videos_per_shard = config.storage.videos_per_shard or auto
         moving = sum(run.count for run in self.layout.runs if run.kind == enums.DYNAMIC)
         rows = moving * (self.layout.slots - moving) + moving * (moving - 1) // 2
-        together = min(LANES, _power_of_two(ROWS // max(rows, 1)))
-        self.batch_size = config.storage.batch_size or min(
-            together, auto
-        )  # not the shard size: that must not change a video
+        together = min(BATCH_SIZE, _power_of_two(PAIRS // max(rows, 1)))
+        # The shard size must not change a video.
+        self.batch_size = config.storage.batch_size or min(together, auto)
         self.slice = divisor(self.batch_size, max(1, SLICE_BYTES // frame_bytes))
         self.mesh = Mesh(np.array(self.devices), ("videos",))
         self._draws: dict[int, Any] = {}  # by how many videos are drawn together
@@ -103,88 +98,10 @@ class Rollout:
     def _shared(self, function: Any, specs: tuple) -> Any:
         return jax.shard_map(function, mesh=self.mesh, in_specs=specs, out_specs=VIDEOS, check_vma=False)
 
-    @property
-    def sizes(self) -> dict[str, int]:
-        """The sizes of the lettered axes of every field."""
-        video = self.config.video
-        own = {"T": video.frames, "K": self.layout.slots, "H": video.height, "W": video.width}
-        own |= {"C": self.keep.contacts} if self.keep.contacts else {}
-        own |= {"J": len(self.layout.joints)} if self.layout.joints else {}
-        corners = max(run.vertices for run in self.layout.runs)
-        own |= {"V": corners} if corners else {}
-        own |= annotations.sizes(self.config.annotations, self.plan)
-        return own | self.sampler.lengths
-
-    @property
-    def fields(self) -> dict[str, Field]:
-        """Every stored field."""
-        scene = jax.eval_shape(self._scene, jax.eval_shape(lambda: jax.random.key(0)))
-        made = [scene_module.State, trajectory.Quality, *([trajectory.Contacts] if self.keep.contacts else [])]
-        made += [trajectory.Energy] if self.keep.energy else []
-        fields = {name: field for record in made for name, (_, field) in axes_module.described(record).items()}
-        fields |= axes_module.fields_of(scene)
-        if not self.keep.energy:
-            del fields["quality/energy_residual"]
-        for name in sets.omitted_fields(self.config.matched):
-            del fields[name]
-        if self.plan.frames:
-            fields["frames"] = Field("uint8", "n T H W 3", "sRGB", "the video")
-        fields |= annotations.fields(self.config.annotations) | self.word_fields
-        if self.config.annotations.lyapunov:
-            fields |= lyapunov.FIELDS
-        fields["index"] = Field("int64", "n", "1", "the video's number in its split")
-        fields["time"] = Field("float64", "T", "s", "of each frame; frame 0 is the initial state")
-        if self.layout.joints:
-            fields["joints/kind"] = Field("uint8", "J", "1", f"index into {', '.join(JOINT_KINDS)}")
-            fields |= {f"joints/{side}": Field("int16", "J", "object", f"slot of object {side}") for side in "ab"}
-        fields["quality/rejected_draws"] = Field("int32", "n", "1", "places drawn again as they did not fit")
-        fields |= {"quality/rejected_videos": rejection.FIELD} if self.wanted else {}
-        for name, axes, unit, meaning in CAMERA:
-            fields[f"camera/{name}"] = Field("float32", axes, unit, meaning)
-        fields |= sampler.fields(self.config) | sets.fields(self.config.matched)
-        return dict(sorted(fields.items()))
-
-    @property
-    def constants(self) -> dict[str, np.ndarray]:
-        """The stored fields that are one for all videos."""
-        if not self.layout.joints:
-            return {"time": self.time}
-        ties = self.layout.joints
-        slots = {f"joints/{side}": np.array([getattr(tie, side) for tie in ties], np.int16) for side in "ab"}
-        return {
-            "time": self.time,
-            "joints/kind": np.array([JOINT_KINDS.index(tie.kind) for tie in ties], np.uint8),
-            **slots,
-        }
-
-    @property
-    def word_fields(self) -> dict[str, Field]:
-        """Those fields that are made on the host."""
-        longest = max((len(split.name) for split in self.config.splits), default=0)
-        found = {"split": Field(f"S{longest}", "n", "", "the split that the video belongs to")} if longest else {}
-        spoken = self.config.annotations.captions
-        return found | (caption.fields(self.layout.slots, self.config.video.frames) if spoken else {})
-
-    def host_fields(self, columns: dict[str, np.ndarray], split: str) -> dict[str, np.ndarray]:
-        """The fields of some videos of a split that are made on the host, from their others there."""
-        count = len(columns["objects/present"])
-        fields = self.word_fields
-        named = {"split": np.full(count, split.encode(), fields["split"].dtype)} if self.config.splits else {}
-        return named | (caption.caption_fields(columns, self.config.video) if self.config.annotations.captions else {})
-
-    @property
-    def time(self) -> np.ndarray:
-        """Of each frame, in seconds: t / fps exactly."""
-        return np.arange(self.config.video.frames, dtype=np.float64) / self.config.video.fps
-
-    def begin(self, split: str, firsts: Sequence[int]) -> DeviceBatch:
-        """Starts `batch_size` videos on each device, from these numbers on; one number per device."""
-        numbers = np.concatenate([np.arange(first, first + self.batch_size, dtype=np.uint32) for first in firsts])
-        return self.begin_with(split, numbers)
-
-    def begin_with(self, split: str, numbers: np.ndarray) -> DeviceBatch:
-        """Starts the videos with these numbers, uint32, `batch_size` for each device."""
+    def start(self, split: str, numbers: np.ndarray) -> DeviceBatch:
+        """The batch of the videos of a split with these numbers [devices * batch_size] uint32, being simulated."""
         root, row = keys_module.seed_words(self.config.seed, zlib.crc32(split.encode())), self.config.row(split)
+        numbers = numbers.astype(np.uint32)
         given = self.sampler.combination(row, root, numbers)
 
         def make(rows: np.ndarray, attempts: np.ndarray) -> DeviceBatch:
@@ -214,8 +131,8 @@ class Rollout:
         return batch._replace(columns=batch.columns | {quality.VISIBILITY: self._shares(seen)})
 
     def draw(self, batch: DeviceBatch, start: int, count: int) -> list[dict[str, Array]]:
-        """Starts to draw `count` videos of each device, from lane `start` on: for each device their frames
-        [count, T, H, W, 3] and what is told of their pixels, by their stored names.
+        """For each device the frames [count, T, H, W, 3] and annotations of `count` of its videos, from row `start` on,
+        by their stored names, being rendered.
 
         Each device runs a program of its own: compiled for several at once, another rounding would differ.
         """
@@ -228,7 +145,7 @@ class Rollout:
             return list(pool.map(draw, own))
 
     def close(self) -> None:
-        """Returns nothing; lets go of the compiled programs, which jax would keep, thousands of memory maps each."""
+        """Frees the compiled programs, which jax would keep, thousands of memory maps each."""
         for program in (self._simulate, *self._draws.values()):
             program.clear_cache()
 
@@ -293,18 +210,14 @@ class Rollout:
 
     def _run(self, scene: Scene, state: State) -> Trajectory:
         """What becomes of these starts; videos first."""
-        made = self._simulated(axes_module.to_device(scene), axes_module.to_device(state), self.keep)
+        made = self._simulated(axes_module.to_device(scene), axes_module.to_device(state), self.save_at)
         between = None if made.between is None else _videos_first(made.between)
         return dataclasses.replace(axes_module.to_stored(dataclasses.replace(made, between=None)), between=between)
 
     def _growth(self, keys: Array, own: SampledScene) -> Array:
         again = functools.partial(self._simulated, keep=SaveAt())
         starts = axes_module.to_device(own.scene), axes_module.to_device(own.state)
-        return lyapunov.lyapunov_exponent(keys, *starts, again, float(self.time[-1]))
-
-    def _scene(self, key: Array) -> Scene:
-        """A scene of a video, for its shape."""
-        return self.sampler.sampled(key, given=jnp.zeros(len(self.sampler.gridded)))[1].scene
+        return lyapunov.lyapunov_exponent(keys, *starts, again, float(self.schema.time[-1]))
 
     def host_columns(self, batch: DeviceBatch) -> list[dict[str, np.ndarray]]:
         """For each device its columns as NumPy arrays; waits until they are there."""
@@ -317,13 +230,6 @@ class Rollout:
 def _videos_first(between: State) -> State:
     """States [T - 1, steps, (2,) K, n] as [n, T - 1, steps, K(, 2)]."""
     return jax.tree.map(lambda x: jnp.moveaxis(jnp.moveaxis(x, -1, 0), -1, 3), between)
-
-
-CAMERA = (
-    ("center", "n T 2", "m", "world point in the middle of the frame"),
-    ("scale", "n T", "px/m", "pixels per metre"),
-    ("angle", "n T", "rad", "of the camera, counter-clockwise"),
-)
 
 
 def _pieces(array: Array) -> list[Any]:

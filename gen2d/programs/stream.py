@@ -10,6 +10,7 @@ import dataclasses
 import functools
 import importlib
 import itertools
+from collections import deque
 from collections.abc import Generator, Iterator, Mapping, Sequence, Set
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -26,8 +27,8 @@ from gen2d.loading.dataloader import without_text
 from gen2d.loading.dataset import ViewOptions, chosen_fields
 from gen2d.loading.epochs import EpochSampler, GlobalBatch, one_of, shuffled
 from gen2d.programs import devices
-from gen2d.programs.batches import check_placed
-from gen2d.programs.rollout import DeviceBatch, Rollout, divisor
+from gen2d.programs.rollout import DeviceBatch, divisor
+from gen2d.programs.source import Request, VideoSource
 from gen2d.records.axes import Array
 from gen2d.records.keys import MAX_VIDEOS
 
@@ -70,8 +71,8 @@ def stream(
     if seed is not None:
         config = dataclasses.replace(config, seed=checked_seed(seed))
     one_of("to", to, tuple(_DELIVER))
-    rollout = _rollout(config.of_split(split), device)
-    names = chosen_fields(config.name, rollout.fields, fields)
+    source = _source(config.of_split(split), device)
+    names = chosen_fields(config.name, source.schema.fields, fields)
     frames = config.frames_of(split)
     options = ViewOptions(split, names, window, stride, start, layout, dtype, "none").within(
         frames, config.video.frames
@@ -80,13 +81,13 @@ def stream(
         raise ConfigError(f"n is {n}, but must be from 1 to 2**32 - 1, or None")
     count = MAX_VIDEOS if n is None else n
     walk = EpochSampler(count, batch_size, order_seed, shuffle, epochs, rank, world_size, drop_last)
-    return Stream(rollout, options, walk, batch_size, to, frames)
+    return Stream(source, options, walk, batch_size, to, frames)
 
 
 @functools.lru_cache(maxsize=4)
-def _rollout(config: Config, device: str) -> Rollout:
-    """The programs of a config, which are compiled when they first run."""
-    return Rollout(config, devices.prepare(device)[:1])
+def _source(config: Config, device: str) -> VideoSource:
+    """The videos of a config; its programs are compiled when they first run."""
+    return VideoSource(config, devices.prepare(device)[:1])
 
 
 class _Cell(NamedTuple):
@@ -103,11 +104,11 @@ class Stream:
     """Batches without end, or of some epochs, from wherever the state says."""
 
     def __init__(
-        self, rollout: Rollout, options: ViewOptions, walk: EpochSampler, batch_size: int, to: str, frames: int
+        self, source: VideoSource, options: ViewOptions, walk: EpochSampler, batch_size: int, to: str, frames: int
     ) -> None:
-        self.rollout, self.options, self.walk, self.to, self._frames = rollout, options, walk, to, frames
-        self.fields = {name: rollout.fields[name] for name in options.fields}
-        self.cell = cell_size(batch_size, rollout.batch_size)
+        self.source, self.options, self.walk, self.to, self._frames = source, options, walk, to, frames
+        self.fields = {name: source.schema.fields[name] for name in options.fields}
+        self.cell = cell_size(batch_size, source.rollout.batch_size)
         self._view = jax.jit(self._viewed)
 
     def __len__(self) -> int:
@@ -127,8 +128,10 @@ class Stream:
 
     def _batches(self) -> Generator[Arrays, None, None]:
         parts: list[Arrays] = []
-        for cells, batch in self._simulated():
-            for place, cell in enumerate(cells):
+        cells: deque[_Cell] = deque()
+        for _, batch in self.source.batches(self._requests(cells), ahead=1):  # the next runs while this is rendered
+            for place in range(min(len(cells), self.source.rollout.batch_size // self.cell)):
+                cell = cells.popleft()
                 parts.append(self._drawn(batch, place * self.cell, cell))
                 if cell.ends:
                     made = parts[0] if len(parts) == 1 else {k: _joined([p[k] for p in parts]) for k in parts[0]}
@@ -149,28 +152,18 @@ class Stream:
                 held = np.minimum(held, len(numbers) - 1)
                 yield _Cell(step, end - begin, numbers[held].astype(np.uint32), first[held], end == real)
 
-    def _simulated(self) -> Iterator[tuple[list[_Cell], DeviceBatch]]:
-        """The cells in groups that are simulated together; the next is begun before one is drawn."""
-        cells, number = self._cells(), self.rollout.batch_size // self.cell
-        before = None
+    def _requests(self, requested: deque[_Cell]) -> Iterator[Request]:
+        """The cells in groups that are simulated together; those requested are appended to `requested`."""
+        cells, number = self._cells(), self.source.rollout.batch_size // self.cell
         while group := list(itertools.islice(cells, number)):
-            held = [group[min(i, len(group) - 1)].numbers for i in range(number)]
-            numbers = np.concatenate(held)
-            after = group, numbers, self.rollout.begin_with(self.options.split, numbers)
-            if before is not None:
-                yield self._checked(*before)
-            before = after
-        if before is not None:
-            yield self._checked(*before)
-
-    def _checked(self, cells: list[_Cell], numbers: np.ndarray, batch: DeviceBatch) -> tuple[list[_Cell], DeviceBatch]:
-        check_placed(self.rollout.config.scene, np.asarray(batch.placed), numbers)
-        return cells, batch
+            requested.extend(group)
+            numbers = np.concatenate([group[min(i, len(group) - 1)].numbers for i in range(number)])
+            yield Request(self.options.split, numbers, np.ones(len(numbers), bool))
 
     def _drawn(self, batch: DeviceBatch, lane: int, cell: _Cell) -> Arrays:
         """A cell's videos as they are delivered."""
         found = {name: batch.columns[name] for name in self.fields if name in batch.columns}
-        told = self.fields.keys() & self.rollout.word_fields.keys()
+        told = self.fields.keys() & self.source.schema.host_fields.keys()
         if self.fields.keys() - batch.columns.keys() - told - {"index"}:
             found |= self._pictures(batch, lane)
         numbers, starts = jnp.asarray(cell.numbers.astype(np.int32)), jnp.asarray(cell.starts, jnp.int32)
@@ -180,15 +173,15 @@ class Stream:
 
     def _words(self, batch: DeviceBatch, lane: int, wanted: Set[str]) -> Arrays:
         """What is told of a cell, on the host; text stays there."""
-        columns = self.rollout.host_columns(batch)[0]
+        columns = self.source.rollout.host_columns(batch)[0]
         own = {name: column[lane : lane + self.cell] for name, column in columns.items()}
-        told = self.rollout.host_fields(own, self.options.split)
+        told = self.source.schema.host_columns(own, self.options.split)
         return {name: v if self.fields[name].is_text else jnp.asarray(v) for name, v in told.items() if name in wanted}
 
     def _pictures(self, batch: DeviceBatch, lane: int) -> Arrays:
         """What is drawn of a cell, in slices that fit the cache."""
-        size = divisor(self.cell, self.rollout.slice)
-        parts = [self.rollout.draw(batch, start, size)[0] for start in range(lane, lane + self.cell, size)]
+        size = divisor(self.cell, self.source.rollout.slice)
+        parts = [self.source.rollout.draw(batch, start, size)[0] for start in range(lane, lane + self.cell, size)]
         wanted = self.fields.keys() & parts[0].keys()
         return {name: jnp.concatenate([part[name] for part in parts]) for name in wanted}
 

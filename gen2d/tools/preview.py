@@ -74,19 +74,12 @@ def _drawn(source: str, videos: int, seed: int | None, overrides: Sequence[str])
 
     from gen2d.config.config import checked_seed, load_config
     from gen2d.programs import devices
-    from gen2d.programs.batches import check_placed
-    from gen2d.programs.rollout import Rollout, per_device
+    from gen2d.programs.source import VideoSource
 
     config = load_config(source, [*overrides, "storage.frames=video"])
     if seed is not None:
         config = dataclasses.replace(config, seed=checked_seed(seed))
     split = config.training.name if config.training else "train"
-    frames = []
-    with contextlib.closing(Rollout(config.of_split(split), devices.prepare()[:1])) as rollout:
-        for first in range(0, videos, rollout.batch_size):
-            batch = rollout.begin(split, [first])
-            placed = per_device(batch.placed)[0][: videos - first]
-            check_placed(config.scene, placed, np.arange(first, first + len(placed)))
-            for start in range(0, min(rollout.batch_size, videos - first), rollout.slice):
-                frames.append(np.asarray(rollout.draw(batch, start, rollout.slice)[0]["frames"]))
-    return config.name, np.concatenate(frames)[:videos], config.video.fps
+    with contextlib.closing(VideoSource(config.of_split(split), devices.prepare()[:1])) as videos_of:
+        frames = videos_of.videos(split, range(videos), ("frames",))["frames"]
+    return config.name, frames, config.video.fps

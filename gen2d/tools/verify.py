@@ -163,12 +163,12 @@ def _remade(root: Place, manifest: Manifest, videos: int, seed: int, trust: Sequ
     """What differs in videos made again; raises FolderError, at once, where that cannot be judged here."""
     from gen2d.generation import regenerate  # imports jax
 
-    rollout = regenerate.rollout_of(root, manifest.identity, trust)
-    regenerate.check_fingerprint(root, rollout, manifest.identity)
+    source = regenerate.source_of(root, manifest.identity, trust)
+    regenerate.check_fingerprint(root, source, manifest.identity)
     chosen = chosen_videos(manifest.splits, videos, seed)
     return (
         Problem(f"{shard_path(root, shard)}: {wrong}", shard)
-        for shard, wrong in regenerate.changed_videos(rollout, root, manifest, chosen)
+        for shard, wrong in regenerate.changed_videos(source, root, manifest, chosen)
     )
 
 

@@ -35,7 +35,7 @@ CASES = {
 def simulated():
     """Some videos' fields, and the keys of the videos; their pictures are drawn in several ways."""
     rollout = Rollout(load_config("bouncing.yaml", SMALL), jax.devices()[:1])
-    batch = rollout.begin("train", [0])
+    batch = rollout.start("train", np.arange(rollout.batch_size))
     assert per_device(batch.placed)[0].all()
     words = jnp.asarray(keys_module.seed_words(3, zlib.crc32(b"train")))
     keys = keys_module.video_keys(words, jnp.arange(4, dtype=jnp.uint32))

@@ -80,28 +80,32 @@ def _parts(folder: Path, overrides: Sequence[str], config: str = CONFIG) -> dict
     from gen2d.generation import encoder as encoder_module
     from gen2d.generation.run import dataset_of
     from gen2d.programs import devices
+    from gen2d.programs.source import VideoRange
 
-    rollout = rollout_of(overrides, config)
+    source = source_of(overrides, config)
+    rollout = source.rollout
     sample, simulate, numbers = _physics(rollout)
-    start, batch = sample(numbers), rollout.begin("train", [0] * len(rollout.devices))
+    start, batch = sample(numbers), rollout.start("train", np.tile(np.arange(rollout.batch_size), len(rollout.devices)))
     whole = rollout.videos_per_shard // rollout.batch_size * rollout.batch_size
-    dataset = dataset_of(rollout, folder / "data", {"train": whole}, {})
-    (shard, *_), columns = open_folder(dataset), rollout.host_columns(batch)[0]
-    encoder = encoder_module.Encoder(rollout, dataset, encoder_module.threads_for(devices.cores()))
-    jobs = encoder_module.encode_tasks([0], [[(shard, 0, rollout.batch_size)]], rollout.batch_size, rollout.slice)
-    pictures = [jax.block_until_ready(rollout.draw(batch, job.start, rollout.slice))[0] for job in jobs]
+    dataset = dataset_of(source, folder / "data", {"train": whole}, {})
+    shard, *_ = open_folder(dataset)
+    encoder = encoder_module.Encoder(source, dataset, encoder_module.threads_for(devices.cores()))
+    slices = [jax.block_until_ready(videos) for videos in source.slices([VideoRange("train", 0, rollout.batch_size)])]
 
     def encode() -> list[Any]:
-        return [encoder.encode(job, columns, drawn) for job, drawn in zip(jobs, pictures, strict=True)]
+        return [encoder.encode(videos) for videos in slices]
 
     blocks = encode() * (whole // rollout.batch_size)
 
     def draw() -> None:
-        for job in jobs:
-            jax.block_until_ready(rollout.draw(batch, job.start, rollout.slice))
+        for videos in slices:
+            jax.block_until_ready(rollout.draw(batch, videos.part.start, rollout.slice))
 
     def transfer() -> list[Any]:
-        return [rollout.host_columns(batch), *(np.asarray(array) for drawn in pictures for array in drawn.values())]
+        return [
+            rollout.host_columns(batch),
+            *(np.asarray(array) for videos in slices for array in videos.rendered.values()),
+        ]
 
     return {
         "sampler": (lambda: jax.block_until_ready(sample(numbers)), rollout.batch_size),
@@ -113,13 +117,13 @@ def _parts(folder: Path, overrides: Sequence[str], config: str = CONFIG) -> dict
     }
 
 
-def rollout_of(overrides: Sequence[str] = (), config: str = CONFIG) -> Any:
-    """The compiled programs of the benchmark's or another config, on all devices of this process."""
+def source_of(overrides: Sequence[str] = (), config: str = CONFIG) -> Any:
+    """The videos of the benchmark's or another config, on all devices of this process."""
     from gen2d.config.config import load_config
     from gen2d.programs import devices
-    from gen2d.programs.rollout import Rollout
+    from gen2d.programs.source import VideoSource
 
-    return Rollout(load_config(config, overrides), devices.prepare())
+    return VideoSource(load_config(config, overrides), devices.prepare())
 
 
 def _physics(rollout: Any) -> tuple[Callable, Callable, np.ndarray]:
@@ -148,12 +152,12 @@ def _physics(rollout: Any) -> tuple[Callable, Callable, np.ndarray]:
 
 def steady(folder: Path, videos: int = 4096, turns: int = 3, peer_videos: int = 0) -> Turns:
     """Videos/s of gen2d once it is compiled, first batch to manifest, and of the peer; the cores' use meanwhile."""
-    rollout, used, idle = rollout_of(), [], []
+    source, used, idle = source_of(), [], []
 
     def ours() -> float:
         with tempfile.TemporaryDirectory(dir=folder) as out:
             before, began = _cpu_seconds(), time.perf_counter()
-            make(rollout, videos, Path(out))
+            make(source, videos, Path(out))
             seconds = time.perf_counter() - began
         own, nobody = (after - b for after, b in zip(_cpu_seconds(), before, strict=True))
         used.append(own / seconds / len(os.sched_getaffinity(0)))
@@ -165,17 +169,17 @@ def steady(folder: Path, videos: int = 4096, turns: int = 3, peer_videos: int = 
     return in_turns({"gen2d": ours} | works, turns) | {"used": used[1:], "idle": idle[1:]}
 
 
-def make(rollout: Any, videos: int, out: Path) -> None:
+def make(source: Any, videos: int, out: Path) -> None:
     """Returns nothing; makes a dataset as `gen2d.generate` does, with programs that are compiled already."""
     from gen2d.generation import encoder as encoder_module
     from gen2d.generation import writers as writers_module
     from gen2d.generation.run import dataset_of
     from gen2d.programs import devices
 
-    dataset = dataset_of(rollout, out, {"train": videos}, {})
-    encoder = encoder_module.Encoder(rollout, dataset, encoder_module.threads_for(devices.cores()))
+    dataset = dataset_of(source, out, {"train": videos}, {})
+    encoder = encoder_module.Encoder(source, dataset, encoder_module.threads_for(devices.cores()))
     writers = writers_module.ShardWriters(dataset)
-    for shard, block in encoder.blocks(encoder_module.batches(open_folder(dataset), rollout.batch_size)):
+    for shard, block in encoder.blocks(encoder_module.shard_ranges(open_folder(dataset))):
         writers.put(shard, block)
     writers.finish()
     encoder.close()
@@ -215,13 +219,13 @@ def physics(folder: Path, scene: str, turns: int) -> Turns:
 def render(folder: Path, case: str, turns: int) -> Turns:
     """CPU seconds a frame of gen2d, of OpenCV and of a copy."""
     of = bench_render.CASES[case]
-    return in_turns(bench_render.works(of, rollout_of(of.overrides)), turns)
+    return in_turns(bench_render.works(of, source_of(of.overrides).rollout), turns)
 
 
 def annotated(folder: Path, turns: int) -> Turns:
     """CPU seconds a frame of drawing with each of the annotations, and the bytes of it."""
     asked = {name: [f"annotations.{part}" for part in parts] for name, parts in bench_render.ANNOTATIONS.items()}
-    rollouts = {name: rollout_of((*bench_render.ANNOTATED.overrides, *parts)) for name, parts in asked.items()}
+    rollouts = {name: source_of((*bench_render.ANNOTATED.overrides, *parts)).rollout for name, parts in asked.items()}
     works, sizes = bench_render.annotating(rollouts)
     return in_turns(works, turns) | {f"bytes {name}": [size] for name, size in sizes.items()}
 

@@ -71,7 +71,7 @@ ANNOTATIONS = {
 def works(case: Case, rollout: Any) -> dict[str, Callable[[], float]]:
     """By name what draws, or copies, all frames of a case and returns the CPU seconds of one."""
     cv2.setNumThreads(1)
-    batch = rollout.begin("train", [0] * len(rollout.devices))
+    batch = rollout.start("train", np.tile(np.arange(rollout.batch_size), len(rollout.devices)))
     columns = rollout.host_columns(batch)[0]
     buffer = np.zeros((rollout.slice, FRAMES, case.pixels, case.pixels, 3), np.uint8)
     source, target = (np.full(case.videos * FRAMES * case.frame_bytes, i, np.uint8) for i in range(2))
@@ -87,7 +87,9 @@ def works(case: Case, rollout: Any) -> dict[str, Callable[[], float]]:
 def annotating(rollouts: Mapping[str, Any]) -> tuple[dict[str, Callable[[], float]], dict[str, int]]:
     """By annotation what draws videos with it and returns the CPU seconds of a frame, and the bytes of it a frame."""
     first = next(iter(rollouts.values()))
-    batch = first.begin("train", [0] * len(first.devices))  # annotations change nothing of what is drawn from
+    batch = first.start(
+        "train", np.tile(np.arange(first.batch_size), len(first.devices))
+    )  # annotations change nothing of what is drawn from
     frames = first.config.video.frames
     each = {name: timed(_drawing(rollout, batch), first.batch_size * frames) for name, rollout in rollouts.items()}
     made = {name: rollout.draw(batch, 0, rollout.slice)[0] for name, rollout in rollouts.items()}

@@ -67,7 +67,7 @@ print(json.dumps({{name: work() for name, work in works({case}, Path({str(tmp_pa
 
 
 def test_bounds_counts_whole_videos_only(tmp_path: Path) -> None:
-    bench.make(bench.rollout_of(TINY), 8, tmp_path)
+    bench.make(bench.source_of(TINY), 8, tmp_path)
     found = bench.bounds(tmp_path)
     assert (found["videos"], found["bad"]) == (8, 0)
     assert found["walls"] < 0.25
@@ -126,8 +126,8 @@ SMALL = bench_render.Case(32, 2, 4)
 
 
 def test_opencv_draws_the_pictures_of_gen2d() -> None:
-    rollout = bench.rollout_of(SMALL.overrides)
-    batch = rollout.begin("train", [0] * len(rollout.devices))
+    rollout = bench.source_of(SMALL.overrides).rollout
+    batch = rollout.start("train", np.tile(np.arange(rollout.batch_size), len(rollout.devices)))
     ours, columns = np.asarray(rollout.draw(batch, 0, 4)[0]["frames"])[0], rollout.host_columns(batch)[0]
     theirs = np.empty_like(ours)
     bench_render.drawn(columns, 0, theirs)

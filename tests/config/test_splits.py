@@ -50,7 +50,7 @@ def test_a_dataset_is_the_same_whatever_split_is_made_first(whole, tmp_path):
 
 def test_each_video_says_its_split_and_how_far_outside_it_is(whole):
     for split, count in (("train", 12), ("holes", 9), ("heavier", 3)):
-        videos = gen2d.open(whole, split, fields=("split", "ood_distance/*", "factors/*"))[:]
+        videos = gen2d.open(whole, split, fields=("split", "out_of_distribution", "ood_distance/*", "factors/*"))[:]
         assert videos["split"].tolist() == [split.encode()] * count
         assert (videos["out_of_distribution"] == (split != "train")).all()
         assert (videos["ood_distance/radius"].max(1) > 0).all() == (split == "holes")
@@ -119,7 +119,7 @@ def test_the_study_s_splits_have_nothing_in_common_with_training_and_start_in_vi
 def columns(numbers, **asked):
     """The columns of the training videos with these numbers, a lane each."""
     config = CONFIG | {"quality": asked, "storage": {"batch_size": len(numbers)}}
-    batch = Rollout(load_config(config), devices.prepare("cpu")[:1]).begin_with("train", np.array(numbers, np.uint32))
+    batch = Rollout(load_config(config), devices.prepare("cpu")[:1]).start("train", np.array(numbers))
     return {name: np.asarray(values) for name, values in batch.columns.items()}
 
 

@@ -128,7 +128,7 @@ def repaired(monkeypatch: pytest.MonkeyPatch) -> None:
     def made(rollout: object, root: Path, counts: Mapping[str, int], fingerprint: object) -> DatasetSpec:
         return synthetic.dataset(root, fields=FIELDS, splits=dict(counts))
 
-    monkeypatch.setattr(regenerate, "rollout_of", lambda *_: None)
+    monkeypatch.setattr(regenerate, "source_of", lambda *_: None)
     monkeypatch.setattr(regenerate, "check_fingerprint", lambda *_: None)
     monkeypatch.setattr(regenerate.devices, "versions", lambda: dict.fromkeys(regenerate.CODECS))
     monkeypatch.setattr(regenerate, "dataset_of", made)

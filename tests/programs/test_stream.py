@@ -14,7 +14,7 @@ from tiny import CONFIG, CROWDED, changed
 
 import gen2d
 from gen2d.core.errors import ConfigError
-from gen2d.programs.batches import NoPlaceError
+from gen2d.programs.source import NoPlaceError
 from gen2d.programs.stream import Stream, cell_size
 
 VIDEOS = 22

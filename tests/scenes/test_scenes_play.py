@@ -45,9 +45,9 @@ def rollout_of(name: str) -> Rollout:
 def made(name: str) -> dict[str, np.ndarray]:
     """All that is stored of a batch of a family's videos, and what is seen of each object; [n, ...]."""
     rollout = rollout_of(name)
-    batch = rollout.begin("train", [0])
+    batch = rollout.start("train", np.arange(rollout.batch_size))
     assert per_device(batch.placed)[0].all()
-    columns = rollout.host_columns(batch)[0] | {"time": rollout.time}
+    columns = rollout.host_columns(batch)[0] | {"time": rollout.schema.time}
     if rollout.config.annotations.visibility:
         columns |= rollout.draw(batch, 0, rollout.batch_size)[0]
     return {key: np.asarray(values, float) for key, values in columns.items() if key != "frames"}

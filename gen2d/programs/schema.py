@@ -1,0 +1,113 @@
+"""The fields that a config's videos have, the sizes of their axes, and the fields that the host fills in."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from gen2d import annotations
+from gen2d.captions import caption
+from gen2d.config import quality
+from gen2d.config.config import Config
+from gen2d.core.enums import JOINT_KINDS
+from gen2d.core.schema import Field
+from gen2d.physics import lyapunov
+from gen2d.physics.simulate import SaveAt
+from gen2d.records import axes, scene, trajectory
+from gen2d.records.layout import Layout
+from gen2d.renderers.plan import FramePlan
+from gen2d.sampling import rejection, sampler
+from gen2d.sampling.matched import sets
+
+CAMERA = (
+    ("center", "n T 2", "m", "world point in the middle of the frame"),
+    ("scale", "n T", "px/m", "pixels per metre"),
+    ("angle", "n T", "rad", "of the camera, counter-clockwise"),
+)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class VideoSchema:
+    """Fields, sizes and constants of a config's videos."""
+
+    config: Config
+    layout: Layout
+    plan: FramePlan
+    save_at: SaveAt
+    sampler: sampler.Sampler
+
+    @property
+    def sizes(self) -> dict[str, int]:
+        """The sizes of the lettered axes of every field."""
+        video = self.config.video
+        sizes = {"T": video.frames, "K": self.layout.slots, "H": video.height, "W": video.width}
+        sizes |= {"C": self.save_at.contacts} if self.save_at.contacts else {}
+        sizes |= {"J": len(self.layout.joints)} if self.layout.joints else {}
+        corners = max(group.vertices for group in self.layout.runs)
+        sizes |= {"V": corners} if corners else {}
+        sizes |= annotations.sizes(self.config.annotations, self.plan)
+        return sizes | self.sampler.lengths
+
+    @property
+    def fields(self) -> dict[str, Field]:
+        """Every stored field, by name."""
+        config = self.config
+        records = [scene.State, trajectory.Quality, *([trajectory.Contacts] if self.save_at.contacts else [])]
+        records += [trajectory.Energy] if self.save_at.energy else []
+        fields = {name: field for record in records for name, (_, field) in axes.described(record).items()}
+        fields |= axes.fields_of(jax.eval_shape(self._scene, jax.eval_shape(lambda: jax.random.key(0))))
+        if not self.save_at.energy:
+            del fields["quality/energy_residual"]
+        for name in sets.omitted_fields(config.matched):
+            del fields[name]
+        if self.plan.frames:
+            fields["frames"] = Field("uint8", "n T H W 3", "sRGB", "the video")
+        fields |= annotations.fields(config.annotations) | self.host_fields
+        if config.annotations.lyapunov:
+            fields |= lyapunov.FIELDS
+        fields["index"] = Field("int64", "n", "1", "the video's number in its split")
+        fields["time"] = Field("float64", "T", "s", "of each frame; frame 0 is the initial state")
+        if self.layout.joints:
+            fields["joints/kind"] = Field("uint8", "J", "1", f"index into {', '.join(JOINT_KINDS)}")
+            fields |= {f"joints/{side}": Field("int16", "J", "object", f"slot of object {side}") for side in "ab"}
+        fields["quality/rejected_draws"] = Field("int32", "n", "1", "places drawn again as they did not fit")
+        fields |= {"quality/rejected_videos": rejection.FIELD} if quality.ranges(config.quality) else {}
+        for name, axis_names, unit, meaning in CAMERA:
+            fields[f"camera/{name}"] = Field("float32", axis_names, unit, meaning)
+        fields |= sampler.fields(config) | sets.fields(config.matched)
+        return dict(sorted(fields.items()))
+
+    def _scene(self, key: jax.Array) -> scene.Scene:
+        return self.sampler.sampled(key, given=jnp.zeros(len(self.sampler.gridded)))[1].scene
+
+    @property
+    def constants(self) -> dict[str, np.ndarray]:
+        """The stored fields that are the same for all videos."""
+        joints = self.layout.joints
+        if not joints:
+            return {"time": self.time}
+        slots = {f"joints/{side}": np.array([getattr(joint, side) for joint in joints], np.int16) for side in "ab"}
+        kinds = np.array([JOINT_KINDS.index(joint.kind) for joint in joints], np.uint8)
+        return {"time": self.time, "joints/kind": kinds, **slots}
+
+    @property
+    def time(self) -> np.ndarray:
+        """The time of each frame [T] in s: t / fps exactly."""
+        return np.arange(self.config.video.frames, dtype=np.float64) / self.config.video.fps
+
+    @property
+    def host_fields(self) -> dict[str, Field]:
+        """The fields that are made on the host, from the others."""
+        longest = max((len(split.name) for split in self.config.splits), default=0)
+        fields = {"split": Field(f"S{longest}", "n", "", "the split that the video belongs to")} if longest else {}
+        described = self.config.annotations.captions
+        return fields | (caption.fields(self.layout.slots, self.config.video.frames) if described else {})
+
+    def host_columns(self, columns: dict[str, np.ndarray], split: str) -> dict[str, np.ndarray]:
+        """The host's fields of some videos of a split, from their other fields there."""
+        count, config = len(columns["objects/present"]), self.config
+        found = {}
+        if config.splits:
+            found["split"] = np.full(count, split.encode(), self.host_fields["split"].dtype)
+        return found | (caption.caption_fields(columns, config.video) if config.annotations.captions else {})

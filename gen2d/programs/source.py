@@ -1,0 +1,188 @@
+"""Videos of a config, wherever they go: the one driver behind generating, streaming, rendering, previewing, checking.
+
+A request names the videos of one batch; the source simulates it, checks that every scene was placed, and renders it in
+slices. Batches, slices, idle devices and the fields that the host makes are its own affair.
+"""
+
+import contextlib
+import itertools
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from gen2d.config.config import Config
+from gen2d.config.plugin_options import Plugin
+from gen2d.core.errors import UserError
+from gen2d.programs.rollout import DeviceBatch, Rollout, per_device
+from gen2d.records.axes import Array
+
+
+class NoPlaceError(UserError):
+    """A scene in which the objects do not fit."""
+
+
+class VideoRange(NamedTuple):
+    """Videos `first` to before `stop` of a split; `tag` is whatever the caller knows them by."""
+
+    split: str
+    first: int
+    stop: int
+    tag: Any = None
+
+
+class Part(NamedTuple):
+    """The videos of one range that one device renders together."""
+
+    order: int  # place among all parts, in the order of the ranges and of their videos
+    range: VideoRange
+    device: int
+    first: int  # number of the video in row 0 of the device's batch
+    start: int  # first row of the slice
+    rows: slice  # of the part's videos in the device's batch
+
+    @property
+    def numbers(self) -> np.ndarray:
+        """The videos' numbers in their split, int64."""
+        return np.arange(self.first + self.rows.start, self.first + self.rows.stop)
+
+
+class Request(NamedTuple):
+    """Videos that are simulated together."""
+
+    split: str
+    numbers: np.ndarray  # [devices * batch_size]
+    wanted: np.ndarray  # bool, the same shape: the others fill the batch up
+    parts: Sequence[Part] = ()
+
+
+class VideoSlice(NamedTuple):
+    """Videos of one range that one device has rendered, or is rendering."""
+
+    part: Part
+    columns: dict[str, np.ndarray]  # of the device's whole batch
+    rendered: dict[str, Array]  # of the slice
+    host_columns: Callable[[dict[str, np.ndarray], str], dict[str, np.ndarray]]
+
+    def __len__(self) -> int:
+        return self.part.rows.stop - self.part.rows.start
+
+    def fields(self) -> dict[str, np.ndarray]:
+        """All fields [m, ...] as stored, by name; waits for the device."""
+        rows, start = self.part.rows, self.part.start
+        fields = {name: column[rows] for name, column in self.columns.items()}
+        for name, array in self.rendered.items():
+            fields[name] = np.asarray(array)[rows.start - start : rows.stop - start]
+        fields["index"] = self.part.numbers
+        return fields | self.host_columns(fields, self.part.range.split)
+
+
+class VideoSource:
+    """The videos of one config on some devices; `schema` says which fields they have."""
+
+    def __init__(self, config: Config, devices: Sequence[Any]) -> None:
+        self.config, self.rollout = config, Rollout(config, devices)
+        self.schema = self.rollout.schema
+
+    def close(self) -> None:
+        """Frees the compiled programs."""
+        self.rollout.close()
+
+    def of_splits(self, splits: Iterable[str]) -> Iterator[tuple["VideoSource", set[str]]]:
+        """The sources of these splits, each with its splits.
+
+        A split with a look or physics of its own has a source of its own, which is closed when the next one is taken.
+        """
+        groups: dict[Config, set[str]] = {}
+        for split in splits:
+            groups.setdefault(self.config.of_split(split), set()).add(split)
+        for config, group in groups.items():
+            if config == self.config:
+                yield self, group
+            else:
+                with contextlib.closing(VideoSource(config, self.rollout.devices)) as other:
+                    yield other, group
+
+    def videos(self, split: str, numbers: Any, fields: Sequence[str] | None = None) -> dict[str, np.ndarray]:
+        """The fields [n, ...] of the videos of a split with these numbers [n], all or those named."""
+        unique, inverse = np.unique(np.asarray(numbers), return_inverse=True)
+        ranges = [VideoRange(split, int(number), int(number) + 1) for number in unique]
+        parts: dict[int, dict[str, np.ndarray]] = {}
+        for piece in self.slices(ranges):
+            own = piece.fields()
+            parts[piece.part.order] = {name: own[name] for name in (own if fields is None else fields)}
+        found = [parts[order] for order in sorted(parts)]
+        return {name: np.concatenate([part[name] for part in found])[inverse] for name in found[0]}
+
+    def slices(self, ranges: Sequence[VideoRange]) -> Iterator[VideoSlice]:
+        """The videos of these ranges, as they are rendered: `part.order` says which come first.
+
+        The next batch is started when the caller has taken the last slice of the one before.
+        """
+        for request, batch in self.batches(self.requests(ranges)):
+            columns = self.rollout.host_columns(batch)
+            for start in sorted({part.start for part in request.parts}):
+                rendered = self.rollout.draw(batch, start, self.rollout.slice)
+                for part in request.parts:
+                    if part.start == start:
+                        at = part.device
+                        yield VideoSlice(part, columns[at], rendered[at], self.schema.host_columns)
+
+    def requests(self, ranges: Sequence[VideoRange]) -> Iterator[Request]:
+        """The batches that hold these ranges, as many at a time as there are devices.
+
+        Batch b holds the videos from b * batch_size on, whatever the ranges are, so that every video keeps its row. An
+        idle device gets a copy of the last batch.
+        """
+        size, devices, order = self.rollout.batch_size, len(self.rollout.devices), itertools.count()
+        batches: dict[tuple[str, int], list[VideoRange]] = {}
+        for own in ranges:
+            for first in range(own.first // size * size, own.stop, size):
+                batches.setdefault((own.split, first), []).append(own)
+        for split, group in itertools.groupby(batches, key=lambda batch: batch[0]):
+            firsts = [first for _, first in group]
+            for place in range(0, len(firsts), devices):
+                own = firsts[place : place + devices]
+                parts = [
+                    Part(next(order), of, device, first, start, slice(max(low, start), min(high, start + step)))
+                    for device, first in enumerate(own)
+                    for of in batches[split, first]
+                    for low, high in [(max(of.first - first, 0), min(of.stop - first, size))]
+                    for step in [self.rollout.slice]
+                    for start in range(low // step * step, high, step)
+                ]
+                batch_starts = own + own[-1:] * (devices - len(own))
+                numbers = np.concatenate([np.arange(first, first + size) for first in batch_starts])
+                wanted = np.zeros((devices, size), bool)
+                for part in parts:
+                    wanted[part.device, part.rows] = True
+                yield Request(split, numbers, wanted.ravel(), parts)
+
+    def batches(self, requests: Iterable[Request], ahead: int = 0) -> Iterator[tuple[Request, DeviceBatch]]:
+        """The simulated batches in order, each checked; as many others as `ahead` are started before one is waited for.
+
+        Raises NoPlaceError where the objects of a wanted video found no place.
+        """
+        started: deque[tuple[Request, DeviceBatch]] = deque()
+        for request in requests:
+            started.append((request, self.rollout.start(request.split, request.numbers)))
+            if len(started) > ahead:
+                yield self._checked(*started.popleft())
+        while started:
+            yield self._checked(*started.popleft())
+
+    def _checked(self, request: Request, batch: DeviceBatch) -> tuple[Request, DeviceBatch]:
+        misplaced = request.wanted & ~np.concatenate(per_device(batch.placed))
+        if misplaced.any():
+            raise NoPlaceError(_misplaced(self.config.scene, int(request.numbers[np.argmax(misplaced)])))
+        return request, batch
+
+
+def _misplaced(scene: Plugin, number: int) -> str:
+    options = [f"scene.{name}" for name in getattr(scene.module, "CROWDED_BY", ())]
+    cause = f": it depends on {', '.join(options)}" if options else ""
+    return (
+        f"scene: video {number} could not be placed without overlap in 100 attempts{cause}; ask for fewer or smaller "
+        "objects, or for more room"
+    )
