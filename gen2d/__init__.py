@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from gen2d.loading.dataloader import DataLoader
     from gen2d.loading.dataset import Dataset, open
     from gen2d.loading.mixture import mix
-    from gen2d.programs.redraw import render, simulate_again
+    from gen2d.programs.redraw import render, render_soft, simulate_again
     from gen2d.programs.stream import stream
     from gen2d.space.space import Space
     from gen2d.tools.preview import preview
@@ -51,7 +51,7 @@ _HOMES = {
     "gen2d.loading.dataloader": "DataLoader",
     "gen2d.loading.dataset": "Dataset open",
     "gen2d.loading.mixture": "mix",
-    "gen2d.programs.redraw": "render simulate_again",
+    "gen2d.programs.redraw": "render render_soft simulate_again",
     "gen2d.programs.stream": "stream",
     "gen2d.space.space": "Space",
     "gen2d.tools.preview": "preview",
@@ -62,7 +62,7 @@ _HOME = {name: home for home, names in _HOMES.items() for name in names.split()}
 __all__ = [
     "Config", "ConfigError", "DamagedError", "DataLoader", "Dataset", "Error", "FolderError", "IncompleteError",
     "Space", "UnreachableError", "UntrustedError", "UserError", "export", "generate", "info", "load_config",
-    "mix", "open", "preview", "render", "simulate_again", "stream", "verify",
+    "mix", "open", "preview", "render", "render_soft", "simulate_again", "stream", "verify",
 ]  # fmt: skip
 
 

@@ -4,11 +4,13 @@ Images are uint8 frames, owners (which object each pixel shows most of), or floa
 `paint(image, cover, color, name)`: coverage [I, H, W] from 0 to 1, sRGB colour, and the id of what is painted.
 """
 
+import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from gen2d.records.axes import Array
 from gen2d.records.layout import SlotGroup
@@ -85,13 +87,25 @@ def hard(linear: bool) -> Painter:
     return paint
 
 
-def soft(linear: bool) -> Painter:
-    """What paints on an image of floats, sRGB or linear light."""
+def soft(linear: bool, sigma: float = 0.0) -> Painter:
+    """What paints on an image of floats, sRGB or linear light; `sigma` (px) blurs every coverage."""
 
     def paint(image: Array, cover: Array, color: Array, name: Any) -> Array:
+        cover = blurred(cover, sigma) if sigma else cover
         return image + cover[..., None] * ((to_linear(color) if linear else color) - image)
 
     return paint
+
+
+def blurred(cover: Array, sigma: float) -> Array:
+    """Coverage [I, H, W] under a Gaussian of standard deviation `sigma` (px), to 4 sigma; the edge goes on outside."""
+    reach = math.ceil(4 * sigma)
+    kernel = np.exp(-0.5 * (np.arange(-reach, reach + 1) / sigma) ** 2)
+    kernel = jnp.asarray(kernel / kernel.sum(), cover.dtype)
+    images = jnp.pad(cover, [(0, 0), (reach, reach), (reach, reach)], mode="edge")[:, None]
+    for shape in ((1, 1, -1, 1), (1, 1, 1, -1)):
+        images = jax.lax.conv(images, kernel.reshape(shape), (1, 1), "VALID")
+    return images[:, 0]
 
 
 # ---- What covers all of an image

@@ -74,10 +74,13 @@ def _painted(stage: RenderScene, plan: FramePlan, at: Instants) -> LayerCanvas:
     return moving_objects(canvas, stage, plan, at, hard(plan.linear))
 
 
-def draw_soft(stage: RenderScene, plan: FramePlan) -> Array:
-    """One video's frames [T, H, W, 3] as floats, 0 to 255, without rounding, noise or motion blur: what the others give
-    but for rounding, and differentiable in places, angles, sizes, colours and the camera."""
-    at, paint = stage.instants, soft(plan.linear)
+def draw_soft(stage: RenderScene, plan: FramePlan, sigma: float = 0.0) -> Array:
+    """One video's frames [T, H, W, 3] as floats from 0 to 255, without rounding, noise or motion blur.
+
+    They are differentiable in positions, angles, sizes, colours and the camera. `sigma` (px) blurs the coverage of each
+    object; with 0 the frames are those of `draw` but for rounding.
+    """
+    at, paint = stage.instants, soft(plan.linear, sigma)
     image = background_image(stage, at, plan)
     image = jnp.broadcast_to(to_linear(image) if plan.linear else image, (len(at.angle), *image.shape[1:]))
     image = all_over(image, stage._replace(occluders=None), plan, at, plan.behind, paint)

@@ -1,14 +1,24 @@
 """Several datasets as one."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any
 
 import numpy as np
 
 from gen2d.core.errors import ConfigError
 from gen2d.core.schema import Field
 from gen2d.loading.epochs import shuffled
-from gen2d.loading.protocols import Batch, FieldStats, Numbers, VideoReader, checked_numbers, filled, item, unbatch
+from gen2d.loading.protocols import (
+    Batch,
+    FieldStats,
+    Key,
+    Numbers,
+    Snapshot,
+    VideoReader,
+    checked_numbers,
+    filled,
+    item,
+    unbatch,
+)
 
 
 class ConcatDataset:
@@ -25,7 +35,7 @@ class ConcatDataset:
     def __len__(self) -> int:
         return int(self.sizes.sum())
 
-    def __getitem__(self, key: Any) -> Batch:
+    def __getitem__(self, key: Key) -> Batch:
         """One video, or for a slice or a sequence of numbers several, stacked."""
         return item(self, key)
 
@@ -53,11 +63,11 @@ class ConcatDataset:
         return {name: _together([part[name] for part in parts], self.sizes) for name in parts[0]}
 
     @property
-    def snapshot(self) -> list[Any]:
+    def snapshot(self) -> Snapshot:
         """The snapshot of each dataset, in their order."""
         return [source.snapshot for source in self.datasets]
 
-    def at(self, snapshot: Any) -> "ConcatDataset":
+    def at(self, snapshot: Snapshot) -> "ConcatDataset":
         """The same datasets at earlier snapshots, while these are there."""
         return self if snapshot == self.snapshot else ConcatDataset(at_snapshots(self.datasets, snapshot))
 
@@ -95,7 +105,7 @@ class ConcatDataset:
         return groups_of(np.searchsorted(self.firsts, numbers, side="right") - 1)
 
 
-def at_snapshots(datasets: Sequence[VideoReader], snapshots: Any) -> list[VideoReader]:
+def at_snapshots(datasets: Sequence[VideoReader], snapshots: Snapshot) -> list[VideoReader]:
     """Each dataset at its own of these snapshots. Raises ConfigError where they are not of so many datasets."""
     if not isinstance(snapshots, list) or len(snapshots) != len(datasets):
         count = len(snapshots) if isinstance(snapshots, list) else 1

@@ -9,17 +9,24 @@ import os
 from collections import deque
 from collections.abc import Callable, Generator, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
-from typing import Any
+from typing import TYPE_CHECKING, Any, Generic, Literal, Self, TypeVar, overload
 
 import numpy as np
 
 from gen2d.core.errors import ConfigError
 from gen2d.loading.epochs import EpochSampler, GlobalBatch, one_of
 from gen2d.loading.mixture import Mixture
-from gen2d.loading.protocols import Batch, VideoReader
+from gen2d.loading.protocols import Batch, LoaderState, VideoReader
+
+if TYPE_CHECKING:
+    import jax
+    import torch
 
 
-class DataLoader:
+A = TypeVar("A")  # arrays of numpy, torch or jax
+
+
+class DataLoader(Generic[A]):
     """Batches as dictionaries of arrays, each rank its slice of every global batch of `batch_size * world_size`.
 
     Unless given, rank and world size are those that torchrun sets in the environment, or one process is all.
@@ -29,12 +36,68 @@ class DataLoader:
     follow; after `break` or `load_state_dict` it goes on with the batch after the last one delivered.
 
     `shuffle` is "global" (or True) or False. `drop_last=False` keeps the last videos of an epoch, which fill no global
-    batch: the ranks' shares of these may differ by one, or be empty. `transform` gets each batch
-    in a thread, and returns new arrays each time. `to` is "numpy", "torch" or "jax", which has no 64-bit numbers unless
-    told to; text stays NumPy's bytes in both. `device` is where batches are put, a torch device or its name or a jax
-    device, and `sharding` how jax lays them out on several. `dataset` is of `gen2d.open` or `gen2d.mix`.
+    batch: the ranks' shares of these may differ by one, or be empty. `transform` gets each batch in a thread, and gives
+    new arrays each time. `to` is "numpy", "torch" or "jax", which has no 64-bit numbers by default; text stays NumPy's
+    bytes in both. `device` is where batches are put, a torch device or its name or a jax device, and `sharding` how jax
+    lays them out on several. `dataset` is what `gen2d.open` or `gen2d.mix` gives.
     """
 
+    @overload
+    def __init__(
+        self: "DataLoader[np.ndarray]",
+        dataset: VideoReader | Mixture,
+        batch_size: int,
+        seed: int = 0,
+        shuffle: bool | str = "global",
+        epochs: int | None = None,
+        rank: int | None = None,
+        world_size: int | None = None,
+        drop_last: bool = True,
+        num_threads: int | None = None,
+        prefetch: int = 2,
+        transform: Callable[[Batch], dict[str, np.ndarray]] | None = None,
+        to: Literal["numpy"] = "numpy",
+        device: None = None,
+        sharding: None = None,
+    ) -> None: ...
+    @overload
+    def __init__(
+        self: "DataLoader[torch.Tensor]",
+        dataset: VideoReader | Mixture,
+        batch_size: int,
+        seed: int = 0,
+        shuffle: bool | str = "global",
+        epochs: int | None = None,
+        rank: int | None = None,
+        world_size: int | None = None,
+        drop_last: bool = True,
+        num_threads: int | None = None,
+        prefetch: int = 2,
+        *,
+        transform: Callable[[Batch], dict[str, np.ndarray]] | None = None,
+        to: Literal["torch"],
+        device: "torch.device | str | None" = None,
+        sharding: None = None,
+    ) -> None: ...
+    @overload
+    def __init__(
+        self: "DataLoader[jax.Array]",
+        dataset: VideoReader | Mixture,
+        batch_size: int,
+        seed: int = 0,
+        shuffle: bool | str = "global",
+        epochs: int | None = None,
+        rank: int | None = None,
+        world_size: int | None = None,
+        drop_last: bool = True,
+        num_threads: int | None = None,
+        prefetch: int = 2,
+        *,
+        transform: Callable[[Batch], dict[str, np.ndarray]] | None = None,
+        to: Literal["jax"],
+        device: object = None,
+        sharding: "jax.sharding.Sharding | None" = None,
+    ) -> None: ...
     def __init__(
         self,
         dataset: VideoReader | Mixture,
@@ -47,10 +110,10 @@ class DataLoader:
         drop_last: bool = True,
         num_threads: int | None = None,
         prefetch: int = 2,
-        transform: Callable[[Batch], Any] | None = None,
+        transform: Callable[[Batch], dict[str, np.ndarray]] | None = None,
         to: str = "numpy",
-        device: Any = None,
-        sharding: Any = None,
+        device: object = None,
+        sharding: "jax.sharding.Sharding | None" = None,
     ) -> None:
         self.threads, self.prefetch = num_threads or min(os.cpu_count() or 1, 8), prefetch
         one_of("to", to, tuple(_DELIVER))
@@ -66,28 +129,28 @@ class DataLoader:
         """The number of batches in one epoch."""
         return len(self.walk)
 
-    def __iter__(self) -> Iterator[Any]:
+    def __iter__(self) -> Iterator[dict[str, A]]:
         self.close()
         self._running = self._batches()
         return self._running
 
-    def __enter__(self) -> "DataLoader":
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
         self.close()
 
     def close(self) -> None:
-        """Returns when the threads of the iteration in progress have ended."""
+        """Ends the iteration in progress and waits for its threads."""
         if self._running is not None:
             self._running.close()
 
-    def state_dict(self) -> dict[str, Any]:
+    def state_dict(self) -> LoaderState:
         """Where the iteration stands, and on which snapshot of the dataset: what has been delivered, not what was read
         ahead."""
         return self.walk.state_dict() | {"snapshot": self.dataset.snapshot}
 
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+    def load_state_dict(self, state: LoaderState) -> None:
         """The next iteration goes on where `state` was taken, on whatever number of ranks.
 
         Where the dataset has grown since, that is the snapshot of the state, which is opened again. Raises FolderError
@@ -95,7 +158,7 @@ class DataLoader:
         """
         self.close()
         snapshot = state.get("snapshot") if isinstance(state, Mapping) else None  # None: of a stream
-        dataset = self.dataset if snapshot is None else self.dataset.at(snapshot)
+        dataset = self.dataset.at(snapshot) if isinstance(snapshot, str | list) else self.dataset
         walk = self.walk.over(len(dataset))
         walk.load_state_dict(state)
         self.dataset, self.walk = dataset, walk

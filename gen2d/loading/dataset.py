@@ -10,7 +10,7 @@ import fnmatch
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, overload
+from typing import Any, TypeVar, overload
 
 import numpy as np
 
@@ -23,11 +23,13 @@ from gen2d.loading.chunks import Chunk, Reader, SplitFiles
 from gen2d.loading.column import LAYOUTS, Column
 from gen2d.loading.concat import ConcatDataset
 from gen2d.loading.epochs import shuffled
-from gen2d.loading.protocols import Batch, Numbers, checked_numbers, filled, item, unbatch
+from gen2d.loading.protocols import Batch, Key, Numbers, Snapshot, checked_numbers, filled, item, unbatch
 from gen2d.storage import codecs
 from gen2d.storage.cache import Cache
 from gen2d.storage.explain import reason
 from gen2d.storage.paths import Network, Place, Url, place
+
+Root = TypeVar("Root", bound=str | Place)
 
 
 @overload
@@ -49,9 +51,24 @@ def open(
     deadline: float = 300.0,
 ) -> "Dataset": ...
 @overload
-def open(path: list[Any] | tuple[Any, ...], *options: Any, **named: Any) -> ConcatDataset: ...
 def open(
-    path: str | Place | list[Any] | tuple[Any, ...],
+    path: list[Root] | tuple[Root, ...],
+    split: str | None = None,
+    fields: Sequence[str] | None = None,
+    window: int | None = None,
+    stride: int = 1,
+    start: str | int = "random",
+    layout: str = "THWC",
+    dtype: str = "uint8",
+    verify: str = "checksum",
+    cache_dir: str | Path | None = None,
+    cache_bytes: int | None = None,
+    *,
+    timeout: float = 30.0,
+    deadline: float = 300.0,
+) -> ConcatDataset: ...
+def open(
+    path: str | Place | list[Root] | tuple[Root, ...],
     split: str | None = None,
     fields: Sequence[str] | None = None,
     window: int | None = None,
@@ -182,7 +199,7 @@ class Dataset:
         """Which of the states of a dataset that grows this is: the manifest's sha256."""
         return self.manifest.sha256
 
-    def at(self, snapshot: Any) -> "Dataset":
+    def at(self, snapshot: Snapshot) -> "Dataset":
         """The dataset as it was at an earlier snapshot, while that is there.
 
         Raises FolderError where it is not, and ConfigError where the snapshot is of another dataset.
@@ -199,7 +216,7 @@ class Dataset:
     def __len__(self) -> int:
         return self._count
 
-    def __getitem__(self, key: Any) -> Batch:
+    def __getitem__(self, key: Key) -> Batch:
         """One video, or for a slice or a sequence of numbers several, stacked."""
         return item(self, key)
 

@@ -61,12 +61,12 @@ class EpochSampler:
         whole, rest = divmod(self.videos, self.global_size)
         return whole + (rest >= self.least)
 
-    def state_dict(self) -> dict[str, Any]:
+    def state_dict(self) -> dict[str, int | bool | None]:
         """Where it stands, and what decides the order."""
         fixed = {"seed": self.seed, "shuffle": self.shuffle, "videos": self.videos}
         return fixed | {"epoch": self.epoch, "position": self.position}
 
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+    def load_state_dict(self, state: Mapping[str, object]) -> None:
         """Goes to where `state` was taken, on whatever number of ranks. Raises ConfigError for what is no state."""
         here = self.state_dict()
         if not isinstance(state, Mapping) or not here.keys() <= state.keys():
@@ -76,10 +76,10 @@ class EpochSampler:
                 raise ConfigError(
                     f"the state has {name} {state[name]}, but this loader has {value}: orders would differ"
                 )
-        place = state["epoch"], state["position"]
-        if not all(isinstance(number, int) and number >= 0 for number in place):
-            raise ConfigError(f"the state has epoch and position {place}, but must have whole numbers")
-        self.epoch, self.position = self._resolved(*place)
+        epoch, position = state["epoch"], state["position"]
+        if not (isinstance(epoch, int) and isinstance(position, int) and min(epoch, position) >= 0):
+            raise ConfigError(f"the state has epoch and position {(epoch, position)}, but must have whole numbers")
+        self.epoch, self.position = self._resolved(epoch, position)
 
     def over(self, videos: int) -> "EpochSampler":
         """The same way through another number of videos, from its beginning."""

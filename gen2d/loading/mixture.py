@@ -8,7 +8,6 @@ positions of the sources as they are, so that every batch holds its shares, too.
 import math
 from collections.abc import Mapping, Sequence
 from fractions import Fraction
-from typing import Any
 
 import numpy as np
 
@@ -16,7 +15,7 @@ from gen2d.core.errors import ConfigError
 from gen2d.core.permutation import hashed
 from gen2d.loading.concat import ConcatDataset, at_snapshots, groups_of
 from gen2d.loading.epochs import SOURCES
-from gen2d.loading.protocols import Batch, Numbers, VideoReader, checked_numbers, item, unbatch
+from gen2d.loading.protocols import Batch, Key, Numbers, Snapshot, VideoReader, checked_numbers, item, unbatch
 
 FINEST = 1000  # a weight is taken as the nearest fraction with a denominator up to this
 Weights = Mapping[str, float] | Sequence[float]
@@ -60,7 +59,7 @@ class Mixture:
     def __len__(self) -> int:
         return self._count
 
-    def __getitem__(self, key: Any) -> Batch:
+    def __getitem__(self, key: Key) -> Batch:
         """The video at a position, or for a slice or a sequence of positions several, stacked."""
         return item(self, key)
 
@@ -73,11 +72,11 @@ class Mixture:
         return f"<{len(self)} videos, in every {sum(self.shares)} {', '.join(parts)}>"
 
     @property
-    def snapshot(self) -> list[Any]:
+    def snapshot(self) -> Snapshot:
         """The snapshot of each dataset, in their order."""
         return self._joined.snapshot
 
-    def at(self, snapshot: Any) -> "Mixture":
+    def at(self, snapshot: Snapshot) -> "Mixture":
         """The mixture of the same datasets at earlier snapshots, while these are there."""
         if snapshot == self.snapshot:
             return self

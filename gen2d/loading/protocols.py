@@ -1,7 +1,7 @@
 """Videos by number: what datasets and mixtures have in common, and several datasets as one, one after the other."""
 
-from collections.abc import Sequence
-from typing import Any, Protocol
+from collections.abc import Mapping, Sequence
+from typing import Protocol, SupportsIndex, TypeAlias
 
 import numpy as np
 
@@ -10,6 +10,9 @@ from gen2d.core.schema import Field
 
 Batch = dict[str, np.ndarray]
 Numbers = Sequence[int] | np.ndarray
+Key = SupportsIndex | slice | Numbers  # of one video, or of several
+Snapshot: TypeAlias = "str | list[Snapshot]"  # of a dataset, or of each of several
+LoaderState: TypeAlias = "Mapping[str, int | bool | Snapshot | None]"  # plain values, as JSON has them
 FieldStats = dict[str, dict[str, list[float] | None]]  # of each field: mean, std, min and max of each component
 
 
@@ -36,9 +39,9 @@ class VideoReader(Protocol):
     def time(self) -> np.ndarray: ...
 
     @property
-    def snapshot(self) -> Any: ...
+    def snapshot(self) -> Snapshot: ...
 
-    def at(self, snapshot: Any) -> Any: ...
+    def at(self, snapshot: Snapshot) -> "VideoReader": ...
 
     def empty(self, count: int) -> Batch: ...
 
@@ -49,13 +52,13 @@ class VideoReader(Protocol):
     def starts(self, numbers: np.ndarray, bits: np.ndarray) -> np.ndarray | None: ...
 
 
-def item(videos: VideoSequence, key: Any) -> Batch:
-    """What `videos[key]` is: one video, or for a slice or a sequence of numbers several, stacked."""
+def item(videos: VideoSequence, key: Key) -> Batch:
+    """`videos[key]`: one video, or for a slice or a sequence of numbers several, stacked."""
     if isinstance(key, slice):
         return videos.batch(range(*key.indices(len(videos))))
-    if np.ndim(key) == 1:
-        return videos.batch(key)
-    return {name: values[0] for name, values in videos.batch([key]).items()}
+    numbers = np.asarray(key)
+    batch = videos.batch(np.atleast_1d(numbers))
+    return batch if numbers.ndim else {name: values[0] for name, values in batch.items()}
 
 
 def unbatch(batch: Batch) -> list[Batch]:
@@ -85,7 +88,7 @@ def filled(source: VideoReader, numbers: np.ndarray, starts: Numbers | None, out
 
 
 def _check_out(out: Batch, like: Batch, count: int) -> None:
-    """Returns nothing; raises ConfigError unless `out` can take `count` videos such as those of the batch `like`."""
+    """Raises ConfigError unless `out` can take `count` videos such as those of the batch `like`."""
     for name, values in like.items():
         given, shape = out.get(name), (count, *values.shape[1:])
         if given is None or given.shape != shape or given.dtype != values.dtype or not given.flags.c_contiguous:

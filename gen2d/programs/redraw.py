@@ -9,7 +9,7 @@ import dataclasses
 import functools
 import zlib
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import Any, overload
 
 import jax
 import jax.numpy as jnp
@@ -36,11 +36,42 @@ from gen2d.records.layout import Layout
 from gen2d.records.scene import Joints, Objects, Scene, State
 from gen2d.renderers.camera import CameraView
 from gen2d.renderers.plan import FramePlan, RenderScene
+from gen2d.renderers.rasterizer import draw_soft
 from gen2d.sampling.matched import sets as sets_module
 from gen2d.xla import on_cpu
 
 FieldColumns = Mapping[str, Any]
 POINTS = 8  # of each object, where tracks are asked for that the config does not have
+
+
+@overload
+def render(
+    ds: Dataset,
+    indices: Numbers,
+    *,
+    height: int | None = None,
+    width: int | None = None,
+    look: str | Mapping[str, Any] | None = None,
+    overrides: Sequence[str] = (),
+    states: FieldColumns | None = None,
+    fields: None = None,
+    trust: Trust = (),
+) -> Array: ...
+
+
+@overload
+def render(
+    ds: Dataset,
+    indices: Numbers,
+    *,
+    height: int | None = None,
+    width: int | None = None,
+    look: str | Mapping[str, Any] | None = None,
+    overrides: Sequence[str] = (),
+    states: FieldColumns | None = None,
+    fields: Sequence[str],
+    trust: Trust = (),
+) -> dict[str, Array]: ...
 
 
 def render(
@@ -54,38 +85,79 @@ def render(
     states: FieldColumns | None = None,
     fields: Sequence[str] | None = None,
     trust: Trust = (),
-) -> Any:
-    """The frames [n, T, H, W, 3] uint8 of these videos, a jax array on jax's default device.
+) -> Array | dict[str, Array]:
+    """Frames [n, T, H, W, 3] uint8 of the videos with these numbers, as a jax array on jax's default device.
 
-    Drawn from what is stored; at the stored settings and fingerprint, the stored frames. `height`, `width` (px), `look`
-    (a name, or a mapping with a name and options) and `overrides` ('annotations.masks=true', 'image.noise=4') draw them
-    otherwise. `states` are those of `simulate_again` instead of the stored ones. With `fields` ("frames",
-    "masks/instance") a dictionary of these, the annotations that they belong to switched on.
-    A family or look that came with the dataset runs only if it is trusted: this user has generated with it, or `trust`
-    holds its sha256.
-    Raises ConfigError and UntrustedError (UserErrors), DamagedError, and IndexError where there is no such video.
+    They are rendered from the stored scenes and states: at the stored settings and fingerprint they equal the stored
+    frames.
+
+        frames = gen2d.render(ds, [0, 1], height=256, width=256, look="shaded")
+        masks = gen2d.render(ds, range(8), fields=["masks/instance"])["masks/instance"]
+
+    Parameters
+    ----------
+    ds : an opened dataset; with or without stored frames.
+    indices : numbers of videos [n], or one; negative ones count from the end.
+    height, width : size of the frames, px; those of the dataset unless given.
+    look : a look's name, or a mapping with its name and options.
+    overrides : other options of the config ('annotations.masks=true', 'image.noise=4').
+    states : fields as `simulate_again` returns them, in place of the stored ones.
+    fields : "frames" and names of annotations, which are switched on: the result is then a dictionary of these.
+    trust : sha256 of code that came with the dataset and may run. Without it a family or look from a file of the
+        dataset runs only if this user has generated with it.
+
+    Raises
+    ------
+    ConfigError, UntrustedError : where an option cannot be, or code is not trusted; both are UserErrors.
+    DamagedError : where a stored field cannot be read.
+    IndexError : where there is no such video.
     """
-    base, numbers = config_of(ds, (), trust), ds.numbers(np.atleast_1d(indices))
-    config = load_config(base, [*overrides, *_changed(height, width), "storage.frames=video"])
-    config = load_config(config, _asked(fields, config.annotations))
-    if look is not None:
-        config = load_config(config.plain() | {"look": named(look)}, copies=config.copies)
+    base, config, numbers = _recipes(ds, indices, height, width, look, overrides, fields, trust)
     if config.image.exposure and states is not None:
         raise ConfigError("states have no motion between frames: image.exposure must be 0 where they are given")
     if config.image.exposure:
-        found = _again(ds, config, numbers)
+        rendered = _again(ds, config, numbers)
     else:
-        columns = dict(_stored(ds, numbers)) | dict(states or {})
-        _check_frames(columns, states)
         settings = _Settings(base, config)
-        stages = _compiled(_staged, settings)(columns, _key_words(ds), jnp.asarray(numbers, jnp.uint32))
-        found = _compiled(_pictures, settings)(stages)
+        rendered = _compiled(_pictures, settings)(_stages(ds, settings, numbers, states))
     if fields is None:
-        return found["frames"]
-    missing = [name for name in fields if name not in found]
+        return rendered["frames"]
+    missing = [name for name in fields if name not in rendered]
     if missing:
-        raise ConfigError(f"fields holds {missing[0]!r}, but must be of {', '.join(sorted(found))}")
-    return {name: found[name] for name in fields}
+        raise ConfigError(f"fields holds {missing[0]!r}, but must be of {', '.join(sorted(rendered))}")
+    return {name: rendered[name] for name in fields}
+
+
+def render_soft(
+    ds: Dataset,
+    indices: Numbers,
+    *,
+    states: FieldColumns | None = None,
+    sigma: float = 0.0,
+    height: int | None = None,
+    width: int | None = None,
+    look: str | Mapping[str, Any] | None = None,
+    overrides: Sequence[str] = (),
+    trust: Trust = (),
+) -> Array:
+    """Frames [n, T, H, W, 3] float32 from 0 to 255 that are differentiable in `states`, without noise or motion blur.
+
+        def loss(position):
+            return ((gen2d.render_soft(ds, [0], states={"states/position": position}, sigma=2.0) - target) ** 2).mean()
+
+        slope = jax.grad(loss)(position)
+
+    `sigma`, px, is the standard deviation of a Gaussian that blurs the coverage of each object: with 0 the frames are
+    those of `render` but for rounding, and an edge has a slope only in the pixels that it crosses; a larger one gives
+    slopes from as far as 4 sigma. `states` are fields by their stored names, [n, T, ...] each, in place of the stored
+    ones. The other parameters and errors are those of `render`.
+    """
+    if not 0 <= sigma <= 1000:
+        raise ConfigError(f"sigma is {sigma!r}, but must be a number of pixels from 0 to 1000")
+    plain = [*overrides, "image.exposure=0", "image.noise=0"]
+    base, config, numbers = _recipes(ds, indices, height, width, look, plain, None, trust)
+    settings = _Settings(base, config)
+    return _compiled(_soft, settings, float(sigma))(_stages(ds, settings, numbers, states))
 
 
 def simulate_again(
@@ -118,7 +190,26 @@ def simulate_again(
     return made | {"time": jnp.arange(config.video.frames) / config.video.fps}
 
 
-# ---- What is asked, checked
+# ---- The recipe, with what is asked for
+
+
+def _recipes(
+    ds: Dataset,
+    indices: Numbers,
+    height: int | None,
+    width: int | None,
+    look: str | Mapping[str, Any] | None,
+    overrides: Sequence[str],
+    fields: Sequence[str] | None,
+    trust: Trust,
+) -> tuple[Config, Config, np.ndarray]:
+    """The dataset's config, that of the frames that are asked for, and the numbers of their videos."""
+    base, numbers = config_of(ds, (), trust), ds.numbers(np.atleast_1d(indices))
+    config = load_config(base, [*overrides, *_changed(height, width), "storage.frames=video"])
+    config = load_config(config, _asked(fields, config.annotations))
+    if look is not None:
+        config = load_config(config.plain() | {"look": named(look)}, copies=config.copies)
+    return base, config, numbers
 
 
 def _changed(height: int | None, width: int | None) -> list[str]:
@@ -207,6 +298,13 @@ class _Settings:
         return view._replace(scale=view.scale * min(new.height / old.height, new.width / old.width))
 
 
+def _stages(ds: Dataset, settings: "_Settings", numbers: np.ndarray, states: FieldColumns | None) -> RenderScene:
+    """What these videos are rendered from, with these states instead of the stored ones."""
+    columns = dict(_stored(ds, numbers)) | dict(states or {})
+    _check_frames(columns, states)
+    return _compiled(_staged, settings)(columns, _key_words(ds), jnp.asarray(numbers, jnp.uint32))
+
+
 def _staged(columns: FieldColumns, words: Array, numbers: Array, settings: _Settings) -> RenderScene:
     config, plan = settings.config, settings.plan
     scene, states = scene_of(columns), from_columns(State, columns)
@@ -221,6 +319,10 @@ def _staged(columns: FieldColumns, words: Array, numbers: Array, settings: _Sett
 def _pictures(stages: RenderScene, settings: _Settings) -> dict[str, Array]:
     """What a run draws, in a program of its own, as there: so that its rounding is the same."""
     return render_module.render_frames(stages, settings.plan, settings.config.annotations)
+
+
+def _soft(stages: RenderScene, settings: _Settings, sigma: float) -> Array:
+    return jax.vmap(lambda stage: draw_soft(stage, settings.plan, sigma))(stages)
 
 
 def _simulated(columns: FieldColumns, words: Array, numbers: Array, settings: _Settings) -> dict[str, Array]:
@@ -238,9 +340,9 @@ def _simulated(columns: FieldColumns, words: Array, numbers: Array, settings: _S
 
 
 @functools.lru_cache(maxsize=16)  # a program takes up to thousands of memory maps, of which a process has some 60,000
-def _compiled(program: Callable, settings: _Settings) -> Callable:
+def _compiled(program: Callable, settings: _Settings, *more: float) -> Callable:
     """One of the programs above for these settings."""
-    return jax.jit(functools.partial(program, settings=settings))
+    return jax.jit(lambda *arrays: program(*arrays, settings, *more))
 
 
 def _again(ds: Dataset, config: Config, numbers: np.ndarray) -> dict[str, Array]:

@@ -195,7 +195,7 @@ def aligned(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.usefixtures("aligned")
 @pytest.mark.parametrize("kind", ["jax", "torch"])
-def test_batches_stay_as_they_were_while_others_follow(toy: Path, kind: str) -> None:
+def test_batches_stay_as_they_were_while_others_follow(toy: Path, kind: Any) -> None:
     library = pytest.importorskip(kind)
     dataset = loader.open(toy, fields="*", window=2)
     expected = list(DataLoader(dataset, 4, epochs=3))

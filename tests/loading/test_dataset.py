@@ -4,7 +4,7 @@ import pickle
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -133,7 +133,7 @@ def test_a_video_that_is_not_there_is_told(toy: Path, index: Any) -> None:
     with pytest.raises(IndexError, match="train has 20 videos"):
         loader.open(toy)[index]
     with pytest.raises(TypeError, match="must be an integer"):
-        loader.open(toy)[1.5]
+        loader.open(toy)[cast(Any, 1.5)]
 
 
 def test_a_folder_that_is_no_complete_dataset_is_told(tmp_path: Path) -> None:

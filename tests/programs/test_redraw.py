@@ -1,5 +1,7 @@
 """Videos drawn and simulated again from a dataset: the same frames, other sizes, looks and frame rates."""
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
@@ -49,6 +51,35 @@ def test_a_larger_picture_shows_the_same(plain):
     shrunk = large.reshape(2, 8, 32, 4, 48, 4, 3).mean((3, 5))
     # Averages over areas, whatever their size: but for rounding, and for pixels in which several rims meet.
     assert np.quantile(np.abs(shrunk - small), 0.995) < 1.5
+
+
+def test_soft_frames_are_the_frames_but_for_rounding(plain):
+    soft = np.asarray(gen2d.render_soft(plain, [3, 1]))
+    assert soft.shape == (2, 8, 32, 48, 3)
+    assert soft.dtype == np.float32
+    assert np.abs(soft - plain[[3, 1]]["frames"]).max() < 2.5  # every layer is rounded there
+
+
+def test_slopes_of_soft_frames_are_those_of_differences_and_reach_from_afar(plain):
+    position = jnp.asarray(gen2d.open(plain.root, fields="states/position")[[0]]["states/position"])
+
+    def column(shift, sigma):
+        moved = position.at[0, :, 0, 0].add(shift)
+        return gen2d.render_soft(plain, [0], states={"states/position": moved}, sigma=sigma)[0].sum((0, 1, 3))
+
+    for sigma in (1.0, 2.0):
+        slope = jax.jacfwd(lambda shift, sigma=sigma: column(shift, sigma))(0.0)
+        step = 1e-2
+        differences = (column(step, sigma) - column(-step, sigma)) / (2 * step)
+        assert_allclose(slope, differences, atol=2e-2 * np.abs(differences).max())
+    reached = [np.count_nonzero(np.asarray(jax.jacfwd(lambda s, w=w: column(s, w))(0.0))) for w in (0.0, 1.0, 3.0)]
+    assert reached[0] < reached[1] < reached[2]
+
+
+@pytest.mark.parametrize("sigma", [-1.0, float("nan"), 2000])
+def test_a_blur_that_cannot_be_is_refused(plain, sigma):
+    with pytest.raises(ConfigError, match=r"sigma is .*, but must be a number of pixels from 0 to 1000"):
+        gen2d.render_soft(plain, [0], sigma=sigma)
 
 
 def test_another_look_and_other_annotations(plain):
