@@ -9,9 +9,6 @@ Names are imported on first use: a training process that only reads data never i
 """
 
 import importlib
-import importlib.machinery
-import pathlib
-import sys
 from typing import TYPE_CHECKING, Any
 
 from gen2d._version import __version__ as __version__
@@ -74,24 +71,3 @@ def __getattr__(name: str) -> Any:
 
 def __dir__() -> list[str]:
     return sorted([*globals(), *_HOME])
-
-
-class _BesideThePackage:
-    """Finds `gen2d.renderers` and `gen2d.configs`, and nothing else, beside the package: where a checkout keeps them.
-
-    In a wheel they lie inside the package. The checkout's root itself must not be on `__path__`: that would make
-    `gen2d.datasets` and a second `gen2d.gen2d` importable.
-    """
-
-    root = pathlib.Path(__file__).parent.parent
-    names = ("gen2d.renderers", "gen2d.configs")
-
-    @classmethod
-    def find_spec(cls, name: str, path: Any = None, target: Any = None) -> importlib.machinery.ModuleSpec | None:
-        if name not in cls.names:
-            return None
-        return importlib.machinery.PathFinder.find_spec(name, [str(cls.root)])
-
-
-if not (pathlib.Path(__file__).parent / "renderers").is_dir():
-    sys.meta_path.insert(0, _BesideThePackage)  # type: ignore[arg-type]  # a class with a find_spec is a finder
