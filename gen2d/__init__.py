@@ -5,13 +5,13 @@
     ds = gen2d.open("datasets/bouncing")
     for batch in gen2d.DataLoader(ds, batch_size=32): ...
 
-Names are imported on first use: a training process that only reads data never imports jax.
+Each name is imported on first use, so a training process that only reads data does not import jax.
 """
 
-import importlib
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from gen2d._version import __version__ as __version__
+from gen2d.core.lazy import attach
 
 if TYPE_CHECKING:
     from gen2d.cli.report import info
@@ -54,7 +54,6 @@ _HOMES = {
     "gen2d.tools.preview": "preview",
     "gen2d.tools.verify": "verify",
 }
-_HOME = {name: home for home, names in _HOMES.items() for name in names.split()}
 
 __all__ = [
     "Config", "ConfigError", "DamagedError", "DataLoader", "Dataset", "Error", "FolderError", "IncompleteError",
@@ -62,12 +61,4 @@ __all__ = [
     "mix", "open", "preview", "render", "simulate_again", "stream", "verify",
 ]  # fmt: skip
 
-
-def __getattr__(name: str) -> Any:
-    if name not in _HOME:
-        raise AttributeError(f"module 'gen2d' has no attribute {name!r}")
-    return getattr(importlib.import_module(_HOME[name]), name)
-
-
-def __dir__() -> list[str]:
-    return sorted([*globals(), *_HOME])
+__getattr__, __dir__ = attach(__name__, _HOMES)
