@@ -70,7 +70,7 @@ def run(options: argparse.Namespace) -> int:
             options.out,
             seed=options.seed,
             split=options.split,
-            sets=options.sets,
+            overrides=options.overrides,
             device=options.device,
             worker=options.worker,
             overwrite=options.overwrite,

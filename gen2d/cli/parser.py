@@ -120,7 +120,7 @@ def add_overrides(parser: Parser) -> None:
         action="append",
         default=[],
         metavar="A.B=V",
-        dest="sets",
+        dest="overrides",
         help="set one option of the config, such as physics.substeps=8 (may be repeated)",
     )
 

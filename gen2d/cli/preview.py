@@ -31,7 +31,7 @@ def add_arguments(parser: Parser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    keywords = {"seed": options.seed, "sets": options.sets, "trust": options.trust, **limits(options)}
+    keywords = {"seed": options.seed, "overrides": options.overrides, "trust": options.trust, **limits(options)}
     if options.videos is not None:
         keywords["videos"] = options.videos
     if options.gallery:

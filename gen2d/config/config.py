@@ -166,8 +166,10 @@ def from_mapping(values: Any, source: str, name: str = "dataset", copies: Copies
     frames, chunk = sections["video"].frames, sections["storage"].chunk_frames
     if chunk is not None and frames % chunk:
         raise ConfigError(f"{source}: storage.chunk_frames is {chunk}, but must divide video.frames, which is {frames}")
-    if sections["annotations"].words and not sections["annotations"].contacts:
-        raise ConfigError(f"{source}: annotations.contacts is 0, but annotations.words needs them: 4 is a good number")
+    if sections["annotations"].captions and not sections["annotations"].contacts:
+        raise ConfigError(
+            f"{source}: annotations.contacts is 0, but annotations.captions needs them: 4 is a good number"
+        )
     config = Config(name=name, seed=seed, **sections)
     _check_grids(config, source)
     enabled = {f"annotations.{name}": bool(value) for name, value in vars(config.annotations).items()}
@@ -245,16 +247,16 @@ def _check_grids(config: Config, source: str) -> None:
 
 
 def load_config(
-    config: "Config | Mapping | str | pathlib.Path", sets: Sequence[str] = (), copies: Copies = NO_COPIES
+    config: "Config | Mapping | str | pathlib.Path", overrides: Sequence[str] = (), copies: Copies = NO_COPIES
 ) -> Config:
-    """A Config from a file's name or path, from a mapping, or from a Config; `sets` overrides: 'physics.substeps=8'.
+    """A Config from a file's name or path, from a mapping, or from a Config, with `overrides` ('physics.substeps=8').
 
     `copies` are of families and looks of the user's own, by their names, for where these are gone or have changed.
     """
     if isinstance(config, Config):
-        return load_config(config.plain(), sets, config.copies) if sets else config
+        return load_config(config.plain(), overrides, config.copies) if overrides else config
     if isinstance(config, Mapping):
-        return from_mapping(overridden(dict(config), sets), "config", copies=copies)
+        return from_mapping(overridden(dict(config), overrides), "config", copies=copies)
     path = plugins.find_config(str(config))
     try:
         text = read_bytes(path, YAML_BYTES).decode("utf-8")
@@ -264,4 +266,4 @@ def load_config(
     if values is not None and not isinstance(values, Mapping):
         raise ConfigError(f"{path}: holds {type(values).__name__}, but must hold a mapping of sections")
     stem = re.sub(r"[^A-Za-z0-9._-]+", "-", path.stem).lstrip("._-")[:100] or "dataset"
-    return from_mapping(overridden(dict(values or {}), sets), str(path), stem)
+    return from_mapping(overridden(dict(values or {}), overrides), str(path), stem)

@@ -40,7 +40,7 @@ def check(options: Any, default: Any, scene: Any, video: Any, annotations: Any, 
             _check_act(name, scene, layout, video, camera)
         else:
             _check_factor(name, options, scene, layout)
-    asked = [name for name in ("contacts", "energy", "predictability") if getattr(annotations, name)]
+    asked = [name for name in ("contacts", "energy", "lyapunov") if getattr(annotations, name)]
     violations = [name for name in options.change if name in VIOLATIONS]
     if asked and violations:
         raise ValueError(f"change is {violations[0]}, which has no books: annotations.{asked[0]} must be off")

@@ -10,15 +10,15 @@ VISIBILITY = "quality/min_visibility"  # the one that is known only when a video
 MEASURES = {
     "contacts": ("quality/contacts", ""),
     "penetration": ("quality/max_penetration", ""),
-    "growth": ("quality/growth", "annotations.predictability"),
-    "residual": ("quality/energy_residual", "annotations.energy"),
+    "lyapunov": ("quality/lyapunov", "annotations.lyapunov"),
+    "energy_residual": ("quality/energy_residual", "annotations.energy"),
     "visibility": (VISIBILITY, "annotations.visibility"),
 }
 
 
 def ranges(options: Any) -> dict[str, tuple[float, float]]:
     """The least and the largest value of each field that is asked for, by its stored name."""
-    asked = {name: tuple(getattr(options, f"{name}_{end}") for end in ("least", "most")) for name in MEASURES}
+    asked = {name: tuple(getattr(options, f"{end}_{name}") for end in ("min", "max")) for name in MEASURES}
     return {
         MEASURES[name][0]: (-np.inf if low is None else low, np.inf if high is None else high)
         for name, (low, high) in asked.items()
@@ -29,8 +29,8 @@ def ranges(options: Any) -> dict[str, tuple[float, float]]:
 def check(options: Any, enabled: Mapping[str, bool]) -> None:
     """ValueError where a range holds nothing, or is of what is not stored; `enabled` says which options are on."""
     for name, (_, needed) in MEASURES.items():
-        low, high = (getattr(options, f"{name}_{end}") for end in ("least", "most"))
+        low, high = (getattr(options, f"{end}_{name}") for end in ("min", "max"))
         if low is not None and high is not None and low > high:
-            raise ValueError(f"{name}_least is {low:g}, but must be {name}_most, {high:g}, or less")
+            raise ValueError(f"min_{name} is {low:g}, but must be max_{name}, {high:g}, or less")
         if needed and (low, high) != (None, None) and not enabled[needed]:
-            raise ValueError(f"{name}_{'least' if high is None else 'most'} is asked for, but needs {needed}: true")
+            raise ValueError(f"{'min' if high is None else 'max'}_{name} is asked for, but needs {needed}: true")

@@ -76,9 +76,9 @@ def parse_yaml(text: str, source: str) -> Any:
         raise ConfigError(f"{source}: not valid YAML: {error}") from None
 
 
-def overridden(values: dict, sets: Sequence[str]) -> dict:
+def overridden(values: dict, overrides: Sequence[str]) -> dict:
     """The mapping with each `a.b=value` put in its place."""
-    for text in sets:
+    for text in overrides:
         path, equals, value = text.partition("=")
         keys = path.strip().split(".")
         if not equals or not all(keys):

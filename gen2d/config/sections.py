@@ -109,30 +109,34 @@ class AnnotationOptions:
         0, int, "rows", "of contacts, per object and 16 frames; 4 is a good number, 0: none", low=0, high=1000
     )
     energy: bool = option(False, bool, "", "books of energy and momentum, and what they leave unexplained")
-    words: bool = option(False, bool, "", "a caption and a list of events, as text; they need contacts")
-    predictability: bool = option(False, bool, "", "how fast a small change of the start grows")
+    captions: bool = option(False, bool, "", "a caption and a list of events, as text; they need contacts")
+    lyapunov: bool = option(False, bool, "", "how fast a small change of the start grows")
 
 
 @dataclasses.dataclass(frozen=True)
 class QualityOptions:
     """Which videos are kept: those within these ranges, others are made instead (null: any)."""
 
-    contacts_least: int | None = option(None, int, "contacts", "that begin in a video", low=0, optional=True)
-    contacts_most: int | None = option(None, int, "contacts", "that begin in a video", low=0, optional=True)
-    penetration_least: float | None = option(None, float, "m", "of a video's deepest overlap", low=0, optional=True)
-    penetration_most: float | None = option(None, float, "m", "of a video's deepest overlap", low=0, optional=True)
-    growth_least: float | None = option(
-        None, float, "1/s", "of a small change; needs annotations.predictability", optional=True
+    min_contacts: int | None = option(None, int, "contacts", "that begin in a video", low=0, optional=True)
+    max_contacts: int | None = option(None, int, "contacts", "that begin in a video", low=0, optional=True)
+    min_penetration: float | None = option(None, float, "m", "of a video's deepest overlap", low=0, optional=True)
+    max_penetration: float | None = option(None, float, "m", "of a video's deepest overlap", low=0, optional=True)
+    min_lyapunov: float | None = option(
+        None, float, "1/s", "of a small change; needs annotations.lyapunov", optional=True
     )
-    growth_most: float | None = option(
-        None, float, "1/s", "of a small change; needs annotations.predictability", optional=True
+    max_lyapunov: float | None = option(
+        None, float, "1/s", "of a small change; needs annotations.lyapunov", optional=True
     )
-    residual_least: float | None = option(None, float, "J", "of energy; needs annotations.energy", low=0, optional=True)
-    residual_most: float | None = option(None, float, "J", "of energy; needs annotations.energy", low=0, optional=True)
-    visibility_least: float | None = option(
+    min_energy_residual: float | None = option(
+        None, float, "J", "of energy; needs annotations.energy", low=0, optional=True
+    )
+    max_energy_residual: float | None = option(
+        None, float, "J", "of energy; needs annotations.energy", low=0, optional=True
+    )
+    min_visibility: float | None = option(
         None, float, "1", "of the object least seen; needs annotations.visibility", low=0, high=1, optional=True
     )
-    visibility_most: float | None = option(
+    max_visibility: float | None = option(
         None, float, "1", "of the object least seen; needs annotations.visibility", low=0, high=1, optional=True
     )
     attempts: int = option(1000, int, "attempts", "at a video, at most", low=1, high=1_000_000)
@@ -196,7 +200,7 @@ class StorageOptions:
         high=65536,
         optional=True,
     )
-    lanes: int | None = option(
+    batch_size: int | None = option(
         None,
         int,
         "videos",

@@ -74,7 +74,7 @@ With JAX, on its default device (`device=` and `sharding=` name others):
 ```python
 import gen2d, jax
 dataset = gen2d.open(".", split="{split}")
-loader = gen2d.DataLoader(dataset, batch_size=32, to="jax", epochs=1, remainder="keep")
+loader = gen2d.DataLoader(dataset, batch_size=32, to="jax", epochs=1, drop_last=False)
 for batch in loader:
     means = jax.tree.map(jax.numpy.mean, batch)
 ```

@@ -13,7 +13,7 @@ from gen2d.core.schema import Field
 from gen2d.storage.paths import Place
 from gen2d.storage.sealed import as_json, sha256
 
-SCHEMA = "gen2d.dataset/2"
+SCHEMA = "gen2d.dataset/3"
 MARK = Path(".gen2d")  # the folder, inside a dataset's, of what only the program needs
 RECORDS = MARK / "records"  # shards that are done, and not in the manifest yet
 SNAPSHOTS = MARK / "snapshots"  # what the manifest before the last one names, and this one does not

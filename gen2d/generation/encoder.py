@@ -20,16 +20,16 @@ from gen2d.programs.rollout import DeviceBatch, Rollout
 from gen2d.records.axes import Array
 
 
-def batches(todo: Sequence[Shard], lanes: int) -> list[tuple[str, int, list[ShardSlice]]]:
+def batches(todo: Sequence[Shard], batch_size: int) -> list[tuple[str, int, list[ShardSlice]]]:
     """The batches that hold these shards' videos, in order: split, number of the first video, and the shards' pieces.
 
-    Batch b holds the videos from b * lanes on, whatever the shards are, so that every video keeps its lane.
+    Batch b holds the videos from b * batch_size on, whatever the shards are, so that every video keeps its row.
     """
     found: dict[tuple[str, int], list[ShardSlice]] = {}
     for shard in todo:
         end = shard.first + shard.count
-        for first in range(shard.first // lanes * lanes, end, lanes):
-            piece = shard, max(shard.first - first, 0), min(end - first, lanes)
+        for first in range(shard.first // batch_size * batch_size, end, batch_size):
+            piece = shard, max(shard.first - first, 0), min(end - first, batch_size)
             found.setdefault((shard.split, first), []).append(piece)
     return [(split, first, pieces) for (split, first), pieces in found.items()]
 
@@ -49,23 +49,23 @@ def groups(
 
 @dataclasses.dataclass(eq=False)
 class EncodeTask:
-    """Videos of one shard that are drawn and compressed together: lanes `rows` of a device's batch."""
+    """Videos of one shard that are drawn and compressed together: `rows` of a device's batch."""
 
     shard: Shard
     device: int
-    first: int  # number of the video in the batch's lane 0
-    start: int  # lane of the slice's first video
+    first: int  # number of the video in the batch's row 0
+    start: int  # row of the slice's first video
     rows: slice
     future: Future[Block] | None = None
 
 
-def encode_tasks(firsts: list[int], pieces: list[list[ShardSlice]], lanes: int, size: int) -> list[EncodeTask]:
-    """The jobs of a group of batches in the order of their videos, in slices of `size` lanes."""
+def encode_tasks(firsts: list[int], pieces: list[list[ShardSlice]], batch_size: int, size: int) -> list[EncodeTask]:
+    """The jobs of a group of batches in the order of their videos, in slices of `size` batch_size."""
     return [
         EncodeTask(shard, device, firsts[device], start, slice(max(low, start), min(high, start + size)))
         for device, own in enumerate(pieces)
         for shard, low, high in own
-        for start in range(0, lanes, size)
+        for start in range(0, batch_size, size)
         if max(low, start) < min(high, start + size)
     ]
 
@@ -102,7 +102,7 @@ class Encoder:
         for place, (_, firsts, pieces) in enumerate(waiting):
             assert batch is not None
             check_block_placed(self.rollout, batch, firsts, pieces)
-            jobs = encode_tasks(firsts, pieces, self.rollout.lanes, self.rollout.slice)
+            jobs = encode_tasks(firsts, pieces, self.rollout.batch_size, self.rollout.slice)
             line.extend(jobs)
             for _ in self._submitted(jobs, batch):
                 while line and line[0].future is not None and line[0].future.done():

@@ -92,7 +92,7 @@ def changed_videos(
     for own, splits in rollouts_of(rollout, [split for split, _ in chosen]):
         encoder = Encoder(own, dataset, threads_for(devices.cores()))
         try:
-            for shard, block in encoder.blocks(_work(dataset, own.lanes, [c for c in chosen if c[0] in splits])):
+            for shard, block in encoder.blocks(_work(dataset, own.batch_size, [c for c in chosen if c[0] in splits])):
                 number = int(block.arrays["index"][0])
                 for name in _changed_fields(stored[shard.split], number, _values(block, dataset)):
                     yield shard.name, f"{name} of {shard.split} video {number} is not what its recipe makes"
@@ -101,13 +101,13 @@ def changed_videos(
 
 
 def _work(
-    dataset: DatasetSpec, lanes: int, chosen: Sequence[tuple[str, int]]
+    dataset: DatasetSpec, batch_size: int, chosen: Sequence[tuple[str, int]]
 ) -> list[tuple[str, int, list[ShardSlice]]]:
     """The batches that hold the chosen videos, each video a piece of its own."""
     owner = {(shard.split, shard.place): shard for shard in plan(dataset.splits, dataset.videos_per_shard)}
     found: dict[tuple[str, int], list[ShardSlice]] = {}
     for split, number in sorted(chosen):
-        shard, lane = owner[split, number // dataset.videos_per_shard], number % lanes
+        shard, lane = owner[split, number // dataset.videos_per_shard], number % batch_size
         found.setdefault((split, number - lane), []).append((shard, lane, lane + 1))
     return [(split, first, pieces) for (split, first), pieces in found.items()]
 

@@ -54,7 +54,7 @@ def generate(
     *,
     seed: int | None = None,
     split: str | None = None,
-    sets: Sequence[str] = (),
+    overrides: Sequence[str] = (),
     device: str = "auto",
     worker: tuple[int, int] = (0, 1),
     overwrite: bool = False,
@@ -64,7 +64,7 @@ def generate(
 ) -> Summary:
     """Makes what is missing of a dataset of `n` videos in a split, and returns what it did.
 
-    `config` is a file's name or path, a mapping or a Config; `sets` overrides single options ('physics.substeps=8').
+    `config` is a file's name or path, a mapping or a Config; `overrides` change single options ('physics.substeps=8').
     Without `split` it is "train", or each that the config has: `n` videos, or as many as it says there.
     Video i depends on the config, the seed, the split and i alone, so a run may be stopped and repeated, extended to a
     larger `n`, or shared by workers (`worker=(r, W)`: this one is number r of W). `out` is datasets/NAME by default,
@@ -73,7 +73,7 @@ def generate(
     UnreachableError, with one sentence.
     """
     say = say or (lambda line: None)
-    config = load_config(config, sets)
+    config = load_config(config, overrides)
     if seed is not None:
         config = dataclasses.replace(config, seed=checked_seed(seed))
     counts = _counts(config, _check_run(n, split, worker, overwrite), split)
@@ -162,7 +162,7 @@ def make(rollout: Rollout, dataset: DatasetSpec, todo: list[Shard], say: Callabl
 
 def _make(rollout: Rollout, dataset: DatasetSpec, todo: list[Shard], say: Callable[[str], None]) -> int:
     encoder, writers = Encoder(rollout, dataset, threads_for(devices.cores())), ShardWriters(dataset)
-    work = batches(todo, rollout.lanes)
+    work = batches(todo, rollout.batch_size)
     size = 0
     with stopping_on_sigterm(say):  # also while it cleans up: then a second signal ends the process
         try:

@@ -31,7 +31,7 @@ def warm_up(rollout: Rollout, encoder: Encoder, work: list, count: int, say: Cal
     batch = _fitted(lambda: jax.block_until_ready(rollout.begin(split, firsts)))
     _fit_slice(rollout, batch)
     compiled = time.perf_counter() - began
-    job = encode_tasks(firsts, [pieces, *([] for _ in firsts[1:])], rollout.lanes, rollout.slice)[0]
+    job = encode_tasks(firsts, [pieces, *([] for _ in firsts[1:])], rollout.batch_size, rollout.slice)[0]
     block, seconds = _measured(rollout, encoder, batch, split, firsts, job)
     size, duration = block.nbytes / len(block) * count, seconds * count
     say(f"Compiled in {compiled:.1f} s. {count:,} videos will take about {in_bytes(size)} and {in_time(duration)}.")
@@ -53,7 +53,7 @@ def _fit_slice(rollout: Rollout, batch: DeviceBatch) -> None:
         except jax.errors.JaxRuntimeError as error:
             if "RESOURCE_EXHAUSTED" not in str(error) or rollout.slice == 1:
                 raise _explained(error) from None
-            rollout.slice = divisor(rollout.lanes, rollout.slice // 2)
+            rollout.slice = divisor(rollout.batch_size, rollout.slice // 2)
 
 
 def _measured(
@@ -68,7 +68,7 @@ def _measured(
     block = encoder.encode(job, rollout.host_columns(batch)[0], drawn[0])
     marks.append(time.perf_counter())
     count, threads = len(rollout.devices), threads_for(devices.cores())
-    videos = rollout.lanes * count, rollout.slice * count, len(block) * threads
+    videos = rollout.batch_size * count, rollout.slice * count, len(block) * threads
     return block, sum((b - a) / n for a, b, n in zip(marks, marks[1:], videos, strict=False))
 
 
@@ -92,6 +92,6 @@ def _fitted(call: Callable[[], Any]) -> Any:
 def _explained(error: Exception) -> Exception:
     if "RESOURCE_EXHAUSTED" in str(error):
         return DeviceMemoryError(
-            "the device has too little memory for a batch: lower storage.lanes, or use --device cpu"
+            "the device has too little memory for a batch: lower storage.batch_size, or use --device cpu"
         )
     return error

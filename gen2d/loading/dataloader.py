@@ -28,8 +28,8 @@ class DataLoader:
     another world size. An iteration ends when `epochs` epochs are through, and the next goes on with the epochs that
     follow; after `break` or `load_state_dict` it goes on with the batch after the last one delivered.
 
-    `shuffle` is "global" (or True) or False. `remainder` says what happens to the last videos of an epoch that fill no
-    global batch: "drop" or "keep" (then the ranks' shares may differ by one, or be empty). `transform` gets each batch
+    `shuffle` is "global" (or True) or False. `drop_last=False` keeps the last videos of an epoch, which fill no global
+    batch: the ranks' shares of these may differ by one, or be empty. `transform` gets each batch
     in a thread, and returns new arrays each time. `to` is "numpy", "torch" or "jax", which has no 64-bit numbers unless
     told to; text stays NumPy's bytes in both. `device` is where batches are put, a torch device or its name or a jax
     device, and `sharding` how jax lays them out on several. `dataset` is of `gen2d.open` or `gen2d.mix`.
@@ -44,7 +44,7 @@ class DataLoader:
         epochs: int | None = None,
         rank: int | None = None,
         world_size: int | None = None,
-        remainder: str = "drop",
+        drop_last: bool = True,
         num_threads: int | None = None,
         prefetch: int = 2,
         transform: Callable[[Batch], Any] | None = None,
@@ -57,7 +57,7 @@ class DataLoader:
         _check_place(to, device, sharding)
         if min(self.prefetch, self.threads) < 1:
             raise ConfigError("prefetch and num_threads must be 1 or more")
-        self.walk = EpochSampler(len(dataset), batch_size, seed, shuffle, epochs, rank, world_size, remainder)
+        self.walk = EpochSampler(len(dataset), batch_size, seed, shuffle, epochs, rank, world_size, drop_last)
         self.dataset, self.transform, self.to = dataset, transform, to
         self.device, self.sharding = device, sharding
         self._running: Generator[Any, None, None] | None = None

@@ -27,7 +27,7 @@ class EpochSampler:
     """The way through a number of videos, and the place on it: each rank has its slice of every global batch.
 
     The way ends when `epochs` epochs are through, and begins again with those that follow. The last videos of an epoch
-    that fill no global batch are left out (`remainder="drop"`) or make a smaller one ("keep").
+    that fill no global batch are left out, unless `drop_last` is False: then they make a smaller one.
     """
 
     def __init__(
@@ -39,16 +39,16 @@ class EpochSampler:
         epochs: int | None,
         rank: int | None,
         world_size: int | None,
-        remainder: str,
+        drop_last: bool,
     ) -> None:
         rank, world_size = _ranks(rank, world_size)
         one_of("shuffle", shuffle, ("global", True, False))
-        one_of("remainder", remainder, ("drop", "keep"))
+        one_of("drop_last", drop_last, (True, False))
         if min(batch_size, world_size) < 1 or not 0 <= rank < world_size:
             raise ConfigError("batch_size and world_size must be 1 or more, and rank from 0 to world_size - 1")
         self.videos, self.seed, self.shuffle, self.epochs = videos, seed, bool(shuffle), epochs
         self.rank, self.world_size, self.global_size = rank, world_size, batch_size * world_size
-        self.least = 1 if remainder == "keep" else self.global_size  # how many videos still make a global batch
+        self.least = self.global_size if drop_last else 1  # how many videos still make a global batch
         self.epoch = self.position = 0
         self._check_size()
 

@@ -13,7 +13,7 @@ from gen2d.records.scene import Scene, State
 from gen2d.records.trajectory import Trajectory
 
 FIELDS = {
-    "quality/growth": Field(
+    "quality/lyapunov": Field(
         "float32", "n", "1/s", "log10 of what a small change of the start is multiplied by, over the video's seconds"
     )
 }

@@ -7,9 +7,7 @@ from gen2d.core.errors import UserError
 from gen2d.dataset.spec import Shard
 from gen2d.programs.rollout import DeviceBatch, Rollout, per_device
 
-ShardSlice = tuple[
-    Shard, int, int
-]  # a shard's videos among those of a batch: lanes from the first to before the second
+ShardSlice = tuple[Shard, int, int]  # a shard's videos among those of a batch: rows from the first to before the second
 
 
 class NoPlaceError(UserError):

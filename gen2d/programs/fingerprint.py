@@ -48,7 +48,7 @@ def machine(rollout: Rollout) -> dict[str, Any]:
     device = rollout.devices[0]
     kind = device.device_kind if device.platform != "cpu" else f"cpu {instruction_set()}"
     flags = sorted(flag for flag in os.environ.get("XLA_FLAGS", "").split() if not flag.startswith(HARMLESS))
-    return {"jaxlib": version("jaxlib"), "device": kind, "lanes": rollout.lanes, "xla_flags": " ".join(flags)}
+    return {"jaxlib": version("jaxlib"), "device": kind, "batch_size": rollout.batch_size, "xla_flags": " ".join(flags)}
 
 
 def _of_splits(rollout: Rollout) -> dict[str, str]:
@@ -73,7 +73,7 @@ def _remembered(rollout: Rollout) -> dict[str, str]:
         version("jax"),
         version("jaxlib"),
         platform,
-        rollout.lanes,
+        rollout.batch_size,
         rollout.slice,
     ]
     path = pathlib.Path(folder or "") / "fingerprints" / sha256(as_json(key))
@@ -95,7 +95,7 @@ def _remembered(rollout: Rollout) -> dict[str, str]:
 
 def _hashes(rollout: Rollout) -> dict[str, str]:
     found = {name: sha256(canonical(text).encode()) for name, text in rollout.lowered().items()}
-    if rollout.config.annotations.words:
+    if rollout.config.annotations.captions:
         found["captions"] = code_hash(caption)
     if rollout.sampler.gridded:
         found["grids"] = code_hash(

@@ -17,14 +17,14 @@ Trust = str | Sequence[str]  # sha256 of code that came with a dataset and may r
 SOURCE_BYTES = 2**24  # of a file of code, at most
 
 
-def config_of(ds: Dataset, sets: Sequence[str] = (), trust: Trust = ()) -> Config:
-    """The config that a dataset's split was made from, with `sets` changed ('video.height=128').
+def config_of(ds: Dataset, overrides: Sequence[str] = (), trust: Trust = ()) -> Config:
+    """The config that a dataset's split was made from, with `overrides` changed ('video.height=128').
 
     Raises UntrustedError where that would run code that came with the dataset and is not trusted.
     """
     if not isinstance(ds, Dataset):
         raise ConfigError(f"ds is of {len(ds.datasets)} folders, but must be of one: give one of ds.datasets")
-    return load_config(config_from(ds.root, ds.manifest.identity, trust).of_split(ds.options.split), sets)
+    return load_config(config_from(ds.root, ds.manifest.identity, trust).of_split(ds.options.split), overrides)
 
 
 def config_from(root: Place, identity: Mapping[str, Any], trust: Trust = ()) -> Config:

@@ -49,7 +49,7 @@ def render(
     height: int | None = None,
     width: int | None = None,
     look: str | Mapping[str, Any] | None = None,
-    sets: Sequence[str] = (),
+    overrides: Sequence[str] = (),
     states: FieldColumns | None = None,
     fields: Sequence[str] | None = None,
     trust: Trust = (),
@@ -57,7 +57,7 @@ def render(
     """The frames [n, T, H, W, 3] uint8 of these videos, a jax array on jax's default device.
 
     Drawn from what is stored; at the stored settings and fingerprint, the stored frames. `height`, `width` (px), `look`
-    (a name, or a mapping with a name and options) and `sets` ('annotations.masks=true', 'image.noise=4') draw them
+    (a name, or a mapping with a name and options) and `overrides` ('annotations.masks=true', 'image.noise=4') draw them
     otherwise. `states` are those of `simulate_again` instead of the stored ones. With `fields` ("frames",
     "masks/instance") a dictionary of these, the annotations that they belong to switched on.
     A family or look that came with the dataset runs only if it is trusted: this user has generated with it, or `trust`
@@ -65,7 +65,7 @@ def render(
     Raises ConfigError and UntrustedError (UserErrors), DamagedError, and IndexError where there is no such video.
     """
     base, numbers = config_of(ds, (), trust), ds.numbers(np.atleast_1d(indices))
-    config = load_config(base, [*sets, *_changed(height, width), "storage.frames=video"])
+    config = load_config(base, [*overrides, *_changed(height, width), "storage.frames=video"])
     config = load_config(config, _asked(fields, config.annotations))
     if look is not None:
         config = load_config(config.plain() | {"look": named(look)}, copies=config.copies)
@@ -93,17 +93,18 @@ def simulate_again(
     *,
     fps: float | None = None,
     frames: int | None = None,
-    sets: Sequence[str] = (),
+    overrides: Sequence[str] = (),
     trust: Trust = (),
 ) -> dict[str, Array]:
     """The states of these videos at another frame rate or for another number of frames, from their stored scenes.
 
     Jax arrays by their stored names: "states/position" [n, T, K, 2] in m and so on, "time" [T] in s, and the camera's
-    fields; with contacts or energy if the config asks for them. `sets` may change the physics ('physics.damping=0.1').
+    fields; with contacts or energy if the config asks for them. `overrides` may change the physics
+    ('physics.damping=0.1').
     At the stored settings the states agree with the stored ones to rounding. `trust` is that of `render`.
     """
     changes = [
-        *sets,
+        *overrides,
         *([] if fps is None else [f"video.fps={fps}"]),
         *([] if frames is None else [f"video.frames={frames}"]),
     ]
@@ -243,17 +244,17 @@ def _compiled(program: Callable, settings: _Settings) -> Callable:
 
 def _again(ds: Dataset, config: Config, numbers: np.ndarray) -> dict[str, Array]:
     """Videos made from their keys again, as they were made: what blurs them is not stored."""
-    lanes = ds.manifest.fingerprint["lanes"]
+    batch_size = ds.manifest.fingerprint["batch_size"]
     found: dict[str, list[Array]] = {}
     order = np.argsort(numbers, kind="stable")
     own_lanes, pictures = (
-        load_config(config, [f"storage.lanes={lanes}"]),
+        load_config(config, [f"storage.batch_size={batch_size}"]),
         _compiled(_pictures, _Settings(config, config)),
     )
     with contextlib.closing(Rollout(own_lanes, jax.devices()[:1])) as rollout:
-        for first in sorted({int(number) // lanes * lanes for number in numbers}):
+        for first in sorted({int(number) // batch_size * batch_size for number in numbers}):
             batch = rollout.begin(ds.options.split, [first])
-            own = numbers[order][(numbers[order] >= first) & (numbers[order] < first + lanes)] - first
+            own = numbers[order][(numbers[order] >= first) & (numbers[order] < first + batch_size)] - first
             stages = jax.tree.map(lambda a, own=own: a[own], batch.stages)
             for name, array in pictures(stages).items():
                 found.setdefault(name, []).append(array)

@@ -1,9 +1,9 @@
 """The device's side of generation: video numbers in, ground truth and frames out, a fixed number of videos at a time.
 
-Two programs. `simulate` samples and simulates `lanes` videos on every device; `draw` draws a slice of them, so small
-that its frames stay in the cache until they are compressed. `lanes` comes from the config, never from the machine, so
-more devices mean more batches, not wider ones, and video i always sits in lane i % lanes of the same program: its bits
-do not depend on how many videos are made, or where.
+Two programs. `simulate` samples and simulates `batch_size` videos on every device; `draw` renders slices of them, small
+enough for its frames to stay in the cache until they are compressed. `batch_size` comes from the config, never from the
+machine, so more devices mean more batches, not wider ones. Video i is always in row i % batch_size of the same program:
+its bits do not depend on how many videos are made, or where.
 """
 
 import dataclasses
@@ -53,7 +53,7 @@ VIDEOS = PartitionSpec("videos")
 
 
 class DeviceBatch(NamedTuple):
-    """`lanes` simulated videos on each device, ready to be drawn."""
+    """`batch_size` simulated videos on each device, ready to be drawn."""
 
     columns: dict[str, Array]  # stored fields but for those that are drawn, [n, ...]
     stages: RenderScene
@@ -86,8 +86,10 @@ class Rollout:
         moving = sum(run.count for run in self.layout.runs if run.kind == enums.DYNAMIC)
         rows = moving * (self.layout.slots - moving) + moving * (moving - 1) // 2
         together = min(LANES, _power_of_two(ROWS // max(rows, 1)))
-        self.lanes = config.storage.lanes or min(together, auto)  # not the shard size: that must not change a video
-        self.slice = divisor(self.lanes, max(1, SLICE_BYTES // frame_bytes))
+        self.batch_size = config.storage.batch_size or min(
+            together, auto
+        )  # not the shard size: that must not change a video
+        self.slice = divisor(self.batch_size, max(1, SLICE_BYTES // frame_bytes))
         self.mesh = Mesh(np.array(self.devices), ("videos",))
         self._draws: dict[int, Any] = {}  # by how many videos are drawn together
         self._drawn: set[int] = set()  # those that have run, and so are compiled
@@ -128,7 +130,7 @@ class Rollout:
         if self.plan.frames:
             fields["frames"] = Field("uint8", "n T H W 3", "sRGB", "the video")
         fields |= annotations.fields(self.config.annotations) | self.word_fields
-        if self.config.annotations.predictability:
+        if self.config.annotations.lyapunov:
             fields |= lyapunov.FIELDS
         fields["index"] = Field("int64", "n", "1", "the video's number in its split")
         fields["time"] = Field("float64", "T", "s", "of each frame; frame 0 is the initial state")
@@ -160,7 +162,7 @@ class Rollout:
         """Those fields that are made on the host."""
         longest = max((len(split.name) for split in self.config.splits), default=0)
         found = {"split": Field(f"S{longest}", "n", "", "the split that the video belongs to")} if longest else {}
-        spoken = self.config.annotations.words
+        spoken = self.config.annotations.captions
         return found | (caption.fields(self.layout.slots, self.config.video.frames) if spoken else {})
 
     def host_fields(self, columns: dict[str, np.ndarray], split: str) -> dict[str, np.ndarray]:
@@ -168,7 +170,7 @@ class Rollout:
         count = len(columns["objects/present"])
         fields = self.word_fields
         named = {"split": np.full(count, split.encode(), fields["split"].dtype)} if self.config.splits else {}
-        return named | (caption.caption_fields(columns, self.config.video) if self.config.annotations.words else {})
+        return named | (caption.caption_fields(columns, self.config.video) if self.config.annotations.captions else {})
 
     @property
     def time(self) -> np.ndarray:
@@ -176,17 +178,17 @@ class Rollout:
         return np.arange(self.config.video.frames, dtype=np.float64) / self.config.video.fps
 
     def begin(self, split: str, firsts: Sequence[int]) -> DeviceBatch:
-        """Starts `lanes` videos on each device, from these numbers on; one number per device."""
-        numbers = np.concatenate([np.arange(first, first + self.lanes, dtype=np.uint32) for first in firsts])
+        """Starts `batch_size` videos on each device, from these numbers on; one number per device."""
+        numbers = np.concatenate([np.arange(first, first + self.batch_size, dtype=np.uint32) for first in firsts])
         return self.begin_with(split, numbers)
 
     def begin_with(self, split: str, numbers: np.ndarray) -> DeviceBatch:
-        """Starts the videos with these numbers, uint32, `lanes` for each device."""
+        """Starts the videos with these numbers, uint32, `batch_size` for each device."""
         root, row = keys_module.seed_words(self.config.seed, zlib.crc32(split.encode())), self.config.row(split)
         given = self.sampler.combination(row, root, numbers)
 
-        def make(lanes: np.ndarray, attempts: np.ndarray) -> DeviceBatch:
-            of_videos = given[lanes], numbers[lanes], attempts.astype(np.uint32)
+        def make(rows: np.ndarray, attempts: np.ndarray) -> DeviceBatch:
+            of_videos = given[rows], numbers[rows], attempts.astype(np.uint32)
             return self._simulate(root, np.int32(row), *self._shares(of_videos))
 
         if not self.wanted:
@@ -206,7 +208,7 @@ class Rollout:
 
     def _seen(self, batch: DeviceBatch) -> DeviceBatch:
         """The batch with what is known of its visibility when it is drawn."""
-        drawn = [self.draw(batch, start, self.slice) for start in range(0, self.lanes, self.slice)]
+        drawn = [self.draw(batch, start, self.slice) for start in range(0, self.batch_size, self.slice)]
         of_devices = zip(*drawn, strict=True)
         seen = np.concatenate([np.asarray(part[quality.VISIBILITY]) for parts in of_devices for part in parts])
         return batch._replace(columns=batch.columns | {quality.VISIBILITY: self._shares(seen)})
@@ -232,11 +234,11 @@ class Rollout:
 
     def lowered(self) -> dict[str, str]:
         """The text of the programs, each for one device, whatever their number."""
-        lanes, word = jax.ShapeDtypeStruct((self.lanes,), np.uint32), jax.ShapeDtypeStruct((), np.int32)
-        given = jax.ShapeDtypeStruct((self.lanes, len(self.sampler.gridded)), np.float32)
+        numbers, word = jax.ShapeDtypeStruct((self.batch_size,), np.uint32), jax.ShapeDtypeStruct((), np.int32)
+        given = jax.ShapeDtypeStruct((self.batch_size, len(self.sampler.gridded)), np.float32)
         simulate = self._simulate if len(self.devices) == 1 else jax.jit(self._simulated_batch)
         with jax.default_device(self.devices[0]):
-            made = simulate.lower(jax.ShapeDtypeStruct((3,), np.uint32), word, given, lanes, lanes)
+            made = simulate.lower(jax.ShapeDtypeStruct((3,), np.uint32), word, given, numbers, numbers)
             drawn = self._draw(self.slice).lower(made.out_info.stages, start=word)
         return {"simulate": made.as_text(), "draw": drawn.as_text()}
 
@@ -278,8 +280,8 @@ class Rollout:
         columns |= {f"factors/{name}": values.astype(jnp.float32) for name, values in drawn.items()}
         columns |= jax.vmap(self.sampler.outside)(drawn)
         columns["quality/rejected_draws"] = own.rejected
-        if config.annotations.predictability:
-            columns["quality/growth"] = self._growth(keys, own)
+        if config.annotations.lyapunov:
+            columns["quality/lyapunov"] = self._growth(keys, own)
         columns = {name: values for name, values in columns.items() if name not in sets.omitted_fields(config.matched)}
         return DeviceBatch(columns | told, stages, own.fits)
 

@@ -2,8 +2,8 @@
 
     for batch in gen2d.stream("bouncing.yaml", seed=0, batch_size=32): ...
 
-Simulated `lanes` videos at a time, in the program that also makes datasets, and drawn a part at a time: a cell, which
-holds all videos of a batch, or some.
+Videos are simulated by the program that also makes datasets, as many at a time as there, and rendered in parts: a
+cell, which holds all videos of a batch, or some.
 """
 
 import dataclasses
@@ -42,7 +42,7 @@ def stream(
     *,
     n: int | None = None,
     split: str = "train",
-    sets: Sequence[str] = (),
+    overrides: Sequence[str] = (),
     fields: Sequence[str] | None = None,
     window: int | None = None,
     stride: int = 1,
@@ -54,7 +54,7 @@ def stream(
     epochs: int | None = None,
     rank: int | None = None,
     world_size: int | None = None,
-    remainder: str = "drop",
+    drop_last: bool = True,
     to: str = "jax",
     device: str = "auto",
 ) -> "Stream":
@@ -66,7 +66,7 @@ def stream(
     is NumPy's bytes in both.
     Raises ConfigError and, where a scene does not fit, NoPlaceError (all UserError).
     """
-    config = load_config(config, sets)
+    config = load_config(config, overrides)
     if seed is not None:
         config = dataclasses.replace(config, seed=checked_seed(seed))
     one_of("to", to, tuple(_DELIVER))
@@ -79,7 +79,7 @@ def stream(
     if n is not None and not 1 <= n <= MAX_VIDEOS:
         raise ConfigError(f"n is {n}, but must be from 1 to 2**32 - 1, or None")
     count = MAX_VIDEOS if n is None else n
-    walk = EpochSampler(count, batch_size, order_seed, shuffle, epochs, rank, world_size, remainder)
+    walk = EpochSampler(count, batch_size, order_seed, shuffle, epochs, rank, world_size, drop_last)
     return Stream(rollout, options, walk, batch_size, to, frames)
 
 
@@ -107,7 +107,7 @@ class Stream:
     ) -> None:
         self.rollout, self.options, self.walk, self.to, self._frames = rollout, options, walk, to, frames
         self.fields = {name: rollout.fields[name] for name in options.fields}
-        self.cell = cell_size(batch_size, rollout.lanes)
+        self.cell = cell_size(batch_size, rollout.batch_size)
         self._view = jax.jit(self._viewed)
 
     def __len__(self) -> int:
@@ -151,7 +151,7 @@ class Stream:
 
     def _simulated(self) -> Iterator[tuple[list[_Cell], DeviceBatch]]:
         """The cells in groups that are simulated together; the next is begun before one is drawn."""
-        cells, number = self._cells(), self.rollout.lanes // self.cell
+        cells, number = self._cells(), self.rollout.batch_size // self.cell
         before = None
         while group := list(itertools.islice(cells, number)):
             held = [group[min(i, len(group) - 1)].numbers for i in range(number)]
@@ -193,7 +193,7 @@ class Stream:
         return {name: jnp.concatenate([part[name] for part in parts]) for name in wanted}
 
     def _viewed(self, found: Arrays, numbers: Array, starts: Array, lane: Array) -> Arrays:
-        """The fields of a cell with windows, layout and type as asked for; columns are of all lanes."""
+        """The fields of a cell with windows, layout and type as asked for; columns are of the whole batch."""
         made = {}
         for name, field in self.fields.items():
             if name not in found and name != "index":
@@ -205,9 +205,9 @@ class Stream:
         return made
 
 
-def cell_size(batch_size: int, lanes: int) -> int:
+def cell_size(batch_size: int, simulated: int) -> int:
     """How many videos a cell holds: as many as possible, so that at most an eighth of what is made is left over."""
-    sizes = [size for size in range(1, min(batch_size, lanes) * 2) if lanes % size == 0]
+    sizes = [size for size in range(1, min(batch_size, simulated) * 2) if simulated % size == 0]
     return max(size for size in sizes if -(-batch_size // size) * size <= batch_size * 9 / 8)
 
 

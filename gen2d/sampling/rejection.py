@@ -41,13 +41,13 @@ def accepted_batch(
 ) -> tuple[Any, np.ndarray]:
     """A batch of videos that are all of the kind that is asked for, and which attempt each is.
 
-    `make(lanes, attempts)` makes those attempts of the videos in these lanes, a batch with `columns` whose arrays have
-    the lanes first. Raises NoVideoError where `options.attempts` are too few.
+    `make(rows, attempts)` makes those attempts of the videos in these rows, a batch with `columns` whose arrays have
+    the rows first. Raises NoVideoError where `options.attempts` are too few.
     """
-    wanted, lanes = ranges(options), np.arange(len(numbers))
+    wanted, rows = ranges(options), np.arange(len(numbers))
     chosen = np.zeros(len(numbers), np.int64)
-    batch = make(lanes, chosen)
-    left, tried = lanes[~_fits(batch, wanted)], 1
+    batch = make(rows, chosen)
+    left, tried = rows[~_fits(batch, wanted)], 1
     while len(left):
         if tried > options.attempts:
             asked = ", ".join(f"{name} from {low:g} to {high:g}" for name, (low, high) in wanted.items())
@@ -55,14 +55,14 @@ def accepted_batch(
                 f"quality: none of {options.attempts} attempts at video {numbers[left[0]]} has {asked}; ask for less, "
                 "or for more quality.attempts"
             )
-        each = min(len(lanes) // len(left), options.attempts)
+        each = min(len(rows) // len(left), options.attempts)
         of, attempts = np.repeat(left, each), tried + np.tile(np.arange(each), len(left))
-        fill = np.resize(np.arange(len(of)), len(lanes))  # a lane left over repeats one for nothing
+        fill = np.resize(np.arange(len(of)), len(rows))  # a row left over repeats one for nothing
         made = make(of[fill], attempts[fill])
         fits = (_fits(made, wanted)[: len(of)] & (attempts <= options.attempts)).reshape(len(left), each)
         found, first = fits.any(axis=1), fits.argmax(axis=1)
         chosen[left[found]] = tried + first[found]
-        source = np.full(len(lanes), -1)
+        source = np.full(len(rows), -1)
         source[left[found]] = (np.arange(len(left)) * each + first)[found]
         batch = _taken(batch, made, source)
         left, tried = left[~found], tried + each
@@ -77,6 +77,6 @@ def _fits(batch: Any, wanted: Mapping[str, tuple[float, float]]) -> np.ndarray:
 
 @jax.jit
 def _taken(old: Any, new: Any, source: Array) -> Any:
-    """The old batch, but where `source` [n] names a lane of the new one."""
-    here, lane = source >= 0, jnp.maximum(source, 0)
-    return jax.tree.map(lambda a, b: jnp.where(here.reshape(-1, *[1] * (a.ndim - 1)), b[lane], a), old, new)
+    """The old batch, but where `source` [n] names a row of the new one."""
+    here, row = source >= 0, jnp.maximum(source, 0)
+    return jax.tree.map(lambda a, b: jnp.where(here.reshape(-1, *[1] * (a.ndim - 1)), b[row], a), old, new)

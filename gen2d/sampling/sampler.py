@@ -44,11 +44,13 @@ def fields(config: Config) -> dict[str, Field]:
         axes = " ".join(["n", *([spec.each] if spec.each else []), *([str(spec.parts)] if spec.parts else [])])
         unit = spec.unit or "1"
         found[f"factors/{name}"] = Field("float32", axes, unit, f"as drawn: {spec.meaning}")
-        splits[f"outside/{name}"] = Field("float32", axes, unit, f"from the training split's nearest: {spec.meaning}")
+        splits[f"ood_distance/{name}"] = Field(
+            "float32", axes, unit, f"from the training split's nearest: {spec.meaning}"
+        )
     derived = getattr(config.scene.module, "DERIVED", {})
     found |= {f"factors/{name}": field for name, field in derived.items()}
     joint = Field("bool", "n", "1", "whether the training split could not have drawn these factors")
-    return found | (splits | {"outside/training": joint} if config.splits else {})
+    return found | (splits | {"out_of_distribution": joint} if config.splits else {})
 
 
 class Sampler:
@@ -170,8 +172,8 @@ class Sampler:
         """By stored name how far each factor lies from what the training split can give, and whether all of them do."""
         if self.training is None:
             return {}
-        found = {f"outside/{name}": self._distance(name, drawn) for name in self.options}
-        return found | {"outside/training": ~self._inside(self.training, drawn)}
+        found = {f"ood_distance/{name}": self._distance(name, drawn) for name in self.options}
+        return found | {"out_of_distribution": ~self._inside(self.training, drawn)}
 
     def _distance(self, name: str, drawn: SampledFactors) -> Array:
         assert self.training is not None

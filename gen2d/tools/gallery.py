@@ -37,7 +37,7 @@ def gallery(
     videos: int = 1,
     *,
     seed: int | None = None,
-    sets: Sequence[str] = (),
+    overrides: Sequence[str] = (),
     trust: Sequence[str] = (),
     timeout: float = 30.0,
     deadline: float = 300.0,
@@ -48,10 +48,10 @@ def gallery(
     check_folder(out)
     if is_dataset(source):
         ds = open_dataset(source, timeout=timeout, deadline=deadline)
-        looks = _looks(config_of(ds, sets, trust).plain()["look"])
-        picture, name = _sheet(ds, videos, looks, sets, trust), ds.manifest.name
+        looks = _looks(config_of(ds, overrides, trust).plain()["look"])
+        picture, name = _sheet(ds, videos, looks, overrides, trust), ds.manifest.name
     else:
-        with _annotated_video(source, videos, seed, sets) as (ds, plain, own):
+        with _annotated_video(source, videos, seed, overrides) as (ds, plain, own):
             picture, name = _sheet(ds, videos, _looks(plain["look"]), (), own), plain["name"]
     path = out / f"{name}-gallery.png"
     with writing(out):
@@ -60,7 +60,7 @@ def gallery(
 
 
 def families(
-    out: Path, videos: int = 1, *, seed: int | None = None, sets: Sequence[str] = (), **_: object
+    out: Path, videos: int = 1, *, seed: int | None = None, overrides: Sequence[str] = (), **_: object
 ) -> list[Path]:
     """The files made in the folder `out`: families.png with a row for each of the first `videos` of every scene family,
     in its config's own look, and the gallery of each, FAMILY-gallery.png."""
@@ -69,7 +69,7 @@ def families(
     rows, paths = [], []
     for name in plugins.names("scene"):
         own = f"{name}.yaml" in plugins.config_names()
-        with _annotated_video(name if own else {"name": name, "scene": name}, videos, seed, sets) as (
+        with _annotated_video(name if own else {"name": name, "scene": name}, videos, seed, overrides) as (
             ds,
             plain,
             own_files,
@@ -91,11 +91,11 @@ def _fitted(sheet: np.ndarray) -> np.ndarray:
 
 @contextlib.contextmanager
 def _annotated_video(
-    source: str | Mapping[str, Any], videos: int, seed: int | None, sets: Sequence[str]
+    source: str | Mapping[str, Any], videos: int, seed: int | None, overrides: Sequence[str]
 ) -> Iterator[tuple[Dataset, dict[str, Any], list[str]]]:
     """A config's first videos, states alone, which last as long as the block, the config, and the sha256 of its own
     files."""
-    config = load_config(source, sets)
+    config = load_config(source, overrides)
     plain, split = config.plain(), config.training.name if config.training else "train"
     bare = plain | {"look": "flat", "annotations": {}, "storage": plain["storage"] | {"frames": "none"}}
     with tempfile.TemporaryDirectory() as folder:
@@ -109,11 +109,11 @@ def _looks(own: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
 
 
 def _sheet(
-    ds: Dataset, videos: int, looks: Mapping[str, Mapping[str, Any]], sets: Sequence[str], trust: Sequence[str]
+    ds: Dataset, videos: int, looks: Mapping[str, Mapping[str, Any]], overrides: Sequence[str], trust: Sequence[str]
 ) -> np.ndarray:
     """All rows as one picture [H, W, 3]."""
     numbers = range(min(videos, len(ds)))
-    rows = [*_look_rows(ds, numbers, looks, sets, trust), *_annotation_rows(ds, numbers, sets, trust)]
+    rows = [*_look_rows(ds, numbers, looks, overrides, trust), *_annotation_rows(ds, numbers, overrides, trust)]
     return np.concatenate([_labelled(name, contact_sheet(frames)) for name, frames in rows])
 
 
@@ -130,20 +130,20 @@ def _look_rows(
     ds: Dataset,
     numbers: Sequence[int],
     looks: Mapping[str, Mapping[str, Any]],
-    sets: Sequence[str],
+    overrides: Sequence[str],
     trust: Sequence[str],
 ) -> Rows:
     """Each look's name and frames [n, T, H, W, 3]."""
     for name, look in looks.items():
-        yield name, np.asarray(render(ds, numbers, look=look, sets=sets, trust=trust))
+        yield name, np.asarray(render(ds, numbers, look=look, overrides=overrides, trust=trust))
 
 
-def _annotation_rows(ds: Dataset, numbers: Sequence[int], sets: Sequence[str], trust: Sequence[str]) -> Rows:
+def _annotation_rows(ds: Dataset, numbers: Sequence[int], overrides: Sequence[str], trust: Sequence[str]) -> Rows:
     """Each annotation's name and frames [n, T, H, W, 3] that show it."""
-    sets = [*sets, f"annotations.tracks={TRACKS}"]
+    overrides = [*overrides, f"annotations.tracks={TRACKS}"]
     fields = ["masks/instance", "masks/amodal", "boxes/visible", "boxes/amodal", "flow/forward", "tracks/points"]
     fields += ["tracks/visible", "frames"]
-    found = render(ds, numbers, look="flat", sets=sets, fields=fields, trust=trust)
+    found = render(ds, numbers, look="flat", overrides=overrides, fields=fields, trust=trust)
     times = shown(found["frames"].shape[1])
     columns = {name: np.asarray(array[:, times]) for name, array in found.items()}
     fastest = np.abs(columns["flow/forward"].astype(np.float32)).max()

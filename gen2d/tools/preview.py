@@ -20,15 +20,15 @@ def preview(
     videos: int = 8,
     *,
     seed: int | None = None,
-    sets: Sequence[str] = (),
+    overrides: Sequence[str] = (),
     trust: Sequence[str] = (),
     timeout: float = 30.0,
     deadline: float = 300.0,
 ) -> list[Path]:
     """Paths of a contact sheet, NAME-sheet.png, and of an animation, NAME.gif, written into the folder `out`.
 
-    `source` is a dataset's folder or URL, or a config; `seed` and `sets` ('video.height=128') change a config. `trust`
-    is that of `render`, for a dataset without frames; `timeout` and `deadline` are those of `open`, in seconds.
+    `source` is a dataset's folder or URL, or a config, with `seed` and `overrides`. `trust` is
+    that of `render`, for a dataset without frames; `timeout` and `deadline` are those of `open`, in seconds.
     Raises UserError for a source or options that cannot be, DamagedError, UnreachableError.
     """
     source, out = str(source) if isinstance(source, Path) else source, Path(out)
@@ -39,7 +39,7 @@ def preview(
         numbers = range(min(videos, len(ds)))
         name, frames, fps = ds.manifest.name, _stored(ds, numbers, trust), ds.manifest.fps
     else:
-        name, frames, fps = _drawn(str(source), videos, seed, sets)
+        name, frames, fps = _drawn(str(source), videos, seed, overrides)
     sheet, animation = out / f"{name}-sheet.png", out / f"{name}.gif"
     with writing(out):
         write(sheet, contact_sheet(frames))
@@ -68,7 +68,7 @@ def _stored(ds: Dataset, numbers: Sequence[int], trust: Sequence[str]) -> np.nda
     return np.asarray(render(ds, numbers, trust=trust))
 
 
-def _drawn(source: str, videos: int, seed: int | None, sets: Sequence[str]) -> tuple[str, np.ndarray, float]:
+def _drawn(source: str, videos: int, seed: int | None, overrides: Sequence[str]) -> tuple[str, np.ndarray, float]:
     """Name, frames and frame rate of a config's first videos, made but not stored."""
     import dataclasses
 
@@ -77,16 +77,16 @@ def _drawn(source: str, videos: int, seed: int | None, sets: Sequence[str]) -> t
     from gen2d.programs.batches import check_placed
     from gen2d.programs.rollout import Rollout, per_device
 
-    config = load_config(source, [*sets, "storage.frames=video"])
+    config = load_config(source, [*overrides, "storage.frames=video"])
     if seed is not None:
         config = dataclasses.replace(config, seed=checked_seed(seed))
     split = config.training.name if config.training else "train"
     frames = []
     with contextlib.closing(Rollout(config.of_split(split), devices.prepare()[:1])) as rollout:
-        for first in range(0, videos, rollout.lanes):
+        for first in range(0, videos, rollout.batch_size):
             batch = rollout.begin(split, [first])
             placed = per_device(batch.placed)[0][: videos - first]
             check_placed(config.scene, placed, np.arange(first, first + len(placed)))
-            for start in range(0, min(rollout.lanes, videos - first), rollout.slice):
+            for start in range(0, min(rollout.batch_size, videos - first), rollout.slice):
                 frames.append(np.asarray(rollout.draw(batch, start, rollout.slice)[0]["frames"]))
     return config.name, np.concatenate(frames)[:videos], config.video.fps

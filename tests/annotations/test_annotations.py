@@ -16,7 +16,14 @@ from gen2d.records import keys as keys_module
 from gen2d.records import scene as scene_module
 
 ALL = [f"annotations.{name}=true" for name in ("masks", "amodal", "boxes", "visibility", "flow")]
-SMALL = ["storage.lanes=4", "video.frames=12", "video.height=40", "video.width=56", "annotations.tracks=5", "seed=3"]
+SMALL = [
+    "storage.batch_size=4",
+    "video.frames=12",
+    "video.height=40",
+    "video.width=56",
+    "annotations.tracks=5",
+    "seed=3",
+]
 CASES = {
     "still": ["look.palette=random"],
     "moving": ["camera.pan=[[-2,2],1]", "camera.turn=0.4", "camera.zoom=0.2", "look=textured"],
@@ -38,8 +45,8 @@ def simulated():
 class Made:
     """The videos, drawn and annotated as a config says."""
 
-    def __init__(self, sets: list[str]) -> None:
-        config = load_config("bouncing.yaml", [*SMALL, *ALL, *sets])
+    def __init__(self, overrides: list[str]) -> None:
+        config = load_config("bouncing.yaml", [*SMALL, *ALL, *overrides])
         self.rollout = Rollout(config, jax.devices()[:1])
         columns, keys = simulated()
 

@@ -60,20 +60,20 @@ def in_turns(works: Mapping[str, Callable[[], float]], turns: int) -> dict[str, 
     return {name: [turn[name] for turn in found] for name in works}
 
 
-def stages(folder: Path, turns: int = 5, peer_videos: int = 32, sets: Sequence[str] = ()) -> Turns:
+def stages(folder: Path, turns: int = 5, peer_videos: int = 32, overrides: Sequence[str] = ()) -> Turns:
     """Seconds a video of each stage of gen2d, and of the peer's stepping and drawing, on this process's cores."""
     import cv2
     import peer
 
     cv2.setNumThreads(1)
-    works = {name: timed(work, videos, time.perf_counter) for name, (work, videos) in _parts(folder, sets).items()}
+    works = {name: timed(work, videos, time.perf_counter) for name, (work, videos) in _parts(folder, overrides).items()}
     works |= {
         f"peer {read}": lambda read=read: peer.seconds_to_step(peer_videos, read) / peer_videos for read in peer.READERS
     }
     return in_turns(works | {"peer draw": lambda: peer.seconds_to_draw(peer_videos) / peer_videos}, turns)
 
 
-def _parts(folder: Path, sets: Sequence[str], config: str = CONFIG) -> dict[str, tuple[Callable[[], Any], int]]:
+def _parts(folder: Path, overrides: Sequence[str], config: str = CONFIG) -> dict[str, tuple[Callable[[], Any], int]]:
     """For each stage of gen2d what does it for a batch, and of how many videos."""
     import jax
 
@@ -81,20 +81,20 @@ def _parts(folder: Path, sets: Sequence[str], config: str = CONFIG) -> dict[str,
     from gen2d.generation.run import dataset_of
     from gen2d.programs import devices
 
-    rollout = rollout_of(sets, config)
+    rollout = rollout_of(overrides, config)
     sample, simulate, numbers = _physics(rollout)
     start, batch = sample(numbers), rollout.begin("train", [0] * len(rollout.devices))
-    whole = rollout.videos_per_shard // rollout.lanes * rollout.lanes
+    whole = rollout.videos_per_shard // rollout.batch_size * rollout.batch_size
     dataset = dataset_of(rollout, folder / "data", {"train": whole}, {})
     (shard, *_), columns = open_folder(dataset), rollout.host_columns(batch)[0]
     encoder = encoder_module.Encoder(rollout, dataset, encoder_module.threads_for(devices.cores()))
-    jobs = encoder_module.encode_tasks([0], [[(shard, 0, rollout.lanes)]], rollout.lanes, rollout.slice)
+    jobs = encoder_module.encode_tasks([0], [[(shard, 0, rollout.batch_size)]], rollout.batch_size, rollout.slice)
     pictures = [jax.block_until_ready(rollout.draw(batch, job.start, rollout.slice))[0] for job in jobs]
 
     def encode() -> list[Any]:
         return [encoder.encode(job, columns, drawn) for job, drawn in zip(jobs, pictures, strict=True)]
 
-    blocks = encode() * (whole // rollout.lanes)
+    blocks = encode() * (whole // rollout.batch_size)
 
     def draw() -> None:
         for job in jobs:
@@ -104,22 +104,22 @@ def _parts(folder: Path, sets: Sequence[str], config: str = CONFIG) -> dict[str,
         return [rollout.host_columns(batch), *(np.asarray(array) for drawn in pictures for array in drawn.values())]
 
     return {
-        "sampler": (lambda: jax.block_until_ready(sample(numbers)), rollout.lanes),
-        "simulate": (lambda: jax.block_until_ready(simulate(*start)), rollout.lanes),
-        "render": (draw, rollout.lanes),
-        "transfer": (transfer, rollout.lanes),
-        "compress": (encode, rollout.lanes),
+        "sampler": (lambda: jax.block_until_ready(sample(numbers)), rollout.batch_size),
+        "simulate": (lambda: jax.block_until_ready(simulate(*start)), rollout.batch_size),
+        "render": (draw, rollout.batch_size),
+        "transfer": (transfer, rollout.batch_size),
+        "compress": (encode, rollout.batch_size),
         "write": (lambda: ShardWriter(dataset).write(shard, blocks), whole),
     }
 
 
-def rollout_of(sets: Sequence[str] = (), config: str = CONFIG) -> Any:
+def rollout_of(overrides: Sequence[str] = (), config: str = CONFIG) -> Any:
     """The compiled programs of the benchmark's or another config, on all devices of this process."""
     from gen2d.config.config import load_config
     from gen2d.programs import devices
     from gen2d.programs.rollout import Rollout
 
-    return Rollout(load_config(config, sets), devices.prepare())
+    return Rollout(load_config(config, overrides), devices.prepare())
 
 
 def _physics(rollout: Any) -> tuple[Callable, Callable, np.ndarray]:
@@ -143,7 +143,7 @@ def _physics(rollout: Any) -> tuple[Callable, Callable, np.ndarray]:
         device = axes.to_device(scene), axes.to_device(state)
         return axes.to_stored(simulate(*device, rollout.layout, rules, *length, sparse=True))
 
-    return jax.jit(sampled), jax.jit(simulated), np.arange(rollout.lanes, dtype=np.uint32)
+    return jax.jit(sampled), jax.jit(simulated), np.arange(rollout.batch_size, dtype=np.uint32)
 
 
 def steady(folder: Path, videos: int = 4096, turns: int = 3, peer_videos: int = 0) -> Turns:
@@ -175,7 +175,7 @@ def make(rollout: Any, videos: int, out: Path) -> None:
     dataset = dataset_of(rollout, out, {"train": videos}, {})
     encoder = encoder_module.Encoder(rollout, dataset, encoder_module.threads_for(devices.cores()))
     writers = writers_module.ShardWriters(dataset)
-    for shard, block in encoder.blocks(encoder_module.batches(open_folder(dataset), rollout.lanes)):
+    for shard, block in encoder.blocks(encoder_module.batches(open_folder(dataset), rollout.batch_size)):
         writers.put(shard, block)
     writers.finish()
     encoder.close()
@@ -215,13 +215,13 @@ def physics(folder: Path, scene: str, turns: int) -> Turns:
 def render(folder: Path, case: str, turns: int) -> Turns:
     """CPU seconds a frame of gen2d, of OpenCV and of a copy."""
     of = bench_render.CASES[case]
-    return in_turns(bench_render.works(of, rollout_of(of.sets)), turns)
+    return in_turns(bench_render.works(of, rollout_of(of.overrides)), turns)
 
 
 def annotated(folder: Path, turns: int) -> Turns:
     """CPU seconds a frame of drawing with each of the annotations, and the bytes of it."""
     asked = {name: [f"annotations.{part}" for part in parts] for name, parts in bench_render.ANNOTATIONS.items()}
-    rollouts = {name: rollout_of((*bench_render.ANNOTATED.sets, *parts)) for name, parts in asked.items()}
+    rollouts = {name: rollout_of((*bench_render.ANNOTATED.overrides, *parts)) for name, parts in asked.items()}
     works, sizes = bench_render.annotating(rollouts)
     return in_turns(works, turns) | {f"bytes {name}": [size] for name, size in sizes.items()}
 
@@ -278,9 +278,9 @@ def measured(work: Callable, folder: Path, cores: Sequence[int] = CORES, **optio
     return json.loads(next(line for line in ran.text.splitlines() if line.startswith("{")))
 
 
-def command(videos: int, out: Path, *sets: str, cache: Path | None = None) -> Ran:
+def command(videos: int, out: Path, *overrides: str, cache: Path | None = None) -> Ran:
     """The product's own command, on a dataset that is not there yet."""
-    arguments = ["--config", CONFIG, "--n", videos, "--out", out, *(part for s in sets for part in ("--set", s))]
+    arguments = ["--config", CONFIG, "--n", videos, "--out", out, *(part for s in overrides for part in ("--set", s))]
     env = {"JAX_COMPILATION_CACHE_DIR": str(cache)} if cache else {}
     return run([sys.executable, "-m", "gen2d", *arguments], env=env)
 

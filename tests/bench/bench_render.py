@@ -35,11 +35,11 @@ class Case(NamedTuple):
         return f"{self.pixels} px, {self.objects} discs"
 
     @property
-    def sets(self) -> tuple[str, ...]:
+    def overrides(self) -> tuple[str, ...]:
         """What differs from configs/benchmark.yaml; many discs are smaller, so that they fit the box."""
         video = [f"video.{name}={value}" for name, value in self.video.items()]
         radius = ["scene.radius=[0.25,0.5]"] if self.objects > 16 else []
-        return *video, *radius, f"scene.balls={self.objects}", f"storage.lanes={self.videos}"
+        return *video, *radius, f"scene.balls={self.objects}", f"storage.batch_size={self.videos}"
 
     @property
     def video(self) -> dict[str, int]:
@@ -89,7 +89,7 @@ def annotating(rollouts: Mapping[str, Any]) -> tuple[dict[str, Callable[[], floa
     first = next(iter(rollouts.values()))
     batch = first.begin("train", [0] * len(first.devices))  # annotations change nothing of what is drawn from
     frames = first.config.video.frames
-    each = {name: timed(_drawing(rollout, batch), first.lanes * frames) for name, rollout in rollouts.items()}
+    each = {name: timed(_drawing(rollout, batch), first.batch_size * frames) for name, rollout in rollouts.items()}
     made = {name: rollout.draw(batch, 0, rollout.slice)[0] for name, rollout in rollouts.items()}
     told = {name: {of: array for of, array in arrays.items() if of != "frames"} for name, arrays in made.items()}
     return each, {
@@ -101,7 +101,7 @@ def _drawing(rollout: Any, batch: Any) -> Callable[[], None]:
     import jax
 
     def draw() -> None:
-        for start in range(0, rollout.lanes, rollout.slice):
+        for start in range(0, rollout.batch_size, rollout.slice):
             jax.block_until_ready(rollout.draw(batch, start, rollout.slice))
 
     return draw

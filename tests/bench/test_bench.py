@@ -20,7 +20,7 @@ import pytest
 from gen2d.config.config import load_config
 
 TINY = ("video.frames=3", "video.height=16", "video.width=16", "scene.balls=2")
-TINY += ("storage.lanes=4", "storage.videos_per_shard=8")
+TINY += ("storage.batch_size=4", "storage.videos_per_shard=8")
 
 
 def test_the_peer_makes_the_scene_of_the_config() -> None:
@@ -42,7 +42,7 @@ def test_the_peer_makes_the_scene_of_the_config() -> None:
 
 @pytest.mark.slow
 def test_every_stage_is_timed(tmp_path: Path) -> None:
-    turns = bench.stages(tmp_path, turns=1, peer_videos=1, sets=TINY)
+    turns = bench.stages(tmp_path, turns=1, peer_videos=1, overrides=TINY)
     assert {"sampler", "simulate", "render", "transfer", "compress", "write", "peer body", "peer draw"} <= turns.keys()
     assert all(seconds > 0 for (seconds,) in turns.values())
 
@@ -126,7 +126,7 @@ SMALL = bench_render.Case(32, 2, 4)
 
 
 def test_opencv_draws_the_pictures_of_gen2d() -> None:
-    rollout = bench.rollout_of(SMALL.sets)
+    rollout = bench.rollout_of(SMALL.overrides)
     batch = rollout.begin("train", [0] * len(rollout.devices))
     ours, columns = np.asarray(rollout.draw(batch, 0, 4)[0]["frames"])[0], rollout.host_columns(batch)[0]
     theirs = np.empty_like(ours)

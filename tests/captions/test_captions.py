@@ -324,7 +324,7 @@ def test_shapes_have_their_nouns() -> None:
 # ---- In a dataset
 
 
-ASKED = {"words": True, "contacts": 8, "visibility": True, "predictability": True}
+ASKED = {"captions": True, "contacts": 8, "visibility": True, "lyapunov": True}
 WORDY = tiny.changed(annotations=ASKED, video={"frames": 16})
 
 
@@ -351,7 +351,7 @@ def test_the_least_visibility_is_that_of_what_moves(made: Path) -> None:
 
 
 def test_growth_is_a_number_that_each_video_has_for_itself(made: Path) -> None:
-    growth = gen2d.open(made, fields="quality/growth")[:]["quality/growth"]
+    growth = gen2d.open(made, fields="quality/lyapunov")[:]["quality/lyapunov"]
     assert np.isfinite(growth).all()
     assert len(np.unique(growth)) == 8
 
@@ -375,5 +375,5 @@ def test_frames_are_drawn_again_beside_words(made: Path) -> None:
 
 
 def test_words_need_contacts() -> None:
-    with pytest.raises(ConfigError, match=r"annotations\.contacts is 0, but annotations\.words needs them"):
-        load_config(tiny.changed(annotations={"words": True}))
+    with pytest.raises(ConfigError, match=r"annotations\.contacts is 0, but annotations\.captions needs them"):
+        load_config(tiny.changed(annotations={"captions": True}))

@@ -21,7 +21,7 @@ from gen2d.sampling.sampler import Sampler
 
 COUNT = 4000
 RED, BLUE = [255, 0, 0], [0, 0, 255]
-SMALL = {"storage": {"lanes": 8}, "video": {"frames": 4, "height": 16, "width": 16}}
+SMALL = {"storage": {"batch_size": 8}, "video": {"frames": 4, "height": 16, "width": 16}}
 
 DISTRIBUTIONS = st.sampled_from(
     [3, [0, 4], {"log_uniform": [0.5, 8]}, {"integer": [0, 5]}, {"choice": [0.5, 1, 2, 3]}, {"normal": [2, 1]},
@@ -186,22 +186,22 @@ def test_the_draws_of_a_split_are_of_its_law_and_tell_how_far_from_training_they
     for split in ("train", "test"):
         values, outside = drawn(config, of, split)
         there = np.arange(6) < values["balls"][:, None]
-        assert not outside["outside/training"].any()
-        assert not any(outside[f"outside/{name}"].any() for name in ("radius", "gravity", "balls"))
+        assert not outside["out_of_distribution"].any()
+        assert not any(outside[f"ood_distance/{name}"].any() for name in ("radius", "gravity", "balls"))
         radius = values["radius"]
         assert (~((radius >= 0.7) & (radius < 0.8)) | ~there).all()
         assert (radius[~there] == 0).all()
         assert_allclose((radius[there] < 0.7).mean(), 0.5, atol=0.03)  # .2 of .4 m
     values, outside = drawn(config, of, "holes")
     there = np.arange(6) < values["balls"][:, None]
-    assert outside["outside/training"].all()
+    assert outside["out_of_distribution"].all()
     radius = values["radius"][there]
-    assert_allclose(outside["outside/radius"][there], np.minimum(radius - 0.7, 0.8 - radius), atol=1e-6)
+    assert_allclose(outside["ood_distance/radius"][there], np.minimum(radius - 0.7, 0.8 - radius), atol=1e-6)
     values, outside = drawn(config, of, "far")
     assert set(np.unique(values["balls"])) == {5, 6}
-    assert_array_equal(outside["outside/balls"], values["balls"] - 4)
-    assert_allclose(outside["outside/gravity"][:, 1], -9.8 - values["gravity"][:, 1], rtol=1e-6)
-    assert not outside["outside/gravity"][:, 0].any()
+    assert_array_equal(outside["ood_distance/balls"], values["balls"] - 4)
+    assert_allclose(outside["ood_distance/gravity"][:, 1], -9.8 - values["gravity"][:, 1], rtol=1e-6)
+    assert not outside["ood_distance/gravity"][:, 0].any()
 
 
 def test_pairs_of_attributes_are_swapped_for_each_ball():
@@ -218,8 +218,8 @@ def test_pairs_of_attributes_are_swapped_for_each_ball():
         assert ((values["elasticity"] >= 0.8) == is_hard)[there].all()
         assert (is_hard[:, 0] != is_hard[:, 1]).any()  # each ball has a draw of its own
         assert_allclose(is_hard[there].mean(), 0.5 if split == "train" else 0.75, atol=0.02)
-        assert outside["outside/training"].all() == (split == "swapped")
-        assert not outside["outside/color"].any()  # each factor alone is as in training
+        assert outside["out_of_distribution"].all() == (split == "swapped")
+        assert not outside["ood_distance/color"].any()  # each factor alone is as in training
 
 
 def test_a_grid_gives_every_combination_once_before_any_twice():

@@ -23,7 +23,7 @@ CONFIG = {
     "video": {"frames": 10, "fps": 10, "height": 16, "width": 16},
     "scene": {"name": "bouncing", "balls": [2, 3], "radius": [0.5, 1.0]},
     "physics": {"substeps": 2},
-    "storage": {"lanes": 8, "videos_per_shard": 8},
+    "storage": {"batch_size": 8, "videos_per_shard": 8},
 }
 SPLITS = {
     "train": {"frames": 6, "factors": {"minus": [{}, {"radius": [0.7, 0.8]}]}},
@@ -50,11 +50,11 @@ def test_a_dataset_is_the_same_whatever_split_is_made_first(whole, tmp_path):
 
 def test_each_video_says_its_split_and_how_far_outside_it_is(whole):
     for split, count in (("train", 12), ("holes", 9), ("heavier", 3)):
-        videos = gen2d.open(whole, split, fields=("split", "outside/*", "factors/*"))[:]
+        videos = gen2d.open(whole, split, fields=("split", "ood_distance/*", "factors/*"))[:]
         assert videos["split"].tolist() == [split.encode()] * count
-        assert (videos["outside/training"] == (split != "train")).all()
-        assert (videos["outside/radius"].max(1) > 0).all() == (split == "holes")
-        assert (videos["outside/gravity"][:, 1] > 0).all() == (split == "heavier")
+        assert (videos["out_of_distribution"] == (split != "train")).all()
+        assert (videos["ood_distance/radius"].max(1) > 0).all() == (split == "holes")
+        assert (videos["ood_distance/gravity"][:, 1] > 0).all() == (split == "heavier")
 
 
 def test_a_split_may_give_the_first_frames_only(whole):
@@ -118,13 +118,13 @@ def test_the_study_s_splits_have_nothing_in_common_with_training_and_start_in_vi
 
 def columns(numbers, **asked):
     """The columns of the training videos with these numbers, a lane each."""
-    config = CONFIG | {"quality": asked, "storage": {"lanes": len(numbers)}}
+    config = CONFIG | {"quality": asked, "storage": {"batch_size": len(numbers)}}
     batch = Rollout(load_config(config), devices.prepare("cpu")[:1]).begin_with("train", np.array(numbers, np.uint32))
     return {name: np.asarray(values) for name, values in batch.columns.items()}
 
 
 def test_videos_of_a_kind_are_those_that_are_and_others_in_place_of_the_rest():
-    every, some = columns(range(8)), columns(range(8), contacts_least=1, contacts_most=2)
+    every, some = columns(range(8)), columns(range(8), min_contacts=1, max_contacts=2)
     contacts, tried = some["quality/contacts"], some["quality/rejected_videos"]
     assert ((contacts >= 1) & (contacts <= 2)).all()
     assert 0 < (tried == 0).sum() < 8
@@ -136,7 +136,7 @@ def test_videos_of_a_kind_are_those_that_are_and_others_in_place_of_the_rest():
 
 def test_how_little_may_be_seen_of_an_object_can_be_asked_for(tmp_path):
     seen = {"annotations": {"visibility": True}, "scene": {"name": "bouncing", "balls": 4, "radius": [0.8, 1.0]}}
-    every, some = ({"quality": asked} | seen for asked in ({}, {"visibility_least": 0.7}))
+    every, some = ({"quality": asked} | seen for asked in ({}, {"min_visibility": 0.7}))
     found = []
     for number, more in enumerate((every, some)):
         gen2d.generate(CONFIG | more, 8, tmp_path / str(number), seed=1)
@@ -154,7 +154,7 @@ def test_a_video_does_not_depend_on_what_is_made_with_it():
     def luck(lanes: np.ndarray, attempts: np.ndarray) -> np.ndarray:
         return hashed(lanes, attempts).astype(np.int64) % 17
 
-    options = load_config(CONFIG | {"quality": {"contacts_most": 1}}).quality
+    options = load_config(CONFIG | {"quality": {"max_contacts": 1}}).quality
     for count in (1, 3, 8):
         numbers = np.arange(count)
         _, chosen = rejection.accepted_batch(lambda lanes, attempts: _batch(luck(lanes, attempts)), numbers, options)
@@ -168,18 +168,18 @@ def _batch(values: np.ndarray) -> DeviceBatch:
 
 
 def test_a_kind_that_there_is_not_is_said(tmp_path):
-    asked = {"contacts_least": 500, "attempts": 20}
+    asked = {"min_contacts": 500, "attempts": 20}
     with pytest.raises(
         rejection.NoVideoError, match="none of 20 attempts at video 0 has quality/contacts from 500 to inf"
     ):
         gen2d.generate(CONFIG | {"quality": asked}, 2, tmp_path / "none")
     for wrong, message in (
         (
-            {"contacts_least": 5, "contacts_most": 2},
-            "quality.contacts_least is 5, but must be contacts_most, 2, or less",
+            {"min_contacts": 5, "max_contacts": 2},
+            "quality.min_contacts is 5, but must be max_contacts, 2, or less",
         ),
-        ({"visibility_most": 0.5}, "quality.visibility_most is asked for, but needs annotations.visibility"),
-        ({"growth_most": 2}, "quality.growth_most is asked for, but needs annotations.predictability"),
+        ({"max_visibility": 0.5}, "quality.max_visibility is asked for, but needs annotations.visibility"),
+        ({"max_lyapunov": 2}, "quality.max_lyapunov is asked for, but needs annotations.lyapunov"),
     ):
         with pytest.raises(ConfigError, match=message):
             load_config(CONFIG | {"quality": wrong})

@@ -262,7 +262,7 @@ def test_a_newer_version_keeps_the_snapshot(tmp_path: Path) -> None:
     reader = gen2d.open(root, fields="*")
     loader = gen2d.DataLoader(reader, 4)
     next(iter(loader))
-    newer = {"producer": {"gen2d": "1", "fingerprint": {"jaxlib": "0", "lanes": 8}}}
+    newer = {"producer": {"gen2d": "1", "fingerprint": {"jaxlib": "0", "batch_size": 8}}}
     assert run(dataset(root, {"train": 12}, **newer)) == []
     assert synthetic.tree(root) == before
     gen2d.DataLoader(gen2d.open(root, fields="*"), 4).load_state_dict(loader.state_dict())

@@ -225,7 +225,7 @@ def test_fewer_videos_keep_what_is_there(tmp_path: Path) -> None:
     [
         ({"seed": 8}, "seed is 7 there and 8 here"),
         ({"config": {"scene": {"name": "toy", "balls": 4}, "fps": 10}}, "config.scene.balls is 3 there and 4 here"),
-        ({"producer": {"fingerprint": {"jaxlib": "1", "lanes": 8}}}, "fingerprint.jaxlib is 0 there and 1 here"),
+        ({"producer": {"fingerprint": {"jaxlib": "1", "batch_size": 8}}}, "fingerprint.jaxlib is 0 there and 1 here"),
         ({"codec": "zstd"}, "codec is gzip there and zstd here"),
     ],
 )

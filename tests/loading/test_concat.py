@@ -119,7 +119,7 @@ def test_statistics_are_those_of_all_videos(roots: list[Path]) -> None:
 @pytest.mark.parametrize("shuffle", [True, False])
 def test_an_epoch_gives_every_video_of_every_dataset_once(roots: list[Path], shuffle: bool) -> None:
     joined, whole = loader.open(roots, fields=("index", "states/angle"), window=2), stored(roots)["states/angle"]
-    options: dict[str, Any] = {"seed": 5, "shuffle": shuffle, "epochs": 1, "remainder": "keep", "num_threads": 3}
+    options: dict[str, Any] = {"seed": 5, "shuffle": shuffle, "epochs": 1, "drop_last": False, "num_threads": 3}
     batches = list(gen2d.DataLoader(joined, 7, **options))
     assert [len(batch["index"]) for batch in batches] == [7, 7, 7, 7, 2]
     angles = np.concatenate([batch["states/angle"] for batch in batches])

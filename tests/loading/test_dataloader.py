@@ -61,7 +61,7 @@ def test_a_huge_dataset_needs_no_memory() -> None:
 def test_an_epoch_gives_each_video_once(toy: Path) -> None:
     dataset = loader.open(toy, fields="index")
     for shuffle in (True, False):
-        batches = numbers(list(DataLoader(dataset, 6, epochs=1, shuffle=shuffle, remainder="keep")))
+        batches = numbers(list(DataLoader(dataset, 6, epochs=1, shuffle=shuffle, drop_last=False)))
         assert [len(batch) for batch in batches] == [6, 6, 6, 2]
         assert sorted(itertools.chain(*batches)) == list(range(TRAIN))
         assert (list(itertools.chain(*batches)) == list(range(TRAIN))) is not shuffle
@@ -76,22 +76,22 @@ def test_each_iteration_goes_on_with_the_next_epoch(toy: Path) -> None:
     assert numbers(list(one)) + numbers(list(one)) == numbers(list(two))
 
 
-@pytest.mark.parametrize("remainder", ["drop", "keep"])
-def test_ranks_share_each_global_batch(toy: Path, remainder: str) -> None:
+@pytest.mark.parametrize("drop_last", [True, False])
+def test_ranks_share_each_global_batch(toy: Path, drop_last: bool) -> None:
     dataset = loader.open(toy, fields="index")
-    alone = numbers(list(DataLoader(dataset, 6, epochs=2, remainder=remainder)))
+    alone = numbers(list(DataLoader(dataset, 6, epochs=2, drop_last=drop_last)))
     for world_size in (2, 3):
         ranks = [
-            numbers(list(DataLoader(dataset, 6 // world_size, 0, True, 2, rank, world_size, remainder)))
+            numbers(list(DataLoader(dataset, 6 // world_size, 0, True, 2, rank, world_size, drop_last)))
             for rank in range(world_size)
         ]
         assert [list(itertools.chain(*parts)) for parts in zip(*ranks, strict=True)] == alone
 
 
-@pytest.mark.parametrize("remainder", ["drop", "keep"])
-def test_a_state_resumes_at_the_very_batch_on_any_world_size(toy: Path, remainder: str) -> None:
+@pytest.mark.parametrize("drop_last", [True, False])
+def test_a_state_resumes_at_the_very_batch_on_any_world_size(toy: Path, drop_last: bool) -> None:
     dataset = loader.open(toy, fields=("index", "states/angle"), window=2)
-    full = DataLoader(dataset, 6, epochs=2, remainder=remainder)
+    full = DataLoader(dataset, 6, epochs=2, drop_last=drop_last)
     batches, states = [], [full.state_dict()]
     for batch in full:
         batches.append(batch)
@@ -100,7 +100,7 @@ def test_a_state_resumes_at_the_very_batch_on_any_world_size(toy: Path, remainde
         for world_size in (1, 2, 3):
             ranks = []
             for rank in range(world_size):
-                part = DataLoader(dataset, 6 // world_size, 0, True, 2, rank, world_size, remainder)
+                part = DataLoader(dataset, 6 // world_size, 0, True, 2, rank, world_size, drop_last)
                 part.load_state_dict(state)
                 ranks.append(list(part))
             for parts, expected in zip(zip(*ranks, strict=True), batches[done:], strict=True):

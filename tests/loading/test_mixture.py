@@ -65,7 +65,7 @@ def test_an_epoch_is_as_long_as_no_video_comes_twice(sources: dict, weights: Any
 def test_over_epochs_every_video_comes_equally_often(sources: dict) -> None:
     mixture = gen2d.mix(sources, WEIGHTS)
     for shuffle in (True, False):
-        loading = gen2d.DataLoader(mixture, 6, seed=3, shuffle=shuffle, epochs=31, remainder="keep")
+        loading = gen2d.DataLoader(mixture, 6, seed=3, shuffle=shuffle, epochs=31, drop_last=False)
         often = Counter(videos(mixture, loading))
         for name, source in sources.items():
             own = [often[name, number] for number in range(len(source))]

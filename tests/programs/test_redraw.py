@@ -7,7 +7,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 import gen2d
 from gen2d.core.errors import ConfigError
 
-SMALL = ["storage.lanes=4", "video.frames=8", "video.height=32", "video.width=48", "annotations.masks=true"]
+SMALL = ["storage.batch_size=4", "video.frames=8", "video.height=32", "video.width=48", "annotations.masks=true"]
 CASES = {
     "plain": [],
     "moving": [
@@ -21,8 +21,8 @@ CASES = {
 BLURRED = ["image.exposure=0.5", "image.exposure_samples=4", "look.palette=random", "image.blending=linear"]
 
 
-def dataset(folder, sets, n=6):
-    gen2d.generate("bouncing.yaml", n, folder, sets=[*SMALL, *sets], device="cpu")
+def dataset(folder, overrides, n=6):
+    gen2d.generate("bouncing.yaml", n, folder, overrides=[*SMALL, *overrides], device="cpu")
     return gen2d.open(folder)
 
 
@@ -43,7 +43,9 @@ def test_drawn_again_the_frames_are_those_stored(case, tmp_path, plain):
 
 def test_a_larger_picture_shows_the_same(plain):
     small = plain[[0, 1]]["frames"].astype(float)
-    large = np.asarray(gen2d.render(plain, [0, 1], height=128, width=192, sets=["look.wall_width=6"])).astype(float)
+    large = np.asarray(gen2d.render(plain, [0, 1], height=128, width=192, overrides=["look.wall_width=6"])).astype(
+        float
+    )
     shrunk = large.reshape(2, 8, 32, 4, 48, 4, 3).mean((3, 5))
     # Averages over areas, whatever their size: but for rounding, and for pixels in which several rims meet.
     assert np.quantile(np.abs(shrunk - small), 0.995) < 1.5

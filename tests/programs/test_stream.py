@@ -42,7 +42,7 @@ def same(stream, loader, count: int | None = None) -> None:
 @pytest.mark.parametrize("shuffle", [False, "global"])
 @pytest.mark.parametrize("batch_size", [1, 3, 4, 9])
 def test_a_stream_gives_the_batches_of_the_dataset(made: Path, batch_size: int, shuffle: bool | str):
-    options: dict[str, Any] = {"shuffle": shuffle, "epochs": 1, "remainder": "keep"}
+    options: dict[str, Any] = {"shuffle": shuffle, "epochs": 1, "drop_last": False}
     loader = gen2d.DataLoader(gen2d.open(made, fields="*"), batch_size, seed=7, **options)
     same(streamed(batch_size, fields="*", order_seed=7, **options), loader)
 
@@ -61,9 +61,9 @@ def test_windows_layouts_and_types_are_those_of_the_loader(made: Path, view: dic
     same(streamed(**view, **options), gen2d.DataLoader(gen2d.open(made, **view), 4, **options))
 
 
-@pytest.mark.parametrize("remainder", ["drop", "keep"])
-def test_a_state_goes_on_in_a_stream_or_in_a_loader_on_any_number_of_ranks(made: Path, remainder: str):
-    options: dict[str, Any] = {"shuffle": True, "remainder": remainder, "epochs": 2}
+@pytest.mark.parametrize("drop_last", [True, False])
+def test_a_state_goes_on_in_a_stream_or_in_a_loader_on_any_number_of_ranks(made: Path, drop_last: bool):
+    options: dict[str, Any] = {"shuffle": True, "drop_last": drop_last, "epochs": 2}
     ds = gen2d.open(made)
     stream = streamed(6, **options)
     assert len(list(itertools.islice(stream, 2))) == 2

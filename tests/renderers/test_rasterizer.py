@@ -471,11 +471,11 @@ def test_a_parser_of_colours_measures_the_speed_of_a_ball():
 def test_batches_share_one_program():
     config = load_config(CONFIG)
     rollout = Rollout(config, jax.devices()[:1])
-    lanes = config.storage.lanes
-    every, *_ = flown(config, 3 * lanes)
-    for first in range(0, 3 * lanes, lanes):
+    count = config.storage.batch_size
+    every, *_ = flown(config, 3 * count)
+    for first in range(0, 3 * count, count):
         batch = DeviceBatch(
-            {}, jax.tree.map(lambda a, first=first: a[first : first + lanes], every), jnp.ones(lanes, bool)
+            {}, jax.tree.map(lambda a, first=first: a[first : first + count], every), jnp.ones(count, bool)
         )
         for start in (0, 2):
             (made,) = rollout.draw(batch, start, 2)

@@ -39,7 +39,7 @@ CONFIG = {
     "physics": {"substeps": 4},
     "image": {"noise": [1, 3]},
     "matched": {"change": CHANGES, "members": MEMBERS, "distance": [1, 2]},
-    "storage": {"lanes": 48, "videos_per_shard": 96},
+    "storage": {"batch_size": 48, "videos_per_shard": 96},
 }
 STATES = ("position", "angle", "velocity", "angular_velocity")
 Videos = dict[str, Any]

@@ -239,8 +239,8 @@ def test_a_hundred_thousand_videos_are_numbers_begin_apart_and_stay_within_walls
 def test_the_page_of_all_families_has_a_row_of_each(tmp_path, monkeypatch):
     monkeypatch.setattr(plugins, "names", lambda kind: ["bouncing"] if kind == "scene" else ["flat"])
     monkeypatch.setattr(gallery, "_annotation_rows", lambda *_: iter(()))
-    small = ["video.frames=3", "video.height=16", "video.width=16", "storage.lanes=1"]
-    page, own = gallery.families(tmp_path, sets=small)
+    small = ["video.frames=3", "video.height=16", "video.width=16", "storage.batch_size=1"]
+    page, own = gallery.families(tmp_path, overrides=small)
     assert (page.name, own.name) == ("families.png", "bouncing-gallery.png")
     assert np.asarray(cv2.imread(str(page))).shape == (333, gallery.LABEL + gallery.PAGE, 3)
     assert own.stat().st_size > 0

@@ -34,9 +34,9 @@ class Film(NamedTuple):
 
 
 @functools.cache
-def film(family: str, lanes: int, seconds: float, fps: float, *sets: str, energy: bool = False) -> Film:
+def film(family: str, videos: int, seconds: float, fps: float, *overrides: str, energy: bool = False) -> Film:
     """Some videos of a family's config, with some options changed."""
-    config = load_config(f"{family}.yaml", [*sets, f"video.fps={fps}"])
+    config = load_config(f"{family}.yaml", [*overrides, f"video.fps={fps}"])
     scene, physics, frames = config.scene, config.physics, round(seconds * fps) + 1
     layout, steps = scene.module.layout(scene.options), substeps(fps, physics.substeps, physics.max_step)
     rules = solver_params(physics, fps, steps)
@@ -48,7 +48,7 @@ def film(family: str, lanes: int, seconds: float, fps: float, *sets: str, energy
         made = simulate(*device, layout, rules, frames, steps, SaveAt(energy=energy), sparse=True)
         return factors, things, to_stored(made)
 
-    factors, things, made = jax.tree.map(np.asarray, run(jax.random.split(jax.random.key(1), lanes)))
+    factors, things, made = jax.tree.map(np.asarray, run(jax.random.split(jax.random.key(1), videos)))
     books = made.energy
     total = None if books is None else books.kinetic + books.rotational + books.potential
     return Film(factors, layout, things, made.states, total, np.arange(frames) / fps)
@@ -216,9 +216,9 @@ def test_a_wrecking_ball_hits_a_tower_that_stands():
 
 
 def test_joints_and_polygons_are_stored_whole(tmp_path):
-    options = ["video.frames=3", "video.height=16", "video.width=24", "storage.lanes=2", "scene.weights=2"]
-    sets = [word for option in options for word in ("--set", option)]
-    made = ran("--config", "seesaw.yaml", "--n", 2, "--out", tmp_path / "made", *sets)
+    options = ["video.frames=3", "video.height=16", "video.width=24", "storage.batch_size=2", "scene.weights=2"]
+    overrides = [word for option in options for word in ("--set", option)]
+    made = ran("--config", "seesaw.yaml", "--n", 2, "--out", tmp_path / "made", *overrides)
     assert made.returncode == 0, made.stderr
     checked = ran("verify", tmp_path / "made")
     assert checked.returncode == 0, checked.stdout

@@ -76,9 +76,9 @@ def played(config: Config, n: int, given: dict[str, Any] | None = None) -> Playe
     return start._replace(states=made.states, contacts=made.contacts)
 
 
-def phyworld(family: str, *sets: str) -> Config:
+def phyworld(family: str, *overrides: str) -> Config:
     """The study's config, small."""
-    return load_config(f"phyworld_{family}.yaml", ["video.height=16", "video.width=16", *sets])
+    return load_config(f"phyworld_{family}.yaml", ["video.height=16", "video.width=16", *overrides])
 
 
 def mixed(ranges: list[tuple[float, float]], n: int, seed: int) -> np.ndarray:
@@ -117,8 +117,8 @@ def test_what_moves_starts_in_view_and_touches_nothing(name):
 
 @pytest.mark.parametrize("family", FAMILIES)
 def test_exactly_n_videos_none_alike_over_shards_seeds_and_splits(family, tmp_path: Path):
-    sets = ["storage.lanes=4", "storage.videos_per_shard=4", "storage.frames=none", "video.frames=3"]
-    config, n, starts = phyworld(family, *sets), 10, []
+    overrides = ["storage.batch_size=4", "storage.videos_per_shard=4", "storage.frames=none", "video.frames=3"]
+    config, n, starts = phyworld(family, *overrides), 10, []
     for seed, split in ((0, "train"), (1, "train"), (0, "test")):
         out = tmp_path / f"{seed}-{split}"
         generate(config, n, out, seed=seed, split=split)
@@ -290,8 +290,8 @@ def test_rack_is_whole_and_its_balls_are_a_gap_apart():
 
 
 def test_break_keeps_momentum_until_a_cushion_is_hit_and_never_gains_energy():
-    sets = ["scene.rows=2", "video.frames=48", "annotations.contacts=8"]
-    config = load_config("billiards.yaml", sets)
+    overrides = ["scene.rows=2", "video.frames=48", "annotations.contacts=8"]
+    config = load_config("billiards.yaml", overrides)
     made, rate = played(config, 8), config.physics.damping
     objects, x, v = made.scene.objects, made.states.position[:, :, :-4], made.states.velocity[:, :, :-4]
     mass, moment, radius = objects.mass[:, None, :-4], objects.moment[:, None, :-4], objects.radius[:, None, :-4, None]

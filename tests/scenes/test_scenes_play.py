@@ -17,13 +17,13 @@ from gen2d.programs.rollout import Rollout, per_device
 
 # Of each family what a law needs beside its config.
 LAWS = {
-    "galton": ["storage.lanes=256"],
-    "funnel": ["storage.lanes=32", "annotations.energy=true", "scene.gap={choice: [0.5, 1.5, 2.5]}"],
-    "marble_run": ["storage.lanes=64"],
-    "cradle": ["storage.lanes=64", "scene.elasticity={choice: [0.8, 1.0]}"],
-    "pile": ["storage.lanes=16"],
-    "occluder": ["storage.lanes=32"],
-    "hidden_mass": ["storage.lanes=256"],
+    "galton": ["storage.batch_size=256"],
+    "funnel": ["storage.batch_size=32", "annotations.energy=true", "scene.gap={choice: [0.5, 1.5, 2.5]}"],
+    "marble_run": ["storage.batch_size=64"],
+    "cradle": ["storage.batch_size=64", "scene.elasticity={choice: [0.8, 1.0]}"],
+    "pile": ["storage.batch_size=16"],
+    "occluder": ["storage.batch_size=32"],
+    "hidden_mass": ["storage.batch_size=256"],
 }
 WRONG = {
     "galton": ["radius=0.35", "radius={normal: [0.2, 0.1]}", "apart=0.3", "jitter=[-3, 0]"],
@@ -49,7 +49,7 @@ def made(name: str) -> dict[str, np.ndarray]:
     assert per_device(batch.placed)[0].all()
     columns = rollout.host_columns(batch)[0] | {"time": rollout.time}
     if rollout.config.annotations.visibility:
-        columns |= rollout.draw(batch, 0, rollout.lanes)[0]
+        columns |= rollout.draw(batch, 0, rollout.batch_size)[0]
     return {key: np.asarray(values, float) for key, values in columns.items() if key != "frames"}
 
 

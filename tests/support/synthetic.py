@@ -39,7 +39,7 @@ def dataset(root: Place, train: int = 20, codec: str = "gzip", **changes: object
         "seed": 7,
         "config": {"scene": {"name": "toy", "balls": 3}, "fps": 10},
         "config_text": "scene: {name: toy, balls: 3}\nfps: 10\n",
-        "producer": {"gen2d": "0", "fingerprint": {"jaxlib": "0", "lanes": 8}},
+        "producer": {"gen2d": "0", "fingerprint": {"jaxlib": "0", "batch_size": 8}},
         "splits": {"train": train, "test": 3},
         "videos_per_shard": 8,
         "codec": codec,

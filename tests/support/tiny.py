@@ -17,7 +17,7 @@ CONFIG = {
     "video": {"frames": 6, "fps": 20, "height": 16, "width": 20},
     "scene": {"name": "bouncing", "balls": [1, 3], "width": 6, "height": 5, "gravity": [0, [-9.8, 0]]},
     "physics": {"substeps": 4},
-    "storage": {"videos_per_shard": 8, "lanes": 4},
+    "storage": {"videos_per_shard": 8, "batch_size": 4},
 }
 
 CROWDED = {"balls": 6, "radius": 1.6, "width": 8, "height": 8}  # a scene in which the balls find no place
