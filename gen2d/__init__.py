@@ -5,16 +5,13 @@
     ds = gen2d.open("datasets/bouncing")
     for batch in gen2d.DataLoader(ds, batch_size=32): ...
 
-Names are imported on first use: a training process that only reads data never imports jax.
+Each name is imported on first use, so a training process that only reads data does not import jax.
 """
 
-import importlib
-import importlib.machinery
-import pathlib
-import sys
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from gen2d._version import __version__ as __version__
+from gen2d.core.lazy import attach
 
 if TYPE_CHECKING:
     from gen2d.cli.report import info
@@ -57,7 +54,6 @@ _HOMES = {
     "gen2d.tools.preview": "preview",
     "gen2d.tools.verify": "verify",
 }
-_HOME = {name: home for home, names in _HOMES.items() for name in names.split()}
 
 __all__ = [
     "Config", "ConfigError", "DamagedError", "DataLoader", "Dataset", "Error", "FolderError", "IncompleteError",
@@ -65,33 +61,4 @@ __all__ = [
     "mix", "open", "preview", "render", "render_soft", "simulate_again", "stream", "verify",
 ]  # fmt: skip
 
-
-def __getattr__(name: str) -> Any:
-    if name not in _HOME:
-        raise AttributeError(f"module 'gen2d' has no attribute {name!r}")
-    return getattr(importlib.import_module(_HOME[name]), name)
-
-
-def __dir__() -> list[str]:
-    return sorted([*globals(), *_HOME])
-
-
-class _BesideThePackage:
-    """Finds `gen2d.renderers` and `gen2d.configs`, and nothing else, beside the package: where a checkout keeps them.
-
-    In a wheel they lie inside the package. The checkout's root itself must not be on `__path__`: that would make
-    `gen2d.datasets` and a second `gen2d.gen2d` importable.
-    """
-
-    root = pathlib.Path(__file__).parent.parent
-    names = ("gen2d.renderers", "gen2d.configs")
-
-    @classmethod
-    def find_spec(cls, name: str, path: Any = None, target: Any = None) -> importlib.machinery.ModuleSpec | None:
-        if name not in cls.names:
-            return None
-        return importlib.machinery.PathFinder.find_spec(name, [str(cls.root)])
-
-
-if not (pathlib.Path(__file__).parent / "renderers").is_dir():
-    sys.meta_path.insert(0, _BesideThePackage)  # type: ignore[arg-type]  # a class with a find_spec is a finder
+__getattr__, __dir__ = attach(__name__, _HOMES)

@@ -1,10 +1,11 @@
-"""The names that a plug-in needs: a scene family, a look, an annotation or an export imports this module and no other.
+"""The public names for plug-ins: a scene family, look, annotation or export imports this module and no other of gen2d.
 
-They stay here wherever they move behind it. Each is imported on first use, so that an export imports no jax.
+The names stay here when their modules move. Each is imported on first use, so an export does not import jax.
 """
 
-import importlib
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from gen2d.core.lazy import attach
 
 if TYPE_CHECKING:
     from gen2d.config.distributions import Distribution
@@ -84,7 +85,6 @@ _HOMES = {
     "gen2d.storage.sealed": "as_json",
     "gen2d.xla": "each_video on_cpu reduce_halves",
 }
-_HOME = {name: home for home, names in _HOMES.items() for name in names.split()}
 
 __all__ = [
     "CIRCLE",
@@ -147,9 +147,4 @@ __all__ = [
     "to_pixels"
 ]  # fmt: skip
 
-
-def __getattr__(name: str) -> Any:
-    if name not in _HOME:
-        raise AttributeError(f"module 'gen2d.plugin' has no attribute {name!r}")
-    home = importlib.import_module(_HOME[name])
-    return getattr(home, name) if hasattr(home, name) else importlib.import_module(f"{_HOME[name]}.{name}")
+__getattr__, __dir__ = attach(__name__, _HOMES)

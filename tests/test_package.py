@@ -29,7 +29,7 @@ LAYERS = (
 )
 RANKS = {room: rank for rank, layer in enumerate(LAYERS) for room in layer}
 # None of these imports jax when it is imported.
-WITHOUT_JAX = ("core", "storage", "dataset", "media", "loading", "captions", "exports", "tools.verify", "cli.report")
+WITHOUT_JAX = ("core", "storage", "dataset", "media", "loading", "captions", "exports", "tools.verify", "cli")
 
 
 def sources() -> dict[str, Path]:
@@ -109,6 +109,22 @@ def test_names_are_nouns_of_the_field() -> None:
         for node in ast.walk(ast.parse(path.read_text())):
             if isinstance(node, ast.FunctionDef | ast.ClassDef):
                 assert node.name.strip("_").lower() not in poetry, f"{module}.{node.name}"
+
+
+@pytest.mark.parametrize("facade", ["gen2d", "gen2d.plugin"])
+def test_public_names_are_declared_alike(facade: str) -> None:
+    module = importlib.import_module(facade)
+    tree = ast.parse(MODULES[facade].read_text())
+    typed = next(node for node in tree.body if isinstance(node, ast.If))
+    declared = {
+        (node.module, alias.name) for node in typed.body if isinstance(node, ast.ImportFrom) for alias in node.names
+    }
+    assert declared == {(home, name) for home, names in module._HOMES.items() for name in names.split()}
+    assert sorted(module.__all__) == sorted(name for _, name in declared)
+    assert set(module.__all__) <= set(dir(module))
+    assert all(getattr(module, name) is not None for name in module.__all__)
+    with pytest.raises(AttributeError, match=f"module '{facade}' has no attribute 'nothing'"):
+        _ = module.nothing
 
 
 def test_few_files_lie_beside_the_rooms() -> None:

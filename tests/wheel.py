@@ -8,6 +8,7 @@ import gen2d
 from gen2d.config import plugins
 
 names = zipfile.ZipFile(sys.argv[1]).namelist()
+assert len(names) == len(set(names)), "a file is in the wheel twice"
 top = {name.split("/")[0] for name in names}
 assert top == {"gen2d", f"gen2d-{gen2d.__version__}.dist-info"}, top
 assert not [name for name in names if name.startswith(("gen2d/datasets", "gen2d/tests", "gen2d/gen2d"))]

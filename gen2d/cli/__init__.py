@@ -1,1 +1,1 @@
-"""The command line: one module for what each verb prints."""
+"""The command line: one module for each verb."""

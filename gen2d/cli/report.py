@@ -1,4 +1,4 @@
-"""What a dataset holds, and what gen2d knows, as text for a terminal."""
+"""A dataset's data sheet, and the options of all plug-ins, as text."""
 
 import dataclasses
 from collections.abc import Iterator, Mapping
@@ -12,7 +12,7 @@ from gen2d.storage.paths import Network, Place, place
 
 
 def _table(rows: list[tuple[str, ...]]) -> list[str]:
-    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     return [
         "  " + "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows
     ]
@@ -21,110 +21,109 @@ def _table(rows: list[tuple[str, ...]]) -> list[str]:
 def info(root: str | Place, *, timeout: float = 30.0, deadline: float = 300.0) -> str:
     """Data sheet of a dataset as text: splits, sizes, every field with its unit, statistics, versions.
 
-    `root` is a folder or a URL; `timeout` and `deadline` are those of `open`. Raises IncompleteError, DamagedError or
-    UnreachableError.
+    `root` is a folder or a URL; `timeout` and `deadline`, in seconds, are those of `open`. Raises IncompleteError,
+    DamagedError or UnreachableError.
     """
     root = place(root, Network(timeout, deadline))
     manifest = read_manifest(root)
     splits = ", ".join(f"{name}: {count:,} videos" for name, count in manifest.splits.items())
+    duration = in_time(sum(manifest.splits.values()) * manifest.sizes.get("T", 0) / manifest.fps)
     sizes = ", ".join(f"{name} = {value}" for name, value in manifest.sizes.items())
-    rows = [("field", "type", "axes", "unit", "meaning")]
-    rows += [(name, f.dtype, f.axes, f.unit, f.meaning) for name, f in manifest.fields.items()]
+    fields = [(name, f.dtype, f.axes, f.unit, f.meaning) for name, f in manifest.fields.items()]
     versions = ", ".join(f"{key} {value}" for key, value in manifest.producer.items() if not isinstance(value, dict))
-    fingerprint = ", ".join(f"{key} {value or '-'}" for key, value in _flat(manifest.fingerprint))
-    made = [f"python -m gen2d --config config.yaml --n {n} --split {s}" for s, n in manifest.splits.items()]
+    fingerprint = ", ".join(f"{key} {value}" for key, value in _fingerprint(manifest.fingerprint))
+    commands = [
+        f"python -m gen2d --config config.yaml --n {count} --split {split} --seed {manifest.seed}"
+        for split, count in manifest.splits.items()
+    ]
     return "\n".join(
         [
             f"{manifest.name} ({root})",
-            f"  {splits}; seed {manifest.seed}, {manifest.fps:g} frames/s, {_duration(manifest)}",
+            f"  {splits}; seed {manifest.seed}, {manifest.fps:g} frames/s, {duration} in total",
             f"  sizes: {sizes}",
             "",
-            *_table(rows),
+            *_table([("field", "type", "axes", "unit", "meaning"), *fields]),
             "",
             f"  {manifest.conventions}",
             "",
-            *_table([("split", "field", "mean", "standard deviation", "least", "largest"), *statistics(manifest)]),
-            f"  of {manifest.stats_sampled}",
+            *_table([("split", "field", "mean", "standard deviation", "min", "max"), *statistics(manifest)]),
+            f"  computed from {manifest.stats_sampled}",
             "",
-            *_table([("on disk", "files", "size"), *_volumes(root, manifest)]),
-            f"  frames and other images compressed with {manifest.codec}, up to {manifest.videos_per_shard:,} "
-            "videos a shard",
+            *_table([("on disk", "files", "size"), *_disk_usage(root, manifest)]),
+            f"  frames and other images are compressed with {manifest.codec}; up to {manifest.videos_per_shard:,} "
+            "videos in a shard",
             "",
-            *(f"  made by {command} --seed {manifest.seed}" for command in made),
-            f"  with {versions}",
-            f"  bits fixed by {fingerprint}",
-            f"  config {manifest.config_sha256}",
-            f"  licence: {manifest.licence or 'none was chosen'}",
+            *(f"  command: {command}" for command in commands),
+            f"  versions: {versions}",
+            f"  fingerprint: {fingerprint}",
+            f"  sha256 of the config: {manifest.config_sha256}",
+            f"  licence: {manifest.licence or 'none'}",
         ]
     )
 
 
-def _duration(manifest: Manifest) -> str:
-    """How long all videos together are."""
-    return in_time(sum(manifest.splits.values()) * manifest.sizes.get("T", 0) / manifest.fps) + " in all"
-
-
-def _volumes(root: Place, manifest: Manifest) -> Iterator[tuple[str, ...]]:
-    """What lies on disk: the shards of each split, and all the rest."""
+def _disk_usage(root: Place, manifest: Manifest) -> Iterator[tuple[str, ...]]:
+    """Rows of name, files and size: shards of each split, and tables of shards."""
     for split, table in manifest.tables.items():
         yield f"shards of {split}", f"{table.shards:,}", in_bytes(table.bytes)
     index = [size for table in manifest.tables.values() if (size := size_of(root / table.file)) is not None]
     yield "tables of shards", f"{len(index):,}", in_bytes(sum(index))
 
 
-def _flat(about: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
-    """The entries of a mapping, those of a mapping in it by both names; hashes are cut."""
-    for key, value in about.items():
+def _fingerprint(entries: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:
+    """Names and values of a fingerprint, nested ones as 'outer.inner', hashes cut to 16 characters."""
+    for key, value in entries.items():
         if isinstance(value, dict):
-            yield from ((f"{key}.{name}", f"{own!s:.16}") for name, own in value.items())
+            yield from _fingerprint(value, f"{key}.")
         else:
-            yield key, value
+            text = f"{value:g}" if isinstance(value, float) else str(value)
+            yield f"{prefix}{key}", (text[:16] if prefix else text) or "-"
 
 
-def plugins_text(name: str | None = None) -> str:
-    """Families, looks and configs with their options; only `name` if it is given."""
-    from gen2d.config import (
-        config,  # imports jax
-        plugins,
-    )
+def plugins(name: str | None = None) -> str:
+    """Scene families, looks and configs with their options as text; only the one called `name`, if it is given.
+
+    Raises ConfigError for an unknown name.
+    """
+    from gen2d.config import plugins
+    from gen2d.config.config import SECTIONS  # imports jax
 
     lines: list[str] = []
     for kind, title in (("scene", "Scene families"), ("look", "Looks")):
-        found = [n for n in plugins.names(kind) if name in (None, n)]
-        lines += [f"{title}:"] if found else []
-        for plugin in found:
+        chosen = [plugin for plugin in plugins.names(kind) if name in (None, plugin)]
+        lines += [f"{title}:"] if chosen else []
+        for plugin in chosen:
             module = plugins.load(kind, plugin)
-            lines += [
-                f" {plugin}: {(module.__doc__ or '').strip().splitlines()[0]}",
-                *_options(kind, module.Options),
-                "",
-            ]
-    configs = [c for c in plugins.config_names() if name in (None, c, c.removesuffix(".yaml"))]
+            lines += [*_section(plugin, module.__doc__, kind, module.Options), ""]
+    configs = [config for config in plugins.config_names() if name in (None, config, config.removesuffix(".yaml"))]
     if configs:
-        lines += [f"Configs (in {plugins.config_folder()}):", *(f"  {c}" for c in configs), ""]
+        lines += [f"Configs (in {plugins.config_folder()}):", *(f"  {config}" for config in configs), ""]
     if name is None:
-        lines.append("Sections that every config has:")
-        for section, options in config.SECTIONS.items():
-            lines += [f" {section}: {(options.__doc__ or '').strip().splitlines()[0]}", *_options(section, options), ""]
+        lines.append("Sections of every config:")
+        for section, options in SECTIONS.items():
+            lines += [*_section(section, options.__doc__, section, options), ""]
     if not lines:
-        names = [*plugins.names("scene"), *plugins.names("look"), *plugins.config_names()]
-        raise ConfigError(f"{name!r} is not known; {plugins.nearest(name or '', names)}")
+        known = [*plugins.names("scene"), *plugins.names("look"), *plugins.config_names()]
+        raise ConfigError(f"{name!r} is not known; {plugins.nearest(name or '', known)}")
     return "\n".join(lines).rstrip()
 
 
-def _options(where: str, options: type) -> list[str]:
+def _section(title: str, doc: str | None, prefix: str, options: type) -> list[str]:
+    """A title with the first line of a docstring, and a table of options: name, default, meaning and allowed values."""
     rows = []
     for field in dataclasses.fields(options):
         spec = field.metadata["option"]
         unit = f" {spec.unit}" if spec.unit not in ("", "1") else ""
-        about = f"{spec.meaning}; {spec.allowed}" + (", drawn" if spec.draw else "")
-        rows.append((f"{where}.{field.name}", f"{_shown(field.default)}{unit}", about))
-    return _table(rows)
+        meaning = f"{spec.meaning}; {spec.allowed}" + (", or a distribution" if spec.draw else "")
+        rows.append((f"{prefix}.{field.name}", f"{_default(field.default)}{unit}", meaning))
+    summary = (doc or "").strip().partition("\n")[0]
+    return [f" {title}: {summary}", *_table(rows)]
 
 
-def _shown(value: Any) -> str:
+def _default(value: Any) -> str:
+    """An option's default as a config would have it."""
     if isinstance(value, tuple):
-        return "[" + ", ".join(map(_shown, value)) + "]"
+        return "[" + ", ".join(map(_default, value)) + "]"
     if hasattr(value, "plain"):
         plain = value.plain()
         if isinstance(plain, dict) and set(plain) <= {"uniform", "integer"}:

@@ -1,10 +1,10 @@
-"""Errors for a person: one sentence each, and the exit code that the command line ends with."""
+"""Errors that end a command: one sentence each, and an exit code."""
 
-LONGEST = 800  # characters of a sentence; what is quoted in it may be longer
+LONGEST = 800  # characters of a sentence; longer ones lose their middle
 
 
 def one_line(text: str) -> str:
-    """The text on one line that a terminal shows as it is, however it was put together."""
+    """The text on one line of at most about `LONGEST` printable characters; others are escaped."""
     text = "".join(c if c.isprintable() else _escaped(c) for c in text)
     return text if len(text) <= LONGEST else f"{text[: LONGEST // 2]} ... {text[-LONGEST // 2 :]}"
 
@@ -14,7 +14,7 @@ def _escaped(character: str) -> str:
 
 
 class Error(Exception):
-    """What ends a command: one sentence, and an exit code."""
+    """An error with one sentence for the user, and the exit code of the command that it ends."""
 
     exit_code = 1
 
@@ -23,13 +23,13 @@ class Error(Exception):
 
 
 class UserError(Error):
-    """Something that the user can mend; exit code 2."""
+    """An error that the user can correct; exit code 2."""
 
     exit_code = 2
 
 
 class ConfigError(UserError):
-    """An option that cannot be: the sentence names file, field, value and what is allowed."""
+    """An option that is not allowed; the sentence names file, field, value and what is allowed."""
 
 
 class FolderError(UserError):
@@ -37,18 +37,18 @@ class FolderError(UserError):
 
 
 class IncompleteError(FolderError):
-    """A folder without a whole dataset: none was begun there, or it is not finished."""
+    """A folder without a complete dataset: none was begun there, or it is unfinished."""
 
 
 class UntrustedError(UserError):
-    """Code of a dataset's that would have to run, and that this user has not said to trust."""
+    """Code that came with a dataset and would have to run, but that the user does not trust."""
 
 
 class DamagedError(Error):
-    """Stored data that is not what was written; the sentence names the file and what is wrong with it; exit code 1."""
+    """Stored data that differs from what was written; the sentence names the file and the damage; exit code 1."""
 
 
 class UnreachableError(Error):
-    """A server or disk that gave no answer, so that nothing is known of the data; exit code 3."""
+    """A server or disk that does not answer, which says nothing about the data; exit code 3."""
 
     exit_code = 3

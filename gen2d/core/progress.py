@@ -1,4 +1,4 @@
-"""What long work tells a person, and how a signal stops it."""
+"""Progress of long work on a terminal, and interruption by a signal."""
 
 import signal
 import sys
@@ -13,26 +13,34 @@ from tqdm import tqdm
 from gen2d.core.humanize import in_time
 
 
+def to_stderr(line: str) -> None:
+    """Prints a line on standard error, at once."""
+    print(line, file=sys.stderr, flush=True)
+
+
 @contextmanager
 def progress(count: int, say: Callable[[str], None]) -> Iterator[Callable[[int], None]]:
-    """A bar on a terminal; elsewhere a plain line every ten seconds. Yields what to call with each number of videos."""
+    """A progress bar on a terminal; elsewhere one line every ten seconds, passed to `say`.
+
+    Yields the function to call with each number of videos done.
+    """
     if sys.stderr.isatty():
         with tqdm(total=count, unit=" videos", smoothing=0.1, dynamic_ncols=True) as bar:
 
-            def moved(videos: int) -> None:
+            def update(videos: int) -> None:
                 bar.update(videos)
 
-            yield moved
+            yield update
         return
-    began = told = time.perf_counter()
+    start = printed = time.perf_counter()
     done = 0
 
     def advance(videos: int) -> None:
-        nonlocal done, told
+        nonlocal done, printed
         done += videos
         now = time.perf_counter()
-        if now - told >= 10 and done < count:
-            told, speed = now, done / (now - began)
+        if now - printed >= 10 and done < count:
+            printed, speed = now, done / (now - start)
             say(f"{done:,} of {count:,} videos, {speed:,.0f} videos/s, {in_time((count - done) / speed)} left")
 
     yield advance
@@ -40,7 +48,7 @@ def progress(count: int, say: Callable[[str], None]) -> Iterator[Callable[[int],
 
 @contextmanager
 def stopping_on_sigterm(say: Callable[[str], None]) -> Iterator[None]:
-    """Makes SIGTERM stop the run as Ctrl-C does; a second signal of either kind ends the process at once."""
+    """A block that SIGTERM interrupts as Ctrl-C does; a second signal of either kind ends the process at once."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -48,12 +56,12 @@ def stopping_on_sigterm(say: Callable[[str], None]) -> Iterator[None]:
     def stop(number: int, _: Any) -> None:
         signal.signal(signal.SIGINT, signal.SIG_DFL)
         signal.signal(signal.SIGTERM, signal.SIG_DFL)
-        say("Stopping; what is being compiled or written is finished or dropped first. A second signal does not wait.")
+        say("Stopping, once compilation has ended and open files are closed or removed; a second signal stops at once.")
         raise KeyboardInterrupt(number)
 
-    before = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
+    handlers = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
         yield
     finally:
-        for number, handler in before.items():
+        for number, handler in handlers.items():
             signal.signal(number, handler)

@@ -3,7 +3,6 @@
 import contextlib
 import dataclasses
 import importlib
-import pkgutil
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -12,7 +11,7 @@ from typing import Any
 
 from gen2d.core.errors import ConfigError, FolderError
 from gen2d.core.progress import progress, stopping_on_sigterm
-from gen2d.exports import formats as formats_package
+from gen2d.exports import formats
 from gen2d.exports.source import Source, source_of
 from gen2d.storage.atomic import publishing, publishing_folder, sweep_beside
 from gen2d.storage.explain import writing_error
@@ -32,11 +31,6 @@ class Exported:
     bytes: int
     seconds: float
     loss: str  # what the format does not keep; "" if it is exact
-
-
-def formats() -> list[str]:
-    """The names of the formats."""
-    return sorted(module.name for module in pkgutil.iter_modules(formats_package.__path__))
 
 
 def export(
@@ -75,8 +69,8 @@ def export(
 
 
 def _module(to: str) -> ModuleType:
-    if to not in formats():
-        raise ConfigError(f"--to is {to!r}, but must be one of {', '.join(formats())}")
+    if to not in formats.names():
+        raise ConfigError(f"--to is {to!r}, but must be one of {', '.join(formats.names())}")
     return importlib.import_module(f"gen2d.exports.formats.{to}")
 
 

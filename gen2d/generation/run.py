@@ -4,7 +4,6 @@ import contextlib
 import dataclasses
 import numbers
 import os
-import shlex
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -24,7 +23,7 @@ from gen2d.programs import devices
 from gen2d.programs.fingerprint import fingerprint, sources
 from gen2d.programs.source import VideoSource
 from gen2d.records.keys import MAX_VIDEOS
-from gen2d.storage.paths import Network, Place, place, shown
+from gen2d.storage.paths import Network, Place, place
 
 CONVENTIONS = (
     "World: metres, y up, radians counter-clockwise, seconds. Pixels: (row, column) from the top left, pixel centres "
@@ -168,8 +167,3 @@ def _make(source: VideoSource, dataset: DatasetSpec, todo: list[Shard], say: Cal
         finally:
             encoder.close()
     return size
-
-
-def command(arguments: Sequence[str]) -> str:
-    """The shell command that runs gen2d with these arguments."""
-    return " ".join(["python -m gen2d", *(shlex.quote(shown(word)) for word in arguments)])

@@ -22,7 +22,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 import gen2d
 from gen2d.core.errors import ConfigError, FolderError, UserError
 from gen2d.core.schema import Field
-from gen2d.exports import export
+from gen2d.exports import export, formats
 from gen2d.exports import source as source_module
 
 SIZES = {"T": 6, "H": 64, "W": 48, "K": 3}
@@ -375,7 +375,7 @@ def test_a_file_is_replaced_only_when_asked(balls: Path, tmp_path: Path) -> None
 
 
 def test_every_format_keeps_the_contract() -> None:
-    for name in export.formats():
+    for name in formats.names():
         module = export._module(name)
         assert (module.__doc__ or "").strip()
         assert isinstance(module.LOSS, str)

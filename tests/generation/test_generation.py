@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import yaml
 from numpy.testing import assert_allclose, assert_array_equal
-from tiny import CONFIG, CROWDED, changed, command, everything, ran, ran_here, run_on, same
+from tiny import CONFIG, CROWDED, changed, command, everything, ran, run_on, same
 
 import gen2d
 from gen2d.core.errors import ConfigError, FolderError, UserError
@@ -266,90 +266,3 @@ def test_the_frame_rate_does_not_change_the_motion(tmp_path: Path):
     generate(fast, 8, tmp_path / "fast")
     one, other = everything(tmp_path / "slow")["states/position"], everything(tmp_path / "fast")["states/position"]
     assert_allclose(one, other[:, ::3], atol=1e-4)
-
-
-def test_the_command_line_tells_what_it_did(tmp_path: Path):
-    (tmp_path / "tiny.yaml").write_text(yaml.safe_dump(CONFIG))
-    done = ran("--config", "tiny.yaml", "--n", 9, cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
-    assert "9 videos in" in done.stdout
-    assert "datasets/tiny" in done.stdout
-    assert "will take about" in done.stderr
-    again = ran_here("--config", "tiny.yaml", "--n", 9, cwd=tmp_path)
-    assert (again.returncode, "nothing to do" in again.stdout) == (0, True)
-    sheet = ran_here("info", "datasets/tiny", cwd=tmp_path)
-    assert "train: 9 videos" in sheet.stdout
-    assert "m/s^2" in sheet.stdout
-    assert ran_here("verify", "datasets/tiny", cwd=tmp_path).returncode == 0
-    path = tmp_path / "datasets/tiny/shards/train-00001-n1.h5"
-    content = bytearray(path.read_bytes())
-    content[len(content) // 2] ^= 4
-    path.write_bytes(content)
-    broken = ran("verify", "datasets/tiny", cwd=tmp_path)
-    assert broken.returncode == 1
-    assert "train-00001" in broken.stdout
-    pictures = ran_here("preview", "tiny.yaml", "--videos", 2, "--out", "pictures", cwd=tmp_path)
-    assert pictures.returncode == 0, pictures.stderr
-    for name in pictures.stdout.split():
-        assert (tmp_path / name).stat().st_size > 500
-
-
-@pytest.mark.parametrize(
-    "arguments",
-    [
-        ["--config", "nothing.yaml", "--n", "1"],
-        ["--config", "bouncing.yaml"],
-        ["--config", "bouncing.yaml", "--n", "many"],
-        ["--config", "bouncing.yaml", "--n", "0"],
-        ["--config", "bouncing.yaml", "--n", "1", "--seed", "-1"],
-        ["--config", "bouncing.yaml", "--n", "1", "--set", "scene.balls=0"],
-        ["--config", "bouncing.yaml", "--n", "1", "--worker", "3"],
-        ["--config", "bouncing.yaml", "--n", "1", "--split", "../x"],
-        ["--config", "bouncing.yaml", "--n", "1", "--over"],
-        ["--config", "bouncing.yaml", "--n", "1", "--device", "gpu"],
-        ["verify", "nowhere"],
-        ["info", "nowhere"],
-        ["preview", "nowhere"],
-        ["list", "nothing"],
-        ["bouncing.yaml"],
-        ["--config", "", "--n", "1"],
-        ["--config", "/dev/zero", "--n", "1"],
-        ["--config", ".", "--n", "1"],
-        ["--config", "bouncing.yaml", "--n", "99999999999999999999"],
-        ["--config", "bouncing.yaml", "--n", "1", "--seed", "1e3"],
-        ["--config", "bouncing.yaml", "--n", "1", "--split", ""],
-        ["--config", "bouncing.yaml", "--n", "1", "--set", "a"],
-        ["--config", "bouncing.yaml", "--n", "1", "--set", "=1"],
-        ["--config", "bouncing.yaml", "--n", "1", "--set", "scene.balls.x=1"],
-        ["--config", "bouncing.yaml", "--n", "1", "--set", "scene.balls=[[["],
-        ["--config", "bouncing.yaml", "--n", "1", "--worker", "1/0"],
-        ["--config", "bouncing.yaml", "--n", "1", "--worker", "2/2"],
-        ["--config", "bouncing.yaml", "--n", "1", "--timeout", "0"],
-        ["--config", "bouncing.yaml", "--n", "1", "--deadline", "nan"],
-        ["--config", "bouncing.yaml", "--n", "1", "--out", "nope://x"],
-        ["--config", "bouncing.yaml", "--n", "1", "extra"],
-        ["verify", "nowhere", "--level", "deep"],
-        ["verify", "nowhere", "--videos", "x"],
-        ["verify"],
-        ["verify", "s3://"],
-        ["clean", "nowhere"],
-        ["clean", "/dev/null"],
-        ["info", "/dev/null"],
-        ["info", "x" * 300],
-        ["export", "nowhere", "--to", "npz"],
-        ["export", "nowhere", "--to", "nothing"],
-        ["preview", "bouncing.yaml", "--videos", "0"],
-        ["preview", "bouncing.yaml", "--out", "/dev/null/x"],
-        ["preview", "bouncing.yaml", "--seed", "-3"],
-        ["list", "\x1b[31m"],
-    ],
-)
-def test_bad_commands_end_with_one_sentence_and_code_two(tmp_path: Path, arguments: list[str]):
-    if "gpu" in arguments and any(d.platform == "gpu" for d in jax.devices()):
-        return
-    done = (ran if "many" in arguments else ran_here)(*arguments, cwd=tmp_path)
-    assert done.returncode == 2, done.stdout + done.stderr
-    sentences = [line for line in done.stderr.splitlines() if line.startswith("gen2d: ")]
-    assert len(sentences) == 1
-    assert "Traceback" not in done.stderr
-    assert not any(tmp_path.iterdir())

@@ -579,7 +579,8 @@ def test_a_wrong_url_is_one_sentence(url: str, told: str) -> None:
     ("url", "missing"), [("s3://bucket/toy", "fsspec"), ("s3://bucket/toy", "s3fs"), ("memory://toy", "fsspec")]
 )
 def test_a_missing_package_is_one_sentence(url: str, missing: str) -> None:
-    code = f"import sys; sys.modules[{missing!r}] = None; from gen2d.cli.main import main; main(['info', {url!r}])"
+    code = f"import sys; sys.modules[{missing!r}] = None; from gen2d.cli.main import main; "
+    code += f"sys.exit(main(['info', {url!r}]))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 2
     assert re.fullmatch(r"gen2d: .* needs .*: pip install 'gen2d\[remote\]'\n", done.stderr), done.stderr

@@ -6,3 +6,10 @@ whether it can hold no others, `SUFFIX`, the ending of the one file that it make
     check(source)           raises ConfigError where this dataset cannot be held
     write(target, source)   fills the folder, or the file
 """
+
+import pkgutil
+
+
+def names() -> list[str]:
+    """The names of the formats."""
+    return sorted(module.name for module in pkgutil.iter_modules(__path__))

@@ -1,0 +1,22 @@
+"""Remove old snapshots of a dataset, and temporary files that no process writes any more."""
+
+import argparse
+
+from gen2d.cli.parser import Parser, add_dataset, add_network, limits
+from gen2d.core.errors import one_line
+
+
+def add_arguments(parser: Parser) -> None:
+    add_dataset(parser)
+    add_network(parser)
+
+
+def run(options: argparse.Namespace) -> int:
+    from gen2d.dataset import folder
+    from gen2d.storage.paths import Network, place
+
+    root = place(options.dataset, Network(**limits(options)))
+    for name in folder.clean(root):
+        print(one_line(f"removed: {name}"))
+    print(f"{root}: clean")
+    return 0

@@ -1,0 +1,48 @@
+"""Write a dataset as films, tar files, NumPy archives or in the layout of another program."""
+
+import argparse
+from pathlib import Path
+
+from gen2d.cli.parser import Parser, add_dataset, add_network, add_trust, limits
+from gen2d.core.humanize import in_bytes, in_time
+from gen2d.exports import formats
+
+
+def add_arguments(parser: Parser) -> None:
+    add_dataset(parser)
+    parser.add_argument("--to", required=True, metavar="FORMAT", help=f"one of {', '.join(formats.names())}")
+    parser.add_argument(
+        "--out", type=Path, metavar="PATH", help="the folder or file to make (default: DIR-FORMAT, beside the dataset)"
+    )
+    parser.add_argument("--split", metavar="NAME", help="the split to export (default: the only one, or train)")
+    parser.add_argument(
+        "--fields",
+        nargs="+",
+        metavar="NAME",
+        help="fields to export, by name or pattern such as 'states/*'; for npz and webdataset only (default: all)",
+    )
+    parser.add_argument("--overwrite", action="store_true", help="replace an export of another dataset")
+    add_trust(parser)
+    add_network(parser)
+
+
+def run(options: argparse.Namespace) -> int:
+    from gen2d.core.progress import to_stderr
+    from gen2d.exports.export import export
+
+    exported = export(
+        options.dataset,
+        options.to,
+        options.out,
+        split=options.split,
+        fields=options.fields,
+        overwrite=options.overwrite,
+        say=to_stderr,
+        trust=options.trust,
+        **limits(options),
+    )
+    size = f"{in_time(exported.seconds)}, {in_bytes(exported.bytes)}"
+    print(f"{exported.videos:,} videos in {size}, in {exported.out}")
+    if exported.loss:
+        print(f"{options.to} is {exported.loss}")
+    return 0

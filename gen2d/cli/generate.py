@@ -1,0 +1,94 @@
+"""Make a dataset, or add videos to one (the verb if none is named)."""
+
+import argparse
+import os
+import shlex
+from typing import TYPE_CHECKING
+
+from gen2d.cli.parser import PROG, Parser, add_network, add_overrides, limits, whole_number
+from gen2d.core.errors import UserError
+from gen2d.core.humanize import in_bytes, in_time
+
+if TYPE_CHECKING:
+    from gen2d.generation.run import Summary
+
+
+def add_arguments(parser: Parser) -> None:
+    parser.add_argument(
+        "--config", required=True, metavar="YAML", help="a config file, or the name of one that comes with gen2d"
+    )
+    parser.add_argument(
+        "--n",
+        required=True,
+        type=whole_number,
+        metavar="N",
+        help="how many videos a split is to hold, those already there included",
+    )
+    parser.add_argument(
+        "--out", metavar="DIR", help="the dataset's folder or URL (default: datasets/NAME in the current folder)"
+    )
+    parser.add_argument(
+        "--seed", type=whole_number, metavar="S", help="a number from 0 to 2**63 - 1 (default: the config's seed, or 0)"
+    )
+    parser.add_argument(
+        "--split", metavar="NAME", help="make this split only (default: all splits of the config, or train)"
+    )
+    add_overrides(parser)
+    parser.add_argument(
+        "--device",
+        default="auto",
+        choices=("auto", "cpu", "gpu"),
+        help="where to compute (default: auto, a GPU if there is one)",
+    )
+    parser.add_argument(
+        "--worker",
+        default="0/1",
+        type=_worker,
+        metavar="R/W",
+        help="share the work: worker R of W, counted from 0, makes every W-th shard (default: 0/1)",
+    )
+    parser.add_argument("--overwrite", action="store_true", help="replace a dataset of another config or seed")
+    add_network(parser)
+
+
+def _worker(text: str) -> tuple[int, int]:
+    number, slash, count = text.partition("/")
+    if not slash or not all(part.isascii() and part.isdecimal() for part in (number, count)):
+        raise UserError(f"--worker is {text!r}, but must be R/W, such as 0/4")
+    return int(number), int(count)
+
+
+def run(options: argparse.Namespace) -> int:
+    from gen2d.core.progress import to_stderr
+    from gen2d.generation.run import generate  # imports jax
+    from gen2d.storage.paths import shown
+
+    try:
+        summary = generate(
+            options.config,
+            options.n,
+            options.out,
+            seed=options.seed,
+            split=options.split,
+            overrides=options.overrides,
+            device=options.device,
+            worker=options.worker,
+            overwrite=options.overwrite,
+            say=to_stderr,
+            **limits(options),
+        )
+    except KeyboardInterrupt:
+        again = [shlex.quote(shown(word)) for word in options.arguments if word != "--overwrite"]
+        to_stderr(f"gen2d: stopped; complete shards are kept. To go on: {' '.join([PROG, *again])}")
+        os._exit(130)  # all files are closed; jax may still compute in the background, and would crash a normal exit
+    print(_report(summary))
+    return 0
+
+
+def _report(summary: "Summary") -> str:
+    if not summary.made:
+        ready = "is complete" if summary.complete else "has all of this worker's shards"
+        return f"{summary.out} {ready}: nothing to do."
+    speed = f"{in_time(summary.seconds)} ({summary.videos_per_second:,.0f} videos/s)"
+    text = f"{summary.made:,} videos in {speed}, {in_bytes(summary.bytes)}, in {summary.out}"
+    return text if summary.complete else text + "; other workers' shards are still missing"

@@ -1,0 +1,16 @@
+"""List scene families, looks and configs, with all their options."""
+
+import argparse
+
+from gen2d.cli.parser import Parser
+
+
+def add_arguments(parser: Parser) -> None:
+    parser.add_argument("name", nargs="?", metavar="NAME", help="show only this family, look or config")
+
+
+def run(options: argparse.Namespace) -> int:
+    from gen2d.cli.report import plugins
+
+    print(plugins(options.name))
+    return 0

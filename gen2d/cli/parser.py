@@ -1,0 +1,152 @@
+"""Argument parsers of the command line: verbs, arguments that they share, and one sentence for each error."""
+
+import argparse
+import itertools
+from collections.abc import Mapping, Sequence
+from types import ModuleType
+from typing import Any, NoReturn
+
+from gen2d._version import __version__
+from gen2d.config.plugins import nearest
+from gen2d.core.errors import UserError
+
+PROG = "python -m gen2d"
+USAGE = """\
+python -m gen2d --config YAML --n N [options]
+       python -m gen2d VERB [options]"""
+DESCRIPTION = "Make datasets of rendered videos of 2D rigid bodies, with every ground truth."
+EXAMPLES = """\
+examples:
+  draw a config before making a dataset:
+    python -m gen2d preview bouncing.yaml
+  make 1000 videos in datasets/bouncing, then 4000 more:
+    python -m gen2d --config bouncing.yaml --n 1000
+    python -m gen2d --config bouncing.yaml --n 5000
+  make videos of another size, with another seed, in another folder:
+    python -m gen2d --config bouncing.yaml --n 100 --set video.height=128 \\
+      --set video.width=128 --seed 7 --out /data/larger
+"""
+
+
+class Parser(argparse.ArgumentParser):
+    """A verb's parser. Option names cannot be shortened; each error is a UserError of one sentence."""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(allow_abbrev=False, **options)
+
+    def error(self, message: str) -> NoReturn:
+        raise UserError(f"{message.removeprefix('argument ')}; see {self.prog} --help")
+
+    def check_names(self, words: Sequence[str]) -> None:
+        """Raises UserError for an unknown option; argparse would first complain of one that is missing."""
+        known = [name for name in self._option_string_actions if name.startswith("--")]
+        for word in itertools.takewhile(lambda word: word != "--", words):
+            name = word.partition("=")[0]
+            if name.startswith("--") and name not in known:
+                likely = [option for option in known if option.startswith(name)] or known
+                raise UserError(f"{name} is not an option; {nearest(name, likely)}")
+
+
+def parse(arguments: Sequence[str], verbs: Mapping[str, ModuleType]) -> argparse.Namespace:
+    """Options of a command line, with the function that runs its verb as `run`.
+
+    A verb is a module with `add_arguments(parser)` and `run(options)`, described by its docstring. `generate` is the
+    verb of a line that starts with an option. Raises UserError; exits after --help and --version.
+    """
+    top = argparse.ArgumentParser(
+        prog=PROG,
+        usage=USAGE,
+        description=DESCRIPTION,
+        epilog=EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    top.add_argument("--version", action="version", version=f"gen2d {__version__}")
+    parsers = top.add_subparsers(
+        title="verbs", metavar="VERB", prog=PROG, parser_class=Parser, help=f"see {PROG} VERB --help for its options"
+    )
+    parser_of: dict[str, Parser] = {}
+    for verb, module in verbs.items():
+        parser_of[verb] = parsers.add_parser(verb, help=module.__doc__, description=module.__doc__)
+        parser_of[verb].set_defaults(run=module.run)
+        module.add_arguments(parser_of[verb])
+    words = list(arguments) or ["--help"]
+    if words[0] in ("--help", "-h", "--version"):
+        top.parse_args(words)  # exits
+    if words[0].startswith("-"):
+        words = ["generate", *words]
+    if words[0] not in verbs:
+        is_config = words[0].endswith((".yaml", ".yml"))
+        hint = f"did you mean --config {words[0]}?" if is_config else nearest(words[0], [*verbs])
+        raise UserError(f"{words[0]!r} is not a verb; {hint}")
+    parser_of[words[0]].check_names(words[1:])
+    options, extra = top.parse_known_args(words, argparse.Namespace(arguments=arguments))
+    if extra:
+        parser_of[words[0]].error(f"{extra[0]!r} is one argument too many")
+    return options
+
+
+def add_dataset(parser: Parser) -> None:
+    """Adds the dataset that a verb is about."""
+    parser.add_argument("dataset", metavar="DIR", help="the dataset's folder or URL")
+
+
+def add_network(parser: Parser) -> None:
+    """Adds how long to wait for a server."""
+    parser.add_argument(
+        "--timeout",
+        type=seconds,
+        default=30.0,
+        metavar="S",
+        help="for a URL: seconds to wait for a server that sends nothing (default: 30)",
+    )
+    parser.add_argument(
+        "--deadline",
+        type=seconds,
+        default=300.0,
+        metavar="S",
+        help="for a URL: seconds that a request and its retries may take together (default: 300)",
+    )
+
+
+def limits(options: argparse.Namespace) -> dict[str, float]:
+    """The arguments that `add_network` added, as keywords."""
+    return {"timeout": options.timeout, "deadline": options.deadline}
+
+
+def add_overrides(parser: Parser) -> None:
+    """Adds changes of single options of a config."""
+    parser.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        metavar="A.B=V",
+        dest="overrides",
+        help="set one option of the config, such as physics.substeps=8 (may be repeated)",
+    )
+
+
+def add_trust(parser: Parser) -> None:
+    """Adds which code of a dataset may run."""
+    parser.add_argument(
+        "--trust",
+        action="append",
+        default=[],
+        metavar="SHA256",
+        help="allow the Python file with this hash, which came with the dataset, to run (may be repeated)",
+    )
+
+
+def whole_number(text: str) -> int:
+    """The value of an argument that is a whole number."""
+    try:
+        return int(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number, such as 100") from None
+
+
+def seconds(text: str) -> float:
+    """The value of an argument that is a duration."""
+    try:
+        return float(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number of seconds, such as 30") from None

@@ -1,0 +1,189 @@
+"""The command line: verbs, help, errors of one sentence, exit codes."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import jax
+import pytest
+import yaml
+from tiny import CONFIG, ran, ran_here
+
+from gen2d.cli.main import VERBS
+from gen2d.cli.parser import Parser, parse
+
+
+def parser_of(verb: str) -> Parser:
+    parser = Parser(prog=verb)
+    VERBS[verb].add_arguments(parser)
+    return parser
+
+
+OPTIONS = [(verb, name) for verb in VERBS for name in parser_of(verb)._option_string_actions if len(name) > 5]
+
+
+@pytest.mark.parametrize("width", [80, 120])
+def test_help_fits_the_terminal(width: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", str(width))
+    top = ran_here("--help")
+    assert ran_here().stdout == top.stdout
+    for words in ((), *((verb,) for verb in VERBS)):
+        done = ran_here(*words, "--help")
+        assert (done.returncode, done.stderr) == (0, "")
+        assert max(map(len, done.stdout.splitlines())) <= width
+    for verb, module in VERBS.items():
+        assert f"\n    {verb} " in top.stdout
+        assert (module.__doc__ or "").strip().endswith(".")
+
+
+def test_every_argument_has_help() -> None:
+    for verb in VERBS:
+        assert all(action.help for action in parser_of(verb)._actions), verb
+
+
+def test_generate_is_the_verb_of_a_line_without_one() -> None:
+    words = ["--config", "a.yaml", "--n", "3", "--set", "video.fps=30", "--worker", "1/4"]
+    bare, named = vars(parse(words, VERBS)), vars(parse(["generate", *words], VERBS))
+    assert (bare.pop("arguments"), named.pop("arguments")) == (words, ["generate", *words])
+    assert bare == named
+    assert bare["worker"] == (1, 4)
+
+
+@pytest.mark.parametrize(("verb", "name"), OPTIONS)
+def test_an_option_cut_short_is_an_error_that_names_it(verb: str, name: str) -> None:
+    done = ran_here(verb, f"{name[:-1]}=1")
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr == f"gen2d: {name[:-1]} is not an option; did you mean {name}?\n"
+
+
+@pytest.mark.parametrize("verb", VERBS)
+def test_a_misspelt_verb_is_an_error_that_names_it(verb: str) -> None:
+    done = ran_here(verb[:2] + verb[3:], "data")
+    assert (done.returncode, done.stderr) == (
+        2,
+        f"gen2d: {verb[:2] + verb[3:]!r} is not a verb; did you mean {verb}?\n",
+    )
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (("bouncing.yaml",), "'bouncing.yaml' is not a verb; did you mean --config bouncing.yaml?"),
+        (("--config", "a.yaml", "--n", "many"), "--n: 'many' is not a whole number, such as 100; see "),
+        (("--config", "a.yaml", "--n", "1", "extra"), "'extra' is one argument too many; see "),
+        (("--config", "a.yaml"), "the following arguments are required: --n; see python -m gen2d generate --help"),
+        (("info", "data", "--timeout", "soon"), "--timeout: 'soon' is not a number of seconds, such as 30; see "),
+        (("info", "a", "\x1b[31m"), r"'\x1b[31m' is one argument too many; see python -m gen2d info --help"),
+    ],
+)
+def test_an_error_says_what_to_write(words: tuple[str, ...], sentence: str) -> None:
+    done = ran_here(*words)
+    assert (done.returncode, done.stdout, done.stderr.count("\n")) == (2, "", 1)
+    assert done.stderr.startswith(f"gen2d: {sentence}")
+
+
+def test_words_after_two_dashes_are_no_options(tmp_path: Path) -> None:
+    done = ran_here("info", "--", "--nothing", cwd=tmp_path)
+    assert (done.returncode, done.stderr) == (
+        2,
+        "gen2d: --nothing is not a gen2d dataset: it has no manifest.json\n",
+    )
+
+
+def test_a_reader_may_leave_early() -> None:
+    code = f"{sys.executable} -m gen2d list | head -n 1"
+    done = subprocess.run(code, shell=True, capture_output=True, text=True, check=False)
+    assert (done.stdout, done.stderr) == ("Scene families:\n", "")
+
+
+def test_help_imports_no_numpy() -> None:
+    code = "import sys, gen2d.cli.main as cli; cli.parse(['info', 'data'], cli.VERBS); print('numpy' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout == "False\n"
+
+
+def test_the_command_line_tells_what_it_did(tmp_path: Path):
+    (tmp_path / "tiny.yaml").write_text(yaml.safe_dump(CONFIG))
+    done = ran("--config", "tiny.yaml", "--n", 9, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "9 videos in" in done.stdout
+    assert "datasets/tiny" in done.stdout
+    assert "will take about" in done.stderr
+    again = ran_here("--config", "tiny.yaml", "--n", 9, cwd=tmp_path)
+    assert (again.returncode, "nothing to do" in again.stdout) == (0, True)
+    sheet = ran_here("info", "datasets/tiny", cwd=tmp_path)
+    assert "train: 9 videos" in sheet.stdout
+    assert "m/s^2" in sheet.stdout
+    assert ran_here("verify", "datasets/tiny", cwd=tmp_path).returncode == 0
+    path = tmp_path / "datasets/tiny/shards/train-00001-n1.h5"
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 4
+    path.write_bytes(content)
+    broken = ran("verify", "datasets/tiny", cwd=tmp_path)
+    assert broken.returncode == 1
+    assert "train-00001" in broken.stdout
+    pictures = ran_here("preview", "tiny.yaml", "--videos", 2, "--out", "pictures", cwd=tmp_path)
+    assert pictures.returncode == 0, pictures.stderr
+    for name in pictures.stdout.split():
+        assert (tmp_path / name).stat().st_size > 500
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["--config", "nothing.yaml", "--n", "1"],
+        ["--config", "bouncing.yaml"],
+        ["--config", "bouncing.yaml", "--n", "many"],
+        ["--config", "bouncing.yaml", "--n", "0"],
+        ["--config", "bouncing.yaml", "--n", "1", "--seed", "-1"],
+        ["--config", "bouncing.yaml", "--n", "1", "--set", "scene.balls=0"],
+        ["--config", "bouncing.yaml", "--n", "1", "--worker", "3"],
+        ["--config", "bouncing.yaml", "--n", "1", "--split", "../x"],
+        ["--config", "bouncing.yaml", "--n", "1", "--over"],
+        ["--config", "bouncing.yaml", "--n", "1", "--device", "gpu"],
+        ["verify", "nowhere"],
+        ["info", "nowhere"],
+        ["preview", "nowhere"],
+        ["list", "nothing"],
+        ["bouncing.yaml"],
+        ["--config", "", "--n", "1"],
+        ["--config", "/dev/zero", "--n", "1"],
+        ["--config", ".", "--n", "1"],
+        ["--config", "bouncing.yaml", "--n", "99999999999999999999"],
+        ["--config", "bouncing.yaml", "--n", "1", "--seed", "1e3"],
+        ["--config", "bouncing.yaml", "--n", "1", "--split", ""],
+        ["--config", "bouncing.yaml", "--n", "1", "--set", "a"],
+        ["--config", "bouncing.yaml", "--n", "1", "--set", "=1"],
+        ["--config", "bouncing.yaml", "--n", "1", "--set", "scene.balls.x=1"],
+        ["--config", "bouncing.yaml", "--n", "1", "--set", "scene.balls=[[["],
+        ["--config", "bouncing.yaml", "--n", "1", "--worker", "1/0"],
+        ["--config", "bouncing.yaml", "--n", "1", "--worker", "2/2"],
+        ["--config", "bouncing.yaml", "--n", "1", "--timeout", "0"],
+        ["--config", "bouncing.yaml", "--n", "1", "--deadline", "nan"],
+        ["--config", "bouncing.yaml", "--n", "1", "--out", "nope://x"],
+        ["--config", "bouncing.yaml", "--n", "1", "extra"],
+        ["verify", "nowhere", "--level", "deep"],
+        ["verify", "nowhere", "--videos", "x"],
+        ["verify"],
+        ["verify", "s3://"],
+        ["clean", "nowhere"],
+        ["clean", "/dev/null"],
+        ["info", "/dev/null"],
+        ["info", "x" * 300],
+        ["export", "nowhere", "--to", "npz"],
+        ["export", "nowhere", "--to", "nothing"],
+        ["preview", "bouncing.yaml", "--videos", "0"],
+        ["preview", "bouncing.yaml", "--out", "/dev/null/x"],
+        ["preview", "bouncing.yaml", "--seed", "-3"],
+        ["list", "\x1b[31m"],
+    ],
+)
+def test_bad_commands_end_with_one_sentence_and_code_two(tmp_path: Path, arguments: list[str]):
+    if "gpu" in arguments and any(d.platform == "gpu" for d in jax.devices()):
+        return
+    done = (ran if "many" in arguments else ran_here)(*arguments, cwd=tmp_path)
+    assert done.returncode == 2, done.stdout + done.stderr
+    sentences = [line for line in done.stderr.splitlines() if line.startswith("gen2d: ")]
+    assert len(sentences) == 1
+    assert "Traceback" not in done.stderr
+    assert not any(tmp_path.iterdir())
