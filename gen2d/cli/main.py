@@ -225,8 +225,7 @@ def verify(arguments: Sequence[str]) -> int:
             raise UserError(f"{root} is not a dataset that gen2d made")
     seed = secrets.randbelow(2**32) if options.seed is None else options.seed
     repair = _repairing(root, options) if options.repair else None
-    limits = {"timeout": options.timeout, "deadline": options.deadline}
-    outcome = verify_and_repair(root, options.level, repair, options.videos, seed, trust=options.trust, **limits)
+    outcome = verify_and_repair(root, options.level, repair, options.videos, seed, options.trust)
     if options.json:
         about = {"dataset": f"{root}", "level": options.level, **dataclasses.asdict(outcome)}
         print(json.dumps(about | ({"videos": options.videos, "seed": seed} if options.level == "regen" else {})))

@@ -3,7 +3,8 @@
 from typing import Any
 
 from gen2d.core.schema import Field
-from gen2d.dataset.manifest import MANIFEST, Manifest, as_bytes
+from gen2d.dataset.manifest import Manifest, as_bytes
+from gen2d.dataset.spec import MANIFEST
 from gen2d.storage.sealed import as_json, sha256
 
 

@@ -1,7 +1,7 @@
 """The dataset's card: what people read about it, from the manifest."""
 
-from gen2d.dataset.manifest import SHEET, Manifest, statistics
-from gen2d.dataset.spec import shard_name, shard_of
+from gen2d.dataset.manifest import Manifest, statistics
+from gen2d.dataset.spec import SHEET, shard_name, shard_of
 
 
 def shown_split(manifest: Manifest) -> str:

@@ -15,7 +15,7 @@ from gen2d.config.trust import remember
 from gen2d.core.errors import ConfigError
 from gen2d.core.progress import progress, stopping_on_sigterm
 from gen2d.dataset import folder as shards
-from gen2d.dataset.spec import SPLIT, DatasetSpec, Shard, mine
+from gen2d.dataset.spec import SPLIT, DatasetSpec, Shard, shards_of_worker
 from gen2d.generation.complete import complete
 from gen2d.generation.encoder import Encoder, batches, threads_for
 from gen2d.generation.warm_up import warm_up
@@ -85,7 +85,7 @@ def generate(
     with contextlib.closing(Rollout(config, on)) as rollout:
         dataset = dataset_of(rollout, out, counts, fingerprint(rollout))
         remaining = [shard for shard in shards.open_folder(dataset, overwrite) if shard.split in counts]
-        todo = mine(remaining, *worker)
+        todo = shards_of_worker(remaining, *worker)
         began, made = time.perf_counter(), sum(shard.count for shard in todo)
         size = make(rollout, dataset, todo, say)
     is_complete = complete(dataset)
