@@ -24,7 +24,8 @@ from gen2d.programs import devices
 from gen2d.programs.fingerprint import fingerprint, sources
 from gen2d.programs.rollout import Rollout
 from gen2d.records.keys import MAX_VIDEOS
-from gen2d.storage.paths import Network, Place, place, shown
+from gen2d.storage.filesystems import shown
+from gen2d.storage.paths import Network, Place, place
 
 CONVENTIONS = (
     "World: metres, y up, radians counter-clockwise, seconds. Pixels: (row, column) from the top left, pixel centres "

@@ -34,8 +34,8 @@ from gen2d.dataset.spec import DatasetSpec, shards_of_worker
 from gen2d.generation.complete import complete
 from gen2d.loading import dataset as loader
 from gen2d.loading.dataloader import DataLoader
+from gen2d.storage import filesystems, ranges
 from gen2d.storage import paths as remote
-from gen2d.storage import ranges
 from gen2d.storage.atomic import publish, sweep
 from gen2d.storage.paths import Url, place
 from gen2d.storage.ranges import Range
@@ -50,7 +50,7 @@ def running() -> Iterator[Server]:
         for name, value in buckets.environment(server).items():
             patch.setenv(name, value)
         yield server
-        remote._file_system.cache_clear()
+        filesystems._connect.cache_clear()
         s3fs.S3FileSystem.clear_instance_cache()
         gc.collect()  # closes connections
 
