@@ -73,7 +73,8 @@ def writing_error(where: Path, error: OSError, again: str = "run the same comman
     if isinstance(error, FileNotFoundError):
         return FolderError(f"{error.filename or where} is gone: was {where} moved or removed during the run?")
     if error.errno in FULL:
-        sentence = f"no space left for {where}: {need}{', ' if need else ''}the disk has {_space(where)}: make room and {again}"
+        need = f"{need}, " if need else ""
+        sentence = f"no space left for {where}: {need}the disk has {_space(where)}: make room and {again}"
     elif error.errno == errno.EFBIG:
         sentence = (
             f"{where} cannot hold so large a file: its file system, or ulimit -f, allows none; allow it and {again}"
