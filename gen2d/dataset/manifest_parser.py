@@ -35,7 +35,7 @@ HASH = re.compile(r"[0-9a-f]{64}")
 
 @dataclasses.dataclass(frozen=True)
 class ShardTable:
-    """What the manifest says of the shard table of a split."""
+    """The manifest's entry on the shard table of a split."""
 
     file: str  # its path in the folder
     sha256: str

@@ -69,11 +69,11 @@ def check_fingerprint(root: Place, rollout: Rollout, identity: Identity) -> None
     """Check that this machine and these versions make the same bits; raises FolderError."""
     there = dict(identity["fingerprint"])
     programs = there.pop("programs", {})
-    _compare(root, there, machine(rollout))  # at once: tracing the programs takes long
-    _compare(root, {"programs": programs}, {"programs": fingerprint(rollout)["programs"]})
+    _check_equal(root, there, machine(rollout))  # at once: tracing the programs takes long
+    _check_equal(root, {"programs": programs}, {"programs": fingerprint(rollout)["programs"]})
 
 
-def _compare(root: Place, there: Identity, here: Identity) -> None:
+def _check_equal(root: Place, there: Identity, here: Identity) -> None:
     both = {"fingerprint": there}, {"fingerprint": here}
     difference = folder.describe_differences(*both, folder.sources_of(root), sources())
     if difference:
@@ -292,7 +292,7 @@ def _remake(
 
 
 def _faults(path: Path, shard: Shard, row: np.void, manifest: Manifest | None) -> list[str]:
-    """What is wrong with a new shard on the disk, a sentence each."""
+    """The faults of a new shard on the disk, a sentence each."""
     if file_sha256(path) != row["sha256"].tobytes().hex():
         return ["the disk does not hold what was written"]
     values = hdf5.read(path)

@@ -149,12 +149,12 @@ def list_folder(folder: Place) -> list[Place]:
 def size_of(path: Place | os.DirEntry[str]) -> int | None:
     """The size of a regular file in bytes; None if there is no such file."""
     try:
-        about = path.stat()
+        status = path.stat()
     except OSError as error:
         if error.errno in (errno.ENOENT, errno.ENOTDIR, errno.ELOOP):
             return None
         raise
-    return about.st_size if stat.S_ISREG(about.st_mode) else None
+    return status.st_size if stat.S_ISREG(status.st_mode) else None
 
 
 def sync(path: Path) -> None:

@@ -26,7 +26,7 @@ class Cache:
 
     folder: Path
     limit: int | None
-    seen: set[str] = dataclasses.field(default_factory=set)  # sha256 of the files that this process has verified
+    verified: set[str] = dataclasses.field(default_factory=set)  # sha256 of the files that this process has verified
 
     def path(self, url: Url, sha256: str, size: int) -> Path:
         """The path of the file, downloaded if needed; open it soon, as other processes may remove it at any time.
@@ -42,18 +42,18 @@ class Cache:
                         raise DamagedError(f"{url} is not what was written: its sha256 differs")
                     self._make_room(part.stat().st_size)
                     part.replace(path)
-                    self.seen.add(sha256)
+                    self.verified.add(sha256)
         return path
 
     def _holds(self, path: Path) -> bool:
         """Whether the file is there and has its sha256; sets its time of last use."""
         try:
-            if path.name not in self.seen and file_sha256(path) != path.name:
+            if path.name not in self.verified and file_sha256(path) != path.name:
                 return False
             os.utime(path)
         except FileNotFoundError:
             return False
-        self.seen.add(path.name)
+        self.verified.add(path.name)
         return True
 
     @contextlib.contextmanager
@@ -80,8 +80,8 @@ class Cache:
         for path in self.folder.iterdir():
             if _OURS.fullmatch(path.name):
                 with contextlib.suppress(FileNotFoundError):
-                    about = path.stat()
-                    files.append((about.st_mtime_ns, about.st_size, path))
+                    status = path.stat()
+                    files.append((status.st_mtime_ns, status.st_size, path))
         total = size + sum(own for _, own, _ in files)
         for _, own, path in sorted(files):
             if total <= self.limit:

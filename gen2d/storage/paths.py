@@ -82,9 +82,9 @@ class Url:
 
     def stat(self) -> os.stat_result:
         """The size and kind; all other entries are zero."""
-        about = attempt(self, _info)
-        kind = stat.S_IFDIR if about["type"] == "directory" else stat.S_IFREG
-        return os.stat_result((kind, 0, 0, 1, 0, 0, about["size"] or 0, 0, 0, 0))
+        info = attempt(self, _info)
+        kind = stat.S_IFDIR if info["type"] == "directory" else stat.S_IFREG
+        return os.stat_result((kind, 0, 0, 1, 0, 0, info["size"] or 0, 0, 0, 0))
 
     def is_file(self) -> bool:
         return stat.S_ISREG(self._kind())

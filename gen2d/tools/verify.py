@@ -189,12 +189,12 @@ def chosen_videos(splits: Mapping[str, int], videos: int, seed: int) -> list[tup
 
 def _check_files(root: Place, manifest: Manifest) -> Iterator[Problem]:
     """The problems of config, plug-ins, sheet and cards; people may edit README.md."""
-    coming = next_manifest(root)  # of a run that was killed while it published this manifest
+    upcoming = next_manifest(root)  # of a run that was killed while it published this manifest
     for name, expected in manifest.files.items():
-        also = coming.files.get(name) if coming else None
-        yield from map(Problem, _check_hash(root / name, expected, also))
-    also = sha256(croissant(coming)) if coming else None
-    yield from map(Problem, _check_hash(root / "croissant.json", sha256(croissant(manifest)), also))
+        next_sha256 = upcoming.files.get(name) if upcoming else None
+        yield from map(Problem, _check_hash(root / name, expected, next_sha256))
+    next_sha256 = sha256(croissant(upcoming)) if upcoming else None
+    yield from map(Problem, _check_hash(root / "croissant.json", sha256(croissant(manifest)), next_sha256))
     if not (root / "README.md").is_file():
         yield Problem(f"{root / 'README.md'} is missing")
 
