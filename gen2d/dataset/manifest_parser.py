@@ -225,14 +225,14 @@ class ManifestParser:
 
     def field(self, name: str, value: Any, sizes: Mapping[str, int]) -> Field:
         where = f"fields.{name}"
-        about = _mapping(value, where, 20)
+        entry = _mapping(value, where, 20)
         for part in ("dtype", "axes", "unit", "meaning", "shape", "codec"):
-            if part not in about:
+            if part not in entry:
                 raise InvalidValueError(f"{where} has no {part}")
-        dtype = _text(about["dtype"], f"{where}.dtype", None, 20)
+        dtype = _text(entry["dtype"], f"{where}.dtype", None, 20)
         if dtype not in DTYPES and not (re.fullmatch(r"S\d{1,7}", dtype) and 1 <= int(dtype[1:]) <= TEXT_BYTES):
             _refuse(f"{where}.dtype", dtype, f"one of {', '.join(DTYPES)}, or S and a number of bytes")
-        axes = _text(about["axes"], f"{where}.axes", None, 200)
+        axes = _text(entry["axes"], f"{where}.axes", None, 200)
         for axis in axes.split(" ") if axes else []:
             if axis.isdigit():
                 _whole(int(axis) if len(axis) < 8 else axis, f"{where}.axes", 1, 10**6)
@@ -240,14 +240,14 @@ class ManifestParser:
                 _refuse(f"{where}.axes", axes, f"made of n, numbers and {', '.join(sizes)}")
         if "n" in axes.split(" ")[1:]:
             _refuse(f"{where}.axes", axes, "axes with n in the first place alone")
-        field = Field(dtype, axes, _text(about["unit"], f"{where}.unit"), _text(about["meaning"], f"{where}.meaning"))
+        field = Field(dtype, axes, _text(entry["unit"], f"{where}.unit"), _text(entry["meaning"], f"{where}.meaning"))
         if field.is_image and (axes.split()[:4] != ["n", "T", "H", "W"] or dtype.startswith("S")):
             _refuse(f"{where}.axes", axes, "n T H W, alone or with more axes, in an image")
         if stored_bytes(field, sizes) > VIDEO_BYTES:
             _refuse(where, field.shape(sizes), f"at most {VIDEO_BYTES} bytes a video")
-        if about["shape"] != list(field.shape(sizes)):
-            _refuse(f"{where}.shape", about["shape"], f"{list(field.shape(sizes))}, as its axes say")
-        _one_of(about["codec"], f"{where}.codec", (self.plain["codec"] if field.is_image else "none",))
+        if entry["shape"] != list(field.shape(sizes)):
+            _refuse(f"{where}.shape", entry["shape"], f"{list(field.shape(sizes))}, as its axes say")
+        _one_of(entry["codec"], f"{where}.codec", (self.plain["codec"] if field.is_image else "none",))
         if name == "frames" and (dtype != "uint8" or axes != "n T H W 3"):
             _refuse(where, f"{dtype} {axes}", "uint8 n T H W 3")
         if name == "objects/present" and (dtype != "bool" or axes != "n K"):
@@ -280,29 +280,29 @@ class ManifestParser:
             _refuse(f"the fields of {where}", sorted(own), f"{_quote(sorted(known))}")
         stats: Stats = {}
         for name, length in known.items():
-            about = _mapping(own[name], f"{where}.{name}", 4, 4)
+            entry = _mapping(own[name], f"{where}.{name}", 4, 4)
             stats[name] = {
-                key: self.moments(about, key, f"{where}.{name}", length) for key in ("mean", "std", "min", "max")
+                key: self.moments(entry, key, f"{where}.{name}", length) for key in ("mean", "std", "min", "max")
             }
         return stats
 
-    def moments(self, about: Mapping[str, Any], key: str, where: str, length: int) -> list[float] | None:
-        if key not in about:
+    def moments(self, entry: Mapping[str, Any], key: str, where: str, length: int) -> list[float] | None:
+        if key not in entry:
             raise InvalidValueError(f"{where} has no {key}")
-        if about[key] is None:
+        if entry[key] is None:
             return None
-        return [_number(value, f"{where}.{key}") for value in _list(about[key], f"{where}.{key}", length)]
+        return [_number(value, f"{where}.{key}") for value in _list(entry[key], f"{where}.{key}", length)]
 
     def table(self, split: str, videos: int, videos_per_shard: int) -> ShardTable:
         where = f"tables.{split}"
-        about = _mapping(self.part("tables")[split], where, 5, 5)
+        entry = _mapping(self.part("tables")[split], where, 5, 5)
         shards = shard_count(videos, videos_per_shard)
         return ShardTable(
-            file=_one_of(about.get("file"), f"{where}.file", (table_name(split, videos),)),
-            sha256=_text(about.get("sha256"), f"{where}.sha256", HASH),
-            shards=_whole(about.get("shards"), f"{where}.shards", shards, shards),
-            bytes=_whole(about.get("bytes"), f"{where}.bytes", 1, 2**62),
-            largest=_whole(about.get("largest"), f"{where}.largest", 1, 2**50),
+            file=_one_of(entry.get("file"), f"{where}.file", (table_name(split, videos),)),
+            sha256=_text(entry.get("sha256"), f"{where}.sha256", HASH),
+            shards=_whole(entry.get("shards"), f"{where}.shards", shards, shards),
+            bytes=_whole(entry.get("bytes"), f"{where}.bytes", 1, 2**62),
+            largest=_whole(entry.get("largest"), f"{where}.largest", 1, 2**50),
         )
 
     def files(self) -> dict[str, str]:
