@@ -52,9 +52,7 @@ def run(options: argparse.Namespace) -> int:
 
     seed = secrets.randbelow(2**32) if options.seed is None else options.seed
     repair_with = repair if options.repair else None
-    outcome = verify_and_repair(
-        root, options.level, repair_with, options.videos, seed, trust=options.trust, **limits(options)
-    )
+    outcome = verify_and_repair(root, options.level, repair_with, options.videos, seed, options.trust)
     if options.json:
         result = {"dataset": f"{root}", "level": options.level, **dataclasses.asdict(outcome)}
         print(json.dumps(result | ({"videos": options.videos, "seed": seed} if options.level == "regen" else {})))

@@ -1,7 +1,7 @@
 """Consecutive videos, ready to store.
 
-A Block is made in host threads, while the device computes what follows: images are compressed, every piece gets its
-checksum, and what the statistics need is summed.
+Host threads encode a Block while the device computes the next one: they compress images, and compute the checksum of
+every chunk and the moments for the statistics.
 """
 
 import dataclasses
@@ -20,8 +20,8 @@ from gen2d.storage import codecs
 class Block:
     """m consecutive videos, ready to store."""
 
-    arrays: Mapping[str, np.ndarray]  # fields stored as they are, [m, ...]
-    chunks: Mapping[str, list[bytes]]  # images, compressed, the same number for every video
+    arrays: Mapping[str, np.ndarray]  # uncompressed fields, [m, ...]
+    chunks: Mapping[str, list[bytes]]  # compressed images, the same number for every video
     crc: Mapping[str, np.ndarray]  # uint32 of every field: over each chunk, or [m] over the bytes of each row
     moments: Mapping[str, np.ndarray]  # float64 [m, 5, components]: count, sum, sum of squares, least, largest
 
@@ -30,34 +30,37 @@ class Block:
 
     @property
     def nbytes(self) -> int:
-        """What it takes on disk."""
+        """The size on disk in bytes."""
         chunks = sum(len(chunk) for chunks in self.chunks.values() for chunk in chunks)
         return chunks + sum(values.nbytes for values in self.arrays.values())
 
 
 def image_names(fields: Mapping[str, Field]) -> list[str]:
-    """The fields that are stored compressed, sorted."""
+    """The names of the compressed fields, sorted."""
     return sorted(name for name, field in fields.items() if field.is_image)
 
 
 def row_names(fields: Mapping[str, Field]) -> list[str]:
-    """The fields of each video that are stored as they are, sorted."""
+    """The names of the uncompressed fields of each video, sorted."""
     return sorted(name for name, field in fields.items() if field.per_video and not field.is_image)
 
 
 def stored_bytes(field: Field, sizes: Mapping[str, int]) -> int:
-    """What one video's value takes before compression."""
+    """The size of one video's value before compression, in bytes."""
     return math.prod(field.shape(sizes)) * np.dtype(field.dtype).itemsize
 
 
 def encode(
     columns: Mapping[str, np.ndarray], fields: Mapping[str, Field], codec: str, chunk_frames: int | None = None
 ) -> Block:
-    """A Block of m videos from columns `[m, ...]` as stored, images in chunks of so many frames, or of all; spends its
-    time in code that releases the GIL."""
-    columns = {name: _checked(name, columns[name], field) for name, field in fields.items() if field.per_video}
+    """A Block of m videos from columns [m, ...].
+
+    An image's chunk holds `chunk_frames` frames, or the whole video. Nearly all the time is spent without the GIL.
+    Raises ValueError for a column of another dtype.
+    """
+    columns = {name: _contiguous(name, columns[name], field) for name, field in fields.items() if field.per_video}
     chunks = {
-        name: [codecs.encode(codec, piece) for video in column for piece in _pieces(video, chunk_frames)]
+        name: [codecs.encode(codec, piece) for video in column for piece in _split(video, chunk_frames)]
         for name, column in columns.items()
         if fields[name].is_image
     }
@@ -74,12 +77,12 @@ def head(block: Block, count: int) -> Block:
     return Block(*({name: part[name][: len(part[name]) // videos * count] for name in part} for part in parts))
 
 
-def _pieces(video: np.ndarray, frames: int | None) -> Iterable[np.ndarray]:
-    """The video, cut into pieces of so many frames, if any number is given."""
+def _split(video: np.ndarray, frames: int | None) -> Iterable[np.ndarray]:
+    """The video in parts of so many frames, or as one part."""
     return (video,) if frames is None else video.reshape(-1, frames, *video.shape[1:])
 
 
-def _checked(name: str, column: np.ndarray, field: Field) -> np.ndarray:
+def _contiguous(name: str, column: np.ndarray, field: Field) -> np.ndarray:
     if column.dtype != np.dtype(field.dtype):
         raise ValueError(f"{name} is {column.dtype}, but must be {field.dtype}")
     return np.ascontiguousarray(column)

@@ -1,9 +1,10 @@
-"""The Croissant description of a dataset, which search engines read, from the manifest."""
+"""The Croissant description of a dataset for search engines, from the manifest."""
 
 from typing import Any
 
 from gen2d.core.schema import Field
-from gen2d.dataset.manifest import MANIFEST, Manifest, as_bytes
+from gen2d.dataset.manifest import Manifest, as_bytes
+from gen2d.dataset.spec import MANIFEST
 from gen2d.storage.sealed import as_json, sha256
 
 
@@ -12,12 +13,8 @@ def croissant(manifest: Manifest) -> bytes:
 
     The shards are one set of files, however many there are; the tables that the manifest names have their checksums.
     """
-    return as_json(_described(manifest))
-
-
-def _described(manifest: Manifest) -> dict[str, Any]:
     content = as_bytes(manifest)
-    return {
+    description = {
         "@context": _CONTEXT,
         "@type": "sc:Dataset",
         "conformsTo": "http://mlcommons.org/croissant/1.0",
@@ -55,6 +52,7 @@ def _described(manifest: Manifest) -> dict[str, Any]:
             }
         ],
     }
+    return as_json(description)
 
 
 _COLUMNS = {"file": "sc:Text", "sha256": "sc:Text", "shards": "sc:Integer", "bytes": "sc:Integer"}
@@ -70,7 +68,7 @@ def _variable(name: str, field: Field) -> dict[str, Any]:
     return {"@type": "sc:PropertyValue", "name": name, "unitText": field.unit, "description": field.meaning, **kind}
 
 
-# The names that Croissant takes from its own and other vocabularies.
+# Croissant's names from its own and other vocabularies.
 _NAMES = ("extract", "field", "fileObject", "fileSet", "includes", "jsonPath", "recordSet", "source")
 _CONTEXT = {
     "@language": "en",

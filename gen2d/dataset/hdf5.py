@@ -1,10 +1,8 @@
-"""HDF5 shards: images in compressed chunks, one a video unless told otherwise, everything else contiguous.
+"""HDF5 shards: images in compressed chunks, by default one per video, everything else contiguous.
 
-Any HDF5 program reads them.
-
-The bytes depend on the compressed chunks and values and on nothing else: no times, hosts or users, and not on how the
-videos were grouped into blocks. h5py serves one thread at a time, so compression happens elsewhere and chunks pass
-through it untouched. Every file holds its own index (`rows.py`), by which gen2d reads without h5py.
+Any HDF5 program reads them. The bytes depend on the compressed chunks and values alone: not on times, hosts or users,
+nor on how the videos were grouped into blocks. h5py serves one thread at a time, so compression happens elsewhere and
+chunks pass through h5py unchanged. Every file holds its own index (`rows.py`), by which gen2d reads without h5py.
 """
 
 import contextlib
@@ -23,13 +21,13 @@ from gen2d.dataset.block import Block, image_names, row_names
 from gen2d.dataset.rows import sealed_rows, video_type
 from gen2d.storage import codecs
 
-INDEX = "chunk_index"  # the dataset of the videos' rows
+INDEX = "chunk_index"  # the HDF5 dataset of the videos' rows
 _ZSTD = codecs.HDF5_FILTERS["zstd"][0]
 
 
 @dataclasses.dataclass(frozen=True)
 class Offsets:
-    """Where in the file what is not compressed begins."""
+    """The offsets in the file of the uncompressed data."""
 
     index: int
     rows: list[int]  # of each field, in the order of their names
@@ -47,11 +45,11 @@ def write(
     constants: Mapping[str, np.ndarray],
     origin: int,
 ) -> Offsets:
-    """Writes a file of these videos of a split and returns where in it each field lies.
+    """Write a file of these videos of a split; returns the offsets of its uncompressed fields.
 
-    `blocks` hold the videos in order; chunks are written as they arrive, so that memory holds one block, never a shard
-    of images. `constants` are the values of the fields that are one for all videos, `origin` is what the checks of the
-    index begin from. Raises OSError when the disk does.
+    `blocks` hold the videos in order; chunks are written as they arrive, so that memory holds one block and never the
+    images of a shard. `constants` are the values of the fields that all videos share, `origin` is the start value of
+    the index's checksums. Raises OSError, and ValueError for blocks that do not hold exactly these videos.
     """
     images, rows, count = image_names(fields), row_names(fields), len(videos)
     with _new(path) as file:
@@ -69,33 +67,35 @@ def write(
             for name in images:
                 own[name]["crc32"] = block.crc[name].reshape(len(block), -1)
         for name, dataset in chunked.items():
-            _note_chunks(dataset, index[name])
+            _fill_offsets(dataset, index[name])
         for name, values in sorted((table | dict(constants)).items()):
             file.create_dataset(name, data=np.asarray(values, _stored_type(fields[name])))
         for name, field in sorted(fields.items()):
             file[name].attrs.update(axes=field.axes, unit=field.unit, meaning=field.meaning)
-        made = file.create_dataset(INDEX, data=sealed_rows(index, origin, videos))
-        made.attrs.update(axes="n", unit="", meaning="where each video's chunks lie, and CRC-32 of all that is stored")
-        return Offsets(_offset(made), [_offset(file[name]) for name in rows])
+        stored = file.create_dataset(INDEX, data=sealed_rows(index, origin, videos))
+        stored.attrs.update(
+            axes="n", unit="", meaning="where each video's chunks lie, and CRC-32 of all that is stored"
+        )
+        return Offsets(_offset(stored), [_offset(file[name]) for name in rows])
 
 
 def read(path: Path) -> dict[str, np.ndarray]:
-    """Every field of the file as one array, by h5py; zstd is decoded here, where h5py needs a plugin."""
-    found: dict[str, np.ndarray] = {}
+    """Every field of the file as one array; zstd is decoded here, as h5py needs a plug-in for it."""
+    fields: dict[str, np.ndarray] = {}
     with h5py.File(path, "r", locking=False) as file:
 
         def visit(name: str, item: h5py.Group | h5py.Dataset) -> None:
             if isinstance(item, h5py.Dataset) and name != INDEX:
-                found[name] = _read_zstd(item) if _has_zstd(item) else item[()]
+                fields[name] = _read_zstd(item) if _has_zstd(item) else item[()]
 
         file.visititems(visit)
-    return found
+    return fields
 
 
 @contextlib.contextmanager
 def _new(path: Path) -> Iterator[h5py.File]:
-    """A new file, closed at the end; what went wrong while writing is raised, not what closing then says of it."""
-    # HDF5's own lock would meet that of the temporary file.
+    """A new file, closed at the end; an error while writing is raised before the error that closing then causes."""
+    # HDF5's own lock would conflict with that of the temporary file.
     file = h5py.File(path, "w", libver=("v110", "v110"), locking=False)
     try:
         yield file
@@ -107,7 +107,7 @@ def _new(path: Path) -> Iterator[h5py.File]:
         raise
     try:
         file.close()
-    except RuntimeError as error:  # HDF5 writes much only now, and h5py then forgets what kind of error it was
+    except RuntimeError as error:  # HDF5 writes much only now, and h5py turns its OSErrors into RuntimeErrors
         raise _as_oserror(error) from error
 
 
@@ -119,11 +119,10 @@ def _as_oserror(error: RuntimeError) -> OSError:
 def _chunked(
     file: h5py.File, name: str, dtype: str, shape: tuple[int, ...], codec: str, chunk_frames: int | None
 ) -> h5py.Dataset:
-    """A new dataset with a chunk per video, or per so many frames.
+    """A new HDF5 dataset with a chunk per video, or per `chunk_frames` frames.
 
-    Made by hand, as h5py refuses a filter without its plugin.
-
-    A process that has imported hdf5plugin writes zstd files with the filter's name in them: other bytes, same content.
+    It uses h5py's low-level functions, as the others refuse a filter without its plug-in. A process that has imported
+    hdf5plugin writes zstd files with the filter's name in them: other bytes, same content.
     """
     settings = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
     settings.set_chunk((1, chunk_frames or shape[1], *shape[2:]))
@@ -139,13 +138,13 @@ def _chunked(
 
 
 def _stored_type(field: Field) -> np.dtype:
-    """The type in the file: of text, one that says that it is UTF-8."""
+    """The type of a field in the file; that of text declares UTF-8."""
     dtype = np.dtype(field.dtype)
     return h5py.string_dtype("utf-8", dtype.itemsize) if field.is_text else dtype
 
 
 def _numbered(blocks: Iterable[Block], count: int, path: Path) -> Iterator[tuple[int, Block]]:
-    """Each block with the row of its first video; insists on `count` videos in all."""
+    """Each block with the row of its first video; raises ValueError unless there are `count` videos in all."""
     first = 0
     for block in blocks:
         if first + len(block) > count:
@@ -157,7 +156,7 @@ def _numbered(blocks: Iterable[Block], count: int, path: Path) -> Iterator[tuple
 
 
 def _write_chunks(chunked: Mapping[str, h5py.Dataset], block: Block, first: int, chunk_frames: int | None) -> None:
-    # h5py asks the file for a dataset's rank each time, which takes longer than to write a small chunk.
+    # h5py reads a dataset's rank from the file each time, which takes longer than writing a small chunk.
     targets = {name: (dataset.id, (0,) * (dataset.ndim - 2)) for name, dataset in chunked.items()}
     # Video by video, so that the file does not depend on the size of a block.
     for row in range(len(block)):
@@ -168,32 +167,32 @@ def _write_chunks(chunked: Mapping[str, h5py.Dataset], block: Block, first: int,
 
 
 def _fill(table: np.ndarray, first: int, values: np.ndarray, name: str) -> None:
-    # Assignment alone would broadcast a wrong shape in silence.
+    # Assignment alone would silently broadcast a wrong shape.
     if values.shape[1:] != table.shape[1:]:
         raise ValueError(f"{name} has shape {values.shape[1:]} a video, but must have {table.shape[1:]}")
     table[first : first + len(values)] = values
 
 
-def _frames(dataset: h5py.Dataset) -> int:
-    """Of a chunk."""
+def _chunk_frames(dataset: h5py.Dataset) -> int:
+    """The number of frames of a chunk."""
     assert dataset.chunks is not None
     return dataset.chunks[1]
 
 
-def _note_chunks(dataset: h5py.Dataset, rows: np.ndarray) -> None:
-    """Puts offset and size of every chunk into the videos' rows [videos, chunks]."""
-    frames = _frames(dataset)
+def _fill_offsets(dataset: h5py.Dataset, rows: np.ndarray) -> None:
+    """Fill offset and size of every chunk into the videos' rows [videos, chunks]."""
+    frames = _chunk_frames(dataset)
 
-    def note(chunk: h5py.h5d.StoreInfo) -> None:
+    def fill(chunk: h5py.h5d.StoreInfo) -> None:
         video, frame = chunk.chunk_offset[:2]
         place = rows[video, frame // frames]
         place["offset"], place["size"] = chunk.byte_offset, chunk.size
 
-    dataset.id.chunk_iter(note)
+    dataset.id.chunk_iter(fill)
 
 
 def _offset(dataset: Any) -> int:
-    return dataset.id.get_offset() or 0  # a dataset without a single byte has no place
+    return dataset.id.get_offset() or 0  # an empty dataset has no offset
 
 
 def _has_zstd(dataset: h5py.Dataset) -> bool:
@@ -202,7 +201,7 @@ def _has_zstd(dataset: h5py.Dataset) -> bool:
 
 def _read_zstd(dataset: h5py.Dataset) -> np.ndarray:
     out = np.empty(dataset.shape, dataset.dtype)
-    frames = _frames(dataset)
+    frames = _chunk_frames(dataset)
     for row in range(len(out)):
         for begin in range(0, dataset.shape[1], frames):
             _, data = dataset.id.read_direct_chunk((row, begin, *[0] * (out.ndim - 2)))

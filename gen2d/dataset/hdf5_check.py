@@ -1,10 +1,9 @@
-"""What HDF5 itself says of a shard, asked in a process of its own.
+"""A check of a shard by the HDF5 library, in a process of its own.
 
-The files of strangers may be made to crash libhdf5, or to keep it busy. Loading never uses it; checking does, so the
-library runs where it can do no more than end: with a limit on memory and on time, and nothing is read there before its
-type and size are known to be right.
+A stranger's file may crash libhdf5 or keep it busy. Loading never uses the library. This check runs it in a process
+with limits on memory and time, which reads no value before it has checked its type and size.
 
-    python -m gen2d.dataset.hdf5_check      a JSON question per line on standard input, a JSON list of faults per answer
+    python -m gen2d.dataset.hdf5_check      reads a JSON request per line, answers each with a JSON list of faults
 """
 
 import atexit
@@ -22,12 +21,12 @@ from typing import Any
 from gen2d.dataset.manifest import Manifest
 from gen2d.dataset.spec import Shard
 
-SECONDS = 60.0  # for one file
-MEMORY = 2**32  # bytes, of address space
+SECONDS = 60.0  # time limit for one file
+MEMORY = 2**32  # limit of the address space, bytes
 
 
 def faults(path: Path, shard: Shard, manifest: Manifest) -> list[str]:
-    """What differs between the file as HDF5 sees it and the manifest, a sentence each."""
+    """The differences between the file as HDF5 reads it and the manifest, a sentence each."""
     fields = {
         name: {
             "dtype": field.dtype,
@@ -40,40 +39,40 @@ def faults(path: Path, shard: Shard, manifest: Manifest) -> list[str]:
         }
         for name, field in manifest.fields.items()
     }
-    question = {"path": str(path.absolute()), "split": shard.split, "first": shard.first, "fields": fields}
+    request = {"path": str(path.absolute()), "split": shard.split, "first": shard.first, "fields": fields}
     with _lock:
-        return _ask(json.dumps(question).encode() + b"\n")
+        return _ask(json.dumps(request).encode() + b"\n")
 
 
-# ---- This side
+# ---- The calling process
 
 _lock = threading.Lock()
 _process: subprocess.Popen[bytes] | None = None
 
 
-def _ask(question: bytes) -> list[str]:
-    process = _started()
+def _ask(request: bytes) -> list[str]:
+    process = _running()
     assert process.stdin
     assert process.stdout
     answer = b""
     with contextlib.suppress(OSError):
-        process.stdin.write(question)
+        process.stdin.write(request)
         process.stdin.flush()
         while not answer.endswith(b"\n"):
             if not select.select([process.stdout], [], [], SECONDS)[0]:
                 _stop()
-                return [f"HDF5 was not done with it after {SECONDS:.0f} s"]
+                return [f"HDF5 has not finished reading it after {SECONDS:.0f} s"]
             part = os.read(process.stdout.fileno(), 2**16)
             if not part:
                 break
             answer += part
     if not answer.endswith(b"\n"):
         _stop()
-        return ["HDF5 crashed while it read it"]
+        return ["HDF5 crashed while reading it"]
     return json.loads(answer)
 
 
-def _started() -> subprocess.Popen[bytes]:
+def _running() -> subprocess.Popen[bytes]:
     global _process
     if _process is None or _process.poll() is not None or _owner != os.getpid():
         _stop()
@@ -87,12 +86,12 @@ _owner = 0
 
 def _start() -> None:
     global _process, _owner
-    words = [sys.executable, "-W", "ignore", "-m", "gen2d.dataset.hdf5_check"]
+    command = [sys.executable, "-W", "ignore", "-m", "gen2d.dataset.hdf5_check"]
     home = str(Path(__file__).parent.parent.parent)
     paths = os.pathsep.join([home, *filter(None, [os.environ.get("PYTHONPATH")])])
     environment = os.environ | {"PYTHONPATH": paths}
     pipe = subprocess.PIPE
-    _process = subprocess.Popen(words, stdin=pipe, stdout=pipe, stderr=subprocess.DEVNULL, env=environment)
+    _process = subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=subprocess.DEVNULL, env=environment)
     _owner = os.getpid()
 
 
@@ -109,7 +108,7 @@ def _stop() -> None:
                     stream.close()
 
 
-# ---- The other side
+# ---- The checking process
 
 
 def _serve() -> None:
@@ -119,38 +118,38 @@ def _serve() -> None:
         resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     for line in sys.stdin.buffer:
-        question = json.loads(line)
+        request = json.loads(line)
         try:
-            found = _faults(question)
+            answer = _faults(request)
         except MemoryError:
-            found = ["HDF5 needs more memory for it than it may have"]
-        except Exception as error:  # h5py raises whatever comes to it
-            found = [f"HDF5 cannot read it ({' '.join(str(error).split())[:200]})"]
-        sys.stdout.write(json.dumps(found) + "\n")
+            answer = ["HDF5 needs more memory for it than it may have"]
+        except Exception as error:  # h5py raises errors of many types
+            answer = [f"HDF5 cannot read it ({' '.join(str(error).split())[:200]})"]
+        sys.stdout.write(json.dumps(answer) + "\n")
         sys.stdout.flush()
 
 
-def _faults(question: Mapping[str, Any]) -> list[str]:
+def _faults(request: Mapping[str, Any]) -> list[str]:
     import h5py
 
-    found = []
-    with h5py.File(question["path"], "r", locking=False) as file:
-        said = file.attrs.get("split"), file.attrs.get("first")
-        if not all(isinstance(part, str | int) or getattr(part, "shape", None) == () for part in said) or said != (
-            question["split"],
-            question["first"],
+    problems = []
+    with h5py.File(request["path"], "r", locking=False) as file:
+        start = file.attrs.get("split"), file.attrs.get("first")
+        if not all(isinstance(part, str | int) or getattr(part, "shape", None) == () for part in start) or start != (
+            request["split"],
+            request["first"],
         ):
-            found.append(f"it says that it begins with {said[0]!s:.60} video {said[1]!s:.60}")
-        for name, about in question["fields"].items():
+            problems.append(f"its attributes say that it begins with {start[0]!s:.60} video {start[1]!s:.60}")
+        for name, about in request["fields"].items():
             dataset = file.get(name)
             if not isinstance(dataset, h5py.Dataset):
-                found.append(f"{name} is missing")
+                problems.append(f"{name} is missing")
             else:
-                found += [f"{name} {wrong}" for wrong in _misdescribed(dataset, about)]
-    return found
+                problems += [f"{name} {problem}" for problem in _dataset_faults(dataset, about)]
+    return problems
 
 
-def _misdescribed(dataset: Any, about: Mapping[str, Any]) -> list[str]:
+def _dataset_faults(dataset: Any, about: Mapping[str, Any]) -> list[str]:
     import numpy as np
 
     if list(dataset.shape or ()) != about["shape"] or dataset.dtype != np.dtype(about["dtype"]):
@@ -159,14 +158,14 @@ def _misdescribed(dataset: Any, about: Mapping[str, Any]) -> list[str]:
         return ["is compressed, but must not be"]
     if dataset.external or dataset.is_virtual:
         return ["lies in another file"]
-    found = []
+    problems = []
     for key in ("axes", "unit", "meaning"):
-        said = dataset.attrs.get(key)
-        if not isinstance(said, str) or said != about[key]:
-            found.append(f"has {key} {said!r:.80}, but must have {about[key]!r}")
+        value = dataset.attrs.get(key)
+        if not isinstance(value, str) or value != about[key]:
+            problems.append(f"has {key} {value!r:.80}, but must have {about[key]!r}")
     if about["constant"] is not None and not np.array_equal(dataset[()], np.array(about["constant"])):
-        found.append("is not what the manifest says")
-    return found
+        problems.append("differs from the manifest")
+    return problems
 
 
 if __name__ == "__main__":

@@ -1,16 +1,16 @@
-"""The dataset's card: what people read about it, from the manifest."""
+"""The dataset card, README.md, from the manifest."""
 
-from gen2d.dataset.manifest import SHEET, Manifest, statistics
-from gen2d.dataset.spec import shard_name, shard_of
+from gen2d.dataset.manifest import Manifest, statistics
+from gen2d.dataset.spec import SHEET, shard_name, shard_of
 
 
 def shown_split(manifest: Manifest) -> str:
-    """The split that cards show and load."""
+    """The split that the cards show and load."""
     return "train" if "train" in manifest.splits else min(manifest.splits)
 
 
 def readme(manifest: Manifest, command: str) -> str:
-    """The dataset's card; `command` is what made it."""
+    """The dataset card as Markdown; `command` is the command that made the dataset."""
     fields, first = manifest.fields, shown_split(manifest)
     lines = (f"| {name} | {f.dtype} | {f.axes} | {f.unit} | {f.meaning} |" for name, f in fields.items())
     shard = shard_of(first, 0, min(manifest.splits[first], manifest.videos_per_shard), manifest.videos_per_shard)
@@ -34,7 +34,7 @@ def readme(manifest: Manifest, command: str) -> str:
     )
 
 
-# The folder is `.` in the examples: its name may be another where it was copied to.
+# The folder is `.` in the examples, as a copy may have another name.
 _README = """# {name}
 
 Rendered videos of two-dimensional rigid bodies with everything that is true about them: {counts} videos,

@@ -1,4 +1,7 @@
-"""Count, sum, sum of squares, least and largest of each channel or component: of a video, of shards, of a split."""
+"""Statistics of fields per channel or component: moments of a video, merged over shards and splits.
+
+Moments are count, sum, sum of squares, minimum and maximum.
+"""
 
 from collections.abc import Mapping
 
@@ -6,7 +9,7 @@ import numpy as np
 
 from gen2d.core.schema import Field
 
-# What the moments are of, as the manifest says it.
+# The values that enter the moments, as the manifest describes them.
 SAMPLED = "frames: every 8th frame, of it every 4th row and column; states: every frame, objects that are present"
 MOMENTS = 5
 
@@ -14,7 +17,7 @@ Stats = dict[str, dict[str, list[float] | None]]  # of each field: mean, std, mi
 
 
 def measured(fields: Mapping[str, Field]) -> dict[str, int]:
-    """The fields that have statistics, sorted, and how many channels or components each has."""
+    """The number of channels or components of each field that has statistics, sorted by name."""
     names = sorted(name for name, field in fields.items() if field.per_video and _is_measured(name))
     return {name: _components(fields[name]) for name in names}
 
@@ -29,9 +32,9 @@ def _components(field: Field) -> int:
 
 
 def moments_of(columns: Mapping[str, np.ndarray], fields: Mapping[str, Field]) -> dict[str, np.ndarray]:
-    """float64 [m, 5, components] of each field that has statistics, from columns [m, ...].
+    """The moments of each field that has statistics, float64 [m, 5, components], from columns [m, ...].
 
-    Sums of uint8 are exact. Each video is summed by itself, so that no grouping of videos changes a bit.
+    Sums of uint8 are exact. Each video is summed by itself, so that the grouping of videos changes no bit.
     """
     present = columns.get("objects/present")
     return {
@@ -44,46 +47,46 @@ def moments_of(columns: Mapping[str, np.ndarray], fields: Mapping[str, Field]) -
 
 def _moments(column: np.ndarray, field: Field, components: int, present: np.ndarray | None) -> np.ndarray:
     axes = field.axes.split()
-    # Components before values, so that each is summed in one piece of memory.
+    # Components before values, so that each sum runs over contiguous memory.
     values = column.reshape(len(column), -1, components).transpose(0, 2, 1).astype(np.float64, order="C")
     count, low, high = np.full(values.shape[:2], values.shape[2], np.float64), values, values
     if "K" in axes and present is not None:
-        there = _spread(present, axes, column.shape)
-        count = np.broadcast_to(there, values.shape).sum(-1, dtype=np.float64)
-        low, high = np.where(there, values, np.inf), np.where(there, values, -np.inf)
-        values = np.where(there, values, 0.0)
+        exists = _spread(present, axes, column.shape)
+        count = np.broadcast_to(exists, values.shape).sum(-1, dtype=np.float64)
+        low, high = np.where(exists, values, np.inf), np.where(exists, values, -np.inf)
+        values = np.where(exists, values, 0.0)
     sums = count, values.sum(-1), (values * values).sum(-1)
     return np.stack([*sums, low.min(-1, initial=np.inf), high.max(-1, initial=-np.inf)], axis=1)
 
 
 def _image_moments(images: np.ndarray, components: int) -> np.ndarray:
-    """The moments of uint8 images [m, T, H, W, ...], in whole numbers, which takes half as long."""
-    some = images[:, ::8, ::4, ::4]  # all pixels would cost more than the rest of `encode` together
-    values = np.ascontiguousarray(some.reshape(len(images), -1, components).transpose(0, 2, 1))
+    """The moments of uint8 images [m, T, H, W, ...], in integers, which takes half as long."""
+    sample = images[:, ::8, ::4, ::4]  # all pixels would take longer than the rest of `encode`
+    values = np.ascontiguousarray(sample.reshape(len(images), -1, components).transpose(0, 2, 1))
     wide = values.astype(np.uint32)
     count = np.full(values.shape[:2], values.shape[2], np.float64)
     return np.stack([count, wide.sum(-1), (wide * wide).sum(-1), values.min(-1), values.max(-1)], axis=1)
 
 
 def _spread(present: np.ndarray, axes: list[str], shape: tuple[int, ...]) -> np.ndarray:
-    """Whether the object that each value belongs to is there, bool [m, 1, values]; `present` is [m, K]."""
+    """Whether the object of each value is present, bool [m, 1, values]; `present` is [m, K]."""
     steps = [size if axis in "nK" else 1 for axis, size in zip(axes, shape, strict=True) if not axis.isdigit()]
     return np.broadcast_to(present.reshape(steps), shape[: len(steps)]).reshape(shape[0], 1, -1)
 
 
 def merged(moments: np.ndarray) -> np.ndarray:
-    """The moments of all together, [5, components], from [m, 5, components]."""
+    """The moments of all m parts together, [5, components], from [m, 5, components]."""
     return np.concatenate([moments[:, :3].sum(0), moments[:, 3:4].min(0), moments[:, 4:].max(0)])
 
 
 def packed(moments: Mapping[str, np.ndarray]) -> np.ndarray:
-    """The moments [5, components] of all fields in a row, float64, in the order of their names."""
+    """The moments [5, components] of all fields as one float64 vector, in the order of their names."""
     parts = [moments[name].reshape(-1) for name in sorted(moments)]
     return np.concatenate(parts) if parts else np.zeros(0)
 
 
 def summary(rows: np.ndarray, fields: Mapping[str, Field]) -> Stats:
-    """Mean, standard deviation, least and largest value by field, from rows as `packed` gives them, [m, ...]."""
+    """Mean, standard deviation, minimum and maximum of each field, from m vectors that `packed` returned."""
     stats, begin = {}, 0
     for name, components in measured(fields).items():
         end = begin + MOMENTS * components
@@ -91,7 +94,7 @@ def summary(rows: np.ndarray, fields: Mapping[str, Field]) -> Stats:
         with np.errstate(all="ignore"):
             mean = total / count
             spread = np.sqrt(np.maximum(squares / count - mean**2, 0))
-        # JSON has no word for a value that does not exist.
+        # JSON has no NaN or infinity: None.
         values = {"mean": mean, "std": spread, "min": low, "max": high}
         stats[name] = {key: value.tolist() if np.isfinite(value).all() else None for key, value in values.items()}
         begin = end

@@ -1,24 +1,17 @@
-"""From the shards that are done to a dataset that readers open: tables, cards and, last, the manifest."""
+"""The completion of a dataset: from finished shards to tables, cards and, last, the manifest that readers open."""
 
 import numpy as np
 
 from gen2d.core.errors import UnreachableError, UserError
 from gen2d.dataset.croissant import croissant
-from gen2d.dataset.folder import (
-    Publication,
-    Sizes,
-    SupersededError,
-    alone,
-    explained,
-    is_done,
-    publish_snapshot,
-    whole_plan,
-)
-from gen2d.dataset.manifest import CONFIG, FILE_BYTES, SHEET, Manifest, ShardTable, describe
+from gen2d.dataset.folder import Sizes, explained, is_done, locked, whole_plan
+from gen2d.dataset.manifest import Manifest, describe
+from gen2d.dataset.manifest_parser import FILE_BYTES, ShardTable
 from gen2d.dataset.readme import readme, shown_split
 from gen2d.dataset.records import Records, read_records
 from gen2d.dataset.rows import npy
-from gen2d.dataset.spec import DatasetSpec, Shard, table_name
+from gen2d.dataset.snapshots import Publication, SupersededError, publish_snapshot
+from gen2d.dataset.spec import SHEET, DatasetSpec, Shard, table_name
 from gen2d.dataset.statistics import summary
 from gen2d.loading.dataset import Dataset, ViewOptions
 from gen2d.media import contact_sheet, images
@@ -27,16 +20,16 @@ from gen2d.storage.explain import reading_error
 from gen2d.storage.paths import Place
 from gen2d.storage.sealed import has_sha256, sha256
 
-ROWS = 4  # videos on a sheet
+ROWS = 4  # videos on a contact sheet
 
 
 def complete(spec: DatasetSpec) -> bool:
-    """Whether the dataset is complete; if it is, its tables, cards and manifest are there.
+    """Publish the dataset if all its shards are done; returns whether they are.
 
-    False while shards are missing that other workers still make.
+    False means that other workers still make shards.
     """
     root = spec.root
-    with explained(root), alone(root):
+    with explained(root), locked(root):
         while True:
             records, sizes = read_records(spec, root), Sizes(root)
             old = records.manifest
@@ -45,15 +38,15 @@ def complete(spec: DatasetSpec) -> bool:
                 return False
             try:
                 publish_snapshot(spec, publication(spec, shards, records, old), records, old)
-            except SupersededError:  # where there are no locks, others may be faster: what they have published stays
+            except SupersededError:  # without locks another process may publish first: start from what it published
                 continue
             return True
 
 
 def publication(spec: DatasetSpec, shards: list[Shard], records: Records, old: Manifest | None) -> Publication:
-    """What a snapshot of these shards consists of beside them; its tables are in the folder then.
+    """The manifest and other files of a snapshot with these shards; writes its tables into the folder.
 
-    Its manifest is `old` where that describes the same shards, whichever versions of the program made it.
+    The manifest is `old` if that describes the same shards, whichever version of gen2d made it.
     """
     tables, rows = {}, {}
     for split in sorted({shard.split for shard in shards}):
@@ -65,11 +58,11 @@ def publication(spec: DatasetSpec, shards: list[Shard], records: Records, old: M
         tables[split] = ShardTable(name, sha256(content), len(own), sum(sizes), max(sizes))
     counts = {shard.split: shard.first + shard.count for shard in shards}
     if old and (old.identity_sha256, old.splits, old.tables) == (spec.identity_sha256, counts, tables):
-        kept = _kept(spec, old)
-        if kept is not None:
-            return kept
+        present = _present_publication(spec, old)
+        if present is not None:
+            return present
     stats = {split: summary(own["moments"], spec.fields) for split, own in rows.items()}
-    files = {CONFIG: spec.config_text.encode(), **spec.copies}
+    files = spec.recipe_files
     hashes = {name: sha256(content) for name, content in files.items()}
     manifest = describe(spec, counts, tables, stats, hashes)
     if "frames" in spec.fields:
@@ -82,10 +75,9 @@ def _cards(spec: DatasetSpec, manifest: Manifest) -> dict[str, bytes]:
     return {"README.md": readme(manifest, spec.command).encode(), "croissant.json": croissant(manifest)}
 
 
-def _kept(spec: DatasetSpec, old: Manifest) -> Publication | None:
-    """The present manifest, and those of its files that are not what was written; None where one of them would be
-    another now."""
-    files = {}
+def _present_publication(spec: DatasetSpec, old: Manifest) -> Publication | None:
+    """The present manifest and the files to write again because they are damaged; None if one of them would differ."""
+    recipe, files = spec.recipe_files, {}
     for name, digest in old.files.items():
         try:
             if has_sha256(spec.root / name, digest, FILE_BYTES):
@@ -94,15 +86,14 @@ def _kept(spec: DatasetSpec, old: Manifest) -> Publication | None:
             failure = reading_error(spec.root / name, error)
             if isinstance(failure, UserError | UnreachableError):
                 raise failure from error
-        own = {CONFIG: spec.config_text.encode(), **spec.copies}.get(name)
-        files[name] = sheet(spec.root, old) if name == SHEET else own or b""
+        files[name] = sheet(spec.root, old) if name == SHEET else recipe.get(name, b"")
         if sha256(files[name]) != digest:
             return None
     return Publication(old, files | _cards(spec, old))
 
 
 def sheet(root: Place, manifest: Manifest) -> bytes:
-    """A contact sheet of the first videos, as a PNG; the manifest need not be in the folder yet."""
+    """A contact sheet of the first videos, as PNG; the manifest need not be in the folder yet."""
     options = ViewOptions(shown_split(manifest), ("frames",), None, 1, "first", "THWC", "uint8", "checksum")
     ds = Dataset(root, manifest, options)
     # One video in memory at a time: they may be long and large.

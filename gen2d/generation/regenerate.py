@@ -1,4 +1,4 @@
-"""A stored dataset against its recipe: some of its videos made again and compared, its bad shards made again."""
+"""Regeneration of a stored dataset from its recipe: videos to compare with, and damaged shards to replace."""
 
 import contextlib
 import dataclasses
@@ -14,10 +14,12 @@ from gen2d.config.config import Config
 from gen2d.core.errors import DamagedError, FolderError
 from gen2d.dataset import folder, hdf5
 from gen2d.dataset.hdf5_check import faults
-from gen2d.dataset.manifest import MANIFEST, Manifest, identity_of, read_manifest
+from gen2d.dataset.manifest import Manifest, identity_of, read_manifest
 from gen2d.dataset.records import Records, read_records, read_tables, tables_by_name
 from gen2d.dataset.rows import shard_type
+from gen2d.dataset.snapshots import SupersededError, check_current, publish_snapshot
 from gen2d.dataset.spec import (
+    MANIFEST,
     MARK,
     RECORDS,
     STAGED,
@@ -36,23 +38,23 @@ from gen2d.programs import devices
 from gen2d.programs.fingerprint import fingerprint, machine, sources
 from gen2d.programs.recipe import Trust, config_from
 from gen2d.programs.source import VideoRange, VideoSource
-from gen2d.storage.atomic import publish_changed, sync
+from gen2d.storage.atomic import publish_changed, remove_tree, sync
 from gen2d.storage.leases import LOCK, leased, temporary_name
 from gen2d.storage.paths import Network, Place, Url, place, upload
 from gen2d.storage.sealed import file_sha256
 
 Identity = Mapping[str, Any]  # of a dataset; its manifest has the same keys
-# What decides the bytes of a shard, when its values are the same.
+# The packages that decide the bytes of a shard with the same values.
 CODECS = ("h5py", "hdf5", "isal", "zstandard", "numpy")
 
 
 def source_of(root: Place, identity: Identity, trust: Trust = ()) -> VideoSource:
     """The videos of the recipe of the dataset in the folder.
 
-    Raises ConfigError where its config cannot be used here, and UntrustedError where that would run code that came with
-    it.
+    Raises ConfigError if its config cannot be used here, and UntrustedError if it names untrusted code of the dataset.
     """
-    return _source(config_from(root, identity, trust), str(identity["fingerprint"].get("device", "")).startswith("cpu"))
+    on_cpu = str(identity["fingerprint"].get("device", "")).startswith("cpu")
+    return _source(config_from(root, identity, trust), on_cpu)
 
 
 @functools.lru_cache(maxsize=1)  # a check, a repair and the check that follows compile once
@@ -61,30 +63,32 @@ def _source(config: Config, on_cpu: bool) -> VideoSource:
 
 
 def check_fingerprint(root: Place, source: VideoSource, identity: Identity) -> None:
-    """Raises FolderError where this machine and these versions would make other bits."""
+    """Check that this machine and these versions make the same bits; raises FolderError."""
     there = dict(identity["fingerprint"])
     programs = there.pop("programs", {})
-    _compare(root, there, machine(source.rollout))  # at once: tracing the programs takes long
-    _compare(root, {"programs": programs}, {"programs": fingerprint(source.rollout)["programs"]})
+    _check_equal(root, there, machine(source.rollout))  # at once: tracing the programs takes long
+    _check_equal(root, {"programs": programs}, {"programs": fingerprint(source.rollout)["programs"]})
 
 
-def _compare(root: Place, there: Identity, here: Identity) -> None:
+def _check_equal(root: Place, there: Identity, here: Identity) -> None:
     both = {"fingerprint": there}, {"fingerprint": here}
-    told = folder.told_differences(*both, folder.sources_of(root), sources())
-    if told:
-        raise FolderError(f"{root}: its videos can be neither judged nor repaired here, as bits would differ: {told}")
+    difference = folder.describe_differences(*both, folder.sources_of(root), sources())
+    if difference:
+        raise FolderError(
+            f"{root}: its videos can be neither compared nor repaired here, as bits would differ: {difference}"
+        )
 
 
 def changed_videos(
     source: VideoSource, root: Place, manifest: Manifest, chosen: Sequence[tuple[str, int]]
 ) -> Iterator[tuple[str, str]]:
-    """For each field of the videos (split, number) that is another when made again: its shard and a sentence.
+    """The shard and a sentence for each field of the videos (split, number) that differs from its regenerated value.
 
-    Videos that cannot be read are passed over: the level "full" names them.
+    Videos that cannot be read are skipped: the level "full" reports them. Raises FolderError if a constant differs.
     """
     for name, values in source.schema.constants.items():
         if name not in manifest.constants or not np.array_equal(values, manifest.constants[name]):
-            raise FolderError(f"{root}: its constant {name} is not the one that its recipe gives")
+            raise FolderError(f"{root}: its constant {name} differs from the one that its recipe makes")
     stored = {split: loader.open(root, split, fields=("*",)) for split in manifest.splits}
     for own, splits in source.of_splits(split for split, _ in chosen):
         ranges = [
@@ -95,7 +99,7 @@ def changed_videos(
         for videos in own.slices(ranges):
             split, number, _, shard = videos.part.range
             fields = {name: column[0] for name, column in videos.fields().items() if name in own.schema.fields}
-            for name in _changed_fields(stored[split], number, fields):
+            for name in _changed_fields(stored[split], number, fields) or ():
                 yield shard, f"{name} of {split} video {number} is not what its recipe makes"
 
 
@@ -106,13 +110,13 @@ def _shard_name(manifest: Manifest, split: str, number: int) -> str:
     return shard_of(split, first, min(size, manifest.splits[split] - first), size).name
 
 
-def _changed_fields(stored: loader.Dataset, number: int, made: Mapping[str, np.ndarray]) -> list[str]:
-    """The names of the fields that are stored otherwise, to the bit."""
+def _changed_fields(stored: loader.Dataset, number: int, fields: Mapping[str, np.ndarray]) -> list[str] | None:
+    """The names of the fields whose stored bits differ from these; None if the stored video cannot be read."""
     try:
         video = stored[number]
     except DamagedError:
-        return []
-    return [name for name, values in made.items() if name not in video or video[name].tobytes() != values.tobytes()]
+        return None
+    return [name for name, values in fields.items() if name not in video or video[name].tobytes() != values.tobytes()]
 
 
 # ---- Repair
@@ -127,45 +131,45 @@ def repair(
     timeout: float = 30.0,
     deadline: float = 300.0,
 ) -> list[str]:
-    """The names of the shards that were made again: those called `bad`, and all whose row or file is not whole.
+    """Make the shards called `bad` again, and all others without an intact row and file; returns their names.
 
-    They are made beside the dataset and verified there. Then they take their places, and tables, cards, config and
-    manifest follow, each if it is not what it should be. At no moment is the dataset worse than it was. Where the
-    manifest is damaged, the tables say what it held.
+    The new shards are made and verified beside the dataset. Then they replace the old ones, and tables, cards, config
+    and manifest are written again where they differ. At no moment is the dataset worse than before. If the manifest is
+    damaged, the tables decide what the dataset holds.
 
-    Raises FolderError, before anything is changed, where a shard cannot be made again here, and UntrustedError where
-    that would run code that came with the dataset.
+    Raises FolderError, before anything changes, if a shard cannot be made again here, and UntrustedError if that needs
+    untrusted code of the dataset.
     """
     root = place(root, Network(timeout, deadline))
     folder.check_links(root)
-    manifest, identity = _what_it_held(root)
+    manifest, identity = _manifest_and_identity(root)
     source = source_of(root, identity, trust)
-    spec = _as_made(source, root, identity, manifest)
-    counts, kept = (manifest.splits, read_tables(root, manifest)) if manifest else _found_tables(root, spec)
+    spec = _original_spec(source, root, identity, manifest)
+    counts, tables = (manifest.splits, read_tables(root, manifest)) if manifest else _tables_by_name(root, spec)
     spec = dataclasses.replace(spec, splits=counts)
-    records = Records(spec.videos_per_shard, kept)
+    records = Records(spec.videos_per_shard, tables)
     shards = plan(counts, spec.videos_per_shard)
-    todo = _to_make(root, shards, records, bad, every_byte=manifest is None)
+    todo = _damaged_shards(root, shards, records, bad, every_byte=manifest is None)
     staged = Records(spec.videos_per_shard, {})
     with folder.explained(root), _staging(root) as stage:
         if todo:
             check_fingerprint(root, source, identity)
-            staged = _made_again(source, spec, stage, todo, records, manifest, say or (lambda line: None))
+            staged = _remake(source, spec, stage, todo, records, manifest, say or (lambda line: None))
         try:
-            with folder.alone(root):
-                folder.check_current(root, manifest)
+            with folder.locked(root):
+                check_current(root, manifest)
                 for shard in todo:
-                    _put(stage / shard_name(shard.name), shard_path(root, shard.name))
-                records = _together(spec, shards, records, staged, todo)
+                    _replace(stage / shard_name(shard.name), shard_path(root, shard.name))
+                records = _merge(spec, shards, records, staged, todo)
                 publish_changed(mark_path(root), folder.mark_content(spec))
-                folder.publish_snapshot(spec, publication(spec, shards, records, manifest), records, manifest)
-        except folder.SupersededError:
+                publish_snapshot(spec, publication(spec, shards, records, manifest), records, manifest)
+        except SupersededError:
             raise FolderError(f"{root} has changed during the repair: run it again") from None
     return [shard.name for shard in todo]
 
 
-def _found_tables(root: Place, spec: DatasetSpec) -> tuple[dict[str, int], dict[str, np.ndarray]]:
-    """How many videos each split has, and the rows that are what was written, where no manifest says which."""
+def _tables_by_name(root: Place, spec: DatasetSpec) -> tuple[dict[str, int], dict[str, np.ndarray]]:
+    """The number of videos and the intact rows of each split, from the tables alone; raises FolderError."""
     counts, rows = tables_by_name(root, shard_type(spec.fields), spec.identity_sha256, spec.videos_per_shard)
     if not counts:
         raise FolderError(
@@ -175,54 +179,55 @@ def _found_tables(root: Place, spec: DatasetSpec) -> tuple[dict[str, int], dict[
     return counts, rows
 
 
-def _what_it_held(root: Place) -> tuple[Manifest | None, Identity]:
-    """The manifest, if it is whole, and what the dataset was made from."""
+def _manifest_and_identity(root: Place) -> tuple[Manifest | None, Identity]:
+    """The manifest, if it is intact, and the identity of the dataset; raises FolderError if neither is known."""
     try:
         manifest = read_manifest(root)
     except DamagedError:
         identity = identity_of(root)
         if identity is None:
             raise FolderError(
-                f"{root}: {MANIFEST} and {mark_path(root)} are both damaged, so nothing says what it held"
+                f"{root}: {MANIFEST} and {mark_path(root)} are both damaged, so nothing says what the dataset held"
             ) from None
         return None, identity
     return manifest, manifest.identity
 
 
-def _as_made(source: VideoSource, root: Place, identity: Identity, manifest: Manifest | None) -> DatasetSpec:
-    """What the folder is to hold, by the versions that its manifest names, if that is whole.
+def _original_spec(source: VideoSource, root: Place, identity: Identity, manifest: Manifest | None) -> DatasetSpec:
+    """The spec of the dataset without its splits, with the versions that its manifest names if that is intact.
 
-    Raises FolderError where its config gives another dataset here.
+    Raises FolderError if the dataset's config makes another dataset here.
     """
     spec = dataset_of(source, root, {}, identity["fingerprint"])
-    told = folder.told_differences(identity, spec.identity, {}, {})
-    if told or (manifest and manifest.fields != spec.fields):
-        raise FolderError(f"{root}: its config gives other videos here than it holds: {told or 'their fields differ'}")
+    difference = folder.describe_differences(identity, spec.identity, {}, {})
+    if difference or (manifest and manifest.fields != spec.fields):
+        difference = difference or "their fields differ"
+        raise FolderError(f"{root}: its config makes other videos here than the dataset holds: {difference}")
     producer = {**manifest.producer, "fingerprint": identity["fingerprint"]} if manifest else spec.producer
     return dataclasses.replace(spec, producer=producer)
 
 
-def _to_make(
+def _damaged_shards(
     root: Place, shards: Sequence[Shard], records: Records, bad: Sequence[str], every_byte: bool
 ) -> list[Shard]:
-    """The shards that must be made again; where `every_byte` matters, each file is compared with its row."""
-    sizes, missing = folder.Sizes(root), set(bad)
+    """The shards that must be made again; with `every_byte`, the sha256 of every file is compared with its row."""
+    sizes, damaged = folder.Sizes(root), set(bad)
     for shard in shards:
-        row = records.of(shard)
+        row = records.row_of(shard)
         if row is None or not folder.is_done(shard, records, sizes):
-            missing.add(shard.name)
+            damaged.add(shard.name)
         elif every_byte and isinstance(root, Path):
             path = root / shard_name(shard.name)
             with contextlib.suppress(OSError):
                 if file_sha256(path) == row["sha256"].tobytes().hex():
                     continue
-            missing.add(shard.name)
-    return [shard for shard in shards if shard.name in missing]
+            damaged.add(shard.name)
+    return [shard for shard in shards if shard.name in damaged]
 
 
 @contextlib.contextmanager
 def _staging(root: Place) -> Iterator[Path]:
-    """A folder in which shards are made again, on the disk of the dataset where that is one."""
+    """A temporary folder for new shards; on the dataset's disk, unless it is at a URL."""
     if isinstance(root, Url):
         with tempfile.TemporaryDirectory(prefix="gen2d-") as home:
             yield Path(home)
@@ -233,11 +238,11 @@ def _staging(root: Place) -> Iterator[Path]:
     with leased(lock), contextlib.ExitStack() as stack:
         stack.callback(lock.unlink, missing_ok=True)
         stage.mkdir()
-        stack.callback(folder.remove_tree, stage)
+        stack.callback(remove_tree, stage)
         yield stage
 
 
-def _made_again(
+def _remake(
     source: VideoSource,
     spec: DatasetSpec,
     stage: Path,
@@ -246,7 +251,7 @@ def _made_again(
     manifest: Manifest | None,
     say: Callable[[str], None],
 ) -> Records:
-    """The rows of the shards, which lie in the folder `stage` then, each verified."""
+    """Make the shards in the folder `stage` and verify them; returns their rows, or raises FolderError."""
     for name in ("shards", f"{RECORDS}"):
         (stage / name).mkdir(parents=True)
     staged_spec = dataclasses.replace(spec, root=stage)
@@ -255,23 +260,23 @@ def _made_again(
     versions = devices.versions()
     same_codecs = manifest is None or all(manifest.producer.get(key) == versions[key] for key in CODECS)
     for shard in todo:
-        path, row, before = stage / shard_name(shard.name), staged.of(shard), records.of(shard)
+        path, row, before = stage / shard_name(shard.name), staged.row_of(shard), records.row_of(shard)
         assert row is not None
-        wrong = _faults(path, shard, row, manifest)
-        other = before is not None and before["sha256"].tobytes() != row["sha256"].tobytes()
-        if not wrong and same_codecs and other and not _reproduces(spec.root, shard, path, manifest):
-            wrong = ["its bytes are not those that were written, in any video"]
-        if wrong:
+        problems = _faults(path, shard, row, manifest)
+        differs = before is not None and before["sha256"].tobytes() != row["sha256"].tobytes()
+        if not problems and same_codecs and differs and not _reproduces(spec.root, shard, path, manifest):
+            problems = ["none of its videos has the bits that were written"]
+        if problems:
             raise FolderError(
-                f"{spec.root}: {shard.name}, made again, is not right, so nothing was changed: {wrong[0]}"
+                f"{spec.root}: {shard.name}, made again, is not right, so nothing was changed: {problems[0]}"
             )
     return staged
 
 
 def _faults(path: Path, shard: Shard, row: np.void, manifest: Manifest | None) -> list[str]:
-    """What is wrong with a shard that was made again, as the disk now has it."""
+    """The faults of a new shard on the disk, a sentence each."""
     if file_sha256(path) != row["sha256"].tobytes().hex():
-        return ["the disk does not have what was written"]
+        return ["the disk does not hold what was written"]
     values = hdf5.read(path)
     if values["index"].tolist() != list(range(shard.first, shard.first + shard.count)):
         return ["its videos have other numbers"]
@@ -279,26 +284,21 @@ def _faults(path: Path, shard: Shard, row: np.void, manifest: Manifest | None) -
 
 
 def _reproduces(root: Place, shard: Shard, path: Path, manifest: Manifest | None) -> bool:
-    """Whether some video of a shard is what it was, to the bit, when made again in the file `path`; the others were
-    then stored otherwise than their recipe makes them."""
+    """Whether the new file `path` has some video of the stored shard, to the bit.
+
+    If it has, this machine makes the right bits, and the stored videos that differ were wrong.
+    """
     if manifest is None:
         return False
-    made, numbers = hdf5.read(path), range(shard.first, shard.first + shard.count)
-    stored = loader.open(root, shard.split, "*")
-    own = [{name: made[name][row] for name in stored.fields} for row in range(shard.count)]
-    return any(_is_stored(stored, number, video) for number, video in zip(numbers, own, strict=True))
+    values, stored = hdf5.read(path), loader.open(root, shard.split, "*")
+    return any(
+        _changed_fields(stored, shard.first + row, {name: values[name][row] for name in stored.fields}) == []
+        for row in range(shard.count)
+    )
 
 
-def _is_stored(stored: loader.Dataset, number: int, made: Mapping[str, np.ndarray]) -> bool:
-    try:
-        video = stored[number]
-    except DamagedError:
-        return False
-    return all(video[name].tobytes() == values.tobytes() for name, values in made.items())
-
-
-def _put(source: Path, target: Place) -> None:
-    """Returns when the file is at its place, instead of what was there."""
+def _replace(source: Path, target: Place) -> None:
+    """Move a file to `target`, which may exist."""
     if isinstance(target, Url):
         upload(source, target)
         return
@@ -307,14 +307,14 @@ def _put(source: Path, target: Place) -> None:
     sync(target.parent)
 
 
-def _together(
+def _merge(
     spec: DatasetSpec, shards: Sequence[Shard], records: Records, staged: Records, todo: Sequence[Shard]
 ) -> Records:
-    """The rows of all shards: of those made again the new ones."""
-    again = {shard.name for shard in todo}
+    """The rows of all shards: `staged` for those in `todo`, `records` for the others."""
+    remade = {shard.name for shard in todo}
     rows: dict[str, list[Any]] = {}
     for shard in shards:
-        row = (staged if shard.name in again else records).of(shard)
+        row = (staged if shard.name in remade else records).row_of(shard)
         assert row is not None
         rows.setdefault(shard.split, []).append(row)
     kind = shard_type(spec.fields)

@@ -14,7 +14,7 @@ from gen2d.config.trust import remember
 from gen2d.core.errors import ConfigError
 from gen2d.core.progress import progress, stopping_on_sigterm
 from gen2d.dataset import folder as shards
-from gen2d.dataset.spec import SPLIT, DatasetSpec, Shard, mine
+from gen2d.dataset.spec import SPLIT, DatasetSpec, Shard, shards_of_worker
 from gen2d.generation.complete import complete
 from gen2d.generation.encoder import Encoder, shard_ranges, threads_for
 from gen2d.generation.warm_up import warm_up
@@ -84,7 +84,7 @@ def generate(
     with contextlib.closing(VideoSource(config, on)) as source:
         dataset = dataset_of(source, out, counts, fingerprint(source.rollout))
         remaining = [shard for shard in shards.open_folder(dataset, overwrite) if shard.split in counts]
-        todo = mine(remaining, *worker)
+        todo = shards_of_worker(remaining, *worker)
         began, made = time.perf_counter(), sum(shard.count for shard in todo)
         size = make(source, dataset, todo, say)
     is_complete = complete(dataset)

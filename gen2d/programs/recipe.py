@@ -8,7 +8,7 @@ from gen2d.config.config import Config, load_config, own_files
 from gen2d.config.plugin_options import StoredCopies
 from gen2d.config.trust import check_trusted
 from gen2d.core.errors import ConfigError
-from gen2d.dataset.manifest import PLUGIN
+from gen2d.dataset.spec import PLUGIN
 from gen2d.loading.dataset import Dataset
 from gen2d.storage.paths import Place, reading
 from gen2d.storage.sealed import read_bytes, sha256

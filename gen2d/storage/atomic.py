@@ -1,6 +1,6 @@
 """Files and folders that appear whole or not at all: written under a temporary name, synced, renamed.
 
-Those of a Url are written in the system's folder for temporary files, and uploaded.
+A file for a URL is written in the system's temporary folder and uploaded.
 """
 
 import contextlib
@@ -16,12 +16,12 @@ from gen2d.storage.leases import LOCK, TEMPORARY, abandoned, leased, remove_aban
 from gen2d.storage.paths import Place, Url, upload
 from gen2d.storage.sealed import read_bytes
 
-_OLD = ".old"  # before a temporary name's end: what a new folder is about to replace
+_OLD = ".old"  # part of the temporary name of a folder that is being replaced
 
 
 @contextlib.contextmanager
 def publishing(path: Place) -> Iterator[Path]:
-    """A temporary file to write, locked; it appears as `path` when the block ends well, and never otherwise."""
+    """A locked temporary file to write in; it becomes `path` when the block ends without an error."""
     folder = Path(tempfile.gettempdir()) if isinstance(path, Url) else path.parent
     prefix = "gen2d-" if isinstance(path, Url) else ""
     temporary = folder / temporary_name(prefix + path.name)
@@ -34,23 +34,23 @@ def publishing(path: Place) -> Iterator[Path]:
                 sync(temporary)
                 temporary.replace(path)
                 sync(folder)
-        finally:  # also after an interrupt
+        finally:  # including an interrupt
             temporary.unlink(missing_ok=True)
 
 
 @contextlib.contextmanager
 def publishing_folder(path: Path) -> Iterator[Path]:
-    """A temporary folder to write in; it appears as `path`, instead of what was there, when the block ends well."""
+    """A temporary folder to write in; it replaces `path` when the block ends without an error."""
     temporary, replaced = (path.with_name(temporary_name(path.name + old)) for old in ("", _OLD))
     with _leased_folder(temporary), _leased_folder(replaced):
         try:
             temporary.mkdir()
             yield temporary
-            os.sync()  # once: a file at a time, many small ones would take minutes
+            os.sync()  # all at once: syncing many small files one by one takes minutes
             if path.exists():
                 path.rename(replaced)
             temporary.rename(path)
-        except BaseException:  # also an interrupt
+        except BaseException:  # including an interrupt
             if replaced.exists() and not path.exists():
                 replaced.rename(path)
             shutil.rmtree(temporary, ignore_errors=True)
@@ -61,7 +61,7 @@ def publishing_folder(path: Path) -> Iterator[Path]:
 
 @contextlib.contextmanager
 def _leased_folder(folder: Path) -> Iterator[None]:
-    """A block in which the temporary folder is this process's; a locked file beside it says so."""
+    """A block during which this process owns the temporary folder, by a locked file beside it."""
     lock = folder.with_name(folder.name + LOCK)
     with leased(lock):
         try:
@@ -71,13 +71,13 @@ def _leased_folder(folder: Path) -> Iterator[None]:
 
 
 def publish(path: Place, content: bytes) -> None:
-    """Returns when the disk, or the server, has `content` as `path`, whole."""
+    """Write a file atomically; on return the disk or server has it."""
     with publishing(path) as temporary:
         temporary.write_bytes(content)
 
 
 def publish_changed(path: Place, content: bytes) -> None:
-    """The same, but a file that holds just that stays as it is."""
+    """Write a file atomically unless it already has this content."""
     try:
         if read_bytes(path, len(content)) == content:
             return
@@ -87,7 +87,7 @@ def publish_changed(path: Place, content: bytes) -> None:
 
 
 def link_or_copy(source: Path, target: Path) -> None:
-    """Returns when the file has this name, too; it is copied where a file system gives no second name."""
+    """Give a file a second name, or copy it where the file system has no hard links."""
     try:
         os.link(source, target)
     except FileExistsError:
@@ -100,20 +100,19 @@ def link_or_copy(source: Path, target: Path) -> None:
 
 
 def work_folder(root: Place) -> Path:
-    """The folder on disk in which what goes to `root` is written first."""
+    """The folder on disk in which files for `root` are written first."""
     return Path(tempfile.gettempdir()) if isinstance(root, Url) else root
 
 
 def sweep(root: Place, folders: tuple[str, ...], force: bool = False) -> list[Path]:
-    """The temporary files that nobody holds in these folders of `root`, which are removed."""
+    """Remove the abandoned temporary files in these folders of `root` and return their paths."""
     if isinstance(root, Url):
         return remove_abandoned(temporaries(work_folder(root), "gen2d-"), force)
     return [path for name in folders for path in remove_abandoned(temporaries(root / name), force)]
 
 
 def sweep_beside(path: Path) -> None:
-    """Removes what nobody holds any more of what was to become `path`; a folder that was about to be replaced when
-    its process was killed comes back."""
+    """Remove abandoned temporary files of `path`; restore a folder whose replacement was interrupted."""
     for left in temporaries(path.parent, f"{path.name}{_OLD}."):
         if not left.is_dir():
             continue
@@ -124,12 +123,12 @@ def sweep_beside(path: Path) -> None:
 
 
 def is_temporary(name: str) -> bool:
-    """Whether it is the name of what is being written, or was when its process was killed."""
+    """Whether this is the name of a temporary file or folder."""
     return TEMPORARY.search(name) is not None
 
 
 def remove_tree(folder: Place) -> None:
-    """Removes the folder and all in it; a link is removed, and not what it leads to."""
+    """Remove a folder and its contents; a link is removed, but not its target."""
     if isinstance(folder, Url):
         for path in folder.rglob("*"):
             path.unlink(missing_ok=True)
@@ -139,19 +138,27 @@ def remove_tree(folder: Place) -> None:
         shutil.rmtree(folder, ignore_errors=True)
 
 
-def size_of(path: Place) -> int | None:
-    """The size of a regular file in bytes; None if there is none."""
+def list_folder(folder: Place) -> list[Place]:
+    """The paths in a folder, sorted; none if there is no such folder."""
     try:
-        about = path.stat()
+        return sorted(folder.iterdir(), key=str)
+    except (FileNotFoundError, NotADirectoryError):
+        return []
+
+
+def size_of(path: Place | os.DirEntry[str]) -> int | None:
+    """The size of a regular file in bytes; None if there is no such file."""
+    try:
+        status = path.stat()
     except OSError as error:
         if error.errno in (errno.ENOENT, errno.ENOTDIR, errno.ELOOP):
             return None
         raise
-    return about.st_size if stat.S_ISREG(about.st_mode) else None
+    return status.st_size if stat.S_ISREG(status.st_mode) else None
 
 
 def sync(path: Path) -> None:
-    """Returns when the disk has the file, or the folder's list of names."""
+    """Flush a file, or a folder's list of names, to the disk."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)

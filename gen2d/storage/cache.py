@@ -1,7 +1,7 @@
-"""A folder that keeps files of remote datasets, each under its sha256, with a limit on their size.
+"""A cache folder for files of remote datasets, each under its sha256, with a limit on their total size.
 
-Any number of processes may share it. A file is fetched under another name by whoever has that name's lock, and renamed
-when its hash is right, so that a crash leaves nothing that counts; the system gives a dead process's lock to the next.
+Any number of processes may share it. The process that holds the lock of a file downloads it under a temporary name and
+renames it when its hash is right, so a crash leaves no wrong file; the system releases the lock of a dead process.
 """
 
 import contextlib
@@ -13,6 +13,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from gen2d.core.errors import DamagedError
+from gen2d.storage.leases import is_at
 from gen2d.storage.paths import Url, download
 from gen2d.storage.sealed import file_sha256
 
@@ -21,77 +22,69 @@ _OURS = re.compile(r"[0-9a-f]{64}")
 
 @dataclasses.dataclass(frozen=True)
 class Cache:
-    """Files by their sha256 in `folder`; the ones used longest ago go when they take more than `limit` bytes."""
+    """Files by their sha256 in `folder`; the least recently used are removed beyond `limit` bytes in all."""
 
     folder: Path
     limit: int | None
-    seen: set[str] = dataclasses.field(default_factory=set)  # what this process knows to be right
+    verified: set[str] = dataclasses.field(default_factory=set)  # sha256 of the files that this process has verified
 
     def path(self, url: Url, sha256: str, size: int) -> Path:
-        """Where the file is, fetched if need be; open it soon, as others may make room at any time.
+        """The path of the file, downloaded if needed; open it soon, as other processes may remove it at any time.
 
-        Raises OSError if it cannot be fetched, DamagedError if it is not what was written.
+        Raises OSError or UnreachableError if it cannot be downloaded, DamagedError if it has another sha256.
         """
         path = self.folder / sha256
         if not self._holds(path):
             with self._locked(path.with_suffix(".part")) as part:
-                if not self._holds(path):  # another process may have fetched it meanwhile
+                if not self._holds(path):  # another process may have downloaded it meanwhile
                     download(url, part, size)
                     if file_sha256(part) != sha256:
                         raise DamagedError(f"{url} is not what was written: its sha256 differs")
                     self._make_room(part.stat().st_size)
                     part.replace(path)
-                    self.seen.add(sha256)
+                    self.verified.add(sha256)
         return path
 
     def _holds(self, path: Path) -> bool:
-        """Whether the file is there and right; its time then says when it was last used."""
+        """Whether the file is there and has its sha256; sets its time of last use."""
         try:
-            if path.name not in self.seen and file_sha256(path) != path.name:
+            if path.name not in self.verified and file_sha256(path) != path.name:
                 return False
             os.utime(path)
         except FileNotFoundError:
             return False
-        self.seen.add(path.name)
+        self.verified.add(path.name)
         return True
 
     @contextlib.contextmanager
     def _locked(self, part: Path) -> Iterator[Path]:
-        """The name to fetch a file under, while no one else does."""
+        """The temporary name of a file, locked until the block ends."""
         self.folder.mkdir(parents=True, exist_ok=True)
         while True:
             with part.open("ab") as file:
                 fcntl.flock(file, fcntl.LOCK_EX)
-                if not _is_at(file.fileno(), part):
-                    continue  # renamed by whoever had the lock before
+                if not is_at(file.fileno(), part):
+                    continue  # the previous owner of the lock has renamed it
                 try:
                     yield part
                 finally:
-                    if _is_at(file.fileno(), part):  # not renamed; and nobody else may, as long as it is locked
+                    if is_at(file.fileno(), part):  # not renamed; no other process renames it while it is locked
                         part.unlink()
                 return
 
     def _make_room(self, size: int) -> None:
-        """Removes files, the longest unused first, until another of `size` bytes fits."""
+        """Remove files, the least recently used first, until another of `size` bytes fits."""
         if self.limit is None:
             return
         files = []
         for path in self.folder.iterdir():
             if _OURS.fullmatch(path.name):
                 with contextlib.suppress(FileNotFoundError):
-                    about = path.stat()
-                    files.append((about.st_mtime_ns, about.st_size, path))
-        total = size + sum(taken for _, taken, _ in files)
-        for _, taken, path in sorted(files):
+                    status = path.stat()
+                    files.append((status.st_mtime_ns, status.st_size, path))
+        total = size + sum(own for _, own, _ in files)
+        for _, own, path in sorted(files):
             if total <= self.limit:
                 break
             path.unlink(missing_ok=True)
-            total -= taken
-
-
-def _is_at(descriptor: int, path: Path) -> bool:
-    """Whether the open file has this name still."""
-    try:
-        return os.path.samestat(os.fstat(descriptor), path.stat())
-    except FileNotFoundError:
-        return False
+            total -= own

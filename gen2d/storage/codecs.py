@@ -1,11 +1,11 @@
-"""How images are compressed: gzip (read by every HDF5 program), zstd (smaller) or none. All of it releases the GIL.
+"""Compression of images: gzip (read by every HDF5 program), zstd (smaller) or none. All of it releases the GIL.
 
-gzip is ordinary deflate in a zlib envelope, which HDF5's own filter reads; isal writes it several times faster than
-zlib does, at its level 0. That is not zlib's level 0, which stores: isal's compresses, as fast as its level 1 into
-15-20 % more bytes. Levels 1 and 2 were seen to answer one call in some hundreds with another stream for the same input:
-valid, but then a shard made again is another file. Levels 0 and 3 never did so, and 3 is three times slower.
+gzip is ordinary deflate in a zlib envelope, which HDF5's own filter reads. isal writes it several times faster than
+zlib. Its level 0 compresses, unlike zlib's, as fast as its level 1 and into 15-20 % more bytes. Levels 1 and 2 were
+seen to return different, valid streams for the same input in one of some hundreds of calls, which would give a
+regenerated shard other bytes. Levels 0 and 3 never did so; level 3 is three times slower.
 
-zstd carries its size and a checksum in each frame, because HDF5's zstd filter checks nothing by itself.
+Each zstd frame contains its size and a checksum, because HDF5's zstd filter checks nothing by itself.
 """
 
 import threading
@@ -18,18 +18,18 @@ from gen2d.core.errors import DamagedError
 
 CODECS = ("gzip", "zstd", "none")
 
-# The filter that HDF5 names in the file, and its options: the level, which no reader needs. For gzip it is 1 although
-# isal's is 0, as HDF5's level 0 says that nothing was compressed.
+# The number of each HDF5 filter and its options: the level, which no reader needs. For gzip it is 1 although isal's is
+# 0, as HDF5's level 0 means no compression.
 HDF5_FILTERS: dict[str, tuple[int, tuple[int, ...]]] = {"gzip": (1, (1,)), "zstd": (32015, (3,))}
 
 _ISAL_LEVEL = 0
 
 crc32 = isal_zlib.crc32
 
-# isal's stub calls its exception class an instance.
+# isal's stub declares its exception class as an instance.
 _ERRORS: tuple[type[Exception], ...] = (isal_zlib.error, zstandard.ZstdError, MemoryError)  # pyright: ignore
 
-# A zstd context is costly to make and serves one thread at a time.
+# A zstd context is costly to create and serves one thread at a time.
 _contexts = threading.local()
 
 
@@ -44,9 +44,9 @@ def encode(codec: str, array: np.ndarray) -> bytes:
 
 
 def decode_into(codec: str, data: bytes | memoryview, out: np.ndarray) -> None:
-    """Fills the contiguous array `out` with what `encode` was given.
+    """Fill the contiguous array `out` with the array that `encode` compressed into `data`.
 
-    Raises DamagedError unless `data` is whole, ends where it should and fills `out` exactly.
+    Raises DamagedError unless `data` is intact, ends where it should and fills `out` exactly.
     """
     try:
         if codec == "zstd":
@@ -63,7 +63,7 @@ def decode_into(codec: str, data: bytes | memoryview, out: np.ndarray) -> None:
 
 def _inflated(data: bytes | memoryview, size: int) -> bytes:
     stream = isal_zlib.decompressobj()
-    # One byte more than expected: a longer stream is noticed, and the buffer need not grow to see the end.
+    # One byte more than expected reveals a longer stream, and the buffer need not grow to reach the end.
     plain = stream.decompress(data, size + 1)
     if not stream.eof or stream.unused_data:
         raise DamagedError("compressed data does not end where it should")
@@ -71,20 +71,20 @@ def _inflated(data: bytes | memoryview, size: int) -> bytes:
 
 
 def _unzstd(data: bytes | memoryview, out: np.ndarray) -> None:
-    # Asked before decompressing, so that a damaged size cannot ask for all the memory there is.
+    # Checked before decompressing, so that a damaged size cannot claim all memory.
     if zstandard.frame_content_size(data) != out.nbytes:
-        raise DamagedError(f"compressed data does not hold the {out.nbytes} bytes that it must hold")
+        raise DamagedError(f"compressed data does not hold {out.nbytes} bytes, as it must")
     if _frame_end(data) != len(data):
         raise DamagedError("compressed data does not end where it should")
-    # With all data and all room at once, zstd decompresses right into the room.
-    room = out.reshape(-1).view(np.uint8)
-    got = _decompressor().stream_reader(data).readinto(room.data) if out.nbytes else 0
-    if got != out.nbytes:
-        raise DamagedError(f"compressed data holds {got} bytes, but must hold {out.nbytes}")
+    # With the whole input and the whole buffer at once, zstd decompresses right into the buffer.
+    buffer = out.reshape(-1).view(np.uint8)
+    size = _decompressor().stream_reader(data).readinto(buffer.data) if out.nbytes else 0
+    if size != out.nbytes:
+        raise DamagedError(f"compressed data holds {size} bytes, but must hold {out.nbytes}")
 
 
 def _frame_end(data: bytes | memoryview) -> int:
-    """Where a zstd frame ends, from the headers of its blocks (RFC 8878, 3.1.1.2), of which it has one in 128 kB."""
+    """The end of a zstd frame, from the headers of its blocks (RFC 8878, 3.1.1.2), one per 128 kB."""
     place = zstandard.frame_header_size(data)
     last = False
     while not last:

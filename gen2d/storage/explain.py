@@ -1,4 +1,4 @@
-"""What an OSError of a disk means for a person, as an error with one true sentence."""
+"""Errors with one sentence for a person, from the OSErrors of a disk."""
 
 import contextlib
 import errno
@@ -9,23 +9,23 @@ from pathlib import Path
 from gen2d.core.errors import DamagedError, FolderError, UnreachableError, UserError
 
 FULL = (errno.ENOSPC, errno.EDQUOT)
-# The disk, or what connects it, fails; the data may well be whole.
+# The disk or its network fails; the data may be whole.
 _FAILING = tuple(
     getattr(errno, name)
     for name in ("EIO", "ESTALE", "ETIMEDOUT", "ENOTCONN", "EHOSTDOWN", "EREMOTEIO", "ENODEV")
-    if hasattr(errno, name)  # not every system has all
+    if hasattr(errno, name)  # no system has them all
 )
 _TOO_MANY = (errno.EMFILE, errno.ENFILE)
 _NO_FILE = (errno.ENXIO, errno.EISDIR, errno.ENOTDIR, errno.ELOOP)
 
 
 def reason(error: Exception) -> str:
-    """What is wrong, without the file's name."""
+    """The message of an error, without the file's name."""
     return str(getattr(error, "strerror", None) or error)
 
 
 def reading_error(path: object, error: OSError) -> Exception:
-    """The error to raise where a file of a dataset could not be read."""
+    """The error to raise when a file of a dataset cannot be read."""
     if isinstance(error, FileNotFoundError):
         return DamagedError(f"{path} is missing")
     if error.errno in _TOO_MANY:
@@ -49,7 +49,7 @@ def reading_error(path: object, error: OSError) -> Exception:
 
 @contextlib.contextmanager
 def explained_reading(path: object) -> Iterator[None]:
-    """A block that reads a file; its OSError becomes one of ours."""
+    """A block that reads a file; its OSError becomes the error of `reading_error`."""
     try:
         yield
     except OSError as error:
@@ -57,10 +57,10 @@ def explained_reading(path: object) -> Iterator[None]:
 
 
 def writing_error(where: Path, error: OSError, again: str = "run the same command again", need: str = "") -> UserError:
-    """The error to raise where a file could not be written in the folder `where`; `again` says how to go on, `need`
-    how much room there must be.
+    """The error to raise when a file cannot be written in the folder `where`.
 
-    Exit code 2 for what another folder mends, 1 for a disk that is full or fails.
+    `again` says how to go on, `need` how much space is needed. The exit code is 1 for a disk that is full or fails, and
+    2 for errors that another folder avoids.
     """
     if isinstance(error, FileExistsError | NotADirectoryError):
         return FolderError(f"{error.filename} is a file, not a folder: choose another --out")
@@ -73,22 +73,25 @@ def writing_error(where: Path, error: OSError, again: str = "run the same comman
     if isinstance(error, FileNotFoundError):
         return FolderError(f"{error.filename or where} is gone: was {where} moved or removed during the run?")
     if error.errno in FULL:
-        told = (
-            f"no space left for {where}: {need}{', ' if need else ''}the disk has {_left(where)}: make room and {again}"
-        )
+        need = f"{need}, " if need else ""
+        sentence = f"no space left for {where}: {need}the disk has {_space(where)}: make room and {again}"
     elif error.errno == errno.EFBIG:
-        told = f"{where} cannot hold so large a file: its file system, or ulimit -f, allows none; allow it and {again}"
+        sentence = (
+            f"{where} cannot hold so large a file: its file system, or ulimit -f, allows none; allow it and {again}"
+        )
     elif error.errno in _FAILING:
-        told = f"{where} cannot be written, as the disk or its network fails ({reason(error)}): mend it and {again}"
+        sentence = (
+            f"{where} cannot be written, as the disk or its network fails ({reason(error)}): repair it and {again}"
+        )
     else:
         return FolderError(f"{where} cannot be written ({reason(error)}): choose another --out")
-    failed = FolderError(told)
-    failed.exit_code = 1
-    return failed
+    failure = FolderError(sentence)
+    failure.exit_code = 1
+    return failure
 
 
-def _left(where: Path) -> str:
-    """How much a disk can still take."""
+def _space(where: Path) -> str:
+    """The space that is left on a disk, for a sentence."""
     try:
         disk = os.statvfs(next(folder for folder in (where, *where.absolute().parents) if folder.exists()))
     except (OSError, StopIteration):

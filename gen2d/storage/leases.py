@@ -1,8 +1,8 @@
-"""Who owns a temporary file: whoever holds the lock on it, which the system gives back when a process dies.
+"""Ownership of temporary files, by locks that the system releases when a process dies.
 
-A name tells nothing: two containers may share a host's name and process numbers. So a temporary file has a random token
-in its name and an exclusive lock (flock) for as long as somebody writes it; a file whose lock is free is abandoned.
-Where a file system has no locks, or none that other machines see, nothing counts as abandoned.
+Host names and process numbers identify no owner, as two containers may share both. So a temporary file has a random
+token in its name, and its writer holds an exclusive lock (flock) on it; a file whose lock is free is abandoned. On a
+file system without locks, or with locks that other machines do not see, no file counts as abandoned.
 """
 
 import contextlib
@@ -17,9 +17,9 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 TEMPORARY = re.compile(r"\.tmp\.[0-9a-f]{16}(\.lock)?$")  # the end of a temporary name
-LOCK = ".lock"  # the end of the name of the file that stands for a temporary folder
+LOCK = ".lock"  # suffix of the file whose lock stands for a temporary folder
 
-# File systems whose locks all who can see a file respect; NFS and Lustre may be mounted without.
+# File systems whose locks hold for everybody who sees a file; NFS and Lustre may be mounted without.
 _ON_DISK = frozenset(
     ("ext2", "ext3", "ext4", "xfs", "btrfs", "zfs", "f2fs", "bcachefs", "jfs", "reiserfs", "apfs", "hfs")
 )
@@ -29,15 +29,15 @@ _WITHOUT = frozenset(("nolock", "local_lock=all", "local_lock=flock", "localfloc
 
 
 def temporary_name(name: str) -> str:
-    """A name that nobody else has, for what is to become `name`."""
+    """A unique temporary name for a file that becomes `name`."""
     return f"{name}.tmp.{secrets.token_hex(8)}"
 
 
 @contextlib.contextmanager
 def leased(path: Path) -> Iterator[int]:
-    """A new, empty, locked file with this name, as a descriptor; the lock lasts as long as the block.
+    """A descriptor of a new, empty file with this name, locked until the block ends.
 
-    Raises OSError. Where there are no locks the file is made all the same.
+    Without locks the file is made all the same. Raises OSError.
     """
     while True:
         descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
@@ -47,15 +47,15 @@ def leased(path: Path) -> Iterator[int]:
                 return
         finally:
             os.close(descriptor)
-        time.sleep(0.001)  # somebody took it for abandoned, in the moment before it was locked
+        time.sleep(0.001)  # another process removed it as abandoned before it was locked
 
 
 @contextlib.contextmanager
 def exclusive(path: Path, seconds: float) -> Iterator[None]:
     """A block that one process at a time runs, by a lock on the file `path`, which stays.
 
-    Raises TimeoutError where another process still has the lock after so many seconds. Where there are no locks the
-    block runs all the same.
+    Without locks the block runs all the same. Raises TimeoutError if another process holds the lock longer than
+    `seconds`.
     """
     end = time.monotonic() + seconds
     descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o666)
@@ -70,7 +70,7 @@ def exclusive(path: Path, seconds: float) -> Iterator[None]:
 
 
 def try_lock(descriptor: int) -> bool | None:
-    """Whether this process now has the lock; None where the file system has no locks."""
+    """Lock a file if no other process has; returns whether it is locked, None if the file system has no locks."""
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
@@ -83,7 +83,7 @@ def try_lock(descriptor: int) -> bool | None:
 
 
 def is_at(descriptor: int, path: Path) -> bool:
-    """Whether the open file has this name still."""
+    """Whether the open file still has this name."""
     try:
         return os.path.samestat(os.fstat(descriptor), path.stat())
     except FileNotFoundError:
@@ -91,9 +91,9 @@ def is_at(descriptor: int, path: Path) -> bool:
 
 
 def remove_abandoned(paths: Iterable[Path], force: bool = False) -> list[Path]:
-    """The temporary files and folders among the paths that nobody holds, which are removed.
+    """Remove the abandoned temporary files and folders among the paths; returns their paths.
 
-    With `force` also those of a file system without locks, where nobody knows.
+    `force` also removes those on a file system without locks, where they may still be in use.
     """
     removed = []
     for path in paths:
@@ -108,7 +108,7 @@ def remove_abandoned(paths: Iterable[Path], force: bool = False) -> list[Path]:
 
 @contextlib.contextmanager
 def abandoned(path: Path, force: bool = False) -> Iterator[bool]:
-    """Whether nobody holds the file, or the folder; while the block lasts, nobody can."""
+    """Whether no process holds the file or folder; none can take it during the block."""
     if not force and not has_locks(path.parent):
         yield False
         return
@@ -129,7 +129,7 @@ def abandoned(path: Path, force: bool = False) -> Iterator[bool]:
 
 
 def temporaries(folder: Path, prefix: str = "") -> Iterator[Path]:
-    """The temporary files and folders right in a folder whose names begin so."""
+    """The temporary files and folders directly in a folder whose names begin with `prefix`."""
     with contextlib.suppress(FileNotFoundError, NotADirectoryError), os.scandir(folder) as entries:
         for entry in entries:
             if TEMPORARY.search(entry.name) and entry.name.startswith(prefix):
@@ -137,11 +137,11 @@ def temporaries(folder: Path, prefix: str = "") -> Iterator[Path]:
 
 
 def has_locks(folder: Path) -> bool:
-    """Whether locks in this folder hold for everybody who sees it."""
+    """Whether locks in this folder hold for every process that sees it, on all machines."""
     try:
         mounts = Path("/proc/self/mountinfo").read_text().splitlines()
     except OSError:
-        return True  # not Linux: a lock holds at least on this machine
+        return True  # not Linux: locks hold at least on this machine
     kind, options = _mount_of(os.path.realpath(folder), mounts)
     if kind == "lustre" and "flock" not in options:
         return False
@@ -149,8 +149,8 @@ def has_locks(folder: Path) -> bool:
 
 
 def _mount_of(path: str, mounts: Iterable[str]) -> tuple[str, frozenset[str]]:
-    """Kind and options of the file system that holds a path (proc(5), mountinfo)."""
-    best, found = "", ("", frozenset[str]())
+    """The type and options of the file system that holds a path (proc(5), mountinfo)."""
+    best, mount = "", ("", frozenset[str]())
     for line in mounts:
         mounted, _, system = line.partition(" - ")
         point = mounted.split(" ")[4].encode().decode("unicode_escape")  # a space is written \040
@@ -158,5 +158,5 @@ def _mount_of(path: str, mounts: Iterable[str]) -> tuple[str, frozenset[str]]:
         if inside and len(point) >= len(best):
             kind, _, options = system.split(" ", 2)
             best = point
-            found = kind, frozenset((options.split(" ")[-1] + "," + mounted.split(" ")[5]).split(","))
-    return found
+            mount = kind, frozenset((options.split(" ")[-1] + "," + mounted.split(" ")[5]).split(","))
+    return mount

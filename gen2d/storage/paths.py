@@ -1,19 +1,18 @@
-"""Files and folders at a URL, used by the names that pathlib has for the same.
+"""Files and folders at a URL, with the interface of pathlib.
 
-`place` makes a Path of a folder on disk and a Url of anything else, and what is written for the one then works with the
-other. fsspec knows the protocols; it is imported when the first URL is met. An object appears whole or not at all, so
-nothing is renamed; folders are only what names begin with.
+`place` returns a Path for a folder on disk and a Url for anything else, and most code works with both. fsspec provides
+the protocols; it is imported when the first URL is met. An object appears whole or not at all, so nothing is renamed;
+folders are only prefixes of names.
 
-Every request has a limit on waiting and a deadline. What a server may mend is tried again until then; what remains is
-UnreachableError, or FileNotFoundError and PermissionError where the server says so. No message, repr or log shows the
-user name, password or query of a URL.
+Every request has a timeout and a deadline. Failures that may be temporary are tried again until the deadline and then
+raise UnreachableError; FileNotFoundError and PermissionError are raised where the server says so. No message, repr or
+log shows the user name, password or query of a URL.
 """
 
 import contextlib
 import dataclasses
 import errno
 import fnmatch
-import functools
 import os
 import re
 import stat
@@ -24,21 +23,22 @@ from pathlib import Path, PurePath
 from typing import Any, TypeVar
 
 from gen2d.core.errors import ConfigError, DamagedError, FolderError, UnreachableError
+from gen2d.storage.filesystems import file_system, shown, without_secrets
 
 PAUSE = 0.25  # s, before the second attempt; doubled before each that follows
 ATTEMPTS = 4
 PIECE = 2**20  # bytes of a file that are received at once
-SLOWEST = 2**20  # bytes/s: a file may take so much longer than the deadline
+SLOWEST = 2**20  # bytes/s, by which the deadline of a large file is extended
 
 T = TypeVar("T")
 
 
 @dataclasses.dataclass(frozen=True)
 class Network:
-    """How long a server is waited for."""
+    """Limits on the time that a server may take."""
 
-    timeout: float = 30.0  # s, to connect, and between two pieces of an answer
-    deadline: float = 300.0  # s, for a request in all, every further attempt included
+    timeout: float = 30.0  # s, to connect and between two parts of an answer
+    deadline: float = 300.0  # s, for a request including all further attempts
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
@@ -48,10 +48,10 @@ class Network:
 
 @dataclasses.dataclass(frozen=True, order=True)
 class Url:
-    """A file or folder elsewhere; methods do as those of pathlib.Path, and raise OSError as they do."""
+    """A file or folder at a URL; its methods behave like those of pathlib.Path and raise the same OSErrors."""
 
     text: str = dataclasses.field(repr=False)  # without the query
-    query: str = dataclasses.field(default="", repr=False)  # with its question mark
+    query: str = dataclasses.field(default="", repr=False)  # including its question mark
     network: Network = dataclasses.field(default=Network(), compare=False, repr=False)
 
     def __truediv__(self, name: str | PurePath) -> "Url":
@@ -73,7 +73,7 @@ class Url:
 
     @property
     def is_listed(self) -> bool:
-        """Whether the server tells what is in a folder; plain web servers need not."""
+        """Whether the server lists folders; plain web servers need not."""
         return not self.is_web
 
     @property
@@ -81,10 +81,10 @@ class Url:
         return self.text.startswith(("http://", "https://"))
 
     def stat(self) -> os.stat_result:
-        """Size and kind; the rest is not known."""
-        about = attempt(self, _about)
-        kind = stat.S_IFDIR if about["type"] == "directory" else stat.S_IFREG
-        return os.stat_result((kind, 0, 0, 1, 0, 0, about["size"] or 0, 0, 0, 0))
+        """The size and kind; all other entries are zero."""
+        info = attempt(self, _info)
+        kind = stat.S_IFDIR if info["type"] == "directory" else stat.S_IFREG
+        return os.stat_result((kind, 0, 0, 1, 0, 0, info["size"] or 0, 0, 0, 0))
 
     def is_file(self) -> bool:
         return stat.S_ISREG(self._kind())
@@ -102,21 +102,21 @@ class Url:
             return 0
 
     def mkdir(self, parents: bool = False, exist_ok: bool = False) -> None:
-        """Does nothing: a folder is there when something is in it."""
+        """Do nothing: a folder exists when something is in it."""
 
     def iterdir(self) -> "Iterator[Url]":
-        listed = attempt(self, lambda system, path: _listed(system, path, system.ls)) if self.is_listed else []
-        return (self / name for name in listed)
+        names = attempt(self, lambda system, path: _names(system, path, system.ls)) if self.is_listed else []
+        return (self / name for name in names)
 
     def glob(self, pattern: str) -> "Iterator[Url]":
         return (path for path in self.iterdir() if fnmatch.fnmatchcase(path.name, pattern))
 
     def rglob(self, pattern: str) -> "Iterator[Url]":
-        listed = attempt(self, lambda system, path: _listed(system, path, system.find)) if self.is_listed else []
-        return (self / name for name in listed if fnmatch.fnmatchcase(PurePath(name).name, pattern))
+        names = attempt(self, lambda system, path: _names(system, path, system.find)) if self.is_listed else []
+        return (self / name for name in names if fnmatch.fnmatchcase(PurePath(name).name, pattern))
 
     def read_bytes(self, limit: int) -> bytes:
-        """The whole content, of at most `limit` bytes; OSError(EFBIG) where it has more."""
+        """The whole content of at most `limit` bytes; raises OSError(EFBIG) for a larger file."""
         return attempt(self, lambda system, path: _read(self, system, path, limit))
 
     def unlink(self, missing_ok: bool = False) -> None:
@@ -127,7 +127,7 @@ class Url:
                 raise
 
     def copy(self, target: "Url") -> None:
-        """Returns when the object has this name, too."""
+        """Copy the object to another URL of the same server."""
         attempt(self, lambda system, path: system.cp_file(path, system._strip_protocol(target.text)), 2**33)
 
 
@@ -135,9 +135,9 @@ Place = Path | Url
 
 
 def place(path: str | Place, network: Network | None = None) -> Place:
-    """Where a dataset lies: a Path, or a Url of what has a protocol other than file.
+    """The Path of a folder on disk, or the Url of a text with another protocol than `file`.
 
-    Raises FolderError for a URL of which it is known at once that it cannot be used.
+    `network` replaces the limits of a Url. Raises FolderError for a URL that cannot be used.
     """
     if isinstance(path, Url):
         return path if network is None else dataclasses.replace(path, network=network)
@@ -150,35 +150,13 @@ def place(path: str | Place, network: Network | None = None) -> Place:
         raise FolderError(f"{shown(path)} must be PROTOCOL://FOLDER, such as s3://bucket/dataset")
     text, mark, query = path.partition("?") if protocol in ("http", "https", "az", "abfs", "abfss") else (path, "", "")
     url = Url(text.rstrip("/"), mark + query, network or Network())
-    _system(url)
+    file_system(url.text, url.network.timeout)
     return url
-
-
-def shown(text: str) -> str:
-    """A URL without what must stay secret: user name and password, and the values of its query."""
-    start, mark, rest = text.partition("://")
-    if not mark:
-        return text
-    rest, question, _ = rest.partition("?")
-    host, slash, path = rest.partition("/")
-    _, at, bare = host.rpartition("@")
-    return f"{start}://{'***@' if at else ''}{bare}{slash}{path}{'?***' if question else ''}"
-
-
-def _without_secrets(sentence: str, url: Url) -> str:
-    """What a library says of a URL, with none of its secrets."""
-    host = url.text.partition("://")[2].partition("/")[0]
-    user = host.rpartition("@")[0]
-    values = [value for pair in url.query.lstrip("?").split("&") for value in (pair.partition("=")[2],)]
-    for secret in (url.query, user, *user.split(":"), *values):
-        if len(secret) > 2:
-            sentence = sentence.replace(secret, "***")
-    return sentence
 
 
 @contextlib.contextmanager
 def reading(root: Place) -> Iterator[None]:
-    """A block that reads a dataset; of a Url its OSError becomes a FolderError."""
+    """A block that reads a dataset; its OSError becomes a FolderError if the dataset is at a URL."""
     try:
         yield
     except OSError as error:
@@ -188,7 +166,7 @@ def reading(root: Place) -> Iterator[None]:
 
 
 def upload(source: Path, url: Url) -> None:
-    """Returns when the file is there, whole."""
+    """Upload a file; on return the server has it whole."""
     size = source.stat().st_size
 
     def put(system: Any, path: str) -> None:
@@ -199,26 +177,30 @@ def upload(source: Path, url: Url) -> None:
 
 
 def download(url: Url, target: Path, size: int) -> None:
-    """Returns when `target` holds the file, all its `size` bytes."""
+    """Download a file of `size` bytes; raises DamagedError if the server says that it has another size."""
+
+    def check_length(length: int | None) -> None:
+        if length is not None and length != size:
+            raise DamagedError(f"{url} has {length} bytes, but must have {size}")
 
     def get(system: Any, path: str) -> None:
         if not url.is_web:
-            _check_length(system.info(path)["size"], size, url)
+            check_length(system.info(path)["size"])
             system.get_file(path, str(target))
             return _check_size(target.stat().st_size, size)
-        got = 0
+        received = 0
         with target.open("wb") as file, _stream(system, path) as source:
-            _check_length(_length(source), size, url)
-            while got <= size and (piece := source.read(min(PIECE, size + 1 - got))):
-                got += len(piece)
+            check_length(_content_length(source))
+            while received <= size and (piece := source.read(min(PIECE, size + 1 - received))):
+                received += len(piece)
                 file.write(piece)
-        _check_size(got, size)
+        _check_size(received, size)
 
     attempt(url, get, size)
 
 
 def read_range(url: Url, system: Any, path: str, start: int, end: int) -> bytes:
-    """The bytes of a file from `start` to before `end`, and never more, whatever the server sends."""
+    """The bytes `start` to `end - 1` of a file, and at most one more if a web server sends too many."""
     if not url.is_web:
         return system.cat_file(path, start=start, end=end)
     with _stream(system, path, Range=f"bytes={start}-{end - 1}") as file:
@@ -228,93 +210,78 @@ def read_range(url: Url, system: Any, path: str, start: int, end: int) -> bytes:
 
 
 def _read(url: Url, system: Any, path: str, limit: int) -> bytes:
-    if not url.is_web:
-        content = _all_of(system, path, limit + 1)
-        if len(content) > limit:
-            raise _too_large(limit)
-        return content
-    with _stream(system, path) as file:
-        content, length = _read_at_most(file, limit), _length(file)
+    length = None
+    if url.is_web:
+        with _stream(system, path) as file:
+            content, length = _read_at_most(file, limit), _content_length(file)
+    else:
+        try:
+            content = system.cat_file(path, start=0, end=limit + 1)
+        except Exception as error:
+            if _status(error) != 416:
+                raise
+            content = b""  # an empty file has no range
     if len(content) > limit:
-        raise _too_large(limit)
+        raise OSError(errno.EFBIG, f"it has more than {limit} bytes")
     if length is not None:
         _check_size(len(content), length)
     return content
 
 
-def _all_of(system: Any, path: str, most: int) -> bytes:
-    """The first `most` bytes of a file, in one request."""
-    try:
-        return system.cat_file(path, start=0, end=most)
-    except Exception as error:
-        if _status(error) == 416:  # it has none
-            return b""
-        raise
-
-
-def _length(file: Any) -> int | None:
-    """How many bytes a web server says will come; None if it does not say."""
-    said = file.r.headers.get("Content-Length", "")
-    return int(said) if said.isdigit() and "Content-Encoding" not in file.r.headers else None
-
-
-def _check_length(said: int | None, expected: int, url: Url) -> None:
-    if said is not None and said != expected:
-        raise DamagedError(f"{url} has {said} bytes, but must have {expected}")
+def _content_length(file: Any) -> int | None:
+    """The number of bytes that a web server announces; None if it announces none."""
+    text = file.r.headers.get("Content-Length", "")
+    return int(text) if text.isdigit() and "Content-Encoding" not in file.r.headers else None
 
 
 def _stream(system: Any, path: str, **headers: str) -> Any:
-    """The answer of a web server, to be read as it comes; a request, and not one more to learn the size."""
+    """The answer of a web server as a stream, without another request for its size."""
     return system.open(path, "rb", block_size=0, size=1, headers={"Accept-Encoding": "identity", **headers})
 
 
 def _read_at_most(file: Any, limit: int) -> bytes:
-    """What comes of a file up to a byte more than `limit`."""
+    """The content of a stream, up to one byte more than `limit`."""
     content = bytearray()
     while len(content) <= limit and (piece := file.read(min(PIECE, limit + 1 - len(content)))):
         content += piece
     return bytes(content)
 
 
-def _too_large(limit: int) -> OSError:
-    return OSError(errno.EFBIG, f"it has more than {limit} bytes")
+def _check_size(received: int, expected: int) -> None:
+    if received != expected:
+        raise OSError(errno.EIO, f"{received} of {expected} bytes arrived")
 
 
-def _check_size(found: int, expected: int) -> None:
-    if found != expected:
-        raise OSError(errno.EIO, f"{found} bytes came of {expected}")
-
-
-def _about(system: Any, path: str) -> dict[str, Any]:
+def _info(system: Any, path: str) -> dict[str, Any]:
     try:
         return system.info(path)
     except FileNotFoundError as error:
-        if error.__cause__ is not None:  # fsspec calls a file missing also where no server answers
+        if error.__cause__ is not None:  # fsspec reports a missing file even if no server answers
             raise error.__cause__ from None
         raise
 
 
-def _listed(system: Any, path: str, call: Callable[..., list[str]]) -> list[str]:
-    """The names under a folder, from it on."""
+def _names(system: Any, path: str, call: Callable[..., list[str]]) -> list[str]:
+    """The names that `call` lists in a folder, relative to it, sorted."""
     try:
-        found = call(path, detail=False)
+        paths = call(path, detail=False)
     except (FileNotFoundError, NotADirectoryError):
         return []
-    inside = system._strip_protocol(path).rstrip("/") + "/"
-    names = (system._strip_protocol(name) for name in found)
-    return sorted(name.removeprefix(inside) for name in names if name.startswith(inside) and name != inside)
+    prefix = system._strip_protocol(path).rstrip("/") + "/"
+    names = (system._strip_protocol(name) for name in paths)
+    return sorted(name.removeprefix(prefix) for name in names if name.startswith(prefix) and name != prefix)
 
 
 # ---- Attempts
 
 
 def attempt(url: Url, call: Callable[[Any, str], T], size: int = 0) -> T:
-    """What `call` returns for the URL's file system and path there, after as many attempts as it takes.
+    """The result of `call` for the URL's file system and the path in it, after as many attempts as it takes.
 
-    `size` are the bytes that move: a large file has more time. Raises OSError for what no other attempt would mend,
-    and UnreachableError.
+    `size` is the number of bytes to transfer, which extends the deadline. Raises OSError for failures that another
+    attempt would not solve, DamagedError, and UnreachableError.
     """
-    system = _system(url)
+    system = file_system(url.text, url.network.timeout)
     path = system._strip_protocol(url.text) + url.query
     end = time.monotonic() + url.network.deadline + size / SLOWEST
     for number in range(ATTEMPTS):
@@ -330,7 +297,7 @@ def attempt(url: Url, call: Callable[[Any, str], T], size: int = 0) -> T:
 
 
 def _within(seconds: float, call: Callable[[], T]) -> T:
-    """What the call returns, if it takes no longer; it is left alone in its thread where it does."""
+    """The result of the call; raises TimeoutError if it takes longer, and leaves it to its thread."""
     returned: list[T] = []
     raised: list[BaseException] = []
 
@@ -350,13 +317,14 @@ def _within(seconds: float, call: Callable[[], T]) -> T:
     return returned[0]
 
 
+# Errors that another attempt would not solve.
 _FINAL = (FileNotFoundError, PermissionError, IsADirectoryError, NotADirectoryError)
-_LASTING = (errno.EFBIG, errno.EOPNOTSUPP, errno.ENOSPC, errno.EMFILE, errno.ENFILE)  # and these
+_FINAL_NUMBERS = (errno.EFBIG, errno.EOPNOTSUPP, errno.ENOSPC, errno.EMFILE, errno.ENFILE)
 
 
 def explained(error: BaseException, url: Url) -> Exception:
-    """The error as one of ours: OSError for what another attempt would not mend, DamagedError for a file of another
-    length, else UnreachableError."""
+    """The error to raise for a library's error: OSError if another attempt would not solve it, DamagedError for a file
+    of another length, otherwise UnreachableError."""
     status = _status(error)
     if status in (401, 403) or "Credentials" in type(error).__name__:
         error = PermissionError()
@@ -373,15 +341,15 @@ def explained(error: BaseException, url: Url) -> Exception:
     number = getattr(error, "errno", None)
     text = getattr(error, "strerror", None) or str(error)
     text = text or ("no answer in time" if isinstance(error, TimeoutError) else type(error).__name__)
-    text = " ".join(_without_secrets(text, url).split()).rstrip(".")
-    lasting = number in _LASTING or isinstance(error, TypeError | ValueError | NotImplementedError | AttributeError)
-    if lasting or (status is not None and 400 <= status < 500 and status not in (408, 425, 429)):
+    text = " ".join(without_secrets(text, url.text, url.query).split()).rstrip(".")
+    final = number in _FINAL_NUMBERS or isinstance(error, TypeError | ValueError | NotImplementedError | AttributeError)
+    if final or (status is not None and 400 <= status < 500 and status not in (408, 425, 429)):
         return OSError(number or errno.EIO, text, str(url))
     return UnreachableError(f"{url} cannot be reached ({text})")
 
 
 def _status(error: BaseException | None) -> int | None:
-    """What a web server, or S3, answered with."""
+    """The HTTP status that a web server or S3 answered with."""
     while error is not None:
         status = getattr(error, "status", None)
         response = getattr(error, "response", None)
@@ -391,43 +359,3 @@ def _status(error: BaseException | None) -> int | None:
             return status
         error = error.__cause__
     return None
-
-
-def _system(url: Url) -> Any:
-    """The file system that knows the URL; one that was made before a fork is another."""
-    return _file_system("/".join(url.text.split("/")[:3]), url.network.timeout, os.getpid())
-
-
-@functools.lru_cache(maxsize=32)
-def _file_system(start: str, timeout: float, process: int) -> Any:
-    name = shown(start)
-    try:
-        import fsspec
-    except ImportError:
-        raise FolderError(f"{name} needs fsspec: pip install 'gen2d[remote]'") from None
-    try:
-        # What others write must be seen at once.
-        return fsspec.core.url_to_fs(start, use_listings_cache=False, **_limits(start, timeout))[0]
-    except ImportError as error:
-        hint = ": pip install 'gen2d[remote]'" if start.startswith(("s3:", "http")) else ""
-        raise FolderError(f"{name} needs another package ({error}){hint}") from None
-    except Exception as error:
-        known = ", ".join(sorted(name for name in fsspec.available_protocols() if name in _COMMON))
-        reason = _without_secrets(" ".join(str(error).split()), Url(start))
-        raise FolderError(f"{name} cannot be used ({reason}); common protocols are {known}") from None
-
-
-def _limits(start: str, timeout: float) -> dict[str, Any]:
-    """How a file system is told how long to wait for a server; that of another protocol has its own limits."""
-    if start.startswith(("http://", "https://")):
-        import aiohttp
-
-        limits = aiohttp.ClientTimeout(total=None, sock_connect=timeout, sock_read=timeout)
-        return {"client_kwargs": {"timeout": limits}}
-    if start.startswith(("s3://", "s3a://")):
-        retries = {"max_attempts": 1}  # trying again is for `attempt`
-        return {"config_kwargs": {"connect_timeout": timeout, "read_timeout": timeout, "retries": retries}}
-    return {}
-
-
-_COMMON = ("s3", "gs", "az", "http", "https", "sftp", "memory", "file")

@@ -1,4 +1,4 @@
-"""Hashes, JSON whose equal values have equal bytes, and JSON that carries the hash of all else in it."""
+"""Canonical JSON, hashes, and sealed JSON: objects that carry the hash of all their other entries."""
 
 import errno
 import hashlib
@@ -11,46 +11,46 @@ from typing import Any, NoReturn
 
 from gen2d.storage.paths import Place, Url
 
-JSON_BYTES = 2**24  # of a file of JSON, at most
+JSON_BYTES = 2**24  # maximum size of a JSON file
 
 
 def as_json(value: Any) -> bytes:
-    """The one way JSON is written here, so that equal values have equal bytes."""
+    """The canonical JSON of a value: equal values have equal bytes."""
     return json.dumps(value, sort_keys=True, indent=1, ensure_ascii=False, allow_nan=False).encode()
 
 
 def parsed(content: bytes) -> dict[str, Any] | None:
-    """The JSON object that these bytes are; None if they are none."""
+    """The JSON object in these bytes; None if they hold none."""
     try:
-        value = json.loads(content, parse_constant=_refused)
+        value = json.loads(content, parse_constant=_refuse)
     except (ValueError, RecursionError):
         return None
     return value if isinstance(value, dict) else None
 
 
-def _refused(name: str) -> NoReturn:
-    raise ValueError(f"{name} is no number")
+def _refuse(name: str) -> NoReturn:
+    raise ValueError(f"{name} is not a number")
 
 
 def sealed(values: Mapping[str, Any], key: str) -> dict[str, Any]:
-    """The values, and under `key` the sha256 of all the others."""
+    """The values, with the sha256 of all others under `key`."""
     rest = {name: value for name, value in values.items() if name != key}
     return rest | {key: sha256(as_json(rest))}
 
 
 def unsealed(content: bytes, key: str) -> dict[str, Any] | None:
-    """What `sealed` gave, from its bytes; None if any of them changed."""
+    """The object that `sealed` returned, from its bytes; None if any of them changed."""
     values = parsed(content)
     try:
         return values if values is not None and content == as_json(sealed(values, key)) else None
-    except (ValueError, RecursionError):  # half a surrogate pair, or too deep
+    except (ValueError, RecursionError):  # half a surrogate pair, or nested too deep
         return None
 
 
 def read_sealed(path: Place, key: str) -> dict[str, Any] | None:
-    """What `sealed` gave and the file holds; None if there is no such file, or any byte changed.
+    """The sealed object in a file; None if there is no such file or any byte changed.
 
-    Raises UnreachableError where a server does not say.
+    At a URL it raises the errors of `Url.read_bytes`.
     """
     try:
         content = read_bytes(path, JSON_BYTES)
@@ -64,12 +64,12 @@ def read_sealed(path: Place, key: str) -> dict[str, Any] | None:
 
 
 def sha256(content: bytes) -> str:
-    """The content's sha256, in hexadecimal."""
+    """The sha256 of the content, in hexadecimal."""
     return hashlib.sha256(content).hexdigest()
 
 
 def file_sha256(path: Path) -> str:
-    """The sha256 of a regular file, read piece by piece. Raises OSError, also for what is no regular file."""
+    """The sha256 of a regular file, in hexadecimal. Raises OSError, also for anything but a regular file."""
     with os.fdopen(open_regular(path), "rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
@@ -85,9 +85,9 @@ def has_sha256(path: Place, expected: str, limit: int) -> bool:
 
 
 def open_regular(path: Path) -> int:
-    """A descriptor of a regular file, to read from; nothing else is ever opened so that it blocks.
+    """A descriptor of a regular file, to read from; opening anything else does not block.
 
-    Raises OSError, IsADirectoryError among them; a pipe, a socket or a device is OSError(ENXIO).
+    Raises OSError: EISDIR for a folder, ENXIO for a pipe, socket or device.
     """
     descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC | os.O_NOCTTY)
     kind = os.fstat(descriptor).st_mode
@@ -103,7 +103,7 @@ def read_bytes(path: Place, limit: int) -> bytes:
     if isinstance(path, Url):
         return path.read_bytes(limit)
     with os.fdopen(open_regular(path), "rb") as file:
-        # As much as there is, and not as `limit` says: that much memory may not be there.
+        # Not `limit` bytes at once: there may be less memory than that.
         content = file.read(min(os.fstat(file.fileno()).st_size, limit) + 1)
     if len(content) > limit:
         raise OSError(errno.EFBIG, f"it has more than {limit} bytes", str(path))

@@ -1,5 +1,8 @@
-"""Whether a dataset on disk is what was written: `quick` looks at names and sizes, `full` at every byte and value,
-`regen` also makes some videos again from their recipe and compares them to the bit."""
+"""Verification of a stored dataset, at three levels.
+
+`quick` checks names and sizes, `full` every byte and value, `regen` also makes some videos again from their recipe and
+compares them to the bit.
+"""
 
 import contextlib
 import dataclasses
@@ -13,27 +16,30 @@ import numpy as np
 
 from gen2d.core.errors import ConfigError, DamagedError, Error, IncompleteError, UnreachableError, UserError, one_line
 from gen2d.dataset.croissant import croissant
-from gen2d.dataset.folder import is_foreign, next_manifest
+from gen2d.dataset.folder import is_foreign
 from gen2d.dataset.hdf5_check import faults
-from gen2d.dataset.manifest import FILE_BYTES, MANIFEST, MARK_SEAL, PLUGIN, Manifest, as_bytes, read_manifest
-from gen2d.dataset.rows import check_shard, intact, npy_header, origin
-from gen2d.dataset.spec import MARK, Shard, mark_path, plan, shard_name, shard_path
+from gen2d.dataset.manifest import MARK_SEAL, Manifest, as_bytes, read_manifest
+from gen2d.dataset.manifest_parser import FILE_BYTES
+from gen2d.dataset.rows import check_shard, intact, npy, npy_header, npy_size, origin
+from gen2d.dataset.snapshots import next_manifest
+from gen2d.dataset.spec import MANIFEST, MARK, PLUGIN, Shard, mark_path, plan, shard_name, shard_path
 from gen2d.loading import dataset as loader
 from gen2d.loading.epochs import order
+from gen2d.storage.atomic import size_of
 from gen2d.storage.explain import reading_error, reason
 from gen2d.storage.paths import Network, Place, Url, download, place, reading
 from gen2d.storage.sealed import file_sha256, has_sha256, read_bytes, read_sealed, sha256
 
 LEVELS = ("quick", "full", "regen")
-VIDEOS = 8  # made again, unless told otherwise
+VIDEOS = 8  # default number of videos to make again
 
-# Of static bodies these are infinite; in every other field a value that is not finite is an error.
+# Fields that are infinite for static bodies; in all others a value that is not finite is an error.
 INFINITE = ("objects/mass", "objects/moment", "joints/stiffness", "joints/lower", "joints/upper")
 
 
 @dataclasses.dataclass(frozen=True)
 class Problem:
-    """One thing that is wrong, in a sentence that names the file; `shard` is the one to make again, if that helps."""
+    """A sentence that names the file and what is wrong; `shard` is the one to make again, if any."""
 
     sentence: str
     shard: str = ""
@@ -44,10 +50,10 @@ class Problem:
 
 @dataclasses.dataclass(frozen=True)
 class Outcome:
-    """What a check found, a sentence each, and what a repair did."""
+    """The problems that a check found, a sentence each, and what a repair did."""
 
-    problems: list[str]  # what is wrong, after the repair if there was one
-    repaired: list[str]  # what was wrong before it and is no more
+    problems: list[str]  # those that remain after the repair, if there was one
+    repaired: list[str]  # those that the repair solved
     remade: list[str]  # names of the shards that were made again
 
 
@@ -65,52 +71,47 @@ def verify(
     timeout: float = 30.0,
     deadline: float = 300.0,
 ) -> list[str]:
-    """What is wrong with the dataset, a sentence each; empty if nothing is.
+    """The problems of a dataset, a sentence each; none if it is whole.
 
-    At the level "regen", as many `videos` as told are made again, chosen from `seed`; that imports jax, and raises
-    FolderError where this machine would make other bits, and UntrustedError where it would run code that came with the
-    dataset and is not trusted (`trust` holds the sha256 of what is). `repair_with` is called with the names of the bad
-    shards, if there are problems, and must make these again and finish the dataset, as `regenerate.repair`
-    does; what is returned is then what remains wrong. `timeout` and `deadline` are those of `open`.
+    `level` is "quick", "full" or "regen". The last one makes `videos` videos, chosen from `seed`, again; it imports
+    jax, and raises FolderError if this machine would make other bits, and UntrustedError if that needs code of the
+    dataset whose sha256 is not in `trust`. If there are problems, `repair_with` is called with the names of the bad
+    shards, must make these again and finish the dataset, as `regenerate.repair` does, and the problems that remain are
+    returned. `timeout` and `deadline` are those of `open`.
     """
-    return verify_and_repair(
-        root, level, repair_with, videos, seed, trust=trust, timeout=timeout, deadline=deadline
-    ).problems
+    root = place(root, Network(timeout, deadline))
+    return verify_and_repair(root, level, repair_with, videos, seed, trust).problems
 
 
 def verify_and_repair(
-    root: str | Place,
-    level: str = "full",
+    root: Place,
+    level: str,
     repair_with: Repair | None = None,
     videos: int = VIDEOS,
     seed: int = 0,
-    *,
     trust: Sequence[str] = (),
-    timeout: float = 30.0,
-    deadline: float = 300.0,
 ) -> Outcome:
-    """What `verify` finds, and what was repaired."""
-    root = place(root, Network(timeout, deadline))
-    found = problems(root, level, videos, seed, trust)
-    if not found or repair_with is None:
-        return Outcome([problem.sentence for problem in found], [], [])
-    remade = repair_with(sorted({problem.shard for problem in found if problem.shard}))
-    left = [problem.sentence for problem in problems(root, level, videos, seed, trust)]
-    repaired = [problem.sentence for problem in found if problem.sentence not in left]
+    """The problems that `verify` returns, and what was repaired."""
+    before = find_problems(root, level, videos, seed, trust)
+    if not before or repair_with is None:
+        return Outcome([problem.sentence for problem in before], [], [])
+    remade = repair_with(sorted({problem.shard for problem in before if problem.shard}))
+    left = [problem.sentence for problem in find_problems(root, level, videos, seed, trust)]
+    repaired = [problem.sentence for problem in before if problem.sentence not in left]
     return Outcome(left, repaired, list(remade or ()))
 
 
 def damaged_shards(root: str | Place, level: str = "full") -> list[str]:
     """The names of the shards that must be made again."""
-    return sorted({problem.shard for problem in problems(place(root), level) if problem.shard})
+    return sorted({problem.shard for problem in find_problems(place(root), level) if problem.shard})
 
 
-def problems(
+def find_problems(
     root: Place, level: str = "full", videos: int = VIDEOS, seed: int = 0, trust: Sequence[str] = ()
 ) -> list[Problem]:
-    """Everything that is wrong, the folder first, then shard by shard, then what made again is another video.
+    """All problems: those of the folder, of the shards in their order, and of the regenerated videos.
 
-    Where the dataset has grown meanwhile, and something seems wrong, all is checked anew.
+    The check starts anew if it finds problems and the dataset has grown meanwhile.
     """
     if level not in LEVELS:
         raise ConfigError(f"level is {level!r}, but must be one of {', '.join(LEVELS)}")
@@ -122,17 +123,17 @@ def problems(
         except (IncompleteError, DamagedError) as error:
             return [Problem(str(error))]
         try:
-            found = list(_problems_of(root, manifest, level, videos, seed, trust))
+            problems = list(_problems_of(root, manifest, level, videos, seed, trust))
         except Error:
             if _has(root, manifest):
                 raise
             continue
-        if not found or _has(root, manifest):
-            return found
+        if not problems or _has(root, manifest):
+            return problems
 
 
 def _has(root: Place, manifest: Manifest) -> bool:
-    """Whether the folder still has this manifest, or none that is whole."""
+    """Whether the folder still has this manifest, or none that is intact."""
     try:
         return read_manifest(root).sha256 == manifest.sha256
     except Error:
@@ -142,40 +143,39 @@ def _has(root: Place, manifest: Manifest) -> bool:
 def _problems_of(
     root: Place, manifest: Manifest, level: str, videos: int, seed: int, trust: Sequence[str]
 ) -> Iterator[Problem]:
-    remade = _remade(root, manifest, videos, seed, trust) if level == "regen" else iter(())
+    changed = _changed_videos(root, manifest, videos, seed, trust) if level == "regen" else iter(())
     with reading(root):
-        files = list(_files(root, manifest))
-        tables, rows = _tables(root, manifest)
+        files = list(_check_files(root, manifest))
+        tables, rows = _check_tables(root, manifest)
         shards = plan(manifest.splits, manifest.videos_per_shard)
-        others = [*_mark(root, manifest), *_foreign(root, manifest)]
-        missized = list(_sizes(root, shards, rows))
-    yield from [*files, *tables, *others, *missized]
+        others = [*_check_mark(root, manifest), *_foreign_files(root, manifest)]
+        sizes = list(_check_sizes(root, shards, rows))
+    yield from [*files, *tables, *others, *sizes]
     if level != "quick":
-        absent = {problem.shard for problem in [*tables, *missized]}
-        present = [shard for shard in shards if shard.name not in absent]
-        with _Contents(root, manifest, rows) as contents:
-            for found in contents.check(present):
-                yield from found
-    yield from remade
+        reported = {problem.shard for problem in [*tables, *sizes]}
+        with _ShardChecker(root, manifest, rows) as checker:
+            for problems in checker.check([shard for shard in shards if shard.name not in reported]):
+                yield from problems
+    yield from changed
 
 
-def _remade(root: Place, manifest: Manifest, videos: int, seed: int, trust: Sequence[str]) -> Iterator[Problem]:
-    """What differs in videos made again; raises FolderError, at once, where that cannot be judged here."""
+def _changed_videos(root: Place, manifest: Manifest, videos: int, seed: int, trust: Sequence[str]) -> Iterator[Problem]:
+    """The fields of regenerated videos that differ; raises FolderError, at once, if this machine makes other bits."""
     from gen2d.generation import regenerate  # imports jax
 
     source = regenerate.source_of(root, manifest.identity, trust)
     regenerate.check_fingerprint(root, source, manifest.identity)
     chosen = chosen_videos(manifest.splits, videos, seed)
     return (
-        Problem(f"{shard_path(root, shard)}: {wrong}", shard)
-        for shard, wrong in regenerate.changed_videos(source, root, manifest, chosen)
+        Problem(f"{shard_path(root, shard)}: {difference}", shard)
+        for shard, difference in regenerate.changed_videos(source, root, manifest, chosen)
     )
 
 
 def chosen_videos(splits: Mapping[str, int], videos: int, seed: int) -> list[tuple[str, int]]:
-    """Split and number of as many videos as asked, or of all there are: which, the seed decides."""
-    everything = sum(splits.values())
-    places = np.sort(order(seed, 0, np.arange(min(videos, everything)), everything))
+    """The split and number of `videos` videos, or of all if there are fewer, chosen from `seed`."""
+    total = sum(splits.values())
+    places = np.sort(order(seed, 0, np.arange(min(videos, total)), total))
     ends = np.cumsum(list(splits.values()))
     owner = np.searchsorted(ends, places, side="right")
     return [
@@ -187,27 +187,27 @@ def chosen_videos(splits: Mapping[str, int], videos: int, seed: int) -> list[tup
 # ---- The folder
 
 
-def _files(root: Place, manifest: Manifest) -> Iterator[Problem]:
-    """What is wrong with config, plug-ins, sheet and cards; README.md is for people, who may write in it."""
-    coming = next_manifest(root)  # of a run that was killed in the middle of publishing it
+def _check_files(root: Place, manifest: Manifest) -> Iterator[Problem]:
+    """The problems of config, plug-ins, sheet and cards; people may edit README.md."""
+    upcoming = next_manifest(root)  # of a run that was killed while it published this manifest
     for name, expected in manifest.files.items():
-        also = coming.files.get(name) if coming else None
-        yield from map(Problem, _wrong(root / name, expected, also))
-    also = sha256(croissant(coming)) if coming else None
-    yield from map(Problem, _wrong(root / "croissant.json", sha256(croissant(manifest)), also))
+        next_sha256 = upcoming.files.get(name) if upcoming else None
+        yield from map(Problem, _check_hash(root / name, expected, next_sha256))
+    next_sha256 = sha256(croissant(upcoming)) if upcoming else None
+    yield from map(Problem, _check_hash(root / "croissant.json", sha256(croissant(manifest)), next_sha256))
     if not (root / "README.md").is_file():
         yield Problem(f"{root / 'README.md'} is missing")
 
 
-def _wrong(path: Place, *expected: str | None) -> Iterator[str]:
-    """What is wrong with a file that must have one of these sha256."""
+def _check_hash(path: Place, *expected: str | None) -> Iterator[str]:
+    """The problems of a file that must have one of these sha256."""
     try:
         if not any(has_sha256(path, one, FILE_BYTES) for one in expected if one):
             yield f"{path} is not what was written"
     except FileNotFoundError:
         yield f"{path} is missing"
     except OSError as error:
-        if isinstance(path, Url):  # of what a server does not give, nothing is known
+        if isinstance(path, Url):  # the file may be whole
             raise
         failure = reading_error(path, error)
         if isinstance(failure, UserError):
@@ -215,64 +215,63 @@ def _wrong(path: Place, *expected: str | None) -> Iterator[str]:
         yield str(failure)
 
 
-def _tables(root: Place, manifest: Manifest) -> tuple[list[Problem], dict[str, np.ndarray]]:
-    """What is wrong with the tables of the splits, and the rows of those that are what was written."""
-    found, kept = [], {}
-    kind, per_shard = manifest.shard_type, manifest.videos_per_shard
+def _check_tables(root: Place, manifest: Manifest) -> tuple[list[Problem], dict[str, np.ndarray]]:
+    """The problems of the splits' tables, and the rows of the tables that are whole."""
+    problems, rows_of = [], {}
+    dtype, per_shard = manifest.shard_type, manifest.videos_per_shard
     sizes = manifest.video_type.itemsize, manifest.row_bytes, manifest.raw_bytes
     for split, table in manifest.tables.items():
         path, begin = root / table.file, origin(manifest.identity_sha256, split)
-        header = npy_header(kind, table.shards)
-        expected = len(header) + table.shards * kind.itemsize
+        header, expected = npy_header(dtype, table.shards), npy_size(dtype, table.shards)
         try:
             content = read_bytes(path, expected)
         except FileNotFoundError:
-            found.append(Problem(f"{path} is missing"))
+            problems.append(Problem(f"{path} is missing"))
             continue
         except OSError as error:
             failure = reading_error(path, error)
             if isinstance(path, Url) or isinstance(failure, UserError):
                 raise failure from error
-            found.append(Problem(str(failure)))
+            problems.append(Problem(str(failure)))
             continue
         if sha256(content) != table.sha256 or len(content) != expected or content[: len(header)] != header:
-            found.append(Problem(f"{path} is not what was written"))
+            problems.append(Problem(f"{path} is not what was written"))
             continue
-        rows = np.frombuffer(content, kind, offset=len(header))
+        rows = np.frombuffer(content, dtype, offset=len(header))
         firsts = range(0, table.shards * per_shard, per_shard)
-        wrong = np.flatnonzero(~intact(rows, begin, firsts)).tolist()
+        damaged = np.flatnonzero(~intact(rows, begin, firsts)).tolist()
         own = plan({split: manifest.splits[split]}, per_shard)
         for shard, row in zip(own, rows, strict=True):
             try:
                 check_shard(row, shard.first, shard.count, *sizes)
             except DamagedError as error:
-                found.append(Problem(f"{path} cannot be right in row {shard.place}: {error}", shard.name))
-        found += [Problem(f"{path} is not what was written, in row {place}", own[place].name) for place in wrong]
+                problems.append(Problem(f"{path} has an impossible row {shard.place}: {error}", shard.name))
+        problems += [Problem(f"{path} is not what was written, in row {row}", own[row].name) for row in damaged]
         if int(rows["bytes"].sum()) != table.bytes or int(rows["bytes"].max()) != table.largest:
-            found.append(Problem(f"{path} has shards of other sizes than {MANIFEST} says"))
-        kept[split] = rows
-    return found, kept
+            problems.append(Problem(f"{path} has shards of other sizes than {MANIFEST} says"))
+        rows_of[split] = rows
+    return problems, rows_of
 
 
-def _mark(root: Place, manifest: Manifest) -> Iterator[Problem]:
-    """What is wrong with what a later run needs; a copy may well have been made without it."""
+def _check_mark(root: Place, manifest: Manifest) -> Iterator[Problem]:
+    """The problems of the mark, which later runs need; a copy may have been made without it."""
     if isinstance(root, Url) and not mark_path(root).exists():
         return
     if (root / MARK).is_dir() or isinstance(root, Url):
         path = mark_path(root)
-        said = read_sealed(path, MARK_SEAL) or {}
-        if any(said.get(key) != value for key, value in manifest.identity.items()):
+        mark = read_sealed(path, MARK_SEAL) or {}
+        if any(mark.get(key) != value for key, value in manifest.identity.items()):
             yield Problem(f"{path} is {'not what was written' if path.exists() else 'missing'}")
 
 
-def _foreign(root: Place, manifest: Manifest) -> Iterator[Problem]:
-    """Files that no run writes; shards that the manifest does not name yet are another matter."""
+def _foreign_files(root: Place, manifest: Manifest) -> Iterator[Problem]:
+    """The files that no run writes; shards that the manifest does not name yet are allowed."""
     for folder in ("shards", "index"):
         for path in sorted((root / folder).glob("*"), key=str):
             if is_foreign(path.name):
                 yield Problem(f"{path} does not belong to the dataset")
     if isinstance(root, Path) and (root / "plugins").is_symlink():
-        yield Problem(f"{root / 'plugins'} is a link, which no run makes")
+        yield Problem(f"{root / 'plugins'} is a link, but gen2d makes no links")
         return
     for path in sorted((root / "plugins").rglob("*"), key=str):
         name = str(path).removeprefix(f"{root}/")
@@ -280,93 +279,77 @@ def _foreign(root: Place, manifest: Manifest) -> Iterator[Problem]:
             yield Problem(f"{path} does not belong to the dataset")
 
 
-def _sizes(root: Place, shards: Sequence[Shard], rows: Mapping[str, np.ndarray]) -> Iterator[Problem]:
+def _check_sizes(root: Place, shards: Sequence[Shard], rows: Mapping[str, np.ndarray]) -> Iterator[Problem]:
+    """The shards whose files are missing or have another size than their rows say."""
+
+    def size(path: Place) -> int | None:
+        try:
+            return size_of(path)
+        except OSError as error:
+            raise reading_error(path, error) from error
+
     paths = [shard_path(root, shard.name) for shard in shards]
     if isinstance(root, Url):
-        with ThreadPoolExecutor(16) as pool:  # a server answers many questions at once
-            sizes = list(pool.map(_size, paths))
+        with ThreadPoolExecutor(16) as pool:  # a server answers many requests at once
+            sizes = list(pool.map(size, paths))
     else:
-        sizes = list(map(_size, paths))
-    for shard, path, size in zip(shards, paths, sizes, strict=True):
-        expected = int(rows[shard.split]["bytes"][shard.place]) if shard.split in rows else size
-        if size is None:
+        sizes = list(map(size, paths))
+    for shard, path, actual in zip(shards, paths, sizes, strict=True):
+        expected = int(rows[shard.split]["bytes"][shard.place]) if shard.split in rows else actual
+        if actual is None:
             yield Problem(f"{path} is missing", shard.name)
-        elif size != expected:
-            yield Problem(f"{path} has {size} bytes, but was written with {expected}", shard.name)
-
-
-def _size(path: Place) -> int | None:
-    try:
-        if not path.is_file():
-            return None
-        return path.stat().st_size
-    except FileNotFoundError:
-        return None
-    except OSError as error:
-        raise reading_error(path, error) from error
+        elif actual != expected:
+            yield Problem(f"{path} has {actual} bytes, but was written with {expected}", shard.name)
 
 
 # ---- The shards
 
 
-class _Contents:
-    """Checks shards one by one, by their bytes, by every value, and by what HDF5 says; at a URL each is fetched."""
+class _ShardChecker:
+    """Checks shards by their bytes, by every value, and by what HDF5 says; at a URL each is downloaded first."""
 
     def __init__(self, root: Place, manifest: Manifest, rows: Mapping[str, np.ndarray]) -> None:
         self.root, self.manifest, self.rows = root, manifest, rows
 
-    def __enter__(self) -> "_Contents":
-        self._stack = contextlib.ExitStack()
-        try:
-            self.near = self.root if isinstance(self.root, Path) else self._fetched_frame()
-            opened = {split: loader.open(self.near, split, ("*",)) for split in self.rows}
-        except BaseException:
-            self._stack.close()
-            raise
-        self.opened = opened
+    def __enter__(self) -> "_ShardChecker":
+        with contextlib.ExitStack() as stack:
+            if isinstance(self.root, Path):
+                self.local = self.root
+            else:  # a folder on disk with the manifest and the tables, into which the shards are downloaded
+                self.local = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="gen2d-")))
+                for name in ("shards", "index"):
+                    (self.local / name).mkdir()
+                (self.local / MANIFEST).write_bytes(as_bytes(self.manifest))
+                for split, rows in self.rows.items():
+                    (self.local / self.manifest.tables[split].file).write_bytes(npy(rows))
+            self.datasets = {split: loader.open(self.local, split, ("*",)) for split in self.rows}
+            self._stack = stack.pop_all()
         return self
 
     def __exit__(self, *_: object) -> None:
         self._stack.close()
 
-    def _fetched_frame(self) -> Path:
-        """A folder on disk with the manifest and the tables of a remote dataset."""
-        near = Path(self._stack.enter_context(tempfile.TemporaryDirectory(prefix="gen2d-")))
-        for name in ("shards", "index"):
-            (near / name).mkdir()
-        (near / MANIFEST).write_bytes(as_bytes(self.manifest))
-        for split in self.rows:
-            table = self.manifest.tables[split]
-            kind = self.manifest.shard_type
-            rows = self.rows[split]
-            (near / table.file).write_bytes(npy_header(kind, len(rows)) + rows.tobytes())
-        return near
-
     def check(self, shards: Iterable[Shard]) -> Iterator[list[Problem]]:
-        """What is wrong with each shard, in their order."""
+        """The problems of each shard, in their order."""
         with ThreadPoolExecutor(min(os.cpu_count() or 1, 8)) as pool:
-            yield from pool.map(self._checked, shards)
+            yield from pool.map(self._check, shards)
 
-    def _checked(self, shard: Shard) -> list[Problem]:
-        path = self.near / shard_name(shard.name)
-        if self.root == self.near:
-            return list(self._problems(path, shard))
+    def _check(self, shard: Shard) -> list[Problem]:
+        path = self.local / shard_name(shard.name)
+        row = self.rows[shard.split][shard.place] if shard.split in self.rows else None
+        if self.root == self.local:
+            return list(self._problems(path, shard, row))
         url = shard_path(self.root, shard.name)
         assert isinstance(url, Url)
-        expected = self._row(shard)
         try:
-            download(url, path, int(expected["bytes"]) if expected is not None else 0)
+            download(url, path, int(row["bytes"]) if row is not None else 0)
         except OSError as error:
             return [Problem(f"{url} cannot be read ({reason(error)})", shard.name)]
-        found = list(self._problems(path, shard))
+        problems = list(self._problems(path, shard, row))
         os.truncate(path, 0)  # it may still be open
-        return [Problem(problem.sentence.replace(str(self.near), str(self.root)), problem.shard) for problem in found]
+        return [Problem(each.sentence.replace(str(self.local), str(self.root)), each.shard) for each in problems]
 
-    def _row(self, shard: Shard) -> np.void | None:
-        return self.rows[shard.split][shard.place] if shard.split in self.rows else None
-
-    def _problems(self, path: Path, shard: Shard) -> Iterator[Problem]:
-        row = self._row(shard)
+    def _problems(self, path: Path, shard: Shard, row: np.void | None) -> Iterator[Problem]:
         try:
             digest = file_sha256(path)
         except OSError as error:
@@ -376,18 +359,18 @@ class _Contents:
             yield Problem(str(failure), shard.name)
             return
         if row is None:
-            return  # its table is wrong, which has been said
+            return  # its table is damaged, which is reported already
         whole = digest == row["sha256"].tobytes().hex()
         if not whole:
             yield Problem(f"{path} is not what was written: its sha256 differs", shard.name)
-        for sentence in self._pieces(shard):
+        for sentence in self._check_values(shard):
             yield Problem(sentence if sentence.startswith(str(path)) else f"{path}: {sentence}", shard.name)
-        if whole:  # else HDF5 has nothing to say that is worth more
-            yield from (Problem(f"{path}: {said}", shard.name) for said in faults(path, shard, self.manifest))
+        if whole:  # otherwise HDF5's errors add nothing
+            yield from (Problem(f"{path}: {fault}", shard.name) for fault in faults(path, shard, self.manifest))
 
-    def _pieces(self, shard: Shard) -> Iterator[str]:
-        """What is wrong with the stored pieces, each found by the index, checked and decoded as for training."""
-        dataset = self.opened[shard.split]
+    def _check_values(self, shard: Shard) -> Iterator[str]:
+        """The problems of the stored values, which are read, checked and decoded as for training."""
+        dataset = self.datasets[shard.split]
         for number in range(shard.first, shard.first + shard.count):
             try:
                 values = dataset.batch([number])
@@ -397,16 +380,10 @@ class _Contents:
             except UnreachableError as error:
                 yield str(error)
                 return
-            yield from (f"{name} of video {number} has {wrong}" for name, wrong in _not_finite(values))
+            for name, value in values.items():
+                if value.dtype.kind == "f" and np.isnan(value).any():
+                    yield f"{name} of video {number} has values that are not a number"
+                elif value.dtype.kind == "f" and name not in INFINITE and np.isinf(value).any():
+                    yield f"{name} of video {number} has infinite values"
             if "index" in values and values["index"][0] != number:
                 yield f"index of video {number} is {values['index'][0]}"
-
-
-def _not_finite(values: Mapping[str, np.ndarray]) -> Iterator[tuple[str, str]]:
-    for name, value in values.items():
-        if value.dtype.kind != "f":
-            continue
-        if np.isnan(value).any():
-            yield name, "values that are not a number"
-        elif name not in INFINITE and np.isinf(value).any():
-            yield name, "infinite values"

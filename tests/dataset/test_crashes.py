@@ -11,6 +11,7 @@ import pytest
 import synthetic
 from crashes import every_crash
 from numpy.testing import assert_array_equal
+from synthetic import small
 
 import gen2d
 from gen2d.core.errors import FolderError
@@ -21,11 +22,7 @@ from gen2d.dataset.spec import DatasetSpec, Shard
 from gen2d.generation import regenerate
 from gen2d.tools.verify import verify
 
-FIELDS = {name: synthetic.FIELDS[name] for name in ("frames", "index", "objects/mass", "time")}
-
-
-def dataset(root: Path, train: int, **changes: Any) -> DatasetSpec:
-    return synthetic.dataset(root, train=train, fields=FIELDS, **changes)
+SPLITS = {count: {"train": count, "test": 3} for count in (12, 30)}
 
 
 def videos(ds: Any) -> Mapping[str, np.ndarray]:
@@ -39,17 +36,15 @@ def same(one: Mapping[str, np.ndarray], other: Mapping[str, np.ndarray]) -> None
 
 
 def contents(root: Path) -> dict[str, bytes]:
-    """Every file and its bytes, but for the log and what waits to be removed."""
-    files = (path for path in root.rglob("*") if path.is_file() and path.name != "run.jsonl")
-    found = {path.relative_to(root).as_posix(): path.read_bytes() for path in files}
-    return {name: content for name, content in found.items() if not name.startswith(".gen2d/snapshots/")}
+    """Every file and its bytes, except earlier snapshots, which wait to be removed."""
+    return {name: own for name, own in synthetic.contents(root).items() if not name.startswith(".gen2d/snapshots/")}
 
 
 @pytest.fixture(scope="module")
 def grown(tmp_path_factory: pytest.TempPathFactory) -> dict[int, Path]:
     """The dataset with these numbers of videos, each made in one run."""
     home = tmp_path_factory.mktemp("grown")
-    return {count: synthetic.folder(synthetic.make(dataset(home / f"{count}", count))) for count in (12, 30)}
+    return {count: synthetic.folder(synthetic.make(small(home / f"{count}", SPLITS[count]))) for count in (12, 30)}
 
 
 def test_while_a_dataset_grows(grown: dict[int, Path], tmp_path: Path) -> None:
@@ -63,7 +58,7 @@ def test_while_a_dataset_grows(grown: dict[int, Path], tmp_path: Path) -> None:
     restored()
     expected, before, after = videos(gen2d.open(grown[12], fields="*")), *(contents(grown[count]) for count in (12, 30))
     reader = gen2d.open(root, fields="*")
-    for _ in every_crash(lambda: synthetic.make(dataset(root, 30))):
+    for _ in every_crash(lambda: synthetic.make(small(root, SPLITS[30]))):
         crashes += 1
         same(videos(reader), expected)  # who has it open, or was to go on where it stood, reads on
         same(videos(gen2d.open(root, fields="*", snapshot=reader.snapshot)), expected)
@@ -71,7 +66,7 @@ def test_while_a_dataset_grows(grown: dict[int, Path], tmp_path: Path) -> None:
         assert len(opened) in (12, 30)
         same({name: values[:12] for name, values in videos(opened).items()}, expected)
         assert verify(root, "full") == []
-        synthetic.make(dataset(root, 30))
+        synthetic.make(small(root, SPLITS[30]))
         assert contents(root) == after
         same(videos(reader), expected)
         restored()
@@ -82,14 +77,14 @@ def test_while_a_dataset_grows(grown: dict[int, Path], tmp_path: Path) -> None:
 
 def test_while_a_dataset_is_made(grown: dict[int, Path], tmp_path: Path) -> None:
     crashes, root = 0, tmp_path / "data"
-    for _ in every_crash(lambda: synthetic.make(dataset(root, 12)), step=2):
+    for _ in every_crash(lambda: synthetic.make(small(root, SPLITS[12])), step=2):
         crashes += 1
         if (root / "manifest.json").exists():
             assert len(gen2d.open(root, fields="*")) == 12
         else:
             with pytest.raises(FolderError, match=r"incomplete|not a gen2d dataset"):
                 gen2d.open(root, fields="*")
-        synthetic.make(dataset(root, 12))
+        synthetic.make(small(root, SPLITS[12]))
         assert contents(root) == contents(grown[12])
         shutil.rmtree(root)
     assert crashes > 30
@@ -98,13 +93,13 @@ def test_while_a_dataset_is_made(grown: dict[int, Path], tmp_path: Path) -> None
 def test_while_snapshots_are_cleaned_away(grown: dict[int, Path], tmp_path: Path) -> None:
     root = tmp_path / "data"
     shutil.copytree(grown[12], root)
-    synthetic.make(dataset(root, 30))
+    synthetic.make(small(root, SPLITS[30]))
     after = contents(root)
     for _ in every_crash(lambda: folder.clean(root)):
         assert verify(root, "full") == []
         shutil.rmtree(root)
         shutil.copytree(grown[12], root)
-        synthetic.make(dataset(root, 30))
+        synthetic.make(small(root, SPLITS[30]))
     assert folder.clean(root) == [] or folder.clean(root) == []
     assert contents(root) == after
     assert not list((root / ".gen2d" / "snapshots").glob("*"))
@@ -126,7 +121,7 @@ def repaired(monkeypatch: pytest.MonkeyPatch) -> None:
                 writer.write(shard, synthetic.blocks(spec, shard))
 
     def made(rollout: object, root: Path, counts: Mapping[str, int], fingerprint: object) -> DatasetSpec:
-        return synthetic.dataset(root, fields=FIELDS, splits=dict(counts))
+        return small(root, dict(counts))
 
     monkeypatch.setattr(regenerate, "source_of", lambda *_: None)
     monkeypatch.setattr(regenerate, "check_fingerprint", lambda *_: None)
@@ -193,7 +188,7 @@ def test_a_repair_that_makes_other_bytes_changes_nothing(
     before = contents(root)
 
     def wrong(rollout: object, spec: DatasetSpec, todo: list[Shard], say: object) -> None:
-        other = synthetic.dataset(spec.root, seed=8, fields=FIELDS)
+        other = small(spec.root, spec.splits, seed=8)
         with ShardWriter(spec) as writer:
             for shard in todo:
                 writer.write(shard, synthetic.blocks(other, shard))

@@ -16,11 +16,12 @@ import pytest
 import synthetic
 from crashes import every_crash
 from numpy.testing import assert_array_equal
+from synthetic import small
 
 import gen2d
 import gen2d.tools.verify as verification
 from gen2d.core.errors import ConfigError, FolderError
-from gen2d.dataset import folder, records
+from gen2d.dataset import folder, records, snapshots
 from gen2d.dataset.folder import clean, open_folder
 from gen2d.dataset.manifest import read_manifest
 from gen2d.dataset.shard_writer import ShardWriter
@@ -30,12 +31,6 @@ from gen2d.generation.run import generate
 from gen2d.storage import leases
 from gen2d.storage.paths import Place, place
 from gen2d.tools.verify import verify
-
-FIELDS = {name: synthetic.FIELDS[name] for name in ("frames", "index", "objects/mass", "time")}
-
-
-def dataset(root: Place, splits: Mapping[str, int], **changes: Any) -> DatasetSpec:
-    return synthetic.dataset(root, fields=FIELDS, splits=splits, **changes)
 
 
 def work(made: DatasetSpec, todo: list[Shard] | None = None) -> list[str]:
@@ -58,7 +53,7 @@ def splits(root: Place) -> Mapping[str, int]:
 
 
 def one_run(tmp_path: Path, counts: Mapping[str, int]) -> Mapping[str, bytes]:
-    return synthetic.tree(synthetic.folder(synthetic.make(dataset(tmp_path / "one", counts))))
+    return synthetic.tree(synthetic.folder(synthetic.make(small(tmp_path / "one", counts))))
 
 
 @pytest.fixture
@@ -97,23 +92,23 @@ def between(monkeypatch: pytest.MonkeyPatch) -> Between:
 @pytest.mark.parametrize("step", ["publish_changed", "check_current"])
 def test_who_publishes_late_takes_nothing_back(tmp_path: Path, between: Between, step: str) -> None:
     root = tmp_path / "data"
-    run(dataset(root, {"train": 12}))
+    run(small(root, {"train": 12}))
     reader = gen2d.open(root, fields="*")
-    small, large = dataset(root, {"train": 30}), dataset(root, {"train": 50})
-    work(small)
-    between(folder, step, lambda: run(large))
-    assert completion.complete(small)
+    late, early = small(root, {"train": 30}), small(root, {"train": 50})
+    work(late)
+    between(snapshots, step, lambda: run(early))
+    assert completion.complete(late)
     assert splits(root) == {"train": 50}
     assert verify(root) == []
     assert len(reader[:]["index"]) == 12
-    assert open_folder(large) == []
+    assert open_folder(early) == []
 
 
 @pytest.mark.usefixtures("without_locks")
 @pytest.mark.parametrize("late", ["train", "val"])
 def test_splits_that_end_at_once_are_all_there(tmp_path: Path, between: Between, late: str) -> None:
     root = tmp_path / "data"
-    own = {"train": dataset(root, {"train": 20}), "val": dataset(root, {"val": 5})}
+    own = {"train": small(root, {"train": 20}), "val": small(root, {"val": 5})}
     first, second = own[late], own["val" if late == "train" else "train"]
     for made in own.values():
         open_folder(made)
@@ -146,20 +141,20 @@ def test_processes_that_begin_and_end_together(tmp_path: Path) -> None:
     """Another split each, and another recipe each: of the latter one wins, and the other is refused."""
     for number in range(10):
         root, other = tmp_path / f"{number}", tmp_path / f"{number}-other"
-        parts = [dataset(root, {"train": 16}), dataset(root, {"val": 16})]
+        parts = [small(root, {"train": 16}), small(root, {"val": 16})]
         assert _codes([_forked(lambda made=made: run(made)) for made in parts]) == [0, 0]
         assert splits(root) == {"train": 16, "val": 16}
-        recipes = [dataset(other, {"train": 16}, seed=seed) for seed in (1, 2)]
+        recipes = [small(other, {"train": 16}, seed=seed) for seed in (1, 2)]
         assert sorted(_codes([_forked(lambda made=made: run(made)) for made in recipes])) == [0, 2]
         assert verify(root) == verify(other) == []
 
 
 def test_one_process_at_a_time_publishes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     root = tmp_path / "data"
-    made = dataset(root, {"train": 12})
+    made = small(root, {"train": 12})
     work(made)
     monkeypatch.setattr(folder, "LOCK_SECONDS", 0.1)
-    with folder.alone(root):
+    with folder.locked(root):
         for action in (lambda: completion.complete(made), lambda: open_folder(made)):
             with pytest.raises(FolderError, match="is being changed by another process: try again"):
                 action()
@@ -170,7 +165,7 @@ def test_one_process_at_a_time_publishes(tmp_path: Path, monkeypatch: pytest.Mon
 @pytest.mark.parametrize("asked", [{"val": 5}, {"train": 12}])
 def test_damage_does_not_make_a_dataset_smaller(tmp_path: Path, harm: str, asked: Mapping[str, int]) -> None:
     root = tmp_path / "data"
-    run(dataset(root, {"train": 30}))
+    run(small(root, {"train": 30}))
     table, manifest = root / "index" / "train-30.npy", root / "manifest.json"
     if harm == "a table":
         table.unlink()
@@ -179,7 +174,7 @@ def test_damage_does_not_make_a_dataset_smaller(tmp_path: Path, harm: str, asked
         content = bytearray(path.read_bytes())
         content[at] ^= 4
         path.write_bytes(content)
-    run(dataset(root, asked))
+    run(small(root, asked))
     assert splits(root) == {"train": 30, **{split: count for split, count in asked.items() if split != "train"}}
     assert verify(root) == []
     assert synthetic.tree(root) == one_run(tmp_path, splits(root))
@@ -188,7 +183,7 @@ def test_damage_does_not_make_a_dataset_smaller(tmp_path: Path, harm: str, asked
 def test_sizes_of_shards_that_appear_meanwhile(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A temporary file gets its name between the listing of the folder and the look at the file."""
     root = tmp_path / "data"
-    run(dataset(root, {"train": 16}))
+    run(small(root, {"train": 16}))
     temporary = root / "shards" / f"train-00020.h5.tmp.{'0' * 16}"
     temporary.touch()
 
@@ -217,9 +212,9 @@ def test_sizes_of_shards_that_appear_meanwhile(tmp_path: Path, monkeypatch: pyte
 @pytest.mark.usefixtures("without_locks")
 def test_a_late_worker_leaves_the_snapshot_of_readers(tmp_path: Path, between: Between) -> None:
     root = tmp_path / "data"
-    run(dataset(root, {"train": 12}))
+    run(small(root, {"train": 12}))
     reader = gen2d.open(root, fields="*")
-    growth = dataset(root, {"train": 30})
+    growth = small(root, {"train": 30})
     todo = open_folder(growth)
     work(growth, todo[:-1])
 
@@ -237,17 +232,17 @@ def test_a_late_worker_leaves_the_snapshot_of_readers(tmp_path: Path, between: B
 def test_splits_that_grow_from_one_snapshot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, order: int) -> None:
     """Readers of the snapshot before, and of the one before that, both read on."""
     root = tmp_path / "data"
-    run(dataset(root, {"train": 12}))
+    run(small(root, {"train": 12}))
     first = gen2d.open(root, "train", fields="*")
-    val, train = dataset(root, {"val": 5}), dataset(root, {"train": 30})
+    val, train = small(root, {"val": 5}), small(root, {"train": 30})
     open_folder(val)
     open_folder(train)
     work(val, plan({"val": 5}, 8))
     assert completion.complete(val)
     second = gen2d.open(root, "train", fields="*")
     work(train, plan({"train": 30}, 8)[1:])
-    entries = folder._entries
-    monkeypatch.setattr(folder, "_entries", lambda path: sorted(entries(path), key=str, reverse=order < 0))
+    entries = snapshots.list_folder
+    monkeypatch.setattr(snapshots, "list_folder", lambda path: entries(path)[::order])
     assert completion.complete(train)
     assert splits(root) == {"train": 30, "val": 5}
     for reader in (first, second):
@@ -257,38 +252,38 @@ def test_splits_that_grow_from_one_snapshot(tmp_path: Path, monkeypatch: pytest.
 def test_a_newer_version_keeps_the_snapshot(tmp_path: Path) -> None:
     """The same videos again, by a version of the program that makes the same bits."""
     root = tmp_path / "data"
-    run(dataset(root, {"train": 12}))
+    run(small(root, {"train": 12}))
     before = synthetic.tree(root)
     reader = gen2d.open(root, fields="*")
     loader = gen2d.DataLoader(reader, 4)
     next(iter(loader))
     newer = {"producer": {"gen2d": "1", "fingerprint": {"jaxlib": "0", "batch_size": 8}}}
-    assert run(dataset(root, {"train": 12}, **newer)) == []
+    assert run(small(root, {"train": 12}, **newer)) == []
     assert synthetic.tree(root) == before
     gen2d.DataLoader(gen2d.open(root, fields="*"), 4).load_state_dict(loader.state_dict())
     (root / "sheet.png").write_bytes(b"")
-    assert run(dataset(root, {"train": 12}, **newer)) == []  # and mends what it can
+    assert run(small(root, {"train": 12}, **newer)) == []  # and mends what it can
     assert synthetic.tree(root) == before
-    run(dataset(root, {"train": 30}, **newer))
+    run(small(root, {"train": 30}, **newer))
     assert read_manifest(root).producer["gen2d"] == "1"
     assert len(reader[:]["index"]) == 12
 
 
 def test_a_lost_shard_costs_readers_nothing(tmp_path: Path) -> None:
     root = tmp_path / "data"
-    run(dataset(root, {"train": 12}))
+    run(small(root, {"train": 12}))
     reader = gen2d.open(root, fields="*")
-    run(dataset(root, {"train": 30}))
+    run(small(root, {"train": 30}))
     (root / "shards" / "train-00003-n6.h5").unlink()
-    assert run(dataset(root, {"train": 30})) == ["train-00003-n6"]
+    assert run(small(root, {"train": 30})) == ["train-00003-n6"]
     assert len(reader[:]["index"]) == 12
 
 
-@pytest.mark.parametrize("step", ["_tables", "_sizes", "_Contents"])
+@pytest.mark.parametrize("step", ["_check_tables", "_check_sizes", "_ShardChecker"])
 def test_verify_while_a_dataset_grows(tmp_path: Path, between: Between, step: str) -> None:
     root = tmp_path / "data"
-    run(dataset(root, {"train": 12}))
-    growth = dataset(root, {"train": 30})
+    run(small(root, {"train": 12}))
+    growth = small(root, {"train": 30})
     work(growth)
     between(verification, step, lambda: completion.complete(growth))
     assert verify(root) == []
@@ -303,7 +298,7 @@ def test_overwriting_is_for_one_process(tmp_path: Path) -> None:
 @pytest.mark.parametrize("where", ["memory://overwritten", "disk"])
 def test_killed_while_it_overwrites(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, where: str) -> None:
     root = place(where) if "://" in where else tmp_path / "data"
-    run(dataset(root, {"train": 12}))
+    run(small(root, {"train": 12}))
     real, left = folder.remove_tree, [3]
 
     def dying(path: Place) -> None:
@@ -313,7 +308,7 @@ def test_killed_while_it_overwrites(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         real(path)
 
     monkeypatch.setattr(folder, "remove_tree", dying)
-    other = dataset(root, {"train": 12}, seed=8)
+    other = small(root, {"train": 12}, seed=8)
     with pytest.raises(KeyboardInterrupt):
         open_folder(other, overwrite=True)
     with pytest.raises(FolderError, match="holds another dataset"):
@@ -324,11 +319,11 @@ def test_killed_while_it_overwrites(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 def test_a_log_that_grows_while_it_is_removed(monkeypatch: pytest.MonkeyPatch) -> None:
     """At a URL a finisher may remove a log that another worker writes: it comes back when that one ends."""
     root = place("memory://grows/data")
-    small, large = dataset(root, {"train": 16}), dataset(root, {"train": 24})
-    open_folder(large)
-    shards, writer = plan({"train": 24}, 8), ShardWriter(large)
+    first, second = small(root, {"train": 16}), small(root, {"train": 24})
+    open_folder(second)
+    shards, writer = plan({"train": 24}, 8), ShardWriter(second)
     for shard in shards[:2]:
-        writer.write(shard, synthetic.blocks(large, shard))
+        writer.write(shard, synthetic.blocks(second, shard))
     real, left = records.read_bytes, [2]  # the first time the finisher looks what is done
 
     def read(path: Place, limit: int) -> bytes:
@@ -336,15 +331,15 @@ def test_a_log_that_grows_while_it_is_removed(monkeypatch: pytest.MonkeyPatch) -
         if "records" in f"{path}":
             left[0] -= 1
             if not left[0]:
-                writer.write(shards[2], synthetic.blocks(large, shards[2]))
+                writer.write(shards[2], synthetic.blocks(second, shards[2]))
         return content
 
     monkeypatch.setattr(records, "read_bytes", read)
-    assert completion.complete(small)
+    assert completion.complete(first)
     assert splits(root) == {"train": 16}
     writer.close()
-    assert open_folder(large) == []
-    assert completion.complete(large)
+    assert open_folder(second) == []
+    assert completion.complete(second)
     assert splits(root) == {"train": 24}
 
 
@@ -353,7 +348,7 @@ def test_a_fork_while_a_thread_reads(tmp_path: Path) -> None:
     from gen2d.loading import chunks
 
     root = tmp_path / "data"
-    run(dataset(root, {"train": 12}))
+    run(small(root, {"train": 12}))
     ds = gen2d.open(root, fields="*")
     held, go = threading.Event(), threading.Event()
 
@@ -378,7 +373,7 @@ def test_a_fork_while_a_thread_reads(tmp_path: Path) -> None:
 def test_nothing_is_left_of_a_growth_that_crashed(tmp_path: Path) -> None:
     """After a crash another number of videos is asked for than before, or only `clean` is called."""
     root, base = tmp_path / "data", tmp_path / "base"
-    synthetic.make(dataset(base, {"train": 12}))
+    synthetic.make(small(base, {"train": 12}))
     expected = one_run(tmp_path, {"train": 50})
     videos = gen2d.open(base, fields="*")[:]
 
@@ -387,14 +382,14 @@ def test_nothing_is_left_of_a_growth_that_crashed(tmp_path: Path) -> None:
         shutil.copytree(base, root)
 
     restored()
-    for crash in every_crash(lambda: run(dataset(root, {"train": 30}))):
+    for crash in every_crash(lambda: run(small(root, {"train": 30}))):
         reader = gen2d.open(root, fields="*")
         if crash % 2:
             clean(root)
             reader = gen2d.open(root, fields="*")
         else:
             assert_array_equal(reader[:12]["frames"], videos["frames"])
-        run(dataset(root, {"train": 50}))
+        run(small(root, {"train": 50}))
         assert len(reader[:]["index"]) == len(reader)
         assert synthetic.tree(root) == expected, crash
         restored()
@@ -402,9 +397,9 @@ def test_nothing_is_left_of_a_growth_that_crashed(tmp_path: Path) -> None:
 
 def test_clean_removes_what_nothing_names(tmp_path: Path) -> None:
     root = tmp_path / "data"
-    run(dataset(root, {"train": 12}))
+    run(small(root, {"train": 12}))
     before = synthetic.tree(root)
-    made = dataset(root, {"train": 30})
+    made = small(root, {"train": 30})
     todo = open_folder(made)
     work(made, todo[:1])  # recorded: it stays
     content = (root / "shards" / f"{todo[0].name}.h5").read_bytes()

@@ -25,7 +25,7 @@ from gen2d.dataset import hdf5
 from gen2d.dataset.block import Block, encode, head
 from gen2d.dataset.folder import free_bytes, log, open_folder
 from gen2d.dataset.manifest import read_manifest
-from gen2d.dataset.spec import mine, plan
+from gen2d.dataset.spec import plan, shards_of_worker
 from gen2d.generation.complete import complete
 from gen2d.storage import codecs
 from gen2d.storage.leases import leased
@@ -46,9 +46,9 @@ def test_a_plan_covers_each_video_once(count: int, size: int) -> None:
 def test_workers_share_the_plan_whatever_is_done() -> None:
     planned = plan({"train": 50}, 4)
     remaining = planned[3:]
-    shares = [mine(remaining, worker, 3) for worker in range(3)]
+    shares = [shards_of_worker(remaining, worker, 3) for worker in range(3)]
     assert sorted(s.place for share in shares for s in share) == [s.place for s in remaining]
-    assert shares[1] == [s for s in mine(planned, 1, 3) if s in remaining]
+    assert shares[1] == [s for s in shards_of_worker(planned, 1, 3) if s in remaining]
 
 
 @CODECS
@@ -253,7 +253,7 @@ def test_overwrite_replaces_a_dataset(tmp_path: Path) -> None:
 @pytest.mark.parametrize("overwrite", [False, True])
 def test_what_is_no_dataset_is_left_alone(tmp_path: Path, overwrite: bool) -> None:
     (tmp_path / "thesis.tex").write_text("years of work")
-    with pytest.raises(FolderError, match="something else"):
+    with pytest.raises(FolderError, match="something other"):
         open_folder(synthetic.dataset(tmp_path), overwrite)
     with pytest.raises(FolderError, match="is a file, not a folder"):
         open_folder(synthetic.dataset(tmp_path / "thesis.tex"), overwrite)
@@ -383,10 +383,10 @@ import os, random, signal, sys, time
 from pathlib import Path
 sys.path.insert(0, {tests!r})
 import synthetic
-from gen2d.dataset.spec import mine
+from gen2d.dataset.spec import shards_of_worker
 def work(made, number):
     with synthetic.ShardWriter(made) as writer:
-        for shard in mine(synthetic.open_folder(made), number, 3):
+        for shard in shards_of_worker(synthetic.open_folder(made), number, 3):
             writer.write(shard, synthetic.blocks(made, shard))
     synthetic.complete(made)
 fields = {{name: synthetic.FIELDS[name] for name in {fields!r}}}

@@ -30,12 +30,12 @@ from gen2d.dataset.folder import log, open_folder
 from gen2d.dataset.manifest import read_manifest
 from gen2d.dataset.records import read_tables
 from gen2d.dataset.rows import origin, sealed_rows
-from gen2d.dataset.spec import DatasetSpec, mine
+from gen2d.dataset.spec import DatasetSpec, shards_of_worker
 from gen2d.generation.complete import complete
 from gen2d.loading import dataset as loader
 from gen2d.loading.dataloader import DataLoader
+from gen2d.storage import filesystems, ranges
 from gen2d.storage import paths as remote
-from gen2d.storage import ranges
 from gen2d.storage.atomic import publish, sweep
 from gen2d.storage.paths import Url, place
 from gen2d.storage.ranges import Range
@@ -50,7 +50,7 @@ def running() -> Iterator[Server]:
         for name, value in buckets.environment(server).items():
             patch.setenv(name, value)
         yield server
-        remote._file_system.cache_clear()
+        filesystems._connect.cache_clear()
         s3fs.S3FileSystem.clear_instance_cache()
         gc.collect()  # closes connections
 
@@ -499,7 +499,7 @@ def test_more_videos_extend_and_equal_one_run(tmp_path: Path) -> None:
 
 def test_workers_share_a_url(toy: Path) -> None:
     made = at("s3://bucket/shared")
-    shares = [mine(open_folder(made), worker, 2) for worker in range(2)]
+    shares = [shards_of_worker(open_folder(made), worker, 2) for worker in range(2)]
     for share, is_last in zip(shares, (False, True), strict=True):
         for shard in share:
             synthetic.write(made, shard, synthetic.blocks(made, shard))
@@ -523,7 +523,7 @@ def test_what_is_no_dataset_is_left_alone(tmp_path: Path) -> None:
     (tmp_path / "thesis.tex").write_text("years of work")
     remote.upload(tmp_path / "thesis.tex", Url("s3://bucket/thesis/thesis.tex"))
     for overwrite in (False, True):
-        with pytest.raises(FolderError, match="holds something else"):
+        with pytest.raises(FolderError, match="holds something other"):
             open_folder(at("s3://bucket/thesis"), overwrite)
     assert list(buckets.tree("s3://bucket/thesis")) == ["thesis.tex"]
 
@@ -531,7 +531,7 @@ def test_what_is_no_dataset_is_left_alone(tmp_path: Path) -> None:
 @pytest.mark.parametrize("method", ["PUT", "GET"])
 def test_no_permission_is_told(server: Server, toy: Path, method: str) -> None:
     server.fault = always("deny", method, "/")
-    with pytest.raises(FolderError, match=r"s3://bucket/denied.* cannot be read or written \(permission was denied\)"):
+    with pytest.raises(FolderError, match=r"s3://bucket/denied.* cannot be read or written \(permission denied\)"):
         synthetic.make(at("s3://bucket/denied"))
     if method == "GET":
         for call in (gen2d.open, gen2d.verify):

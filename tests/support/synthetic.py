@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -58,6 +59,12 @@ def dataset(root: Place, train: int = 20, codec: str = "gzip", **changes: object
     return DatasetSpec(**values)  # pyright: ignore[reportArgumentType]
 
 
+def small(root: Place, splits: Mapping[str, int], **changes: Any) -> DatasetSpec:
+    """A dataset with these splits and four of the fields, for tests that make many."""
+    fields = {name: FIELDS[name] for name in ("frames", "index", "objects/mass", "time")}
+    return dataset(root, fields=fields, splits=splits, **changes)
+
+
 def video(made: DatasetSpec, split: str, number: int) -> dict[str, np.ndarray]:
     """One video, which depends on (seed, split, number) only."""
     random = np.random.default_rng([made.seed, len(split), number])
@@ -110,7 +117,7 @@ def make(made: DatasetSpec, size: int = 3, **options: bool) -> DatasetSpec:
 
 
 def write(made: DatasetSpec, shard: Shard, blocks: Iterable[Block]) -> None:
-    """Returns when the shard is done."""
+    """Make the shard from these blocks."""
     with ShardWriter(made) as writer:
         writer.write(shard, blocks)
 
