@@ -11,15 +11,13 @@ import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import yaml
-
 from gen2d.config import matched as matched_module
 from gen2d.config import plugins
 from gen2d.config import quality as quality_module
 from gen2d.config.joint_distribution import JointDistribution
 from gen2d.config.options import build, coordinates, plain_of
 from gen2d.config.plugin_options import NO_COPIES, Copies, Plugin, StoredCopies, named, plugin_of
-from gen2d.config.reading import YAML_BYTES, overridden, parse_yaml
+from gen2d.config.reading import YAML_BYTES, overridden, parse_yaml, yaml_text
 from gen2d.config.sections import (
     AnnotationOptions,
     CameraOptions,
@@ -65,11 +63,11 @@ class Config:
 
     def text(self) -> str:
         """The resolved config as YAML; read again it gives the same config."""
-        return yaml.safe_dump(self.plain(), sort_keys=False)
+        return yaml_text(self.plain())
 
     def recipe_text(self) -> str:
         """The recipe with its seed as YAML: what a dataset keeps, however many videos it has."""
-        return yaml.safe_dump({"name": self.name, "seed": self.seed, **self.recipe()}, sort_keys=False)
+        return yaml_text({"name": self.name, "seed": self.seed, **self.recipe()})
 
     @property
     def copies(self) -> Copies:

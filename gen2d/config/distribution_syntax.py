@@ -26,7 +26,9 @@ LARGEST = 1e12  # in any unit: the square of a larger number leaves no room in a
 
 def is_number(value: Any) -> bool:
     """Whether the value is a real number that a simulation can take."""
-    return isinstance(value, Real) and not isinstance(value, bool) and abs(float(value)) <= LARGEST
+    if isinstance(value, int):  # which may be too large for a float
+        return not isinstance(value, bool) and abs(value) <= LARGEST
+    return isinstance(value, Real) and abs(float(value)) <= LARGEST
 
 
 def _far_in_the_tail(mean: float, deviation: float, low: float, high: float) -> bool:

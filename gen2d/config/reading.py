@@ -1,83 +1,87 @@
-"""YAML and `--set` as plain values, of bounded size."""
+"""YAML 1.2 as plain values, of bounded size; `--set`; and plain values as YAML."""
 
+import io
 import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import yaml
+from ruamel.yaml import YAML
+from ruamel.yaml.error import YAMLError
+from ruamel.yaml.events import AliasEvent, CollectionEndEvent, CollectionStartEvent, DocumentStartEvent, ScalarEvent
 
 from gen2d.config.plugin_options import named
 from gen2d.core.errors import ConfigError
 
-# Reading ------------------------------------------------------------------------------------------------------------
-
-
-class _Loader(yaml.SafeLoader):
-    """YAML with 1e-3 as a number (YAML 1.1 takes it for text) and without silently doubled keys."""
-
-
-def _mapping(loader: _Loader, node: yaml.MappingNode) -> dict:
-    seen = set()
-    for key, _ in node.value:
-        if not isinstance(key.value, str):
-            raise yaml.constructor.ConstructorError(None, None, "a name must be text", key.start_mark)
-        if key.value in seen:
-            raise yaml.constructor.ConstructorError(None, None, f"{key.value} stands there twice", key.start_mark)
-        seen.add(key.value)
-    return loader.construct_mapping(node, deep=True)
-
-
-_Loader.add_implicit_resolver(
-    "tag:yaml.org,2002:float", re.compile(r"^[-+]?(\d[\d_]*)(\.[\d_]*)?[eE][-+]?\d+$"), list("-+0123456789")
-)
-
-
-_Loader.add_constructor("tag:yaml.org,2002:map", _mapping)
-
-YAML_BYTES = 2**20  # of a config
-YAML_DEPTH, YAML_NODES = 40, 50_000  # of what it stands for, each alias as often as it stands there
-
-
-def _check_bounds(text: str) -> None:
-    """Raises ConfigError for a YAML text that stands for more than a config could be, before it is read."""
-    sizes: dict[str, int] = {}  # of what has an anchor
-    open_nodes: list[tuple[str | None, int]] = []  # anchor, and how many nodes there were before
-    nodes = 0
-    for event in yaml.parse(text, _Loader):
-        if isinstance(event, yaml.AliasEvent):
-            nodes += sizes.get(event.anchor, 1)  # one that is not known, or open still, is an error later
-        elif isinstance(event, yaml.ScalarEvent):
-            nodes += 1
-            sizes |= {event.anchor: 1} if event.anchor else {}
-        elif isinstance(event, yaml.CollectionStartEvent):
-            open_nodes.append((event.anchor, nodes))
-            nodes += 1
-        elif isinstance(event, yaml.CollectionEndEvent):
-            anchor, before = open_nodes.pop()
-            sizes |= {anchor: nodes - before} if anchor else {}
-        if len(open_nodes) > YAML_DEPTH:
-            raise yaml.YAMLError(f"nested more than {YAML_DEPTH} deep")
-        if nodes > YAML_NODES:
-            raise yaml.YAMLError(f"more than {YAML_NODES:,} values")
+YAML_BYTES = 2**20  # size of a config file
+YAML_DEPTH, YAML_NODES = 40, 50_000  # levels and nodes of a text; an alias counts as the nodes that it stands for
+YAML_DIGITS = 1000  # characters of a number; Python prints no integer of more than 4300 digits
 
 
 def parse_yaml(text: str, source: str) -> Any:
-    """The value that a YAML text stands for."""
+    """Plain value of a YAML text; raises ConfigError, which names `source`, if the text is invalid or too large."""
     try:
-        _check_bounds(text)
-        return yaml.load(text, _Loader)
-    except RecursionError:
-        raise ConfigError(f"{source}: not valid YAML: it holds itself") from None
-    except yaml.YAMLError as error:
+        _check_events(text)
+        yaml = _yaml()
+        yaml.composer.warn_double_anchors = False  # the later anchor counts, as YAML defines it
+        return yaml.load(text)
+    except YAMLError as error:
         mark = getattr(error, "problem_mark", None)
         where = f" in line {mark.line + 1}" if mark else ""
         raise ConfigError(f"{source}: not valid YAML{where}: {getattr(error, 'problem', None) or error}") from None
-    except ValueError as error:  # a date that does not exist
+    except (ValueError, AssertionError) as error:  # a date that does not exist, a version of YAML that does not
         raise ConfigError(f"{source}: not valid YAML: {error}") from None
 
 
+def _check_events(text: str) -> None:
+    """Raise YAMLError, before any value is constructed, for a text beyond the bounds or with features of no config."""
+    sizes: dict[str, int] = {}  # nodes under each anchor
+    open_nodes: list[tuple[str | None, int]] = []  # anchor of each open collection, and the number of nodes before it
+    nodes = 0
+    if re.search(r"!\S{1000}", text):  # ruamel.yaml takes quadratic time over a tag
+        raise YAMLError("a tag of more than 1,000 characters")
+    for event in _yaml().parse(text):
+        if isinstance(event, DocumentStartEvent) and event.version not in (None, (1, 2)):
+            raise YAMLError("its %YAML line must say 1.2")
+        if isinstance(event, ScalarEvent | CollectionStartEvent) and event.ctag is not None:
+            raise YAMLError("tags such as !!binary are not allowed")
+        if isinstance(event, AliasEvent):
+            if any(event.anchor == anchor for anchor, _ in open_nodes):
+                raise YAMLError(f"&{event.anchor} contains itself")
+            nodes += sizes.get(event.anchor, 1)  # the composer refuses an unknown anchor
+        elif isinstance(event, ScalarEvent):
+            if event.implicit[0] and len(event.value) > YAML_DIGITS and event.value[0] in "+-0123456789":
+                raise YAMLError(f"a number of more than {YAML_DIGITS:,} characters")
+            nodes += 1
+            sizes |= {event.anchor: 1} if event.anchor else {}
+        elif isinstance(event, CollectionStartEvent):
+            open_nodes.append((event.anchor, nodes))
+            nodes += 1
+        elif isinstance(event, CollectionEndEvent):
+            anchor, before = open_nodes.pop()
+            sizes |= {anchor: nodes - before} if anchor else {}
+        if len(open_nodes) > YAML_DEPTH:
+            raise YAMLError(f"nested more than {YAML_DEPTH} deep")
+        if nodes > YAML_NODES:
+            raise YAMLError(f"more than {YAML_NODES:,} values")
+
+
+def yaml_text(values: Mapping[str, Any]) -> str:
+    """The YAML text of plain values, in their order; `parse_yaml` reads the same values from it."""
+    yaml, text = _yaml(), io.StringIO()
+    yaml.default_flow_style = yaml.allow_unicode = False
+    yaml.width = 2**31  # characters of a line: a text that ruamel.yaml folds may be read with other spaces
+    yaml.representer.sort_base_mapping_type_on_output = False
+    yaml.dump(values, text)
+    return text.getvalue()
+
+
+def _yaml() -> YAML:
+    """A reader and writer of plain values; one for each text, since it keeps state."""
+    return YAML(typ="safe", pure=True)
+
+
 def overridden(values: dict, overrides: Sequence[str]) -> dict:
-    """The mapping with each `a.b=value` put in its place."""
+    """The mapping with the value of each `a.b=value` in place."""
     for text in overrides:
         path, equals, value = text.partition("=")
         keys = path.strip().split(".")

@@ -1,1 +1,1 @@
-"""Pictures and films as files; nothing here knows of simulations."""
+"""Pictures and films as files, independent of simulations."""

@@ -10,18 +10,18 @@ SMALLEST = 96  # px: smaller frames are enlarged by whole factors, so that pixel
 
 
 def shown(frames: int) -> np.ndarray:
-    """The numbers of the frames that a sheet shows, the first and the last among them."""
+    """Indices of the frames that a sheet shows, evenly spaced from the first to the last."""
     return np.unique(np.linspace(0, frames - 1, COLUMNS).round().astype(int))
 
 
 def contact_sheet(frames: np.ndarray) -> np.ndarray:
-    """One picture [H, W, 3]: a row for each of the videos [n, T, H, W, 3], first to last frame from left to right."""
+    """A picture [H, W, 3] of videos [n, T, H, W, 3]: a row for each, with time from left to right."""
     rows = [np.concatenate([framed(video[t]) for t in shown(len(video))], axis=1) for video in frames]
     return np.concatenate(rows)
 
 
 def reduced(video: np.ndarray) -> np.ndarray:
-    """The frames of a video [T, H, W, 3] that a sheet shows, larger ones averaged down."""
+    """Frames of a video [T, H, W, 3] that a sheet shows, at most LARGEST pixels a side by averaging."""
     frames = video[shown(len(video))]
     factor = -(-max(frames.shape[1:3]) // LARGEST)
     if factor == 1:
@@ -31,10 +31,11 @@ def reduced(video: np.ndarray) -> np.ndarray:
 
 
 def enlarged(image: np.ndarray) -> np.ndarray:
-    """A small image [H, W] or [H, W, 3] larger by a whole factor."""
+    """An image [H, W] or [H, W, 3] repeated by a whole factor until no side is below SMALLEST."""
     factor = -(-SMALLEST // min(image.shape[:2]))
     return np.repeat(np.repeat(image, factor, axis=0), factor, axis=1)
 
 
 def framed(frame: np.ndarray) -> np.ndarray:
+    """An enlarged frame with a grey border."""
     return np.pad(enlarged(frame), [(GAP, GAP), (GAP, GAP), (0, 0)], constant_values=GREY)

@@ -1,4 +1,4 @@
-"""Videos as films: OpenCV's MPEG-4 encoder, which is always there, and PyAV's encoders, an extra."""
+"""Film files: MPEG-4 by OpenCV, which is always installed, and other codecs by PyAV, an optional dependency."""
 
 import os
 from collections.abc import Mapping
@@ -13,11 +13,11 @@ from gen2d.core.errors import ConfigError, UserError
 
 LOSS = "lossy: colours at half the resolution, and rounded"  # of YUV 4:2:0
 SLOWEST = 0.1  # frames/s; OpenCV rounds rates to a thousandth
-FASTEST = 2**16 - 1  # frames/s; what MPEG-4 has bits for
+FASTEST = 2**16 - 1  # frames/s; MPEG-4 stores 16 bits
 
 
 def mp4v(path: Path, frames: np.ndarray, fps: float) -> None:
-    """Writes frames [T, H, W, 3], H and W even, as MPEG-4; OSError if the file does not hold all of them."""
+    """Write frames [T, H, W, 3], H and W even, as MPEG-4; raises OSError if the file lacks any of them."""
     height, width = frames.shape[1:3]
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), fps, (width, height))
     if not writer.isOpened():
@@ -25,20 +25,19 @@ def mp4v(path: Path, frames: np.ndarray, fps: float) -> None:
     for image in frames:
         writer.write(np.ascontiguousarray(image[..., ::-1]))
     writer.release()
-    # It tells of no error, not even of a full disk.
-    found = cv2.VideoCapture(str(path))
-    sizes = [
-        found.get(what) for what in (cv2.CAP_PROP_FRAME_COUNT, cv2.CAP_PROP_FRAME_HEIGHT, cv2.CAP_PROP_FRAME_WIDTH)
-    ]
-    found.release()
+    # OpenCV reports no error, not even a full disk.
+    film = cv2.VideoCapture(str(path))
+    properties = cv2.CAP_PROP_FRAME_COUNT, cv2.CAP_PROP_FRAME_HEIGHT, cv2.CAP_PROP_FRAME_WIDTH
+    sizes = [film.get(number) for number in properties]
+    film.release()
     if sizes != [len(frames), height, width]:
         raise OSError(f"{path}: OpenCV could not write all of a film")
 
 
 def encode(path: Path, frames: np.ndarray, fps: float, codec: str, pixels: str, options: Mapping[str, str]) -> None:
-    """Writes frames [T, H, W, 3] by one of PyAV's encoders, or raises OSError; `pixels` and `options` are FFmpeg's."""
+    """Write frames [T, H, W, 3] by a codec of PyAV; raises OSError. `pixels` and `options` are FFmpeg's."""
     av = pyav()
-    # Bit-exact: without versions and random numbers in the file.
+    # Bit-exact: the file holds no versions and no random numbers.
     try:
         with av.open(str(path), "w", options={"fflags": "+bitexact"}) as file:
             stream = file.add_stream(codec, rate=rate_of(fps), options=dict(options))
@@ -47,13 +46,13 @@ def encode(path: Path, frames: np.ndarray, fps: float, codec: str, pixels: str, 
             for image in frames:
                 file.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24")))
             file.mux(stream.encode(None))
-    except av.FFmpegError as error:  # of which some are an OSError, and some are not
+    except av.FFmpegError as error:  # only some of these are an OSError
         raise OSError(error.errno, error.strerror, str(path)) from error
 
 
 def pyav() -> ModuleType:
-    """PyAV, or a UserError that says how to get it."""
-    os.environ.setdefault("SVT_LOG", "1")  # errors alone, when AV1's encoder is loaded
+    """The module of PyAV; raises a UserError that says how to install it."""
+    os.environ.setdefault("SVT_LOG", "1")  # AV1's encoder prints errors only
     try:
         import av
     except ImportError:
@@ -62,19 +61,19 @@ def pyav() -> ModuleType:
 
 
 def rate_of(fps: float) -> Fraction:
-    """The frame rate as films store it, such as 30000/1001."""
+    """Frame rate as a fraction, such as 30000/1001."""
     return Fraction(fps).limit_denominator(1001)
 
 
 def check_size(name: str, size: tuple[int, int]) -> None:
-    """Returns nothing; raises ConfigError where colours cannot be stored at half the frame's resolution."""
+    """Raise ConfigError for an odd height or width, at which colours cannot have half the resolution."""
     for side, pixels in zip(("height", "width"), size, strict=True):
         if pixels % 2:
             raise ConfigError(f"video.{side} is {pixels}, but must be even for {name}: choose ffv1, npz or webdataset")
 
 
 def check_rate(name: str, fps: float, fastest: float) -> None:
-    """Returns nothing; raises ConfigError for a frame rate that a format cannot store."""
+    """Raise ConfigError for a frame rate that a format cannot store."""
     if not SLOWEST <= fps <= fastest:
         raise ConfigError(
             f"video.fps is {fps:g}, but must be from {SLOWEST:g} to {fastest:g} for {name}: choose npz or webdataset"

@@ -1,27 +1,33 @@
-"""PNG and GIF files, and the folders that they go into."""
+"""PNG and animated WebP files, and the folders that they go into."""
 
 import contextlib
+import errno
+import io
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
 import cv2
 import numpy as np
+from PIL import Image
 
 from gen2d.core.errors import FolderError
 from gen2d.media.contact_sheet import framed
 from gen2d.storage.atomic import publish
 
+WEBP_SIDE = 16383  # px, the largest height and width of the format
+SHORTEST = 11  # ms of a frame; browsers show a shorter one for 100 ms
+
 
 def check_folder(out: Path) -> None:
-    """Returns nothing; makes the folder for pictures, or raises FolderError, before any is drawn."""
+    """Make the folder for pictures; raises FolderError, before any is drawn, if none can be written there."""
     with writing(out), tempfile.TemporaryFile(dir=out):
         pass
 
 
 @contextlib.contextmanager
 def writing(out: Path) -> Iterator[None]:
-    """A block that writes into a folder, which is made first; its OSError becomes a FolderError."""
+    """Context that makes a folder and turns each OSError of writing there into a FolderError."""
     try:
         out.mkdir(parents=True, exist_ok=True)
         yield
@@ -30,31 +36,28 @@ def writing(out: Path) -> Iterator[None]:
 
 
 def animate(path: Path, frames: np.ndarray, fps: float) -> None:
-    """Writes all videos side by side as an animated GIF that loops."""
-    across = int(np.ceil(np.sqrt(len(frames))))
-    blank = np.zeros_like(frames[0])
-    cells = [*frames, *[blank] * (-len(frames) % across)]
-    rows = [np.concatenate([_tiled(v) for v in cells[i : i + across]], axis=2) for i in range(0, len(cells), across)]
-    movie = cv2.Animation()
-    movie.frames = [image[..., ::-1].copy() for image in np.concatenate(rows, axis=1)]
-    movie.durations = [max(20, round(1000 / fps))] * len(movie.frames)
-    done, content = cv2.imencodeanimation(".gif", movie)
-    if not done:
-        raise OSError("OpenCV could not make a GIF")
-    publish(path, content.tobytes())
-
-
-def _tiled(video: np.ndarray) -> np.ndarray:
-    return np.stack([framed(frame) for frame in video])
+    """Write videos [n, T, H, W, 3] side by side as a lossless animated WebP that loops; raises OSError."""
+    columns = int(np.ceil(np.sqrt(len(frames))))
+    tiles = [np.stack([framed(frame) for frame in video]) for video in frames]
+    tiles += [np.zeros_like(tiles[0])] * (-len(tiles) % columns)
+    rows = [np.concatenate(tiles[i : i + columns], axis=2) for i in range(0, len(tiles), columns)]
+    film = np.concatenate(rows, axis=1)
+    height, width = film.shape[1:3]
+    if max(height, width) > WEBP_SIDE:
+        raise OSError(errno.EFBIG, f"{width} x {height} px, but a WebP has at most {WEBP_SIDE} px a side")
+    first, *others = [Image.fromarray(image) for image in film]
+    content, duration = io.BytesIO(), max(SHORTEST, round(1000 / fps))
+    first.save(content, "WEBP", save_all=True, append_images=others, duration=duration, loop=0, lossless=True)
+    publish(path, content.getvalue())
 
 
 def write(path: Path, image: np.ndarray) -> None:
-    """Writes a picture [H, W, 3]."""
+    """Write a picture [H, W, 3], uint8 RGB, as a PNG file."""
     publish(path, png(image))
 
 
 def png(image: np.ndarray) -> bytes:
-    """A picture [H, W, 3] as the bytes of a PNG file."""
+    """The bytes of a PNG file that holds a picture [H, W, 3], uint8 RGB."""
     done, content = cv2.imencode(".png", image[..., ::-1])
     if not done:
         raise OSError("OpenCV could not write a PNG")

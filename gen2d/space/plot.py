@@ -19,7 +19,7 @@ from gen2d.space.bodies import Body, Drawable, Film
 RED, DARK, WHITE = (220, 30, 30), (60, 60, 60), (255, 255, 255)
 SHIFT = 6  # fractional bits of the coordinates that OpenCV takes
 MARGIN = 0.05  # of the view that is shown where none is asked for, on each side
-FORMATS = (".png", ".gif", ".mp4")
+FORMATS = (".png", ".webp", ".mp4")
 ViewBounds = tuple[float, float, float, float]
 
 
@@ -101,7 +101,7 @@ def overlay(of: Drawable, *, view: ViewBounds | None = None, size: int = 400, co
 
 
 def save(of: Film, path: str | Path, **options: Any) -> Path:
-    """The path of a file made there: .png all frames over each other, .gif (loops) or .mp4 the film.
+    """The path of a file made there: .png all frames over each other, .webp (loops) or .mp4 the film.
 
     Options are those of `overlay` and of `picture`. ConfigError for another ending, OSError where it cannot be written.
     """
@@ -113,7 +113,7 @@ def save(of: Film, path: str | Path, **options: Any) -> Path:
         return path
     view = options.pop("view", None) or _seen(of)
     film = np.stack([picture(of, frame, view=view, **options) for frame in range(len(of.position))])
-    if path.suffix == ".gif":
+    if path.suffix == ".webp":
         animate(path, film[None], of.fps)
     else:
         films.mp4v(path, film, of.fps)

@@ -5,7 +5,7 @@
     ball = space.add_circle((0, 3), radius=0.5, elasticity=0.8)
     video = space.simulate(seconds=2)
     video.position[:, ball], video.contacts.time, video.energy.residual
-    video.save("fall.gif")
+    video.save("fall.webp")
 
 A body's number is the place in which it was added, and its place in every result. The solver's slots are in another
 order (a layout's runs hold one shape and kind each): `Space.slots` says which is whose.

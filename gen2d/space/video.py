@@ -47,7 +47,7 @@ class Video:
         return plot.overlay(self, **options)
 
     def save(self, path: str | Path, **options: Any) -> Path:
-        """The path of a file written there: .gif or .mp4 the video, .png all frames over each other."""
+        """The path of a file written there: .webp or .mp4 the video, .png all frames over each other."""
         from gen2d.space import plot
 
         return plot.save(self, path, **options)

@@ -1,4 +1,4 @@
-"""Parts of remote files, asked for all at once, those near each other together."""
+"""Byte ranges of remote files, read in parallel and coalesced when they are close."""
 
 import errno
 from collections.abc import Sequence
@@ -8,9 +8,9 @@ from typing import NamedTuple
 from gen2d.core.errors import DamagedError, UnreachableError
 from gen2d.storage.paths import Url, attempt, read_range
 
-NEAR = 2**18  # bytes: reading over such a gap takes less time than asking twice
-LONGEST = 2**23  # bytes in one request: longer ones take more time than several at once
-AT_ONCE = 32  # requests
+NEAR = 2**18  # bytes; reading a gap of this size takes less time than a second request
+LONGEST = 2**23  # bytes of a request; a longer one takes more time than several in parallel
+AT_ONCE = 32  # parallel requests
 
 
 class Range(NamedTuple):
@@ -22,23 +22,26 @@ class Range(NamedTuple):
 
 
 def read_ranges(ranges: Sequence[Range]) -> list[bytes | Exception]:
-    """The bytes of each range, or why there are none."""
+    """Bytes of each range, or the error of reading it."""
     spans = _spans(ranges)
     if len(spans) > 1:
         with ThreadPoolExecutor(min(AT_ONCE, len(spans)), "gen2d-ranges") as pool:
             read = dict(zip(spans, pool.map(_read, spans), strict=True))
     else:
         read = {span: _read(span) for span in spans}
-    found: dict[Range, bytes | Exception] = {}
+    contents: dict[Range, bytes | Exception] = {}
     for span, members in spans.items():
         data = read[span]
         for one in members:
-            found[one] = data if isinstance(data, Exception) else data[one.start - span.start : one.end - span.start]
-    return [found[one] for one in ranges]
+            contents[one] = data if isinstance(data, Exception) else data[one.start - span.start : one.end - span.start]
+    return [contents[one] for one in ranges]
 
 
 def _spans(ranges: Sequence[Range]) -> dict[Range, list[Range]]:
-    """What to ask for, and which ranges are in it."""
+    """The range of each request, and the ranges inside it.
+
+    Not fsspec's `merge_offset_ranges`, which in its older versions loses the end of a range that contains another.
+    """
     spans: dict[Range, list[Range]] = {}
     span, members = None, []
     for one in sorted(ranges):

@@ -1,12 +1,11 @@
-"""A gallery for a person: the same videos in every look, then in the flat one with what is told of their pixels; and
-that of every scene family, with a page that has a row of each.
+"""Gallery of the same videos in every look and with every annotation, and a page of all scene families.
 
-The videos of a config are made in a temporary folder, as states alone; from there on it is one way for all.
+The videos of a config are first generated without frames in a temporary folder, then rendered as those of a dataset.
 """
 
 import contextlib
 import tempfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,15 +19,15 @@ from gen2d.loading.dataset import Dataset
 from gen2d.loading.dataset import open as open_dataset
 from gen2d.media.contact_sheet import GAP, contact_sheet, shown
 from gen2d.media.images import check_folder, write, writing
-from gen2d.media.overlays import VideoFields, amodal_overlay, boxes_overlay, flow_overlay, masks_overlay, tracks_overlay
+from gen2d.media.overlays import amodal_overlay, boxes_overlay, flow_overlay, masks_overlay, tracks_overlay
 from gen2d.programs.recipe import config_of
 from gen2d.programs.redraw import render
 from gen2d.storage.sealed import sha256
 from gen2d.tools.preview import check_videos, is_dataset
 
-LABEL = 125  # px, of the strip with a row's name
+LABEL = 125  # px, width of a row's name
 PAGE = 1000  # px, width of a row without its name, on the page of all families
-TRACKS = 6  # points of an object
+TRACKS = 6  # track points per object
 
 
 def gallery(
@@ -42,8 +41,10 @@ def gallery(
     timeout: float = 30.0,
     deadline: float = 300.0,
 ) -> Path:
-    """The file made in the folder `out`, NAME-gallery.png: a row for each look and annotation, or for each of the first
-    `videos` of it. The config's own look has its options, the others their defaults."""
+    """Path of NAME-gallery.png in the folder `out`: every look and annotation, each of the first `videos` in a row.
+
+    The config's own look has its options, the others their defaults. Raises as `preview` does.
+    """
     check_videos(videos)
     check_folder(out)
     if is_dataset(source):
@@ -62,8 +63,8 @@ def gallery(
 def families(
     out: Path, videos: int = 1, *, seed: int | None = None, overrides: Sequence[str] = (), **_: object
 ) -> list[Path]:
-    """The files made in the folder `out`: families.png with a row for each of the first `videos` of every scene family,
-    in its config's own look, and the gallery of each, FAMILY-gallery.png."""
+    """Paths of families.png, with the first `videos` of every scene family in its config's look, and of the gallery of
+    each, FAMILY-gallery.png, in the folder `out`."""
     check_videos(videos)
     check_folder(out)
     rows, paths = [], []
@@ -85,7 +86,7 @@ def families(
 
 
 def _fitted(sheet: np.ndarray) -> np.ndarray:
-    """The sheet, as wide as all rows of the page."""
+    """A sheet resized to the width of the page."""
     return cv2.resize(sheet, (PAGE, round(PAGE * sheet.shape[0] / sheet.shape[1])), interpolation=cv2.INTER_AREA)
 
 
@@ -93,8 +94,8 @@ def _fitted(sheet: np.ndarray) -> np.ndarray:
 def _annotated_video(
     source: str | Mapping[str, Any], videos: int, seed: int | None, overrides: Sequence[str]
 ) -> Iterator[tuple[Dataset, dict[str, Any], list[str]]]:
-    """A config's first videos, states alone, which last as long as the block, the config, and the sha256 of its own
-    files."""
+    """Context of a temporary dataset with a config's first videos, without frames, the plain config, and the sha256 of
+    each user's own file."""
     config = load_config(source, overrides)
     plain, split = config.plain(), config.training.name if config.training else "train"
     bare = plain | {"look": "flat", "annotations": {}, "storage": plain["storage"] | {"frames": "none"}}
@@ -104,20 +105,21 @@ def _annotated_video(
 
 
 def _looks(own: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
-    """All looks by what they are called in the gallery; `own` has its options."""
+    """Every look by its name in the gallery; `own` keeps its options."""
     return {name: {"name": name} for name in plugins.names("look")} | {Path(own["name"]).stem: own}
 
 
 def _sheet(
     ds: Dataset, videos: int, looks: Mapping[str, Mapping[str, Any]], overrides: Sequence[str], trust: Sequence[str]
 ) -> np.ndarray:
-    """All rows as one picture [H, W, 3]."""
+    """A picture [H, W, 3] of all rows."""
     numbers = range(min(videos, len(ds)))
     rows = [*_look_rows(ds, numbers, looks, overrides, trust), *_annotation_rows(ds, numbers, overrides, trust)]
     return np.concatenate([_labelled(name, contact_sheet(frames)) for name, frames in rows])
 
 
 def _labelled(name: str, picture: np.ndarray) -> np.ndarray:
+    """A picture with its name on a white strip at the left."""
     strip = np.full((len(picture), LABEL, 3), 255, np.uint8)
     cv2.putText(strip, name, (2 * GAP, 20), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (0, 0, 0), 1, cv2.LINE_AA)
     return np.concatenate([strip, picture], axis=1)
@@ -133,32 +135,31 @@ def _look_rows(
     overrides: Sequence[str],
     trust: Sequence[str],
 ) -> Rows:
-    """Each look's name and frames [n, T, H, W, 3]."""
+    """Name and frames [n, T, H, W, 3] of each look."""
     for name, look in looks.items():
         yield name, np.asarray(render(ds, numbers, look=look, overrides=overrides, trust=trust))
 
 
 def _annotation_rows(ds: Dataset, numbers: Sequence[int], overrides: Sequence[str], trust: Sequence[str]) -> Rows:
-    """Each annotation's name and frames [n, T, H, W, 3] that show it."""
+    """Name of each annotation, and frames [n, T, H, W, 3] that show it."""
     overrides = [*overrides, f"annotations.tracks={TRACKS}"]
     fields = ["masks/instance", "masks/amodal", "boxes/visible", "boxes/amodal", "flow/forward", "tracks/points"]
     fields += ["tracks/visible", "frames"]
-    found = render(ds, numbers, look="flat", overrides=overrides, fields=fields, trust=trust)
-    times = shown(found["frames"].shape[1])
-    columns = {name: np.asarray(array[:, times]) for name, array in found.items()}
+    batch = render(ds, numbers, look="flat", overrides=overrides, fields=fields, trust=trust)
+    times = shown(batch["frames"].shape[1])
+    columns = {name: np.asarray(array[:, times]) for name, array in batch.items()}
     fastest = np.abs(columns["flow/forward"].astype(np.float32)).max()
     columns["flow/forward"] = columns["flow/forward"] / max(fastest, 1e-3)
-    for name, draw in DRAWN.items():
-        yield name, np.stack([_film(columns, video, draw) for video in range(len(numbers))])
+    videos, frames = columns["frames"].shape[:2]
+    for name, overlay in OVERLAYS.items():
+        drawn = [
+            [overlay({field: array[video, t] for field, array in columns.items()}) for t in range(frames)]
+            for video in range(videos)
+        ]
+        yield name, np.array(drawn)
 
 
-def _film(columns: VideoFields, video: int, draw: Callable[[VideoFields], np.ndarray]) -> np.ndarray:
-    """One video's pictures."""
-    times = range(columns["frames"].shape[1])
-    return np.stack([draw({name: array[video, t] for name, array in columns.items()}) for t in times])
-
-
-DRAWN = {
+OVERLAYS = {
     "masks": masks_overlay,
     "amodal": amodal_overlay,
     "boxes": boxes_overlay,

@@ -1,4 +1,4 @@
-"""Pictures for a person: a contact sheet (videos down, time across) and an animation, of a dataset or of a config."""
+"""Contact sheet (videos down, time across) and animation of a dataset or a config."""
 
 import contextlib
 from collections.abc import Sequence
@@ -25,11 +25,11 @@ def preview(
     timeout: float = 30.0,
     deadline: float = 300.0,
 ) -> list[Path]:
-    """Paths of a contact sheet, NAME-sheet.png, and of an animation, NAME.gif, written into the folder `out`.
+    """Paths of a contact sheet, NAME-sheet.png, and an animation, NAME.webp, written into the folder `out`.
 
-    `source` is a dataset's folder or URL, or a config, with `seed` and `overrides`. `trust` is
-    that of `render`, for a dataset without frames; `timeout` and `deadline` are those of `open`, in seconds.
-    Raises UserError for a source or options that cannot be, DamagedError, UnreachableError.
+    `source` is a dataset's folder or URL, or a config, which `seed` and `overrides` change. `trust` is that of `render`,
+    for a dataset without frames; `timeout` and `deadline`, in seconds, are those of `open`.
+    Raises UserError for an invalid source or option, DamagedError, UnreachableError.
     """
     source, out = str(source) if isinstance(source, Path) else source, Path(out)
     check_videos(videos)
@@ -40,7 +40,7 @@ def preview(
         name, frames, fps = ds.manifest.name, _stored(ds, numbers, trust), ds.manifest.fps
     else:
         name, frames, fps = _drawn(str(source), videos, seed, overrides)
-    sheet, animation = out / f"{name}-sheet.png", out / f"{name}.gif"
+    sheet, animation = out / f"{name}-sheet.png", out / f"{name}.webp"
     with writing(out):
         write(sheet, contact_sheet(frames))
         animate(animation, frames, fps)
@@ -48,19 +48,19 @@ def preview(
 
 
 def is_dataset(source: str | Url) -> bool:
-    """Whether it is a dataset, at a URL or in a folder, that is to be drawn; all else is a config."""
-    found = place(source)
-    return isinstance(found, Url) or found.is_dir()
+    """Whether the source is a dataset, at a URL or in a folder, rather than a config."""
+    path = place(source)
+    return isinstance(path, Url) or path.is_dir()
 
 
 def check_videos(videos: int) -> None:
-    """Returns nothing; raises UserError where there would be no video."""
+    """Raise UserError unless `videos` is positive."""
     if videos < 1:
         raise UserError(f"--videos is {videos}, but must be 1 or more")
 
 
 def _stored(ds: Dataset, numbers: Sequence[int], trust: Sequence[str]) -> np.ndarray:
-    """The frames of a dataset's videos, drawn again where they are not stored."""
+    """Frames of a dataset's videos, rendered if they are not stored."""
     if "frames" in ds.manifest.fields:
         return ds.batch(numbers)["frames"]
     from gen2d.programs.redraw import render
@@ -69,7 +69,7 @@ def _stored(ds: Dataset, numbers: Sequence[int], trust: Sequence[str]) -> np.nda
 
 
 def _drawn(source: str, videos: int, seed: int | None, overrides: Sequence[str]) -> tuple[str, np.ndarray, float]:
-    """Name, frames and frame rate of a config's first videos, made but not stored."""
+    """Name of a config, and the frames and frame rate of its first videos."""
     import dataclasses
 
     from gen2d.config.config import checked_seed, load_config

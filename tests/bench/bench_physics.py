@@ -23,7 +23,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import peer
 import pymunk
-from charts import FAINT, LEFT, Chart
+from charts import FAINT, cost_chart, save
 
 FRAMES, STEPS, STEP = 64, 4, 1 / 240  # s
 GRAVITY, ELASTICITY, FRICTION = -9.81, 0.9, 0.2  # m/s^2; each body's, of which gen2d and Chipmunk make products
@@ -300,24 +300,18 @@ def table(costs: Sequence[Cost]) -> list[str]:
     return lines
 
 
-COLORS = {"states": (221, 170, 68), "all": (153, 68, 17), "pymunk": (34, 102, 221), "phyjax2d": (119, 153, 34)}
+COLORS = {"states": "#44aadd", "all": "#114499", "pymunk": "#dd6622", "phyjax2d": "#229977"}
 
 
 def chart(costs: Sequence[Cost], path: Path) -> None:
-    """Returns nothing; draws the cost of discs against their number, both in logarithms, into a PNG file."""
+    """Write a chart of the cost of discs against their number as a PNG file."""
     costs = [cost for cost in costs if cost.name.endswith("discs")]
-    values, counts = [micros for cost in costs for micros in cost.micros.values()], [cost.objects for cost in costs]
-    drawn = Chart(min(counts) / 1.15, max(counts) * 1.15, min(values) / 1.5, max(values) * 2)
-    drawn.grid(counts)
-    guide = [drawn.place(cost.objects, cost.pairs * min(costs[0].micros.values()) / costs[0].pairs) for cost in costs]
-    drawn.line(guide, FAINT, 1)
+    counts = [cost.objects for cost in costs]
+    axes = cost_chart("Physics on one core", "discs in a box, N", "microseconds a video and step", counts)
     for name, color in COLORS.items():
-        points = [drawn.place(cost.objects, cost.micros[name]) for cost in costs if name in cost.micros]
-        drawn.line(points, color, 2)
-        for point in points:
-            drawn.dot(point, color)
-    drawn.axes()
-    names = [name for name in COLORS if any(name in cost.micros for cost in costs)]
-    rows = [*((LINES[name], COLORS[name], 2) for name in names), ("pairs that can meet, slope only", FAINT, 1)]
-    drawn.legend(rows, LEFT + 244, dots=True)
-    drawn.save(path, "Physics on one core", "discs in a box, N", "microseconds a video and step")
+        points = [(cost.objects, cost.micros[name]) for cost in costs if name in cost.micros]
+        if points:
+            axes.plot(*zip(*points, strict=True), "o-", color=color, label=LINES[name])
+    guide = [cost.pairs * min(costs[0].micros.values()) / costs[0].pairs for cost in costs]
+    axes.plot(counts, guide, color=FAINT, linewidth=1, label="pairs that can meet, slope only")
+    save(axes, path)

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 import peer
-from charts import FAINT, LEFT, Chart
+from charts import FAINT, cost_chart, save
 from timing import timed
 
 FRAMES = 64  # of a video
@@ -171,26 +171,26 @@ def table_of_annotations(found: Sequence[Annotated]) -> list[str]:
     return lines + [f"{a.name:26} {a.micros:8.2f} {a.added:8.2f} {a.bytes:8,}" for a in found]
 
 
-COLORS = {"gen2d": (153, 68, 17), "opencv": (34, 102, 221)}  # blue, green, red, as cv2 has it
-ENDS = {"gen2d": (0, -16), "opencv": (-1, 16)}  # where a line's number stands: by which point, and how far beside it
+COLORS = {"gen2d": "#114499", "opencv": "#dd6622"}
+ENDS = {
+    "gen2d": (0, "right"),
+    "opencv": (-1, "left"),
+}  # the point by which a line's number of discs stands, and its side
 
 
 def chart(drawings: Sequence[Drawing], path: Path) -> None:
-    """Returns nothing; draws the cost of a frame against its side, both in logarithms, into a PNG file: a line for each
-    number of discs, with the number at its end."""
-    values, sizes = [d.micros[name] for d in drawings for name in COLORS], sorted({d.pixels for d in drawings})
-    made = Chart(sizes[0] / 1.2, sizes[-1] * 1.2, min(values) / 1.5, max(values) * 3)
-    made.grid(sizes)
-    made.line([made.place(size, min(values) * (size / sizes[0]) ** 2) for size in sizes], FAINT, 1)
+    """Write a chart of the cost of a frame against its side as a PNG file, a line for each number of discs."""
+    sizes = sorted({d.pixels for d in drawings})
+    axes = cost_chart("Drawing on one core", "side of the frame, pixels", "microseconds a frame", sizes)
     for name, color in COLORS.items():
-        end, aside = ENDS[name]
+        end, side = ENDS[name]
         for count in sorted({d.objects for d in drawings}):
-            points = [made.place(d.pixels, d.micros[name]) for d in drawings if d.objects == count]
-            made.line(points, color, 2)
-            for point in points:
-                made.dot(point, color)
-            made.text(str(count), (points[end][0] + aside, points[end][1] + 4), align=0.5)
-    made.axes()
-    rows = [(f"{LINES[name]}, N discs", color, 2) for name, color in COLORS.items()]
-    made.legend([*rows, ("pixels, slope only", FAINT, 1)], LEFT + 264, dots=False)
-    made.save(path, "Drawing on one core", "side of the frame, pixels", "microseconds a frame")
+            points = [(d.pixels, d.micros[name]) for d in drawings if d.objects == count]
+            axes.plot(*zip(*points, strict=True), "o-", color=color)
+            offset = (-8 if side == "right" else 8, 0)
+            axes.annotate(str(count), points[end], offset, textcoords="offset points", ha=side, va="center")
+        axes.lines[-1].set_label(f"{LINES[name]}, N discs")
+    least = min(d.micros[name] for d in drawings for name in COLORS)
+    guide = [least * (size / sizes[0]) ** 2 for size in sizes]
+    axes.plot(sizes, guide, color=FAINT, linewidth=1, label="pixels, slope only")
+    save(axes, path)

@@ -3,7 +3,6 @@
 import dataclasses
 
 import pytest
-import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 from tiny import CONFIG, changed
@@ -11,7 +10,7 @@ from tiny import CONFIG, changed
 from gen2d.config import plugins
 from gen2d.config.config import MAX_SEED, load_config
 from gen2d.config.distribution_syntax import parse
-from gen2d.config.reading import parse_yaml
+from gen2d.config.reading import parse_yaml, yaml_text
 from gen2d.core.errors import ConfigError
 
 BAD = {
@@ -43,12 +42,15 @@ BAD = {
     "seed: -1": ("seed is -1", "0 to 2**63 - 1"),
     "seed: 9223372036854775808": ("seed is 9223372036854775808", "0 to 2**63 - 1"),
     "name: a/b": ("name is 'a/b'", "letters"),
-    "video: {frames: 3, frames: 4}": ("frames stands there twice", "line 1"),
+    "video: {frames: 3, frames: 4}": ('duplicate key "frames"', "line 1"),
     "video: {frames: [3": ("not valid YAML", "line"),
     "- 1": ("holds list", "mapping of sections"),
     "a.b": ("holds str", "mapping of sections"),
     "video: 0": ("video is 0", "a mapping"),
-    "{[1, 2]: 3}": ("not valid YAML", "a name must be text"),
+    "{[1, 2]: 3}": ("(1, 2) is not a section",),
+    "annotations: {masks: yes}": ("annotations.masks is 'yes'", "must be true or false"),
+    "video: {frames: !!int 3}": ("not valid YAML", "tags such as !!binary are not allowed"),
+    "video: &v {frames: *v}": ("not valid YAML", "&v contains itself"),
     "video: {frames: 2001-99-99}": ("not valid YAML", "month"),
     "scene: {velocity: [1e40, 0]}": ("scene.velocity is", "number"),
     "scene: {spin: {normal: [0, 1, 6, 7]}}": ("scene.spin is", "within 4 deviations"),
@@ -90,10 +92,24 @@ def test_scientific_notation_is_a_number():
     assert parse_yaml("[1e-3, 1E6, -2e+1, 1.5e3]", "here") == [1e-3, 1e6, -20.0, 1500.0]
 
 
+PLAIN = st.recursive(
+    st.none() | st.booleans() | st.integers(-(2**63), 2**63) | st.floats(allow_nan=False) | st.text(),
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=20), inner, max_size=4),
+    max_leaves=20,
+)
+
+
+@given(st.dictionaries(st.text(), PLAIN | st.sampled_from(["yes", "on", "1e-3", "017", "2001-01-01", "~", "=", "<<"])))
+def test_plain_values_survive_yaml_in_their_order(values):
+    again = parse_yaml(yaml_text(values), "its text")
+    assert again == values
+    assert list(again) == list(values)
+
+
 @pytest.mark.parametrize("name", plugins.config_names())
 def test_a_resolved_config_means_the_same(name):
     config = load_config(name)
-    again = load_config(yaml.safe_load(config.text()))
+    again = load_config(parse_yaml(config.text(), "its text"))
     assert again.plain() == config.plain()
     assert again.sha256() == config.sha256()
 

@@ -12,11 +12,11 @@ import h5py
 import jax
 import numpy as np
 import pytest
-import yaml
 from numpy.testing import assert_allclose, assert_array_equal
 from tiny import CONFIG, CROWDED, changed, command, everything, ran, run_on, same
 
 import gen2d
+from gen2d.config.reading import yaml_text
 from gen2d.core.errors import ConfigError, FolderError, UserError
 from gen2d.generation.run import generate
 from gen2d.programs.rollout import Rollout
@@ -103,7 +103,7 @@ def test_a_video_does_not_depend_on_how_many_are_made_or_how_they_lie(
 
 def test_a_video_does_not_depend_on_the_number_of_devices(tiny: Path, tmp_path: Path):
     config = tmp_path / "tiny.yaml"
-    config.write_text(yaml.safe_dump(CONFIG))
+    config.write_text(yaml_text(CONFIG))
     for devices in {1, 3} - {len(jax.devices())}:  # those of this process made the other
         out = tmp_path / str(devices)
         run_on(devices, f"from gen2d.generation.run import generate; generate({str(config)!r}, {N}, {str(out)!r})")
@@ -168,7 +168,7 @@ def test_another_config_or_seed_is_refused_unless_overwritten(tmp_path: Path):
 
 def test_killed_at_random_moments_it_completes_to_the_same_bits(tiny: Path, tmp_path: Path):
     config, out = tmp_path / "tiny.yaml", tmp_path / "data"
-    config.write_text(yaml.safe_dump(changed(storage={"videos_per_shard": 4})))
+    config.write_text(yaml_text(changed(storage={"videos_per_shard": 4})))
     clean = tmp_path / "clean"
     generate(str(config), 160, clean)
     words, environment = command("--config", config, "--n", 160, "--out", out)
@@ -199,7 +199,7 @@ def test_killed_at_random_moments_it_completes_to_the_same_bits(tiny: Path, tmp_
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_stops_it_and_says_how_to_go_on(tmp_path: Path, number: int):
     config, out = tmp_path / "tiny.yaml", tmp_path / "data"
-    config.write_text(yaml.safe_dump(changed(storage={"videos_per_shard": 4})))
+    config.write_text(yaml_text(changed(storage={"videos_per_shard": 4})))
     arguments = ["--config", config, "--n", 40_000, "--out", out]  # enough for a process that is seldom looked at
     words, environment = command(*arguments)
     process = subprocess.Popen(words, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)

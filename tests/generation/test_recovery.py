@@ -17,10 +17,10 @@ import buckets
 import pytest
 import s3fs
 import tiny
-import yaml
 from synthetic import contents
 
 import gen2d
+from gen2d.config.reading import yaml_text
 from gen2d.dataset.folder import clean
 from gen2d.generation.regenerate import repair
 from gen2d.generation.run import generate
@@ -113,7 +113,7 @@ class Reader(threading.Thread):
 def test_two_hundred_kills_while_a_dataset_grows(tmp_path: Path) -> None:
     """Three workers of the real command, all killed at once or one of them; a reader of the old snapshot goes on."""
     config, out, chance = tmp_path / "tiny.yaml", tmp_path / "data", random.Random(6)
-    config.write_text(yaml.safe_dump(tiny.CONFIG))
+    config.write_text(yaml_text(tiny.CONFIG))
     count, killed, rounds = 24, 0, 0
 
     def workers(n: int) -> list[subprocess.Popen]:

@@ -10,10 +10,10 @@ import jax
 import jax.numpy as jnp
 import pytest
 import synthetic
-import yaml
 from tiny import changed, command
 
 import gen2d
+from gen2d.config.reading import yaml_text
 from gen2d.programs.fingerprint import canonical, code_hash
 
 Edit = Callable[[str, str, str], None]
@@ -36,7 +36,7 @@ def package(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for name in ("gen2d", "renderers", "configs"):
         shutil.copytree(ROOT / name, home / name, symlinks=True, ignore=shutil.ignore_patterns("__pycache__"))
     config = changed(video={"frames": 3}, annotations={"contacts": 4, "captions": True})
-    (home / "tiny.yaml").write_text(yaml.safe_dump(config))
+    (home / "tiny.yaml").write_text(yaml_text(config))
     done = run(home, "--config", "tiny.yaml", "--n", 3, "--out", "data")
     assert done.returncode == 0, done.stderr
     return home

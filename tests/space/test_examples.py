@@ -66,7 +66,7 @@ def opened(path) -> list[np.ndarray]:
     """The frames in a file."""
     if path.suffix == ".png":
         return [np.asarray(cv2.imread(str(path)))[..., ::-1]]
-    if path.suffix == ".gif":
+    if path.suffix == ".webp":
         return [frame[..., 2::-1] for frame in cv2.imreadanimation(str(path))[1].frames]
     film, frames = cv2.VideoCapture(str(path)), []
     while (read := film.read())[0]:
@@ -121,7 +121,7 @@ def test_five_balls_that_overlap(tmp_path):
 def test_five_balls_that_collide(tmp_path):
     space = five_balls(damping=-math.log(0.95) / 0.04)
     video = space.simulate(1.2, fps=25)
-    frames = opened(video.save(tmp_path / "five.gif", view=(-10, -10, 10, 10)))
+    frames = opened(video.save(tmp_path / "five.webp", view=(-10, -10, 10, 10)))
 
     assert len(frames) == 31
     assert frames[0].shape[:2] == (404, 404)  # white around it
@@ -217,7 +217,7 @@ def test_cradle(tmp_path):
         ball = space.add_circle(start, radius, elasticity=1, friction=0)
         space.add_joint("distance", ball, anchor_b=(x, length))
     video = space.simulate(1, fps=60, contacts=0)
-    assert len(opened(video.save(tmp_path / "cradle.gif", size=200))) == 61
+    assert len(opened(video.save(tmp_path / "cradle.webp", size=200))) == 61
 
     speed = math.sqrt(2 * GRAVITY * length * (1 - math.cos(swing)))
     assert_allclose(video.velocity[:, 0, 0].max(), speed, rtol=5e-3)
@@ -239,7 +239,7 @@ def test_box_on_a_ramp(friction, tmp_path):
     space.add_segment(-5 * along, 5 * along, friction=friction)
     box = space.add_box(2 * along + 0.25 * up, 1, 0.5, angle=slope, friction=friction)
     video = space.simulate(2)
-    video.save(tmp_path / "ramp.gif", size=200)
+    video.save(tmp_path / "ramp.webp", size=200)
 
     slid = (video.position[:, box] - video.position[0, box]) @ along
     pull = max(0.0, GRAVITY * (math.sin(slope) - friction * math.cos(slope)))

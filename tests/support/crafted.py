@@ -532,7 +532,7 @@ def a_name_on_the_disk(root: Path, chance: random.Random) -> str:
 def a_picture_that_leads_away(root: Path, chance: random.Random) -> str:
     """Who looks at a preview in the dataset's own folder would write there."""
     (root.parent / "victim").write_bytes(b"precious")
-    for name in ("toy-sheet.png", "toy.gif"):
+    for name in ("toy-sheet.png", "toy.webp"):
         if chance.random() < 0.2:
             os.mkfifo(root / name)
         else:

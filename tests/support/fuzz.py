@@ -5,9 +5,8 @@ import random
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-import yaml
-
 from gen2d.config.plugins import config_folder
+from gen2d.config.reading import parse_yaml
 
 JUNK: list[Any] = [
     None,
@@ -23,6 +22,7 @@ JUNK: list[Any] = [
     1e13,
     -1e300,
     10**30,
+    10**400,
     float("inf"),
     float("nan"),
     0.5,
@@ -108,12 +108,24 @@ TEXTS = [
     "seed: 2020-13-45",
     "seed: 0o17",
     "seed: 1_000",
+    "seed: +_",
+    "seed: " + "1" * 400,
+    "seed: 0x" + "1" * 5000,
+    "scene: {balls: 0x" + "1" * 500 + "}",
     "name: 1",
     "a: &x [&y [1], *y]\n" * 2,
     "x: |\n" + " a\n" * 2000,
     "\ufeffseed: 1",
     "seed: !!binary aGk=",
     "seed: !!set {a, b}",
+    "seed: !!bool x",
+    "seed: !!int ''",
+    "seed: !!omap [a: 1, a: 2]",
+    "!" * 2**20,
+    "%YAML 1.1\n---\nseed: 1e-3",
+    "%YAML 1.3\n---\n",
+    "? &a [*a]\n: 1",
+    "scene: &a {radius: *a}",
     "seed: .nan",
     "a0: &a0 [x]\n" + "".join(f"a{k}: &a{k} [{', '.join([f'*a{k - 1}'] * 9)}]\n" for k in range(1, 30)),
     "splits: {" + ", ".join(f"s{k}: {{videos: 1}}" for k in range(5000)) + "}",
@@ -144,9 +156,9 @@ def places(value: Any, path: tuple = ()) -> Iterator[tuple]:
 def changed_configs(count: int, seed: int) -> Iterator[Any]:
     """Mappings, most of which are no config."""
     chance = random.Random(seed)
-    texts = [path.read_text() for path in sorted(config_folder().glob("*.yaml"))]
+    configs = [parse_yaml(path.read_text(), str(path)) for path in sorted(config_folder().glob("*.yaml"))]
     for _ in range(count):
-        config = yaml.safe_load(chance.choice(texts))
+        config = copy.deepcopy(chance.choice(configs))
         for _ in range(chance.choice([1, 1, 1, 2, 5])):
             change(config, chance)
         yield config
