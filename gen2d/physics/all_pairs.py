@@ -122,7 +122,7 @@ class AllPairs:
         events = past.events
         if events is not None:
             of = zip(events, rows, outs, strict=True)
-            events = [record_event(event, row, last, time, self.setup.one) for event, row, (last, _) in of]
+            events = [record_event(event, row, last, time) for event, row, (last, _) in of]
         now = AllPairsCarry([memory for _, memory in outs], self._seen(past, rows), events)
         return [motion for motion, *_ in groups], [work for *_, work in groups], now
 

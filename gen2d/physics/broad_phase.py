@@ -69,16 +69,16 @@ def round_robin_of(a: np.ndarray, b: np.ndarray) -> RoundRobin:
     return RoundRobin(ring, of_first, pair)
 
 
-def bits_of(near: Array, one: Array) -> Array:
+def bits_of(near: Array) -> Array:
     """Booleans [R, P, n] as bits of words [R, W n]."""
     bit = np.float32(2) ** (np.arange(near.shape[1]) % BITS)[:, None].astype(np.float32)
     marked = jnp.where(near, bit, np.float32(0))
     columns = [marked[:, p] for p in range(near.shape[1])]
     words = [functools.reduce(jnp.add, columns[i : i + BITS]) for i in range(0, len(columns), BITS)]
-    return jnp.concatenate(materialize(words, one), axis=1).astype(jnp.uint32)
+    return jnp.concatenate(materialize(words), axis=1).astype(jnp.uint32)
 
 
-def bits_in_round_robin(centre: Array, reach: Array, ring: RoundRobin, one: Array) -> Array:
+def bits_in_round_robin(centre: Array, reach: Array, ring: RoundRobin) -> Array:
     """The bits of a tournament [R, W n]: which of those with centres [2, N, n] and reaches [N, n] overlap, m."""
     rounds = len(ring.numbers)
     everyone = jnp.concatenate([centre, reach[None]])
@@ -95,7 +95,7 @@ def bits_in_round_robin(centre: Array, reach: Array, ring: RoundRobin, one: Arra
         beside = -t % rounds  # whom it meets, from round 0 on
         meet(t, others[:, t : t + 1], twice[:, beside : beside + rounds], (turns - t) % rounds > t)
     meet(rounds, everyone[:, :1], others[:, ring.of_first], turns >= 0)
-    return jnp.concatenate(materialize(words, one), axis=1).astype(jnp.uint32)
+    return jnp.concatenate(materialize(words), axis=1).astype(jnp.uint32)
 
 
 class ActivePairs(NamedTuple):

@@ -179,24 +179,24 @@ def point(normal: Array, on_a: Array, on_b: Array, a: Shape, b: Shape) -> Point:
     return Point(normal, dot(normal, on_b - on_a) - a.radius - b.radius, middle - a.centre, middle - b.centre)
 
 
-def disc_disc(a: Disc, b: Disc, one: Array | float = 1.0) -> tuple[Point]:
+def disc_disc(a: Disc, b: Disc) -> tuple[Point]:
     """One point; discs with the same centre part upwards."""
     offset = b.centre - a.centre
     up = jnp.stack([jnp.zeros_like(offset[0]), jnp.ones_like(offset[1])])
     return (point(direction(offset, up), a.centre, b.centre, a, b),)
 
 
-def stadium_disc(a: Stadium, b: Disc, one: Array | float = 1.0) -> tuple[Point]:
+def stadium_disc(a: Stadium, b: Disc) -> tuple[Point]:
     """One point; a disc centred on the core line parts across it."""
     along = jnp.clip(dot(b.centre - a.centre, a.direction), -a.half_length, a.half_length)
     nearest = a.centre + along * a.direction
     return (point(direction(b.centre - nearest, turned(a.direction)), nearest, b.centre, a, b),)
 
 
-def hull_disc(a: Hull, b: Disc, one: Array | float = 1.0) -> tuple[Point]:
+def hull_disc(a: Hull, b: Disc) -> tuple[Point]:
     """One point; a disc centred inside parts through the face of least penetration."""
     only = Hull(b.centre, (b.centre,), (b.centre,), b.radius)
-    gap, face = materialize(widest(a, only), one)
+    gap, face = materialize(widest(a, only))
     start, end = facing(a, face)
     tangent = turned(face)
     along = jnp.clip(dot(b.centre - start, tangent), 0.0, dot(end - start, tangent))
@@ -205,13 +205,13 @@ def hull_disc(a: Hull, b: Disc, one: Array | float = 1.0) -> tuple[Point]:
     return (point(normal, nearest, b.centre, a, b),)
 
 
-def hull_hull(a: Hull, b: Hull, one: Array | float = 1.0) -> tuple[Point, Point]:
+def hull_hull(a: Hull, b: Hull) -> tuple[Point, Point]:
     """Two points, in the order of the normal's tangent; the second is FAR where two corners touch."""
-    (gap_a, face_a), (gap_b, face_b) = materialize((widest(a, b), widest(b, a)), one)
+    (gap_a, face_a), (gap_b, face_b) = materialize((widest(a, b), widest(b, a)))
     other = gap_b > gap_a + SLOP
     face = jnp.where(other, -face_b, face_a)
     tangent = turned(face)
-    (low_a, high_a), (high_b, low_b) = materialize((facing(a, face), facing(b, -face)), one)
+    (low_a, high_a), (high_b, low_b) = materialize((facing(a, face), facing(b, -face)))
 
     end_a, end_b, nearest = nearest_ends(low_a, high_a, low_b, high_b)
     # Overlapping hulls may have edges whose nearest points are corners; lines have no inside.
@@ -226,14 +226,14 @@ def hull_hull(a: Hull, b: Hull, one: Array | float = 1.0) -> tuple[Point, Point]
     return first, second._replace(gap=jnp.where(at_corners, FAR, second.gap))
 
 
-def hull_stadium(a: Hull, b: Stadium, one: Array | float = 1.0) -> tuple[Point, Point]:
+def hull_stadium(a: Hull, b: Stadium) -> tuple[Point, Point]:
     """Two points, as `hull_hull`."""
-    return hull_hull(a, core(b), one)
+    return hull_hull(a, core(b))
 
 
-def stadium_stadium(a: Stadium, b: Stadium, one: Array | float = 1.0) -> tuple[Point, Point]:
+def stadium_stadium(a: Stadium, b: Stadium) -> tuple[Point, Point]:
     """Two points, as `hull_hull`."""
-    return hull_hull(core(a), core(b), one)
+    return hull_hull(core(a), core(b))
 
 
 PAIRS: dict[tuple[type, type], Callable[..., tuple[Point, ...]]] = {
@@ -246,10 +246,10 @@ PAIRS: dict[tuple[type, type], Callable[..., tuple[Point, ...]]] = {
 }
 
 
-def touches(a: Shape, b: Shape, one: Array | float = 1.0) -> tuple[Point, ...]:
+def touches(a: Shape, b: Shape) -> tuple[Point, ...]:
     """The points of any pair of shapes. If only (b, a) is in the table, seen from there: the tangent turns round, and
     with it the order."""
     if pair := PAIRS.get((type(a), type(b))):
-        return pair(a, b, one)
-    mirrored = PAIRS[type(b), type(a)](b, a, one)
+        return pair(a, b)
+    mirrored = PAIRS[type(b), type(a)](b, a)
     return tuple(Point(-p.normal, p.gap, p.arm_b, p.arm_a) for p in reversed(mirrored))

@@ -33,9 +33,7 @@ def empty_events(shape: tuple[int, ...], dtype: jnp.dtype) -> ContactEvent:
     return ContactEvent(zero - 1, vector, vector, zero, zero, zero, jnp.zeros(shape, jnp.int32))
 
 
-def record_event(
-    event: ContactEvent, solved: SolvedPair, relaxed: SolvedPair, start: Array, one: Array
-) -> ContactEvent:
+def record_event(event: ContactEvent, solved: SolvedPair, relaxed: SolvedPair, start: Array) -> ContactEvent:
     """The event with one more step, which began at `start`: the row after its biased solve, and after its last one."""
     points = list(zip(solved.touches, solved.impulses, relaxed.impulses, strict=True))
     touching = [(biased.normal > 0) | (last.normal > 0) for _, biased, last in points]
@@ -45,7 +43,7 @@ def record_event(
         second, other = touching[1] & ~on, points[1][0]._replace(grip=None)
         bounced = bounced | (touching[1] & (other.tau >= 0))
         touch, on = jax.tree.map(lambda x, y: jnp.where(second, y, x), touch, other), on | second
-    first = materialize(jnp.where(on & (event.time < 0), 1.0, 0.0), one) > 0.5
+    first = materialize(jnp.where(on & (event.time < 0), 1.0, 0.0)) > 0.5
     assert touch.place is not None, "who keeps events asks for the touches' places"
     news = (start + jnp.maximum(touch.tau, 0.0), touch.place, touch.normal, touch.arrival)
     time, place, normal, approach = (jnp.where(first, new, old) for new, old in zip(news, event[:4], strict=True))

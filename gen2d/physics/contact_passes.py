@@ -34,7 +34,7 @@ from gen2d.xla import materialize
 
 
 def _exchange(
-    row: ContactConstraint, was: SolvedPair, press: Callable, a: Motion | None, b: Motion, work: Work | None, one: Array
+    row: ContactConstraint, was: SolvedPair, press: Callable, a: Motion | None, b: Motion, work: Work | None
 ) -> tuple[Motion | None, Motion, SolvedPair, Work | None]:
     """Both motions after a row's normal impulses, its friction and what resists its rolling; the row; the work.
 
@@ -45,22 +45,22 @@ def _exchange(
         # What presses two discs gives them no slip, so both impulses can be had at once.
         (at,), (old,) = was.touches, was.impulses
         speed, slip = relative(at.grip, at.normal, a, b)
-        pressed = materialize(press(0, at, speed, old), one)
-        impulse = Impulse(pressed, materialize(friction_impulse(row, at, pressed, slip, old), one))
+        pressed = materialize(press(0, at, speed, old))
+        impulse = Impulse(pressed, materialize(friction_impulse(row, at, pressed, slip, old)))
         more = add_impulses(impulse, old)
         a, b = apply_impulse(row, at, more, a, b)
         return a, b, SolvedPair(was.touches, [impulse], None), dissipated_by_discs(work, row.grip, more, speed, slip)
     pressed, impulses = [], []
     for i, (at, old) in enumerate(zip(was.touches, was.impulses, strict=True)):
         speed, _ = relative(at.grip, at.normal, a, b)
-        pressed.append(materialize(press(i, at, speed, old), one))
+        pressed.append(materialize(press(i, at, speed, old)))
         a, b = apply_impulse(row, at, (pressed[-1] - old.normal, None), a, b)
     for at, old, normal in zip(was.touches, was.impulses, pressed, strict=True):
         _, slip = relative(at.grip, at.normal, a, b)
-        impulses.append(Impulse(normal, materialize(friction_impulse(row, at, normal, slip, old), one)))
+        impulses.append(Impulse(normal, materialize(friction_impulse(row, at, normal, slip, old))))
         a, b = apply_impulse(row, at, (None, impulses[-1].tangent - old.tangent), a, b)
     if roll is not None:
-        roll = materialize(rolling_impulse(row, sum(pressed[1:], pressed[0]), a, b, roll), one)
+        roll = materialize(rolling_impulse(row, sum(pressed[1:], pressed[0]), a, b, roll))
         a, b = spin_change(row, roll - was.roll, a, b)
     more = [add_impulses(new, old) for new, old in zip(impulses, was.impulses, strict=True)]
     twist = None if roll is None else roll - was.roll
@@ -96,7 +96,7 @@ def warm_start(
         work = dissipated_by_discs(work, row.grip, olds[0], *speeds)
     else:
         work = dissipated(work, row, points, olds, roll, (motion_a, motion_b), (new_a, new_b))
-    new_b = materialize(new_b, setup.one) if row.firm else new_b
+    new_b = materialize(new_b) if row.firm else new_b
     return (shape_a, new_a, fall_a, a[3]), (shape_b, new_b, fall_b, work), points
 
 
@@ -155,12 +155,12 @@ def solve(
         return alone if together is None else jnp.where(together >= 0, old.normal + together, alone)
 
     was = SolvedPair(points, kept_impulses(memory.impulses), memory.roll)
-    new_a, new_b, solved, work = _exchange(row, was, press, motion_a, motion_b, work, setup.one)
+    new_a, new_b, solved, work = _exchange(row, was, press, motion_a, motion_b, work)
     pushes = _pushes(row, points, solved.impulses, drift_a, drift_b, rules)
     drift_b = _drifted(drift_b, points, pushes, motion_b, new_b)
     if row.a is not None and drift_a is not None and new_a is not None:
         drift_a = _drifted(drift_a, points, pushes, motion_a, new_a)
-    new_b, drift_b = materialize((new_b, drift_b), setup.one) if row.firm else (new_b, drift_b)
+    new_b, drift_b = materialize((new_b, drift_b)) if row.firm else (new_b, drift_b)
     return (new_a, drift_a, a[2]), (new_b, drift_b, work), solved
 
 
@@ -197,12 +197,12 @@ def relax(
         again.append(impact_impulse(touch, speed, threshold))
         return relaxed_impulse(row, touch, speed, old, threshold)
 
-    new_a, new_b, now, work = _exchange(row, solved, press, motion_a, motion_b, work, setup.one)
+    new_a, new_b, now, work = _exchange(row, solved, press, motion_a, motion_b, work)
     left = []
     for at, hit, impulse in zip(now.touches, again, now.impulses, strict=True):
         left.append(_left(at, (at.tau >= 0) | hit, impulse))
-    left = materialize(left, setup.one)
-    new_b = materialize(new_b, setup.one) if row.firm else new_b
+    left = materialize(left)
+    new_b = materialize(new_b) if row.firm else new_b
     return (new_a, *a[1:]), (new_b, push_b, work), (now, WarmStart(left, now.roll))
 
 

@@ -63,17 +63,17 @@ def contact_points(
 ) -> list[ContactPoint]:
     if row.grip is not None:
         apart, where = _offset(row, a, b)
-        apart, inverse, where = materialize((apart, inverse_length(apart), where), setup.one)
+        apart, inverse, where = materialize((apart, inverse_length(apart), where))
         gap, flat = 1 / inverse - a.radius - b.radius, None
         if where is not None:
             gap, flat = jnp.where(where == ELSEWHERE, FAR, gap), where == MIDDLE
         place = b.centre if setup.contacts else None
         normal, core = apart * inverse, CoreOffset(apart, a.radius + b.radius, flat)
         return [ContactPoint(row.grip, normal, gap, pressed[0], fall, place, core)]
-    points = materialize(touches(a, b, setup.one), setup.one)
+    points = materialize(touches(a, b))
     places = [b.centre + p.arm_b if setup.contacts else None for p in points]
     return [
-        ContactPoint(materialize(frame_at(row, p), setup.one), p.normal, p.gap, last, fall, place)
+        ContactPoint(materialize(frame_at(row, p)), p.normal, p.gap, last, fall, place)
         for p, last, place in zip(points, pressed, places, strict=True)
     ]
 
@@ -102,9 +102,9 @@ def impact_of(
     grip, normal = at.grip, at.normal
     if at.core is None:
         path, approach = _to_plane(at, shift, approach, pull)
-        tau = materialize(time_of_impact(path, approach, h, threshold), setup.one)
+        tau = materialize(time_of_impact(path, approach, h, threshold))
     else:
-        tau, normal = _met_round(at, at.core, course, approach, pull, setup.one, h)
+        tau, normal = _met_round(at, at.core, course, approach, pull, h)
         speed, pull = _closing(at, normal, motion_a, motion_b)
         grip = _levered(row, at, tau)
     arrived = approach_speed(speed, pull, tau, h)
@@ -128,7 +128,7 @@ def _to_plane(at: ContactPoint, shift: Array, approach: Array, pull: Array | flo
 
 
 def _met_round(
-    at: ContactPoint, core: CoreOffset, course: Approach, approach: Array, pull: Array | float, one: Array, h: float
+    at: ContactPoint, core: CoreOffset, course: Approach, approach: Array, pull: Array | float, h: float
 ) -> tuple[Array, Array]:
     """Time of impact, and normal, of two round shapes, or of a disc and a core line."""
     plane = None if core.flat is None else (core.flat, *_to_plane(at, course.shift, approach, pull))
@@ -144,9 +144,9 @@ def _met_round(
     tau = time_of_impact(path, approach, h, course.threshold)
     # Two round shapes meet in the normal of that time, at which their distance is what both radii make.
     scale = jnp.where((tau >= 0) & (gap > 0), 1 / jnp.maximum(core.reach, SLOWEST), inverse)
-    tau, scale = materialize((tau, scale), one)
+    tau, scale = materialize((tau, scale))
     met = jnp.where(tau >= 0, (apart + jnp.maximum(tau, 0.0) * mean) * scale, at.normal)
-    return tau, materialize(met, one) if core.flat is None else jnp.where(core.flat, at.normal, met)
+    return tau, materialize(met) if core.flat is None else jnp.where(core.flat, at.normal, met)
 
 
 def bounce_threshold(

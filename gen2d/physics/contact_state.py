@@ -11,7 +11,6 @@ class PassSetup(NamedTuple):
 
     gravity: Array  # [2, 1, ...] m/s^2
     threshold: Array  # [...] m/s: slower impacts do not bounce
-    one: Array  # see settled()
     contacts: bool  # whether touches shall say where they are
 
 

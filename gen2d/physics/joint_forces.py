@@ -113,10 +113,10 @@ def direction_of(apart: Array) -> tuple[Array, Array]:
     return jnp.where(squared > SHORTEST**2, apart / length, 0.0), jnp.where(squared > SHORTEST**2, length, 0.0)
 
 
-def anchors_of(a: JointSide, b: JointSide, places: Any, one: Array | float) -> tuple[Array, Array, Array]:
+def anchors_of(a: JointSide, b: JointSide, places: Any) -> tuple[Array, Array, Array]:
     """Both arms, and how far the anchors are apart, m [2, P, ...]; of a table of positions and angles."""
     (place_a, angle_a), (place_b, angle_b) = (joint_lines(places, end.lines) for end in (a, b))
-    arm_a, arm_b = materialize((rotated(a.anchor, angle_a), rotated(b.anchor, angle_b)), one)
+    arm_a, arm_b = materialize((rotated(a.anchor, angle_a), rotated(b.anchor, angle_b)))
     return arm_a, arm_b, place_b + arm_b - place_a - arm_a
 
 
@@ -144,7 +144,7 @@ def _total(x: Array) -> Array:
 
 
 def warm_start(
-    ties: list[JointBatch], bodies: list[Any], fixed: list[Any], motions: list[Motion], memory: list[tuple], one: Array
+    ties: list[JointBatch], bodies: list[Any], fixed: list[Any], motions: list[Motion], memory: list[tuple]
 ) -> tuple:
     """Every round as it stands, the motions with its last impulses, and the work done."""
     if not ties:
@@ -154,10 +154,10 @@ def warm_start(
     for tied, impulses in zip(ties, memory, strict=True):
         angle_a, angle_b = (joint_lines(places[1], end.lines) for end in (tied.a, tied.b))
         angle = angle_b - angle_a - tied.rest
-        joint = JointState(tied, *anchors_of(tied.a, tied.b, places, one), angle, impulses)
+        joint = JointState(tied, *anchors_of(tied.a, tied.b, places), angle, impulses)
         held.append(joint)
         if tied.kind != "distance":
-            book = _Turns(joint, now, one)
+            book = _Turns(joint, now)
             book.apply(impulses[0] - impulses[1])
             book.apply(impulses[2], motor=True)
             now = _with(now, joint, book.a, book.b)
@@ -172,7 +172,6 @@ def solve(
     falls: list[Array],
     fixed: list[Any],
     rules: SolverParams,
-    one: Array,
     biased: bool,
 ) -> tuple:
     """Every round after a pass, motions and ways (what a body goes beyond its velocity), and the work done."""
@@ -184,12 +183,12 @@ def solve(
     done, works = [], []
     for joint in held:
         if joint.tied.kind != "distance":
-            book = _Turns(joint, now, one)
+            book = _Turns(joint, now)
             joint = joint._replace(impulses=_turn(joint, book, rules, biased))
             now = _with(now, joint, book.a, book.b)
             works.append(book.work)
         elif biased:
-            now, way, work = _spring(joint, now, way, fall, rules.step, one)
+            now, way, work = _spring(joint, now, way, fall, rules.step)
             works.append(work)
         done.append(joint)
     return done, groups_of(now, motions), groups_of(way, ways), works
@@ -202,8 +201,8 @@ class _Turns:
     compile two hinges.
     """
 
-    def __init__(self, held: JointState, motions: Motion, one: Array) -> None:
-        self.held, self.one = held, one
+    def __init__(self, held: JointState, motions: Motion) -> None:
+        self.held = held
         self.a, self.b = joint_lines(motions, held.tied.a.lines), joint_lines(motions, held.tied.b.lines)
         self._lost, self._driven = jnp.zeros_like(held.angle), jnp.zeros_like(held.angle)
 
@@ -220,12 +219,12 @@ class _Turns:
     def apply(self, twist: Array, motor: bool = False) -> None:
         """Applies an angular impulse on b and its reaction on a; books their work."""
         tied, before = self.held.tied, self.speed
-        twist, before = materialize((twist, before), self.one)
+        twist, before = materialize((twist, before))
         spins = (
             self.a.spin - tied.a.inertia.moment * twist,
             self.b.spin + tied.b.inertia.moment * twist,
         )
-        spin_a, spin_b = materialize(spins, self.one)
+        spin_a, spin_b = materialize(spins)
         self.a, self.b = self.a._replace(spin=spin_a), self.b._replace(spin=spin_b)
         gained = 0.5 * twist * (before + self.speed)
         if motor:
@@ -258,9 +257,7 @@ def _turn(joint: JointState, book: _Turns, rules: SolverParams, biased: bool) ->
     return *news, new_motor
 
 
-def _spring(
-    joint: JointState, now: Motion, way: Motion, fall: Array, h: float, one: Array
-) -> tuple[Motion, Motion, Work]:
+def _spring(joint: JointState, now: Motion, way: Motion, fall: Array, h: float) -> tuple[Motion, Motion, Work]:
     """Motions and ways with an impulse at half of the step, and the work that it took from the motion.
 
     What the spring holds of that is taken off when the books are closed.
@@ -280,7 +277,7 @@ def _spring(
     speed = closing(olds)
     stretch = length - tied.rest + 0.5 * h * speed
     pushed = -h * (k * stretch + c * speed) / (1 + inverse * h * (0.25 * h * k + 0.5 * c))
-    pushed, axis = materialize((pushed, axis), one)
+    pushed, axis = materialize((pushed, axis))
     push = pushed * axis
     news = [_pushed(end, arm, old, sign * push) for (end, arm, sign), old in zip(ends, olds, strict=True)]
     lost = -0.5 * pushed * (speed + closing(news))
@@ -305,7 +302,7 @@ def springs_energy(ties: list[JointBatch], bodies: list[Any], fixed: list[Any]) 
         return 0.0
     places, energy = table_of(*([(body.position, body.angle) for body in some] for some in (bodies, fixed))), 0.0
     for tied in soft:
-        length = direction_of(anchors_of(tied.a, tied.b, places, 1.0)[2])[1]
+        length = direction_of(anchors_of(tied.a, tied.b, places)[2])[1]
         stiffness = jnp.where(tied.there & jnp.isfinite(tied.stiffness), tied.stiffness, 0.0)
         energy = energy + jnp.sum(0.5 * stiffness * (length - tied.rest) ** 2, axis=-2)
     return energy

@@ -232,22 +232,22 @@ class NearbyPairs:
 
     def _bits(self, kind: PairBatch, bodies: list[tuple], walls: list[tuple], half: Array) -> Array:
         """A bit for each row that is near, in words [R, W n]."""
-        (centre, reach), one = bodies[kind.second], self.setup.one
+        centre, reach = bodies[kind.second]
         if kind.first is None:
             here = [jnp.where(post.present, 0.0, jnp.nan) for post in kind.posts.values()]
             gaps = [
                 signed_distance(walls[i][0], centre) - reach - half + x for i, x in zip(kind.posts, here, strict=True)
             ]
-            return bits_of(jnp.stack(materialize(gaps, one)) < 0, one)
+            return bits_of(jnp.stack(materialize(gaps)) < 0)
         if kind.ring is not None:
-            return bits_in_round_robin(centre, reach, kind.ring, one)
+            return bits_in_round_robin(centre, reach, kind.ring)
 
         def play(_: int, a: tuple, b: tuple) -> tuple[tuple, tuple, Array]:
             apart, both = b[0] - a[0], a[1] + b[1]
-            return a, b, materialize(dot(apart, apart) - both * both, one)
+            return a, b, materialize(dot(apart, apart) - both * both)
 
         *_, gaps = bipartite_rounds(bodies[kind.first], (centre, reach), play)
-        return bits_of(jnp.stack(gaps) < 0, one)
+        return bits_of(jnp.stack(gaps) < 0)
 
     def _place(self, kind: PairBatch, spot: RowLookup, pair: np.ndarray) -> GatherIndices:
         """Where rows are; `pair` [R, bits] says which pair of a round a bit stands for."""
@@ -306,7 +306,7 @@ class NearbyPairs:
         `play(i, k, place, a, b, carried)` gives both sides of the rows of chunk k of kind i, and what is carried on.
         What carries None is not known yet: its first chunk is played once, to see what it looks like.
         """
-        one, carries = self.setup.one, list(carries)
+        carries = list(carries)
         tables = [self._table(group, self._size(g)) for g, group in enumerate(groups)]
         for i, kind in enumerate(self.kinds):
             fixed = self._fixed([walls[j] for j in kind.posts]) if kind.first is None else None
@@ -320,8 +320,8 @@ class NearbyPairs:
                 a = now[kind.first].at(place.a) if fixed is None else fixed.at(place.a)
                 a, b, carried = play(i, k, place, a, now[kind.second].at(place.b), carried)
                 if fixed is None:
-                    now[kind.first] = now[kind.first].put(place.a, a, one)
-                now[kind.second] = now[kind.second].put(place.b, b, one)
+                    now[kind.first] = now[kind.first].put(place.a, a)
+                now[kind.second] = now[kind.second].put(place.b, b)
                 return {g: x.lines for g, x in now.items()}, carried
 
             start = {g: tables[g].lines for g in kind.groups}, carries[i]
@@ -337,7 +337,7 @@ class NearbyPairs:
         """The room with a chunk's values; new room if there is none."""
         if room is None:
             return jnp.zeros((self._room(kind), len(values), self.chunk), self._dtype)
-        return room.at[k].set(materialize(jnp.stack(values), self.setup.one), mode=SAFE)
+        return room.at[k].set(materialize(jnp.stack(values)), mode=SAFE)
 
     def warm(
         self, past: NearbyCarry, bodies: list[tuple], walls: list[tuple], motions: list[Motion], works: list
@@ -419,7 +419,7 @@ class NearbyPairs:
         time: Array,
     ) -> tuple[list[Motion], list, NearbyCarry]:
         """Motions and works after the relaxing pass, and what all rows hand on; the step began at `time`."""
-        found, one = rows.found, self.setup.one
+        found = rows.found
         specs = [self._spec(kind) for kind in self.kinds]
 
         def play(i: int, k: Array, place: GatherIndices, a: Any, b: Any, carried: tuple) -> tuple:
@@ -429,12 +429,12 @@ class NearbyPairs:
             a, b, (last, memory) = contact_passes.relax(row, solved, a, b, setup)
             new = CachedConstraint(memory, jnp.full(self.chunk, past.step, self._dtype), None, None)
             if self.setup.contacts:
-                event = record_event(self._event(past, lines.at(place.row)), solved, last, time, one)
+                event = record_event(self._event(past, lines.at(place.row)), solved, last, time)
                 new = new._replace(event=event, elasticity=row.elasticity)
                 mark = 2 * past.step + jnp.where((event.flags & ON) > 0, 1, 0)
                 old = marks.at[place.row].get(mode=SAFE)
                 marks = marks.at[place.row].set(jnp.where(contact_passes.touching(solved, last), mark, old), mode=SAFE)
-            return a, b, (lines.put(place.row, new, one).lines, marks)
+            return a, b, (lines.put(place.row, new).lines, marks)
 
         groups = [(motion, drift.push, work) for motion, drift, work in zip(motions, drifts, works, strict=True)]
         marks = past.marks or [jnp.zeros(0, jnp.int32)] * len(self.kinds)
@@ -473,7 +473,7 @@ class NearbyPairs:
         written, contact_rows = past.written, past.contact_rows
         for kind, lines, marks in zip(self.kinds, past.lines, past.marks, strict=True):
             recent = marks[:-1].reshape(*kind.a.shape, self._lanes) >= 2 * past.first - 1
-            words = bits_of(recent, self.setup.one)
+            words = bits_of(recent)
             written = self._tell(past, kind, PackedTable(lines, self._spec(kind)), words, written, contact_rows)
             contact_rows = contact_rows.at[:-1].add(
                 jnp.sum(count_active(words).reshape(-1, self._lanes), axis=0, dtype=jnp.int32)
@@ -484,7 +484,7 @@ class NearbyPairs:
         self, past: NearbyCarry, kind: PairBatch, lines: PackedTable, words: Array, written: Array, contact_rows: Array
     ) -> Array:
         """What is written, and the rows of a kind with a bit in words [R, W n]; `contact_rows` have been before."""
-        n, one, rows = self._lanes, self.setup.one, active_pairs(words, self.chunk)
+        n, rows = self._lanes, active_pairs(words, self.chunk)
         counts = count_active(words).reshape(-1, n)
         before = contact_rows[:-1] + jnp.cumsum(counts, axis=0, dtype=jnp.int32) - counts  # by round and word
         spec = pack(_empty_contact_rows(self._dtype), (1,), self._dtype)[1]
@@ -506,7 +506,7 @@ class NearbyPairs:
             where = jnp.where(spot.there & (rank < room), rank * n + place.lane, room * n)
             row = jnp.minimum(place.row // n, kind.a.size - 1)
             a, b = (x.at[row].get(mode=SAFE) for x in slots)
-            return PackedTable(written, spec).put(where, ContactRow(new, jnp.full_like(a, number), a, b), one).lines
+            return PackedTable(written, spec).put(where, ContactRow(new, jnp.full_like(a, number), a, b)).lines
 
         return jax.lax.fori_loop(0, rows.starts[-1], chunk, written)
 

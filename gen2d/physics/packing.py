@@ -73,12 +73,12 @@ class PackedTable(NamedTuple):
         """The tree with leaves [..., C] of some lines."""
         return unpack(list(self.lines.at[where].get(mode=SAFE).T), self.spec)
 
-    def put(self, where: Array, tree: Any, one: Array) -> "PackedTable":
+    def put(self, where: Array, tree: Any) -> "PackedTable":
         """The table with other lines there; two may be the same only if they are the last."""
         found, _ = pack(tree, where.shape, self.lines.dtype)
         if not found:
             return self
-        return self._replace(lines=self.lines.at[where].set(materialize(jnp.stack(found), one).T, mode=SAFE))
+        return self._replace(lines=self.lines.at[where].set(materialize(jnp.stack(found)).T, mode=SAFE))
 
     def whole(self, shape: tuple[int, ...]) -> Any:
         """The tree with leaves [..., *shape] of all lines but the last."""

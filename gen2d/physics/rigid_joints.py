@@ -141,7 +141,7 @@ def _apart(linkage: JointSystem, rows: JointRows, apart: Array) -> Array:
     return jnp.where((plan.way == ALONG)[:, None], joint_lines(length, plan.joint), beside)
 
 
-def _rows(linkage: JointSystem, stance: Anchors, one: Array) -> JointRows:
+def _rows(linkage: JointSystem, stance: Anchors) -> JointRows:
     plan, dtype = linkage.plan, linkage.rest.dtype
     direction = jnp.asarray(np.stack([plan.way == X, plan.way == Y])[..., None], dtype)
     direction = jnp.broadcast_to(direction, (*direction.shape[:2], *linkage.rest.shape[1:]))
@@ -156,17 +156,17 @@ def _rows(linkage: JointSystem, stance: Anchors, one: Array) -> JointRows:
         )
         direction = jnp.where((plan.way == ACROSS)[:, None], turned(direction_of(between)[0]), direction)
     lever_a, lever_b = (dot(turned(joint_lines(arm, plan.joint)), direction) for arm in (stance.arm_a, stance.arm_b))
-    return materialize(JointRows(direction, (lever_a, lever_b)), one)
+    return materialize(JointRows(direction, (lever_a, lever_b)))
 
 
-def _pushed(linkage: JointSystem, rows: JointRows, table: Motion, impulses: Array, one: Array) -> Motion:
+def _pushed(linkage: JointSystem, rows: JointRows, table: Motion, impulses: Array) -> Motion:
     """The motions after the rows' impulses."""
     push, (lever_a, lever_b) = impulses * rows.direction, rows.levers
     parts = Motion(
         jnp.concatenate([-push, push, jnp.zeros_like(push[:, :1])], axis=-2),
         jnp.concatenate([-lever_a * impulses, lever_b * impulses, jnp.zeros_like(impulses[:1])], axis=-2),
     )
-    parts, total = materialize(parts, one), None
+    parts, total = materialize(parts), None
     for places in linkage.plan.pushers():
         part = joint_lines(parts, places)
         total = part if total is None else jax.tree.map(jnp.add, total, part)
@@ -175,7 +175,7 @@ def _pushed(linkage: JointSystem, rows: JointRows, table: Motion, impulses: Arra
     mass, moment = (x[:moving] for x in linkage.inertia)
     more = Motion(mass * total.velocity, moment * total.spin)
     new = jax.tree.map(lambda x, y: jnp.concatenate([x[..., :moving, :] + y, x[..., moving:, :]], axis=-2), table, more)
-    return materialize(new, one)
+    return materialize(new)
 
 
 def _speeds(linkage: JointSystem, rows: JointRows, table: Motion) -> Array:
@@ -187,7 +187,7 @@ def _speeds(linkage: JointSystem, rows: JointRows, table: Motion) -> Array:
     return speeds[1] - speeds[0]
 
 
-def _bands(linkage: JointSystem, rows: JointRows, one: Array) -> list[Array]:
+def _bands(linkage: JointSystem, rows: JointRows) -> list[Array]:
     """The diagonals of J M^-1 J^T, 1/kg [R, ...], from the main one on: the speed along the row so many rows later that
     a unit impulse along this one gives."""
     plan, bands = linkage.plan, []
@@ -208,14 +208,12 @@ def _bands(linkage: JointSystem, rows: JointRows, one: Array) -> list[Array]:
         both = usable & jnp.concatenate([usable[offset:], jnp.zeros_like(usable[:offset])], axis=-2)
         bands[offset] = jnp.where(both, bands[offset], 0.0)
     bands[0] = jnp.where(usable, (1 + COMPLIANCE) * bands[0], jnp.inf)
-    return materialize(bands, one)
+    return materialize(bands)
 
 
-def _exchanged(
-    linkage: JointSystem, rows: JointRows, table: Motion, impulses: Array, one: Array
-) -> tuple[Motion, Work]:
+def _exchanged(linkage: JointSystem, rows: JointRows, table: Motion, impulses: Array) -> tuple[Motion, Work]:
     """The motions after impulses, and the work that these do, J [1, ...]."""
-    new = _pushed(linkage, rows, table, impulses, one)
+    new = _pushed(linkage, rows, table, impulses)
     gained = 0.5 * impulses * (_speeds(linkage, rows, table) + _speeds(linkage, rows, new))
     driven = jnp.zeros_like(gained)
     for end, lever, sign in zip((linkage.a, linkage.b), rows.levers, (-1, 1), strict=True):
@@ -229,13 +227,13 @@ def _exchanged(
 
 
 def warm_start(
-    linkage: JointSystem, bodies: list[Any], fixed: list[Any], motions: list[Motion], impulses: Array, one: Array
+    linkage: JointSystem, bodies: list[Any], fixed: list[Any], motions: list[Motion], impulses: Array
 ) -> tuple[Anchors, list[Motion], Work]:
     """The joints as they stand, the motions with the last step's impulses, and the work done."""
     places = table_of(*([(body.position, body.angle) for body in some] for some in (bodies, fixed)))
-    stance = Anchors(*anchors_of(linkage.a, linkage.b, places, one))
+    stance = Anchors(*anchors_of(linkage.a, linkage.b, places))
     now = table_of(motions, [body.motion for body in fixed])
-    now, work = _exchanged(linkage, _rows(linkage, stance, one), now, impulses, one)
+    now, work = _exchanged(linkage, _rows(linkage, stance), now, impulses)
     return stance, groups_of(now, motions), work
 
 
@@ -247,7 +245,6 @@ def solve(
     fixed: list[Any],
     impulses: Array,
     h: float,
-    one: Array,
 ) -> tuple[list[Motion], Array, Work]:
     """The motions with which the anchors meet after a step of h seconds, the impulses by then, and the work done.
 
@@ -255,13 +252,13 @@ def solve(
     """
     still = [body.motion for body in fixed]
     now, more = table_of(motions, still), table_of(beyond, [jax.tree.map(jnp.zeros_like, m) for m in still])
-    rows, works = _rows(linkage, stance, one), []
+    rows, works = _rows(linkage, stance), []
     early = _apart(linkage, rows, stance.apart)
     undone = early - jnp.clip(early, -h * FASTEST, h * FASTEST)
-    matrix = _Matrix(linkage, rows, one)
+    matrix = _Matrix(linkage, rows)
     for _ in range(NEWTON_ITERATIONS):
         way = jax.tree.map(lambda x, y: h * x + y, now, more)
-        late = _apart(linkage, rows, _gone(linkage, stance, way, one).apart)
+        late = _apart(linkage, rows, _gone(linkage, stance, way).apart)
         impulses, now, work = matrix.closed(now, impulses, (late - undone) / h)
         works.append(work)
     return groups_of(now, motions), impulses, jax.tree.map(lambda *x: sum(x), *works)
@@ -275,23 +272,22 @@ def relax(
     fixed: list[Any],
     impulses: Array,
     h: float,
-    one: Array,
 ) -> tuple[list[Motion], Array, Work]:
     """The motions with which the anchors stay together after the bodies have gone their ways."""
     still = [body.motion for body in fixed]
     now, way = table_of(motions, still), table_of(ways, [jax.tree.map(lambda x: h * x, m) for m in still])
-    rows = _rows(linkage, _gone(linkage, stance, way, one), one)
-    impulses, now, work = _Matrix(linkage, rows, one).closed(now, impulses, _speeds(linkage, rows, now))
+    rows = _rows(linkage, _gone(linkage, stance, way))
+    impulses, now, work = _Matrix(linkage, rows).closed(now, impulses, _speeds(linkage, rows, now))
     return groups_of(now, motions), impulses, work
 
 
-def _gone(linkage: JointSystem, stance: Anchors, ways: Motion, one: Array) -> Anchors:
+def _gone(linkage: JointSystem, stance: Anchors, ways: Motion) -> Anchors:
     """The joints as they stand after the bodies have gone their ways."""
     arms, apart = [], stance.apart
     for lines, arm, sign in zip(linkage.plan.lines, stance[:2], (-1, 1), strict=True):
         way = joint_lines(ways, lines)
         more = jnp.sin(way.spin) * turned(arm) - 2 * jnp.sin(way.spin / 2) ** 2 * arm
-        arms.append(materialize(arm + more, one))
+        arms.append(materialize(arm + more))
         apart = apart + sign * (way.velocity + more)
     return Anchors(arms[0], arms[1], apart)
 
@@ -299,14 +295,14 @@ def _gone(linkage: JointSystem, stance: Anchors, ways: Motion, one: Array) -> An
 class _Matrix:
     """The system of the rows, factored."""
 
-    def __init__(self, linkage: JointSystem, rows: JointRows, one: Array) -> None:
-        bands = _bands(linkage, rows, one)
-        self._of, self._rows, self._one = linkage, rows, one
+    def __init__(self, linkage: JointSystem, rows: JointRows) -> None:
+        bands = _bands(linkage, rows)
+        self._of, self._rows = linkage, rows
         self._give = jnp.where(jnp.isfinite(bands[0]), COMPLIANCE * bands[0], 0.0)
         self._factors = factor(bands)
 
     def closed(self, now: Motion, impulses: Array, speeds: Array) -> tuple[Array, Motion, Work]:
         """The impulses that take these speeds from the rows, the motions with them, and the work done."""
-        wanted = materialize(speeds + self._give * impulses, self._one)
-        more = -materialize(solve_factored(self._factors, wanted), self._one)
-        return impulses + more, *_exchanged(self._of, self._rows, now, more, self._one)
+        wanted = materialize(speeds + self._give * impulses)
+        more = -materialize(solve_factored(self._factors, wanted))
+        return impulses + more, *_exchanged(self._of, self._rows, now, more)

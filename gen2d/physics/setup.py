@@ -325,13 +325,20 @@ def build_model(
     one = 1.0 + jax.lax.stop_gradient(jnp.maximum(-jnp.max(objects.radius), 0.0))  # 1, but the compiler cannot know
     # In a pile at rest, what has to be stopped anew each step is what gravity gave: that must not count as a bounce.
     at_rest = 2 * rules.step * jnp.sqrt(jnp.sum(scene.gravity**2, axis=0))
-    setup = PassSetup(scene.gravity[:, None], jnp.maximum(rules.bounce_threshold, at_rest), one, contacts)
+    setup = PassSetup(scene.gravity[:, None], jnp.maximum(rules.bounce_threshold, at_rest), contacts)
     made = (_sparse if sparse else _dense)(objects, layout, groups, fixed, setup, rules)
     rails = [
         _rail(f, objects.present[s : s + 1]) for f, (r, s) in zip(fixed, standing(layout), strict=True) if r.collides
     ]
     return Model(
-        groups, fixed, [r for r in rails if r is not None], scene.gravity, made, *_ties(scene, layout, groups), forces
+        groups,
+        fixed,
+        [r for r in rails if r is not None],
+        scene.gravity,
+        made,
+        *_ties(scene, layout, groups),
+        forces,
+        one,
     )
 
 

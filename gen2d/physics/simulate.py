@@ -22,6 +22,7 @@ from gen2d.records.axes import Array
 from gen2d.records.layout import Layout
 from gen2d.records.scene import Scene, State
 from gen2d.records.trajectory import Energy, Quality, Trajectory
+from gen2d.xla import runtime_one
 
 MOST_STEPS = 10_000  # a frame
 Forces = Callable[[State, Array], tuple[Array, Array]]
@@ -68,30 +69,31 @@ def simulate(
     scene, state = without_empty(scene, state)
     hook = _hook(scene, state, layout, forces)
     scenery = build_model(scene, state, layout, rules, hook, keep.contacts > 0, sparse)
-    start, contacts = _start(state, layout, scenery, keep, rules), scenery.contacts
+    with runtime_one(scenery.one):
+        start, contacts = _start(state, layout, scenery, keep, rules), scenery.contacts
 
-    if isinstance(contacts, NearbyPairs):
-        after = jax.eval_shape(lambda world: step(world, scenery, rules).contacts, start)
-        start = start._replace(contacts=contacts.with_room(start.contacts, after))
+        if isinstance(contacts, NearbyPairs):
+            after = jax.eval_shape(lambda world: step(world, scenery, rules).contacts, start)
+            start = start._replace(contacts=contacts.with_room(start.contacts, after))
 
-    def frame(world: WorldState, number: Array) -> tuple[WorldState, tuple]:
-        world = world._replace(time=number * (steps * rules.step), contacts=contacts.frame_begins(world.contacts))
-        if keep.between:
-            world, way = jax.lax.scan(lambda now, _: _shown(step(now, scenery, rules)), world, length=steps)
-        else:
-            world, way = jax.lax.fori_loop(0, steps, lambda _, now: step(now, scenery, rules), world), None
-        past, happened = contacts.frame_ends(world.contacts)
-        return world._replace(contacts=past), (_shown(world)[1], way, _sums(world, scenery), happened)
+        def frame(world: WorldState, number: Array) -> tuple[WorldState, tuple]:
+            world = world._replace(time=number * (steps * rules.step), contacts=contacts.frame_begins(world.contacts))
+            if keep.between:
+                world, way = jax.lax.scan(lambda now, _: _shown(step(now, scenery, rules)), world, length=steps)
+            else:
+                world, way = jax.lax.fori_loop(0, steps, lambda _, now: step(now, scenery, rules), world), None
+            past, happened = contacts.frame_ends(world.contacts)
+            return world._replace(contacts=past), (_shown(world)[1], way, _sums(world, scenery), happened)
 
-    numbers = jnp.arange(frames - 1, dtype=state.angle.dtype)
-    last, (bodies, way, sums, happened) = jax.lax.scan(frame, start, numbers)
-    between = None if way is None else _substep_states(state, way, layout, rules.step)
-    states = _states(state, bodies, layout, numbers * (steps * rules.step) + steps * rules.step)
-    first = _sums(start, scenery)
-    energy = None if first is None else _energy(first, sums)
-    residual = None if energy is None else jnp.max(jnp.abs(energy.residual), axis=0)
-    depth, begins, rows = contacts.ended(last.contacts, happened, keep.contacts, 1 / (steps * rules.step))
-    return Trajectory(states, Quality(depth, begins, residual), rows, energy, between)
+        numbers = jnp.arange(frames - 1, dtype=state.angle.dtype)
+        last, (bodies, way, sums, happened) = jax.lax.scan(frame, start, numbers)
+        between = None if way is None else _substep_states(state, way, layout, rules.step)
+        states = _states(state, bodies, layout, numbers * (steps * rules.step) + steps * rules.step)
+        first = _sums(start, scenery)
+        energy = None if first is None else _energy(first, sums)
+        residual = None if energy is None else jnp.max(jnp.abs(energy.residual), axis=0)
+        depth, begins, rows = contacts.ended(last.contacts, happened, keep.contacts, 1 / (steps * rules.step))
+        return Trajectory(states, Quality(depth, begins, residual), rows, energy, between)
 
 
 def _shown(world: WorldState) -> tuple[WorldState, list[BodyState]]:

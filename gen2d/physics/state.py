@@ -68,6 +68,7 @@ class Model(NamedTuple):
     ties: list[joint_forces.JointBatch]
     linkage: rigid_joints.JointSystem | None
     forces: Callable | None  # (bodies, time) -> for each group force [2, N, ...] N and torque [N, ...] N m
+    one: Array  # see `xla.runtime_one`
 
 
 class WorldState(NamedTuple):

@@ -82,11 +82,11 @@ def _warmth(warmed: Motion, before: Motion) -> Array:
     return x + y
 
 
-def _arrived(body: BodyState, way: Motion, one: Array) -> tuple[tuple[Array, Array], Motion]:
+def _arrived(body: BodyState, way: Motion) -> tuple[tuple[Array, Array], Motion]:
     """Position and angle after a way, and what rounding keeps back of it for the next one (W. Kahan, 1965)."""
     assert body.rest is not None
     old, add = Motion(body.position, body.angle), jax.tree.map(jnp.add, way, body.rest)
-    new = materialize(jax.tree.map(jnp.add, old, add), one)
+    new = materialize(jax.tree.map(jnp.add, old, add))
     gone = jax.tree.map(lambda n, o, d: jax.lax.stop_gradient(d - (n - o)), new, old, add)
     return (new.velocity, new.spin), gone
 
@@ -95,9 +95,9 @@ class _Rigid:
     """The linkage in a step: its impulses so far and their work; nothing where there is none."""
 
     def __init__(
-        self, linked: rigid_joints.JointSystem | None, world: WorldState, fixed: list[BodyState], h: float, one: Array
+        self, linked: rigid_joints.JointSystem | None, world: WorldState, fixed: list[BodyState], h: float
     ) -> None:
-        self._of, self._world, self._fixed, self._h, self._one = linked, world, fixed, h, one
+        self._of, self._world, self._fixed, self._h = linked, world, fixed, h
         self.pushes, self.works = world.pushes, []
 
     def warm(self, motions: list[Motion]) -> list[Motion]:
@@ -105,9 +105,7 @@ class _Rigid:
         if self._of is None or self.pushes is None:
             return motions
         bodies = self._world.bodies
-        self._stance, motions, work = rigid_joints.warm_start(
-            self._of, bodies, self._fixed, motions, self.pushes, self._one
-        )
+        self._stance, motions, work = rigid_joints.warm_start(self._of, bodies, self._fixed, motions, self.pushes)
         self.works.append(work)
         return motions
 
@@ -122,7 +120,7 @@ class _Rigid:
     def _after(self, play: Callable, motions: list[Motion], ways: list[Motion]) -> list[Motion]:
         if self._of is None:
             return motions
-        of = self._of, self._stance, motions, ways, self._fixed, self.pushes, self._h, self._one
+        of = self._of, self._stance, motions, ways, self._fixed, self.pushes, self._h
         motions, self.pushes, work = play(*of)
         self.works.append(work)
         return motions
@@ -131,15 +129,14 @@ class _Rigid:
 def step(world: WorldState, scenery: Model, rules: SolverParams) -> WorldState:
     """The world one step later."""
     h, groups, contacts, past = rules.step, scenery.groups, scenery.contacts, world.contacts
-    one = contacts.setup.one
     falls, spin_ups = _accelerations(world, scenery)
     turns = spin_ups or [0.0] * len(groups)
     free = [_free(*of, rules) for of in zip(world.bodies, falls, turns, strict=True)]
-    flying, more = materialize([motion for motion, _ in free], one), [way for _, way in free]
+    flying, more = materialize([motion for motion, _ in free]), [way for _, way in free]
     fixed = [BodyState(*body.at(world.time), body.still) for body in scenery.fixed]
 
-    held, motions, tied = joint_forces.warm_start(scenery.ties, world.bodies, fixed, flying, world.ties, one)
-    rigid = _Rigid(scenery.linkage, world, fixed, h, one)
+    held, motions, tied = joint_forces.warm_start(scenery.ties, world.bodies, fixed, flying, world.ties)
+    rigid = _Rigid(scenery.linkage, world, fixed, h)
     joined = rigid.warm(motions)
     shapes = [to_world(g.form, b.position, b.angle) for g, b in zip(groups, world.bodies, strict=True)]
     walls = [(f.shape_at(b), f.motion) for f, b in zip(scenery.fixed, fixed, strict=True)]
@@ -151,7 +148,7 @@ def step(world: WorldState, scenery: Model, rules: SolverParams) -> WorldState:
     pushes = [_warmth(*of) for of in zip(motions, joined, strict=True)]
 
     ways = [Motion(*(jnp.zeros_like(x) for x in m)) for m in motions]
-    held, motions, ways, tied_more = joint_forces.solve(held, motions, ways, falls, fixed, rules, one, biased=True)
+    held, motions, ways, tied_more = joint_forces.solve(held, motions, ways, falls, fixed, rules, biased=True)
     drifts = [Displacement(way, push) for way, push in zip(ways, pushes, strict=True)]
     motions, drifts, works, rows = contacts.solve(past, found, walls, motions, drifts, works)
     beyond = [_beyond(*of) for of in zip(drifts, more, strict=True)]
@@ -161,9 +158,9 @@ def step(world: WorldState, scenery: Model, rules: SolverParams) -> WorldState:
     ways = clamp_displacement(
         ways, [s if g.collides else None for s, g in zip(shapes, groups, strict=True)], scenery.rails
     )
-    places = [_arrived(b, way, one) for b, way in zip(world.bodies, ways, strict=True)]
+    places = [_arrived(b, way) for b, way in zip(world.bodies, ways, strict=True)]
 
-    held, motions, _, tied_last = joint_forces.solve(held, motions, ways, falls, fixed, rules, one, biased=False)
+    held, motions, _, tied_last = joint_forces.solve(held, motions, ways, falls, fixed, rules, biased=False)
     motions, works, past = contacts.relax(past, rows, walls, motions, drifts, works, world.time)
     motions = rigid.relax(motions, ways)
     if book is not None:
