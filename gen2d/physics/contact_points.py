@@ -126,8 +126,8 @@ def impact_of(
 
 def _closing(point: ContactPoint, normal: Array, a: Motion | None, b: Motion) -> tuple[Array, Array | float]:
     """Speed of b relative to a along a normal, m/s, and acceleration of b towards a, m/s^2."""
-    pull = 0.0 if point.acceleration is None else -dot(normal, point.acceleration)
-    return relative_speed(point.frame, normal, a, b)[0], pull
+    speed, _ = relative_speed(point.frame, normal, a, b)
+    return speed, 0.0 if point.acceleration is None else -dot(normal, point.acceleration)
 
 
 def _plane_approach(
