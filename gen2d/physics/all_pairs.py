@@ -85,11 +85,7 @@ class AllPairs(ContactSolver):
         return run_schedule(sides, statics, self.order, play)
 
     def solve(
-        self,
-        carry: AllPairsCarry,
-        contacts: list[list[ContactPoint]],
-        sides: list[BodySide],
-        statics: list[BodySide],
+        self, carry: AllPairsCarry, contacts: list[list[ContactPoint]], sides: list[BodySide], statics: list[BodySide]
     ) -> tuple[list[BodySide], list[SolvedPair]]:
         def play(k: int, a: BodySide, b: BodySide) -> tuple[BodySide, BodySide, SolvedPair]:
             warm = carry.warm[k]

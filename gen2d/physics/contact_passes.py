@@ -102,7 +102,6 @@ MIN_PUSH = 1e-9  # m/s: marks a contact that holds its bodies without pushing th
 def _push(constraint: ContactConstraint, solved: SolvedPair, a: BodySide, b: BodySide, params: SolverParams) -> Array:
     """Bound on the speed, m/s, that the contact adds to its bodies or passes on between them; 0 without a resting
     contact."""
-    assert b.push is not None, "the biased pass needs pushes"
     rate, *_ = softness(constraint, params)
     largest = b.push if a.push is None else jnp.maximum(a.push, b.push)
     push = jnp.zeros_like(largest)
@@ -117,10 +116,9 @@ def _drifted(old: BodySide, new: BodySide, contacts: list[ActiveContact], push: 
 
     If two points bounce in the same step, the mean of their times counts.
     """
-    assert old.motion is not None, "only moving bodies drift"
-    assert new.motion is not None, "only moving bodies drift"
-    assert old.drift is not None, "only moving bodies drift"
-    assert old.push is not None, "only moving bodies drift"
+    assert old.motion, "only moving bodies drift"
+    assert new.motion, "only moving bodies drift"
+    assert old.drift, "only moving bodies drift"
     tau = jnp.maximum(contacts[0].tau, 0.0)
     if len(contacts) == 2:
         second = jnp.maximum(contacts[1].tau, 0.0)
@@ -190,7 +188,7 @@ def relax(
 
     def normal_impulse(_: int, contact: ActiveContact, speed: Array, old: Impulse) -> Array:
         resting = jnp.where(contact.tau < 0, old.normal, 0.0)
-        threshold = bounce_threshold(contact, resting, a.push, b.push, setup)
+        threshold = bounce_threshold(contact, resting, a, b, setup)
         bounced.append(bounces_again(contact, speed, threshold))
         return relaxed_impulse(constraint, contact, speed, old, threshold)
 

@@ -1,6 +1,6 @@
 """Contact points of a pair, with their impact in this step."""
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax.numpy as jnp
 
@@ -83,15 +83,6 @@ def contact_points(
     ]
 
 
-class Approach(NamedTuple):
-    """Relative path of the two bodies of a pair in this step."""
-
-    a: Motion | None
-    b: Motion
-    shift: Array  # [2, ...] m: shift of b's path relative to a's by earlier impacts in this step
-    threshold: Array  # m/s: slower impacts do not bounce
-
-
 def impact_of(
     constraint: ContactConstraint, point: ContactPoint, a: BodySide, b: BodySide, setup: PassSetup, h: float
 ) -> ActiveContact:
@@ -99,19 +90,17 @@ def impact_of(
 
     Earlier impacts in this step have shifted the bodies' paths; the impact is computed on the shifted paths.
     """
-    assert b.motion is not None, "only static bodies lack a motion"
-    assert b.drift is not None, "only static bodies lack a drift"
-    assert b.push is not None, "only static bodies lack a push"
+    assert b.motion, "only static bodies lack a motion"
+    assert b.drift, "only static bodies lack a drift"
     speed, pull = _closing(point, point.normal, a.motion, b.motion)
     shift = b.drift.velocity if a.drift is None else b.drift.velocity - a.drift.velocity
-    threshold = bounce_threshold(point, point.last_normal, a.push, b.push, setup)
-    path, approach = Approach(a.motion, b.motion, shift, threshold), -speed - pull * h
-    frame, normal = point.frame, point.normal
+    threshold = bounce_threshold(point, point.last_normal, a, b, setup)
+    approach, frame, normal = -speed - pull * h, point.frame, point.normal
     if point.core is None:
-        to_plane, approach = _plane_approach(point, shift, approach, pull)
-        tau = materialize(time_of_impact(to_plane, approach, h, threshold))
+        path, approach = _plane_approach(point, shift, approach, pull)
+        tau = materialize(time_of_impact(path, approach, h, threshold))
     else:
-        tau, normal = _round_impact(point, point.core, path, approach, pull, h)
+        tau, normal = _round_impact(point, point.core, a.motion, b.motion, shift, approach, pull, threshold, h)
         speed, pull = _closing(point, normal, a.motion, b.motion)
         frame = _frame_of_discs(constraint, point, tau)
     arrival = approach_speed(speed, pull, tau, h)
@@ -139,20 +128,28 @@ def _plane_approach(
 
 
 def _round_impact(
-    point: ContactPoint, core: CoreOffset, bodies: Approach, approach: Array, pull: Array | float, h: float
+    point: ContactPoint,
+    core: CoreOffset,
+    a: Motion | None,
+    b: Motion,
+    shift: Array,
+    approach: Array,
+    pull: Array | float,
+    threshold: Array,
+    h: float,
 ) -> tuple[Array, Array]:
     """Time of impact and normal of two round shapes, or of a disc and a core line."""
-    plane = None if core.flat is None else (core.flat, *_plane_approach(point, bodies.shift, approach, pull))
-    velocity = bodies.b.velocity if bodies.a is None else bodies.b.velocity - bodies.a.velocity
+    plane = None if core.flat is None else (core.flat, *_plane_approach(point, shift, approach, pull))
+    velocity = b.velocity if a is None else b.velocity - a.velocity
     mean = velocity if point.acceleration is None else velocity - 0.5 * h * point.acceleration
-    offset = core.offset + bodies.shift
+    offset = core.offset + shift
     inverse = inverse_length(offset)
     gap = jnp.maximum(1 / inverse - core.reach, 0.0)
     path = round_path(offset, gap, core.reach, mean)
     if plane is not None:  # a contact that belongs to a neighbouring segment has no impact
         flat, straight, approach = plane
         path = select(flat, straight, path._replace(c=jnp.where(point.gap < FAR / 2, path.c, FAR**2)))
-    tau = time_of_impact(path, approach, h, bodies.threshold)
+    tau = time_of_impact(path, approach, h, threshold)
     # The normal is that at the time of impact, when the distance equals the sum of the radii.
     scale = jnp.where((tau >= 0) & (gap > 0), 1 / jnp.maximum(core.reach, SLOWEST), inverse)
     tau, scale = materialize((tau, scale))
@@ -161,15 +158,14 @@ def _round_impact(
 
 
 def bounce_threshold(
-    point: ContactPoint | ActiveContact, normal: Array, push_a: Array | None, push_b: Array | None, setup: PassSetup
+    point: ContactPoint | ActiveContact, normal: Array, a: BodySide, b: BodySide, setup: PassSetup
 ) -> Array:
     """Approach speed above which a contact bounces, m/s.
 
     It exceeds what pushing overlaps apart may add and what the pair's last normal impulse causes in a step; otherwise
     a pile would bounce on itself.
     """
-    assert push_b is not None, "only static bodies lack a push"
-    push = push_b if push_a is None else push_a + push_b
+    push = b.push if a.push is None else a.push + b.push
     return setup.threshold + push + point.frame.k_normal * normal
 
 

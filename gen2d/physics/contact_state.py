@@ -1,6 +1,6 @@
 """Records that the contact solver hands from pass to pass and from step to step."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from gen2d.physics.collision import Shape
 from gen2d.physics.constraint import ActiveContact, Impulse, Motion
@@ -23,7 +23,7 @@ class BodySide(NamedTuple):
     motion: Motion | None = None  # None: static bodies at rest
     acceleration: Array | None = None  # [2, N, ...] m/s^2; None: gravity's
     drift: Motion | None = None  # m, rad: displacement beyond h times the new velocity, as impacts act at their time
-    push: Array | None = None  # [N, ...] m/s: bound on the speed from pushing overlaps apart; 0: no contact holds it
+    push: Any = None  # [N, ...] m/s: bound on the speed from pushing overlaps apart; 0: no contact; None: static
     work: Work | None = None
 
 

@@ -235,20 +235,17 @@ class NearbyPairs(ContactSolver):
             for shape, group, way in zip(shapes, self.groups, ways, strict=True)
         ]
         bodies = [(shape.centre, reach) for shape, reach in zip(shapes, reaches, strict=True)]
-        walls = [side.shape for side in statics]
+        walls = [side.shape for side in statics if side.shape is not None]
         return [active_pairs(self._near_bits(batch, bodies, walls, half), self.chunk) for batch in self.batches]
 
-    def _near_bits(self, batch: PairBatch, bodies: list[tuple], walls: list[Shape | None], half: Array) -> Array:
+    def _near_bits(self, batch: PairBatch, bodies: list[tuple], walls: list[Shape], half: Array) -> Array:
         """A bit for each pair that is near, in words [R, W n]."""
         centre, reach = bodies[batch.second]
         if batch.first is None:
             # The distance to an absent body is not a number, so that it is near nothing.
             absent = [jnp.where(static.present, 0.0, jnp.nan) for static in batch.statics.values()]
-            gaps = []
-            for i, x in zip(batch.statics, absent, strict=True):
-                wall = walls[i]
-                assert wall is not None, "the broad phase needs shapes"
-                gaps.append(signed_distance(wall, centre) - reach - half + x)
+            near = zip(batch.statics, absent, strict=True)
+            gaps = [signed_distance(walls[i], centre) - reach - half + x for i, x in near]
             return bits_of(jnp.stack(materialize(gaps)) < 0)
         if batch.round_robin is not None:
             return bits_in_round_robin(centre, reach, batch.round_robin)

@@ -74,15 +74,8 @@ def _free_motion(
 def _total_drift(side: BodySide, free: Motion) -> Motion:
     """Displacement beyond h times the motion: the drift of impacts, and that of free flight for bodies that no contact
     holds."""
-    assert side.push is not None, "the biased pass returns pushes"
     unheld = jnp.where(side.push > 0, 0.0, 1.0)
     return jax.tree.map(lambda x, y: x + unheld * y, side.drift, free)
-
-
-def _speed_change(after: Motion, before: Motion) -> Array:
-    """Bound on the speed that warm starting added, m/s."""
-    x, y = jnp.abs(after.velocity - before.velocity)
-    return x + y
 
 
 def _displaced(body: BodyState, displacement: Motion, motion: Motion) -> BodyState:
@@ -114,15 +107,8 @@ class _RigidJoints:
         self.works.append(work)
         return motions
 
-    def solve(self, motions: list[Motion], drifts: list[Motion]) -> list[Motion]:
-        """Motions with which the anchors meet at the end of the step."""
-        return self._apply(rigid_joints.solve, motions, drifts)
-
-    def relax(self, motions: list[Motion], displacements: list[Motion]) -> list[Motion]:
-        """Motions with which the anchors stay together after the displacements."""
-        return self._apply(rigid_joints.relax, motions, displacements)
-
-    def _apply(self, solver: Callable, motions: list[Motion], displacements: list[Motion]) -> list[Motion]:
+    def run(self, solver: Callable, motions: list[Motion], displacements: list[Motion]) -> list[Motion]:
+        """Motions after `rigid_joints.solve`, with drifts, or `rigid_joints.relax`, with displacements."""
         if self._system is None:
             return motions
         motions, self.impulses, work = solver(
@@ -156,7 +142,10 @@ def step(world: WorldState, model: Model, params: SolverParams) -> WorldState:
     sides = [BodySide(shape, motion, acceleration, work=work) for shape, motion, acceleration, work in of_groups]
     sides, contacts = solver.warm_start(carry, sides, statics)
     motions = _motions(sides)
-    pushes = [_speed_change(*of) for of in zip(motions, before, strict=True)]
+    pushes = []  # bounds on the speeds that warm starting added
+    for after, old in zip(motions, before, strict=True):
+        x, y = jnp.abs(after.velocity - old.velocity)
+        pushes.append(x + y)
 
     drifts = [Motion(*(jnp.zeros_like(x) for x in m)) for m in motions]
     joints, motions, drifts, work_solve = joint_forces.solve(
@@ -167,7 +156,7 @@ def step(world: WorldState, model: Model, params: SolverParams) -> WorldState:
     statics = [BodySide(motion=side.motion) for side in statics]
     sides, solved = solver.solve(carry, contacts, sides, statics)
     drifts = [_total_drift(*of) for of in zip(sides, free_drifts, strict=True)]
-    motions = rigid.solve(_motions(sides), drifts)
+    motions = rigid.run(rigid_joints.solve, _motions(sides), drifts)
 
     displacements = [jax.tree.map(lambda x, y: h * x + y, *of) for of in zip(motions, drifts, strict=True)]
     solid = [s if g.collides else None for s, g in zip(shapes, groups, strict=True)]
@@ -179,7 +168,7 @@ def step(world: WorldState, model: Model, params: SolverParams) -> WorldState:
     )
     sides = [side._replace(motion=motion, drift=None) for side, motion in zip(sides, motions, strict=True)]
     sides, carry = solver.relax(carry, solved, sides, statics, world.time)
-    motions = rigid.relax(_motions(sides), displacements)
+    motions = rigid.run(rigid_joints.relax, _motions(sides), displacements)
     if ledger is not None:
         olds, works = [body.motion for body in world.bodies], [side.work for side in sides]
         done = zip(works, groups, olds, free, free_drifts, displacements, accelerations, spin_ups, strict=True)

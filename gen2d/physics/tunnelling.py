@@ -19,16 +19,15 @@ def clamp_displacement(displacements: list[Motion], shapes: list, segments: list
     pairs = [(segment, g) for segment in segments for g, shape in enumerate(shapes) if isinstance(shape, Disc)]
     if not pairs:
         return displacements
-    risky = [_risky(displacements[g].velocity, segment, shapes[g]) for segment, g in pairs]
+    risky = []
+    for a, g in pairs:
+        b, displacement = shapes[g], displacements[g].velocity
+        offset = b.centre - a.centre
+        deep = jnp.abs(dot(turned(a.direction), offset)) < a.radius + 0.5 * b.radius
+        deep = deep & (jnp.abs(dot(a.direction, offset)) <= a.half_length + 0.9 * b.radius)
+        risky.append((16 * dot(displacement, displacement) > b.radius**2) | deep)
     some = jnp.any(jnp.stack([jnp.any(x) for x in risky]))
     return jax.lax.cond(some, lambda: _clamped(displacements, shapes, pairs, risky), lambda: displacements)
-
-
-def _risky(displacement: Array, a: Stadium, b: Disc) -> Array:
-    offset = b.centre - a.centre
-    deep = jnp.abs(dot(turned(a.direction), offset)) < a.radius + 0.5 * b.radius
-    deep = deep & (jnp.abs(dot(a.direction, offset)) <= a.half_length + 0.9 * b.radius)
-    return (16 * dot(displacement, displacement) > b.radius**2) | deep
 
 
 def _clamped(
