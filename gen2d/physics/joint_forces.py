@@ -222,7 +222,7 @@ class _Hinges:
         """Applies an angular impulse on b and its reaction on a, and adds their work."""
         batch, before = self._joint.batch, self.speed
         twist, before = materialize((twist, before))
-        spins = (self.a.spin - batch.a.inertia.moment * twist, self.b.spin + batch.b.inertia.moment * twist)
+        spins = self.a.spin - batch.a.inertia.moment * twist, self.b.spin + batch.b.inertia.moment * twist
         spin_a, spin_b = materialize(spins)
         self.a, self.b = self.a._replace(spin=spin_a), self.b._replace(spin=spin_b)
         gain = 0.5 * twist * (before + self.speed)

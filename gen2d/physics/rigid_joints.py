@@ -11,6 +11,7 @@ there. Contacts are solved before.
 """
 
 import dataclasses
+import functools
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -166,12 +167,9 @@ def _pushed(system: JointSystem, rows: JointRows, table: Motion, impulses: Array
         jnp.concatenate([-linear, linear, jnp.zeros_like(linear[:, :1])], axis=-2),
         jnp.concatenate([-lever_a * impulses, lever_b * impulses, jnp.zeros_like(impulses[:1])], axis=-2),
     )
-    parts, total = materialize(parts), None
-    for places in system.plan.rows_of_bodies():
-        part = take_rows(parts, places)
-        total = part if total is None else jax.tree.map(jnp.add, total, part)
-    assert total is not None
-    moving = system.plan.moving
+    parts, moving = materialize(parts), system.plan.moving
+    each = (take_rows(parts, places) for places in system.plan.rows_of_bodies())
+    total = functools.reduce(lambda x, y: jax.tree.map(jnp.add, x, y), each)
     mass, moment = (x[:moving] for x in system.inertia)
     more = Motion(mass * total.velocity, moment * total.spin)
     new = jax.tree.map(lambda x, y: jnp.concatenate([x[..., :moving, :] + y, x[..., moving:, :]], axis=-2), table, more)
