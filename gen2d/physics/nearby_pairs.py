@@ -338,7 +338,7 @@ class NearbyPairs(ContactSolver):
                 rows, carries[i] = jax.lax.fori_loop(0, listed.chunks[i], chunk, start)
             for g, x in rows.items():
                 tables[g] = tables[g]._replace(rows=x)
-        return [t.whole((self._size(g), self._scenes)) for g, t in enumerate(tables)], carries
+        return [t.unpacked((self._size(g), self._scenes)) for g, t in enumerate(tables)], carries
 
     def _store(self, batch: PairBatch, buffer: Array | None, k: Array, values: list[Array]) -> Array:
         """Buffer with the values of chunk k; a new one if there is none."""
@@ -501,7 +501,7 @@ class NearbyPairs(ContactSolver):
         if carry.log is None or carry.log_count is None:
             return depth, begins, None
         spec = pack(_empty_row(self._dtype), (1,), self._dtype)[1]
-        log, count = PackedTable(carry.log, spec).whole((slots, self._scenes)), carry.log_count[:-1]
+        log, count = PackedTable(carry.log, spec).unpacked((slots, self._scenes)), carry.log_count[:-1]
         filled = jnp.arange(slots)[:, None] < count
         order = order_of(jnp.where(filled, log.pair_event.time, jnp.inf))
 

@@ -56,8 +56,8 @@ def unpack(columns: Sequence[Array], spec: TableSpec) -> Any:
         if not isinstance(part, LeafSpec):
             return part
         own = columns[part.first : part.first + math.prod(part.lead)]
-        whole = jnp.stack(list(own)).reshape(*part.lead, *own[0].shape) if part.lead else own[0]
-        return whole.astype(part.dtype)
+        array = jnp.stack(list(own)).reshape(*part.lead, *own[0].shape) if part.lead else own[0]
+        return array.astype(part.dtype)
 
     return jax.tree.unflatten(spec.tree, [leaf(part) for part in spec.leaves])
 
@@ -79,7 +79,7 @@ class PackedTable(NamedTuple):
             return self
         return self._replace(rows=self.rows.at[where].set(materialize(jnp.stack(columns)).T, mode=SAFE))
 
-    def whole(self, shape: tuple[int, ...]) -> Any:
+    def unpacked(self, shape: tuple[int, ...]) -> Any:
         """Tree with leaves [..., *shape] of all rows but the last."""
         return unpack([column.reshape(shape) for column in self.rows[:-1].T], self.spec)
 

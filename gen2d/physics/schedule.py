@@ -77,9 +77,9 @@ class Match(NamedTuple):
 
 def matches(sizes: list[int], statics: int) -> list[Match]:
     """Matches of groups of these sizes and of static bodies, which come last."""
-    found = [Match(g, g, n - 1) for g, n in enumerate(sizes) if n > 1]
-    found += [Match(g, h, max(n, m)) for h, m in enumerate(sizes) for g, n in enumerate(sizes[:h])]
-    return found + [Match(f, g, 1, static=True) for f in range(statics) for g in range(len(sizes))]
+    order = [Match(g, g, n - 1) for g, n in enumerate(sizes) if n > 1]
+    order += [Match(g, h, max(n, m)) for h, m in enumerate(sizes) for g, n in enumerate(sizes[:h])]
+    return order + [Match(f, g, 1, static=True) for f in range(statics) for g in range(len(sizes))]
 
 
 def pairings(first: int, second: int, match: Match) -> tuple[np.ndarray, np.ndarray]:
