@@ -1,16 +1,18 @@
-"""Every row in every step: all pairs that can meet, round by round (tournament.py), whether they are near or not.
+"""Contact solver over every pair of bodies, round by round (schedule.py), near or not.
 
-No branch, no gather: what a GPU likes, and what has a gradient. The work grows with the square of the number of bodies.
+It has no branch and no gather, which suits GPUs, and has a reverse-mode gradient. Its cost grows with the square of the
+number of bodies.
 """
 
 import dataclasses
-from typing import Any, NamedTuple
+from collections.abc import Callable
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-from gen2d.physics import contact_passes, tunnelling
-from gen2d.physics.constraint import ContactConstraint, ContactPoint, Impulse, Motion
+from gen2d.physics import contact_passes
+from gen2d.physics.constraint import ContactConstraint, ContactPoint, Impulse
 from gen2d.physics.contact_log import (
     ContactEvent,
     PairEvent,
@@ -20,7 +22,8 @@ from gen2d.physics.contact_log import (
     pair_event,
     record_event,
 )
-from gen2d.physics.contact_state import Displacement, PassSetup, SolvedPair, WarmStart
+from gen2d.physics.contact_solver import ContactSolver
+from gen2d.physics.contact_state import BodySide, PassSetup, SolvedPair, WarmStart
 from gen2d.physics.params import SolverParams
 from gen2d.physics.schedule import Match, run_schedule
 from gen2d.records.axes import Array
@@ -28,131 +31,105 @@ from gen2d.records.trajectory import Contacts
 
 
 class Observed(NamedTuple):
-    """What has been seen so far in rows of one size."""
+    """Contact quality so far, of pairs by their place in a round."""
 
     depth: Array  # m: deepest overlap
     begins: Array  # contacts that began
 
 
 class AllPairsCarry(NamedTuple):
-    """What all rows hand on from step to step."""
+    """Solver state carried between steps."""
 
-    rows: list[WarmStart]
-    seen: dict[int, Observed]  # by size of row
+    warm: list[WarmStart]
+    observed: dict[int, Observed]  # by number of pairs in a round
     events: list[ContactEvent] | None
 
 
 @dataclasses.dataclass(frozen=True)
-class AllPairs:
-    """All rows of a video, in the order in which they are played."""
+class AllPairs(ContactSolver):
+    """Contact solver over the constraints of all rounds, in their order."""
 
-    rows: list[ContactConstraint]
-    points: list[int]  # of each row: how many points of contact it has
-    slots: list[tuple[Array, Array]]  # of each row: those of its objects
+    constraints: list[ContactConstraint]
+    points: list[int]  # contact points of a pair, by round
+    slots: list[tuple[Array, Array]]  # of the objects, by round
     order: list[Match]
     setup: PassSetup
-    rules: SolverParams
+    params: SolverParams
 
-    def start(self, contacts: int) -> AllPairsCarry:
-        """What the first step begins with."""
-        shapes, dtype = [row.present.shape for row in self.rows], self.setup.threshold.dtype
+    def start(self, slots: int) -> AllPairsCarry:
+        shapes, dtype = [c.present.shape for c in self.constraints], self.setup.threshold.dtype
 
-        def nothing(row: ContactConstraint, points: int) -> WarmStart:
-            zero = jnp.zeros(row.present.shape, dtype)
-            return WarmStart([Impulse(zero, zero)] * points, None if row.rolling is None else zero)
+        def cold(constraint: ContactConstraint, points: int) -> WarmStart:
+            zero = jnp.zeros(constraint.present.shape, dtype)
+            return WarmStart([Impulse(zero, zero)] * points, None if constraint.rolling is None else zero)
 
         return AllPairsCarry(
-            rows=[nothing(*of) for of in zip(self.rows, self.points, strict=True)],
-            seen={shape[0]: Observed(jnp.zeros(shape, dtype), jnp.zeros(shape, jnp.int32)) for shape in shapes},
-            events=[empty_events(shape, dtype) for shape in shapes] if contacts else None,
+            warm=[cold(*of) for of in zip(self.constraints, self.points, strict=True)],
+            observed={shape[0]: Observed(jnp.zeros(shape, dtype), jnp.zeros(shape, jnp.int32)) for shape in shapes},
+            events=[empty_events(shape, dtype) for shape in shapes] if slots else None,
         )
 
-    def warm(
-        self, past: AllPairsCarry, bodies: list[tuple], walls: list[tuple], motions: list[Motion], works: list
-    ) -> tuple[list[Motion], list, list[list[ContactPoint]]]:
-        """Motions and works with the last step's impulses, and the points of every row.
+    def allocate(self, carry: AllPairsCarry, step: Callable) -> AllPairsCarry:
+        return carry
 
-        `bodies` are shapes and accelerations, the latter None where all fall alike; `walls` are shapes and motions,
-        the latter None where they stand still.
-        """
+    def begin_frame(self, carry: AllPairsCarry) -> AllPairsCarry:
+        events = None if carry.events is None else [began_touching(event) for event in carry.events]
+        return carry._replace(events=events)
 
-        def play(k: int, a: tuple, b: tuple) -> tuple:
-            return contact_passes.warm_start(self.rows[k], past.rows[k], a, b, self.setup)
+    def warm_start(
+        self, carry: AllPairsCarry, sides: list[BodySide], statics: list[BodySide]
+    ) -> tuple[list[BodySide], list[list[ContactPoint]]]:
+        def play(k: int, a: BodySide, b: BodySide) -> tuple[BodySide, BodySide, list[ContactPoint]]:
+            return contact_passes.warm_start(self.constraints[k], carry.warm[k], a, b, self.setup)
 
-        groups = [(shape, m, fall, w) for (shape, fall), m, w in zip(bodies, motions, works, strict=True)]
-        groups, found = run_schedule(groups, [(*wall, None, None) for wall in walls], self.order, play)
-        return [motion for _, motion, *_ in groups], [work for *_, work in groups], found
+        return run_schedule(sides, statics, self.order, play)
 
     def solve(
-        self,
-        past: AllPairsCarry,
-        found: list[list[ContactPoint]],
-        walls: list[tuple],
-        motions: list[Motion],
-        drifts: list,
-        works: list,
-    ) -> tuple[list[Motion], list[Displacement], list, list[SolvedPair]]:
-        """Motions, drifts and works after the biased pass, and every row."""
+        self, carry: AllPairsCarry, contacts: list[list[ContactPoint]], sides: list[BodySide], statics: list[BodySide]
+    ) -> tuple[list[BodySide], list[SolvedPair]]:
+        def play(k: int, a: BodySide, b: BodySide) -> tuple[BodySide, BodySide, SolvedPair]:
+            warm = carry.warm[k]
+            return contact_passes.solve(self.constraints[k], warm, contacts[k], a, b, self.setup, self.params)
 
-        def play(k: int, a: tuple, b: tuple) -> tuple:
-            return contact_passes.solve(self.rows[k], past.rows[k], found[k], a, b, self.setup, self.rules)
-
-        groups = list(zip(motions, drifts, works, strict=True))
-        groups, rows = run_schedule(groups, [(motion, None, None) for _, motion in walls], self.order, play)
-        motions, drifts, works = (list(values) for values in zip(*groups, strict=True))
-        return motions, drifts, works, rows
+        return run_schedule(sides, statics, self.order, play)
 
     def relax(
         self,
-        past: AllPairsCarry,
-        rows: list[SolvedPair],
-        walls: list[tuple],
-        motions: list[Motion],
-        drifts: list,
-        works: list,
+        carry: AllPairsCarry,
+        solved: list[SolvedPair],
+        sides: list[BodySide],
+        statics: list[BodySide],
         time: Array,
-    ) -> tuple[list[Motion], list, AllPairsCarry]:
-        """Motions and works after the relaxing pass, and what all rows hand on; the step began at `time`."""
+    ) -> tuple[list[BodySide], AllPairsCarry]:
+        def play(k: int, a: BodySide, b: BodySide) -> tuple[BodySide, BodySide, tuple[SolvedPair, WarmStart]]:
+            return contact_passes.relax(self.constraints[k], solved[k], a, b, self.setup)
 
-        def play(k: int, a: tuple, b: tuple) -> tuple:
-            return contact_passes.relax(self.rows[k], rows[k], a, b, self.setup)
-
-        groups = [(motion, drift.push, work) for motion, drift, work in zip(motions, drifts, works, strict=True)]
-        groups, outs = run_schedule(groups, [(motion, None, None) for _, motion in walls], self.order, play)
-        events = past.events
+        sides, relaxed = run_schedule(sides, statics, self.order, play)
+        events, observed = carry.events, dict(carry.observed)
         if events is not None:
-            of = zip(events, rows, outs, strict=True)
-            events = [record_event(event, row, last, time, self.setup.one) for event, row, (last, _) in of]
-        now = AllPairsCarry([memory for _, memory in outs], self._seen(past, rows), events)
-        return [motion for motion, *_ in groups], [work for *_, work in groups], now
+            of = zip(events, solved, relaxed, strict=True)
+            events = [record_event(event, pair, last, time) for event, pair, (last, _) in of]
+        for pair, warm in zip(solved, carry.warm, strict=True):
+            depth, began = contact_passes.observe(pair, warm)
+            old = observed[size := depth.shape[0]]
+            observed[size] = Observed(jnp.maximum(old.depth, depth), old.begins + began)
+        return sides, AllPairsCarry([warm for _, warm in relaxed], observed, events)
 
-    def _seen(self, past: AllPairsCarry, rows: list[SolvedPair]) -> dict[int, Observed]:
-        seen = dict(past.seen)
-        for row, solved, memory in zip(self.rows, rows, past.rows, strict=True):
-            depth, began = tunnelling.visible_motion(solved, memory)
-            old = seen[size := row.present.shape[0]]
-            seen[size] = Observed(jnp.maximum(old.depth, depth), old.begins + began)
-        return seen
+    def end_frame(self, carry: AllPairsCarry) -> tuple[AllPairsCarry, PairEvent | None]:
+        if carry.events is None:
+            return carry, None
+        events = [pair_event(event, c.elasticity) for event, c in zip(carry.events, self.constraints, strict=True)]
+        return carry, jax.tree.map(lambda *x: jnp.concatenate(x, axis=-2), *events)
 
-    def frame_begins(self, past: AllPairsCarry) -> AllPairsCarry:
-        """The same, with nothing seen in the frame yet."""
-        return past if past.events is None else past._replace(events=[began_touching(event) for event in past.events])
-
-    def frame_ends(self, past: AllPairsCarry) -> tuple[AllPairsCarry, PairEvent | None]:
-        """The same, and what happened in the frame."""
-        if past.events is None:
-            return past, None
-        rows = [pair_event(event, row.elasticity) for event, row in zip(past.events, self.rows, strict=True)]
-        return past, jax.tree.map(lambda *x: jnp.concatenate(x, axis=-2), *rows)
-
-    def ended(self, past: AllPairsCarry, happened: Any, slots: int, fps: float) -> tuple[Array, Array, Contacts | None]:
-        """Of the whole video: the deepest overlap, m, how many contacts began, and up to `slots` rows of contacts."""
-        lanes = self.setup.threshold.shape
-        depth, begins = jnp.zeros(lanes, self.setup.threshold.dtype), jnp.zeros(lanes, jnp.int32)
-        for seen in past.seen.values():
-            depth = jnp.maximum(depth, jnp.max(seen.depth, axis=0))
-            begins = begins + jnp.sum(seen.begins, axis=0)
-        if happened is None:
+    def results(
+        self, carry: AllPairsCarry, events: PairEvent | None, slots: int, fps: float
+    ) -> tuple[Array, Array, Contacts | None]:
+        scenes = self.setup.threshold.shape
+        depth, begins = jnp.zeros(scenes, self.setup.threshold.dtype), jnp.zeros(scenes, jnp.int32)
+        for observed in carry.observed.values():
+            depth = jnp.maximum(depth, jnp.max(observed.depth, axis=0))
+            begins = begins + jnp.sum(observed.begins, axis=0)
+        if events is None:
             return depth, begins, None
         a, b = (jnp.concatenate(side, axis=0) for side in zip(*self.slots, strict=True))
-        return depth, begins, compact(happened, a, b, fps, slots)
+        return depth, begins, compact(events, a, b, fps, slots)

@@ -7,23 +7,25 @@ import jax.numpy as jnp
 
 from gen2d.records.axes import Array
 
-UNROLL = 4  # rows in a turn of a loop
+UNROLL = 4  # rows per iteration of a loop
 
 
 class BandFactors(NamedTuple):
-    """L and D of a symmetric band matrix L D L^T, each [R, ...]."""
+    """Factors L and D of a symmetric band matrix L D L^T, each [R, ...]."""
 
     below: list[Array]  # the diagonals of L after the main one, which is 1
     inverse: Array  # 1 / D
 
 
 def factor(bands: list[Array]) -> BandFactors:
-    """The factors of a symmetric positive band matrix, given by its diagonals [R, ...] from the main one on; where
-    that is infinite, a row gives zero."""
+    """Factors of a symmetric positive band matrix from its diagonals [R, ...], the main one first.
+
+    A row whose main diagonal is infinite gets a solution of zero.
+    """
     width, zero = len(bands), jnp.zeros_like(bands[0][0])
 
     def row(less: list, terms: list) -> tuple:
-        """What the rows so far take off the next ones, and this row's factors."""
+        """What the rows so far subtract from the next ones, and this row's factors."""
         first, *others = less or [[]]
         own = [x - y for x, y in zip(terms, [*first, zero], strict=True)]
         inverse = 1 / own[0]
@@ -36,13 +38,13 @@ def factor(bands: list[Array]) -> BandFactors:
     return jax.lax.scan(row, start, bands, unroll=UNROLL)[1]
 
 
-def solve_factored(factors: BandFactors, wanted: Array) -> Array:
-    """x [R, ...] of L D L^T x = `wanted`."""
-    start = [jnp.zeros_like(wanted[0])] * len(factors.below)
+def solve_factored(factors: BandFactors, b: Array) -> Array:
+    """Solution x [R, ...] of L D L^T x = b."""
+    start = [jnp.zeros_like(b[0])] * len(factors.below)
 
     def down(less: list, row: tuple[BandFactors, Array]) -> tuple:
-        (below, inverse), want = row
-        value = want - less[0] if less else want
+        (below, inverse), value = row
+        value = value - less[0] if less else value
         return [f * value + x for f, x in zip(below, [*less[1:], 0.0], strict=False)], (below, inverse * value)
 
     def up(later: list, row: tuple) -> tuple:
@@ -51,5 +53,5 @@ def solve_factored(factors: BandFactors, wanted: Array) -> Array:
             x = x - f * y
         return [x, *later][: len(later)], x
 
-    found = jax.lax.scan(down, start, (factors, wanted), unroll=UNROLL)[1]
-    return jax.lax.scan(up, start, found, reverse=True, unroll=UNROLL)[1]
+    scaled = jax.lax.scan(down, start, (factors, b), unroll=UNROLL)[1]
+    return jax.lax.scan(up, start, scaled, reverse=True, unroll=UNROLL)[1]

@@ -1,8 +1,8 @@
-"""A row of the solver: pairs of bodies that are solved at once, and the impulses at one point of contact of each.
+"""A batch of contact constraints, and the impulses at one point of each.
 
-All arrays are [pairs, ...], vectors [2, pairs, ...], scenes last. Velocity at a point r from the centre of mass is
-v + spin x r, so a normal impulse has the lever r x n and a tangential one r . n; discs have a normal lever of zero, and
-the tangential one is their radius.
+Arrays are [pairs, ...], vectors [2, pairs, ...], scenes last. The velocity at a point r from the centre of mass is
+v + spin x r, so a normal impulse has the lever r x n and a tangential one r . n. A disc's normal lever is zero, its
+tangential one the radius.
 """
 
 from typing import NamedTuple, TypeAlias
@@ -16,41 +16,41 @@ from gen2d.records.axes import Array
 
 
 class Inertia(NamedTuple):
-    """One over mass (1/kg) and over moment of inertia (1 / (kg m^2)); zero of what nothing can move."""
+    """Inverse mass (1/kg) and inverse moment of inertia (1 / (kg m^2)); zero for bodies that nothing moves."""
 
     mass: Array
     moment: Array
 
 
 class Motion(NamedTuple):
-    """How bodies move while they are solved; also by how much impacts change where they go."""
+    """Velocity and spin of bodies, or a displacement and an angle."""
 
     velocity: Array  # [2, N, ...] m/s; m
     spin: Array  # [N, ...] rad/s; rad
 
 
 class Impulse(NamedTuple):
-    """Accumulated impulses at a point; what is left of them at the end of a step warm-starts the next."""
+    """Accumulated impulses at a point."""
 
     normal: Array  # N s
     tangent: Array  # N s
 
 
 class ContactFrame(NamedTuple):
-    """How an impulse at a point becomes motion. A lever that is None is zero, always."""
+    """Levers and effective masses of a contact point. A lever that is None is always zero."""
 
     normal_a: Array | None  # m
     normal_b: Array | None
     tangent_a: Array | None
     tangent_b: Array
-    k_normal: Array  # 1/kg: speed that a unit impulse gives
+    k_normal: Array  # 1/kg: speed per unit impulse
     k_tangent: Array
-    normal_mass: Array  # one over it; zero where there is nothing to push
+    normal_mass: Array  # its inverse; zero without contact
     tangent_mass: Array
 
 
 class ContactConstraint(NamedTuple):
-    """What stays the same of a row for a whole video. Where not both bodies are `present` it has no mass."""
+    """Constants of a batch of pairs over a video. A pair has no mass unless both bodies are `present`."""
 
     a: Inertia | None  # None: nothing moves it
     b: Inertia
@@ -58,195 +58,202 @@ class ContactConstraint(NamedTuple):
     elasticity: Array
     friction: Array
     rolling: Array | None  # m: torque over normal force
-    grip: ContactFrame | None  # of two discs, or of a disc on something fixed; of others it changes with every step
-    firm: bool  # against something fixed: twice as stiff
-    # Of a fixed segment, where others go on from its ends: two directions [2, 1, ...], zero where there is none.
+    frame: ContactFrame | None  # of two discs, or a disc on a static body at rest; else it changes from step to step
+    static: bool  # against a static or kinematic body: twice as stiff
+    # Where other segments continue a static segment at its ends: two directions [2, 1, ...], zero without one.
     left: tuple[Array, Array] | None = None
     right: tuple[Array, Array] | None = None
 
 
 class CoreOffset(NamedTuple):
-    """What the impact of two round shapes needs to know, or of a disc and the core line of another shape."""
+    """Geometry of the impact of two round shapes, or of a disc and the core line of another shape."""
 
-    apart: Array  # [2, ...] m: offset of the centres, or of the disc from the core line
+    offset: Array  # [2, ...] m: between the centres, or from the core line to the disc
     reach: Array  # m: sum of the radii
-    flat: Array | None  # where the core line's middle, not its end, is nearest; None: two discs
+    flat: Array | None  # whether the nearest point of the core line is not an end; None: two discs
 
 
 class ContactPoint(NamedTuple):
-    """A point of a row as the step begins."""
+    """A contact point at the start of a step."""
 
-    grip: ContactFrame
+    frame: ContactFrame
     normal: Array
     gap: Array
-    pressed: Array  # N s: normal impulse of the last step
-    fall: Array | None  # [2, ...] m/s^2: acceleration of b over a; None where they fall alike
-    place: Array | None  # [2, ...] m: of the point, or of b's centre where b is a disc; None where nobody asks
-    core: CoreOffset | None = None  # None: of shapes with corners
+    last_normal: Array  # N s: normal impulse of the last step
+    acceleration: Array | None  # [2, ...] m/s^2: of b relative to a; None: equal
+    position: Array | None  # [2, ...] m: of the point, or of b's centre if b is a disc; None: not logged
+    core: CoreOffset | None = None  # None: shapes with corners
 
 
 class ActiveContact(NamedTuple):
-    """A point of a row as it stands in this step; tau < 0 where it does not bounce (impacts.py)."""
+    """A contact point with its impact in this step."""
 
-    grip: ContactFrame
+    frame: ContactFrame
     normal: Array
     gap: Array
-    tau: Array
+    tau: Array  # s: time of impact; negative without a bounce (time_of_impact.py)
     arrival: Array  # m/s: approach speed at tau
-    target: Array  # m/s: normal speed at the end of the step, of a bounce
-    place: Array | None  # [2, ...] m: of the point; None where nobody asks
+    target: Array  # m/s: normal speed at the end of the step after a bounce
+    position: Array | None  # [2, ...] m: of the point; None: not logged
 
 
 def reciprocal(x: Array, usable: Array) -> Array:
-    """1 / x where it is usable, else 0; finite in its gradient, too."""
+    """1 / x where usable, else 0, with a finite gradient."""
     return jnp.where(usable, 1 / jnp.where(usable, x, 1.0), 0.0)
 
 
 def mix_materials(a: Array, b: Array, mixing: str) -> Array:
-    """The coefficient of a pair."""
+    """Coefficient of a pair from those of its bodies."""
     return {"mean": (a + b) / 2, "product": a * b, "max": jnp.maximum(a, b), "geometric": jnp.sqrt(a * b)}[mixing]
 
 
 def frame_of(
-    row: ContactConstraint, levers: tuple[Array | None, Array | None, Array | None, Array], near: Array
+    constraint: ContactConstraint, levers: tuple[Array | None, Array | None, Array | None, Array], near: Array
 ) -> ContactFrame:
-    """The grip with these levers: normal a, normal b, tangent a, tangent b; no mass where it is not `near`."""
+    """Frame with these levers (normal a, normal b, tangent a, tangent b), without mass where not `near`."""
     normal_a, normal_b, tangent_a, tangent_b = levers
-    k_mass, moment_a = row.b.mass, 0.0
-    if row.a is not None:
-        k_mass, moment_a = row.a.mass + row.b.mass, row.a.moment
+    k_mass, moment_a = constraint.b.mass, 0.0
+    if constraint.a is not None:
+        k_mass, moment_a = constraint.a.mass + constraint.b.mass, constraint.a.moment
 
     def k(a: Array | None, b: Array | None) -> Array:
-        of_a = 0.0 if a is None else moment_a * a**2
-        return k_mass + of_a + (0.0 if b is None else row.b.moment * b**2)
+        k_a = 0.0 if a is None else moment_a * a**2
+        return k_mass + k_a + (0.0 if b is None else constraint.b.moment * b**2)
 
     ks = k(normal_a, normal_b), k(tangent_a, tangent_b)
     return ContactFrame(*levers, *ks, *(reciprocal(k, near) for k in ks))
 
 
-def frame_at(row: ContactConstraint, point: Point) -> ContactFrame:
-    """The grip of a point of contact."""
+def frame_at(constraint: ContactConstraint, point: Point) -> ContactFrame:
+    """Frame of a point of contact."""
     (ax, ay), (bx, by), (nx, ny) = point.arm_a, point.arm_b, point.normal
-    a = (None, None) if row.a is None else (ax * ny - ay * nx, ax * nx + ay * ny)
+    a = (None, None) if constraint.a is None else (ax * ny - ay * nx, ax * nx + ay * ny)
     levers = a[0], bx * ny - by * nx, a[1], bx * nx + by * ny
-    return frame_of(row, levers, row.present & (point.gap < FAR / 2))
+    return frame_of(constraint, levers, constraint.present & (point.gap < FAR / 2))
 
 
-def relative(grip: ContactFrame, normal: Array, a: Motion | None, b: Motion) -> tuple[Array, Array]:
-    """Normal and tangential speed of b over a at the point, m/s."""
+def relative_speed(frame: ContactFrame, normal: Array, a: Motion | None, b: Motion) -> tuple[Array, Array]:
+    """Normal and tangential speed of b relative to a at the point, m/s."""
     velocity = b.velocity if a is None else b.velocity - a.velocity
     speed = dot(normal, velocity)
-    slip = normal[0] * velocity[1] - normal[1] * velocity[0] + grip.tangent_b * b.spin
-    if grip.normal_b is not None:
-        speed = speed + grip.normal_b * b.spin
-    if a is not None and grip.normal_a is not None:
-        speed = speed - grip.normal_a * a.spin
-    if a is not None and grip.tangent_a is not None:
-        slip = slip - grip.tangent_a * a.spin
+    slip = normal[0] * velocity[1] - normal[1] * velocity[0] + frame.tangent_b * b.spin
+    if frame.normal_b is not None:
+        speed = speed + frame.normal_b * b.spin
+    if a is not None and frame.normal_a is not None:
+        speed = speed - frame.normal_a * a.spin
+    if a is not None and frame.tangent_a is not None:
+        slip = slip - frame.tangent_a * a.spin
     return speed, slip
 
 
-Components: TypeAlias = tuple[Array | None, Array | None]  # of an impulse or its levers: normal, tangential; None: zero
+Components: TypeAlias = tuple[Array | None, Array | None]  # normal and tangential; None: zero
 
 
-def _twist(levers: Components, impulse: Components) -> Array | float:
+def _angular(levers: Components, impulse: Components) -> Array | float:
+    """Angular impulse of an impulse, N m s."""
     parts = zip(levers, impulse, strict=True)
-    found = [lever * p for lever, p in parts if lever is not None and p is not None]
-    return sum(found[1:], found[0]) if found else 0.0
+    terms = [lever * p for lever, p in parts if lever is not None and p is not None]
+    return sum(terms[1:], terms[0]) if terms else 0.0
 
 
 def apply_impulse(
-    row: ContactConstraint, at: ContactPoint | ActiveContact, impulse: Impulse | Components, a: Motion | None, b: Motion
+    constraint: ContactConstraint,
+    point: ContactPoint | ActiveContact,
+    impulse: Impulse | Components,
+    a: Motion | None,
+    b: Motion,
 ) -> tuple[Motion | None, Motion]:
     """Both motions after the impulse on b and its reaction on a."""
-    grip, directions = at.grip, (at.normal, turned(at.normal))
+    frame, directions = point.frame, (point.normal, turned(point.normal))
     parts = [p * d for p, d in zip(impulse, directions, strict=True) if p is not None]
-    push = sum(parts[1:], parts[0])
-    turn = _twist((grip.normal_b, grip.tangent_b), impulse)
-    b = Motion(b.velocity + row.b.mass * push, b.spin + row.b.moment * turn)
-    if row.a is None or a is None:
+    linear = sum(parts[1:], parts[0])
+    angular = _angular((frame.normal_b, frame.tangent_b), impulse)
+    b = Motion(b.velocity + constraint.b.mass * linear, b.spin + constraint.b.moment * angular)
+    if constraint.a is None or a is None:
         return a, b
-    turn = _twist((grip.normal_a, grip.tangent_a), impulse)
-    return Motion(a.velocity - row.a.mass * push, a.spin - row.a.moment * turn), b
+    angular = _angular((frame.normal_a, frame.tangent_a), impulse)
+    return Motion(a.velocity - constraint.a.mass * linear, a.spin - constraint.a.moment * angular), b
 
 
-def add_impulses(new: Impulse, old: Impulse) -> Impulse:
-    """What a solve added to an impulse."""
+def impulse_change(new: Impulse, old: Impulse) -> Impulse:
+    """Difference of two accumulated impulses."""
     return Impulse(new.normal - old.normal, new.tangent - old.tangent)
 
 
-def softness(row: ContactConstraint, rules: SolverParams) -> tuple[float, float, float]:
-    """`Rules.softness` of a row's overlaps."""
-    return rules.softness(2 * rules.hertz if row.firm else rules.hertz, rules.damping_ratio)
+def softness(constraint: ContactConstraint, params: SolverParams) -> tuple[float, float, float]:
+    """`SolverParams.softness` of an overlapping contact."""
+    return params.softness(2 * params.hertz if constraint.static else params.hertz, params.damping_ratio)
 
 
 def biased_impulse(
-    row: ContactConstraint, touch: ActiveContact, speed: Array, old: Impulse, rules: SolverParams
+    constraint: ContactConstraint, contact: ActiveContact, speed: Array, old: Impulse, params: SolverParams
 ) -> Array:
-    """The accumulated normal impulse after the biased solve of a row.
+    """Accumulated normal impulse after the biased solve.
 
-    Apart: the gap may be closed, no more. Overlapping: a soft push. Bouncing: its target exactly. Passing: nothing, as
-    the straight line of a soft contact would stop a body that only grazes the other, or that comes a step later.
+    A separated contact may close its gap, an overlapping one is pushed apart softly, and a bounce reaches its target
+    speed exactly. A fast approach that misses in this step gets no impulse, as the straight line of a soft contact
+    would stop a body that only grazes the other or arrives a step later.
     """
-    rate, mass_scale, impulse_scale = softness(row, rules)
-    apart, mass = touch.gap > 0, touch.grip.normal_mass
-    bias = jnp.where(apart, touch.gap / rules.step, jnp.maximum(rate * touch.gap, -rules.push_speed))
+    rate, mass_scale, impulse_scale = softness(constraint, params)
+    apart, mass = contact.gap > 0, contact.frame.normal_mass
+    bias = jnp.where(apart, contact.gap / params.step, jnp.maximum(rate * contact.gap, -params.push_speed))
     soft = old.normal - jnp.where(apart, 1.0, mass_scale) * mass * (speed + bias)
     soft = jnp.maximum(soft - jnp.where(apart, 0.0, impulse_scale) * old.normal, 0.0)
-    soft = jnp.where(touch.tau == MISSES, 0.0, soft)
-    hard = old.normal + mass * (touch.target - speed)
-    return jnp.where(mass > 0, jnp.where(touch.tau >= 0, hard, soft), 0.0)
+    soft = jnp.where(contact.tau == MISSES, 0.0, soft)
+    hard = old.normal + mass * (contact.target - speed)
+    return jnp.where(mass > 0, jnp.where(contact.tau >= 0, hard, soft), 0.0)
 
 
-def impact_impulse(touch: ActiveContact, speed: Array, threshold: Array) -> Array:
-    """Where a neighbour's bounce has closed a row that is in contact: it bounces, too."""
-    return (speed < -threshold) & (touch.gap <= 0) & (touch.grip.normal_mass > 0)
+def bounces_again(contact: ActiveContact, speed: Array, threshold: Array) -> Array:
+    """Whether a touching contact bounces in the relaxing pass, as a neighbour's bounce closes it."""
+    return (speed < -threshold) & (contact.gap <= 0) & (contact.frame.normal_mass > 0)
 
 
 def relaxed_impulse(
-    row: ContactConstraint, touch: ActiveContact, speed: Array, old: Impulse, threshold: Array
+    constraint: ContactConstraint, contact: ActiveContact, speed: Array, old: Impulse, threshold: Array
 ) -> Array:
-    """The accumulated normal impulse after the relaxing solve, without bias.
+    """Accumulated normal impulse after the relaxing solve, without bias.
 
-    No say has a row that bounced and parts, one that is apart and carried nothing (it would brake a body one step
-    before its impact), and one that a neighbour closes across a gap (it bounces in a later step).
+    Leave unchanged: contacts that bounced and are separating; separated contacts that carried no impulse, which would
+    brake a body one step before its impact; and gaps that a neighbour is closing, which bounce in a later step.
     """
-    mass = touch.grip.normal_mass
-    pushes = (touch.tau < 0) & ((old.normal > 0) | (touch.gap <= 0)) & (speed >= -threshold) & (mass > 0)
-    soft = jnp.where(pushes, jnp.maximum(old.normal - mass * speed, 0.0), old.normal)
-    hard = old.normal - (1 + row.elasticity) * mass * speed
-    return jnp.where(impact_impulse(touch, speed, threshold), hard, soft)
+    mass = contact.frame.normal_mass
+    active = (contact.tau < 0) & ((old.normal > 0) | (contact.gap <= 0)) & (speed >= -threshold) & (mass > 0)
+    soft = jnp.where(active, jnp.maximum(old.normal - mass * speed, 0.0), old.normal)
+    hard = old.normal - (1 + constraint.elasticity) * mass * speed
+    return jnp.where(bounces_again(contact, speed, threshold), hard, soft)
 
 
 def friction_impulse(
-    row: ContactConstraint, touch: ActiveContact, normal_impulse: Array, slip: Array, old: Impulse
+    constraint: ContactConstraint, contact: ActiveContact, normal_impulse: Array, slip: Array, old: Impulse
 ) -> Array:
-    """The accumulated tangential impulse: what stops the slip, within Coulomb's bound of the normal impulse now.
-
-    Without a bound there is none; said so, as the gradient of a clip between two zeros is not zero.
-    """
-    bound = row.friction * normal_impulse
-    rub = jnp.clip(old.tangent - touch.grip.tangent_mass * slip, -bound, bound)
-    return jnp.where(bound > 0, rub, 0.0)
+    """Accumulated tangential impulse that stops the slip, within Coulomb's bound."""
+    bound = constraint.friction * normal_impulse
+    tangent = jnp.clip(old.tangent - contact.frame.tangent_mass * slip, -bound, bound)
+    return jnp.where(bound > 0, tangent, 0.0)  # the gradient of a clip between two zeros is not zero
 
 
-def spin_change(row: ContactConstraint, roll: Array, a: Motion | None, b: Motion) -> tuple[Motion | None, Motion]:
+def apply_angular_impulse(
+    constraint: ContactConstraint, roll: Array, a: Motion | None, b: Motion
+) -> tuple[Motion | None, Motion]:
     """Both motions after an angular impulse on b and its reaction on a."""
-    b = b._replace(spin=b.spin + row.b.moment * roll)
-    if row.a is None or a is None:
+    b = b._replace(spin=b.spin + constraint.b.moment * roll)
+    if constraint.a is None or a is None:
         return a, b
-    return a._replace(spin=a.spin - row.a.moment * roll), b
+    return a._replace(spin=a.spin - constraint.a.moment * roll), b
 
 
-def turning(a: Motion | None, b: Motion) -> Array:
-    """Spin of b over a, rad/s."""
+def relative_spin(a: Motion | None, b: Motion) -> Array:
+    """Spin of b relative to a, rad/s."""
     return b.spin if a is None else b.spin - a.spin
 
 
-def rolling_impulse(row: ContactConstraint, normal_impulse: Array, a: Motion | None, b: Motion, old: Array) -> Array:
-    """The accumulated angular impulse that stops rolling, within its bound of the normal impulse now."""
-    assert row.rolling is not None, "only rows with rolling resistance have such an impulse"
-    k = row.b.moment if row.a is None else row.a.moment + row.b.moment
-    mass = reciprocal(k, row.present & (k > 0))
-    bound = row.rolling * normal_impulse
-    return jnp.clip(old - mass * turning(a, b), -bound, bound)
+def rolling_impulse(
+    constraint: ContactConstraint, normal_impulse: Array, a: Motion | None, b: Motion, old: Array
+) -> Array:
+    """Accumulated angular impulse that stops rolling, within its bound by the normal impulse."""
+    assert constraint.rolling is not None, "the constraint has no rolling resistance"
+    k = constraint.b.moment if constraint.a is None else constraint.a.moment + constraint.b.moment
+    mass = reciprocal(k, constraint.present & (k > 0))
+    bound = constraint.rolling * normal_impulse
+    return jnp.clip(old - mass * relative_spin(a, b), -bound, bound)

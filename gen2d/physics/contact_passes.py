@@ -1,6 +1,6 @@
-"""What the three passes of a step do to a row: warm starting, the biased solve, the relaxing solve.
+"""The three passes over a batch of contacts: warm start, biased solve, relaxing solve.
 
-A row is any number of pairs; dense.py hands it all pairs of a round, sparse.py those that are near each other.
+A batch holds any number of pairs: all pairs of a round (all_pairs.py) or a chunk of near ones (nearby_pairs.py).
 """
 
 import functools
@@ -13,200 +13,203 @@ from gen2d.physics.constraint import (
     ContactConstraint,
     ContactPoint,
     Impulse,
-    Motion,
-    add_impulses,
+    apply_angular_impulse,
     apply_impulse,
     biased_impulse,
+    bounces_again,
     friction_impulse,
-    impact_impulse,
-    relative,
+    impulse_change,
+    relative_speed,
     relaxed_impulse,
     rolling_impulse,
     softness,
-    spin_change,
 )
-from gen2d.physics.contact_points import both_points, bounce_threshold, contact_points, impact_of
-from gen2d.physics.contact_state import Displacement, PassSetup, SolvedPair, WarmStart
-from gen2d.physics.energy import Work, dissipated, dissipated_by_discs
+from gen2d.physics.contact_points import bounce_threshold, contact_points, impact_of, two_point_impulses
+from gen2d.physics.contact_state import BodySide, Motion, PassSetup, SolvedPair, WarmStart
+from gen2d.physics.energy import dissipated, dissipated_by_discs
 from gen2d.physics.params import SolverParams
 from gen2d.records.axes import Array
 from gen2d.xla import materialize
 
 
-def _exchange(
-    row: ContactConstraint, was: SolvedPair, press: Callable, a: Motion | None, b: Motion, work: Work | None, one: Array
-) -> tuple[Motion | None, Motion, SolvedPair, Work | None]:
-    """Both motions after a row's normal impulses, its friction and what resists its rolling; the row; the work.
+def _apply_pass(
+    constraint: ContactConstraint, pair: SolvedPair, normal_impulse: Callable, a: BodySide, b: BodySide
+) -> tuple[BodySide, BodySide, SolvedPair]:
+    """Both sides and the pair after normal impulses, friction and rolling resistance.
 
-    `press(i, touch, speed, old)` gives the accumulated normal impulse at point i.
+    `normal_impulse(i, contact, speed, old)` returns the accumulated normal impulse at point i.
     """
-    before, roll = (a, b), was.roll
-    if row.grip is not None and roll is None:
-        # What presses two discs gives them no slip, so both impulses can be had at once.
-        (at,), (old,) = was.touches, was.impulses
-        speed, slip = relative(at.grip, at.normal, a, b)
-        pressed = materialize(press(0, at, speed, old), one)
-        impulse = Impulse(pressed, materialize(friction_impulse(row, at, pressed, slip, old), one))
-        more = add_impulses(impulse, old)
-        a, b = apply_impulse(row, at, more, a, b)
-        return a, b, SolvedPair(was.touches, [impulse], None), dissipated_by_discs(work, row.grip, more, speed, slip)
-    pressed, impulses = [], []
-    for i, (at, old) in enumerate(zip(was.touches, was.impulses, strict=True)):
-        speed, _ = relative(at.grip, at.normal, a, b)
-        pressed.append(materialize(press(i, at, speed, old), one))
-        a, b = apply_impulse(row, at, (pressed[-1] - old.normal, None), a, b)
-    for at, old, normal in zip(was.touches, was.impulses, pressed, strict=True):
-        _, slip = relative(at.grip, at.normal, a, b)
-        impulses.append(Impulse(normal, materialize(friction_impulse(row, at, normal, slip, old), one)))
-        a, b = apply_impulse(row, at, (None, impulses[-1].tangent - old.tangent), a, b)
-    if roll is not None:
-        roll = materialize(rolling_impulse(row, sum(pressed[1:], pressed[0]), a, b, roll), one)
-        a, b = spin_change(row, roll - was.roll, a, b)
-    more = [add_impulses(new, old) for new, old in zip(impulses, was.impulses, strict=True)]
-    twist = None if roll is None else roll - was.roll
-    return (
-        a,
-        b,
-        SolvedPair(was.touches, impulses, roll),
-        dissipated(work, row, was.touches, more, twist, before, (a, b)),
-    )
+    assert b.motion is not None, "only static bodies lack a motion"
+    before, roll = (a.motion, b.motion), pair.roll
+    motions, impulses = before, []
+    if constraint.frame is not None and roll is None:
+        # The normal impulse between two discs adds no slip, so both impulses follow from the same velocities.
+        (contact,), (old,) = pair.contacts, pair.impulses
+        speed, slip = relative_speed(contact.frame, contact.normal, *before)
+        normal = materialize(normal_impulse(0, contact, speed, old))
+        impulses.append(Impulse(normal, materialize(friction_impulse(constraint, contact, normal, slip, old))))
+        change = impulse_change(impulses[0], old)
+        motions = apply_impulse(constraint, contact, change, *before)
+        work = dissipated_by_discs(b.work, constraint.frame, change, speed, slip)
+    else:
+        normals = []
+        for i, (contact, old) in enumerate(zip(pair.contacts, pair.impulses, strict=True)):
+            speed, _ = relative_speed(contact.frame, contact.normal, *motions)
+            normals.append(materialize(normal_impulse(i, contact, speed, old)))
+            motions = apply_impulse(constraint, contact, (normals[-1] - old.normal, None), *motions)
+        for contact, old, normal in zip(pair.contacts, pair.impulses, normals, strict=True):
+            _, slip = relative_speed(contact.frame, contact.normal, *motions)
+            tangent = materialize(friction_impulse(constraint, contact, normal, slip, old))
+            impulses.append(Impulse(normal, tangent))
+            motions = apply_impulse(constraint, contact, (None, tangent - old.tangent), *motions)
+        if roll is not None and pair.roll is not None:
+            roll = materialize(rolling_impulse(constraint, sum(normals[1:], normals[0]), *motions, roll))
+            motions = apply_angular_impulse(constraint, roll - pair.roll, *motions)
+        changes = [impulse_change(new, old) for new, old in zip(impulses, pair.impulses, strict=True)]
+        twist = None if roll is None or pair.roll is None else roll - pair.roll
+        work = dissipated(b.work, constraint, pair.contacts, changes, twist, before, motions)
+    solved = SolvedPair(pair.contacts, impulses, roll)
+    return a._replace(motion=motions[0]), b._replace(motion=motions[1], work=work), solved
 
 
 def warm_start(
-    row: ContactConstraint, memory: WarmStart, a: tuple, b: tuple, setup: PassSetup
-) -> tuple[tuple, tuple, list[ContactPoint]]:
-    """Both sides with the last step's impulses, and the row's points.
-
-    A side is its shape, motion, acceleration (None where all fall alike) and work; a fixed one has no motion where it
-    stands still.
-    """
-    (shape_a, motion_a, fall_a, _), (shape_b, motion_b, fall_b, work) = a, b
-    olds, roll = kept_impulses(memory.impulses), memory.roll
-    fall = setup.gravity if row.firm else None
-    if fall_b is not None:
-        fall = fall_b if row.firm else fall_b - fall_a
-    points = contact_points(row, shape_a, shape_b, [jnp.abs(old.normal) for old in memory.impulses], fall, setup)
-    new_a, new_b = motion_a, motion_b
-    for at, old in zip(points, olds, strict=True):
-        new_a, new_b = apply_impulse(row, at, old, new_a, new_b)
+    constraint: ContactConstraint, memory: WarmStart, a: BodySide, b: BodySide, setup: PassSetup
+) -> tuple[BodySide, BodySide, list[ContactPoint]]:
+    """Both sides with the impulses of the last step, and the contact points."""
+    assert b.motion is not None, "only static bodies lack a motion"
+    olds, roll, before = warm_start_impulses(memory.impulses), memory.roll, (a.motion, b.motion)
+    acceleration = setup.gravity if constraint.static else None
+    if b.acceleration is not None:
+        acceleration = b.acceleration if a.acceleration is None else b.acceleration - a.acceleration
+    normals = [jnp.abs(old.normal) for old in memory.impulses]
+    points, motions = contact_points(constraint, a.shape, b.shape, normals, acceleration, setup), before
+    for point, old in zip(points, olds, strict=True):
+        motions = apply_impulse(constraint, point, old, *motions)
     if roll is not None:
-        new_a, new_b = spin_change(row, roll, new_a, new_b)
-    if row.grip is not None and roll is None:
-        speeds = relative(row.grip, points[0].normal, motion_a, motion_b)
-        work = dissipated_by_discs(work, row.grip, olds[0], *speeds)
+        motions = apply_angular_impulse(constraint, roll, *motions)
+    if constraint.frame is not None and roll is None:
+        speeds = relative_speed(constraint.frame, points[0].normal, *before)
+        work = dissipated_by_discs(b.work, constraint.frame, olds[0], *speeds)
     else:
-        work = dissipated(work, row, points, olds, roll, (motion_a, motion_b), (new_a, new_b))
-    new_b = materialize(new_b, setup.one) if row.firm else new_b
-    return (shape_a, new_a, fall_a, a[3]), (shape_b, new_b, fall_b, work), points
+        work = dissipated(b.work, constraint, points, olds, roll, before, motions)
+    motion_b = materialize(motions[1]) if constraint.static else motions[1]
+    return a._replace(motion=motions[0]), b._replace(motion=motion_b, work=work), points
 
 
-HELD = 1e-9  # m/s: the push of a contact that does not push
+MIN_PUSH = 1e-9  # m/s: marks a contact that holds its bodies without pushing them apart
 
 
-def _pushes(
-    row: ContactConstraint,
-    points: list[ActiveContact],
-    impulses: list[Impulse],
-    a: Displacement | None,
-    b: Displacement,
-    rules: SolverParams,
-) -> Array:
-    """What a row's contact may add to its bodies' speeds, or hand on; 0 where there is none but an impact."""
-    rate, *_ = softness(row, rules)
-    found = b.push if a is None else jnp.maximum(a.push, b.push)
-    pushes = jnp.zeros_like(found)
-    for at, impulse in zip(points, impulses, strict=True):
-        own = jnp.maximum(found, jnp.clip(-rate * at.gap, HELD, rules.push_speed))
-        pushes = jnp.maximum(pushes, jnp.where((at.tau < 0) & (impulse.normal > 0), own, 0.0))
-    return pushes
+def _push(constraint: ContactConstraint, solved: SolvedPair, a: BodySide, b: BodySide, params: SolverParams) -> Array:
+    """Bound on the speed, m/s, that the contact adds to its bodies or passes on between them; 0 without a resting
+    contact."""
+    rate, *_ = softness(constraint, params)
+    largest = b.push if a.push is None else jnp.maximum(a.push, b.push)
+    push = jnp.zeros_like(largest)
+    for contact, impulse in zip(solved.contacts, solved.impulses, strict=True):
+        own = jnp.maximum(largest, jnp.clip(-rate * contact.gap, MIN_PUSH, params.push_speed))
+        push = jnp.maximum(push, jnp.where((contact.tau < 0) & (impulse.normal > 0), own, 0.0))
+    return push
 
 
-def _drifted(drift: Displacement, points: list[ActiveContact], pushes: Array, old: Motion, new: Motion) -> Displacement:
-    """The drift with what the time of an impact takes off the way.
+def _drifted(old: BodySide, new: BodySide, contacts: list[ActiveContact], push: Array) -> BodySide:
+    """The side with its drift reduced by tau times the change of velocity.
 
-    Of two points that bounce in the same step the way counts from the mean of their times.
+    If two points bounce in the same step, the mean of their times counts.
     """
-    tau = jnp.maximum(points[0].tau, 0.0)
-    if len(points) == 2:
-        second = jnp.maximum(points[1].tau, 0.0)
-        both = (points[0].tau >= 0) & (points[1].tau >= 0)
+    assert old.motion, "only moving bodies drift"
+    assert new.motion, "only moving bodies drift"
+    assert old.drift, "only moving bodies drift"
+    tau = jnp.maximum(contacts[0].tau, 0.0)
+    if len(contacts) == 2:
+        second = jnp.maximum(contacts[1].tau, 0.0)
+        both = (contacts[0].tau >= 0) & (contacts[1].tau >= 0)
         tau = jnp.where(both, 0.5 * (tau + second), tau + second)
-    way = Motion(drift.way.velocity - tau * (new.velocity - old.velocity), drift.way.spin - tau * (new.spin - old.spin))
-    return Displacement(way, jnp.maximum(drift.push, pushes))
+    velocity = old.drift.velocity - tau * (new.motion.velocity - old.motion.velocity)
+    spin = old.drift.spin - tau * (new.motion.spin - old.motion.spin)
+    return new._replace(drift=Motion(velocity, spin), push=jnp.maximum(old.push, push))
 
 
 def solve(
-    row: ContactConstraint,
+    constraint: ContactConstraint,
     memory: WarmStart,
-    found: list[ContactPoint],
-    a: tuple,
-    b: tuple,
+    points: list[ContactPoint],
+    a: BodySide,
+    b: BodySide,
     setup: PassSetup,
-    rules: SolverParams,
-) -> tuple[tuple, tuple, SolvedPair]:
-    """Both sides after the biased solve, and the row. A side is its motion, drift and work."""
-    (motion_a, drift_a, _), (motion_b, drift_b, work) = a, b
-    points = [impact_of(row, at, a[:2], b[:2], setup, rules.step) for at in found]
-    both = both_points(row, points, [relative(p.grip, p.normal, motion_a, motion_b)[0] for p in points])
+    params: SolverParams,
+) -> tuple[BodySide, BodySide, SolvedPair]:
+    """Both sides and the pair after the biased solve, bounces included."""
+    motion_a, motion_b = a.motion, b.motion
+    assert motion_b is not None, "only static bodies lack a motion"
+    contacts = [impact_of(constraint, point, a, b, setup, params.step) for point in points]
+    speeds = [relative_speed(c.frame, c.normal, motion_a, motion_b)[0] for c in contacts]
+    both = two_point_impulses(constraint, contacts, speeds)
 
-    def press(i: int, touch: ActiveContact, speed: Array, old: Impulse) -> Array:
-        alone = biased_impulse(row, touch, speed, old, rules)
-        together = both[i]
+    def normal_impulse(i: int, contact: ActiveContact, speed: Array, old: Impulse) -> Array:
+        alone, together = biased_impulse(constraint, contact, speed, old, params), both[i]
         return alone if together is None else jnp.where(together >= 0, old.normal + together, alone)
 
-    was = SolvedPair(points, kept_impulses(memory.impulses), memory.roll)
-    new_a, new_b, solved, work = _exchange(row, was, press, motion_a, motion_b, work, setup.one)
-    pushes = _pushes(row, points, solved.impulses, drift_a, drift_b, rules)
-    drift_b = _drifted(drift_b, points, pushes, motion_b, new_b)
-    if row.a is not None and drift_a is not None and new_a is not None:
-        drift_a = _drifted(drift_a, points, pushes, motion_a, new_a)
-    new_b, drift_b = materialize((new_b, drift_b), setup.one) if row.firm else (new_b, drift_b)
-    return (new_a, drift_a, a[2]), (new_b, drift_b, work), solved
+    pair = SolvedPair(contacts, warm_start_impulses(memory.impulses), memory.roll)
+    new_a, new_b, solved = _apply_pass(constraint, pair, normal_impulse, a, b)
+    push = _push(constraint, solved, a, b, params)
+    new_b = _drifted(b, new_b, contacts, push)
+    if constraint.a is not None and a.drift is not None:
+        new_a = _drifted(a, new_a, contacts, push)
+    if constraint.static:
+        new_b = materialize(new_b._replace(work=None))._replace(work=new_b.work)
+    return new_a, new_b, solved
 
 
-JOLT = 1.0  # m/s: what is faster than this is an impact, also in a pile
+MAX_STACK_IMPACT = 1.0  # m/s: faster contacts count as impacts even inside a stack
 
 
-def _left(at: ActiveContact, bounced: Array, impulse: Impulse) -> Impulse:
-    """What the next step starts with.
+def _next_impulse(contact: ActiveContact, bounced: Array, impulse: Impulse) -> Impulse:
+    """Impulse that the next step starts with.
 
-    Impacts do not warm-start the next step, so `kept_impulses` drops negative impulses. The impulse is stored negated
-    when the bodies were already touching, so that a resting pile mistaken for an impact recovers in the next step.
+    Impacts do not warm-start the next step, so `warm_start_impulses` drops negative impulses. The impulse is stored
+    negated when the bodies were already touching, so that a resting pile mistaken for an impact recovers in the next
+    step.
     """
-    told = jnp.minimum(impulse.normal, JOLT * at.grip.normal_mass)
-    normal = jnp.where(bounced, jnp.where(at.gap <= 0, -told, 0.0), impulse.normal)
+    negated = jnp.minimum(impulse.normal, MAX_STACK_IMPACT * contact.frame.normal_mass)
+    normal = jnp.where(bounced, jnp.where(contact.gap <= 0, -negated, 0.0), impulse.normal)
     return Impulse(normal, jnp.where(bounced, 0.0, impulse.tangent))
 
 
-def kept_impulses(impulses: list[Impulse]) -> list[Impulse]:
-    """What warm-starts a step, of what the last one left."""
+def warm_start_impulses(impulses: list[Impulse]) -> list[Impulse]:
+    """Impulses of the last step without those of impacts, which are stored as negative normal impulses."""
     return [Impulse(jnp.maximum(i.normal, 0.0), i.tangent) for i in impulses]
 
 
 def relax(
-    row: ContactConstraint, solved: SolvedPair, a: tuple, b: tuple, setup: PassSetup
-) -> tuple[tuple, tuple, tuple[SolvedPair, WarmStart]]:
-    """Both sides after the relaxing solve, the row, and what it leaves to the next step.
+    constraint: ContactConstraint, solved: SolvedPair, a: BodySide, b: BodySide, setup: PassSetup
+) -> tuple[BodySide, BodySide, tuple[SolvedPair, WarmStart]]:
+    """Both sides and the pair after the relaxing solve, and the impulses for the next step."""
+    bounced = []
 
-    A side is its motion, the push of its drift, and its work.
-    """
-    (motion_a, push_a, _), (motion_b, push_b, work), again = a, b, []
+    def normal_impulse(_: int, contact: ActiveContact, speed: Array, old: Impulse) -> Array:
+        resting = jnp.where(contact.tau < 0, old.normal, 0.0)
+        threshold = bounce_threshold(contact, resting, a, b, setup)
+        bounced.append(bounces_again(contact, speed, threshold))
+        return relaxed_impulse(constraint, contact, speed, old, threshold)
 
-    def press(_: int, touch: ActiveContact, speed: Array, old: Impulse) -> Array:
-        threshold = bounce_threshold(touch, jnp.where(touch.tau < 0, old.normal, 0.0), push_a, push_b, setup)
-        again.append(impact_impulse(touch, speed, threshold))
-        return relaxed_impulse(row, touch, speed, old, threshold)
-
-    new_a, new_b, now, work = _exchange(row, solved, press, motion_a, motion_b, work, setup.one)
-    left = []
-    for at, hit, impulse in zip(now.touches, again, now.impulses, strict=True):
-        left.append(_left(at, (at.tau >= 0) | hit, impulse))
-    left = materialize(left, setup.one)
-    new_b = materialize(new_b, setup.one) if row.firm else new_b
-    return (new_a, *a[1:]), (new_b, push_b, work), (now, WarmStart(left, now.roll))
+    a, new_b, last = _apply_pass(constraint, solved, normal_impulse, a, b)
+    of = zip(last.contacts, bounced, last.impulses, strict=True)
+    impulses = materialize([_next_impulse(c, (c.tau >= 0) | again, impulse) for c, again, impulse in of])
+    if constraint.static:
+        new_b = new_b._replace(motion=materialize(new_b.motion))
+    return a, new_b, (last, WarmStart(impulses, last.roll))
 
 
 def touching(solved: SolvedPair, last: SolvedPair) -> Array:
-    """Whether anything pressed the two of a row together in a step, in its biased solve or in its last one."""
-    pressed = [i.normal > 0 for row in (solved, last) for i in row.impulses]
+    """Whether a normal impulse acted in the biased or in the relaxing pass."""
+    pressed = [i.normal > 0 for pair in (solved, last) for i in pair.impulses]
     return functools.reduce(jnp.logical_or, pressed)
+
+
+def observe(solved: SolvedPair, warm: WarmStart) -> tuple[Array, Array]:
+    """Deepest overlap of a pair, m, and whether a contact began in this step, as a bounce does."""
+    depth = jnp.zeros_like(solved.contacts[0].gap)
+    for contact in solved.contacts:
+        depth = jnp.maximum(depth, jnp.where(contact.frame.normal_mass > 0, -contact.gap, 0.0))
+    now, before = (sum(i.normal for i in x[1:]) + x[0].normal for x in (solved.impulses, warm.impulses))
+    return depth, (now > 0) & (before == 0)

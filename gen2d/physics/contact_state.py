@@ -1,37 +1,42 @@
-"""What contacts hand from pass to pass and from step to step."""
+"""Records that the contact solver hands from pass to pass and from step to step."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+from gen2d.physics.collision import Shape
 from gen2d.physics.constraint import ActiveContact, Impulse, Motion
+from gen2d.physics.energy import Work
 from gen2d.records.axes import Array
 
 
 class PassSetup(NamedTuple):
-    """What the passes need to know of a video."""
+    """Inputs of the passes that are constant over a video."""
 
     gravity: Array  # [2, 1, ...] m/s^2
     threshold: Array  # [...] m/s: slower impacts do not bounce
-    one: Array  # see settled()
-    contacts: bool  # whether touches shall say where they are
+    log: bool  # whether contacts store their positions
 
 
-class Displacement(NamedTuple):
-    """What a pass changes in where a body goes, beyond its new velocity."""
+class BodySide(NamedTuple):
+    """Bodies on one side of a batch of contacts; what a pass does not need is None."""
 
-    way: Motion  # m, rad: impacts act at their time, not at the start of the step
-    push: Array  # [N, ...] m/s: what pushing overlaps apart may have added to its speed; 0: no contact holds it
+    shape: Shape | None = None  # in the world
+    motion: Motion | None = None  # None: static bodies at rest
+    acceleration: Array | None = None  # [2, N, ...] m/s^2; None: gravity's
+    drift: Motion | None = None  # m, rad: displacement beyond h times the new velocity, as impacts act at their time
+    push: Any = None  # [N, ...] m/s: bound on the speed from pushing overlaps apart; 0: no contact; None: static
+    work: Work | None = None
 
 
 class WarmStart(NamedTuple):
-    """What a row leaves to the next step."""
+    """Impulses of a contact that the next step starts with."""
 
-    impulses: list[Impulse]  # at its points; `kept` says what of them counts
+    impulses: list[Impulse]  # at its points; see `warm_start_impulses`
     roll: Array | None  # N m s, against rolling
 
 
 class SolvedPair(NamedTuple):
-    """A row before or after a pass."""
+    """A contact before or after a pass."""
 
-    touches: list[ActiveContact]
+    contacts: list[ActiveContact]
     impulses: list[Impulse]
     roll: Array | None

@@ -1,8 +1,9 @@
-"""The books of energy and momentum: what there is, where it went and what came in, each computed by itself.
+"""Energy and momentum accounting; every term is computed by itself.
 
-An impulse P changes the kinetic energy by P . (u + u') / 2 with u and u' the speeds at its point before and after: so a
-row knows what it takes, from its own impulses and speeds. What gravity's discrete kick m a . (h v + h^2 a / 2) and the
-real fall m a . dx differ by belongs to what changed the fall: contacts, or damping.
+An impulse P changes the kinetic energy by P . (u + u') / 2, with u and u' the speeds at its point before and after, so
+a contact knows its work from its own impulses and speeds. Gravity's discrete kick does the work
+m a . (h v + h^2 a / 2); its difference from that of the real fall, m a . dx, belongs to what changed the fall: contacts
+or damping.
 """
 
 from collections.abc import Sequence
@@ -18,44 +19,37 @@ from gen2d.physics.constraint import (
     ContactPoint,
     Impulse,
     Motion,
-    relative,
-    turning,
+    relative_speed,
+    relative_spin,
 )
 from gen2d.records.axes import Array
 from gen2d.xla import sum_bodies
 
 
 class Work(NamedTuple):
-    """What was done to a body since frame 0, J [N, ...], or by joints, J [1, ...]. None: nothing can do such work."""
+    """Work since frame 0 on bodies, J [N, ...], or by joints, J [1, ...]. None: no such work is possible."""
 
     lost: Array  # in contacts and rigid joints
-    driven: Array | None  # by forces, motors, and bodies that move as they like
-    damped: Array | None  # lost to damping, of bodies and of springs
+    driven: Array | None  # by forces, motors and kinematic bodies
+    damped: Array | None  # lost to damping of bodies and springs
 
 
 class Ledger(NamedTuple):
-    """The work on each group of bodies, and by all joints."""
+    """Work on each group of bodies and by all joints."""
 
     groups: list[Work]
     joints: Work | None
 
 
 def dissipated_by_discs(
-    work: Work | None, grip: ContactFrame, impulse: Impulse, speed: Array, slip: Array
+    work: Work | None, frame: ContactFrame, impulse: Impulse, speed: Array, slip: Array
 ) -> Work | None:
-    """The work with an impulse at a point where the two directions do not mix; speeds before it."""
+    """Work with that of an impulse whose two directions do not interact; speeds are those before it."""
     if work is None:
         return None
-    gained = impulse.normal * (speed + 0.5 * grip.k_normal * impulse.normal)
-    gained = gained + impulse.tangent * (slip + 0.5 * grip.k_tangent * impulse.tangent)
-    return work._replace(lost=work.lost - gained)
-
-
-def _of_surface(grip: ContactFrame, normal: Array, a: Motion) -> tuple[Array, Array]:
-    """Normal and tangential speed of a's own point."""
-    still = Motion(jnp.zeros_like(a.velocity), jnp.zeros_like(a.spin))
-    speed, slip = relative(grip, normal, a, still)
-    return -speed, -slip
+    gain = impulse.normal * (speed + 0.5 * frame.k_normal * impulse.normal)
+    gain = gain + impulse.tangent * (slip + 0.5 * frame.k_tangent * impulse.tangent)
+    return work._replace(lost=work.lost - gain)
 
 
 MotionPair: TypeAlias = tuple[Motion | None, Motion]  # of a and b
@@ -63,85 +57,90 @@ MotionPair: TypeAlias = tuple[Motion | None, Motion]  # of a and b
 
 def dissipated(
     work: Work | None,
-    row: ContactConstraint,
+    constraint: ContactConstraint,
     points: Sequence[ContactPoint | ActiveContact],
     impulses: list[Impulse],
     roll: Array | None,
     before: MotionPair,
     after: MotionPair,
 ) -> Work | None:
-    """The work with all impulses of a row, which led from motions to others."""
+    """Work with that of all impulses of a pair, from the motions before and after them."""
     if work is None:
         return None
     lost, driven = work.lost, work.driven
-    mover = before[0] if row.firm else None  # what moves as it likes does work where it pushes
-    for at, impulse in zip(points, impulses, strict=True):
-        sums = (x + y for x, y in zip(*(relative(at.grip, at.normal, *m) for m in (before, after)), strict=True))
+    mover = before[0] if constraint.static else None  # a kinematic body does work where it pushes
+    for point, impulse in zip(points, impulses, strict=True):
+        speeds = (relative_speed(point.frame, point.normal, *motions) for motions in (before, after))
+        sums = (x + y for x, y in zip(*speeds, strict=True))
         lost = lost - 0.5 * sum(p * s for p, s in zip(impulse, sums, strict=True))
         if mover is not None and driven is not None:
-            surface = _of_surface(at.grip, at.normal, mover)
-            driven = driven + sum(p * s for p, s in zip(impulse, surface, strict=True))
+            rest = Motion(jnp.zeros_like(mover.velocity), jnp.zeros_like(mover.spin))
+            speed, slip = relative_speed(point.frame, point.normal, mover, rest)
+            driven = driven + sum(p * s for p, s in zip(impulse, (-speed, -slip), strict=True))
     if roll is not None:
-        lost = lost - 0.5 * roll * (turning(*before) + turning(*after))
+        lost = lost - 0.5 * roll * (relative_spin(*before) + relative_spin(*after))
         driven = driven if mover is None or driven is None else driven + roll * mover.spin
     return Work(lost, driven, work.damped)
 
 
-def _energies(motion: Motion, group: Any) -> Array:
+def _kinetic(motion: Motion, group: Any) -> Array:
     return 0.5 * (group.mass * dot(motion.velocity, motion.velocity) + group.moment * motion.spin**2)
 
 
-def _taken(group: Any, fall: Array, spin_up: Array | float, aside: Motion) -> Array:
-    """m a . dx, and the same of the angle."""
-    linear = group.mass * dot(fall, aside.velocity)
-    return linear if isinstance(spin_up, float) else linear + group.moment * spin_up * aside.spin
+def _work_of(group: Any, acceleration: Array, angular: Array | float, displacement: Motion) -> Array:
+    """Work m a . dx, with its angular part."""
+    linear = group.mass * dot(acceleration, displacement.velocity)
+    return linear if isinstance(angular, float) else linear + group.moment * angular * displacement.spin
 
 
 def record_energy(
     work: Work,
     group: Any,
     old: Motion,
-    flying: Motion,
-    more: Motion,
-    way: Motion,
-    fall: Array,
-    spin_up: Array | float,
+    free: Motion,
+    free_drift: Motion,
+    displacement: Motion,
+    acceleration: Array,
+    angular: Array | float,
     gravity: Array,
     h: float,
 ) -> Work:
-    """The work on a group after a step, from its motion before it, and its motion and way if nothing had touched it.
+    """Work on a group after a step.
 
-    How far it went beyond that: that, times m a, was not gravity's work but that of what touched it. Likewise damping
-    is what is missing of the energy and of the way of a fall without it.
+    `old` is the motion before the step; `free`, and `free_drift` beyond h times it, are those of a step without any
+    contact or joint. The work of the acceleration over the displacement that differs from the free one belongs to
+    contacts and joints. Damping takes the energy and the displacement that an undamped fall would have more.
     """
-    free = Motion(h * flying.velocity + more.velocity, h * flying.spin + more.spin)
-    aside = Motion(way.velocity - free.velocity, way.spin - free.spin)
-    lost, driven, damped = work.lost + _taken(group, fall, spin_up, aside), work.driven, work.damped
+    free_way = Motion(h * free.velocity + free_drift.velocity, h * free.spin + free_drift.spin)
+    deviation = Motion(displacement.velocity - free_way.velocity, displacement.spin - free_way.spin)
+    lost = work.lost + _work_of(group, acceleration, angular, deviation)
+    driven, damped = work.driven, work.damped
     if damped is not None:
-        kicked = Motion(old.velocity + h * fall, old.spin + h * spin_up)
-        undamped = h * old.velocity + 0.5 * h**2 * fall, h * old.spin + 0.5 * h**2 * spin_up
-        behind = Motion(free.velocity - undamped[0], free.spin - undamped[1])
-        damped = damped + _energies(kicked, group) - _energies(flying, group) + _taken(group, fall, spin_up, behind)
+        undamped = Motion(old.velocity + h * acceleration, old.spin + h * angular)
+        way = h * old.velocity + 0.5 * h**2 * acceleration, h * old.spin + 0.5 * h**2 * angular
+        missing = Motion(free_way.velocity - way[0], free_way.spin - way[1])
+        damped = damped + _kinetic(undamped, group) - _kinetic(free, group)
+        damped = damped + _work_of(group, acceleration, angular, missing)
     if driven is not None:
-        driven = driven + _taken(group, fall - gravity[:, None], spin_up, way)
+        driven = driven + _work_of(group, acceleration - gravity[:, None], angular, displacement)
     return Work(lost, driven, damped)
 
 
 def accumulate(work: Work | None, passes: list[Work]) -> Work | None:
-    """The work by all joints after a step's passes."""
+    """Work by all joints after the passes of a step."""
     if work is None or not passes:
         return work
     lost, driven, damped = zip(*passes, strict=True)
-    return Work(sum(lost, work.lost), _sum(work.driven, driven), _sum(work.damped, damped))
+
+    def total(old: Array | None, parts: Sequence[Array | None]) -> Array | None:
+        return None if old is None else sum((part for part in parts if part is not None), old)
+
+    return Work(sum(lost, work.lost), total(work.driven, driven), total(work.damped, damped))
 
 
-def _sum(old: Array | None, parts: Sequence[Array | None]) -> Array | None:
-    return None if old is None else sum((part for part in parts if part is not None), old)
-
-
-def close_balance(book: Ledger, springs: Array) -> tuple[Array, ...]:
-    """Lost in contact, put in, lost to damping, by now; what springs hold now is not lost."""
-    works = book.groups if book.joints is None else [*book.groups, book.joints]
+def close_balance(ledger: Ledger, springs: Array) -> tuple[Array, ...]:
+    """Energy lost in contacts, put in, and lost to damping so far; energy stored in springs is not lost."""
+    works = ledger.groups if ledger.joints is None else [*ledger.groups, ledger.joints]
     lost, driven, damped = (
         sum((sum_bodies(part) for part in parts if part is not None), jnp.zeros_like(springs))
         for parts in zip(*works, strict=True)
@@ -150,14 +149,14 @@ def close_balance(book: Ledger, springs: Array) -> tuple[Array, ...]:
 
 
 def balance(groups: list[Any], bodies: list[Any], gravity: Array, springs: Array) -> tuple[Array | float, ...]:
-    """Kinetic, rotational and potential energy, linear [2, ...] and angular momentum of all bodies, now."""
+    """Kinetic, rotational and potential energy, and linear [2, ...] and angular momentum of all bodies."""
     kinetic = rotational = potential = angular = 0.0
     linear = jnp.zeros_like(gravity)
-    for g, body in zip(groups, bodies, strict=True):
+    for group, body in zip(groups, bodies, strict=True):
         (x, y), v, spin = body.position, body.motion.velocity, body.motion.spin
-        kinetic = kinetic + sum_bodies(0.5 * g.mass * dot(v, v))
-        rotational = rotational + sum_bodies(0.5 * g.moment * spin**2)
-        potential = potential - sum_bodies(g.mass * dot(gravity[:, None], body.position))
-        linear = linear + sum_bodies(g.mass * v)
-        angular = angular + sum_bodies(g.mass * (x * v[1] - y * v[0]) + g.moment * spin)
+        kinetic = kinetic + sum_bodies(0.5 * group.mass * dot(v, v))
+        rotational = rotational + sum_bodies(0.5 * group.moment * spin**2)
+        potential = potential - sum_bodies(group.mass * dot(gravity[:, None], body.position))
+        linear = linear + sum_bodies(group.mass * v)
+        angular = angular + sum_bodies(group.mass * (x * v[1] - y * v[0]) + group.moment * spin)
     return kinetic, rotational, potential + springs, linear, angular

@@ -1,11 +1,11 @@
-"""Only the rows that are near each other, found anew in every step: what a CPU likes.
+"""Contact solver over the pairs that are near each other, found again in every step; for CPUs.
 
-A step looks at all pairs once, for a bit each: whether they may meet in it (near.py). The three passes then run over
-those rows in chunks, of all scenes at once, round after round in the order of dense.py. Bodies, and what is remembered
-of a row, lie in tables with a line each (tables.py): a chunk's lines are gathered, solved and put back. A row that is
-not near would have changed nothing, so the result is that of dense.py, but for the rounding of other machine code.
+A step looks at every pair once, for a bit: whether the two may meet in it (broad_phase.py). The three passes then run
+over the near pairs of all scenes in chunks, in the order of all_pairs.py. Bodies and what is cached of a pair are rows
+of packed tables (packing.py): a chunk's rows are gathered, solved and put back. A pair that is not near would change
+nothing, so the result equals that of all_pairs.py up to rounding.
 
-The loops end when the rows do, so there is no reverse-mode gradient here: dense.py has it.
+The loops end with the last near pair, so there is no reverse-mode gradient; all_pairs.py has one.
 """
 
 import dataclasses
@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gen2d.physics import contact_passes, tunnelling
+from gen2d.physics import contact_passes
 from gen2d.physics.broad_phase import (
     BITS,
     ActivePairs,
@@ -31,7 +31,7 @@ from gen2d.physics.broad_phase import (
     signed_distance,
 )
 from gen2d.physics.collision import Shape, dot
-from gen2d.physics.constraint import ContactConstraint, Impulse, Motion
+from gen2d.physics.constraint import ContactConstraint, Impulse
 from gen2d.physics.contact_log import (
     ON,
     ContactEvent,
@@ -43,7 +43,8 @@ from gen2d.physics.contact_log import (
     pair_event,
     record_event,
 )
-from gen2d.physics.contact_state import Displacement, PassSetup, WarmStart
+from gen2d.physics.contact_solver import ContactSolver
+from gen2d.physics.contact_state import BodySide, PassSetup, WarmStart
 from gen2d.physics.packing import SAFE, PackedTable, TableSpec, make_table, pack, repeat_rows, unpack
 from gen2d.physics.params import SolverParams
 from gen2d.physics.schedule import bipartite_rounds
@@ -55,102 +56,108 @@ NEVER = -2  # the step of what has not happened
 
 
 class StaticSide(NamedTuple):
-    """A fixed body, as rows need it beside its shape; leaves [..., 1, n]."""
+    """Constants of a static or kinematic body; leaves [..., 1, n]."""
 
-    side: Any
-    left: tuple[Array, Array] | None  # see `rows.Row`
+    material: Any
+    left: tuple[Array, Array] | None  # see `ContactConstraint`
     right: tuple[Array, Array] | None
     present: Array
 
 
 class DynamicSide(NamedTuple):
-    """What stays the same of the bodies of a group; leaves [..., N, n]."""
+    """Constants of a group of bodies; leaves [..., N, n]."""
 
-    side: Any
+    material: Any
     gravity: Array
     threshold: Array
 
 
 @dataclasses.dataclass(frozen=True)
 class PairBatch:
-    """Rows that are solved by the same operations: a match of two groups, or of some fixed bodies with a group."""
+    """Pairs that are solved by the same operations: of two groups, or of some static bodies with a group."""
 
-    first: int | None  # a group; None: fixed bodies
-    posts: dict[int, StaticSide]  # which
+    first: int | None  # a group; None: static bodies
+    statics: dict[int, StaticSide]  # by number
     second: int
-    a: np.ndarray  # [R, P] who meets in each of R rounds, by their numbers in their group, or among the posts
+    a: np.ndarray  # [R, P] the pairs of R rounds, by number in the group or place among the statics
     b: np.ndarray
-    slots: tuple[np.ndarray, np.ndarray]  # [R, P] theirs
-    ring: RoundRobin | None  # of a group with itself
-    row: Callable[[Any, Any], ContactConstraint]  # from both sides
+    slots: tuple[np.ndarray, np.ndarray]  # [R, P] of the objects
+    round_robin: RoundRobin | None  # of a group with itself
+    constraint: Callable[[Any, Any], ContactConstraint]  # from the materials of both sides
     points: int
 
     @property
     def groups(self) -> list[int]:
-        """The groups whose bodies it moves."""
+        """Groups whose bodies move."""
         return [self.second] if self.first in (None, self.second) else [self.first, self.second]
+
+    @property
+    def pair_of_bit(self) -> np.ndarray:
+        """The pair [R, bits] that each bit of a round stands for."""
+        every = np.broadcast_to(np.arange(self.a.shape[1]), self.a.shape)
+        return every if self.round_robin is None else self.round_robin.pair
 
 
 class GatherIndices(NamedTuple):
-    """Where the rows of a chunk are, each [C]; where there is no row, the last line of all."""
+    """Table rows of the pairs of a chunk, each [C]; the last row of a table where there is no pair."""
 
-    a: Array  # lines of the tables of their bodies
+    a: Array  # of the bodies
     b: Array
-    row: Array  # and of the table of rows
-    lane: Array
+    pair: Array  # of the pairs
+    scene: Array
 
 
 class PassBuffers(NamedTuple):
-    """What a step's passes tell each other of the rows of a kind, by chunk."""
+    """What the passes of a step hand on about the pairs of a batch, by chunk."""
 
-    places: Array  # [K, 4, C]
-    found: Array  # [K, F, C]
+    indices: Array  # [K, 4, C]
+    contacts: Array  # [K, F, C]
     solved: Array
 
 
 class ListedPairs(NamedTuple):
-    """What the first pass tells the others, of each kind: how many chunks there are, and what it keeps of them."""
+    """Near pairs of each batch, and their contacts after the warm start."""
 
-    chunks: list[Array]
-    places: list[Array]
-    kept: list[Array]
-    specs: dict[int, TableSpec]  # how to read it
+    chunks: list[Array]  # how many there are
+    indices: list[Array]
+    packed: list[Array]
+    specs: dict[int, TableSpec]  # of the packed contacts
 
 
 class SolvedChunk(NamedTuple):
-    """What the second pass tells the third, of each kind."""
+    """Contacts of each batch after the biased pass."""
 
-    found: ListedPairs
-    kept: list[Array]
+    listed: ListedPairs
+    packed: list[Array]
     specs: dict[int, TableSpec]
-    seen: list[tuple[Array, Array]]  # by scene, and nobody's: the deepest overlap, m, and how many contacts began
+    observed: list[tuple[Array, Array]]  # [n + 1] each: deepest overlap, m, and contacts that began
 
 
 class CachedConstraint(NamedTuple):
-    """What is remembered of a row; of impulses nothing, if it is older than the last step."""
+    """What is cached of a pair."""
 
-    memory: WarmStart
+    warm: WarmStart  # counts if it is of the last step
     stamp: Array  # the step that wrote it
     event: ContactEvent | None
     elasticity: Array | None
 
 
 class NearbyCarry(NamedTuple):
-    """What all rows hand on from step to step."""
+    """Solver state carried between steps."""
 
-    lines: list[Array]  # of each kind, a line for each row: see `CachedConstraint`
-    marks: list[Array]  # [R P n + 1] twice the last step in which a row touched, and one more if it stayed in touch
-    stores: list[PassBuffers] | None  # room to write into; None: nobody knows yet how much
+    cache: list[Array]  # of each batch, a row per pair: see `CachedConstraint`
+    last_touch: list[Array]  # [R P n + 1] twice the last step in which a pair touched, plus 1 if it still touches
+    buffers: list[PassBuffers] | None  # None: not allocated yet
     depth: Array  # [n + 1] m
     begins: Array  # [n + 1]
     step: Array
     first: Array  # the frame's first step
-    written: Array | None  # contacts: a line for each row and scene
-    contact_rows: Array | None  # [n + 1] how many rows of contacts there are so far
+    log: Array | None  # packed rows of logged contacts, of all scenes
+    log_count: Array | None  # [n + 1] contacts logged so far
 
 
 class ContactRow(NamedTuple):
-    """A row of contacts as it is written."""
+    """A logged contact."""
 
     pair_event: PairEvent
     frame: Array
@@ -159,384 +166,357 @@ class ContactRow(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True)
-class NearbyPairs:
-    """All rows of a video, of which only those are solved whose bodies are near each other."""
+class NearbyPairs(ContactSolver):
+    """Contact solver over all pairs of a video, of which each step solves those that are near."""
 
-    kinds: list[PairBatch]
-    seats: list[DynamicSide]  # by group
+    batches: list[PairBatch]
+    groups: list[DynamicSide]
     rolling: bool  # whether anything resists rolling
     setup: PassSetup
-    rules: SolverParams
-    chunk: int  # rows that are solved at once
+    params: SolverParams
+    chunk: int  # pairs that are solved at once
 
     @property
-    def _lanes(self) -> int:
+    def _scenes(self) -> int:
         return self.setup.threshold.shape[-1]
 
     @property
     def _dtype(self) -> Any:
         return self.setup.threshold.dtype
 
-    def start(self, contacts: int) -> NearbyCarry:
-        """What the first step begins with."""
-        n, count = self._lanes, jnp.zeros(self._lanes + 1, jnp.int32)
+    def start(self, slots: int) -> NearbyCarry:
+        n, count = self._scenes, jnp.zeros(self._scenes + 1, jnp.int32)
         return NearbyCarry(
-            lines=[repeat_rows(self._nothing(kind), kind.a.size * n, self._dtype).lines for kind in self.kinds],
-            marks=[jnp.full(kind.a.size * n + 1, NEVER, jnp.int32) for kind in self.kinds] if contacts else [],
-            stores=None,
+            cache=[repeat_rows(self._cold(batch), batch.a.size * n, self._dtype).rows for batch in self.batches],
+            last_touch=[jnp.full(b.a.size * n + 1, NEVER, jnp.int32) for b in self.batches] if slots else [],
+            buffers=None,
             depth=count.astype(self._dtype),
             begins=count,
             step=jnp.zeros((), jnp.int32),
             first=jnp.zeros((), jnp.int32),
-            written=repeat_rows(_empty_contact_rows(self._dtype), contacts * n, self._dtype).lines
-            if contacts
-            else None,
-            contact_rows=count if contacts else None,
+            log=repeat_rows(_empty_row(self._dtype), slots * n, self._dtype).rows if slots else None,
+            log_count=count if slots else None,
         )
 
-    def with_room(self, past: NearbyCarry, after: NearbyCarry) -> NearbyCarry:
-        """The same with room for what a step, whose result looks like `after`, has to write."""
-        return past._replace(stores=jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), after.stores))
+    def allocate(self, carry: NearbyCarry, step: Callable) -> NearbyCarry:
+        buffers = jax.eval_shape(step, carry).buffers
+        return carry._replace(buffers=jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), buffers))
 
-    def _nothing(self, kind: PairBatch) -> CachedConstraint:
+    def _cold(self, batch: PairBatch) -> CachedConstraint:
         zero = jnp.zeros(1, self._dtype)
-        memory = WarmStart([Impulse(zero, zero)] * kind.points, zero if self.rolling else None)
-        if not self.setup.contacts:
-            return CachedConstraint(memory, zero + NEVER, None, None)
-        return CachedConstraint(memory, zero + NEVER, empty_events((1,), self._dtype), zero)
+        warm = WarmStart([Impulse(zero, zero)] * batch.points, zero if self.rolling else None)
+        if not self.setup.log:
+            return CachedConstraint(warm, zero + NEVER, None, None)
+        return CachedConstraint(warm, zero + NEVER, empty_events((1,), self._dtype), zero)
 
-    def _spec(self, kind: PairBatch) -> TableSpec:
-        return pack(self._nothing(kind), (1,), self._dtype)[1]
+    def _cached(self, batch: PairBatch, rows: Array) -> PackedTable:
+        return PackedTable(rows, pack(self._cold(batch), (1,), self._dtype)[1])
 
-    # ---- Which rows are near
+    # ---- Broad phase
 
-    def _near(self, shapes: list[Shape], walls: list[tuple], motions: list[Motion]) -> list[ActivePairs]:
-        """The rows of each kind that may meet in this step."""
+    def _near(self, sides: list[BodySide], statics: list[BodySide]) -> list[ActivePairs]:
+        """Pairs of each batch that may meet in this step."""
+        motions = [side.motion for side in sides if side.motion is not None]
         squares = [dot(motion.velocity, motion.velocity) for motion in motions]
-        fastest = jnp.zeros(self._lanes, self._dtype)
+        fastest = jnp.zeros(self._scenes, self._dtype)
         for square in squares:
             fastest = jnp.maximum(fastest, jnp.sqrt(max_bodies(square)))
-        for shape, motion in walls:
-            if motion is not None:
-                speed = jnp.sqrt(dot(motion.velocity, motion.velocity)) + jnp.abs(motion.spin) * bounding_radius(shape)
+        for side in statics:
+            if side.motion is not None and side.shape is not None:
+                velocity, spin = side.motion
+                speed = jnp.sqrt(dot(velocity, velocity)) + jnp.abs(spin) * bounding_radius(side.shape)
                 fastest = jnp.maximum(fastest, speed[0])
-        # Two that meet come no faster than both do now, or than the fastest of all has made one of them.
-        half = 0.5 * self.rules.step * fastest
-        ways = [self.rules.step * jnp.sqrt(square) + half for square in squares]
+        # A body moves as fast as it does now, or as the fastest of all may hit it on its way.
+        half = 0.5 * self.params.step * fastest
+        ways = [self.params.step * jnp.sqrt(square) + half for square in squares]
+        shapes = [side.shape for side in sides if side.shape is not None]
         reaches = [
-            jnp.where(seat.side.present, bounding_radius(shape) + way, jnp.nan)  # what is not there is near nothing
-            for shape, seat, way in zip(shapes, self.seats, ways, strict=True)
+            jnp.where(group.material.present, bounding_radius(shape) + way, jnp.nan)  # no pair has an absent body
+            for shape, group, way in zip(shapes, self.groups, ways, strict=True)
         ]
         bodies = [(shape.centre, reach) for shape, reach in zip(shapes, reaches, strict=True)]
-        return [active_pairs(self._bits(kind, bodies, walls, half), self.chunk) for kind in self.kinds]
+        walls = [side.shape for side in statics if side.shape is not None]
+        return [active_pairs(self._near_bits(batch, bodies, walls, half), self.chunk) for batch in self.batches]
 
-    def _bits(self, kind: PairBatch, bodies: list[tuple], walls: list[tuple], half: Array) -> Array:
-        """A bit for each row that is near, in words [R, W n]."""
-        (centre, reach), one = bodies[kind.second], self.setup.one
-        if kind.first is None:
-            here = [jnp.where(post.present, 0.0, jnp.nan) for post in kind.posts.values()]
-            gaps = [
-                signed_distance(walls[i][0], centre) - reach - half + x for i, x in zip(kind.posts, here, strict=True)
-            ]
-            return bits_of(jnp.stack(materialize(gaps, one)) < 0, one)
-        if kind.ring is not None:
-            return bits_in_round_robin(centre, reach, kind.ring, one)
+    def _near_bits(self, batch: PairBatch, bodies: list[tuple], walls: list[Shape], half: Array) -> Array:
+        """A bit for each pair that is near, in words [R, W n]."""
+        centre, reach = bodies[batch.second]
+        if batch.first is None:
+            # The distance to an absent body is not a number, so that it is near nothing.
+            absent = [jnp.where(static.present, 0.0, jnp.nan) for static in batch.statics.values()]
+            near = zip(batch.statics, absent, strict=True)
+            gaps = [signed_distance(walls[i], centre) - reach - half + x for i, x in near]
+            return bits_of(jnp.stack(materialize(gaps)) < 0)
+        if batch.round_robin is not None:
+            return bits_in_round_robin(centre, reach, batch.round_robin)
 
         def play(_: int, a: tuple, b: tuple) -> tuple[tuple, tuple, Array]:
-            apart, both = b[0] - a[0], a[1] + b[1]
-            return a, b, materialize(dot(apart, apart) - both * both, one)
+            offset, both = b[0] - a[0], a[1] + b[1]
+            return a, b, materialize(dot(offset, offset) - both * both)
 
-        *_, gaps = bipartite_rounds(bodies[kind.first], (centre, reach), play)
-        return bits_of(jnp.stack(gaps) < 0, one)
+        *_, gaps = bipartite_rounds(bodies[batch.first], (centre, reach), play)
+        return bits_of(jnp.stack(gaps) < 0)
 
-    def _place(self, kind: PairBatch, spot: RowLookup, pair: np.ndarray) -> GatherIndices:
-        """Where rows are; `pair` [R, bits] says which pair of a round a bit stands for."""
-        n, (_, pairs), bits = self._lanes, kind.a.shape, pair.shape[1]
-        lane, bit = spot.word % n, jnp.minimum(spot.word // n * BITS + spot.bit, bits - 1)
+    def _gather(self, batch: PairBatch, lookup: RowLookup, pair_of_bit: np.ndarray) -> GatherIndices:
+        """Table rows of the pairs of a chunk."""
+        n, (_, pairs), bits = self._scenes, batch.a.shape, pair_of_bit.shape[1]
+        scene, bit = lookup.word % n, jnp.minimum(lookup.word // n * BITS + lookup.bit, bits - 1)
 
-        def looked_up(values: np.ndarray, where: Array) -> Array:
+        def entry(values: np.ndarray, where: Array) -> Array:
             return jnp.asarray(values.reshape(-1), jnp.int32).at[where].get(mode=SAFE)
 
-        row = spot.round * pairs + looked_up(pair, spot.round * bits + bit)
-        a, b = looked_up(kind.a, row), looked_up(kind.b, row)
-        ends = len(kind.posts) if kind.first is None else self._size(kind.first), self._size(kind.second), kind.a.size
-        lines = (jnp.where(spot.there, x * n + lane, end * n) for x, end in zip((a, b, row), ends, strict=True))
-        return GatherIndices(*lines, lane=jnp.where(spot.there, lane, n))
+        pair = lookup.round * pairs + entry(pair_of_bit, lookup.round * bits + bit)
+        a, b = entry(batch.a, pair), entry(batch.b, pair)
+        count = len(batch.statics) if batch.first is None else self._size(batch.first)
+        ends = count, self._size(batch.second), batch.a.size
+        rows = (jnp.where(lookup.there, x * n + scene, end * n) for x, end in zip((a, b, pair), ends, strict=True))
+        return GatherIndices(*rows, scene=jnp.where(lookup.there, scene, n))
 
     def _size(self, group: int) -> int:
-        return self.seats[group].threshold.shape[0]
+        return self.groups[group].threshold.shape[0]
 
-    def _places(self, near: list[ActivePairs], stores: list[PassBuffers] | None) -> list[Array]:
-        """Where the rows of all chunks are: in a loop of its own, or each gather would compute it again."""
-        if stores is None:
-            return [
-                jnp.zeros((self._room(kind), len(GatherIndices._fields), self.chunk), jnp.int32) for kind in self.kinds
-            ]
+    def _indices(self, near: list[ActivePairs], buffers: list[PassBuffers] | None) -> list[Array]:
+        """Table rows of the pairs of all chunks, in loops of their own, or each gather would compute them again."""
+        if buffers is None:
+            fields = len(GatherIndices._fields)
+            return [jnp.zeros((self._most_chunks(batch), fields, self.chunk), jnp.int32) for batch in self.batches]
 
-        def placed(kind: PairBatch, rows: ActivePairs, room: Array) -> Array:
-            pair = _pairs(kind) if kind.ring is None else kind.ring.pair
+        def filled(batch: PairBatch, active: ActivePairs, buffer: Array) -> Array:
+            pair_of_bit = batch.pair_of_bit
 
-            def chunk(k: Array, room: Array) -> Array:
-                place = self._place(kind, row_lookup(rows, k, self.chunk), pair)
-                return room.at[k].set(jnp.stack(place), mode=SAFE)
+            def chunk(k: Array, buffer: Array) -> Array:
+                indices = self._gather(batch, row_lookup(active, k, self.chunk), pair_of_bit)
+                return buffer.at[k].set(jnp.stack(indices), mode=SAFE)
 
-            return jax.lax.fori_loop(0, rows.starts[-1], chunk, room)
+            return jax.lax.fori_loop(0, active.starts[-1], chunk, buffer)
 
-        return [placed(*of) for of in zip(self.kinds, near, [store.places for store in stores], strict=True)]
+        return [filled(*of) for of in zip(self.batches, near, [b.indices for b in buffers], strict=True)]
 
-    def _room(self, kind: PairBatch) -> int:
-        """How many chunks there may be."""
-        rounds, pairs = kind.a.shape
-        return rounds * -(-pairs * self._lanes // self.chunk)
+    def _most_chunks(self, batch: PairBatch) -> int:
+        rounds, pairs = batch.a.shape
+        return rounds * -(-pairs * self._scenes // self.chunk)
 
     # ---- The passes
 
     def _table(self, tree: Any, count: int) -> PackedTable:
-        return make_table(tree, (count, self._lanes), self._dtype)
+        return make_table(tree, (count, self._scenes), self._dtype)
 
-    def _fixed(self, trees: list[Any]) -> PackedTable:
-        """A table of fixed bodies, whose trees have leaves [..., 1, n]."""
+    def _static_table(self, trees: list[Any]) -> PackedTable:
+        """Table of static bodies, from trees with leaves [..., 1, n]."""
         return self._table(jax.tree.map(lambda *x: jnp.concatenate(x, axis=-2), *trees), len(trees))
 
     def _pass(
-        self, groups: list[Any], walls: list[Any], found: ListedPairs, carries: list[Any], play: Callable
-    ) -> tuple:
-        """The groups, and what is carried for each kind, after all rows that are near.
+        self, sides: list[BodySide], statics: list[BodySide], listed: ListedPairs, carries: list[Any], play: Callable
+    ) -> tuple[list[BodySide], list[Any]]:
+        """Sides and carries of all batches after a pass over the near pairs.
 
-        `play(i, k, place, a, b, carried)` gives both sides of the rows of chunk k of kind i, and what is carried on.
-        What carries None is not known yet: its first chunk is played once, to see what it looks like.
+        `play(i, k, indices, a, b, carry)` returns both sides and the carry after chunk k of batch i. A carry with a
+        None has no buffer yet; one chunk is then played to find its shape.
         """
-        one, carries = self.setup.one, list(carries)
-        tables = [self._table(group, self._size(g)) for g, group in enumerate(groups)]
-        for i, kind in enumerate(self.kinds):
-            fixed = self._fixed([walls[j] for j in kind.posts]) if kind.first is None else None
+        carries = list(carries)
+        tables = [self._table(side, self._size(g)) for g, side in enumerate(sides)]
+        for i, batch in enumerate(self.batches):
+            fixed = self._static_table([statics[j] for j in batch.statics]) if batch.first is None else None
 
             def chunk(
-                k: Array, state: tuple, i: int = i, kind: PairBatch = kind, fixed: PackedTable | None = fixed
+                k: Array, state: tuple, i: int = i, batch: PairBatch = batch, fixed: PackedTable | None = fixed
             ) -> tuple:
-                lines, carried = state
-                now = {g: tables[g]._replace(lines=x) for g, x in lines.items()}
-                place = GatherIndices(*found.places[i][k])
-                a = now[kind.first].at(place.a) if fixed is None else fixed.at(place.a)
-                a, b, carried = play(i, k, place, a, now[kind.second].at(place.b), carried)
+                rows, carry = state
+                now = {g: tables[g]._replace(rows=x) for g, x in rows.items()}
+                indices = GatherIndices(*listed.indices[i][k])
+                a = now[batch.first].at(indices.a) if fixed is None else fixed.at(indices.a)
+                a, b, carry = play(i, k, indices, a, now[batch.second].at(indices.b), carry)
                 if fixed is None:
-                    now[kind.first] = now[kind.first].put(place.a, a, one)
-                now[kind.second] = now[kind.second].put(place.b, b, one)
-                return {g: x.lines for g, x in now.items()}, carried
+                    now[batch.first] = now[batch.first].put(indices.a, a)
+                now[batch.second] = now[batch.second].put(indices.b, b)
+                return {g: x.rows for g, x in now.items()}, carry
 
-            start = {g: tables[g].lines for g in kind.groups}, carries[i]
+            start = {g: tables[g].rows for g in batch.groups}, carries[i]
             if any(x is None for x in jax.tree.leaves(carries[i], is_leaf=lambda x: x is None)):
-                lines, carries[i] = chunk(jnp.zeros((), jnp.int32), start)
+                rows, carries[i] = chunk(jnp.zeros((), jnp.int32), start)
             else:
-                lines, carries[i] = jax.lax.fori_loop(0, found.chunks[i], chunk, start)
-            for g, x in lines.items():
-                tables[g] = tables[g]._replace(lines=x)
-        return [t.whole((self._size(g), self._lanes)) for g, t in enumerate(tables)], carries
+                rows, carries[i] = jax.lax.fori_loop(0, listed.chunks[i], chunk, start)
+            for g, x in rows.items():
+                tables[g] = tables[g]._replace(rows=x)
+        return [t.unpacked((self._size(g), self._scenes)) for g, t in enumerate(tables)], carries
 
-    def _kept(self, kind: PairBatch, room: Array | None, k: Array, values: list[Array]) -> Array:
-        """The room with a chunk's values; new room if there is none."""
-        if room is None:
-            return jnp.zeros((self._room(kind), len(values), self.chunk), self._dtype)
-        return room.at[k].set(materialize(jnp.stack(values), self.setup.one), mode=SAFE)
+    def _store(self, batch: PairBatch, buffer: Array | None, k: Array, values: list[Array]) -> Array:
+        """Buffer with the values of chunk k; a new one if there is none."""
+        if buffer is None:
+            return jnp.zeros((self._most_chunks(batch), len(values), self.chunk), self._dtype)
+        return buffer.at[k].set(materialize(jnp.stack(values)), mode=SAFE)
 
-    def warm(
-        self, past: NearbyCarry, bodies: list[tuple], walls: list[tuple], motions: list[Motion], works: list
-    ) -> tuple[list[Motion], list, ListedPairs]:
-        """Motions and works with the last step's impulses, and which rows there are.
-
-        `bodies` are shapes and accelerations, the latter None where all fall alike; `walls` are shapes and motions,
-        the latter None where they stand still.
-        """
-        near = self._near([shape for shape, _ in bodies], walls, motions)
-        found = ListedPairs([rows.starts[-1] for rows in near], self._places(near, past.stores), [], {})
-        seats = [self._table(seat, self._size(g)) for g, seat in enumerate(self.seats)]
-        firsts = [self._fixed(list(k.posts.values())) if k.first is None else seats[k.first] for k in self.kinds]
-        memories = [PackedTable(x, self._spec(kind)) for x, kind in zip(past.lines, self.kinds, strict=True)]
+    def warm_start(
+        self, carry: NearbyCarry, sides: list[BodySide], statics: list[BodySide]
+    ) -> tuple[list[BodySide], ListedPairs]:
+        near = self._near(sides, statics)
+        listed = ListedPairs([active.starts[-1] for active in near], self._indices(near, carry.buffers), [], {})
+        groups = [self._table(group, self._size(g)) for g, group in enumerate(self.groups)]
+        firsts = [
+            self._static_table(list(b.statics.values())) if b.first is None else groups[b.first] for b in self.batches
+        ]
+        caches = [self._cached(batch, rows) for batch, rows in zip(self.batches, carry.cache, strict=True)]
         specs: dict[int, TableSpec] = {}
 
-        def play(i: int, k: Array, place: GatherIndices, a: Any, b: Any, room: Array | None) -> tuple:
-            kind, first, seat = self.kinds[i], firsts[i].at(place.a), seats[self.kinds[i].second].at(place.b)
-            line = memories[i].at(place.row)
-            fresh = line.stamp == (past.step - 1).astype(self._dtype)
-            memory = jax.tree.map(lambda x: jnp.where(fresh, x, 0.0), line.memory)
-            row = kind.row(first.side, seat.side)
+        def play(
+            i: int, k: Array, indices: GatherIndices, a: BodySide, b: BodySide, buffer: Array | None
+        ) -> tuple[BodySide, BodySide, Array]:
+            batch = self.batches[i]
+            first, second = firsts[i].at(indices.a), groups[batch.second].at(indices.b)
+            cached = caches[i].at(indices.pair)
+            fresh = cached.stamp == (carry.step - 1).astype(self._dtype)
+            warm = jax.tree.map(lambda x: jnp.where(fresh, x, 0.0), cached.warm)
+            constraint = batch.constraint(first.material, second.material)
             if isinstance(first, StaticSide):
-                row = row._replace(left=first.left, right=first.right)
-            setup = self.setup._replace(gravity=seat.gravity, threshold=seat.threshold)
-            a, b, points = contact_passes.warm_start(row, memory, a, b, setup)
-            values, specs[i] = pack((row, memory, points, seat.threshold), (self.chunk,), self._dtype, once=True)
-            return a, b, self._kept(kind, room, k, values)
+                constraint = constraint._replace(left=first.left, right=first.right)
+            setup = self.setup._replace(gravity=second.gravity, threshold=second.threshold)
+            a, b, points = contact_passes.warm_start(constraint, warm, a, b, setup)
+            packed = (constraint, warm, points, second.threshold)
+            values, specs[i] = pack(packed, (self.chunk,), self._dtype, once=True)
+            return a, b, self._store(batch, buffer, k, values)
 
-        rooms = [None] * len(self.kinds) if past.stores is None else [store.found for store in past.stores]
-        groups = [(shape, m, fall, w) for (shape, fall), m, w in zip(bodies, motions, works, strict=True)]
-        groups, kept = self._pass(groups, [(*wall, None, None) for wall in walls], found, rooms, play)
-        found = found._replace(kept=kept, specs=specs)
-        return [motion for _, motion, *_ in groups], [work for *_, work in groups], found
+        buffers = [None] * len(self.batches) if carry.buffers is None else [b.contacts for b in carry.buffers]
+        sides, packed = self._pass(sides, statics, listed, buffers, play)
+        return sides, listed._replace(packed=packed, specs=specs)
 
-    def _again(self, found: ListedPairs, i: int, k: Array) -> tuple[ContactConstraint, WarmStart, list, PassSetup]:
-        """What the first pass has kept of a chunk of rows."""
-        row, memory, points, threshold = unpack(list(found.kept[i][k]), found.specs[i])
-        return row, memory, points, self.setup._replace(threshold=threshold)
+    def _unpacked(self, listed: ListedPairs, i: int, k: Array) -> tuple[ContactConstraint, WarmStart, list, PassSetup]:
+        """What the warm start stored of chunk k of batch i."""
+        constraint, warm, points, threshold = unpack(list(listed.packed[i][k]), listed.specs[i])
+        return constraint, warm, points, self.setup._replace(threshold=threshold)
 
     def solve(
-        self,
-        past: NearbyCarry,
-        found: ListedPairs,
-        walls: list[tuple],
-        motions: list[Motion],
-        drifts: list,
-        works: list,
-    ) -> tuple[list[Motion], list[Displacement], list, SolvedChunk]:
-        """Motions, drifts and works after the biased pass, and what it has seen of the rows."""
+        self, carry: NearbyCarry, contacts: ListedPairs, sides: list[BodySide], statics: list[BodySide]
+    ) -> tuple[list[BodySide], SolvedChunk]:
         specs: dict[int, TableSpec] = {}
 
-        def play(i: int, k: Array, place: GatherIndices, a: Any, b: Any, carried: tuple) -> tuple:
-            room, depth, begins = carried
-            row, memory, points, setup = self._again(found, i, k)
-            a, b, solved = contact_passes.solve(row, memory, points, a, b, setup, self.rules)
+        def play(i: int, k: Array, indices: GatherIndices, a: BodySide, b: BodySide, carried: tuple) -> tuple:
+            buffer, depth, begins = carried
+            constraint, warm, points, setup = self._unpacked(contacts, i, k)
+            a, b, solved = contact_passes.solve(constraint, warm, points, a, b, setup, self.params)
             values, specs[i] = pack(solved, (self.chunk,), self._dtype, once=True)
-            deep, began = tunnelling.visible_motion(solved, memory)
-            depth, begins = depth.at[place.lane].max(deep), begins.at[place.lane].add(began.astype(jnp.int32))
-            return a, b, (self._kept(self.kinds[i], room, k, values), depth, begins)
+            overlap, began = contact_passes.observe(solved, warm)
+            depth, begins = depth.at[indices.scene].max(overlap), begins.at[indices.scene].add(began.astype(jnp.int32))
+            return a, b, (self._store(self.batches[i], buffer, k, values), depth, begins)
 
-        rooms = [None] * len(self.kinds) if past.stores is None else [store.solved for store in past.stores]
-        nothing = jnp.zeros_like(past.depth), jnp.zeros_like(past.begins)
-        groups = list(zip(motions, drifts, works, strict=True))
-        fixed = [(motion, None, None) for _, motion in walls]
-        groups, carries = self._pass(groups, fixed, found, [(room, *nothing) for room in rooms], play)
-        motions, drifts, works = (list(values) for values in zip(*groups, strict=True))
-        seen = [(depth, begins) for _, depth, begins in carries]
-        return motions, drifts, works, SolvedChunk(found, [kept for kept, *_ in carries], specs, seen)
+        buffers = [None] * len(self.batches) if carry.buffers is None else [b.solved for b in carry.buffers]
+        zero = jnp.zeros_like(carry.depth), jnp.zeros_like(carry.begins)
+        sides, carries = self._pass(sides, statics, contacts, [(buffer, *zero) for buffer in buffers], play)
+        observed = [(depth, begins) for _, depth, begins in carries]
+        return sides, SolvedChunk(contacts, [packed for packed, *_ in carries], specs, observed)
 
     def relax(
-        self,
-        past: NearbyCarry,
-        rows: SolvedChunk,
-        walls: list[tuple],
-        motions: list[Motion],
-        drifts: list,
-        works: list,
-        time: Array,
-    ) -> tuple[list[Motion], list, NearbyCarry]:
-        """Motions and works after the relaxing pass, and what all rows hand on; the step began at `time`."""
-        found, one = rows.found, self.setup.one
-        specs = [self._spec(kind) for kind in self.kinds]
+        self, carry: NearbyCarry, solved: SolvedChunk, sides: list[BodySide], statics: list[BodySide], time: Array
+    ) -> tuple[list[BodySide], NearbyCarry]:
+        listed = solved.listed
+        specs = [self._cached(batch, rows).spec for batch, rows in zip(self.batches, carry.cache, strict=True)]
 
-        def play(i: int, k: Array, place: GatherIndices, a: Any, b: Any, carried: tuple) -> tuple:
-            lines, marks = PackedTable(carried[0], specs[i]), carried[1]
-            row, _, _, setup = self._again(found, i, k)
-            solved = unpack(list(rows.kept[i][k]), rows.specs[i])
-            a, b, (last, memory) = contact_passes.relax(row, solved, a, b, setup)
-            new = CachedConstraint(memory, jnp.full(self.chunk, past.step, self._dtype), None, None)
-            if self.setup.contacts:
-                event = record_event(self._event(past, lines.at(place.row)), solved, last, time, one)
-                new = new._replace(event=event, elasticity=row.elasticity)
-                mark = 2 * past.step + jnp.where((event.flags & ON) > 0, 1, 0)
-                old = marks.at[place.row].get(mode=SAFE)
-                marks = marks.at[place.row].set(jnp.where(contact_passes.touching(solved, last), mark, old), mode=SAFE)
-            return a, b, (lines.put(place.row, new, one).lines, marks)
+        def play(i: int, k: Array, indices: GatherIndices, a: BodySide, b: BodySide, carried: tuple) -> tuple:
+            cache, touch = PackedTable(carried[0], specs[i]), carried[1]
+            constraint, _, _, setup = self._unpacked(listed, i, k)
+            pair = unpack(list(solved.packed[i][k]), solved.specs[i])
+            a, b, (last, warm) = contact_passes.relax(constraint, pair, a, b, setup)
+            new = CachedConstraint(warm, jnp.full(self.chunk, carry.step, self._dtype), None, None)
+            if self.setup.log:
+                event = record_event(self._event(carry, cache.at(indices.pair)), pair, last, time)
+                new = new._replace(event=event, elasticity=constraint.elasticity)
+                now = 2 * carry.step + jnp.where((event.flags & ON) > 0, 1, 0)
+                old = touch.at[indices.pair].get(mode=SAFE)
+                now = jnp.where(contact_passes.touching(pair, last), now, old)
+                touch = touch.at[indices.pair].set(now, mode=SAFE)
+            return a, b, (cache.put(indices.pair, new).rows, touch)
 
-        groups = [(motion, drift.push, work) for motion, drift, work in zip(motions, drifts, works, strict=True)]
-        marks = past.marks or [jnp.zeros(0, jnp.int32)] * len(self.kinds)
-        carries = list(zip(past.lines, marks, strict=True))
-        groups, carries = self._pass(groups, [(motion, None, None) for _, motion in walls], found, carries, play)
-        depth, begins = past.depth, past.begins
-        for deep, began in rows.seen:
-            depth, begins = jnp.maximum(depth, deep), begins + began
-        past = past._replace(
-            lines=[lines for lines, _ in carries],
-            marks=[marks for _, marks in carries] if self.setup.contacts else [],
-            stores=[PassBuffers(*of) for of in zip(found.places, found.kept, rows.kept, strict=True)],
+        last_touch = carry.last_touch or [jnp.zeros(0, jnp.int32)] * len(self.batches)
+        sides, carries = self._pass(sides, statics, listed, list(zip(carry.cache, last_touch, strict=True)), play)
+        depth, begins = carry.depth, carry.begins
+        for overlap, began in solved.observed:
+            depth, begins = jnp.maximum(depth, overlap), begins + began
+        of_batches = zip(listed.indices, listed.packed, solved.packed, strict=True)
+        return sides, carry._replace(
+            cache=[cache for cache, _ in carries],
+            last_touch=[touch for _, touch in carries] if self.setup.log else [],
+            buffers=[PassBuffers(*of) for of in of_batches],
             depth=depth,
             begins=begins,
-            step=past.step + 1,
+            step=carry.step + 1,
         )
-        return [motion for motion, *_ in groups], [work for *_, work in groups], past
 
-    # ---- What happened
+    # ---- Logged contacts
 
-    def _event(self, past: NearbyCarry, line: CachedConstraint) -> ContactEvent:
-        """A row's event in this frame so far: what an older one says counts only for whether it touched before."""
-        assert line.event is not None, "lines hold events where contacts are kept"
-        current, ended = line.stamp >= past.first, line.stamp == past.first - 1  # it is of the last frame's last step
-        fresh = began_touching(line.event._replace(flags=jnp.where(ended, line.event.flags, 0)))
-        return jax.tree.map(lambda x, y: jnp.where(current, x, y), line.event, fresh)
+    def _event(self, carry: NearbyCarry, cached: CachedConstraint) -> ContactEvent:
+        """Event of a pair in this frame so far; of an older one only whether the pair touched is kept."""
+        assert cached.event is not None, "events are cached where contacts are logged"
+        current = cached.stamp >= carry.first
+        ended = cached.stamp == carry.first - 1  # written by the last step of the last frame
+        fresh = began_touching(cached.event._replace(flags=jnp.where(ended, cached.event.flags, 0)))
+        return jax.tree.map(lambda x, y: jnp.where(current, x, y), cached.event, fresh)
 
-    def frame_begins(self, past: NearbyCarry) -> NearbyCarry:
-        """The same, with nothing seen in the frame yet."""
-        return past._replace(first=past.step)
+    def begin_frame(self, carry: NearbyCarry) -> NearbyCarry:
+        return carry._replace(first=carry.step)
 
-    def frame_ends(self, past: NearbyCarry) -> tuple[NearbyCarry, None]:
-        """The same, with the rows of contacts of the frame."""
-        if past.written is None or past.contact_rows is None:
-            return past, None
-        written, contact_rows = past.written, past.contact_rows
-        for kind, lines, marks in zip(self.kinds, past.lines, past.marks, strict=True):
-            recent = marks[:-1].reshape(*kind.a.shape, self._lanes) >= 2 * past.first - 1
-            words = bits_of(recent, self.setup.one)
-            written = self._tell(past, kind, PackedTable(lines, self._spec(kind)), words, written, contact_rows)
-            contact_rows = contact_rows.at[:-1].add(
-                jnp.sum(count_active(words).reshape(-1, self._lanes), axis=0, dtype=jnp.int32)
-            )
-        return past._replace(written=written, contact_rows=contact_rows), None
+    def end_frame(self, carry: NearbyCarry) -> tuple[NearbyCarry, None]:
+        if carry.log is None or carry.log_count is None:
+            return carry, None
+        log, count = carry.log, carry.log_count
+        for batch, rows, touch in zip(self.batches, carry.cache, carry.last_touch, strict=True):
+            recent = touch[:-1].reshape(*batch.a.shape, self._scenes) >= 2 * carry.first - 1
+            words = bits_of(recent)
+            log = self._logged(carry, batch, self._cached(batch, rows), words, log, count)
+            new = jnp.sum(count_active(words).reshape(-1, self._scenes), axis=0, dtype=jnp.int32)
+            count = count.at[:-1].add(new)
+        return carry._replace(log=log, log_count=count), None
 
-    def _tell(
-        self, past: NearbyCarry, kind: PairBatch, lines: PackedTable, words: Array, written: Array, contact_rows: Array
+    def _logged(
+        self, carry: NearbyCarry, batch: PairBatch, cache: PackedTable, words: Array, log: Array, count: Array
     ) -> Array:
-        """What is written, and the rows of a kind with a bit in words [R, W n]; `contact_rows` have been before."""
-        n, one, rows = self._lanes, self.setup.one, active_pairs(words, self.chunk)
+        """Log with the pairs of a batch that have a bit in words [R, W n], after `count` [n + 1] contacts."""
+        n, active = self._scenes, active_pairs(words, self.chunk)
         counts = count_active(words).reshape(-1, n)
-        before = contact_rows[:-1] + jnp.cumsum(counts, axis=0, dtype=jnp.int32) - counts  # by round and word
-        spec = pack(_empty_contact_rows(self._dtype), (1,), self._dtype)[1]
-        slots = [jnp.asarray(x.reshape(-1), jnp.int32) for x in kind.slots]
-        room, width = (len(written) - 1) // n, words.shape[1]
-        number = past.step // jnp.maximum(past.step - past.first, 1)
+        before = count[:-1] + jnp.cumsum(counts, axis=0, dtype=jnp.int32) - counts  # by round and word
+        spec = pack(_empty_row(self._dtype), (1,), self._dtype)[1]
+        slots = [jnp.asarray(x.reshape(-1), jnp.int32) for x in batch.slots]
+        capacity, width = (len(log) - 1) // n, words.shape[1]
+        frame = carry.step // jnp.maximum(carry.step - carry.first, 1)
+        every = np.broadcast_to(np.arange(batch.a.shape[1]), batch.a.shape)
 
-        def chunk(k: Array, written: Array) -> Array:
-            spot = row_lookup(rows, k, self.chunk)
-            place = self._place(kind, spot, _pairs(kind))
-            line = lines.at(place.row)
-            event, last = self._event(past, line), line.stamp == (past.step - 1).astype(self._dtype)
+        def chunk(k: Array, log: Array) -> Array:
+            lookup = row_lookup(active, k, self.chunk)
+            indices = self._gather(batch, lookup, every)
+            cached = cache.at(indices.pair)
+            event, last = self._event(carry, cached), cached.stamp == (carry.step - 1).astype(self._dtype)
             event = event._replace(flags=jnp.where(last, event.flags, event.flags & ~ON))
-            new = pair_event(event, line.elasticity)
-            began = past.first.astype(self._dtype) * self.rules.step  # when an end without a touch is contact_rows
+            new = pair_event(event, cached.elasticity)
+            began = carry.first.astype(self._dtype) * self.params.step  # the time of an end without a touch
             new = new._replace(time=jnp.where(new.time >= 0, new.time, began))
-            word = jnp.minimum(spot.round * width + spot.word, before.size - 1)
-            rank = before.reshape(-1).at[word].get(mode=SAFE) + spot.rank
-            where = jnp.where(spot.there & (rank < room), rank * n + place.lane, room * n)
-            row = jnp.minimum(place.row // n, kind.a.size - 1)
-            a, b = (x.at[row].get(mode=SAFE) for x in slots)
-            return PackedTable(written, spec).put(where, ContactRow(new, jnp.full_like(a, number), a, b), one).lines
+            word = jnp.minimum(lookup.round * width + lookup.word, before.size - 1)
+            rank = before.reshape(-1).at[word].get(mode=SAFE) + lookup.rank
+            where = jnp.where(lookup.there & (rank < capacity), rank * n + indices.scene, capacity * n)
+            pair = jnp.minimum(indices.pair // n, batch.a.size - 1)
+            a, b = (x.at[pair].get(mode=SAFE) for x in slots)
+            return PackedTable(log, spec).put(where, ContactRow(new, jnp.full_like(a, frame), a, b)).rows
 
-        return jax.lax.fori_loop(0, rows.starts[-1], chunk, written)
+        return jax.lax.fori_loop(0, active.starts[-1], chunk, log)
 
-    def ended(self, past: NearbyCarry, _: None, slots: int, fps: float) -> tuple[Array, Array, Contacts | None]:
-        """Of the whole video: the deepest overlap, m, how many contacts began, and up to `slots` rows of contacts."""
-        depth, begins = past.depth[:-1], past.begins[:-1]
-        if past.written is None or past.contact_rows is None:
+    def results(self, carry: NearbyCarry, events: None, slots: int, fps: float) -> tuple[Array, Array, Contacts | None]:
+        depth, begins = carry.depth[:-1], carry.begins[:-1]
+        if carry.log is None or carry.log_count is None:
             return depth, begins, None
-        spec = pack(_empty_contact_rows(self._dtype), (1,), self._dtype)[1]
-        contact_rows, count = PackedTable(past.written, spec).whole((slots, self._lanes)), past.contact_rows[:-1]
+        spec = pack(_empty_row(self._dtype), (1,), self._dtype)[1]
+        log, count = PackedTable(carry.log, spec).unpacked((slots, self._scenes)), carry.log_count[:-1]
         filled = jnp.arange(slots)[:, None] < count
-        order = order_of(jnp.where(filled, contact_rows.pair_event.time, jnp.inf))
+        order = order_of(jnp.where(filled, log.pair_event.time, jnp.inf))
 
         def in_order(x: Array) -> Array:
             x = jnp.where(filled, x, jnp.zeros_like(x))
             return jnp.take_along_axis(x, jnp.broadcast_to(order, x.shape), axis=-2)
 
-        return depth, begins, contacts_of(*jax.tree.map(in_order, contact_rows), count=count)
+        return depth, begins, contacts_of(*jax.tree.map(in_order, log), count=count)
 
 
-def _pairs(kind: PairBatch) -> np.ndarray:
-    """The pairs of each round, one for each bit."""
-    return np.broadcast_to(np.arange(kind.a.shape[1]), kind.a.shape)
-
-
-def _empty_contact_rows(dtype: Any) -> ContactRow:
+def _empty_row(dtype: Any) -> ContactRow:
     nothing = pair_event(empty_events((1,), dtype), jnp.zeros(1, dtype))
     return ContactRow(nothing, *[jnp.zeros(1, jnp.int32)] * 3)
 
 
-def chunk_of(lanes: int) -> int:
-    """How many rows to solve at once with so many scenes: a few times fewer than are near in a round."""
-    return min(max(16, 1 << (lanes // 16).bit_length()), 256)
+def chunk_of(scenes: int) -> int:
+    """Pairs to solve at once with so many scenes: a few times fewer than are near in a round."""
+    return min(max(16, 1 << (scenes // 16).bit_length()), 256)

@@ -8,18 +8,20 @@ from gen2d.config.sections import PhysicsOptions
 
 @dataclasses.dataclass(frozen=True)
 class SolverParams:
-    """Numbers of a solver step; `solver_params` makes them from a config."""
+    """Parameters of a solver step; `solver_params` computes them from a config."""
 
     step: float  # s
-    bounce_threshold: float  # m/s: slower impacts do not bounce, nor do those that gravity makes in two steps
-    hertz: float  # stiffness of an overlapping contact; twice that against a fixed object
+    bounce_threshold: (
+        float  # m/s: slower impacts do not bounce, nor do those at speeds that gravity reaches in two steps
+    )
+    hertz: float  # stiffness of an overlapping contact; doubled against static and kinematic bodies
     damping_ratio: float
-    push_speed: float  # m/s: an overlap is undone no faster
+    push_speed: float  # m/s: the fastest correction of an overlap
     damping: float  # 1/s, of velocity and spin
     mixing: str
 
     def softness(self, hertz: float, damping_ratio: float) -> tuple[float, float, float]:
-        """Of an implicit damped spring at this step: bias rate (1/s), mass scale and impulse scale."""
+        """Bias rate (1/s), mass scale and impulse scale of an implicit damped spring."""
         omega = 2 * math.pi * hertz
         a1 = 2 * damping_ratio + self.step * omega
         a2 = self.step * omega * a1
@@ -27,7 +29,7 @@ class SolverParams:
 
 
 def solver_params(physics: PhysicsOptions, fps: float, steps: int) -> SolverParams:
-    """The solver's numbers, from the options of physics and the steps of a frame."""
+    """Parameters of the solver for `steps` steps per frame."""
     step = 1 / (fps * steps)
     return SolverParams(
         step=step,

@@ -1,16 +1,17 @@
 """Rigid joints, solved all at once: rods keep the distance of two anchors, hinges keep them in one place.
 
-One joint after the other, as contacts are solved, a light body between heavy ones stretches: what a pass leaves shrinks
-by a hundredth where the masses are as 100 to 1. So each pass solves the whole system J M^-1 J^T x = b, a row for each
-rod and two for each hinge. Rows share a body only with few others; in the order that reverse Cuthill-McKee gives them
-the matrix is a narrow band (of four for a chain of any length), and L D L^T of a band takes one loop over its rows.
+Solved one after the other, as contacts are, joints stretch between bodies of very different masses: with a ratio of
+100 a pass reduces the error by a hundredth. So each pass solves the whole system J M^-1 J^T x = b, with a row for each
+rod and two for each hinge. Few rows share a body. In reverse Cuthill-McKee order the matrix is a narrow band, of four
+diagonals for a chain of any length, and its L D L^T factors take one loop over the rows.
 
-A step with these passes is RATTLE (H. C. Andersen, 1983), which keeps a pendulum's energy: the first makes the anchors
-meet at the end of the step, with the turn of the arms meanwhile, the second takes away the speed with which they would
-part there. Contacts come before, so joints have the last word.
+The two passes make a step RATTLE (H. C. Andersen, 1983), which keeps a pendulum's energy: the first makes the anchors
+meet at the end of the step, with arms that have turned by then, the second removes the speed with which they would part
+there. Contacts are solved before.
 """
 
 import dataclasses
+import functools
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -22,36 +23,38 @@ from gen2d.physics.banded import factor, solve_factored
 from gen2d.physics.collision import dot, turned
 from gen2d.physics.constraint import Inertia, Motion
 from gen2d.physics.energy import Work
-from gen2d.physics.joint_forces import JointSide, anchors_of, direction_of, groups_of, joint_lines, table_of
+from gen2d.physics.joint_forces import JointSide, anchors_of, direction_of, groups_of, table_of, take_rows
 from gen2d.records.axes import Array
 from gen2d.records.layout import JointSpec
 from gen2d.xla import materialize
 
 X, Y, ALONG, ACROSS = range(4)  # the direction of a row
-COMPLIANCE = 1e-5  # of a row's own term, as softness: what keeps the impulses of joints bounded that say the same twice
-NEWTON_ITERATIONS = 2  # times: one leaves a fast double pendulum three times the error of energy
-FASTEST = 10.0  # m/s: anchors that are apart come together no faster
+COMPLIANCE = 1e-5  # relative to a row's diagonal: bounds the impulses of redundant joints
+NEWTON_ITERATIONS = 2  # a single one leaves a fast double pendulum three times the error of energy
+FASTEST = 10.0  # m/s: the fastest correction of anchors that are apart
 
 
 @dataclasses.dataclass(frozen=True)
 class JointSystemPlan:
-    """Which rows there are and what they share; R rows of J joints in a table with N moving bodies."""
+    """Rows of the system and the bodies that they share; R rows of J joints in a table with N moving bodies."""
 
-    joint: np.ndarray  # [R] whose row it is
-    way: np.ndarray  # [R] X, Y or ALONG; ACROSS: the line from another hinge of the same two bodies
+    joint: np.ndarray  # [R]
+    direction: np.ndarray  # [R] X, Y or ALONG; ACROSS: to the line from another hinge of the same two bodies
     other: np.ndarray  # [R] that hinge
-    lines: tuple[np.ndarray, np.ndarray]  # [J] of both bodies
+    bodies: tuple[np.ndarray, np.ndarray]  # [J] table rows of both bodies
     moving: int  # N
 
     @property
     def ends(self) -> np.ndarray:
-        """The bodies of each row, [2, R]; -1: a fixed one."""
-        ends = np.stack(self.lines)[:, self.joint]
+        """Bodies of each row, [2, R]; -1: a static one."""
+        ends = np.stack(self.bodies)[:, self.joint]
         return np.where(ends < self.moving, ends, -1)
 
     def shared(self, offset: int) -> list[tuple[int, int, np.ndarray]]:
-        """Which sides of a row and of the one so many rows later are the same body: both sides and, by row, 1 where
-        both have the same sign there, -1 where not, 0 where they are two bodies."""
+        """Sides of each row and of the row `offset` later that are the same body.
+
+        Each entry has both sides and, by row, 1 for the same body with equal signs, -1 with opposite signs, else 0.
+        """
         ends, rows = self.ends, len(self.joint) - offset
         found = []
         for a in (0, 1):
@@ -63,43 +66,43 @@ class JointSystemPlan:
 
     @property
     def width(self) -> int:
-        """How many diagonals are not zero, from the main one on."""
+        """Number of nonzero diagonals, from the main one on."""
         return max(o + 1 for o in range(len(self.joint)) if self.shared(o))
 
-    def pushers(self) -> np.ndarray:
-        """For each moving body the places of its rows among those of side 0, then of side 1; 2 R: none."""
+    def rows_of_bodies(self) -> np.ndarray:
+        """Rows of each moving body, those of side 0 before those of side 1, padded with 2 R."""
         rows, ends = len(self.joint), self.ends
-        places = [np.flatnonzero(ends.reshape(-1) == line) for line in range(self.moving)]
-        deep = max(map(len, places))
-        return np.stack([np.pad(p, (0, deep - len(p)), constant_values=2 * rows) for p in places], axis=1)
+        places = [np.flatnonzero(ends.reshape(-1) == body) for body in range(self.moving)]
+        most = max(map(len, places))
+        return np.stack([np.pad(p, (0, most - len(p)), constant_values=2 * rows) for p in places], axis=1)
 
 
-def joint_system_plan(ties: Sequence[JointSpec], moving: int) -> JointSystemPlan:
-    """The plan of joints, whose bodies are named by their lines in the table, moving ones first.
+def joint_system_plan(joints: Sequence[JointSpec], moving: int) -> JointSystemPlan:
+    """Plan of joints whose bodies are named by table row, moving ones first.
 
-    Two hinges weld two bodies: the second has a row only across the line between them, a third would say nothing new.
+    Two hinges weld two bodies: the second has only a row across the line between them, a third is redundant.
     """
-    from scipy.sparse import csr_array  # not above: it takes .2 s, for which no scene without joints should wait
+    from scipy.sparse import csr_array  # takes .2 s to import, for which scenes without joints need not wait
     from scipy.sparse.csgraph import reverse_cuthill_mckee
 
-    a, b = (np.array([getattr(tie, side) for tie in ties]) for side in "ab")
-    mine = [{line for line in (tie.a, tie.b) if line < moving} for tie in ties]
-    near = np.array([[bool(one & other) for other in mine] for one in mine])
+    a, b = (np.array([getattr(joint, side) for joint in joints]) for side in "ab")
+    bodies = [{row for row in (joint.a, joint.b) if row < moving} for joint in joints]
+    near = np.array([[bool(own & other) for other in bodies] for own in bodies])
     order = reverse_cuthill_mckee(csr_array(near), symmetric_mode=True)
     hinges: dict[frozenset, list[int]] = {}
-    for j, tie in enumerate(ties):
-        if tie.kind != "distance":
-            hinges.setdefault(frozenset((tie.a, tie.b)), []).append(j)
+    for j, joint in enumerate(joints):
+        if joint.kind != "distance":
+            hinges.setdefault(frozenset((joint.a, joint.b)), []).append(j)
 
-    def ways(j: int) -> list[tuple[int, int, int]]:
-        if ties[j].kind == "distance":
+    def rows_of(j: int) -> list[tuple[int, int, int]]:
+        if joints[j].kind == "distance":
             return [(j, ALONG, j)]
-        alike = hinges[frozenset((ties[j].a, ties[j].b))]
+        alike = hinges[frozenset((joints[j].a, joints[j].b))]
         return [[(j, X, j), (j, Y, j)], [(j, ACROSS, alike[0])], []][min(alike.index(j), 2)]
 
-    rows = [row for j in order for row in ways(int(j))]
-    joint, way, other = (np.array(x) for x in zip(*rows, strict=True))
-    return JointSystemPlan(joint, way, other, (a, b), moving)
+    rows = [row for j in order for row in rows_of(int(j))]
+    joint, direction, other = (np.array(x) for x in zip(*rows, strict=True))
+    return JointSystemPlan(joint, direction, other, (a, b), moving)
 
 
 class JointSystem(NamedTuple):
@@ -108,205 +111,199 @@ class JointSystem(NamedTuple):
     plan: JointSystemPlan
     a: JointSide
     b: JointSide
-    inertia: Inertia  # of all bodies in the table; zero of fixed ones
-    rigid: Array  # bool: whether it is there, and no spring
+    inertia: Inertia  # of all bodies in the table; zero of static ones
+    rigid: Array  # bool: present, and no spring
     rest: Array  # m, of rods
 
 
 class JointRows(NamedTuple):
-    """The rows as they stand, each [R, ...]."""
+    """Rows in this step, each [R, ...]."""
 
     direction: Array  # [2, R, ...]
-    levers: tuple[Array, Array]  # m, of both sides: what turns a body
+    levers: tuple[Array, Array]  # m, of both sides
 
 
-def zero_impulses(linkage: JointSystem) -> Array:
-    """The rows' impulses, N s [R, ...], when they have done nothing."""
-    return jnp.zeros_like(linkage.rest[..., linkage.plan.joint, :])
+def zero_impulses(system: JointSystem) -> Array:
+    """Impulses of the rows before the first step, N s [R, ...]."""
+    return jnp.zeros_like(system.rest[..., system.plan.joint, :])
 
 
 class Anchors(NamedTuple):
-    """The joints as they stand, each [2, J, ...] m."""
+    """Anchors of the joints, each [2, J, ...] m."""
 
     arm_a: Array
     arm_b: Array
-    apart: Array  # from a's anchor to b's
+    offset: Array  # from a's anchor to b's
 
 
-def _apart(linkage: JointSystem, rows: JointRows, apart: Array) -> Array:
-    """How far the anchors are from where they belong, along each row, m [R, ...]."""
-    plan = linkage.plan
-    length = direction_of(apart)[1] - linkage.rest
-    beside = dot(joint_lines(apart, plan.joint), rows.direction)
-    return jnp.where((plan.way == ALONG)[:, None], joint_lines(length, plan.joint), beside)
+def _error(system: JointSystem, rows: JointRows, offset: Array) -> Array:
+    """Position error along each row, m [R, ...]."""
+    plan = system.plan
+    length = direction_of(offset)[1] - system.rest
+    along = dot(take_rows(offset, plan.joint), rows.direction)
+    return jnp.where((plan.direction == ALONG)[:, None], take_rows(length, plan.joint), along)
 
 
-def _rows(linkage: JointSystem, stance: Anchors, one: Array) -> JointRows:
-    plan, dtype = linkage.plan, linkage.rest.dtype
-    direction = jnp.asarray(np.stack([plan.way == X, plan.way == Y])[..., None], dtype)
-    direction = jnp.broadcast_to(direction, (*direction.shape[:2], *linkage.rest.shape[1:]))
-    if (plan.way == ALONG).any():
-        along = joint_lines(direction_of(stance.apart)[0], plan.joint)
-        direction = jnp.where((plan.way == ALONG)[:, None], along, direction)
-    if (plan.way == ACROSS).any():
-        a, of_other = plan.lines[0], joint_lines(stance.arm_a, plan.other)
+def _rows(system: JointSystem, anchors: Anchors) -> JointRows:
+    plan, dtype = system.plan, system.rest.dtype
+    direction = jnp.asarray(np.stack([plan.direction == X, plan.direction == Y])[..., None], dtype)
+    direction = jnp.broadcast_to(direction, (*direction.shape[:2], *system.rest.shape[1:]))
+    if (plan.direction == ALONG).any():
+        along = take_rows(direction_of(anchors.offset)[0], plan.joint)
+        direction = jnp.where((plan.direction == ALONG)[:, None], along, direction)
+    if (plan.direction == ACROSS).any():
+        a, other = plan.bodies[0], take_rows(anchors.arm_a, plan.other)
         same = (a[plan.joint] == a[plan.other])[:, None]
-        between = joint_lines(stance.arm_a, plan.joint) - jnp.where(
-            same, of_other, joint_lines(stance.arm_b, plan.other)
-        )
-        direction = jnp.where((plan.way == ACROSS)[:, None], turned(direction_of(between)[0]), direction)
-    lever_a, lever_b = (dot(turned(joint_lines(arm, plan.joint)), direction) for arm in (stance.arm_a, stance.arm_b))
-    return materialize(JointRows(direction, (lever_a, lever_b)), one)
+        between = take_rows(anchors.arm_a, plan.joint) - jnp.where(same, other, take_rows(anchors.arm_b, plan.other))
+        direction = jnp.where((plan.direction == ACROSS)[:, None], turned(direction_of(between)[0]), direction)
+    lever_a, lever_b = (dot(turned(take_rows(arm, plan.joint)), direction) for arm in (anchors.arm_a, anchors.arm_b))
+    return materialize(JointRows(direction, (lever_a, lever_b)))
 
 
-def _pushed(linkage: JointSystem, rows: JointRows, table: Motion, impulses: Array, one: Array) -> Motion:
-    """The motions after the rows' impulses."""
-    push, (lever_a, lever_b) = impulses * rows.direction, rows.levers
+def _pushed(system: JointSystem, rows: JointRows, table: Motion, impulses: Array) -> Motion:
+    """Motions after the impulses of the rows."""
+    linear, (lever_a, lever_b) = impulses * rows.direction, rows.levers
     parts = Motion(
-        jnp.concatenate([-push, push, jnp.zeros_like(push[:, :1])], axis=-2),
+        jnp.concatenate([-linear, linear, jnp.zeros_like(linear[:, :1])], axis=-2),
         jnp.concatenate([-lever_a * impulses, lever_b * impulses, jnp.zeros_like(impulses[:1])], axis=-2),
     )
-    parts, total = materialize(parts, one), None
-    for places in linkage.plan.pushers():
-        part = joint_lines(parts, places)
-        total = part if total is None else jax.tree.map(jnp.add, total, part)
-    assert total is not None
-    moving = linkage.plan.moving
-    mass, moment = (x[:moving] for x in linkage.inertia)
+    parts, moving = materialize(parts), system.plan.moving
+    each = (take_rows(parts, places) for places in system.plan.rows_of_bodies())
+    total = functools.reduce(lambda x, y: jax.tree.map(jnp.add, x, y), each)
+    mass, moment = (x[:moving] for x in system.inertia)
     more = Motion(mass * total.velocity, moment * total.spin)
     new = jax.tree.map(lambda x, y: jnp.concatenate([x[..., :moving, :] + y, x[..., moving:, :]], axis=-2), table, more)
-    return materialize(new, one)
+    return materialize(new)
 
 
-def _speeds(linkage: JointSystem, rows: JointRows, table: Motion) -> Array:
-    """How fast the anchors part along each row, m/s."""
-    plan, speeds = linkage.plan, []
-    for lines, lever in zip(plan.lines, rows.levers, strict=True):
-        motion = joint_lines(table, lines[plan.joint])
+def _speeds(system: JointSystem, rows: JointRows, table: Motion) -> Array:
+    """Speed with which the anchors part along each row, m/s."""
+    plan, speeds = system.plan, []
+    for bodies, lever in zip(plan.bodies, rows.levers, strict=True):
+        motion = take_rows(table, bodies[plan.joint])
         speeds.append(dot(rows.direction, motion.velocity) + lever * motion.spin)
     return speeds[1] - speeds[0]
 
 
-def _bands(linkage: JointSystem, rows: JointRows, one: Array) -> list[Array]:
-    """The diagonals of J M^-1 J^T, 1/kg [R, ...], from the main one on: the speed along the row so many rows later that
-    a unit impulse along this one gives."""
-    plan, bands = linkage.plan, []
-    usable = joint_lines(linkage.rigid, plan.joint)
-    inertias = [joint_lines(end.inertia, plan.joint) for end in (linkage.a, linkage.b)]
+def _bands(system: JointSystem, rows: JointRows) -> list[Array]:
+    """Diagonals of J M^-1 J^T, 1/kg [R, ...], from the main one on.
+
+    An entry is the speed along a later row that a unit impulse along this row causes.
+    """
+    plan, bands = system.plan, []
+    usable = take_rows(system.rigid, plan.joint)
+    inertias = [take_rows(side.inertia, plan.joint) for side in (system.a, system.b)]
     count = len(plan.joint)
     for offset in range(plan.width):
         here, there = slice(0, count - offset), slice(offset, count)
-        straight = dot(rows.direction[:, here], rows.direction[:, there])
-        band = jnp.zeros_like(straight)
+        linear = dot(rows.direction[:, here], rows.direction[:, there])
+        band = jnp.zeros_like(linear)
         for a, b, sign in plan.shared(offset):
             mass, moment = (x[here] for x in inertias[a])
-            turning = moment * rows.levers[a][here] * rows.levers[b][there]
-            band = band + jnp.asarray(sign, straight.dtype)[:, None] * (mass * straight + turning)
+            angular = moment * rows.levers[a][here] * rows.levers[b][there]
+            band = band + jnp.asarray(sign, linear.dtype)[:, None] * (mass * linear + angular)
         bands.append(jnp.concatenate([band, jnp.zeros_like(rows.levers[0][:offset])], axis=-2))
     usable = usable & (bands[0] > 0)
     for offset in range(1, plan.width):
         both = usable & jnp.concatenate([usable[offset:], jnp.zeros_like(usable[:offset])], axis=-2)
         bands[offset] = jnp.where(both, bands[offset], 0.0)
     bands[0] = jnp.where(usable, (1 + COMPLIANCE) * bands[0], jnp.inf)
-    return materialize(bands, one)
+    return materialize(bands)
 
 
-def _exchanged(
-    linkage: JointSystem, rows: JointRows, table: Motion, impulses: Array, one: Array
-) -> tuple[Motion, Work]:
-    """The motions after impulses, and the work that these do, J [1, ...]."""
-    new = _pushed(linkage, rows, table, impulses, one)
-    gained = 0.5 * impulses * (_speeds(linkage, rows, table) + _speeds(linkage, rows, new))
-    driven = jnp.zeros_like(gained)
-    for end, lever, sign in zip((linkage.a, linkage.b), rows.levers, (-1, 1), strict=True):
-        of = linkage.plan.joint
-        if end.fixed.any():  # what moves as it likes does work where it is held
-            motion = joint_lines(new, end.lines[of])
+def _apply(system: JointSystem, rows: JointRows, table: Motion, impulses: Array) -> tuple[Motion, Work]:
+    """Motions after impulses, and their work, J [1, ...]."""
+    new = _pushed(system, rows, table, impulses)
+    gain = 0.5 * impulses * (_speeds(system, rows, table) + _speeds(system, rows, new))
+    driven, joint = jnp.zeros_like(gain), system.plan.joint
+    for side, lever, sign in zip((system.a, system.b), rows.levers, (-1, 1), strict=True):
+        if side.static.any():  # a kinematic body does work where it is held
+            motion = take_rows(new, side.rows[joint])
             work = impulses * (dot(rows.direction, motion.velocity) + lever * motion.spin)
-            driven = driven - sign * jnp.where(end.fixed[of][:, None], work, 0.0)
-    lost, driven = (jnp.sum(x, axis=-2, keepdims=True) for x in (-gained, driven))
+            driven = driven - sign * jnp.where(side.static[joint][:, None], work, 0.0)
+    lost, driven = (jnp.sum(x, axis=-2, keepdims=True) for x in (-gain, driven))
     return new, Work(lost, driven, None)
 
 
 def warm_start(
-    linkage: JointSystem, bodies: list[Any], fixed: list[Any], motions: list[Motion], impulses: Array, one: Array
+    system: JointSystem, bodies: list[Any], statics: list[Any], motions: list[Motion], impulses: Array
 ) -> tuple[Anchors, list[Motion], Work]:
-    """The joints as they stand, the motions with the last step's impulses, and the work done."""
-    places = table_of(*([(body.position, body.angle) for body in some] for some in (bodies, fixed)))
-    stance = Anchors(*anchors_of(linkage.a, linkage.b, places, one))
-    now = table_of(motions, [body.motion for body in fixed])
-    now, work = _exchanged(linkage, _rows(linkage, stance, one), now, impulses, one)
-    return stance, groups_of(now, motions), work
+    """Anchors at the start of the step, motions with the impulses of the last step, and their work."""
+    places = table_of(*([(body.position, body.angle) for body in some] for some in (bodies, statics)))
+    anchors = Anchors(*anchors_of(system.a, system.b, places))
+    now = table_of(motions, [body.motion for body in statics])
+    now, work = _apply(system, _rows(system, anchors), now, impulses)
+    return anchors, groups_of(now, motions), work
 
 
 def solve(
-    linkage: JointSystem,
-    stance: Anchors,
+    system: JointSystem,
+    anchors: Anchors,
     motions: list[Motion],
-    beyond: list[Motion],
-    fixed: list[Any],
+    drifts: list[Motion],
+    statics: list[Any],
     impulses: Array,
     h: float,
-    one: Array,
 ) -> tuple[list[Motion], Array, Work]:
-    """The motions with which the anchors meet after a step of h seconds, the impulses by then, and the work done.
+    """Motions with which the anchors meet after a step of h seconds, the accumulated impulses, and their work.
 
-    `beyond` is by how much more than h times its motion a body goes.
+    A body's displacement is h times its motion plus its drift.
     """
-    still = [body.motion for body in fixed]
-    now, more = table_of(motions, still), table_of(beyond, [jax.tree.map(jnp.zeros_like, m) for m in still])
-    rows, works = _rows(linkage, stance, one), []
-    early = _apart(linkage, rows, stance.apart)
-    undone = early - jnp.clip(early, -h * FASTEST, h * FASTEST)
-    matrix = _Matrix(linkage, rows, one)
+    still = [body.motion for body in statics]
+    now, drift = table_of(motions, still), table_of(drifts, [jax.tree.map(jnp.zeros_like, m) for m in still])
+    rows, works = _rows(system, anchors), []
+    error = _error(system, rows, anchors.offset)
+    remaining = error - jnp.clip(error, -h * FASTEST, h * FASTEST)
+    matrix = _Matrix(system, rows)
     for _ in range(NEWTON_ITERATIONS):
-        way = jax.tree.map(lambda x, y: h * x + y, now, more)
-        late = _apart(linkage, rows, _gone(linkage, stance, way, one).apart)
-        impulses, now, work = matrix.closed(now, impulses, (late - undone) / h)
+        displacement = jax.tree.map(lambda x, y: h * x + y, now, drift)
+        error = _error(system, rows, _moved(system, anchors, displacement).offset)
+        impulses, now, work = matrix.solve(now, impulses, (error - remaining) / h)
         works.append(work)
     return groups_of(now, motions), impulses, jax.tree.map(lambda *x: sum(x), *works)
 
 
 def relax(
-    linkage: JointSystem,
-    stance: Anchors,
+    system: JointSystem,
+    anchors: Anchors,
     motions: list[Motion],
-    ways: list[Motion],
-    fixed: list[Any],
+    displacements: list[Motion],
+    statics: list[Any],
     impulses: Array,
     h: float,
-    one: Array,
 ) -> tuple[list[Motion], Array, Work]:
-    """The motions with which the anchors stay together after the bodies have gone their ways."""
-    still = [body.motion for body in fixed]
-    now, way = table_of(motions, still), table_of(ways, [jax.tree.map(lambda x: h * x, m) for m in still])
-    rows = _rows(linkage, _gone(linkage, stance, way, one), one)
-    impulses, now, work = _Matrix(linkage, rows, one).closed(now, impulses, _speeds(linkage, rows, now))
+    """Motions with which the anchors stay together after the displacements, the accumulated impulses, and their
+    work."""
+    still = [body.motion for body in statics]
+    now = table_of(motions, still)
+    displacement = table_of(displacements, [jax.tree.map(lambda x: h * x, m) for m in still])
+    rows = _rows(system, _moved(system, anchors, displacement))
+    impulses, now, work = _Matrix(system, rows).solve(now, impulses, _speeds(system, rows, now))
     return groups_of(now, motions), impulses, work
 
 
-def _gone(linkage: JointSystem, stance: Anchors, ways: Motion, one: Array) -> Anchors:
-    """The joints as they stand after the bodies have gone their ways."""
-    arms, apart = [], stance.apart
-    for lines, arm, sign in zip(linkage.plan.lines, stance[:2], (-1, 1), strict=True):
-        way = joint_lines(ways, lines)
-        more = jnp.sin(way.spin) * turned(arm) - 2 * jnp.sin(way.spin / 2) ** 2 * arm
-        arms.append(materialize(arm + more, one))
-        apart = apart + sign * (way.velocity + more)
-    return Anchors(arms[0], arms[1], apart)
+def _moved(system: JointSystem, anchors: Anchors, displacement: Motion) -> Anchors:
+    """Anchors after the displacements."""
+    arms, offset = [], anchors.offset
+    for bodies, arm, sign in zip(system.plan.bodies, anchors[:2], (-1, 1), strict=True):
+        moved = take_rows(displacement, bodies)
+        more = jnp.sin(moved.spin) * turned(arm) - 2 * jnp.sin(moved.spin / 2) ** 2 * arm
+        arms.append(materialize(arm + more))
+        offset = offset + sign * (moved.velocity + more)
+    return Anchors(arms[0], arms[1], offset)
 
 
 class _Matrix:
-    """The system of the rows, factored."""
+    """Factored system of the rows."""
 
-    def __init__(self, linkage: JointSystem, rows: JointRows, one: Array) -> None:
-        bands = _bands(linkage, rows, one)
-        self._of, self._rows, self._one = linkage, rows, one
-        self._give = jnp.where(jnp.isfinite(bands[0]), COMPLIANCE * bands[0], 0.0)
+    def __init__(self, system: JointSystem, rows: JointRows) -> None:
+        bands = _bands(system, rows)
+        self._system, self._rows = system, rows
+        self._compliance = jnp.where(jnp.isfinite(bands[0]), COMPLIANCE * bands[0], 0.0)
         self._factors = factor(bands)
 
-    def closed(self, now: Motion, impulses: Array, speeds: Array) -> tuple[Array, Motion, Work]:
-        """The impulses that take these speeds from the rows, the motions with them, and the work done."""
-        wanted = materialize(speeds + self._give * impulses, self._one)
-        more = -materialize(solve_factored(self._factors, wanted), self._one)
-        return impulses + more, *_exchanged(self._of, self._rows, now, more, self._one)
+    def solve(self, now: Motion, impulses: Array, speeds: Array) -> tuple[Array, Motion, Work]:
+        """Accumulated impulses that cancel the speeds of the rows, motions with them, and the work done."""
+        target = materialize(speeds + self._compliance * impulses)
+        more = -materialize(solve_factored(self._factors, target))
+        return impulses + more, *_apply(self._system, self._rows, now, more)

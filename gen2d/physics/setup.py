@@ -1,6 +1,6 @@
-"""From a scene to what the solver needs of it: groups of moving bodies, fixed bodies, joints, and a row for every pair.
+"""Setup of the solver: from a scene to groups of moving bodies, static bodies, joints and a constraint for every pair.
 
-The layout says which slots hold what, so all of this is known when a program is compiled, but for the numbers.
+The layout says which slots hold what, so everything but the numbers is known when a program is compiled.
 """
 
 import itertools
@@ -20,7 +20,7 @@ from gen2d.physics.constraint import ContactConstraint, Inertia, Motion, frame_o
 from gen2d.physics.contact_state import PassSetup
 from gen2d.physics.nearby_pairs import DynamicSide, NearbyPairs, PairBatch, StaticSide, chunk_of
 from gen2d.physics.params import SolverParams
-from gen2d.physics.schedule import match_of_rows, matches, pairings, run_schedule
+from gen2d.physics.schedule import matches, pairings, run_schedule
 from gen2d.physics.shapes import BodyShape, CapsuleShape, DiscShape, body_shape_of, to_world
 from gen2d.physics.state import BodyGroupState, Model, StaticBody
 from gen2d.records.axes import Array, Record
@@ -28,10 +28,10 @@ from gen2d.records.layout import JointSpec, Layout, SlotGroup
 from gen2d.records.scene import Objects, Scene, State
 
 
-class GroupSide(NamedTuple):
-    """What a row needs to know of one of its sides."""
+class Material(NamedTuple):
+    """Inertia and surface of the bodies on one side of a constraint."""
 
-    inverse: Inertia | None
+    inverse: Inertia | None  # None: static
     present: Array
     radius: Array
     elasticity: Array
@@ -41,7 +41,7 @@ class GroupSide(NamedTuple):
 
 
 def without_empty(scene: Scene, state: State) -> tuple[Scene, State]:
-    """Both with nothing in their empty slots, so that whatever stood there (NaN, too) cannot matter."""
+    """Scene and state with zeros in empty slots, so that values there, such as NaN, have no effect."""
     present = scene.objects.present
 
     def clean(values: Record) -> Record:
@@ -51,292 +51,276 @@ def without_empty(scene: Scene, state: State) -> tuple[Scene, State]:
 
 
 def pad_groups(count: int) -> int:
-    """How many bodies a group of so many has: a tournament needs an even number."""
+    """Size of the group of `count` bodies; a round robin needs an even number."""
     return count + count % 2 if count > 1 else count
 
 
-def slots_of(value: Any, first: int, count: int, room: int | None = None) -> Any:
-    """Some slots of arrays [..., K, n], with zeros up to `room`."""
+def slots_of(value: Any, first: int, count: int, size: int | None = None) -> Any:
+    """Some slots of arrays [..., K, n], padded with zeros to `size`."""
 
     def some(x: Array) -> Array:
         part = x[..., first : first + count, :]
-        return jnp.pad(part, [(0, 0)] * (x.ndim - 2) + [(0, (room or count) - count), (0, 0)])
+        return jnp.pad(part, [(0, 0)] * (x.ndim - 2) + [(0, (size or count) - count), (0, 0)])
 
     return jax.tree.map(some, value)
 
 
 def moving(layout: Layout) -> list[tuple[SlotGroup, int]]:
-    """The runs of dynamic bodies, each a group, and their first slots."""
-    return [(run, first) for run, first in layout.spans if run.kind == DYNAMIC]
+    """Slot groups of dynamic bodies, with their first slots."""
+    return [(group, first) for group, first in layout.spans if group.kind == DYNAMIC]
 
 
-def standing(layout: Layout) -> list[tuple[SlotGroup, int]]:
-    """Every static and kinematic slot, and the run that it is in."""
-    runs = [(run, first) for run, first in layout.spans if run.kind != DYNAMIC]
-    return [(run, first + i) for run, first in runs for i in range(run.count)]
+def static_slots(layout: Layout) -> list[tuple[SlotGroup, int]]:
+    """Slots of static and kinematic bodies, with their slot groups."""
+    groups = [(group, first) for group, first in layout.spans if group.kind != DYNAMIC]
+    return [(group, first + i) for group, first in groups for i in range(group.count)]
 
 
 def _inverse(value: Array, present: Array) -> Array:
     return reciprocal(value, present & jnp.isfinite(value) & (value > 0))
 
 
-def _group(objects: Objects, layout: Layout, run: SlotGroup, first: int) -> BodyGroupState:
-    some = slots_of(objects, first, run.count, pad_groups(run.count))
-    inverse = Inertia(_inverse(some.mass, some.present), _inverse(some.moment, some.present))
+def _group(objects: Objects, group: SlotGroup, first: int) -> BodyGroupState:
+    own = slots_of(objects, first, group.count, pad_groups(group.count))
+    inverse = Inertia(_inverse(own.mass, own.present), _inverse(own.moment, own.present))
     mass, moment = (_inverse(x, x > 0) for x in inverse)
-    return BodyGroupState(body_shape_of(some, run, slice(None)), inverse, mass, moment, run.collides)
+    return BodyGroupState(body_shape_of(own, group, slice(None)), inverse, mass, moment, group.collides)
 
 
-def _fixed(objects: Objects, state: State, run: SlotGroup, slot: int) -> StaticBody:
-    some, place = slots_of(objects, slot, 1), slots_of(state, slot, 1)
-    motion = Motion(place.velocity, place.angular_velocity) if run.kind == KINEMATIC else None
-    form = body_shape_of(some, run, slice(None))
-    return StaticBody(form, place.position, place.angle, motion, to_world(form, place.position, place.angle))
+def _static(objects: Objects, state: State, group: SlotGroup, slot: int) -> StaticBody:
+    own, start = slots_of(objects, slot, 1), slots_of(state, slot, 1)
+    motion = Motion(start.velocity, start.angular_velocity) if group.kind == KINEMATIC else None
+    shape = body_shape_of(own, group, slice(None))
+    return StaticBody(shape, start.position, start.angle, motion, to_world(shape, start.position, start.angle))
 
 
-def _side(objects: Objects, first: int, count: int, inverse: Inertia | None) -> GroupSide:
-    some = slots_of(objects, first, count, pad_groups(count))
-    slots = jnp.broadcast_to(jnp.arange(first, first + pad_groups(count))[:, None], some.radius.shape)
-    resistance = some.rolling_resistance
-    rolling = None if resistance is None else resistance * some.radius
-    return GroupSide(inverse, some.present, some.radius, some.elasticity, some.friction, rolling, slots)
+def _material(objects: Objects, first: int, count: int, inverse: Inertia | None) -> Material:
+    own = slots_of(objects, first, count, pad_groups(count))
+    slots = jnp.broadcast_to(jnp.arange(first, first + pad_groups(count))[:, None], own.radius.shape)
+    resistance = own.rolling_resistance
+    rolling = None if resistance is None else resistance * own.radius
+    return Material(inverse, own.present, own.radius, own.elasticity, own.friction, rolling, slots)
 
 
-def _sides(objects: Objects, layout: Layout, groups: list[BodyGroupState]) -> tuple[list[GroupSide], list[GroupSide]]:
-    """Of the groups and of the fixed bodies; a kinematic one has an inertia, which is infinite."""
-    ours = [_side(objects, s, run.count, g.inverse) for (run, s), g in zip(moving(layout), groups, strict=True)]
-    nothing = jnp.zeros_like(objects.radius[:1])
-    unmoved = Inertia(nothing, nothing)
-    theirs = [_side(objects, s, 1, unmoved if run.kind == KINEMATIC else None) for run, s in standing(layout)]
-    return ours, theirs
+def _materials(objects: Objects, layout: Layout, groups: list[BodyGroupState]) -> tuple[list[Material], list[Material]]:
+    """Materials of the groups and of the static bodies; a kinematic body has infinite inertia."""
+    dynamic = [_material(objects, s, run.count, g.inverse) for (run, s), g in zip(moving(layout), groups, strict=True)]
+    zero = jnp.zeros_like(objects.radius[:1])
+    infinite = Inertia(zero, zero)
+    of_slots = static_slots(layout)
+    return dynamic, [_material(objects, s, 1, infinite if run.kind == KINEMATIC else None) for run, s in of_slots]
 
 
-def _apart(a: GroupSide, b: GroupSide, layout: Layout) -> Array:
-    """Where two collide: where no joint ties them together, and neither is of a run that nothing touches."""
-    tied = [tie for tie in layout.joints if not tie.collide]
-    together = jnp.zeros(b.slot.shape, bool)
-    for run, first in layout.spans:
-        if not run.collides:
+def _collide(a: Material, b: Material, layout: Layout) -> Array:
+    """Whether two bodies collide: no joint connects them, and both slot groups collide."""
+    excluded = jnp.zeros(b.slot.shape, bool)
+    for group, first in layout.spans:
+        if not group.collides:
             for slot in (a.slot, b.slot):
-                together = together | ((slot >= first) & (slot < first + run.count))
-    for i, j in ((tie.a, tie.b) for tie in tied):
-        together = together | ((a.slot == i) & (b.slot == j)) | ((a.slot == j) & (b.slot == i))
-    return ~together
+                excluded = excluded | ((slot >= first) & (slot < first + group.count))
+    for i, j in ((joint.a, joint.b) for joint in layout.joints if not joint.collide):
+        excluded = excluded | ((a.slot == i) & (b.slot == j)) | ((a.slot == j) & (b.slot == i))
+    return ~excluded
 
 
-def _round(a: BodyShape, b: BodyShape, fixed: bool, still: bool) -> bool:
-    """Whether a pair's levers are known beforehand: two discs, or a disc on something that stands still."""
-    if not isinstance(b, DiscShape):
-        return False
-    return (isinstance(a, DiscShape) and (not fixed or still)) or (isinstance(a, CapsuleShape) and fixed and still)
-
-
-def _row(
-    a: GroupSide, b: GroupSide, forms: tuple[BodyShape, BodyShape], fixed: bool, layout: Layout, mixing: str
+def _constraint(
+    a: Material, b: Material, shapes: tuple[BodyShape, BodyShape], static: bool, layout: Layout, mixing: str
 ) -> ContactConstraint:
     rolling = None
     if a.rolling is not None and b.rolling is not None:
         rolling = jnp.maximum(a.rolling, b.rolling) + jnp.zeros_like(b.radius)
-    assert b.inverse is not None, "a fixed body is never second"
+    assert b.inverse is not None, "the second body is dynamic"
     values = jax.tree.map(lambda x: jnp.broadcast_to(x, b.radius.shape), a._replace(inverse=None))
     a = values._replace(inverse=a.inverse)
-    here = a.present & b.present & (b.inverse.mass > 0) & _apart(a, b, layout)
-    if a.inverse is not None and not fixed:
-        here = here & (a.inverse.mass > 0)
-    elasticity, friction = (
-        mix_materials(a.elasticity, b.elasticity, mixing),
-        mix_materials(a.friction, b.friction, mixing),
-    )
-    row = ContactConstraint(a.inverse, b.inverse, here, elasticity, friction, rolling, None, fixed)
-    if not _round(*forms, fixed, a.inverse is None):
-        return row
+    present = a.present & b.present & (b.inverse.mass > 0) & _collide(a, b, layout)
+    if a.inverse is not None and not static:
+        present = present & (a.inverse.mass > 0)
+    elasticity = mix_materials(a.elasticity, b.elasticity, mixing)
+    friction = mix_materials(a.friction, b.friction, mixing)
+    constraint = ContactConstraint(a.inverse, b.inverse, present, elasticity, friction, rolling, None, static)
+    # The levers of two discs, and of a disc on a static body at rest, do not change.
+    at_rest, round_a = a.inverse is None, isinstance(shapes[0], DiscShape)
+    constant = (round_a and (not static or at_rest)) or (isinstance(shapes[0], CapsuleShape) and static and at_rest)
+    if not (isinstance(shapes[1], DiscShape) and constant):
+        return constraint
     levers = None, None, None if a.inverse is None else a.radius, -b.radius
-    return row._replace(grip=frame_of(row, levers, here))
+    return constraint._replace(frame=frame_of(constraint, levers, present))
 
 
-TOGETHER = 1e-4  # m: ends that are so near to another segment lie on it
+ENDS_MEET = 1e-4  # m: ends that are so near to another segment lie on it
 
 
-def _onward(ends: Array, own: np.ndarray, shapes: Stadium) -> tuple[Array, Array]:
-    """For ends [2, E, n] of segments `own` [E], the two directions in which others go on from there, zero if none do;
-    of all segments [S, ..., 1, n] one after the other, in a loop, which is compiled once for all of them."""
+def _directions_onward(ends: Array, own: np.ndarray, shapes: Stadium) -> tuple[Array, Array]:
+    """Two directions in which other segments continue at the ends [2, E, n] of segments `own` [E]; zero without one.
 
-    def on(found: tuple[Array, Array], other: tuple[Stadium, Array]) -> tuple[tuple[Array, Array], None]:
+    Segments [S, ..., 1, n] are visited in a loop, so that its body is compiled once.
+    """
+
+    def visit(found: tuple[Array, Array], other: tuple[Stadium, Array]) -> tuple[tuple[Array, Array], None]:
         (first, second), (shape, number) = found, other
-        aside, along, _ = from_core(shape, ends)
-        there = (dot(aside, aside) < TOGETHER**2) & (shape.half_length > TOGETHER) & (number != own)[:, None]
-        for way, goes in ((1, along < shape.half_length - TOGETHER), (-1, along > TOGETHER - shape.half_length)):
-            new, empty = there & goes, dot(first, first) == 0
+        offset, along, _ = from_core(shape, ends)
+        meets = (dot(offset, offset) < ENDS_MEET**2) & (shape.half_length > ENDS_MEET) & (number != own)[:, None]
+        for sign, goes in ((1, along < shape.half_length - ENDS_MEET), (-1, along > ENDS_MEET - shape.half_length)):
+            new, empty = meets & goes, dot(first, first) == 0
             first, second = (
-                jnp.where(new & empty, way * shape.direction, first),
-                jnp.where(new & ~empty, way * shape.direction, second),
+                jnp.where(new & empty, sign * shape.direction, first),
+                jnp.where(new & ~empty, sign * shape.direction, second),
             )
         return (first, second), None
 
-    nothing = jnp.zeros_like(ends)
-    return jax.lax.scan(on, (nothing, nothing), (shapes, jnp.arange(len(shapes.radius))))[0]
+    zero = jnp.zeros_like(ends)
+    return jax.lax.scan(visit, (zero, zero), (shapes, jnp.arange(len(shapes.radius))))[0]
 
 
-def _ways(fixed: list[StaticBody]) -> dict[int, list]:
-    """Of each fixed segment that stands still what goes on from its two ends; nothing where there is one at most."""
-    lines = {i: f.shape for i, f in enumerate(fixed) if isinstance(f.shape, Stadium) and f.motion is None}
-    if len(lines) < 2:
+def _neighbours(statics: list[StaticBody]) -> dict[int, list]:
+    """Directions of the continuing segments at both ends of each static segment; empty for a single segment."""
+    segments = {i: f.shape for i, f in enumerate(statics) if isinstance(f.shape, Stadium) and f.motion is None}
+    if len(segments) < 2:
         return {}
-    shapes: Stadium = jax.tree.map(lambda *x: jnp.stack(jnp.broadcast_arrays(*x)), *lines.values())
+    shapes: Stadium = jax.tree.map(lambda *x: jnp.stack(jnp.broadcast_arrays(*x)), *segments.values())
     reach = shapes.half_length[:, None] * shapes.direction
     ends = jnp.stack([shapes.centre - reach, shapes.centre + reach], axis=1)  # [S, 2 ends, 2, 1, n]
-    numbers = np.arange(2 * len(lines))
-    found = _onward(jnp.moveaxis(ends[..., 0, :], 2, 0).reshape(2, len(numbers), -1), numbers // 2, shapes)
-    each = [tuple(x[:, k : k + 1] for x in found) for k in numbers]
-    return {i: each[2 * k : 2 * k + 2] for k, i in enumerate(lines)}
+    numbers = np.arange(2 * len(segments))
+    ends = jnp.moveaxis(ends[..., 0, :], 2, 0).reshape(2, len(numbers), -1)
+    directions = _directions_onward(ends, numbers // 2, shapes)
+    each = [tuple(x[:, k : k + 1] for x in directions) for k in numbers]
+    return {i: each[2 * k : 2 * k + 2] for k, i in enumerate(segments)}
 
 
-def _dense(
+def _all_pairs(
     objects: Objects,
     layout: Layout,
     groups: list[BodyGroupState],
-    fixed: list[StaticBody],
+    statics: list[StaticBody],
     setup: PassSetup,
-    rules: SolverParams,
+    params: SolverParams,
 ) -> AllPairs:
-    order = matches([pad_groups(run.count) for run, _ in moving(layout)], len(fixed))
-    forms, matched, ways = [g.form for g in groups], match_of_rows(order), _ways(fixed)
-    pairs = [(fixed[m.first].form if m.fixed else forms[m.first], forms[m.second]) for m in matched]
+    order = matches([pad_groups(group.count) for group, _ in moving(layout)], len(statics))
+    neighbours, rounds = _neighbours(statics), [match for match in order for _ in range(match.rounds)]
+    pairs = [((statics if m.static else groups)[m.first].body_shape, groups[m.second].body_shape) for m in rounds]
 
-    def play(k: int, a: GroupSide, b: GroupSide) -> tuple[GroupSide, GroupSide, tuple[ContactConstraint, Array, Array]]:
-        row, m = _row(a, b, pairs[k], matched[k].fixed, layout, rules.mixing), matched[k]
-        if row.grip is not None and m.fixed and m.first in ways:
-            row = row._replace(left=ways[m.first][0], right=ways[m.first][1])
-        return a, b, (row, jnp.broadcast_to(a.slot, b.slot.shape), b.slot)
+    def play(k: int, a: Material, b: Material) -> tuple[Material, Material, tuple[ContactConstraint, Array, Array]]:
+        match = rounds[k]
+        constraint = _constraint(a, b, pairs[k], match.static, layout, params.mixing)
+        if constraint.frame is not None and match.static and match.first in neighbours:
+            left, right = neighbours[match.first]
+            constraint = constraint._replace(left=left, right=right)
+        return a, b, (constraint, jnp.broadcast_to(a.slot, b.slot.shape), b.slot)
 
-    _, made = run_schedule(*_sides(objects, layout, groups), order, play)
-    points = [_points(*of) for of in pairs]
-    return AllPairs([row for row, *_ in made], points, [(a, b) for _, a, b in made], order, setup, rules)
-
-
-def _points(a: BodyShape, b: BodyShape) -> int:
-    """How many points of contact two shapes have."""
-    return 1 if _is_disc(a) or _is_disc(b) else 2
+    _, played = run_schedule(*_materials(objects, layout, groups), order, play)
+    slots = [(a, b) for _, a, b in played]
+    points = [_point_count(*of) for of in pairs]
+    return AllPairs([constraint for constraint, *_ in played], points, slots, order, setup, params)
 
 
-def _sparse(
+def _point_count(a: BodyShape, b: BodyShape) -> int:
+    """Number of contact points of two shapes."""
+    return 1 if isinstance(a, DiscShape) or isinstance(b, DiscShape) else 2
+
+
+def _nearby_pairs(
     objects: Objects,
     layout: Layout,
     groups: list[BodyGroupState],
-    fixed: list[StaticBody],
+    statics: list[StaticBody],
     setup: PassSetup,
-    rules: SolverParams,
+    params: SolverParams,
 ) -> NearbyPairs:
-    ours, theirs = _sides(objects, layout, groups)
-    sizes, firsts = [side.slot.shape[0] for side in ours], [first for _, first in moving(layout)]
-    solid, firm = ([run.collides for run, _ in of] for of in (moving(layout), standing(layout)))
-    fixed_slots, ways, kinds = [slot for _, slot in standing(layout)], _ways(fixed), []
+    dynamic, static = _materials(objects, layout, groups)
+    sizes, firsts = [material.slot.shape[0] for material in dynamic], [first for _, first in moving(layout)]
+    solid, solid_static = ([group.collides for group, _ in of] for of in (moving(layout), static_slots(layout)))
+    slots_of_statics, neighbours, batches = [slot for _, slot in static_slots(layout)], _neighbours(statics), []
 
-    def add(forms: tuple[BodyShape, BodyShape], of_a: np.ndarray, b: np.ndarray, **more: Any) -> None:
-        def row(a: GroupSide, b: GroupSide) -> ContactConstraint:
-            return _row(a, b, forms, more["first"] is None, layout, rules.mixing)
+    def add(shapes: tuple[BodyShape, BodyShape], slots_a: np.ndarray, b: np.ndarray, **more: Any) -> None:
+        def constraint(a: Material, b: Material) -> ContactConstraint:
+            return _constraint(a, b, shapes, more["first"] is None, layout, params.mixing)
 
-        slots = of_a, b + firsts[more["second"]]
-        kinds.append(PairBatch(b=b, slots=slots, row=row, points=_points(*forms), **more))
+        slots = slots_a, b + firsts[more["second"]]
+        batches.append(PairBatch(b=b, slots=slots, constraint=constraint, points=_point_count(*shapes), **more))
 
     for m in matches(sizes, 0):
         if not (solid[m.first] and solid[m.second]):
             continue
         a, b = pairings(sizes[m.first], sizes[m.second], m)
         ring = round_robin_of(a, b) if m.first == m.second else None
-        forms = groups[m.first].form, groups[m.second].form
-        add(forms, a + firsts[m.first], b, first=m.first, second=m.second, a=a, posts={}, ring=ring)
+        shapes = groups[m.first].body_shape, groups[m.second].body_shape
+        add(shapes, a + firsts[m.first], b, first=m.first, second=m.second, a=a, statics={}, round_robin=ring)
     for g, group in enumerate(groups):
+        disc = isinstance(group.body_shape, DiscShape)
 
-        def like(i: int, form: BodyShape = group.form) -> tuple:
-            """What fixed bodies have in common whose rows with the group are of one kind."""
-            of = fixed[i]
-            return type(of.form), len(jax.tree.leaves(of.form)), of.motion is None, i in ways and _is_disc(form)
+        def operations(i: int, disc: bool = disc) -> tuple:
+            """Key of the static bodies that are solved by the same operations."""
+            body = statics[i]
+            leaves = len(jax.tree.leaves(body.body_shape))
+            return type(body.body_shape), leaves, body.motion is None, i in neighbours and disc
 
-        touching = [i for i in range(len(fixed)) if solid[g] and firm[i]]
-        for alike, numbers in itertools.groupby(touching, key=like):
-            some = list(numbers)
-            onward = {i: ways[i] if alike[-1] else (None, None) for i in some}
-            posts = {i: StaticSide(theirs[i], left, right, theirs[i].present) for i, (left, right) in onward.items()}
-            a, b = np.indices((len(some), sizes[g]))
-            slots = np.array([fixed_slots[i] for i in some])[a]
-            add((fixed[some[0]].form, group.form), slots, b, first=None, second=g, a=a, posts=posts, ring=None)
-    seats = [
-        DynamicSide(
-            side,
-            jnp.broadcast_to(setup.gravity, (2, *side.slot.shape)),
-            jnp.broadcast_to(setup.threshold, side.slot.shape),
-        )
-        for side in ours
-    ]
+        touching = [i for i in range(len(statics)) if solid[g] and solid_static[i]]
+        for key, numbers in itertools.groupby(touching, key=operations):
+            alike = list(numbers)
+            ends = {i: neighbours[i] if key[-1] else (None, None) for i in alike}
+            sides = {i: StaticSide(static[i], left, right, static[i].present) for i, (left, right) in ends.items()}
+            a, b = np.indices((len(alike), sizes[g]))
+            slots = np.array([slots_of_statics[i] for i in alike])[a]
+            shapes = statics[alike[0]].body_shape, group.body_shape
+            add(shapes, slots, b, first=None, second=g, a=a, statics=sides, round_robin=None)
+    sides = []
+    for material in dynamic:
+        gravity = jnp.broadcast_to(setup.gravity, (2, *material.slot.shape))
+        sides.append(DynamicSide(material, gravity, jnp.broadcast_to(setup.threshold, material.slot.shape)))
     rolling = objects.rolling_resistance is not None
-    return NearbyPairs(kinds, seats, rolling, setup, rules, chunk_of(setup.threshold.shape[-1]))
+    return NearbyPairs(batches, sides, rolling, setup, params, chunk_of(setup.threshold.shape[-1]))
 
 
-def _is_disc(form: BodyShape) -> bool:
-    return isinstance(form, DiscShape)
-
-
-def _ties(
+def _joints(
     scene: Scene, layout: Layout, groups: list[BodyGroupState]
 ) -> tuple[list[joint_forces.JointBatch], rigid_joints.JointSystem | None]:
-    """The joints in rounds, and what of them is rigid. A body's line in the solver's table is its place among the
-    groups, or behind them."""
+    """Joints in rounds, and the system of the rigid ones; bodies are rows of a table, groups before static bodies."""
     if not layout.joints:
         return [], None
-    values, nothing = scene.joints, jnp.zeros_like(scene.objects.mass[:1])
+    values, zero = scene.joints, jnp.zeros_like(scene.objects.mass[:1])
     assert values is not None, "a layout with joints needs scene.joints"
-    sizes, still = [pad_groups(run.count) for run, _ in moving(layout)], [slot for _, slot in standing(layout)]
-    lines = {slot: sum(sizes) + place for place, slot in enumerate(still)}
-    for g, (run, first) in enumerate(moving(layout)):
-        lines |= {first + i: sum(sizes[:g]) + i for i in range(run.count)}
-    unmoved = [Inertia(nothing, nothing)] * len(still)
-    inverse = jax.tree.map(lambda *x: jnp.concatenate(x, axis=-2), *(g.inverse for g in groups), *unmoved)
+    sizes, static = [pad_groups(group.count) for group, _ in moving(layout)], [slot for _, slot in static_slots(layout)]
+    rows = {slot: sum(sizes) + i for i, slot in enumerate(static)}
+    for g, (group, first) in enumerate(moving(layout)):
+        rows |= {first + i: sum(sizes[:g]) + i for i in range(group.count)}
+    infinite = [Inertia(zero, zero)] * len(static)
+    inverse = jax.tree.map(lambda *x: jnp.concatenate(x, axis=-2), *(g.inverse for g in groups), *infinite)
 
-    def end(slots: np.ndarray, anchor: Array) -> joint_forces.JointSide:
-        of = np.array([lines[int(slot)] for slot in slots])
-        return joint_forces.JointSide(of, of >= sum(sizes), joint_forces.joint_lines(inverse, of), anchor)
+    def side(slots: np.ndarray, anchor: Array) -> joint_forces.JointSide:
+        own = np.array([rows[int(slot)] for slot in slots])
+        return joint_forces.JointSide(own, own >= sum(sizes), joint_forces.take_rows(inverse, own), anchor)
 
-    def tied(numbers: Sequence[int]) -> joint_forces.JointBatch:
-        ties, of = [layout.joints[j] for j in numbers], joint_forces.joint_lines(values, np.array(numbers))
-        a, b = (np.array([getattr(tie, side) for tie in ties]) for side in "ab")
-        there = scene.objects.present[a] & scene.objects.present[b]
-        ends = end(a, of.anchor_a), end(b, of.anchor_b)
-        rest = (of.rest, of.stiffness, of.damping, of.lower, of.upper, of.motor_speed, of.motor_torque)
-        return joint_forces.JointBatch(ties[0].kind, *ends, there, *rest)
+    def batch(numbers: Sequence[int]) -> joint_forces.JointBatch:
+        joints, own = [layout.joints[j] for j in numbers], joint_forces.take_rows(values, np.array(numbers))
+        a, b = (np.array([getattr(joint, side) for joint in joints]) for side in "ab")
+        present = scene.objects.present[a] & scene.objects.present[b]
+        sides = side(a, own.anchor_a), side(b, own.anchor_b)
+        rest = (own.rest, own.stiffness, own.damping, own.lower, own.upper, own.motor_speed, own.motor_torque)
+        return joint_forces.JointBatch(joints[0].kind, *sides, present, *rest)
 
-    named = [JointSpec(tie.kind, lines[tie.a], lines[tie.b]) for tie in layout.joints]
-    every = tied(range(len(named)))
-    springs = np.array([tie.kind == "distance" for tie in named])[:, None] & jnp.isfinite(every.stiffness)
-    linked = rigid_joints.JointSystem(
-        rigid_joints.joint_system_plan(named, sum(sizes)), every.a, every.b, inverse, every.there & ~springs, every.rest
-    )
-    return [tied(numbers) for numbers in joint_forces.joint_rounds(named, sum(sizes))], linked
+    joints = [JointSpec(joint.kind, rows[joint.a], rows[joint.b]) for joint in layout.joints]
+    every = batch(range(len(joints)))
+    springs = np.array([joint.kind == "distance" for joint in joints])[:, None] & jnp.isfinite(every.stiffness)
+    plan = rigid_joints.joint_system_plan(joints, sum(sizes))
+    system = rigid_joints.JointSystem(plan, every.a, every.b, inverse, every.present & ~springs, every.rest)
+    return [batch(numbers) for numbers in joint_forces.joint_rounds(joints, sum(sizes))], system
 
 
 def build_model(
-    scene: Scene, state: State, layout: Layout, rules: SolverParams, forces: Any, contacts: bool, sparse: bool
+    scene: Scene, state: State, layout: Layout, params: SolverParams, forces: Any, log: bool, sparse: bool
 ) -> Model:
-    """What stays the same for a whole video; `contacts` says whether touches shall say where they are, `sparse` which
-    form of the solver it is for."""
+    """Constants of a video; `log` asks for the positions of contacts, `sparse` for the solver of near pairs."""
     objects = scene.objects
-    groups = [_group(objects, layout, run, first) for run, first in moving(layout)]
-    fixed = [_fixed(objects, state, run, slot) for run, slot in standing(layout)]
-    one = 1.0 + jax.lax.stop_gradient(jnp.maximum(-jnp.max(objects.radius), 0.0))  # 1, but the compiler cannot know
-    # In a pile at rest, what has to be stopped anew each step is what gravity gave: that must not count as a bounce.
-    at_rest = 2 * rules.step * jnp.sqrt(jnp.sum(scene.gravity**2, axis=0))
-    setup = PassSetup(scene.gravity[:, None], jnp.maximum(rules.bounce_threshold, at_rest), one, contacts)
-    made = (_sparse if sparse else _dense)(objects, layout, groups, fixed, setup, rules)
-    rails = [
-        _rail(f, objects.present[s : s + 1]) for f, (r, s) in zip(fixed, standing(layout), strict=True) if r.collides
-    ]
-    return Model(
-        groups, fixed, [r for r in rails if r is not None], scene.gravity, made, *_ties(scene, layout, groups), forces
-    )
-
-
-def _rail(body: StaticBody, present: Array) -> Stadium | None:
-    """A fixed segment that stands still, and None if it is no such thing; of negative length where it is absent."""
-    if body.motion is not None or not isinstance(body.shape, Stadium):
-        return None
-    return body.shape._replace(half_length=jnp.where(present, body.shape.half_length, -FAR))
+    groups = [_group(objects, group, first) for group, first in moving(layout)]
+    statics = [_static(objects, state, group, slot) for group, slot in static_slots(layout)]
+    one = 1.0 + jax.lax.stop_gradient(jnp.maximum(-jnp.max(objects.radius), 0.0))  # 1.0, unknown to the compiler
+    # A pile at rest is stopped anew in each step from the speed that gravity gave it, which is not a bounce.
+    at_rest = 2 * params.step * jnp.sqrt(jnp.sum(scene.gravity**2, axis=0))
+    setup = PassSetup(scene.gravity[:, None], jnp.maximum(params.bounce_threshold, at_rest), log)
+    solver = (_nearby_pairs if sparse else _all_pairs)(objects, layout, groups, statics, setup, params)
+    segments = []
+    for body, (group, slot) in zip(statics, static_slots(layout), strict=True):
+        if group.collides and body.motion is None and isinstance(body.shape, Stadium):
+            half_length = jnp.where(objects.present[slot : slot + 1], body.shape.half_length, -FAR)
+            segments.append(body.shape._replace(half_length=half_length))
+    return Model(groups, statics, segments, scene.gravity, solver, *_joints(scene, layout, groups), forces, one)

@@ -1,4 +1,4 @@
-"""What a slot's shape is in its own frame, and where it lies in the world."""
+"""Shapes in the body frame and in the world."""
 
 from typing import NamedTuple, TypeAlias, overload
 
@@ -34,26 +34,26 @@ class PolygonShape(NamedTuple):
 BodyShape: TypeAlias = DiscShape | CapsuleShape | PolygonShape
 
 
-def body_shape_of(objects: Objects, run: SlotGroup, slots: slice | Array) -> BodyShape:
-    """The form of a run's slots; objects in the device's layout."""
+def body_shape_of(objects: Objects, group: SlotGroup, slots: slice | Array) -> BodyShape:
+    """Body shape of some slots of a slot group; objects in the device layout."""
     radius = objects.radius[slots]
-    if run.shape == "circle":
+    if group.shape == "circle":
         return DiscShape(radius)
-    if run.shape in ("segment", "capsule"):
+    if group.shape in ("segment", "capsule"):
         return CapsuleShape(objects.half_length[slots], radius)
     assert objects.vertices is not None, "a layout with polygons needs objects.vertices"
-    vertices = tuple(objects.vertices[: run.vertices, :, slots])
+    vertices = tuple(objects.vertices[: group.vertices, :, slots])
     return PolygonShape(vertices, edge_normals(vertices), radius)
 
 
 @overload
-def to_world(form: CapsuleShape, position: Array, angle: Array) -> Stadium: ...
+def to_world(shape: CapsuleShape, position: Array, angle: Array) -> Stadium: ...
 @overload
-def to_world(form: BodyShape, position: Array, angle: Array) -> Shape: ...
-def to_world(form: BodyShape, position: Array, angle: Array) -> Shape:
-    """The shape in the world; position [2, N, ...] in m, angle [N, ...] in rad."""
-    if isinstance(form, DiscShape):
-        return Disc(position, form.radius)
-    if isinstance(form, CapsuleShape):
-        return Stadium(position, jnp.stack([jnp.cos(angle), jnp.sin(angle)]), form.half_length, form.radius)
-    return hull(form.vertices, form.normals, position, angle, form.radius)
+def to_world(shape: BodyShape, position: Array, angle: Array) -> Shape: ...
+def to_world(shape: BodyShape, position: Array, angle: Array) -> Shape:
+    """Shape in the world at a position [2, N, ...] in m and an angle [N, ...] in rad."""
+    if isinstance(shape, DiscShape):
+        return Disc(position, shape.radius)
+    if isinstance(shape, CapsuleShape):
+        return Stadium(position, jnp.stack([jnp.cos(angle), jnp.sin(angle)]), shape.half_length, shape.radius)
+    return hull(shape.vertices, shape.normals, position, angle, shape.radius)

@@ -8,74 +8,73 @@ import jax.numpy as jnp
 from gen2d.physics import joint_forces, rigid_joints
 from gen2d.physics.collision import Shape, Stadium
 from gen2d.physics.constraint import Inertia, Motion
+from gen2d.physics.contact_solver import ContactSolver
 from gen2d.physics.energy import Ledger
 from gen2d.physics.shapes import BodyShape, to_world
 from gen2d.records.axes import Array
 
 
 class BodyState(NamedTuple):
-    """Some moving bodies as they are now."""
+    """State of some moving bodies."""
 
     position: Array  # [2, N, ...] m
     angle: Array  # [N, ...] rad
     motion: Motion
-    rest: Motion | None = None  # m, rad: what rounding has kept back of the ways so far
+    remainder: Motion | None = None  # m, rad: what rounding has kept back of the displacements so far
 
 
 class BodyGroupState(NamedTuple):
-    """What stays the same of the moving bodies of one run; an empty slot has no mass, and no inverse of it."""
+    """Constants of a slot group of moving bodies; an empty slot has neither mass nor inverse mass."""
 
-    form: BodyShape
+    body_shape: BodyShape
     inverse: Inertia
     mass: Array  # [N, ...] kg
     moment: Array  # [N, ...] kg m^2
-    collides: bool = True  # whether they meet anything
+    collides: bool = True  # whether they collide with anything
 
 
 class StaticBody(NamedTuple):
-    """A body that nothing can push, at the start. `motion` is None where it stands still."""
+    """A static or kinematic body at the start; the motion of a static one is None."""
 
-    form: BodyShape
+    body_shape: BodyShape
     position: Array  # [2, 1, ...] m
     angle: Array  # [1, ...] rad
     motion: Motion | None
-    shape: Shape  # as it lies at the start
+    shape: Shape  # in the world at the start
 
-    @property
-    def still(self) -> Motion:
-        """Its motion, zero where it stands still."""
-        return self.motion or Motion(jnp.zeros_like(self.position), jnp.zeros_like(self.angle))
-
-    def at(self, time: Array) -> tuple[Array, Array]:
-        """Where it is by then."""
+    def at(self, time: Array) -> BodyState:
+        """State at a time."""
         if self.motion is None:
-            return self.position, self.angle
-        return self.position + time * self.motion.velocity, self.angle + time * self.motion.spin
+            rest = Motion(jnp.zeros_like(self.position), jnp.zeros_like(self.angle))
+            return BodyState(self.position, self.angle, rest)
+        position, angle = self.position + time * self.motion.velocity, self.angle + time * self.motion.spin
+        return BodyState(position, angle, self.motion)
 
     def shape_at(self, now: BodyState) -> Shape:
-        """Its shape where it is now."""
-        return self.shape if self.motion is None else to_world(self.form, now.position, now.angle)
+        """Shape in the world in a state."""
+        return self.shape if self.motion is None else to_world(self.body_shape, now.position, now.angle)
 
 
 class Model(NamedTuple):
-    """What stays the same for a whole video."""
+    """Constants of a video."""
 
     groups: list[BodyGroupState]
-    fixed: list[StaticBody]
-    rails: list[Stadium]  # fixed segments that stand still; where there is none, of negative length
+    statics: list[StaticBody]
+    segments: list[Stadium]  # static segments at rest; of negative length where absent
     gravity: Array  # [2, ...] m/s^2
-    contacts: Any  # how pairs are solved: Dense or Sparse
-    ties: list[joint_forces.JointBatch]
-    linkage: rigid_joints.JointSystem | None
+    solver: ContactSolver
+    joints: list[joint_forces.JointBatch]
+    joint_system: rigid_joints.JointSystem | None
     forces: Callable | None  # (bodies, time) -> for each group force [2, N, ...] N and torque [N, ...] N m
+    one: Array  # see `xla.runtime_one`
 
 
 class WorldState(NamedTuple):
-    """All that changes from one step to the next."""
+    """State carried between steps."""
 
     bodies: list[BodyState]
     time: Array  # s
-    contacts: Any  # what the contacts hand on from step to step
-    ties: list[Any]  # of each round of joints: its impulses
-    pushes: Array | None  # of the linkage's rows
+    contacts: Any  # carry of the contact solver
+    joints: list[Any]  # impulses of each round of joints
+    joint_system: Array | None  # impulses of the rigid joints
     ledger: Ledger | None

@@ -27,8 +27,8 @@ def preview(
 ) -> list[Path]:
     """Paths of a contact sheet, NAME-sheet.png, and an animation, NAME.webp, written into the folder `out`.
 
-    `source` is a dataset's folder or URL, or a config, which `seed` and `overrides` change. `trust` is that of `render`,
-    for a dataset without frames; `timeout` and `deadline`, in seconds, are those of `open`.
+    `source` is a dataset's folder or URL, or a config, which `seed` and `overrides` change. `trust` is that of
+    `render`, for a dataset without frames; `timeout` and `deadline`, in seconds, are those of `open`.
     Raises UserError for an invalid source or option, DamagedError, UnreachableError.
     """
     source, out = str(source) if isinstance(source, Path) else source, Path(out)

@@ -6,11 +6,11 @@ from pathlib import Path
 
 import jax
 import pytest
-import yaml
 from tiny import CONFIG, ran, ran_here
 
 from gen2d.cli.main import VERBS
 from gen2d.cli.parser import Parser, parse
+from gen2d.config.reading import yaml_text
 
 
 def parser_of(verb: str) -> Parser:
@@ -103,7 +103,7 @@ def test_help_imports_no_numpy() -> None:
 
 
 def test_the_command_line_tells_what_it_did(tmp_path: Path):
-    (tmp_path / "tiny.yaml").write_text(yaml.safe_dump(CONFIG))
+    (tmp_path / "tiny.yaml").write_text(yaml_text(CONFIG))
     done = ran("--config", "tiny.yaml", "--n", 9, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert "9 videos in" in done.stdout

@@ -34,7 +34,7 @@ def made() -> tuple:
     worlds = [world(balls, box(10)) for balls in discs]
     scene, state = (jax.tree.map(lambda *x: jnp.stack(x), *(w[i] for w in worlds)) for i in (0, 1))
     keys = keys_module.video_keys(jnp.asarray(keys_module.seed_words(3, 0)), jnp.arange(len(worlds), dtype=jnp.uint32))
-    run = functools.partial(simulate, layout=worlds[0][2], rules=rules(), frames=FRAMES, steps=STEPS, sparse=True)
+    run = functools.partial(simulate, layout=worlds[0][2], params=rules(), frames=FRAMES, steps=STEPS, sparse=True)
     return keys, axes.to_device(scene), axes.to_device(state), run
 
 

@@ -117,7 +117,7 @@ def test_a_ring_finds_each_near_pair_once(count):
     reach[0, 0] = np.nan  # is not there
     a, b = pairings(count, count, Match(0, 0, count - 1))
     ring = round_robin_of(a, b)
-    words = np.asarray(bits_in_round_robin(jnp.asarray(centre), jnp.asarray(reach), ring, jnp.ones(())))
+    words = np.asarray(bits_in_round_robin(jnp.asarray(centre), jnp.asarray(reach), ring))
     found = []
     for turn, word, bit in _visited(words, 16):
         pair = ring.pair[turn, word // lanes * 16 + bit]
@@ -129,7 +129,7 @@ def test_a_ring_finds_each_near_pair_once(count):
 
 def test_bits_of_more_pairs_than_a_word_has():
     near = np.random.default_rng(2).random((3, 21, 4)) < 0.5
-    words = np.asarray(bits_of(jnp.asarray(near), jnp.ones(()))).reshape(3, 2, 4)
+    words = np.asarray(bits_of(jnp.asarray(near))).reshape(3, 2, 4)
     back = [(words[:, p // 16] >> (p % 16)) & 1 for p in range(21)]
     np.testing.assert_array_equal(np.stack(back, axis=1), near)
 
