@@ -17,10 +17,8 @@ from gen2d.plugin import (
     Layout,
     SampledScene,
     SlotGroup,
-    assemble,
-    capsules_between,
-    discs,
-    hinge_chain,
+    builder,
+    common,
     option,
 )
 
@@ -31,30 +29,19 @@ DERIVED = {"kink": Field("float32", "n", "1", "joint that it is pulled by at the
 class Options:
     """How the chain is made and hung, and what is drawn at random."""
 
-    links: int = option(12, int, "links", "of the chain", low=2, high=200)
-    ends: int = option(2, int, "pins", "that it hangs from", low=1, high=2)
-    length: Distribution = option([0.35, 0.5], float, "m", "of a link, joint to joint", low=1e-2, high=100, draw=True)
-    radius: Distribution = option([0.06, 0.1], float, "m", "of a link", low=1e-3, high=100, draw=True)
-    density: Distribution = option(1.0, float, "kg/m^2", "of the links", low=1e-6, high=1e6, draw=True)
-    span: Distribution = option(
-        [0.4, 0.85], float, "1", "between two pins, over the chain's length", low=0, high=1, draw=True
-    )
-    slope: Distribution = option([-0.3, 0.3], float, "rad", "of the line from the left pin to the right", draw=True)
-    held: Distribution = option(
-        [0.0, 1.0], float, "1", "which joint it is pulled by; 0: the first that is possible, 1: the last",
-        low=0, high=1, draw=True,
-    )  # fmt: skip
-    above: Distribution = option(
-        [0, 1], int, "1", "1: pulled to above the line between the pins, 0: to below", low=0, high=1, draw=True
-    )
-    angle: Distribution = option(
-        [-2.0, 2.0], float, "rad", "of a chain with one pin at the start, from hanging down", draw=True
-    )
-    friction: Distribution = option(0.0, float, "N m", "most torque of a joint's friction", low=0, draw=True)
-    gravity: tuple[Distribution, ...] = option([0, -9.8], float, "m/s^2", "x right, y up", parts=2, draw=True)
-    color: tuple[Distribution, ...] = option(
-        [[60, 254]] * 3, int, "sRGB", "of each link", parts=3, draw=True, low=0, high=255, each="links"
-    )
+    links: int = option(12, int, "links", "number of links in the chain", low=2, high=200)
+    ends: int = option(2, int, "pins", "number of pins that the chain hangs from", low=1, high=2)
+    length: Distribution = common.length("length of a link, joint to joint", [0.35, 0.5], low=1e-2, high=100)
+    radius: Distribution = common.radius("a link", [0.06, 0.1], high=100)
+    density: Distribution = common.density("the links")
+    span: Distribution = common.fraction("distance between two pins, over the chain's length", [0.4, 0.85])
+    slope: Distribution = common.angle("slope of the line from the left pin to the right one", [-0.3, 0.3])
+    held: Distribution = common.fraction("joint that is pulled; 0: the first that is possible, 1: the last")
+    above: Distribution = option([0, 1], int, "1", "1: pulled up, 0: pulled down", low=0, high=1, draw=True)
+    angle: Distribution = common.angle("angle of a chain with one pin at the start, from hanging down", [-2.0, 2.0])
+    friction: Distribution = option(0.0, float, "N m", "largest torque of the friction in a joint", low=0, draw=True)
+    gravity: tuple[Distribution, ...] = common.gravity()
+    color: tuple[Distribution, ...] = common.color("each link", [[60, 254]] * 3, each="links")
 
 
 def sizes(options: Options) -> dict[str, int]:
@@ -99,11 +86,13 @@ def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledSc
     """One video's scene and start: the chain at rest, taut."""
     n, radius = options.links, factors["radius"]
     corners, kink = _straight(factors, n) if options.ends == 1 else _pulled(factors, n)
-    pins = discs(corners[:: n if options.ends == 2 else n + 1], 1.5 * radius, kind=STATIC, layer=2, collides=False)
+    pins = builder.discs(
+        corners[:: n if options.ends == 2 else n + 1], 1.5 * radius, kind=STATIC, layer=2, collides=False
+    )
     material = {"density": factors["density"], "color": factors["color"], "collides": False}
-    links = capsules_between(corners[:-1], corners[1:], radius, **material)
-    joints = hinge_chain(links, options.ends == 2, motor_torque=factors["friction"])
-    scene, state = assemble(layout(options), [pins, links], factors["gravity"], joints)
+    links = builder.capsules_between(corners[:-1], corners[1:], radius, **material)
+    joints = builder.hinge_chain(links, options.ends == 2, motor_torque=factors["friction"])
+    scene, state = builder.assemble(layout(options), [pins, links], factors["gravity"], joints)
     return SampledScene(scene, state, derived={"kink": kink})
 
 

@@ -11,7 +11,7 @@ import dataclasses
 
 import jax.numpy as jnp
 
-from gen2d.plugin import CLEARANCE, Array, Distribution, Field, Layout, SampledScene, SlotGroup, assemble, discs, option
+from gen2d.plugin import CLEARANCE, Array, Distribution, Field, Layout, SampledScene, SlotGroup, builder, common, option
 
 NEVER = -1.0  # the contact frame of balls that do not approach
 DERIVED = {
@@ -25,32 +25,24 @@ DERIVED = {
 class Options:
     """The balls, the view, and when they shall touch."""
 
-    width: float = option(10.0, float, "m", "of the view", above=0, high=1000)
-    height: float = option(10.0, float, "m", "of the view", above=0, high=1000)
-    radius_1: Distribution = option([0.5, 1.5], float, "m", "of the first ball", low=1e-3, draw=True)
-    radius_2: Distribution = option([0.5, 1.5], float, "m", "of the second ball", low=1e-3, draw=True)
-    speed_1: Distribution = option([1.0, 4.0], float, "m/s", "of the first ball, to the right", low=0, draw=True)
-    speed_2: Distribution = option([1.0, 4.0], float, "m/s", "of the second ball, to the left", low=0, draw=True)
-    density: Distribution = option(1.0, float, "kg/m^2", "of each ball", low=1e-6, high=1e6, draw=True, each="balls")
-    elasticity: Distribution = option(1.0, float, "1", "of each ball", low=0, high=1, draw=True, each="balls")
-    friction: Distribution = option(0.0, float, "1", "of each ball", low=0, high=100, draw=True, each="balls")
-    frame: float = option(0.1, float, "s", "between two frames as contact frames count: 1 / video.fps", above=0)
+    width: float = common.size("width of the view", 10.0)
+    height: float = common.size("height of the view", 10.0)
+    radius_1: Distribution = common.radius("the first ball", [0.5, 1.5])
+    radius_2: Distribution = common.radius("the second ball", [0.5, 1.5])
+    speed_1: Distribution = common.speed("the first ball, to the right", [1.0, 4.0])
+    speed_2: Distribution = common.speed("the second ball, to the left", [1.0, 4.0])
+    density: Distribution = common.density("each ball", each="balls")
+    elasticity: Distribution = common.elasticity("each ball", 1.0, each="balls")
+    friction: Distribution = common.friction("each ball", 0.0, each="balls")
+    frame: float = option(0.1, float, "s", "time between frames in contact_frames: 1 / video.fps", above=0)
     contact_frames: tuple[float, ...] = option(
-        [8.0, 24.0], float, "frames", "first and last at which the balls may touch, where there is room",
+        [8.0, 24.0], float, "frames", "first and last frame at which the balls may touch, where there is room",
         parts=2, above=0,
     )  # fmt: skip
-    contact: Distribution = option(
-        [0, 1], float, "1", "of the contact between the first time and the last that are possible",
-        draw=True, low=0, high=1,
-    )  # fmt: skip
-    place: tuple[Distribution, ...] = option(
-        [[0, 1], [0, 1]], float, "1", "of both balls among those possible; 0, 0 is the lowest and leftmost",
-        parts=2, draw=True, low=0, high=1,
-    )  # fmt: skip
-    margin: float = option(0.5, float, "m", "above and below the larger ball, at least", low=0)
-    color: tuple[Distribution, ...] = option(
-        [[90, 254]] * 3, int, "sRGB", "of each ball", parts=3, draw=True, low=0, high=255, each="balls"
-    )
+    contact: Distribution = common.fraction("time of the contact, from the first that is possible to the last")
+    place: tuple[Distribution, ...] = common.position("both balls")
+    margin: float = option(0.5, float, "m", "smallest distance of the larger ball from the top and bottom", low=0)
+    color: tuple[Distribution, ...] = common.color("each ball", each="balls")
 
 
 def check(options: Options) -> None:
@@ -90,13 +82,13 @@ def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledSc
     first = radius[0] + factors["place"][0] * spare
     nearest = radius.max() + options.margin
     y = nearest + factors["place"][1] * (options.height - 2 * nearest)
-    balls = discs(
+    balls = builder.discs(
         jnp.stack([jnp.stack([first, y]), jnp.stack([first + radius.sum() + gap, y])]), radius,
         velocity=jnp.stack([speed, jnp.zeros(2)], 1) * jnp.asarray([[1.0], [-1.0]]),
-        **{name: factors[name] for name in ("density", "elasticity", "friction", "color")},
+        **builder.material(factors),
     )  # fmt: skip
     derived = {"contact_frame": jnp.where(speed.sum() > 0, time / options.frame, NEVER)}
-    return SampledScene(*assemble(layout(options), [balls], jnp.zeros(2)), derived=derived)
+    return SampledScene(*builder.assemble(layout(options), [balls], jnp.zeros(2)), derived=derived)
 
 
 def _contact(share: Array, closing: Array, room: Array, options: Options) -> tuple[Array, Array]:

@@ -5,49 +5,29 @@ import math
 
 import jax.numpy as jnp
 
-from gen2d.plugin import (
-    STATIC,
-    Array,
-    Distribution,
-    Layout,
-    SampledScene,
-    SlotGroup,
-    assemble,
-    box_walls,
-    discs,
-    option,
-    segments,
-)
+from gen2d.plugin import STATIC, Array, Distribution, Layout, SampledScene, SlotGroup, builder, common, option
 
 
 @dataclasses.dataclass(frozen=True)
 class Options:
     """What is drawn at random, and the board."""
 
-    balls: Distribution = option([1, 3], int, "balls", "one above the other", low=1, high=64, draw=True)
-    rows: int = option(
-        5, int, "rows", "of pegs, each half a spacing beside the last; there is one bin more", low=1, high=12
-    )
-    spacing: float = option(1.0, float, "m", "of pegs that are neighbours, in and between rows", above=0, high=100)
-    peg_radius: float = option(0.18, float, "m", "of each peg", above=0)
-    bin_height: float = option(1.8, float, "m", "of the bins", above=0, high=1000)
-    apart: float = option(0.9, float, "m", "from one ball's centre to the next one's at the start", above=0)
-    radius: Distribution = option([0.2, 0.26], float, "m", "of each ball", low=1e-3, draw=True, each="balls")
-    jitter: Distribution = option(
-        [-0.15, 0.15], float, "m", "of each ball at the start, right of the middle", draw=True, each="balls"
-    )
-    density: Distribution = option(1.0, float, "kg/m^2", "of each ball", low=1e-6, high=1e6, draw=True, each="balls")
-    elasticity: Distribution = option([0.5, 0.9], float, "1", "of each ball", low=0, high=1, draw=True, each="balls")
-    friction: Distribution = option(0.2, float, "1", "of each ball", low=0, high=100, draw=True, each="balls")
-    board_elasticity: Distribution = option([0.5, 0.8], float, "1", "of pegs and bins", low=0, high=1, draw=True)
-    board_friction: Distribution = option(0.2, float, "1", "of pegs and bins", low=0, high=100, draw=True)
-    gravity: tuple[Distribution, ...] = option(
-        [0, -9.8], float, "m/s^2", "x right, y up; the same for a whole video", parts=2, draw=True
-    )
-    color: tuple[Distribution, ...] = option(
-        [[90, 254]] * 3, int, "sRGB", "of each ball", parts=3, draw=True, low=0, high=255, each="balls"
-    )
-    peg_color: tuple[Distribution, ...] = option([150] * 3, int, "sRGB", "of pegs", parts=3, draw=True, low=0, high=255)
+    balls: Distribution = common.count("balls", [1, 3], "number of balls, one above the other")
+    rows: int = option(5, int, "rows", "number of rows of pegs; there is one bin more", low=1, high=12)
+    spacing: float = option(1.0, float, "m", "distance of neighbouring pegs, in and between rows", above=0, high=100)
+    peg_radius: float = option(0.18, float, "m", "radius of each peg", above=0)
+    bin_height: float = common.size("height of the bins", 1.8)
+    apart: float = option(0.9, float, "m", "distance from one ball's centre to the next one's at the start", above=0)
+    radius: Distribution = common.radius("each ball", [0.2, 0.26], each="balls")
+    jitter: Distribution = common.length("offset of each ball from the middle", [-0.15, 0.15], each="balls", low=None)
+    density: Distribution = common.density("each ball", each="balls")
+    elasticity: Distribution = common.elasticity("each ball", [0.5, 0.9], each="balls")
+    friction: Distribution = common.friction("each ball", 0.2, each="balls")
+    board_elasticity: Distribution = common.elasticity("pegs and bins", [0.5, 0.8])
+    board_friction: Distribution = common.friction("pegs and bins", 0.2)
+    gravity: tuple[Distribution, ...] = common.gravity()
+    color: tuple[Distribution, ...] = common.color("each ball", each="balls")
+    peg_color: tuple[Distribution, ...] = common.color("pegs", [150] * 3)
 
 
 def check(options: Options) -> None:
@@ -106,13 +86,14 @@ def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledSc
     number = jnp.arange(len(factors["radius"]))
     heights = top_peg(options) + options.spacing + number * options.apart
     places = jnp.stack([right / 2 + factors["jitter"], heights], axis=-1)
-    material = {name: factors[name] for name in ("density", "elasticity", "friction", "color")}
-    balls = discs(places, factors["radius"], number < factors["balls"], **material)
+    balls = builder.discs(places, factors["radius"], number < factors["balls"], **builder.material(factors))
 
-    board = {"elasticity": factors["board_elasticity"], "friction": factors["board_friction"]}
-    lattice = discs(jnp.asarray(pegs(options)), options.peg_radius, kind=STATIC, color=factors["peg_color"], **board)
+    board = builder.material(factors, "board")
+    lattice = builder.discs(
+        jnp.asarray(pegs(options)), options.peg_radius, kind=STATIC, color=factors["peg_color"], **board
+    )
     at = jnp.arange(1, options.rows + 1) * options.spacing
     feet = jnp.stack([at, jnp.zeros_like(at)], axis=-1)
-    bins = segments(feet, feet + jnp.asarray([0.0, options.bin_height]), **board)
-    parts = [balls, lattice, bins, box_walls(right, top, **board)]
-    return SampledScene(*assemble(here, parts, factors["gravity"]))
+    bins = builder.segments(feet, feet + jnp.asarray([0.0, options.bin_height]), **board)
+    parts = [balls, lattice, bins, builder.box_walls(right, top, **board)]
+    return SampledScene(*builder.assemble(here, parts, factors["gravity"]))

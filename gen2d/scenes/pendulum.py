@@ -14,10 +14,8 @@ from gen2d.plugin import (
     Layout,
     SampledScene,
     SlotGroup,
-    assemble,
-    capsules_between,
-    discs,
-    distance_joints,
+    builder,
+    common,
     option,
 )
 
@@ -31,19 +29,15 @@ DERIVED = {"period": Field("float32", "n", "s", "of small swings of the first li
 class Options:
     """How many links, and what is drawn at random of each."""
 
-    links: int = option(1, int, "links", "1: a pendulum, 2: a double pendulum", low=1, high=2)
-    length: Distribution = option([1.0, 2.0], float, "m", "of each link", low=0.05, high=1000, draw=True, each="links")
-    angle: Distribution = option(
-        [-2.5, 2.5], float, "rad", "of each link at the start, from hanging down", draw=True, each="links"
-    )
-    swing: Distribution = option(0.0, float, "rad/s", "of each link at the start", draw=True, each="links")
-    radius: Distribution = option([0.2, 0.35], float, "m", "of each bob", low=1e-3, high=100, draw=True, each="links")
-    density: Distribution = option(1.0, float, "kg/m^2", "of each bob", low=1e-6, high=1e6, draw=True, each="links")
-    rod_density: Distribution = option(0.2, float, "kg/m^2", "of the rods", low=1e-6, high=1e6, draw=True)
-    gravity: tuple[Distribution, ...] = option([0, -9.8], float, "m/s^2", "x right, y up", parts=2, draw=True)
-    color: tuple[Distribution, ...] = option(
-        [[60, 254]] * 3, int, "sRGB", "of each bob", parts=3, draw=True, low=0, high=255, each="links"
-    )
+    links: int = option(1, int, "links", "number of links; 1: a pendulum, 2: a double pendulum", low=1, high=2)
+    length: Distribution = common.length("length of each link", [1.0, 2.0], each="links", low=0.05, high=1000)
+    angle: Distribution = common.angle("angle of each link at the start, from hanging down", [-2.5, 2.5], each="links")
+    swing: Distribution = common.spin("each link at the start", each="links")
+    radius: Distribution = common.radius("each bob", [0.2, 0.35], each="links", high=100)
+    density: Distribution = common.density("each bob", each="links")
+    rod_density: Distribution = common.density("the rods", 0.2)
+    gravity: tuple[Distribution, ...] = common.gravity()
+    color: tuple[Distribution, ...] = common.color("each bob", [[60, 254]] * 3, each="links")
 
 
 def sizes(options: Options) -> dict[str, int]:
@@ -74,20 +68,22 @@ def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledSc
     ways = length[:, None] * jnp.stack([jnp.sin(angle), -jnp.cos(angle)], -1)
     speeds = factors["swing"][:, None] * jnp.stack([-ways[:, 1], ways[:, 0]], -1)
     ends, end_speeds = jnp.cumsum(ways, 0), jnp.cumsum(speeds, 0)
-    pin = discs(jnp.zeros((1, 2)), PIN, kind=STATIC, layer=3, collides=False)
-    rods = capsules_between(
-        ends - ways, ends, ROD, density=factors["rod_density"], velocity=end_speeds - speeds / 2, spin=factors["swing"],
-        layer=1, collides=False,
+    pin = builder.discs(jnp.zeros((1, 2)), PIN, kind=STATIC, layer=3, collides=False)
+    rods = builder.capsules_between(
+        ends - ways, ends, ROD, velocity=end_speeds - speeds / 2, spin=factors["swing"], layer=1, collides=False,
+        **builder.material(factors, "rod"),
     )  # fmt: skip
-    bob = {name: factors[name] for name in ("density", "color")}
-    bobs = discs(
-        ends, factors["radius"], angle=angle, velocity=end_speeds, spin=factors["swing"], layer=2, collides=False, **bob
+    bobs = builder.discs(
+        ends, factors["radius"], angle=angle, velocity=end_speeds, spin=factors["swing"], layer=2, collides=False,
+        **builder.material(factors),
     )  # fmt: skip
     half, up = (jnp.stack(pair, -1) for pair in ((rods.objects["half_length"], jnp.zeros(n)), (jnp.zeros(n), length)))
     nothing = jnp.zeros((n, 2))
     # In the frame of a bob `up` is where it hangs; a rod goes from its left end to its right.
     above, below = (jnp.stack(x, 1).reshape(-1, 2) for x in ((nothing, -half, half), (up, up, nothing)))
-    scene, state = assemble(layout(options), [pin, rods, bobs], factors["gravity"], distance_joints(above, below))
+    scene, state = builder.assemble(
+        layout(options), [pin, rods, bobs], factors["gravity"], builder.distance_joints(above, below)
+    )
     return SampledScene(
         scene, state, derived={"period": _period(rods.objects, bobs.objects, length, factors["gravity"])}
     )
