@@ -41,7 +41,7 @@ def lyapunov_exponent(
 def perturbation(keys: Array, scene: Scene, state: State) -> State:
     """A change of the size SMALL."""
     dynamic = scene.objects.present & (scene.objects.kind == DYNAMIC)
-    drawn = jax.vmap(lambda key: jax.random.normal(key_for(key, "growth"), (2, *state.position.shape[:2])))(keys)
+    drawn = jax.vmap(lambda key: jax.random.normal(key_for(key, "lyapunov"), (2, *state.position.shape[:2])))(keys)
     place, velocity = jnp.where(dynamic, jnp.moveaxis(drawn, 0, -1), 0.0)
     still = jnp.zeros_like(state.angle)
     way = State(place, still, velocity, still)

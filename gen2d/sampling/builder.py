@@ -132,7 +132,7 @@ def polygons(
 ) -> BodyGroup:
     """Convex polygons with these centres of mass [K, 2] m and, relative to them, `vertices` [K, V, 2] m.
 
-    Vertices are counter-clockwise. A polygon has the first `count` [K] of them, all by default; the rest repeat its last.
+    They are counter-clockwise. A polygon has the first `count` [K] of them, all by default; the rest repeat its last.
     """
     mass, moment = polygon_mass(vertices, material.get("density", 1.0)), polygon_moment(vertices, jnp.ones(()))
     own = vertices.shape[1] if count is None else count

@@ -19,14 +19,18 @@ class Options:
     rows: Distribution = common.count("rows", [3, 5], "rows of the rack: 1, 3, 6, 10, ... balls", high=21)
     width: float = common.size("width of the table, inside", 10.0)
     height: float = common.size("height of the table, inside", 5.0)
-    head: float = option(2.5, float, "m", "largest distance from the left cushion to the cue ball", above=0)
-    spot: float = option(6.0, float, "m", "distance from the left cushion to the first ball of the rack", above=0)
+    head_distance: float = option(2.5, float, "m", "largest distance from the left cushion to the cue ball", above=0)
+    spot_distance: float = option(
+        6.0, float, "m", "distance from the left cushion to the first ball of the rack", above=0
+    )
     radius: Distribution = common.radius("the balls", 0.24)
     gap: Distribution = common.length("gap between neighbours in the rack", 0.01, low=1e-3)
     density: Distribution = common.density("the balls")
     speed: Distribution = common.speed("the cue ball", [6.0, 12.0])
-    aim: Distribution = common.angle("angle of the stroke, counter-clockwise from the line to the rack", [-0.08, 0.08])
-    place: tuple[Distribution, ...] = common.position("the cue ball")
+    aim_angle: Distribution = common.angle(
+        "angle of the stroke, counter-clockwise from the line to the rack", [-0.08, 0.08]
+    )
+    relative_position: tuple[Distribution, ...] = common.position("the cue ball")
     elasticity: Distribution = common.elasticity("the balls", 0.97)
     friction: Distribution = common.friction("the balls", 0.05)
     cushion_elasticity: Distribution = common.elasticity("the cushions", 0.85)
@@ -42,15 +46,17 @@ def check(options: Options) -> None:
     """ValueError where the rack or the cue ball may not fit the table."""
     rows, radius = int(options.rows.support[1]), options.radius.support[1]
     side = (rows - 1) * (2 * radius + options.gap.support[1])
-    if not (options.spot + side * math.sqrt(0.75) + radius < options.width and side + 2 * radius < options.height):
+    if not (
+        options.spot_distance + side * math.sqrt(0.75) + radius < options.width and side + 2 * radius < options.height
+    ):
         raise ValueError(
             f"rows may be {rows}, but with a radius of {radius:g} m they must fit a table of {options.width:g} x "
-            f"{options.height:g} m, {options.spot:g} m from its left side"
+            f"{options.height:g} m, {options.spot_distance:g} m from its left side"
         )
-    if not (radius < options.head and options.head + 2 * radius < options.spot):
+    if not (radius < options.head_distance and options.head_distance + 2 * radius < options.spot_distance):
         raise ValueError(
-            f"head is {options.head:g} m, but the cue ball, with a radius of up to {radius:g} m, must start between "
-            f"the left cushion and the rack, at {options.spot:g} m"
+            f"head_distance is {options.head_distance:g} m, but the cue ball, with a radius of up to {radius:g} m, "
+            f"must start between the left cushion and the rack, at {options.spot_distance:g} m"
         )
 
 
@@ -69,11 +75,11 @@ def layout(options: Options) -> Layout:
 def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledScene:
     """One video's scene and start: the rack at its spot, and the cue ball on its way there."""
     radius, rows = factors["radius"], factors["rows"]
-    nearest, farthest = jnp.stack([radius, radius]), jnp.stack([options.head, options.height - radius])
-    cue = nearest + factors["place"] * (farthest - nearest)
-    spot = jnp.asarray([options.spot, options.height / 2])
+    nearest, farthest = jnp.stack([radius, radius]), jnp.stack([options.head_distance, options.height - radius])
+    cue = nearest + factors["relative_position"] * (farthest - nearest)
+    spot = jnp.asarray([options.spot_distance, options.height / 2])
     rack = spot + _triangle(int(options.rows.support[1])) * (2 * radius + factors["gap"])
-    way = jnp.arctan2(*(spot - cue)[::-1]) + factors["aim"]
+    way = jnp.arctan2(*(spot - cue)[::-1]) + factors["aim_angle"]
     stroke = factors["speed"] * jnp.stack([jnp.cos(way), jnp.sin(way)])
     balls = builder.discs(
         jnp.concatenate([cue[None], rack]),

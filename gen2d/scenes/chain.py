@@ -36,8 +36,8 @@ class Options:
     density: Distribution = common.density("the links")
     span: Distribution = common.fraction("distance between two pins, over the chain's length", [0.4, 0.85])
     slope: Distribution = common.angle("slope of the line from the left pin to the right one", [-0.3, 0.3])
-    held: Distribution = common.fraction("joint that is pulled; 0: the first that is possible, 1: the last")
-    above: Distribution = option([0, 1], int, "1", "1: pulled up, 0: pulled down", low=0, high=1, draw=True)
+    pulled_joint: Distribution = common.fraction("joint that is pulled; 0: the first that is possible, 1: the last")
+    pulled_above: Distribution = option([0, 1], int, "1", "1: pulled up, 0: pulled down", low=0, high=1, draw=True)
     angle: Distribution = common.angle("angle of a chain with one pin at the start, from hanging down", [-2.0, 2.0])
     friction: Distribution = option(0.0, float, "N m", "largest torque of the friction in a joint", low=0, draw=True)
     gravity: tuple[Distribution, ...] = common.gravity()
@@ -78,7 +78,7 @@ def _bounds(options: Options, whole: float) -> tuple[float, float, float, float]
     # An ellipse with the pins as its foci.
     depth = whole / 2 * math.sqrt(1 - options.span.support[0] ** 2)
     tilt = whole / 2 * math.sin(min(max(map(abs, options.slope.support)), math.pi / 2))
-    top = depth if options.above.support[1] else 0.2 * depth
+    top = depth if options.pulled_above.support[1] else 0.2 * depth
     return -whole / 2 - rim, -depth - tilt - rim, whole / 2 + rim, top + tilt + rim
 
 
@@ -109,9 +109,9 @@ def _pulled(factors: dict[str, Array], n: int) -> tuple[Array, Array]:
     """
     apart = factors["span"] * n  # all in lengths of a link
     first, last = jnp.ceil((n - apart) / 2 + 1e-3), jnp.floor((n + apart) / 2 - 1e-3)
-    kink = first + jnp.minimum(jnp.floor(factors["held"] * (last - first + 1)), last - first)
+    kink = first + jnp.minimum(jnp.floor(factors["pulled_joint"] * (last - first + 1)), last - first)
     along = (kink**2 - (n - kink) ** 2 + apart**2) / (2 * apart)
-    aside = jnp.sqrt(jnp.maximum(kink**2 - along**2, 0.0)) * (2 * factors["above"] - 1)
+    aside = jnp.sqrt(jnp.maximum(kink**2 - along**2, 0.0)) * (2 * factors["pulled_above"] - 1)
     number, zero = jnp.arange(n + 1.0), jnp.zeros(())
     one, tip, other = jnp.stack([zero, zero]), jnp.stack([along, aside]), jnp.stack([apart, zero])
     up, down = (number / kink)[:, None], ((number - kink) / (n - kink))[:, None]

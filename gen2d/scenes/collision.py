@@ -16,7 +16,10 @@ from gen2d.plugin import CLEARANCE, Array, Distribution, Field, Layout, SampledS
 NEVER = -1.0  # the contact frame of balls that do not approach
 DERIVED = {
     "contact_frame": Field(
-        "float32", "n", "frames", "when the balls touch, from the start, in units of scene.frame; -1: they never do"
+        "float32",
+        "n",
+        "frames",
+        "when the balls touch, from the start, in units of scene.frame_interval; -1: they never do",
     )
 }
 
@@ -34,13 +37,13 @@ class Options:
     density: Distribution = common.density("each ball", each="balls")
     elasticity: Distribution = common.elasticity("each ball", 1.0, each="balls")
     friction: Distribution = common.friction("each ball", 0.0, each="balls")
-    frame: float = option(0.1, float, "s", "time between frames in contact_frames: 1 / video.fps", above=0)
+    frame_interval: float = option(0.1, float, "s", "time between frames in contact_frames: 1 / video.fps", above=0)
     contact_frames: tuple[float, ...] = option(
         [8.0, 24.0], float, "frames", "first and last frame at which the balls may touch, where there is room",
         parts=2, above=0,
     )  # fmt: skip
-    contact: Distribution = common.fraction("time of the contact, from the first that is possible to the last")
-    place: tuple[Distribution, ...] = common.position("both balls")
+    contact_fraction: Distribution = common.fraction("time of the contact, from the first that is possible to the last")
+    relative_position: tuple[Distribution, ...] = common.position("both balls")
     margin: float = option(0.5, float, "m", "smallest distance of the larger ball from the top and bottom", low=0)
     color: tuple[Distribution, ...] = common.color("each ball", each="balls")
 
@@ -77,17 +80,17 @@ def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledSc
     """One video's scene and start: the balls on one line, as far apart as the time of their contact asks for."""
     radius = jnp.stack([factors["radius_1"], factors["radius_2"]])
     speed = jnp.stack([factors["speed_1"], factors["speed_2"]])
-    time, gap = _contact(factors["contact"], speed.sum(), options.width - 2 * radius.sum(), options)
+    time, gap = _contact(factors["contact_fraction"], speed.sum(), options.width - 2 * radius.sum(), options)
     spare = options.width - 2 * radius.sum() - gap
-    first = radius[0] + factors["place"][0] * spare
+    first = radius[0] + factors["relative_position"][0] * spare
     nearest = radius.max() + options.margin
-    y = nearest + factors["place"][1] * (options.height - 2 * nearest)
+    y = nearest + factors["relative_position"][1] * (options.height - 2 * nearest)
     balls = builder.discs(
         jnp.stack([jnp.stack([first, y]), jnp.stack([first + radius.sum() + gap, y])]), radius,
         velocity=jnp.stack([speed, jnp.zeros(2)], 1) * jnp.asarray([[1.0], [-1.0]]),
         **builder.material(factors),
     )  # fmt: skip
-    derived = {"contact_frame": jnp.where(speed.sum() > 0, time / options.frame, NEVER)}
+    derived = {"contact_frame": jnp.where(speed.sum() > 0, time / options.frame_interval, NEVER)}
     return SampledScene(*builder.assemble(layout(options), [balls], jnp.zeros(2)), derived=derived)
 
 
@@ -96,7 +99,7 @@ def _contact(share: Array, closing: Array, room: Array, options: Options) -> tup
 
     `closing` is the speed at which they approach, `room` how far apart they may be.
     """
-    first, last = (frame * options.frame for frame in options.contact_frames)
+    first, last = (frame * options.frame_interval for frame in options.contact_frames)
     latest = jnp.minimum(last, room / closing)
     earliest = jnp.where(latest >= first, first, latest / 2)
     time = earliest + share * (latest - earliest)

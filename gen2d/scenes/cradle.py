@@ -14,13 +14,13 @@ class Options:
     """What is drawn at random, and what is shown. Nothing falls: the row is seen from above."""
 
     balls: Distribution = common.count("balls", [3, 6], "number of balls in the row", low=2)
-    moving: Distribution = common.count("balls", [1, 2], "number of balls that come from the left", high=63)
+    moving_balls: Distribution = common.count("balls", [1, 2], "number of balls that come from the left", high=63)
     width: float = common.size("width of the view", 18.0)
     height: float = common.size("height of the view", 4.5)
     radius: Distribution = common.radius("every ball", [0.5, 0.8])
     # Bodies that touch are hit all at once, and how they share the speed is then not determined.
     gap: Distribution = common.length("gap between neighbours", [0.03, 0.1], low=1e-3)
-    approach: Distribution = common.length("gap between moving and resting balls", [0.5, 2.0], low=1e-3)
+    approach_distance: Distribution = common.length("gap between moving and resting balls", [0.5, 2.0], low=1e-3)
     speed: Distribution = common.speed("the balls that move", [2.0, 5.0])
     density: Distribution = common.density("each ball", each="balls")
     elasticity: Distribution = common.elasticity("every ball", 1.0)
@@ -30,14 +30,14 @@ class Options:
 
 def check(options: Options) -> None:
     """ValueError where all balls could move, or the row may not fit what is shown."""
-    few, most = options.balls.support[0], options.moving.support[1]
+    few, most = options.balls.support[0], options.moving_balls.support[1]
     if not most < few:
-        raise ValueError(f"moving may be {most:g}, but must be less than balls, which may be {few:g}")
+        raise ValueError(f"moving_balls may be {most:g}, but must be less than balls, which may be {few:g}")
     largest = options.radius.support[1]
     if not 2 * largest < options.height:
         raise ValueError(f"radius may be {largest:g} m, but a ball must fit a height of {options.height:g} m")
     pitch = 2 * largest + options.gap.support[1]
-    row = (options.balls.support[1] + most) * pitch + 2 * options.approach.support[1]
+    row = (options.balls.support[1] + most) * pitch + 2 * options.approach_distance.support[1]
     if not row <= options.width:
         raise ValueError(
             f"width is {options.width:g} m, but must be {row:g} m or more for the largest row in its middle"
@@ -54,14 +54,14 @@ def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledSc
     """One video's scene and start: those at rest in the middle, the others to the left of them."""
     number, (moving, radius, gap) = (
         jnp.arange(len(factors["density"])),
-        (factors[x] for x in ("moving", "radius", "gap")),
+        (factors[x] for x in ("moving_balls", "radius", "gap")),
     )
     pitch, resting = 2 * radius + gap, factors["balls"] - moving
     x = options.width / 2 + (number - moving - (resting - 1) / 2) * pitch
-    x = jnp.where(number < moving, x - factors["approach"] + gap, x)
+    x = jnp.where(number < moving, x - factors["approach_distance"] + gap, x)
     places = jnp.stack([x, jnp.full_like(x, options.height / 2)], axis=-1)
     speed = jnp.where(number < moving, factors["speed"], 0.0)
     velocity = jnp.stack([speed, jnp.zeros_like(speed)], axis=-1)
     balls = builder.discs(places, radius, number < factors["balls"], velocity=velocity, **builder.material(factors))
-    derived = {"contact_time": factors["approach"] / factors["speed"]}
+    derived = {"contact_time": factors["approach_distance"] / factors["speed"]}
     return SampledScene(*builder.assemble(layout(options), [balls], jnp.zeros(2)), derived=derived)

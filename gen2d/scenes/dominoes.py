@@ -20,8 +20,10 @@ class Options:
     friction: Distribution = common.friction("the dominoes and the ball", [0.4, 0.6])
     floor_friction: Distribution = common.friction("the floor", 1.0)
     radius: Distribution = common.radius("the ball", [0.2, 0.3], high=100)
-    aim: Distribution = common.fraction("height of the ball's centre, over that of a domino", [0.75, 0.95])
-    way: Distribution = common.length("gap between the ball and the first domino", [0.2, 0.6], low=1e-3, high=100)
+    ball_height: Distribution = common.fraction("height of the ball's centre, over that of a domino", [0.75, 0.95])
+    ball_distance: Distribution = common.length(
+        "gap between the ball and the first domino", [0.2, 0.6], low=1e-3, high=100
+    )
     speed: Distribution = common.speed("the ball", [2.0, 4.0], high=1000)
     spin: Distribution = common.spin("the first domino at the start, about its right foot")
     gravity: tuple[Distribution, ...] = common.gravity()
@@ -31,22 +33,25 @@ class Options:
 
 def check(options: Options) -> None:
     """ValueError where the ball would begin in the floor."""
-    lowest = options.aim.support[0] * options.height.support[0]
+    lowest = options.ball_height.support[0] * options.height.support[0]
     if not options.radius.support[1] <= lowest:
         raise ValueError(
-            f"radius may be {options.radius.support[1]:g} m, but the ball's centre may be as low as {lowest:g} m (aim "
-            "times height)"
+            f"radius may be {options.radius.support[1]:g} m, but the ball's centre may be as low as {lowest:g} m "
+            "(ball_height times height)"
         )
 
 
 def layout(options: Options) -> Layout:
     """The floor, the ball, then the dominoes from left to right."""
     most = int(options.dominoes.support[1])
-    ends = {name: getattr(options, name).support[1] for name in ("height", "thickness", "gap", "radius", "way", "aim")}
+    ends = {
+        name: getattr(options, name).support[1]
+        for name in ("height", "thickness", "gap", "radius", "ball_distance", "ball_height")
+    }
     row = most * ends["thickness"] + (most - 1) * ends["gap"]
-    width = 2 * ends["radius"] + ends["way"] + row + ends["height"]  # the last one's fall
+    width = 2 * ends["radius"] + ends["ball_distance"] + row + ends["height"]  # the last one's fall
     runs = SlotGroup("segment", 1, STATIC), SlotGroup("circle", 1), SlotGroup("polygon", most, vertices=4)
-    top = max(1.2 * ends["height"], ends["aim"] * ends["height"] + ends["radius"])
+    top = max(1.2 * ends["height"], ends["ball_height"] * ends["height"] + ends["radius"])
     reach = max((ends["height"] ** 2 + ends["thickness"] ** 2) ** 0.5 / 2, ends["radius"])
     return Layout(runs, (0.0, 0.0, width, top), reach)
 
@@ -56,7 +61,7 @@ def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledSc
     layers = layout(options)
     count, most = factors["dominoes"], int(options.dominoes.support[1])
     height, thickness, gap, radius = (factors[name] for name in ("height", "thickness", "gap", "radius"))
-    run_up, numbers = 2 * radius + factors["way"], jnp.arange(most)
+    run_up, numbers = 2 * radius + factors["ball_distance"], jnp.arange(most)
     length = run_up + count * thickness + (count - 1) * gap + height
     first = (layers.bounds[2] - length) / 2 + run_up
     x = first + thickness / 2 + numbers * (thickness + gap)
@@ -68,7 +73,7 @@ def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledSc
         **builder.material(factors),
     )  # fmt: skip
     ball = builder.discs(
-        jnp.stack([first - factors["way"] - radius, factors["aim"] * height])[None], radius,
+        jnp.stack([first - factors["ball_distance"] - radius, factors["ball_height"] * height])[None], radius,
         velocity=jnp.stack([factors["speed"], jnp.zeros(())]),
         **builder.material(factors) | builder.material(factors, "ball"),
     )  # fmt: skip

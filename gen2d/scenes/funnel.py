@@ -16,7 +16,7 @@ class Options:
     balls: Distribution = common.count("balls", [4, 12])
     width: float = common.size("width of the box, inside", 8.0)
     height: float = common.size("height of the box, inside", 12.0)
-    neck: float = common.size("height of the gap above the floor", 3.5)
+    neck_height: float = common.size("height of the gap above the floor", 3.5)
     angle: Distribution = common.angle("angle of the slopes, from the horizontal", [0.5, 0.8], low=0, high=1.5)
     gap: Distribution = common.length("gap between the slopes", [1.0, 2.5])
     radius: Distribution = common.radius("each ball", [0.3, 0.45], each="balls")
@@ -29,7 +29,7 @@ class Options:
     color: tuple[Distribution, ...] = common.color("each ball", each="balls")
 
 
-CROWDED_BY = ("balls", "radius", "width", "height", "neck", "angle", "gap")  # whether everything finds a place
+CROWDED_BY = ("balls", "radius", "width", "height", "neck_height", "angle", "gap")  # whether everything finds a place
 
 
 def check(options: Options) -> None:
@@ -40,7 +40,7 @@ def check(options: Options) -> None:
     if not 2 * largest < options.width:
         raise ValueError(f"radius may be {largest:g} m, but a ball must fit a box of {options.width:g} m")
     steep = options.angle.support[1]
-    room = options.height - options.neck - math.tan(steep) * (options.width - narrow) / 2
+    room = options.height - options.neck_height - math.tan(steep) * (options.width - narrow) / 2
     if not 2 * largest < room:
         raise ValueError(
             f"angle may be {steep:g} rad, but the slopes would leave {room:g} m of the height, too little for a ball"
@@ -60,13 +60,13 @@ def layout(options: Options) -> Layout:
 def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledScene:
     """One video's scene and start: balls at rest at random places above the slopes."""
     radius, middle = factors["radius"], options.width / 2
-    rim = options.neck + jnp.tan(factors["angle"]) * (middle - factors["gap"] / 2)
+    rim = options.neck_height + jnp.tan(factors["angle"]) * (middle - factors["gap"] / 2)
     present = jnp.arange(len(radius)) < factors["balls"]
     low, high = jnp.stack([jnp.zeros_like(rim), rim]), jnp.asarray([options.width, options.height])
     places, rejected, fits = place(jax.random.fold_in(key, 0), radius, present, low, high)
     upper = jnp.stack([jnp.asarray([0.0, options.width]), jnp.stack([rim, rim])], axis=-1)
     sides = middle + jnp.asarray([-0.5, 0.5]) * factors["gap"]
-    lower = jnp.stack([sides, jnp.full(2, options.neck)], axis=-1)
+    lower = jnp.stack([sides, jnp.full(2, options.neck_height)], axis=-1)
     parts = [
         builder.discs(places, radius, present, **builder.material(factors)),
         builder.box_walls(options.width, options.height, **builder.material(factors, "wall")),

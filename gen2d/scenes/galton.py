@@ -17,7 +17,9 @@ class Options:
     spacing: float = option(1.0, float, "m", "distance of neighbouring pegs, in and between rows", above=0, high=100)
     peg_radius: float = option(0.18, float, "m", "radius of each peg", above=0)
     bin_height: float = common.size("height of the bins", 1.8)
-    apart: float = option(0.9, float, "m", "distance from one ball's centre to the next one's at the start", above=0)
+    ball_spacing: float = option(
+        0.9, float, "m", "distance from one ball's centre to the next one's at the start", above=0
+    )
     radius: Distribution = common.radius("each ball", [0.2, 0.26], each="balls")
     jitter: Distribution = common.length("offset of each ball from the middle", [-0.15, 0.15], each="balls", low=None)
     density: Distribution = common.density("each ball", each="balls")
@@ -35,8 +37,10 @@ def check(options: Options) -> None:
     largest, room = options.radius.support[1], options.spacing - 2 * options.peg_radius
     if not 2 * largest < room:
         raise ValueError(f"radius may be {largest:g} m, but a ball must fit between pegs {room:g} m apart")
-    if not 2 * largest < options.apart:
-        raise ValueError(f"apart is {options.apart:g} m, but must be above the diameter of a ball, {2 * largest:g} m")
+    if not 2 * largest < options.ball_spacing:
+        raise ValueError(
+            f"ball_spacing is {options.ball_spacing:g} m, but must be above the diameter of a ball, {2 * largest:g} m"
+        )
     aside = max(map(abs, options.jitter.support))
     if not aside + largest < width(options) / 2:
         raise ValueError(f"jitter may be {aside:g} m to a side, but a ball must fit a board of {width(options):g} m")
@@ -76,7 +80,7 @@ def layout(options: Options) -> Layout:
         SlotGroup("segment", options.rows, STATIC),
         SlotGroup("segment", 4, STATIC),
     )
-    top = top_peg(options) + options.spacing + (most - 1) * options.apart + 2 * largest
+    top = top_peg(options) + options.spacing + (most - 1) * options.ball_spacing + 2 * largest
     return Layout(runs, (0.0, 0.0, width(options), top), largest)
 
 
@@ -84,7 +88,7 @@ def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledSc
     """One video's scene and start: balls at rest above the first peg, each a little aside."""
     here, (_, _, right, top) = layout(options), layout(options).bounds
     number = jnp.arange(len(factors["radius"]))
-    heights = top_peg(options) + options.spacing + number * options.apart
+    heights = top_peg(options) + options.spacing + number * options.ball_spacing
     places = jnp.stack([right / 2 + factors["jitter"], heights], axis=-1)
     balls = builder.discs(places, factors["radius"], number < factors["balls"], **builder.material(factors))
 

@@ -39,7 +39,7 @@ class Options:
     speed: tuple[Distribution, ...] = option(
         [[1, 4]] * 2, float, "m/s", "speed of each ball", parts=2, above=0, draw=True, each="pairs"
     )
-    place: tuple[Distribution, ...] = common.fractions(
+    relative_position: tuple[Distribution, ...] = common.fractions(
         "position of each ball; 0: at its wall, 1: in the middle", each="pairs"
     )
     offset: Distribution = option(
@@ -74,7 +74,9 @@ def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledSc
     radius, density, pairs = factors["radius"], factors["density"], factors["pairs"]
     number, sides = jnp.arange(len(density)), jnp.asarray([1.0, -1.0])
     present = number < pairs
-    inwards = radius + factors["place"] * (options.width / 2 - 2 * radius)  # m, from the ball's side of the box
+    inwards = radius + factors["relative_position"] * (
+        options.width / 2 - 2 * radius
+    )  # m, from the ball's side of the box
     x = jnp.where(sides > 0, inwards, options.width - inwards)
     aside = factors["offset"] * 2 * radius
     y = ((number + 0.5) / pairs * options.height)[:, None] - sides * aside[:, None] / 2

@@ -23,8 +23,10 @@ class Options:
     )  # fmt: skip
     length: Distribution = common.fraction("horizontal length of each ramp, over the width", [0.6, 0.78], each="ramps")
     radius: Distribution = common.radius("the ball", [0.16, 0.24])
-    place: Distribution = common.fraction("position of the ball; 0: at the wall, 1: over the first ramp's middle")
-    drop: Distribution = common.length("height of the ball above the first ramp", [0.0, 0.3])
+    relative_position: Distribution = common.fraction(
+        "position of the ball; 0: at the wall, 1: over the first ramp's middle"
+    )
+    drop_height: Distribution = common.length("height of the ball above the first ramp", [0.0, 0.3])
     density: Distribution = common.density("the ball")
     elasticity: Distribution = common.elasticity("the ball", [0.2, 0.6])
     friction: Distribution = common.friction("the ball", [0.0, 0.8])
@@ -58,7 +60,7 @@ def check(options: Options) -> None:
 def headroom(options: Options) -> float:
     """What the ball needs above the first ramp's upper end, m."""
     largest = options.radius.support[1]
-    return largest * (1 + 1 / math.cos(options.slope.support[1])) + options.drop.support[1]
+    return largest * (1 + 1 / math.cos(options.slope.support[1])) + options.drop_height.support[1]
 
 
 def layout(options: Options) -> Layout:
@@ -89,8 +91,8 @@ def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledSc
     begins, ends = (jnp.where(left, x, options.width - x) for x in (jnp.zeros_like(across), across))
 
     radius, slope = factors["radius"], factors["slope"][0]
-    x = radius + 1e-3 + factors["place"] * (across[0] / 2 - radius)
-    y = top - x * rise[0] + radius / jnp.cos(slope) + factors["drop"]
+    x = radius + 1e-3 + factors["relative_position"] * (across[0] / 2 - radius)
+    y = top - x * rise[0] + radius / jnp.cos(slope) + factors["drop_height"]
     board = {"elasticity": factors["ramp_elasticity"], "friction": factors["ramp_friction"]}
     starts, stops = (jnp.stack(point, axis=-1) for point in ((begins, upper), (ends, upper - falls)))
     parts = [

@@ -24,7 +24,7 @@ class Options:
     walls: bool = option(True, bool, "", "whether the box has walls; without them balls leave the view")
     screen_width: Distribution = option([2.5, 4.5], float, "m", "width of the screen", above=0, draw=True)
     screen_height: Distribution = option([5.0, 7.0], float, "m", "height of the screen", above=0, draw=True)
-    screen_place: tuple[Distribution, ...] = common.fractions(
+    screen_position: tuple[Distribution, ...] = common.fractions(
         "position of the screen, across and up, with room for a ball on both sides"
     )
     screen_color: tuple[Distribution, ...] = common.color("the screen", [[60, 140]] * 3)
@@ -33,7 +33,7 @@ class Options:
         {"choice": [-1, 1]}, int, "1", "side that each ball comes from; -1: left, 1: right", low=-1, high=1,
         draw=True, each="balls",
     )  # fmt: skip
-    place: tuple[Distribution, ...] = common.fractions(
+    relative_position: tuple[Distribution, ...] = common.fractions(
         "position of each ball: across, 1: at the screen; up, within its own part of the screen",
         each="balls",
     )
@@ -83,13 +83,13 @@ def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledSc
     present = number < factors["balls"]
     size = jnp.stack([factors["screen_width"], factors["screen_height"]])
     beside = jnp.asarray([2 * largest, 0.0])
-    corner = beside + factors["screen_place"] * (jnp.asarray([options.width, options.height]) - size - 2 * beside)
+    corner = beside + factors["screen_position"] * (jnp.asarray([options.width, options.height]) - size - 2 * beside)
 
     left, right = corner[0], options.width - corner[0] - size[0]  # m, between the walls and the screen
-    across = radius + factors["place"][:, 0] * (jnp.where(side < 0, left, right) - 2 * radius)
+    across = radius + factors["relative_position"][:, 0] * (jnp.where(side < 0, left, right) - 2 * radius)
     x = jnp.where(side < 0, across, options.width - across)
     part = size[1] / factors["balls"]
-    y = corner[1] + number * part + radius + factors["place"][:, 1] * (part - 2 * radius)
+    y = corner[1] + number * part + radius + factors["relative_position"][:, 1] * (part - 2 * radius)
     velocity = jnp.stack([-side * speed, jnp.zeros_like(speed)], axis=-1)
     balls = builder.discs(jnp.stack([x, y], axis=-1), radius, present, velocity=velocity, **builder.material(factors))
     walls = (

@@ -21,22 +21,24 @@ class Options:
     density: Distribution = common.density("the ball")
     speed: Distribution = common.speed("the throw", [1.0, 4.0])
     angle: Distribution = common.angle("angle of the throw, counter-clockwise; 0: to the right", 0.0)
-    place: Distribution = common.fraction("position of the start among those possible, from left to right")
-    drop: Distribution = common.length("distance of the ball's start from the upper side", [0.5, 1.5])
-    seconds: float = option(2.4, float, "s", "time for which the ball passes neither side, where there is room", low=0)
-    entry: float = option(0.5, float, "m", "largest distance of the start from the side, where there is not", low=0)
+    relative_position: Distribution = common.fraction("position of the start among those possible, from left to right")
+    top_distance: Distribution = common.length("distance of the ball's start from the upper side", [0.5, 1.5])
+    duration: float = option(2.4, float, "s", "time for which the ball passes neither side, where there is room", low=0)
+    entry_distance: float = option(
+        0.5, float, "m", "largest distance of the start from the side, if there is no such room", low=0
+    )
     gravity: tuple[Distribution, ...] = common.gravity((0, -2.5))
     color: tuple[Distribution, ...] = common.color("the ball")
 
 
 def check(options: Options) -> None:
     """ValueError where the ball may start outside of the view."""
-    largest, drop = options.radius.support[1], options.drop.support[1]
+    largest, drop = options.radius.support[1], options.top_distance.support[1]
     if not 2 * largest < options.width:
         raise ValueError(f"radius may be {largest:g} m, but a ball must fit a view {options.width:g} m wide")
     if not 2 * largest + drop <= options.height:
         raise ValueError(
-            f"drop may be {drop:g} m, but a ball with a radius of {largest:g} m must start in a view "
+            f"top_distance may be {drop:g} m, but a ball with a radius of {largest:g} m must start in a view "
             f"{options.height:g} m high"
         )
 
@@ -51,7 +53,13 @@ def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledSc
     radius, angle = factors["radius"], factors["angle"]
     velocity = factors["speed"] * jnp.stack([jnp.cos(angle), jnp.sin(angle)])
     # Its way to the side is that of a ball without gravity, which is exact where gravity points down.
-    x = start_position(factors["place"], radius, options.width - radius, options.seconds * velocity[0], options.entry)
-    start = jnp.stack([x, options.height - radius - factors["drop"]])
+    x = start_position(
+        factors["relative_position"],
+        radius,
+        options.width - radius,
+        options.duration * velocity[0],
+        options.entry_distance,
+    )
+    start = jnp.stack([x, options.height - radius - factors["top_distance"]])
     ball = builder.discs(start[None], radius, velocity=velocity, elasticity=1.0, **builder.material(factors))
     return SampledScene(*builder.assemble(layout(options), [ball], factors["gravity"]))

@@ -32,7 +32,7 @@ class Options:
     links: int = option(1, int, "links", "number of links; 1: a pendulum, 2: a double pendulum", low=1, high=2)
     length: Distribution = common.length("length of each link", [1.0, 2.0], each="links", low=0.05, high=1000)
     angle: Distribution = common.angle("angle of each link at the start, from hanging down", [-2.5, 2.5], each="links")
-    swing: Distribution = common.spin("each link at the start", each="links")
+    spin: Distribution = common.spin("each link at the start", each="links")
     radius: Distribution = common.radius("each bob", [0.2, 0.35], each="links", high=100)
     density: Distribution = common.density("each bob", each="links")
     rod_density: Distribution = common.density("the rods", 0.2)
@@ -56,7 +56,7 @@ def layout(options: Options) -> Layout:
         for i in range(n)
     ]
     room, widest = n * length + radius, max(map(abs, options.angle.support))
-    low = n == 1 and options.swing.support == (0.0, 0.0) and widest < math.pi / 2
+    low = n == 1 and options.spin.support == (0.0, 0.0) and widest < math.pi / 2
     bounds = (-room, -room, room, radius - math.cos(widest) * options.length.support[0] if low else room)
     joints = tuple(tie for link in ties for tie in link)
     return Layout((pin, rods, bobs), (*bounds[:3], max(bounds[3], PIN)), max(length / 2 + ROD, radius), joints)
@@ -66,15 +66,15 @@ def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledSc
     """One video's scene and start: every link at its angle."""
     length, angle, n = factors["length"], factors["angle"], options.links
     ways = length[:, None] * jnp.stack([jnp.sin(angle), -jnp.cos(angle)], -1)
-    speeds = factors["swing"][:, None] * jnp.stack([-ways[:, 1], ways[:, 0]], -1)
+    speeds = factors["spin"][:, None] * jnp.stack([-ways[:, 1], ways[:, 0]], -1)
     ends, end_speeds = jnp.cumsum(ways, 0), jnp.cumsum(speeds, 0)
     pin = builder.discs(jnp.zeros((1, 2)), PIN, kind=STATIC, layer=3, collides=False)
     rods = builder.capsules_between(
-        ends - ways, ends, ROD, velocity=end_speeds - speeds / 2, spin=factors["swing"], layer=1, collides=False,
+        ends - ways, ends, ROD, velocity=end_speeds - speeds / 2, spin=factors["spin"], layer=1, collides=False,
         **builder.material(factors, "rod"),
     )  # fmt: skip
     bobs = builder.discs(
-        ends, factors["radius"], angle=angle, velocity=end_speeds, spin=factors["swing"], layer=2, collides=False,
+        ends, factors["radius"], angle=angle, velocity=end_speeds, spin=factors["spin"], layer=2, collides=False,
         **builder.material(factors),
     )  # fmt: skip
     half, up = (jnp.stack(pair, -1) for pair in ((rods.objects["half_length"], jnp.zeros(n)), (jnp.zeros(n), length)))

@@ -21,11 +21,13 @@ class Options:
     shape: str = option("ball", str, "", "shape of the body on the slope", choices=("ball", "capsule"))
     width: float = common.size("width of the view, and of slope and floor together", 10.0)
     height: float = common.size("height of the view", 6.0)
-    foot: float = common.size("distance from the left side to where the slope meets the floor", 7.0)
+    foot_distance: float = common.size("distance from the left side to where the slope meets the floor", 7.0)
     slope: Distribution = common.angle("slope, down to the right", [0.25, 0.6], low=0.01, high=1.5)
     radius: Distribution = common.radius("the ball or the capsule's ends", [0.35, 0.6])
     half_length: Distribution = common.length("half the distance between a capsule's ends", [0.3, 0.6])
-    place: Distribution = common.fraction("position on the slope; 0: highest possible, 1: lowest", [0, 0.25])
+    relative_position: Distribution = common.fraction(
+        "position on the slope; 0: highest possible, 1: lowest", [0, 0.25]
+    )
     density: Distribution = common.density("the body on the slope")
     friction: Distribution = common.friction("the body on the slope", [0.0, 0.4])
     elasticity: Distribution = common.elasticity("the body on the slope", [0.0, 0.5])
@@ -40,17 +42,19 @@ def check(options: Options) -> None:
     """ValueError where the slope may leave the view, or be too short."""
     radius, steepest = options.radius.support[1], options.slope.support[1]
     most = 2 * (radius + (options.half_length.support[1] if options.shape == "capsule" else 0.0))
-    if not options.foot < options.width:
-        raise ValueError(f"foot is {options.foot:g} m, but must be left of the wall, at {options.width:g} m")
-    if not most < options.foot:
+    if not options.foot_distance < options.width:
+        raise ValueError(
+            f"foot_distance is {options.foot_distance:g} m, but must be left of the wall, at {options.width:g} m"
+        )
+    if not most < options.foot_distance:
         raise ValueError(
             f"radius may be {radius:g} m, but what is up to {most:g} m long must fit a slope with its foot at "
-            f"{options.foot:g} m"
+            f"{options.foot_distance:g} m"
         )
-    if not options.foot * math.tan(steepest) + 2 * radius < options.height:
+    if not options.foot_distance * math.tan(steepest) + 2 * radius < options.height:
         raise ValueError(
-            f"slope may be {steepest:g} rad, but with its foot at {options.foot:g} m, and {2 * radius:g} m on top, it "
-            f"must fit a view {options.height:g} m high"
+            f"slope may be {steepest:g} rad, but with its foot at {options.foot_distance:g} m, and "
+            f"{2 * radius:g} m on top, it must fit a view {options.height:g} m high"
         )
 
 
@@ -65,16 +69,16 @@ def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledSc
     """One video's scene and start: a ball or capsule at rest that touches the slope."""
     slope, radius = factors["slope"], factors["radius"]
     half = factors["half_length"] if options.shape == "capsule" else jnp.zeros(())
-    length, top = options.foot / jnp.cos(slope), options.foot * jnp.tan(slope)
+    length, top = options.foot_distance / jnp.cos(slope), options.foot_distance * jnp.tan(slope)
     nearest = half + radius  # to both ends, along the slope: within the view, and clear of the floor
-    along = nearest + factors["place"] * (length - 2 * nearest)
+    along = nearest + factors["relative_position"] * (length - 2 * nearest)
     downhill, normal = jnp.stack([jnp.cos(slope), -jnp.sin(slope)]), jnp.stack([jnp.sin(slope), jnp.cos(slope)])
     start = (jnp.stack([jnp.zeros(()), top]) + along * downhill + radius * normal)[None]
     if options.shape == "ball":
         body = builder.discs(start, radius, angle=-slope, **builder.material(factors))
     else:
         body = builder.capsules(start, -slope, half, radius, **builder.material(factors))
-    foot, corner = jnp.asarray([options.foot, 0.0]), jnp.asarray([options.width, 0.0])
+    foot, corner = jnp.asarray([options.foot_distance, 0.0]), jnp.asarray([options.width, 0.0])
     ends = jnp.stack([jnp.stack([jnp.zeros(()), top]), foot, corner, jnp.asarray([options.width, options.height])])
     ground = builder.segments(ends[:-1], ends[1:], **builder.material(factors, "ground"))
     return SampledScene(

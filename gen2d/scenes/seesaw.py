@@ -17,13 +17,15 @@ class Options:
     length: Distribution = common.length("length of the plank", [6.0, 8.0], low=0.1, high=1000)
     thickness: Distribution = common.length("thickness of the plank", [0.2, 0.3], low=1e-2, high=100)
     plank_density: Distribution = common.density("the plank", 0.5)
-    pivot: Distribution = common.length("height of the pivot, in the plank's middle", [0.8, 1.4], low=0.02, high=100)
+    pivot_height: Distribution = common.length(
+        "height of the pivot, in the plank's middle", [0.8, 1.4], low=0.02, high=100
+    )
     width: Distribution = common.length("width of each weight", [0.6, 1.2], each="weights", low=1e-2)
     height: Distribution = common.length("height of each weight", [0.6, 1.2], each="weights", low=1e-2)
-    place: Distribution = common.fraction(
+    relative_position: Distribution = common.fraction(
         "position of each weight in its share of the plank; 0: leftmost", each="weights"
     )
-    drop: Distribution = common.length("height of each weight above the plank", [0.0, 1.5], each="weights")
+    drop_height: Distribution = common.length("height of each weight above the plank", [0.0, 1.5], each="weights")
     density: Distribution = common.density("each weight", {"log_uniform": [0.5, 2.0]}, each="weights")
     elasticity: Distribution = common.elasticity("all but the floor", 0.0)
     friction: Distribution = common.friction("all", [0.5, 0.9])
@@ -40,10 +42,10 @@ def check(options: Options) -> None:
             f"width may be {options.width.support[1]:g} m, but a weight must fit its part of the plank, which may be "
             f"{part:g} m (length over weights)"
         )
-    if options.thickness.support[1] >= 2 * options.pivot.support[0]:
+    if options.thickness.support[1] >= 2 * options.pivot_height.support[0]:
         raise ValueError(
             f"thickness may be {options.thickness.support[1]:g} m, but the plank must be above the floor, with its "
-            f"middle at {options.pivot.support[0]:g} m (pivot)"
+            f"middle at {options.pivot_height.support[0]:g} m (pivot_height)"
         )
 
 
@@ -57,7 +59,7 @@ def layout(options: Options) -> Layout:
         SlotGroup("polygon", 1, vertices=4, layer=1),
         SlotGroup("polygon", most, vertices=4, layer=1),
     )
-    top = options.pivot.support[1] + options.thickness.support[1] / 2 + options.drop.support[1] + height
+    top = options.pivot_height.support[1] + options.thickness.support[1] / 2 + options.drop_height.support[1] + height
     half = length / 2 + max(width, height)  # what slides off lies beside it
     reach = max(length**2 + options.thickness.support[1] ** 2, width**2 + height**2) ** 0.5 / 2
     return Layout(runs, (-half, 0.0, half, max(top, length / 2)), reach, (JointSpec("revolute", 1, 2),))
@@ -65,7 +67,7 @@ def layout(options: Options) -> Layout:
 
 def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledScene:
     """One video's scene and start: the plank level, its weights on it or above it."""
-    layers, pivot, length, thickness = layout(options), factors["pivot"], factors["length"], factors["thickness"]
+    layers, pivot, length, thickness = layout(options), factors["pivot_height"], factors["length"], factors["thickness"]
     surface = {name: factors[name] for name in ("elasticity", "friction")}
     ground = builder.floor(layers, friction=factors["friction"])
     # Its upper corner is the pivot, its centre of mass at a third of the height.
@@ -74,8 +76,8 @@ def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledSc
     level = jnp.stack([jnp.zeros(()), pivot])[None]
     plank = builder.boxes(level, 0.0, length, thickness, layer=1, **surface, **builder.material(factors, "plank"))
     numbers, part = jnp.arange(len(factors["width"])), length / factors["weights"]
-    x = numbers * part + factors["width"] / 2 + factors["place"] * (part - factors["width"]) - length / 2
-    y = pivot + (thickness + factors["height"]) / 2 + factors["drop"]
+    x = numbers * part + factors["width"] / 2 + factors["relative_position"] * (part - factors["width"]) - length / 2
+    y = pivot + (thickness + factors["height"]) / 2 + factors["drop_height"]
     weights = builder.boxes(
         jnp.stack([x, y], -1), 0.0, factors["width"], factors["height"], numbers < factors["weights"],
         layer=1, **builder.material(factors),

@@ -17,12 +17,14 @@ class Options:
 
     balls: Distribution = common.count("balls", [1, 3], "number of balls in a video, one above the other")
     width: float = common.size("width of the view; the floors go on beyond it", 14.0)
-    storey: float = common.size("distance from floor to floor", 2.5)
+    floor_spacing: float = common.size("distance from floor to floor", 2.5)
     radius: Distribution = common.radius("each ball", [0.5, 0.9], each="balls")
     density: Distribution = common.density("each ball", each="balls")
     speed: Distribution = common.speed("each ball, to the right", [2.0, 6.0], each="balls")
     spin: Distribution = common.spin("each ball, counter-clockwise: back-spin", [0.0, 20.0], each="balls")
-    place: Distribution = common.fraction("position of each ball; 0: leftmost, 1: rightmost", [0.1, 0.5], each="balls")
+    relative_position: Distribution = common.fraction(
+        "position of each ball; 0: leftmost, 1: rightmost", [0.1, 0.5], each="balls"
+    )
     friction: Distribution = common.friction("each ball", [0.1, 0.5], each="balls")
     floor_friction: Distribution = common.friction("the floors", 1.0)
     gravity: tuple[Distribution, ...] = common.gravity()
@@ -33,9 +35,10 @@ class Options:
 def check(options: Options) -> None:
     """ValueError where a ball may not fit its storey."""
     largest = options.radius.support[1]
-    if not 2 * largest < min(options.storey, options.width):
+    if not 2 * largest < min(options.floor_spacing, options.width):
         raise ValueError(
-            f"radius may be {largest:g} m, but a ball must fit a storey of {options.width:g} x {options.storey:g} m"
+            f"radius may be {largest:g} m, but a ball must fit a storey of {options.width:g} x "
+            f"{options.floor_spacing:g} m"
         )
 
 
@@ -43,14 +46,14 @@ def layout(options: Options) -> Layout:
     """The balls, and as many floors, each from the lowest on."""
     most = int(options.balls.support[1])
     runs = SlotGroup("circle", most), SlotGroup("segment", most, STATIC)
-    return Layout(runs, (0.0, 0.0, options.width, most * options.storey), options.radius.support[1])
+    return Layout(runs, (0.0, 0.0, options.width, most * options.floor_spacing), options.radius.support[1])
 
 
 def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledScene:
     """One video's scene and start: each ball on its floor, at its speed and spin."""
     radius, most = factors["radius"], len(factors["radius"])
-    present, floor = jnp.arange(most) < factors["balls"], options.storey * jnp.arange(most)
-    x = radius + factors["place"] * (options.width - 2 * radius)
+    present, floor = jnp.arange(most) < factors["balls"], options.floor_spacing * jnp.arange(most)
+    x = radius + factors["relative_position"] * (options.width - 2 * radius)
     balls = builder.discs(
         jnp.stack([x, floor + radius], 1), radius, present,
         velocity=jnp.stack([factors["speed"], jnp.zeros(most)], 1),

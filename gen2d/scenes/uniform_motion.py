@@ -24,9 +24,11 @@ class Options:
     direction: Distribution = common.angle(
         "direction of the motion, counter-clockwise; 0: to the right", {"choice": [0, math.pi]}
     )
-    place: tuple[Distribution, ...] = common.position("the start")
-    seconds: float = option(2.4, float, "s", "time for which the ball stays in view, where there is room", low=0)
-    entry: float = option(0.5, float, "m", "largest distance of the start from the side, where there is not", low=0)
+    relative_position: tuple[Distribution, ...] = common.position("the start")
+    duration: float = option(2.4, float, "s", "time for which the ball stays in view, where there is room", low=0)
+    entry_distance: float = option(
+        0.5, float, "m", "largest distance of the start from the side, if there is no such room", low=0
+    )
     margin: float = option(0.5, float, "m", "smallest distance of the ball from the top and bottom at the start", low=0)
     color: tuple[Distribution, ...] = common.color("the ball")
 
@@ -52,6 +54,8 @@ def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledSc
     velocity = factors["speed"] * jnp.stack([jnp.cos(direction), jnp.sin(direction)])
     room = jnp.asarray([options.width, options.height])
     nearest = radius + jnp.asarray([0.0, options.margin])
-    start = start_position(factors["place"], nearest, room - nearest, options.seconds * velocity, options.entry)
+    start = start_position(
+        factors["relative_position"], nearest, room - nearest, options.duration * velocity, options.entry_distance
+    )
     ball = builder.discs(start[None], radius, velocity=velocity, elasticity=1.0, **builder.material(factors))
     return SampledScene(*builder.assemble(layout(options), [ball], jnp.zeros(2)))

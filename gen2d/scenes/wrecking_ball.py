@@ -34,9 +34,11 @@ class Options:
     elasticity: Distribution = common.elasticity("ball and blocks", 0.0)
     radius: Distribution = common.radius("the ball", [0.4, 0.6], low=1e-2, high=100)
     ball_density: Distribution = common.density("the ball and its chain", 5.0)
-    chain: Distribution = common.length("distance from the pin to the ball's centre", [3.0, 4.0], low=0.1)
+    chain_length: Distribution = common.length("distance from the pin to the ball's centre", [3.0, 4.0], low=0.1)
     angle: Distribution = common.angle("angle of the chain, from hanging down", [0.8, 1.4], low=0, high=1.57)
-    aim: Distribution = common.fraction("lowest height of the ball's centre, over the height of the tower", [0.4, 0.8])
+    ball_height: Distribution = common.fraction(
+        "lowest height of the ball's centre, over the height of the tower", [0.4, 0.8]
+    )
     gap: Distribution = common.length("gap between the tower and the ball when lowest", [0.0, 0.2])
     gravity: tuple[Distribution, ...] = common.gravity()
     ball_color: tuple[Distribution, ...] = common.color("the ball", [200, 200, 210])
@@ -45,18 +47,20 @@ class Options:
 
 def check(options: Options) -> None:
     """ValueError where the ball might swing through the floor."""
-    lowest = options.aim.support[0] * options.blocks.support[0] * options.height.support[0]
+    lowest = options.ball_height.support[0] * options.blocks.support[0] * options.height.support[0]
     if options.radius.support[1] > lowest:
         raise ValueError(
             f"radius may be {options.radius.support[1]:g} m, but the ball's middle may swing as low as {lowest:g} m "
-            "(aim times blocks times height)"
+            "(ball_height times blocks times height)"
         )
 
 
 def layout(options: Options) -> Layout:
     """The floor, the pin, the links of the chain, the ball, then the blocks from the lowest up."""
     n, most = options.links, int(options.blocks.support[1])
-    width, height, radius, chain = (getattr(options, x).support[1] for x in ("width", "height", "radius", "chain"))
+    width, height, radius, chain = (
+        getattr(options, x).support[1] for x in ("width", "height", "radius", "chain_length")
+    )
     runs = (
         SlotGroup("segment", 1, STATIC),
         SlotGroup("circle", 1, STATIC, layer=3, collides=False),
@@ -67,7 +71,7 @@ def layout(options: Options) -> Layout:
     ties = [JointSpec("revolute", 1 + i, 2 + i) for i in range(n)] + [JointSpec("revolute", 2 + n, 1 + n)]
     tower = most * height
     left = -2 * radius - options.gap.support[1] - chain
-    top = max(options.aim.support[1] * tower + chain + PIN, tower)
+    top = max(options.ball_height.support[1] * tower + chain + PIN, tower)
     reach = max(chain / n / 2 + LINK, radius, (width**2 + height**2) ** 0.5 / 2)
     return Layout(runs, (left, 0.0, width + DEBRIS * tower, top), reach, tuple(ties))
 
@@ -75,9 +79,9 @@ def layout(options: Options) -> Layout:
 def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledScene:
     """One video's scene and start: the tower's left side at 0, the ball at rest on its taut chain."""
     layers, n, most = layout(options), options.links, int(options.blocks.support[1])
-    width, height, radius, chain, angle = (factors[x] for x in ("width", "height", "radius", "chain", "angle"))
+    width, height, radius, chain, angle = (factors[x] for x in ("width", "height", "radius", "chain_length", "angle"))
     ground = builder.floor(layers, friction=factors["friction"])
-    lowest = factors["aim"] * factors["blocks"] * height
+    lowest = factors["ball_height"] * factors["blocks"] * height
     top = jnp.stack([-radius - factors["gap"], lowest + chain])
     pin = builder.discs(top[None], PIN, kind=STATIC, layer=3, collides=False)
     way = chain * jnp.stack([-jnp.sin(angle), -jnp.cos(angle)])
