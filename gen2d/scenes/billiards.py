@@ -43,7 +43,7 @@ class Options:
 
 
 def check(options: Options) -> None:
-    """ValueError where the rack or the cue ball may not fit the table."""
+    """Raises ValueError where the rack or the cue ball may not fit the table."""
     rows, radius = int(options.rows.support[1]), options.radius.support[1]
     side = (rows - 1) * (2 * radius + options.gap.support[1])
     if not (
@@ -73,7 +73,7 @@ def layout(options: Options) -> Layout:
 
 
 def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledScene:
-    """One video's scene and start: the rack at its spot, and the cue ball on its way there."""
+    """One video's scene and initial state: the rack in place, and the cue ball on its way there."""
     radius, rows = factors["radius"], factors["rows"]
     nearest, farthest = jnp.stack([radius, radius]), jnp.stack([options.head_distance, options.height - radius])
     cue = nearest + factors["relative_position"] * (farthest - nearest)
@@ -93,5 +93,5 @@ def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledSc
 
 
 def _triangle(rows: int) -> np.ndarray:
-    """Places [rows (rows + 1) / 2, 2] a unit apart, row by row from the one at the origin to the right."""
+    """Points [rows (rows + 1) / 2, 2] of a triangle, a unit apart, row by row from the origin to the right."""
     return np.array([[math.sqrt(0.75) * row, k - row / 2] for row in range(rows) for k in range(row + 1)], np.float32)

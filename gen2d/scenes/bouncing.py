@@ -10,7 +10,7 @@ from gen2d.plugin import STATIC, Array, Distribution, Layout, SampledScene, Slot
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """What is drawn at random, and the box."""
+    """The balls and their box."""
 
     balls: Distribution = common.count("balls", [3, 8])
     width: float = common.size("width of the box, inside", 10.0)
@@ -34,7 +34,7 @@ CROWDED_BY = ("balls", "radius", "width", "height")  # the options that decide w
 
 
 def check(options: Options) -> None:
-    """ValueError where the box cannot hold a ball."""
+    """Raises ValueError where the box cannot hold a ball."""
     largest = options.radius.support[1]
     if not 2 * largest < min(options.width, options.height):
         raise ValueError(
@@ -49,7 +49,7 @@ def layout(options: Options) -> Layout:
 
 
 def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledScene:
-    """One video's scene and start: balls at random places that do not overlap."""
+    """One video's scene and initial state: balls at random positions without overlap."""
     radius, box = factors["radius"], jnp.asarray([options.width, options.height])
     present = jnp.arange(len(radius)) < factors["balls"]
     places, rejected, fits = place(jax.random.fold_in(key, 0), radius, present, jnp.zeros(2), box)

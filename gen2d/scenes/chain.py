@@ -27,7 +27,7 @@ DERIVED = {"kink": Field("float32", "n", "1", "joint that it is pulled by at the
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """How the chain is made and hung, and what is drawn at random."""
+    """The chain and the pins that it hangs from."""
 
     links: int = option(12, int, "links", "number of links in the chain", low=2, high=200)
     ends: int = option(2, int, "pins", "number of pins that the chain hangs from", low=1, high=2)
@@ -45,12 +45,12 @@ class Options:
 
 
 def sizes(options: Options) -> dict[str, int]:
-    """How many links there are."""
+    """The number of links."""
     return {"links": options.links}
 
 
 def check(options: Options) -> None:
-    """ValueError where there may be no joint that it can be pulled tight by."""
+    """Raises ValueError where no joint may exist by which the chain can be pulled tight."""
     least = options.span.support[0]
     if options.ends == 2 and not 2 / options.links <= least <= options.span.support[1] < 1:
         raise ValueError(
@@ -70,7 +70,7 @@ def layout(options: Options) -> Layout:
 
 
 def _bounds(options: Options, whole: float) -> tuple[float, float, float, float]:
-    """All that a chain of a length in m can reach, but for the upper part of what it hardly does."""
+    """Bounds in m of what a chain of this length can reach, without the upper part, which it hardly ever does."""
     rim = 2 * options.radius.support[1]
     if options.ends == 1:
         turn = min(max(map(abs, options.angle.support)), math.pi)
@@ -83,7 +83,7 @@ def _bounds(options: Options, whole: float) -> tuple[float, float, float, float]
 
 
 def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledScene:
-    """One video's scene and start: the chain at rest, taut."""
+    """One video's scene and initial state: the chain at rest, taut."""
     n, radius = options.links, factors["radius"]
     corners, kink = _straight(factors, n) if options.ends == 1 else _pulled(factors, n)
     pins = builder.discs(

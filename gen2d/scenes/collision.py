@@ -26,7 +26,7 @@ DERIVED = {
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """The balls, the view, and when they shall touch."""
+    """The balls, the view and the time of contact."""
 
     width: float = common.size("width of the view", 10.0)
     height: float = common.size("height of the view", 10.0)
@@ -49,7 +49,7 @@ class Options:
 
 
 def check(options: Options) -> None:
-    """ValueError where the view may not hold both balls, or the window is no window."""
+    """Raises ValueError where the view may not hold both balls, or the first contact frame is after the last."""
     largest = options.radius_1.support[1], options.radius_2.support[1]
     if not 2 * sum(largest) + 2 * CLEARANCE < options.width:
         raise ValueError(
@@ -77,7 +77,7 @@ def layout(options: Options) -> Layout:
 
 
 def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledScene:
-    """One video's scene and start: the balls on one line, as far apart as the time of their contact asks for."""
+    """One video's scene and initial state: balls on one line, whose gap follows from the time of contact."""
     radius = jnp.stack([factors["radius_1"], factors["radius_2"]])
     speed = jnp.stack([factors["speed_1"], factors["speed_2"]])
     time, gap = _contact(factors["contact_fraction"], speed.sum(), options.width - 2 * radius.sum(), options)
@@ -95,7 +95,7 @@ def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledSc
 
 
 def _contact(share: Array, closing: Array, room: Array, options: Options) -> tuple[Array, Array]:
-    """After how many seconds two balls touch, at this share of the window, and how far apart they start, in m.
+    """Time in s until two balls touch, at this fraction of the window, and the gap in m between them at the start.
 
     `closing` is the speed at which they approach, `room` how far apart they may be.
     """

@@ -11,7 +11,7 @@ DERIVED = {"contact_time": Field("float32", "n", "s", "at which the first of tho
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """What is drawn at random, and what is shown. Nothing falls: the row is seen from above."""
+    """The row of balls, seen from above, so that nothing falls."""
 
     balls: Distribution = common.count("balls", [3, 6], "number of balls in the row", low=2)
     moving_balls: Distribution = common.count("balls", [1, 2], "number of balls that come from the left", high=63)
@@ -29,7 +29,7 @@ class Options:
 
 
 def check(options: Options) -> None:
-    """ValueError where all balls could move, or the row may not fit what is shown."""
+    """Raises ValueError where all balls could move, or the row may not fit the view."""
     few, most = options.balls.support[0], options.moving_balls.support[1]
     if not most < few:
         raise ValueError(f"moving_balls may be {most:g}, but must be less than balls, which may be {few:g}")
@@ -51,7 +51,7 @@ def layout(options: Options) -> Layout:
 
 
 def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledScene:
-    """One video's scene and start: those at rest in the middle, the others to the left of them."""
+    """One video's scene and initial state: the balls at rest in the middle, the others to their left."""
     number, (moving, radius, gap) = (
         jnp.arange(len(factors["density"])),
         (factors[x] for x in ("moving_balls", "radius", "gap")),

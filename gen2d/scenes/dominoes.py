@@ -9,7 +9,7 @@ from gen2d.plugin import STATIC, Array, Distribution, Layout, SampledScene, Slot
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """What is drawn at random."""
+    """The row of dominoes and the ball."""
 
     dominoes: Distribution = common.count("dominoes", [6, 10])
     height: Distribution = common.length("height of the dominoes", [1.2, 1.8], low=1e-2, high=100)
@@ -32,7 +32,7 @@ class Options:
 
 
 def check(options: Options) -> None:
-    """ValueError where the ball would begin in the floor."""
+    """Raises ValueError where the ball would begin in the floor."""
     lowest = options.ball_height.support[0] * options.height.support[0]
     if not options.radius.support[1] <= lowest:
         raise ValueError(
@@ -57,7 +57,7 @@ def layout(options: Options) -> Layout:
 
 
 def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledScene:
-    """One video's scene and start: ball, row and the last one's fall are in the middle of the view."""
+    """One video's scene and initial state: ball, row and the last one's fall are in the middle of the view."""
     layers = layout(options)
     count, most = factors["dominoes"], int(options.dominoes.support[1])
     height, thickness, gap, radius = (factors[name] for name in ("height", "thickness", "gap", "radius"))

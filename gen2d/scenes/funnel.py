@@ -11,7 +11,7 @@ from gen2d.plugin import STATIC, Array, Distribution, Layout, SampledScene, Slot
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """What is drawn at random, and the box that the funnel is in."""
+    """The balls, the funnel and its box."""
 
     balls: Distribution = common.count("balls", [4, 12])
     width: float = common.size("width of the box, inside", 8.0)
@@ -33,7 +33,7 @@ CROWDED_BY = ("balls", "radius", "width", "height", "neck_height", "angle", "gap
 
 
 def check(options: Options) -> None:
-    """ValueError where the slopes do not fit the box, or leave no room for a ball above them."""
+    """Raises ValueError where the slopes do not fit the box, or leave no room for a ball above them."""
     largest, (narrow, wide) = options.radius.support[1], options.gap.support
     if not wide < options.width:
         raise ValueError(f"gap may be {wide:g} m, but must be less than the width of the box, {options.width:g} m")
@@ -58,7 +58,7 @@ def layout(options: Options) -> Layout:
 
 
 def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledScene:
-    """One video's scene and start: balls at rest at random places above the slopes."""
+    """One video's scene and initial state: balls at rest at random positions above the slopes."""
     radius, middle = factors["radius"], options.width / 2
     rim = options.neck_height + jnp.tan(factors["angle"]) * (middle - factors["gap"] / 2)
     present = jnp.arange(len(radius)) < factors["balls"]

@@ -10,7 +10,7 @@ from gen2d.plugin import STATIC, Array, Distribution, Layout, SampledScene, Slot
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """What is drawn at random, and the board."""
+    """The balls and the board."""
 
     balls: Distribution = common.count("balls", [1, 3], "number of balls, one above the other")
     rows: int = option(5, int, "rows", "number of rows of pegs; there is one bin more", low=1, high=12)
@@ -33,7 +33,7 @@ class Options:
 
 
 def check(options: Options) -> None:
-    """ValueError where a ball does not fit between pegs, or two touch at the start."""
+    """Raises ValueError where a ball does not fit between pegs, or two touch at the start."""
     largest, room = options.radius.support[1], options.spacing - 2 * options.peg_radius
     if not 2 * largest < room:
         raise ValueError(f"radius may be {largest:g} m, but a ball must fit between pegs {room:g} m apart")
@@ -47,17 +47,17 @@ def check(options: Options) -> None:
 
 
 def width(options: Options) -> float:
-    """Of the board, m."""
+    """Width of the board, m."""
     return (options.rows + 1) * options.spacing
 
 
 def top_peg(options: Options) -> float:
-    """How high the first row of pegs is, m; the last is half a spacing above the bins."""
+    """Height of the first row of pegs, m; the last row is half a spacing above the bins."""
     return options.bin_height + options.spacing * (0.5 + math.sqrt(0.75) * (options.rows - 1))
 
 
 def pegs(options: Options) -> list[tuple[float, float]]:
-    """Their centres, m, in rows from the top; those of the last stand above the walls between bins.
+    """Centres of the pegs, m, in rows from the top; the last row stands above the walls between bins.
 
     No peg is nearer to a wall than a spacing, so that no ball is caught there.
     """
@@ -85,7 +85,7 @@ def layout(options: Options) -> Layout:
 
 
 def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledScene:
-    """One video's scene and start: balls at rest above the first peg, each a little aside."""
+    """One video's scene and initial state: balls at rest above the first peg, each a little aside."""
     here, (_, _, right, top) = layout(options), layout(options).bounds
     number = jnp.arange(len(factors["radius"]))
     heights = top_peg(options) + options.spacing + number * options.ball_spacing

@@ -14,7 +14,7 @@ DERIVED = {
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """What is drawn at random, and the box. Nothing falls: the balls are seen from above.
+    """The pairs of balls and their box, seen from above, so that nothing falls.
 
     A list of two is of the ball that comes from the left and of the one that comes from the right.
     """
@@ -51,7 +51,7 @@ class Options:
 
 
 def check(options: Options) -> None:
-    """ValueError where the pairs do not fit beside each other, or two balls not behind one another."""
+    """Raises ValueError where the pairs do not fit beside each other, or two balls not behind one another."""
     largest, pairs = options.radius.support[1], options.pairs.support[1]
     lane = 2 * largest * (1 + max(map(abs, options.offset.support)))
     if not pairs * lane < options.height:
@@ -70,7 +70,7 @@ def layout(options: Options) -> Layout:
 
 
 def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledScene:
-    """One video's scene and start: every pair in its lane, one from the left and one from the right."""
+    """One video's scene and initial state: every pair in its lane, one from the left and one from the right."""
     radius, density, pairs = factors["radius"], factors["density"], factors["pairs"]
     number, sides = jnp.arange(len(density)), jnp.asarray([1.0, -1.0])
     present = number < pairs

@@ -12,7 +12,7 @@ CLEARANCE = 0.02  # m: how much more room than it needs the ball has between two
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """What is drawn at random, and the box."""
+    """The ramps, the ball and their box."""
 
     ramps: Distribution = common.count("ramps", [3, 4], high=16)
     width: float = common.size("width of the box, inside", 4.0)
@@ -38,7 +38,7 @@ class Options:
 
 
 def check(options: Options) -> None:
-    """ValueError where the ball could miss a ramp, or not pass between two."""
+    """Raises ValueError where the ball could miss a ramp, or not pass between two."""
     largest, (short, long) = options.radius.support[1], options.length.support
     ramps, steep = options.ramps.support[1], options.slope.support[1]
     if not short > 0.5:
@@ -58,7 +58,7 @@ def check(options: Options) -> None:
 
 
 def headroom(options: Options) -> float:
-    """What the ball needs above the first ramp's upper end, m."""
+    """Height that the ball needs above the first ramp's upper end, m."""
     largest = options.radius.support[1]
     return largest * (1 + 1 / math.cos(options.slope.support[1])) + options.drop_height.support[1]
 
@@ -74,7 +74,7 @@ def layout(options: Options) -> Layout:
 
 
 def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledScene:
-    """One video's scene and start: ramps as far below each other as the height allows, and the ball over the first.
+    """One video's scene and initial state: ramps as far apart as the height allows, and the ball over the first.
 
     The first begins at the left wall, the next at the right one, and so on.
     """

@@ -16,7 +16,7 @@ DERIVED = {
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """What is drawn at random, and the box."""
+    """The balls, the screen and the box."""
 
     balls: Distribution = common.count("balls", [1, 3], "number of balls in a video, each at a height of its own")
     width: float = common.size("width of the box, inside", 10.0)
@@ -48,7 +48,7 @@ class Options:
 
 
 def check(options: Options) -> None:
-    """ValueError where a ball does not fit behind the screen or beside it, or the screen into the box."""
+    """Raises ValueError where a ball does not fit behind the screen or beside it, or the screen into the box."""
     largest, most = options.radius.support[1], options.balls.support[1]
     (narrow, wide), (low, high) = options.screen_width.support, options.screen_height.support
     if not 2 * largest < narrow:
@@ -77,7 +77,7 @@ def layout(options: Options) -> Layout:
 
 
 def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledScene:
-    """One video's scene and start: balls on their way to the screen, each in its own part of the screen's height."""
+    """One video's scene and initial state: balls on their way to the screen, each at its own part of its height."""
     radius, side, speed = factors["radius"], factors["side"], factors["speed"]
     number, largest = jnp.arange(len(radius)), options.radius.support[1]
     present = number < factors["balls"]

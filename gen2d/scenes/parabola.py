@@ -13,7 +13,7 @@ from gen2d.plugin import Array, Distribution, Layout, SampledScene, SlotGroup, b
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """The ball, how it is thrown, and the view."""
+    """The ball, its throw and the view."""
 
     width: float = common.size("width of the view", 10.0)
     height: float = common.size("height of the view", 10.0)
@@ -32,7 +32,7 @@ class Options:
 
 
 def check(options: Options) -> None:
-    """ValueError where the ball may start outside of the view."""
+    """Raises ValueError where the ball may start outside of the view."""
     largest, drop = options.radius.support[1], options.top_distance.support[1]
     if not 2 * largest < options.width:
         raise ValueError(f"radius may be {largest:g} m, but a ball must fit a view {options.width:g} m wide")
@@ -49,7 +49,7 @@ def layout(options: Options) -> Layout:
 
 
 def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledScene:
-    """One video's scene and start: the ball where it stays in view long enough, if there is such a place."""
+    """One video's scene and initial state: the ball where it stays in view long enough, if such a position exists."""
     radius, angle = factors["radius"], factors["angle"]
     velocity = factors["speed"] * jnp.stack([jnp.cos(angle), jnp.sin(angle)])
     # Its way to the side is that of a ball without gravity, which is exact where gravity points down.

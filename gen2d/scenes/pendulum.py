@@ -27,7 +27,7 @@ DERIVED = {"period": Field("float32", "n", "s", "of small swings of the first li
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """How many links, and what is drawn at random of each."""
+    """The links of the pendulum, each a rod with a bob."""
 
     links: int = option(1, int, "links", "number of links; 1: a pendulum, 2: a double pendulum", low=1, high=2)
     length: Distribution = common.length("length of each link", [1.0, 2.0], each="links", low=0.05, high=1000)
@@ -41,7 +41,7 @@ class Options:
 
 
 def sizes(options: Options) -> dict[str, int]:
-    """How many links there are."""
+    """The number of links."""
     return {"links": options.links}
 
 
@@ -63,7 +63,7 @@ def layout(options: Options) -> Layout:
 
 
 def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledScene:
-    """One video's scene and start: every link at its angle."""
+    """One video's scene and initial state: every link at its angle."""
     length, angle, n = factors["length"], factors["angle"], options.links
     ways = length[:, None] * jnp.stack([jnp.sin(angle), -jnp.cos(angle)], -1)
     speeds = factors["spin"][:, None] * jnp.stack([-ways[:, 1], ways[:, 0]], -1)
@@ -90,7 +90,7 @@ def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledSc
 
 
 def _period(rods: dict[str, Array], bobs: dict[str, Array], length: Array, gravity: Array) -> Array:
-    """Seconds of a small swing of the first link: 2 pi sqrt(I / m g d)."""
+    """Period in s of small swings of the first link: 2 pi sqrt(I / m g d)."""
     rod, bob = rods["mass"][0], bobs["mass"][0]
     inertia = rods["moment"][0] + bobs["moment"][0] + (rod / 4 + bob) * length[0] ** 2
     return 2 * jnp.pi * jnp.sqrt(inertia / ((rod / 2 + bob) * length[0] * jnp.maximum(jnp.linalg.norm(gravity), 1e-6)))

@@ -13,7 +13,7 @@ TURN = [-math.pi, math.pi]
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """What is drawn at random, and the bin."""
+    """The objects and the bin."""
 
     discs: Distribution = common.count("discs", [2, 8])
     boxes: Distribution = common.count("boxes", [2, 6])
@@ -52,7 +52,7 @@ def reach(options: Options) -> float:
 
 
 def check(options: Options) -> None:
-    """ValueError where the bin cannot hold an object."""
+    """Raises ValueError where the bin cannot hold an object."""
     if not 2 * reach(options) < min(options.width, options.height):
         raise ValueError(
             f"disc_radius, box_size and capsule_half_length allow an object {2 * reach(options):g} m across, but it "
@@ -73,7 +73,7 @@ def layout(options: Options) -> Layout:
 
 
 def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledScene:
-    """One video's scene and start: everything at rest in the air, so far apart that it may be turned as it likes."""
+    """One video's scene and initial state: everything at rest in the air, so far apart that it may have any angle."""
     radius, size, half = factors["disc_radius"], factors["box_size"], factors["capsule_half_length"]
     kinds = ("discs", "boxes", "capsules")
     around = [radius, jnp.linalg.norm(size, axis=-1) / 2, half + factors["capsule_radius"]]

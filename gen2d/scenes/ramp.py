@@ -16,7 +16,7 @@ DERIVED = {"length": Field("float32", "n", "m", "of the slope")}
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """The slope, and what is on it."""
+    """The slope and the body on it."""
 
     shape: str = option("ball", str, "", "shape of the body on the slope", choices=("ball", "capsule"))
     width: float = common.size("width of the view, and of slope and floor together", 10.0)
@@ -39,7 +39,7 @@ class Options:
 
 
 def check(options: Options) -> None:
-    """ValueError where the slope may leave the view, or be too short."""
+    """Raises ValueError where the slope may leave the view, or be too short."""
     radius, steepest = options.radius.support[1], options.slope.support[1]
     most = 2 * (radius + (options.half_length.support[1] if options.shape == "capsule" else 0.0))
     if not options.foot_distance < options.width:
@@ -59,14 +59,14 @@ def check(options: Options) -> None:
 
 
 def layout(options: Options) -> Layout:
-    """What is on the slope; slope, floor and wall."""
+    """The body on the slope; slope, floor and wall."""
     long = options.half_length.support[1] if options.shape == "capsule" else 0.0
     runs = SlotGroup("circle" if options.shape == "ball" else "capsule", 1), SlotGroup("segment", 3, STATIC)
     return Layout(runs, (0.0, 0.0, options.width, options.height), options.radius.support[1] + long)
 
 
 def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledScene:
-    """One video's scene and start: a ball or capsule at rest that touches the slope."""
+    """One video's scene and initial state: a ball or capsule at rest that touches the slope."""
     slope, radius = factors["slope"], factors["radius"]
     half = factors["half_length"] if options.shape == "capsule" else jnp.zeros(())
     length, top = options.foot_distance / jnp.cos(slope), options.foot_distance * jnp.tan(slope)

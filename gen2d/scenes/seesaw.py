@@ -11,7 +11,7 @@ DERIVED = {"torque": Field("float32", "n", "N m", "of all weights about the pivo
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """What is drawn at random."""
+    """The plank and its weights."""
 
     weights: Distribution = common.count("weights", [1, 4], high=32)
     length: Distribution = common.length("length of the plank", [6.0, 8.0], low=0.1, high=1000)
@@ -35,7 +35,7 @@ class Options:
 
 
 def check(options: Options) -> None:
-    """ValueError where a weight may be wider than its part of the plank, or the plank may touch the floor."""
+    """Raises ValueError where a weight may be wider than its part of the plank, or the plank may touch the floor."""
     part = options.length.support[0] / options.weights.support[1]
     if options.width.support[1] > part:
         raise ValueError(
@@ -66,7 +66,7 @@ def layout(options: Options) -> Layout:
 
 
 def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledScene:
-    """One video's scene and start: the plank level, its weights on it or above it."""
+    """One video's scene and initial state: the plank level, its weights on it or above it."""
     layers, pivot, length, thickness = layout(options), factors["pivot_height"], factors["length"], factors["thickness"]
     surface = {name: factors[name] for name in ("elasticity", "friction")}
     ground = builder.floor(layers, friction=factors["friction"])

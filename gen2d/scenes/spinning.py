@@ -33,7 +33,7 @@ class Options:
 
 
 def check(options: Options) -> None:
-    """ValueError where a ball may not fit its storey."""
+    """Raises ValueError where a ball may not fit its storey."""
     largest = options.radius.support[1]
     if not 2 * largest < min(options.floor_spacing, options.width):
         raise ValueError(
@@ -50,7 +50,7 @@ def layout(options: Options) -> Layout:
 
 
 def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledScene:
-    """One video's scene and start: each ball on its floor, at its speed and spin."""
+    """One video's scene and initial state: each ball on its floor, at its speed and spin."""
     radius, most = factors["radius"], len(factors["radius"])
     present, floor = jnp.arange(most) < factors["balls"], options.floor_spacing * jnp.arange(most)
     x = radius + factors["relative_position"] * (options.width - 2 * radius)

@@ -17,7 +17,7 @@ DERIVED = {
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """What is drawn at random."""
+    """The blocks of the tower."""
 
     blocks: Distribution = common.count("blocks", [3, 6], "number of blocks in the tower", high=32)
     width: Distribution = common.length("width of each block", [1.2, 2.0], each="blocks", low=1e-2, high=100)
@@ -44,7 +44,7 @@ def layout(options: Options) -> Layout:
 
 
 def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledScene:
-    """One video's scene and start: the tower at rest in the middle of the view."""
+    """One video's scene and initial state: the tower at rest in the middle of the view."""
     width, height = factors["width"], factors["height"]
     present = jnp.arange(len(width)) < factors["blocks"]
     steps = jnp.concatenate([jnp.zeros(1), factors["offset"][1:] * width[:-1] / 2])
@@ -60,7 +60,7 @@ def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledSc
 
 
 def _margin(x: Array, width: Array, mass: Array, present: Array) -> Array:
-    """The least distance in m of the centre of mass of all above a joint from the edges of what carries it.
+    """Smallest distance in m, over all joints, of the centre of mass above the joint from the edge of its support.
 
     A stack in which each block lies on one other stands if, and only if, it is above 0 at every joint (the floor's
     too), as long as gravity is upright.

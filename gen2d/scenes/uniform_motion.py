@@ -34,7 +34,7 @@ class Options:
 
 
 def check(options: Options) -> None:
-    """ValueError where the ball may be larger than the view."""
+    """Raises ValueError where the ball may be larger than the view."""
     largest = options.radius.support[1]
     if not (2 * largest < options.width and 2 * (largest + options.margin) < options.height):
         raise ValueError(
@@ -49,7 +49,7 @@ def layout(options: Options) -> Layout:
 
 
 def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledScene:
-    """One video's scene and start: the ball where it stays in view long enough, if there is such a place."""
+    """One video's scene and initial state: the ball where it stays in view long enough, if such a position exists."""
     radius, direction = factors["radius"], factors["direction"]
     velocity = factors["speed"] * jnp.stack([jnp.cos(direction), jnp.sin(direction)])
     room = jnp.asarray([options.width, options.height])

@@ -23,7 +23,7 @@ DEBRIS = 0.8  # of the tower's height: how much is seen beyond the tower
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """How many links, and what is drawn at random."""
+    """The ball, its chain and the tower."""
 
     links: int = option(4, int, "links", "number of links in the chain; 1: a rod", low=1, high=64)
     blocks: Distribution = common.count("blocks", [3, 5], "number of blocks in the tower", high=32)
@@ -46,7 +46,7 @@ class Options:
 
 
 def check(options: Options) -> None:
-    """ValueError where the ball might swing through the floor."""
+    """Raises ValueError where the ball might swing through the floor."""
     lowest = options.ball_height.support[0] * options.blocks.support[0] * options.height.support[0]
     if options.radius.support[1] > lowest:
         raise ValueError(
@@ -77,7 +77,7 @@ def layout(options: Options) -> Layout:
 
 
 def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledScene:
-    """One video's scene and start: the tower's left side at 0, the ball at rest on its taut chain."""
+    """One video's scene and initial state: the tower's left side at 0, the ball at rest on its taut chain."""
     layers, n, most = layout(options), options.links, int(options.blocks.support[1])
     width, height, radius, chain, angle = (factors[x] for x in ("width", "height", "radius", "chain_length", "angle"))
     ground = builder.floor(layers, friction=factors["friction"])
