@@ -27,9 +27,7 @@ class Options:
     gap: Distribution = common.length("gap between neighbours in the rack", 0.01, low=1e-3)
     density: Distribution = common.density("the balls")
     speed: Distribution = common.speed("the cue ball", [6.0, 12.0])
-    aim_angle: Distribution = common.angle(
-        "angle of the stroke, counter-clockwise from the line to the rack", [-0.08, 0.08]
-    )
+    aim_angle: Distribution = common.angle("angle of the stroke from the line to the rack", [-0.08, 0.08])
     relative_position: tuple[Distribution, ...] = common.position("the cue ball")
     elasticity: Distribution = common.elasticity("the balls", 0.97)
     friction: Distribution = common.friction("the balls", 0.05)

@@ -21,9 +21,7 @@ class Options:
     floor_friction: Distribution = common.friction("the floor", 1.0)
     radius: Distribution = common.radius("the ball", [0.2, 0.3], high=100)
     ball_height: Distribution = common.fraction("height of the ball's centre, over that of a domino", [0.75, 0.95])
-    ball_distance: Distribution = common.length(
-        "gap between the ball and the first domino", [0.2, 0.6], low=1e-3, high=100
-    )
+    ball_distance: Distribution = common.length("gap between ball and first domino", [0.2, 0.6], low=1e-3, high=100)
     speed: Distribution = common.speed("the ball", [2.0, 4.0], high=1000)
     spin: Distribution = common.spin("the first domino at the start, about its right foot")
     gravity: tuple[Distribution, ...] = common.gravity()

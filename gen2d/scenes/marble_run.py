@@ -23,9 +23,7 @@ class Options:
     )  # fmt: skip
     length: Distribution = common.fraction("horizontal length of each ramp, over the width", [0.6, 0.78], each="ramps")
     radius: Distribution = common.radius("the ball", [0.16, 0.24])
-    relative_position: Distribution = common.fraction(
-        "position of the ball; 0: at the wall, 1: over the first ramp's middle"
-    )
+    relative_position: Distribution = common.fraction("position; 0: at the wall, 1: over the first ramp's middle")
     drop_height: Distribution = common.length("height of the ball above the first ramp", [0.0, 0.3])
     density: Distribution = common.density("the ball")
     elasticity: Distribution = common.elasticity("the ball", [0.2, 0.6])

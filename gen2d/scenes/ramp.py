@@ -25,9 +25,7 @@ class Options:
     slope: Distribution = common.angle("slope, down to the right", [0.25, 0.6], low=0.01, high=1.5)
     radius: Distribution = common.radius("the ball or the capsule's ends", [0.35, 0.6])
     half_length: Distribution = common.length("half the distance between a capsule's ends", [0.3, 0.6])
-    relative_position: Distribution = common.fraction(
-        "position on the slope; 0: highest possible, 1: lowest", [0, 0.25]
-    )
+    relative_position: Distribution = common.fraction("position on the slope; 0: highest, 1: lowest", [0, 0.25])
     density: Distribution = common.density("the body on the slope")
     friction: Distribution = common.friction("the body on the slope", [0.0, 0.4])
     elasticity: Distribution = common.elasticity("the body on the slope", [0.0, 0.5])

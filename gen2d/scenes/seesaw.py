@@ -17,14 +17,10 @@ class Options:
     length: Distribution = common.length("length of the plank", [6.0, 8.0], low=0.1, high=1000)
     thickness: Distribution = common.length("thickness of the plank", [0.2, 0.3], low=1e-2, high=100)
     plank_density: Distribution = common.density("the plank", 0.5)
-    pivot_height: Distribution = common.length(
-        "height of the pivot, in the plank's middle", [0.8, 1.4], low=0.02, high=100
-    )
+    pivot_height: Distribution = common.length("height of the pivot", [0.8, 1.4], low=0.02, high=100)
     width: Distribution = common.length("width of each weight", [0.6, 1.2], each="weights", low=1e-2)
     height: Distribution = common.length("height of each weight", [0.6, 1.2], each="weights", low=1e-2)
-    relative_position: Distribution = common.fraction(
-        "position of each weight in its share of the plank; 0: leftmost", each="weights"
-    )
+    relative_position: Distribution = common.fraction("position in its part of the plank; 0: leftmost", each="weights")
     drop_height: Distribution = common.length("height of each weight above the plank", [0.0, 1.5], each="weights")
     density: Distribution = common.density("each weight", {"log_uniform": [0.5, 2.0]}, each="weights")
     elasticity: Distribution = common.elasticity("all but the floor", 0.0)

@@ -22,9 +22,7 @@ class Options:
     density: Distribution = common.density("each ball", each="balls")
     speed: Distribution = common.speed("each ball, to the right", [2.0, 6.0], each="balls")
     spin: Distribution = common.spin("each ball, counter-clockwise: back-spin", [0.0, 20.0], each="balls")
-    relative_position: Distribution = common.fraction(
-        "position of each ball; 0: leftmost, 1: rightmost", [0.1, 0.5], each="balls"
-    )
+    relative_position: Distribution = common.fraction("position; 0: leftmost, 1: rightmost", [0.1, 0.5], each="balls")
     friction: Distribution = common.friction("each ball", [0.1, 0.5], each="balls")
     floor_friction: Distribution = common.friction("the floors", 1.0)
     gravity: tuple[Distribution, ...] = common.gravity()

@@ -21,9 +21,7 @@ class Options:
     radius: Distribution = common.radius("the ball", [0.7, 1.4])
     density: Distribution = common.density("the ball")
     speed: Distribution = common.speed("the ball", [1.0, 4.0])
-    direction: Distribution = common.angle(
-        "direction of the motion, counter-clockwise; 0: to the right", {"choice": [0, math.pi]}
-    )
+    direction: Distribution = common.angle("direction; 0: to the right", {"choice": [0, math.pi]})
     relative_position: tuple[Distribution, ...] = common.position("the start")
     duration: float = option(2.4, float, "s", "time for which the ball stays in view, where there is room", low=0)
     entry_distance: float = option(

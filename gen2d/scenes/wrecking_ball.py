@@ -36,9 +36,7 @@ class Options:
     ball_density: Distribution = common.density("the ball and its chain", 5.0)
     chain_length: Distribution = common.length("distance from the pin to the ball's centre", [3.0, 4.0], low=0.1)
     angle: Distribution = common.angle("angle of the chain, from hanging down", [0.8, 1.4], low=0, high=1.57)
-    ball_height: Distribution = common.fraction(
-        "lowest height of the ball's centre, over the height of the tower", [0.4, 0.8]
-    )
+    ball_height: Distribution = common.fraction("lowest height of the ball's centre, over the tower's", [0.4, 0.8])
     gap: Distribution = common.length("gap between the tower and the ball when lowest", [0.0, 0.2])
     gravity: tuple[Distribution, ...] = common.gravity()
     ball_color: tuple[Distribution, ...] = common.color("the ball", [200, 200, 210])
