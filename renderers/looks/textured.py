@@ -18,7 +18,7 @@ class Options(PlainOptions):
         0.8,
         float,
         "1",
-        "contrast of the spots; 1: they are black or white, whichever differs more from the background",
+        "contrast of the spots; 1: black or white, whichever differs more from the background",
         low=0,
         high=1,
     )
