@@ -15,12 +15,7 @@ class Options(PlainOptions):
     background_kind: str = option("noise", str, "", "what is behind everything", choices=("plain", "gradient", "noise"))
     background_to: tuple = option([64, 64, 84], int, "sRGB", "where it ends", parts=3, low=0, high=255)
     contrast: float = option(
-        0.8,
-        float,
-        "1",
-        "contrast of the spots; 1: black or white, whichever differs more from the background",
-        low=0,
-        high=1,
+        0.8, float, "1", "contrast of the spots; 1: black or white, the farther from the background", low=0, high=1
     )
     cell_size: float = option(0.6, float, "1", "size of a spot, over the largest object's reach", above=0)
 

@@ -1,5 +1,6 @@
 """Groups of bodies: what they take from a family's factors."""
 
+import jax.numpy as jnp
 import numpy as np
 
 from gen2d.records.layout import Layout, SlotGroup
@@ -7,7 +8,7 @@ from gen2d.sampling import builder
 
 
 def test_material_is_what_there_is_among_the_factors():
-    density, color, friction = (np.ones(1) * x for x in (1, 2, 3))
+    density, color, friction = (jnp.full(1, x) for x in (1, 2, 3))
     factors = {"density": density, "color": color, "wall_friction": friction, "radius": density, "wall_width": color}
     assert builder.material(factors) == {"density": density, "color": color}
     assert builder.material(factors, "wall") == {"friction": friction}
