@@ -268,7 +268,7 @@ def test_balls_part_as_they_must_down_to_a_centimetre_a_second():
 def test_contact_frames_count_the_frames_of_the_video():
     for name in ("collision", "phyworld_collision"):
         config = load_config(f"{name}.yaml")
-        assert config.scene.options.frame * config.video.fps == 1
+        assert config.scene.options.frame_interval * config.video.fps == 1
 
 
 # Billiards ----------------------------------------------------------------------------------------------------------
