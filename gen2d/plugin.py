@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from gen2d.core.lazy import attach
 
 if TYPE_CHECKING:
+    from gen2d.config import common
     from gen2d.config.distributions import Distribution
     from gen2d.config.options import option
     from gen2d.core.enums import CIRCLE, DYNAMIC, KINEMATIC, STATIC
@@ -38,24 +39,14 @@ if TYPE_CHECKING:
     from gen2d.renderers.plan import FramePlan, RenderScene, tile_windows
     from gen2d.renderers.primitives import Instants, PixelWindow
     from gen2d.renderers.rasterizer import alone
-    from gen2d.sampling.builder import (
-        SampledScene,
-        assemble,
-        box_walls,
-        boxes,
-        capsules,
-        capsules_between,
-        discs,
-        distance_joints,
-        hinge_chain,
-        polygons,
-        segments,
-    )
+    from gen2d.sampling import builder
+    from gen2d.sampling.builder import SampledScene
     from gen2d.sampling.placement import CLEARANCE, place, start_position
     from gen2d.storage.sealed import as_json
     from gen2d.xla import each_video, on_cpu, reduce_halves
 
 _HOMES = {
+    "gen2d.config": "common",
     "gen2d.config.distributions": "Distribution",
     "gen2d.config.options": "option",
     "gen2d.core.enums": "CIRCLE DYNAMIC KINEMATIC STATIC",
@@ -77,10 +68,8 @@ _HOMES = {
     "gen2d.renderers.plan": "FramePlan RenderScene tile_windows",
     "gen2d.renderers.primitives": "Instants PixelWindow",
     "gen2d.renderers.rasterizer": "alone",
-    "gen2d.sampling.builder": (
-        "SampledScene assemble box_walls boxes capsules capsules_between discs distance_joints hinge_chain "
-        "polygons segments"
-    ),
+    "gen2d.sampling": "builder",
+    "gen2d.sampling.builder": "SampledScene",
     "gen2d.sampling.placement": "CLEARANCE place start_position",
     "gen2d.storage.sealed": "as_json",
     "gen2d.xla": "each_video on_cpu reduce_halves",
@@ -117,21 +106,15 @@ __all__ = [
     "are_lines",
     "are_moving",
     "as_json",
-    "assemble",
-    "box_walls",
-    "boxes",
-    "capsules",
-    "capsules_between",
+    "builder",
+    "common",
     "contrasting",
     "dataset",
-    "discs",
-    "distance_joints",
     "each_video",
     "extents",
     "films",
     "fraction",
     "hashed",
-    "hinge_chain",
     "line_fields",
     "mean_color",
     "on_cpu",
@@ -139,9 +122,7 @@ __all__ = [
     "pixel_at",
     "place",
     "plain",
-    "polygons",
     "reduce_halves",
-    "segments",
     "start_position",
     "tile_windows",
     "to_pixels"

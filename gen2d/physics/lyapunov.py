@@ -40,7 +40,7 @@ def lyapunov_exponent(
 def perturbation(keys: Array, scene: Scene, state: State) -> State:
     """Random perturbation of the size SMALL."""
     dynamic = scene.objects.present & (scene.objects.kind == DYNAMIC)
-    drawn = jax.vmap(lambda key: jax.random.normal(key_for(key, "growth"), (2, *state.position.shape[:2])))(keys)
+    drawn = jax.vmap(lambda key: jax.random.normal(key_for(key, "lyapunov"), (2, *state.position.shape[:2])))(keys)
     position, velocity = jnp.where(dynamic, jnp.moveaxis(drawn, 0, -1), 0.0)
     zero = jnp.zeros_like(state.angle)
     change = State(position, zero, velocity, zero)

@@ -1,9 +1,10 @@
-"""The parts that a scene is put together from: discs, capsules, segments, boxes and polygons, for one video at a time.
+"""Groups of bodies from which a scene is assembled: discs, capsules, segments, boxes and polygons, of one video.
 
-    balls = discs(places, factors["radius"], present, density=factors["density"], velocity=factors["velocity"])
-    scene, state = assembled(layout(options), [balls, box_walls(options.width, options.height)], factors["gravity"])
+    balls = builder.discs(positions, radius, present, velocity=velocity, **builder.material(factors))
+    walls = builder.box_walls(options.width, options.height, **builder.material(factors, "wall"))
+    scene, state = builder.assemble(layout(options), [balls, walls], factors["gravity"])
 
-A part is what a run of slots holds. Numbers are broadcast to its slots; a slot that holds nothing is zero everywhere.
+A group fills a run of slots. Numbers are broadcast to its slots; empty slots are zero everywhere.
 """
 
 import dataclasses
@@ -29,28 +30,28 @@ from gen2d.records.layout import Layout, SlotGroup
 from gen2d.records.scene import Joints, Objects, Scene, State
 
 GREY = (128.0, 128.0, 128.0)
-OPTIONAL = ("vertices", "vertex_count", "rolling_resistance", "force", "torque")  # what a scene may lack
+OPTIONAL = ("vertices", "vertex_count", "rolling_resistance", "force", "torque")  # fields that a scene may lack
 
 
 class SampledScene(NamedTuple):
-    """What a family makes of its factors, for one video."""
+    """One video's scene and initial state, sampled by a family from its factors."""
 
     scene: Scene
     state: State
-    rejected: Any = 0  # places drawn again, as they did not fit
-    fits: Any = True  # whether everything found a place
-    derived: Mapping[str, Array] = MappingProxyType({})  # what follows from the drawn numbers; the family's DERIVED
+    rejected: Any = 0  # positions that were drawn again because of overlap
+    fits: Any = True  # whether everything could be placed
+    derived: Mapping[str, Array] = MappingProxyType({})  # numbers that follow from the factors
 
 
 class BodyGroup(NamedTuple):
-    """A run, and what its slots hold: `objects` without their depth."""
+    """Bodies in a run of slots: `objects` without their depth, and their initial state."""
 
     run: SlotGroup
     objects: dict[str, Array]
     state: State
 
 
-# What every part takes besides its shapes, each a number or one for each slot [K].
+# Arguments of every group besides its shape; each is a number, or one for each slot [K].
 MATERIAL = {
     "density": "kg/m^2; default 1",
     "mass": "kg; default: area times density",
@@ -59,53 +60,62 @@ MATERIAL = {
     "elasticity": "coefficient of restitution; default 0",
     "friction": "Coulomb coefficient; default 0",
     "color": "sRGB, [3] or [K, 3]; default grey",
-    "kind": "DYNAMIC, STATIC or KINEMATIC, of all; segments are static by default, all else is dynamic",
-    "layer": "of all, in the drawing order",
-    "collides": "whether anything meets them; of all, default True",
+    "kind": "DYNAMIC, STATIC or KINEMATIC, of the group; default DYNAMIC, of segments STATIC",
+    "layer": "of the group, in the drawing order",
+    "collides": "whether the group collides with anything; default True",
     "rolling_resistance": "torque over normal force and radius",
     "force": "N, [2] or [K, 2], constant",
     "torque": "N m, constant",
 }
 
 
+def material(factors: Mapping[str, Array], of: str = "") -> dict[str, Any]:
+    """The density, elasticity, friction and color among a family's factors, as arguments of a group.
+
+    Those `of` "wall" are the factors `wall_elasticity`, `wall_friction` and so on.
+    """
+    names = {name: f"{of}_{name}" if of else name for name in ("density", "elasticity", "friction", "color")}
+    return {name: factors[factor] for name, factor in names.items() if factor in factors}
+
+
 def discs(position: Array, radius: Any, present: Any = True, *, angle: Any = 0.0, **material: Any) -> BodyGroup:
-    """Discs at these centres [K, 2] m, with this radius in m."""
+    """Discs with these centres [K, 2] m and radii in m."""
     radius = jnp.broadcast_to(radius, position.shape[:1]).astype(jnp.float32)
     mass = disc_mass(radius, material.get("density", 1.0))
-    return _part("circle", position, angle, present, material, mass, disc_moment(radius, jnp.ones(())), radius=radius)
+    return _group("circle", position, angle, present, material, mass, disc_moment(radius, jnp.ones(())), radius=radius)
 
 
 def capsules(
     position: Array, angle: Any, half_length: Any, radius: Any, present: Any = True, **material: Any
 ) -> BodyGroup:
-    """Capsules at these centres [K, 2] m; `half_length` m is half the distance between the centres of their ends."""
+    """Capsules with these centres [K, 2] m; `half_length` m is half the distance between the centres of their ends."""
     half, radius = (jnp.broadcast_to(x, position.shape[:1]).astype(jnp.float32) for x in (half_length, radius))
     mass, moment = stadium_mass(half, radius, material.get("density", 1.0)), stadium_moment(half, radius, jnp.ones(()))
-    return _part("capsule", position, angle, present, material, mass, moment, radius=radius, half_length=half)
+    return _group("capsule", position, angle, present, material, mass, moment, radius=radius, half_length=half)
 
 
 def capsules_between(a: Any, b: Any, radius: Any, present: Any = True, **material: Any) -> BodyGroup:
-    """Capsules whose ends have their centres at these points [K, 2] m and those."""
+    """Capsules whose ends have their centres at `a` and `b` [K, 2] m."""
     a, b = (jnp.asarray(x, jnp.float32) for x in (a, b))
-    way = b - a
-    angle, half = jnp.arctan2(way[:, 1], way[:, 0]), jnp.linalg.norm(way, axis=-1) / 2
+    along = b - a
+    angle, half = jnp.arctan2(along[:, 1], along[:, 0]), jnp.linalg.norm(along, axis=-1) / 2
     return capsules((a + b) / 2, angle, half, radius, present, **material)
 
 
 def segments(a: Any, b: Any, present: Any = True, **material: Any) -> BodyGroup:
-    """Segments from these points [K, 2] m to those; static unless `kind` says otherwise, and then with a mass."""
+    """Segments from `a` to `b` [K, 2] m; static by default. Others have `mass`, 1 kg by default."""
     a, b = (jnp.asarray(x, jnp.float32) for x in (a, b))
-    way = b - a
-    half = jnp.linalg.norm(way, axis=-1) / 2
+    along = b - a
+    half = jnp.linalg.norm(along, axis=-1) / 2
     mass = jnp.asarray(material.get("mass", 1.0), jnp.float32)
-    return _part(
-        "segment", (a + b) / 2, jnp.arctan2(way[:, 1], way[:, 0]), present, {"kind": STATIC, **material}, mass,
+    return _group(
+        "segment", (a + b) / 2, jnp.arctan2(along[:, 1], along[:, 0]), present, {"kind": STATIC, **material}, mass,
         stadium_moment(half, jnp.zeros_like(half), jnp.ones(())), half_length=half,
     )  # fmt: skip
 
 
 def boxes(position: Array, angle: Any, width: Any, height: Any, present: Any = True, **material: Any) -> BodyGroup:
-    """Rectangles at these centres [K, 2] m, with these sides in m."""
+    """Rectangles with these centres [K, 2] m and sides in m."""
     count = position.shape[0]
     corners = box_vertices(*(jnp.broadcast_to(x, (count,)).astype(jnp.float32) for x in (width, height)))
     return polygons(position, angle, corners, present, **material)
@@ -120,21 +130,29 @@ def polygons(
     count: Any = None,
     **material: Any,
 ) -> BodyGroup:
-    """Convex polygons with their centres of mass at these points [K, 2] m; `vertices` [K, V, 2] m counter-clockwise
-    from there. `count` [K] of them are a polygon's own, the rest repeat its last; default: all."""
+    """Convex polygons with these centres of mass [K, 2] m and, relative to them, `vertices` [K, V, 2] m.
+
+    They are counter-clockwise. A polygon has the first `count` [K] of them, all by default; the rest repeat its last.
+    """
     mass, moment = polygon_mass(vertices, material.get("density", 1.0)), polygon_moment(vertices, jnp.ones(()))
     own = vertices.shape[1] if count is None else count
     shape = {"vertices": vertices, "vertex_count": jnp.broadcast_to(own, position.shape[:1])}
-    return _part("polygon", position, angle, present, material, mass, moment, **shape)
+    return _group("polygon", position, angle, present, material, mass, moment, **shape)
 
 
 def box_walls(width: float, height: float, **material: Any) -> BodyGroup:
-    """The floor, right wall, ceiling and left wall of a box from 0, 0 to width, height m; each faces inwards."""
+    """Floor, right wall, ceiling and left wall of a box from (0, 0) to (width, height) m; each faces inwards."""
     corners = jnp.asarray([[0, 0], [width, 0], [width, height], [0, height]], jnp.float32)
     return segments(corners, jnp.roll(corners, -1, axis=0), **material)
 
 
-def _part(
+def floor(layout: Layout, widths: float = 4.0, **material: Any) -> BodyGroup:
+    """A floor at height 0; to both sides it extends `widths` times as far as the layout's bounds do to the right."""
+    reach = widths * layout.bounds[2]
+    return segments([(-reach, 0.0)], [(reach, 0.0)], **material)
+
+
+def _group(
     shape: str,
     position: Array,
     angle: Any,
@@ -144,7 +162,7 @@ def _part(
     moment: Array,
     **sizes: Array,
 ) -> BodyGroup:
-    """`mass` is that of the density, `moment` that of one kilogram."""
+    """A group of one shape, where `mass` follows from the density and `moment` is that of one kilogram."""
     assert material.keys() <= MATERIAL.keys(), f"{material.keys() - MATERIAL.keys()} are not of {list(MATERIAL)}"
     count, kind = position.shape[0], material.get("kind", DYNAMIC)
     present = jnp.broadcast_to(present, (count,))
@@ -174,30 +192,32 @@ def _part(
         objects |= {"vertex_count": slots(sizes["vertex_count"], dtype=jnp.uint8)}
     more = {"rolling_resistance": (), "force": (2,), "torque": ()}
     objects |= {name: slots(material[name], *axes) for name, axes in more.items() if name in material}
-    moves = slots(material.get("velocity", 0.0), 2), slots(material.get("spin", 0.0))
-    return BodyGroup(run, objects, State(slots(position, 2), slots(angle), *moves))
+    motion = slots(material.get("velocity", 0.0), 2), slots(material.get("spin", 0.0))
+    return BodyGroup(run, objects, State(slots(position, 2), slots(angle), *motion))
 
 
 def assemble(
-    layout: Layout, parts: Sequence[BodyGroup], gravity: Array, joints: Joints | None = None
+    layout: Layout, groups: Sequence[BodyGroup], gravity: Array, joints: Joints | None = None
 ) -> tuple[Scene, State]:
-    """Scene and initial state of these parts, whose runs are the layout's; `gravity` [2] m/s^2.
+    """Scene and initial state of these groups; `gravity` [2] m/s^2.
 
-    Raises AssertionError where they are not.
+    Raises AssertionError unless their runs are the layout's.
     """
-    runs = tuple(part.run for part in parts)
-    assert runs == layout.runs, f"the parts are {runs}, but the layout has {layout.runs}"
+    runs = tuple(group.run for group in groups)
+    assert runs == layout.runs, f"the groups are {runs}, but the layout has {layout.runs}"
     corners = max(run.vertices for run in runs)
-    names = [*parts[0].objects, *(name for name in OPTIONAL if any(name in part.objects for part in parts))]
-    found = {name: jnp.concatenate([_held(part, name, corners) for part in parts]) for name in dict.fromkeys(names)}
-    depth = jnp.where(found["present"], jnp.asarray(layout.depths), 0).astype(jnp.int16)
-    state = jax.tree.map(lambda *values: jnp.concatenate(values), *(part.state for part in parts))
-    return Scene(Objects(depth=depth, **found), jnp.asarray(gravity, jnp.float32), joints), state
+    names = [*groups[0].objects, *(name for name in OPTIONAL if any(name in group.objects for group in groups))]
+    fields = {
+        name: jnp.concatenate([_values_of(group, name, corners) for group in groups]) for name in dict.fromkeys(names)
+    }
+    depth = jnp.where(fields["present"], jnp.asarray(layout.depths), 0).astype(jnp.int16)
+    state = jax.tree.map(lambda *values: jnp.concatenate(values), *(group.state for group in groups))
+    return Scene(Objects(depth=depth, **fields), jnp.asarray(gravity, jnp.float32), joints), state
 
 
-def _held(part: BodyGroup, name: str, corners: int) -> Array:
-    """A part's values of one of the objects' fields; zero where it has none."""
-    count = part.run.count
+def _values_of(group: BodyGroup, name: str, corners: int) -> Array:
+    """A group's values of one of the objects' fields; zero if it lacks the field."""
+    count = group.run.count
     empty = {
         "vertices": jnp.zeros((count, corners, 2)),
         "vertex_count": jnp.zeros(count, jnp.uint8),
@@ -205,15 +225,18 @@ def _held(part: BodyGroup, name: str, corners: int) -> Array:
         "force": jnp.zeros((count, 2)),
         "torque": jnp.zeros(count),
     }
-    values = part.objects[name] if name in part.objects else empty[name]
-    if name == "vertices" and values.shape[1] < corners:  # its last corner again, which changes nothing
+    values = group.objects[name] if name in group.objects else empty[name]
+    if name == "vertices" and values.shape[1] < corners:  # repeats the last vertex
         values = jnp.concatenate([values, jnp.repeat(values[:, -1:], corners - values.shape[1], axis=1)], axis=1)
     return values
 
 
 def distance_joints(anchor_a: Any, anchor_b: Any, **numbers: Any) -> Joints:
-    """A scene's joints, in the order of its layout's: anchors [J, 2] m in the frames of their objects, and what else
-    `Joints` has, each a number or one for each joint; default: rigid, without limits and motors."""
+    """Joints in the order of the layout's, with anchors [J, 2] m in the frames of their objects.
+
+    `numbers` are other fields of `Joints`, each a number or one for each joint. By default, joints are rigid and have
+    neither limits nor motors.
+    """
     anchors = [jnp.asarray(x, jnp.float32) for x in (anchor_a, anchor_b)]
     usual = {"rest": 0.0, "stiffness": jnp.inf, "damping": 0.0, "lower": -jnp.inf, "upper": jnp.inf}
     usual |= {"motor_speed": 0.0, "motor_torque": 0.0}
@@ -226,8 +249,11 @@ def distance_joints(anchor_a: Any, anchor_b: Any, **numbers: Any) -> Joints:
 
 
 def hinge_chain(links: BodyGroup, tail: bool, **numbers: Any) -> Joints:
-    """The revolute joints of bars in a row: where each begins, in the middle of an object or at the end of the bar
-    before, and with a `tail` where the last ends, in the middle of another object, which is that joint's `a`."""
+    """Revolute joints of a row of bars.
+
+    The first bar hangs from the middle of an object, each other one from the end of the bar before it. With a `tail`,
+    another joint connects the middle of an object, its `a`, with the end of the last bar.
+    """
     half = links.objects["half_length"]
     ends, middle = jnp.stack([half, jnp.zeros_like(half)], -1), jnp.zeros((1, 2))
     above, below = jnp.concatenate([middle, ends[:-1]]), -ends

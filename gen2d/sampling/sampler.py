@@ -1,9 +1,11 @@
-"""From a video's key to its scene: the factors that a family's options name are drawn, and the family builds from them.
+"""Sampling of a video's scene: the factors are drawn from its key, and the family builds the scene from them.
 
-A factor is an option that is drawn: one number a video, or one for each of the things that its `each` names. That is a
-drawn whole number such as `balls`, whose largest value is the length of the axis, or a size that the family fixes.
+A factor is an option that is drawn: one number a video, or one for each of the objects that its `each` names. That is
+either a drawn whole number such as `balls`, whose largest value is the length of the axis, or a size that the family
+fixes.
 
-Each split has a law of its own (laws.py). One program draws from all of them: it is told the split's row.
+Each split has a joint distribution of its own (config/joint_distribution.py). One program samples from all of them and
+takes the split's row as an argument.
 """
 
 import functools
@@ -31,30 +33,30 @@ FactorChange = Callable[[SampledFactors, Callable[[Array], SampledFactors]], Sam
 
 
 def sizes(scene: Plugin) -> dict[str, int]:
-    """The lengths of the factors' axes: the most there may be of what is counted, and those that the family fixes."""
+    """Lengths of the factors' axes: the largest counts that may be drawn, and the sizes that the family fixes."""
     fixed = scene.module.sizes(scene.options) if hasattr(scene.module, "sizes") else {}
     counted = {spec.each for spec in drawn_options(scene.module).values() if spec.each} - fixed.keys()
     return fixed | {each: int(getattr(scene.options, each).support[1]) for each in sorted(counted)}
 
 
 def fields(config: Config) -> dict[str, Field]:
-    """What is stored of the factors, of the numbers that the family derives from them, and of splits."""
-    found, splits = {}, {}
+    """Stored fields of the factors, of the numbers that the family derives from them, and of splits."""
+    stored, splits = {}, {}
     for name, spec in drawn_options(config.scene.module).items():
         axes = " ".join(["n", *([spec.each] if spec.each else []), *([str(spec.parts)] if spec.parts else [])])
         unit = spec.unit or "1"
-        found[f"factors/{name}"] = Field("float32", axes, unit, f"as drawn: {spec.meaning}")
+        stored[f"factors/{name}"] = Field("float32", axes, unit, f"as drawn: {spec.meaning}")
         splits[f"ood_distance/{name}"] = Field(
-            "float32", axes, unit, f"from the training split's nearest: {spec.meaning}"
+            "float32", axes, unit, f"distance from what the training split can draw: {spec.meaning}"
         )
     derived = getattr(config.scene.module, "DERIVED", {})
-    found |= {f"factors/{name}": field for name, field in derived.items()}
+    stored |= {f"factors/{name}": field for name, field in derived.items()}
     joint = Field("bool", "n", "1", "whether the training split could not have drawn these factors")
-    return found | (splits | {"out_of_distribution": joint} if config.splits else {})
+    return stored | (splits | {"out_of_distribution": joint} if config.splits else {})
 
 
 class Sampler:
-    """The draws of a config's scenes, whatever their split."""
+    """Draws of a config's scenes, in every split."""
 
     def __init__(self, config: Config) -> None:
         self.scene, self.laws, self.options = config.scene, config.laws, drawn_options(config.scene.module)
@@ -65,46 +67,46 @@ class Sampler:
         self.gridded = sorted({name for names, _ in self.combinations for name in names})
 
     def combination(self, row: int, words: np.ndarray, numbers: np.ndarray) -> np.ndarray:
-        """For each video [n] what is given of its factors [n, G] float32: its combination of those that are on a grid.
+        """Values [n, G] float32 of the factors on a grid, a combination for each video number [n].
 
-        Each combination comes once before any comes again, in an order that the words (seed and split) decide.
+        Each combination comes once before any comes again, in an order that `words` (seed and split) decide.
         """
         names, every = self.combinations[row]
-        found = np.zeros((len(numbers), len(self.gridded)), np.float32)
+        values = np.zeros((len(numbers), len(self.gridded)), np.float32)
         if not names:
-            return found
+            return values
         seed = int(hashed(*map(int, words))[0] >> np.uint64(1))
         rounds, places = np.divmod(np.asarray(numbers, np.int64), len(every))
         for number in np.unique(rounds):
             own = rounds == number
             chosen = every[order(seed, int(number), places[own], len(every))]
-            found[np.ix_(own, [self.gridded.index(name) for name in names])] = chosen
-        return found
+            values[np.ix_(own, [self.gridded.index(name) for name in names])] = chosen
+        return values
 
     def sampled(
         self, key: Array, row: Any = 0, given: Any = (), change: FactorChange | None = None
     ) -> tuple[SampledFactors, SampledScene]:
-        """A video's factors, those that follow from others included, and its scene and start.
+        """A video's factors, including derived ones, and its scene and initial state.
 
-        `row` is that of the split, `given` [G] what `combination` says of the video. `change(found, draw)` makes other
-        factors of those that are found, where `draw(key)` draws all anew.
+        `row` is that of the split, `given` [G] the video's `combination`. `change(factors, draw)` returns the factors
+        to use instead of these, where `draw(key)` draws all of them anew.
         """
         draw_key, place_key = jax.random.split(key)
-        drawn = self.drawn(draw_key, row, given, change)
-        made: Any = self.scene.module.sample(place_key, drawn, self.scene.options)
-        rejected, fits = jnp.asarray(made.rejected, jnp.int32), jnp.asarray(made.fits, bool)
-        return {**drawn, **made.derived}, made._replace(rejected=rejected, fits=fits, derived={})
+        factors = self.drawn(draw_key, row, given, change)
+        scene: Any = self.scene.module.sample(place_key, factors, self.scene.options)
+        rejected, fits = jnp.asarray(scene.rejected, jnp.int32), jnp.asarray(scene.fits, bool)
+        return {**factors, **scene.derived}, scene._replace(rejected=rejected, fits=fits, derived={})
 
     def drawn(self, key: Array, row: Any = 0, given: Any = (), change: FactorChange | None = None) -> SampledFactors:
-        """A video's factors by name; zero for what is beyond the number there is."""
-        found = self._sampled_factors(key, row, given)
-        found = change(found, lambda other: self._sampled_factors(other, row, given)) if change else found
-        return {name: self._counted(name, values, found) for name, values in found.items()}
+        """A video's factors by name; zero for objects beyond the drawn count."""
+        factors = self._sampled_factors(key, row, given)
+        factors = change(factors, lambda other: self._sampled_factors(other, row, given)) if change else factors
+        return {name: self._counted(name, values, factors) for name, values in factors.items()}
 
     def _sampled_factors(self, key: Array, row: Any, given: Any) -> SampledFactors:
-        """All factors by name. Each has a key of its own, so that its draws do not depend on which others there are."""
+        """All factors by name. Each has a key of its own, so its draws do not depend on the other factors."""
         components = self._components(key, row)
-        found = {}
+        factors = {}
         for (name, spec), own in zip(self.options.items(), keys_for(key, [*self.options]), strict=True):
             shape = (self.lengths[spec.each],) if spec.each else ()
             keys = jax.random.split(own, spec.parts) if spec.parts else [own]
@@ -113,14 +115,14 @@ class Sampler:
                 self._coordinate(k, coordinate, shape, which, row, given)
                 for k, coordinate in zip(keys, self._coordinates(name), strict=True)
             ]
-            found[name] = jnp.stack(parts, axis=-1) if spec.parts else parts[0]
-        return found
+            factors[name] = jnp.stack(parts, axis=-1) if spec.parts else parts[0]
+        return factors
 
     def _coordinates(self, name: str) -> list[str]:
         return list(coordinates(name, getattr(self.scene.options, name)))
 
     def _coordinate(self, key: Array, name: str, shape: tuple[int, ...], which: Array, row: Any, given: Any) -> Array:
-        """One coordinate's draws, from the distribution that its product has."""
+        """One coordinate's draws, from its distribution in the chosen product."""
         own = [product.parts[name] for product in self.products]
         distinct = list(dict.fromkeys(own))
         draws = [source.sample(key, shape) for source in distinct]
@@ -135,9 +137,10 @@ class Sampler:
         return jnp.where(here, given[self.gridded.index(name)].astype(values.dtype), values)
 
     def _components(self, key: Array, row: Any) -> dict[str, Array]:
-        """By axis ("" is the video) the number of the product that is drawn from, of all splits' one after the other.
+        """Index of the product to draw from, by axis ("" is the video), into the products of all splits.
 
-        A law whose products differ in numbers of one axis alone, such as each ball's, is drawn from for each of these.
+        Where a split's products differ only in factors of one axis, each of its objects draws a product of its own. So
+        {radius: small, color: red} or {radius: large, color: blue} for each ball gives videos with balls of both sorts.
         """
         counts = [len(law.products) for law in self.laws]
         firsts = jnp.asarray(np.cumsum([0, *counts[:-1]]))[row]
@@ -152,70 +155,72 @@ class Sampler:
             return firsts + (jax.random.uniform(key, shape)[..., None] >= jnp.asarray(ends)[row]).sum(-1)
 
         common = pick(own, ())
-        found = {"": common}
+        components = {"": common}
         for axis, length in self.lengths.items():
             each = jnp.asarray([a == axis for a in axes])[row]
-            found[axis] = jnp.where(each, pick(key_for(own, axis), (length,)), common)
-        return found
+            components[axis] = jnp.where(each, pick(key_for(own, axis), (length,)), common)
+        return components
 
     def _axis(self, law: JointDistribution) -> str:
-        found = {self.options[name.partition("[")[0]].each for name in law.differing}
-        return found.pop() if len(found) == 1 else ""
+        axes = {self.options[name.partition("[")[0]].each for name in law.differing}
+        return axes.pop() if len(axes) == 1 else ""
 
-    def _counted(self, name: str, values: Array, found: SampledFactors) -> Array:
+    def _counted(self, name: str, values: Array, factors: SampledFactors) -> Array:
         each = self.options[name].each
-        return values if each not in found else jnp.where(_there(each, values, found), values, 0)
+        return values if each not in factors else jnp.where(_present(each, values, factors), values, 0)
 
-    # ---- How far from the training split
+    # ---- Distance from the training split
 
-    def outside(self, drawn: SampledFactors) -> dict[str, Array]:
-        """By stored name how far each factor lies from what the training split can give, and whether all of them do."""
+    def outside(self, factors: SampledFactors) -> dict[str, Array]:
+        """By stored name: distance of each factor from what training can draw, and whether it cannot draw them all."""
         if self.training is None:
             return {}
-        found = {f"ood_distance/{name}": self._distance(name, drawn) for name in self.options}
-        return found | {"out_of_distribution": ~self._inside(self.training, drawn)}
+        distances = {f"ood_distance/{name}": self._distance(name, factors) for name in self.options}
+        return distances | {"out_of_distribution": ~self._inside(self.training, factors)}
 
-    def _distance(self, name: str, drawn: SampledFactors) -> Array:
+    def _distance(self, name: str, factors: SampledFactors) -> Array:
         assert self.training is not None
-        values, names = drawn[name], self._coordinates(name)
+        values, names = factors[name], self._coordinates(name)
         parts = jnp.moveaxis(values, -1, 0) if self.options[name].parts else values[None]
-        far = [_far(part, self.training.spans(own)) for part, own in zip(parts, names, strict=True)]
-        distance = jnp.stack(far, axis=-1) if self.options[name].parts else far[0]
-        return self._counted(name, distance, drawn)
+        distances = [_distance_from(part, self.training.spans(own)) for part, own in zip(parts, names, strict=True)]
+        distance = jnp.stack(distances, axis=-1) if self.options[name].parts else distances[0]
+        return self._counted(name, distance, factors)
 
-    def _inside(self, law: JointDistribution, drawn: SampledFactors) -> Array:
-        """Whether a law can give these factors: all of them from one product, or each thing's from one of its own."""
+    def _inside(self, law: JointDistribution, factors: SampledFactors) -> Array:
+        """Whether a distribution can draw these factors: all from one product, or each object's from one of its own."""
         axis = self._axis(law)
         fits = []
         for product in law.products:
             of_video, of_each = jnp.asarray(True), jnp.ones(self.lengths[axis] if axis else (), bool)
             for name, spec in self.options.items():
-                inside = self._held(product.parts, name, drawn)
+                inside = self._within(product.parts, name, factors)
                 if spec.each and spec.each == axis:
-                    of_each &= inside | ~self._present(spec, inside, drawn)
+                    of_each &= inside | ~self._counts(spec, inside, factors)
                 else:
-                    of_video &= jnp.all(inside | ~self._present(spec, inside, drawn))
+                    of_video &= jnp.all(inside | ~self._counts(spec, inside, factors))
             fits.append(of_video & of_each)
         return jnp.all(functools.reduce(jnp.logical_or, fits))
 
-    def _held(self, parts: Any, name: str, drawn: SampledFactors) -> Array:
-        """Whether each of a factor's values lies in a product, all parts of a vector together."""
-        values = drawn[name]
+    def _within(self, parts: Any, name: str, factors: SampledFactors) -> Array:
+        """Whether each of a factor's values lies in a product; a vector does if all its parts do."""
+        values = factors[name]
         each = jnp.moveaxis(values, -1, 0) if self.options[name].parts else values[None]
-        far = [_far(part, parts[own].spans) for part, own in zip(each, self._coordinates(name), strict=True)]
-        return functools.reduce(jnp.logical_and, [distance == 0 for distance in far])
+        distances = [
+            _distance_from(part, parts[own].spans) for part, own in zip(each, self._coordinates(name), strict=True)
+        ]
+        return functools.reduce(jnp.logical_and, [distance == 0 for distance in distances])
 
-    def _present(self, spec: Option, inside: Array, drawn: SampledFactors) -> Array:
-        return _there(spec.each, inside, drawn) if spec.each in drawn else jnp.ones_like(inside)
-
-
-def _there(each: str, values: Array, found: SampledFactors) -> Array:
-    """Which of the counted things [K, ...] there are, like these values of them."""
-    return (jnp.arange(values.shape[0]) < found[each]).reshape(-1, *[1] * (values.ndim - 1))
+    def _counts(self, spec: Option, inside: Array, factors: SampledFactors) -> Array:
+        return _present(spec.each, inside, factors) if spec.each in factors else jnp.ones_like(inside)
 
 
-def _far(values: Array, spans: tuple[Span, ...]) -> Array:
-    """How far each value is from the nearest of some spans; 0 within."""
+def _present(each: str, values: Array, factors: SampledFactors) -> Array:
+    """Which of the counted objects [K, ...] are present, in the shape of `values`."""
+    return (jnp.arange(values.shape[0]) < factors[each]).reshape(-1, *[1] * (values.ndim - 1))
+
+
+def _distance_from(values: Array, spans: tuple[Span, ...]) -> Array:
+    """Distance of each value from the nearest span; 0 within."""
     x = values.astype(jnp.float32)
     low = np.array([span.low for span in spans], np.float32)
     last = np.array([span.last for span in spans], np.float32)

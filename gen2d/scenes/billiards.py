@@ -9,69 +9,52 @@ import math
 import jax.numpy as jnp
 import numpy as np
 
-from gen2d.plugin import (
-    STATIC,
-    Array,
-    Distribution,
-    Layout,
-    SampledScene,
-    SlotGroup,
-    assemble,
-    box_walls,
-    discs,
-    option,
-)
+from gen2d.plugin import STATIC, Array, Distribution, Layout, SampledScene, SlotGroup, builder, common, option
 
 
 @dataclasses.dataclass(frozen=True)
 class Options:
     """The table, the rack and the stroke."""
 
-    rows: Distribution = option([3, 5], int, "rows", "of the rack: 1, 3, 6, 10, ... balls", low=1, high=21, draw=True)
-    width: float = option(10.0, float, "m", "of the table, inside", above=0, high=1000)
-    height: float = option(5.0, float, "m", "of the table, inside", above=0, high=1000)
-    head: float = option(2.5, float, "m", "from the left cushion to where the cue ball starts, at most", above=0)
-    spot: float = option(6.0, float, "m", "from the left cushion to the first ball of the rack", above=0)
-    radius: Distribution = option(0.24, float, "m", "of the balls", low=1e-3, draw=True)
-    gap: Distribution = option(0.01, float, "m", "between neighbours in the rack", low=1e-3, draw=True)
-    density: Distribution = option(1.0, float, "kg/m^2", "of the balls", low=1e-6, high=1e6, draw=True)
-    speed: Distribution = option([6.0, 12.0], float, "m/s", "of the cue ball", low=0, draw=True)
-    aim: Distribution = option(
-        [-0.08, 0.08], float, "rad", "off the way to the first ball of the rack, counter-clockwise", draw=True
+    rows: Distribution = common.count("rows", [3, 5], "rows of the rack: 1, 3, 6, 10, ... balls", high=21)
+    width: float = common.size("width of the table, inside", 10.0)
+    height: float = common.size("height of the table, inside", 5.0)
+    head_distance: float = option(2.5, float, "m", "largest distance from the left cushion to the cue ball", above=0)
+    spot_distance: float = option(
+        6.0, float, "m", "distance from the left cushion to the first ball of the rack", above=0
     )
-    place: tuple[Distribution, ...] = option(
-        [[0, 1], [0, 1]], float, "1", "of the cue ball among those possible; 0, 0 is the lowest and leftmost",
-        parts=2, draw=True, low=0, high=1,
-    )  # fmt: skip
-    elasticity: Distribution = option(0.97, float, "1", "of the balls", low=0, high=1, draw=True)
-    friction: Distribution = option(0.05, float, "1", "of the balls", low=0, high=100, draw=True)
-    cushion_elasticity: Distribution = option(0.85, float, "1", "of the cushions", low=0, high=1, draw=True)
-    cushion_friction: Distribution = option(0.2, float, "1", "of the cushions", low=0, high=100, draw=True)
-    cue_color: tuple[Distribution, ...] = option(
-        [245, 245, 240], int, "sRGB", "of the cue ball", parts=3, draw=True, low=0, high=255
+    radius: Distribution = common.radius("the balls", 0.24)
+    gap: Distribution = common.length("gap between neighbours in the rack", 0.01, low=1e-3)
+    density: Distribution = common.density("the balls")
+    speed: Distribution = common.speed("the cue ball", [6.0, 12.0])
+    aim_angle: Distribution = common.angle("angle of the stroke from the line to the rack", [-0.08, 0.08])
+    relative_position: tuple[Distribution, ...] = common.position("the cue ball")
+    elasticity: Distribution = common.elasticity("the balls", 0.97)
+    friction: Distribution = common.friction("the balls", 0.05)
+    cushion_elasticity: Distribution = common.elasticity("the cushions", 0.85)
+    cushion_friction: Distribution = common.friction("the cushions", 0.2)
+    cue_color: tuple[Distribution, ...] = common.color("the cue ball", [245, 245, 240])
+    color: tuple[Distribution, ...] = common.color(
+        "each ball of the rack", [[90, 254], [40, 180], [90, 254]], each="rack"
     )
-    color: tuple[Distribution, ...] = option(
-        [[90, 254], [40, 180], [90, 254]], int, "sRGB", "of each ball of the rack",
-        parts=3, draw=True, low=0, high=255, each="rack",
-    )  # fmt: skip
-    cushion_color: tuple[Distribution, ...] = option(
-        [120, 72, 40], int, "sRGB", "of the cushions", parts=3, draw=True, low=0, high=255
-    )
+    cushion_color: tuple[Distribution, ...] = common.color("the cushions", [120, 72, 40])
 
 
 def check(options: Options) -> None:
-    """ValueError where the rack or the cue ball may not fit the table."""
+    """Raises ValueError where the rack or the cue ball may not fit the table."""
     rows, radius = int(options.rows.support[1]), options.radius.support[1]
     side = (rows - 1) * (2 * radius + options.gap.support[1])
-    if not (options.spot + side * math.sqrt(0.75) + radius < options.width and side + 2 * radius < options.height):
+    if not (
+        options.spot_distance + side * math.sqrt(0.75) + radius < options.width and side + 2 * radius < options.height
+    ):
         raise ValueError(
             f"rows may be {rows}, but with a radius of {radius:g} m they must fit a table of {options.width:g} x "
-            f"{options.height:g} m, {options.spot:g} m from its left side"
+            f"{options.height:g} m, {options.spot_distance:g} m from its left side"
         )
-    if not (radius < options.head and options.head + 2 * radius < options.spot):
+    if not (radius < options.head_distance and options.head_distance + 2 * radius < options.spot_distance):
         raise ValueError(
-            f"head is {options.head:g} m, but the cue ball, with a radius of up to {radius:g} m, must start between "
-            f"the left cushion and the rack, at {options.spot:g} m"
+            f"head_distance is {options.head_distance:g} m, but the cue ball, with a radius of up to {radius:g} m, "
+            f"must start between the left cushion and the rack, at {options.spot_distance:g} m"
         )
 
 
@@ -88,29 +71,25 @@ def layout(options: Options) -> Layout:
 
 
 def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledScene:
-    """One video's scene and start: the rack at its spot, and the cue ball on its way there."""
+    """One video's scene and initial state: the rack in place, and the cue ball on its way there."""
     radius, rows = factors["radius"], factors["rows"]
-    nearest, farthest = jnp.stack([radius, radius]), jnp.stack([options.head, options.height - radius])
-    cue = nearest + factors["place"] * (farthest - nearest)
-    spot = jnp.asarray([options.spot, options.height / 2])
+    nearest, farthest = jnp.stack([radius, radius]), jnp.stack([options.head_distance, options.height - radius])
+    cue = nearest + factors["relative_position"] * (farthest - nearest)
+    spot = jnp.asarray([options.spot_distance, options.height / 2])
     rack = spot + _triangle(int(options.rows.support[1])) * (2 * radius + factors["gap"])
-    way = jnp.arctan2(*(spot - cue)[::-1]) + factors["aim"]
+    way = jnp.arctan2(*(spot - cue)[::-1]) + factors["aim_angle"]
     stroke = factors["speed"] * jnp.stack([jnp.cos(way), jnp.sin(way)])
-    balls = discs(
+    balls = builder.discs(
         jnp.concatenate([cue[None], rack]),
         radius,
         jnp.arange(1 + len(rack)) <= rows * (rows + 1) // 2,
         velocity=jnp.zeros((1 + len(rack), 2)).at[0].set(stroke),
-        color=jnp.concatenate([factors["cue_color"][None], factors["color"]]),
-        **{name: factors[name] for name in ("density", "elasticity", "friction")},
+        **builder.material(factors) | {"color": jnp.concatenate([factors["cue_color"][None], factors["color"]])},
     )
-    cushions = box_walls(
-        options.width, options.height, elasticity=factors["cushion_elasticity"], friction=factors["cushion_friction"],
-        color=factors["cushion_color"],
-    )  # fmt: skip
-    return SampledScene(*assemble(layout(options), [balls, cushions], jnp.zeros(2)))
+    cushions = builder.box_walls(options.width, options.height, **builder.material(factors, "cushion"))
+    return SampledScene(*builder.assemble(layout(options), [balls, cushions], jnp.zeros(2)))
 
 
 def _triangle(rows: int) -> np.ndarray:
-    """Places [rows (rows + 1) / 2, 2] a unit apart, row by row from the one at the origin to the right."""
+    """Points [rows (rows + 1) / 2, 2] of a triangle, a unit apart, row by row from the origin to the right."""
     return np.array([[math.sqrt(0.75) * row, k - row / 2] for row in range(rows) for k in range(row + 1)], np.float32)

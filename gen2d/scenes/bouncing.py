@@ -5,52 +5,36 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 
-from gen2d.plugin import (
-    STATIC,
-    Array,
-    Distribution,
-    Layout,
-    SampledScene,
-    SlotGroup,
-    assemble,
-    box_walls,
-    discs,
-    option,
-    place,
-)
+from gen2d.plugin import STATIC, Array, Distribution, Layout, SampledScene, SlotGroup, builder, common, option, place
 
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """What is drawn at random, and the box."""
+    """The balls and their box."""
 
-    balls: Distribution = option([3, 8], int, "balls", "in a video", low=1, high=64, draw=True)
-    width: float = option(10.0, float, "m", "of the box, inside", above=0, high=1000)
-    height: float = option(10.0, float, "m", "of the box, inside", above=0, high=1000)
-    radius: Distribution = option([0.5, 1.0], float, "m", "of each ball", low=1e-3, draw=True, each="balls")
-    density: Distribution = option(1.0, float, "kg/m^2", "of each ball", low=1e-6, high=1e6, draw=True, each="balls")
+    balls: Distribution = common.count("balls", [3, 8])
+    width: float = common.size("width of the box, inside", 10.0)
+    height: float = common.size("height of the box, inside", 10.0)
+    radius: Distribution = common.radius("each ball", [0.5, 1.0], each="balls")
+    density: Distribution = common.density("each ball", each="balls")
     velocity: tuple[Distribution, ...] = option(
-        [{"normal": [0, 3]}, {"normal": [0, 3]}], float, "m/s", "of each ball at the start",
+        [{"normal": [0, 3]}, {"normal": [0, 3]}], float, "m/s", "velocity of each ball at the start",
         parts=2, draw=True, each="balls",
     )  # fmt: skip
-    spin: Distribution = option(0.0, float, "rad/s", "of each ball at the start", draw=True, each="balls")
-    elasticity: Distribution = option(0.9, float, "1", "of each ball", low=0, high=1, draw=True, each="balls")
-    friction: Distribution = option(0.2, float, "1", "of each ball", low=0, high=100, draw=True, each="balls")
-    wall_elasticity: Distribution = option(0.9, float, "1", "of the box", low=0, high=1, draw=True)
-    wall_friction: Distribution = option(0.2, float, "1", "of the box", low=0, high=100, draw=True)
-    gravity: tuple[Distribution, ...] = option(
-        [0, -9.8], float, "m/s^2", "x right, y up; the same for a whole video", parts=2, draw=True
-    )
-    color: tuple[Distribution, ...] = option(
-        [[40, 254]] * 3, int, "sRGB", "of each ball", parts=3, draw=True, low=0, high=255, each="balls"
-    )
+    spin: Distribution = common.spin("each ball at the start", each="balls")
+    elasticity: Distribution = common.elasticity("each ball", 0.9, each="balls")
+    friction: Distribution = common.friction("each ball", 0.2, each="balls")
+    wall_elasticity: Distribution = common.elasticity("the box", 0.9)
+    wall_friction: Distribution = common.friction("the box", 0.2)
+    gravity: tuple[Distribution, ...] = common.gravity()
+    color: tuple[Distribution, ...] = common.color("each ball", [[40, 254]] * 3, each="balls")
 
 
 CROWDED_BY = ("balls", "radius", "width", "height")  # the options that decide whether everything finds a place
 
 
 def check(options: Options) -> None:
-    """ValueError where the box cannot hold a ball."""
+    """Raises ValueError where the box cannot hold a ball."""
     largest = options.radius.support[1]
     if not 2 * largest < min(options.width, options.height):
         raise ValueError(
@@ -65,13 +49,12 @@ def layout(options: Options) -> Layout:
 
 
 def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledScene:
-    """One video's scene and start: balls at random places that do not overlap."""
+    """One video's scene and initial state: balls at random positions without overlap."""
     radius, box = factors["radius"], jnp.asarray([options.width, options.height])
     present = jnp.arange(len(radius)) < factors["balls"]
     places, rejected, fits = place(jax.random.fold_in(key, 0), radius, present, jnp.zeros(2), box)
-    material = {name: factors[name] for name in ("density", "velocity", "spin", "elasticity", "friction", "color")}
-    walls = box_walls(
-        options.width, options.height, elasticity=factors["wall_elasticity"], friction=factors["wall_friction"]
+    balls = builder.discs(
+        places, radius, present, velocity=factors["velocity"], spin=factors["spin"], **builder.material(factors)
     )
-    parts = [discs(places, radius, present, **material), walls]
-    return SampledScene(*assemble(layout(options), parts, factors["gravity"]), rejected, fits)
+    walls = builder.box_walls(options.width, options.height, **builder.material(factors, "wall"))
+    return SampledScene(*builder.assemble(layout(options), [balls, walls], factors["gravity"]), rejected, fits)

@@ -17,10 +17,8 @@ from gen2d.plugin import (
     Layout,
     SampledScene,
     SlotGroup,
-    assemble,
-    capsules_between,
-    discs,
-    hinge_chain,
+    builder,
+    common,
     option,
 )
 
@@ -29,41 +27,30 @@ DERIVED = {"kink": Field("float32", "n", "1", "joint that it is pulled by at the
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """How the chain is made and hung, and what is drawn at random."""
+    """The chain and the pins that it hangs from."""
 
-    links: int = option(12, int, "links", "of the chain", low=2, high=200)
-    ends: int = option(2, int, "pins", "that it hangs from", low=1, high=2)
-    length: Distribution = option([0.35, 0.5], float, "m", "of a link, joint to joint", low=1e-2, high=100, draw=True)
-    radius: Distribution = option([0.06, 0.1], float, "m", "of a link", low=1e-3, high=100, draw=True)
-    density: Distribution = option(1.0, float, "kg/m^2", "of the links", low=1e-6, high=1e6, draw=True)
-    span: Distribution = option(
-        [0.4, 0.85], float, "1", "between two pins, over the chain's length", low=0, high=1, draw=True
-    )
-    slope: Distribution = option([-0.3, 0.3], float, "rad", "of the line from the left pin to the right", draw=True)
-    held: Distribution = option(
-        [0.0, 1.0], float, "1", "which joint it is pulled by; 0: the first that is possible, 1: the last",
-        low=0, high=1, draw=True,
-    )  # fmt: skip
-    above: Distribution = option(
-        [0, 1], int, "1", "1: pulled to above the line between the pins, 0: to below", low=0, high=1, draw=True
-    )
-    angle: Distribution = option(
-        [-2.0, 2.0], float, "rad", "of a chain with one pin at the start, from hanging down", draw=True
-    )
-    friction: Distribution = option(0.0, float, "N m", "most torque of a joint's friction", low=0, draw=True)
-    gravity: tuple[Distribution, ...] = option([0, -9.8], float, "m/s^2", "x right, y up", parts=2, draw=True)
-    color: tuple[Distribution, ...] = option(
-        [[60, 254]] * 3, int, "sRGB", "of each link", parts=3, draw=True, low=0, high=255, each="links"
-    )
+    links: int = option(12, int, "links", "number of links in the chain", low=2, high=200)
+    ends: int = option(2, int, "pins", "number of pins that the chain hangs from", low=1, high=2)
+    length: Distribution = common.length("length of a link, joint to joint", [0.35, 0.5], low=1e-2, high=100)
+    radius: Distribution = common.radius("a link", [0.06, 0.1], high=100)
+    density: Distribution = common.density("the links")
+    span: Distribution = common.fraction("distance between two pins, over the chain's length", [0.4, 0.85])
+    slope: Distribution = common.angle("slope of the line from the left pin to the right one", [-0.3, 0.3])
+    pulled_joint: Distribution = common.fraction("joint that is pulled; 0: the first that is possible, 1: the last")
+    pulled_above: Distribution = option([0, 1], int, "1", "1: pulled up, 0: pulled down", low=0, high=1, draw=True)
+    angle: Distribution = common.angle("angle of a chain with one pin at the start, from hanging down", [-2.0, 2.0])
+    friction: Distribution = option(0.0, float, "N m", "largest torque of the friction in a joint", low=0, draw=True)
+    gravity: tuple[Distribution, ...] = common.gravity()
+    color: tuple[Distribution, ...] = common.color("each link", [[60, 254]] * 3, each="links")
 
 
 def sizes(options: Options) -> dict[str, int]:
-    """How many links there are."""
+    """The number of links."""
     return {"links": options.links}
 
 
 def check(options: Options) -> None:
-    """ValueError where there may be no joint that it can be pulled tight by."""
+    """Raises ValueError where no joint may exist by which the chain can be pulled tight."""
     least = options.span.support[0]
     if options.ends == 2 and not 2 / options.links <= least <= options.span.support[1] < 1:
         raise ValueError(
@@ -83,7 +70,7 @@ def layout(options: Options) -> Layout:
 
 
 def _bounds(options: Options, whole: float) -> tuple[float, float, float, float]:
-    """All that a chain of a length in m can reach, but for the upper part of what it hardly does."""
+    """Bounds in m of what a chain of this length can reach, without the upper part, which it hardly ever does."""
     rim = 2 * options.radius.support[1]
     if options.ends == 1:
         turn = min(max(map(abs, options.angle.support)), math.pi)
@@ -91,19 +78,21 @@ def _bounds(options: Options, whole: float) -> tuple[float, float, float, float]
     # An ellipse with the pins as its foci.
     depth = whole / 2 * math.sqrt(1 - options.span.support[0] ** 2)
     tilt = whole / 2 * math.sin(min(max(map(abs, options.slope.support)), math.pi / 2))
-    top = depth if options.above.support[1] else 0.2 * depth
+    top = depth if options.pulled_above.support[1] else 0.2 * depth
     return -whole / 2 - rim, -depth - tilt - rim, whole / 2 + rim, top + tilt + rim
 
 
 def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledScene:
-    """One video's scene and start: the chain at rest, taut."""
+    """One video's scene and initial state: the chain at rest, taut."""
     n, radius = options.links, factors["radius"]
     corners, kink = _straight(factors, n) if options.ends == 1 else _pulled(factors, n)
-    pins = discs(corners[:: n if options.ends == 2 else n + 1], 1.5 * radius, kind=STATIC, layer=2, collides=False)
+    pins = builder.discs(
+        corners[:: n if options.ends == 2 else n + 1], 1.5 * radius, kind=STATIC, layer=2, collides=False
+    )
     material = {"density": factors["density"], "color": factors["color"], "collides": False}
-    links = capsules_between(corners[:-1], corners[1:], radius, **material)
-    joints = hinge_chain(links, options.ends == 2, motor_torque=factors["friction"])
-    scene, state = assemble(layout(options), [pins, links], factors["gravity"], joints)
+    links = builder.capsules_between(corners[:-1], corners[1:], radius, **material)
+    joints = builder.hinge_chain(links, options.ends == 2, motor_torque=factors["friction"])
+    scene, state = builder.assemble(layout(options), [pins, links], factors["gravity"], joints)
     return SampledScene(scene, state, derived={"kink": kink})
 
 
@@ -120,9 +109,9 @@ def _pulled(factors: dict[str, Array], n: int) -> tuple[Array, Array]:
     """
     apart = factors["span"] * n  # all in lengths of a link
     first, last = jnp.ceil((n - apart) / 2 + 1e-3), jnp.floor((n + apart) / 2 - 1e-3)
-    kink = first + jnp.minimum(jnp.floor(factors["held"] * (last - first + 1)), last - first)
+    kink = first + jnp.minimum(jnp.floor(factors["pulled_joint"] * (last - first + 1)), last - first)
     along = (kink**2 - (n - kink) ** 2 + apart**2) / (2 * apart)
-    aside = jnp.sqrt(jnp.maximum(kink**2 - along**2, 0.0)) * (2 * factors["above"] - 1)
+    aside = jnp.sqrt(jnp.maximum(kink**2 - along**2, 0.0)) * (2 * factors["pulled_above"] - 1)
     number, zero = jnp.arange(n + 1.0), jnp.zeros(())
     one, tip, other = jnp.stack([zero, zero]), jnp.stack([along, aside]), jnp.stack([apart, zero])
     up, down = (number / kink)[:, None], ((number - kink) / (n - kink))[:, None]

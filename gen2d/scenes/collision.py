@@ -11,50 +11,45 @@ import dataclasses
 
 import jax.numpy as jnp
 
-from gen2d.plugin import CLEARANCE, Array, Distribution, Field, Layout, SampledScene, SlotGroup, assemble, discs, option
+from gen2d.plugin import CLEARANCE, Array, Distribution, Field, Layout, SampledScene, SlotGroup, builder, common, option
 
 NEVER = -1.0  # the contact frame of balls that do not approach
 DERIVED = {
     "contact_frame": Field(
-        "float32", "n", "frames", "when the balls touch, from the start, in units of scene.frame; -1: they never do"
+        "float32",
+        "n",
+        "frames",
+        "when the balls touch, from the start, in units of scene.frame_interval; -1: they never do",
     )
 }
 
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """The balls, the view, and when they shall touch."""
+    """The balls, the view and the time of contact."""
 
-    width: float = option(10.0, float, "m", "of the view", above=0, high=1000)
-    height: float = option(10.0, float, "m", "of the view", above=0, high=1000)
-    radius_1: Distribution = option([0.5, 1.5], float, "m", "of the first ball", low=1e-3, draw=True)
-    radius_2: Distribution = option([0.5, 1.5], float, "m", "of the second ball", low=1e-3, draw=True)
-    speed_1: Distribution = option([1.0, 4.0], float, "m/s", "of the first ball, to the right", low=0, draw=True)
-    speed_2: Distribution = option([1.0, 4.0], float, "m/s", "of the second ball, to the left", low=0, draw=True)
-    density: Distribution = option(1.0, float, "kg/m^2", "of each ball", low=1e-6, high=1e6, draw=True, each="balls")
-    elasticity: Distribution = option(1.0, float, "1", "of each ball", low=0, high=1, draw=True, each="balls")
-    friction: Distribution = option(0.0, float, "1", "of each ball", low=0, high=100, draw=True, each="balls")
-    frame: float = option(0.1, float, "s", "between two frames as contact frames count: 1 / video.fps", above=0)
+    width: float = common.size("width of the view", 10.0)
+    height: float = common.size("height of the view", 10.0)
+    radius_1: Distribution = common.radius("the first ball", [0.5, 1.5])
+    radius_2: Distribution = common.radius("the second ball", [0.5, 1.5])
+    speed_1: Distribution = common.speed("the first ball, to the right", [1.0, 4.0])
+    speed_2: Distribution = common.speed("the second ball, to the left", [1.0, 4.0])
+    density: Distribution = common.density("each ball", each="balls")
+    elasticity: Distribution = common.elasticity("each ball", 1.0, each="balls")
+    friction: Distribution = common.friction("each ball", 0.0, each="balls")
+    frame_interval: float = option(0.1, float, "s", "time between frames in contact_frames: 1 / video.fps", above=0)
     contact_frames: tuple[float, ...] = option(
-        [8.0, 24.0], float, "frames", "first and last at which the balls may touch, where there is room",
+        [8.0, 24.0], float, "frames", "first and last frame at which the balls may touch, where there is room",
         parts=2, above=0,
     )  # fmt: skip
-    contact: Distribution = option(
-        [0, 1], float, "1", "of the contact between the first time and the last that are possible",
-        draw=True, low=0, high=1,
-    )  # fmt: skip
-    place: tuple[Distribution, ...] = option(
-        [[0, 1], [0, 1]], float, "1", "of both balls among those possible; 0, 0 is the lowest and leftmost",
-        parts=2, draw=True, low=0, high=1,
-    )  # fmt: skip
-    margin: float = option(0.5, float, "m", "above and below the larger ball, at least", low=0)
-    color: tuple[Distribution, ...] = option(
-        [[90, 254]] * 3, int, "sRGB", "of each ball", parts=3, draw=True, low=0, high=255, each="balls"
-    )
+    contact_fraction: Distribution = common.fraction("time of the contact, from the first that is possible to the last")
+    relative_position: tuple[Distribution, ...] = common.position("both balls")
+    margin: float = option(0.5, float, "m", "smallest distance of the larger ball from the top and bottom", low=0)
+    color: tuple[Distribution, ...] = common.color("each ball", each="balls")
 
 
 def check(options: Options) -> None:
-    """ValueError where the view may not hold both balls, or the window is no window."""
+    """Raises ValueError where the view may not hold both balls, or the first contact frame is after the last."""
     largest = options.radius_1.support[1], options.radius_2.support[1]
     if not 2 * sum(largest) + 2 * CLEARANCE < options.width:
         raise ValueError(
@@ -82,29 +77,29 @@ def layout(options: Options) -> Layout:
 
 
 def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledScene:
-    """One video's scene and start: the balls on one line, as far apart as the time of their contact asks for."""
+    """One video's scene and initial state: balls on one line, whose gap follows from the time of contact."""
     radius = jnp.stack([factors["radius_1"], factors["radius_2"]])
     speed = jnp.stack([factors["speed_1"], factors["speed_2"]])
-    time, gap = _contact(factors["contact"], speed.sum(), options.width - 2 * radius.sum(), options)
+    time, gap = _contact(factors["contact_fraction"], speed.sum(), options.width - 2 * radius.sum(), options)
     spare = options.width - 2 * radius.sum() - gap
-    first = radius[0] + factors["place"][0] * spare
+    first = radius[0] + factors["relative_position"][0] * spare
     nearest = radius.max() + options.margin
-    y = nearest + factors["place"][1] * (options.height - 2 * nearest)
-    balls = discs(
+    y = nearest + factors["relative_position"][1] * (options.height - 2 * nearest)
+    balls = builder.discs(
         jnp.stack([jnp.stack([first, y]), jnp.stack([first + radius.sum() + gap, y])]), radius,
         velocity=jnp.stack([speed, jnp.zeros(2)], 1) * jnp.asarray([[1.0], [-1.0]]),
-        **{name: factors[name] for name in ("density", "elasticity", "friction", "color")},
+        **builder.material(factors),
     )  # fmt: skip
-    derived = {"contact_frame": jnp.where(speed.sum() > 0, time / options.frame, NEVER)}
-    return SampledScene(*assemble(layout(options), [balls], jnp.zeros(2)), derived=derived)
+    derived = {"contact_frame": jnp.where(speed.sum() > 0, time / options.frame_interval, NEVER)}
+    return SampledScene(*builder.assemble(layout(options), [balls], jnp.zeros(2)), derived=derived)
 
 
 def _contact(share: Array, closing: Array, room: Array, options: Options) -> tuple[Array, Array]:
-    """After how many seconds two balls touch, at this share of the window, and how far apart they start, in m.
+    """Time in s until two balls touch, at this fraction of the window, and the gap in m between them at the start.
 
     `closing` is the speed at which they approach, `room` how far apart they may be.
     """
-    first, last = (frame * options.frame for frame in options.contact_frames)
+    first, last = (frame * options.frame_interval for frame in options.contact_frames)
     latest = jnp.minimum(last, room / closing)
     earliest = jnp.where(latest >= first, first, latest / 2)
     time = earliest + share * (latest - earliest)

@@ -4,19 +4,7 @@ import dataclasses
 
 import jax.numpy as jnp
 
-from gen2d.plugin import (
-    STATIC,
-    Array,
-    Distribution,
-    Field,
-    Layout,
-    SampledScene,
-    SlotGroup,
-    assemble,
-    box_walls,
-    discs,
-    option,
-)
+from gen2d.plugin import STATIC, Array, Distribution, Field, Layout, SampledScene, SlotGroup, builder, common, option
 
 DERIVED = {
     "contact_time": Field("float32", "n pairs", "s", "at which the two of a pair meet, if nothing else does before"),
@@ -26,47 +14,44 @@ DERIVED = {
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """What is drawn at random, and the box. Nothing falls: the balls are seen from above.
+    """The pairs of balls and their box, seen from above, so that nothing falls.
 
     A list of two is of the ball that comes from the left and of the one that comes from the right.
     """
 
-    pairs: Distribution = option(
-        [1, 2], int, "pairs", "in a video, each in a lane of its own", low=1, high=32, draw=True
-    )
-    width: float = option(10.0, float, "m", "of the box, inside", above=0, high=1000)
-    height: float = option(8.0, float, "m", "of the box, inside", above=0, high=1000)
-    radius: Distribution = option([0.5, 0.8], float, "m", "of every ball", low=1e-3, draw=True)
-    color: tuple[Distribution, ...] = option(
-        [[90, 254]] * 3, int, "sRGB", "of every ball", parts=3, draw=True, low=0, high=255
-    )
+    pairs: Distribution = common.count("pairs", [1, 2], "number of pairs, each in a lane of its own", high=32)
+    width: float = common.size("width of the box, inside", 10.0)
+    height: float = common.size("height of the box, inside", 8.0)
+    radius: Distribution = common.radius("every ball", [0.5, 0.8])
+    color: tuple[Distribution, ...] = common.color("every ball")
     density: tuple[Distribution, ...] = option(
-        [{"log_uniform": [0.2, 5]}] * 2, float, "kg/m^2", "of each ball", parts=2, low=1e-6, high=1e6,
+        [{"log_uniform": [0.2, 5]}] * 2, float, "kg/m^2", "density of each ball", parts=2, low=1e-6, high=1e6,
         draw=True, each="pairs",
     )  # fmt: skip
     elasticity: tuple[Distribution, ...] = option(
-        [[0.7, 1.0]] * 2, float, "1", "of each ball", parts=2, low=0, high=1, draw=True, each="pairs"
-    )
-    friction: tuple[Distribution, ...] = option(
-        [[0.0, 0.5]] * 2, float, "1", "of each ball", parts=2, low=0, high=100, draw=True, each="pairs"
-    )
-    speed: tuple[Distribution, ...] = option(
-        [[1, 4]] * 2, float, "m/s", "of each ball, towards the other", parts=2, above=0, draw=True, each="pairs"
-    )
-    place: tuple[Distribution, ...] = option(
-        [[0, 1]] * 2, float, "1", "of each ball at the start: 0 at its side of the box, 1 in the middle",
-        parts=2, low=0, high=1, draw=True, each="pairs",
+        [[0.7, 1.0]] * 2, float, "1", "coefficient of restitution of each ball", parts=2, low=0, high=1,
+        draw=True, each="pairs",
     )  # fmt: skip
+    friction: tuple[Distribution, ...] = option(
+        [[0.0, 0.5]] * 2, float, "1", "coefficient of friction of each ball", parts=2, low=0, high=100,
+        draw=True, each="pairs",
+    )  # fmt: skip
+    speed: tuple[Distribution, ...] = option(
+        [[1, 4]] * 2, float, "m/s", "speed of each ball", parts=2, above=0, draw=True, each="pairs"
+    )
+    relative_position: tuple[Distribution, ...] = common.fractions(
+        "position of each ball; 0: at its wall, 1: in the middle", each="pairs"
+    )
     offset: Distribution = option(
-        [-0.5, 0.5], float, "1", "of the right ball's path above the left one's, over twice the radius",
+        [-0.5, 0.5], float, "1", "height of the right ball's path above the left one's, over twice the radius",
         low=-0.99, high=0.99, draw=True, each="pairs",
     )  # fmt: skip
-    wall_elasticity: Distribution = option(1.0, float, "1", "of the box", low=0, high=1, draw=True)
-    wall_friction: Distribution = option(0.0, float, "1", "of the box", low=0, high=100, draw=True)
+    wall_elasticity: Distribution = common.elasticity("the box", 1.0)
+    wall_friction: Distribution = common.friction("the box", 0.0)
 
 
 def check(options: Options) -> None:
-    """ValueError where the pairs do not fit beside each other, or two balls not behind one another."""
+    """Raises ValueError where the pairs do not fit beside each other, or two balls not behind one another."""
     largest, pairs = options.radius.support[1], options.pairs.support[1]
     lane = 2 * largest * (1 + max(map(abs, options.offset.support)))
     if not pairs * lane < options.height:
@@ -85,11 +70,13 @@ def layout(options: Options) -> Layout:
 
 
 def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledScene:
-    """One video's scene and start: every pair in its lane, one from the left and one from the right."""
+    """One video's scene and initial state: every pair in its lane, one from the left and one from the right."""
     radius, density, pairs = factors["radius"], factors["density"], factors["pairs"]
     number, sides = jnp.arange(len(density)), jnp.asarray([1.0, -1.0])
     present = number < pairs
-    inwards = radius + factors["place"] * (options.width / 2 - 2 * radius)  # m, from the ball's side of the box
+    inwards = radius + factors["relative_position"] * (
+        options.width / 2 - 2 * radius
+    )  # m, from the ball's side of the box
     x = jnp.where(sides > 0, inwards, options.width - inwards)
     aside = factors["offset"] * 2 * radius
     y = ((number + 0.5) / pairs * options.height)[:, None] - sides * aside[:, None] / 2
@@ -99,17 +86,14 @@ def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledSc
         """Of the balls, from what is of pairs."""
         return values.reshape(-1, *values.shape[2:])
 
-    material = {name: each(factors[name]) for name in ("density", "elasticity", "friction")}
-    balls = discs(
-        each(jnp.stack([x, y], axis=-1)), radius, jnp.repeat(present, 2), velocity=each(velocity),
-        color=factors["color"], **material,
-    )  # fmt: skip
-    walls = box_walls(
-        options.width, options.height, elasticity=factors["wall_elasticity"], friction=factors["wall_friction"]
+    own = {name: each(factors[name]) for name in ("density", "elasticity", "friction")} | {"color": factors["color"]}
+    balls = builder.discs(
+        each(jnp.stack([x, y], axis=-1)), radius, jnp.repeat(present, 2), velocity=each(velocity), **own
     )
+    walls = builder.box_walls(options.width, options.height, **builder.material(factors, "wall"))
     closing, way = factors["speed"].sum(-1), x[:, 1] - x[:, 0] - jnp.sqrt(4 * radius**2 - aside**2)
     derived = {
         "contact_time": jnp.where(present, way / jnp.where(present, closing, 1.0), 0.0),
         "mass_ratio": jnp.where(present, density[:, 0] / jnp.where(present, density[:, 1], 1.0), 0.0),
     }
-    return SampledScene(*assemble(layout(options), [balls, walls], jnp.zeros(2)), derived=derived)
+    return SampledScene(*builder.assemble(layout(options), [balls, walls], jnp.zeros(2)), derived=derived)

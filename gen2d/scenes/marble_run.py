@@ -5,61 +5,38 @@ import math
 
 import jax.numpy as jnp
 
-from gen2d.plugin import (
-    STATIC,
-    Array,
-    Distribution,
-    Layout,
-    SampledScene,
-    SlotGroup,
-    assemble,
-    box_walls,
-    discs,
-    option,
-    segments,
-)
+from gen2d.plugin import STATIC, Array, Distribution, Layout, SampledScene, SlotGroup, builder, common, option
 
 CLEARANCE = 0.02  # m: how much more room than it needs the ball has between two ramps, at least
 
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """What is drawn at random, and the box."""
+    """The ramps, the ball and their box."""
 
-    ramps: Distribution = option([3, 4], int, "ramps", "in a video", low=1, high=16, draw=True)
-    width: float = option(4.0, float, "m", "of the box, inside", above=0, high=1000)
-    height: float = option(6.5, float, "m", "of the box, inside", above=0, high=1000)
+    ramps: Distribution = common.count("ramps", [3, 4], high=16)
+    width: float = common.size("width of the box, inside", 4.0)
+    height: float = common.size("height of the box, inside", 6.5)
     slope: Distribution = option(
-        [0.16, 0.3], float, "rad", "of each ramp, down from the side that it begins at", above=0, high=1.5,
+        [0.16, 0.3], float, "rad", "slope of each ramp, down from the wall that it begins at", above=0, high=1.5,
         draw=True, each="ramps",
     )  # fmt: skip
-    length: Distribution = option(
-        [0.6, 0.78], float, "1", "of each ramp, across, over the width", low=0, high=1, draw=True, each="ramps"
-    )
-    radius: Distribution = option([0.16, 0.24], float, "m", "of the ball", low=1e-3, draw=True)
-    place: Distribution = option(
-        [0.0, 1.0], float, "1", "of the ball at the start: 0 at the side, 1 over the middle of the first ramp",
-        low=0, high=1, draw=True,
-    )  # fmt: skip
-    drop: Distribution = option([0.0, 0.3], float, "m", "of the ball, down to the first ramp", low=0, draw=True)
-    density: Distribution = option(1.0, float, "kg/m^2", "of the ball", low=1e-6, high=1e6, draw=True)
-    elasticity: Distribution = option([0.2, 0.6], float, "1", "of the ball", low=0, high=1, draw=True)
-    friction: Distribution = option([0.0, 0.8], float, "1", "of the ball", low=0, high=100, draw=True)
-    ramp_elasticity: Distribution = option(0.7, float, "1", "of ramps and box", low=0, high=1, draw=True)
-    ramp_friction: Distribution = option(0.8, float, "1", "of ramps and box", low=0, high=100, draw=True)
-    gravity: tuple[Distribution, ...] = option(
-        [0, -9.8], float, "m/s^2", "x right, y up; the same for a whole video", parts=2, draw=True
-    )
-    color: tuple[Distribution, ...] = option(
-        [[90, 254]] * 3, int, "sRGB", "of the ball", parts=3, draw=True, low=0, high=255
-    )
-    ramp_color: tuple[Distribution, ...] = option(
-        [170] * 3, int, "sRGB", "of ramps", parts=3, draw=True, low=0, high=255
-    )
+    length: Distribution = common.fraction("horizontal length of each ramp, over the width", [0.6, 0.78], each="ramps")
+    radius: Distribution = common.radius("the ball", [0.16, 0.24])
+    relative_position: Distribution = common.fraction("position; 0: at the wall, 1: over the first ramp's middle")
+    drop_height: Distribution = common.length("height of the ball above the first ramp", [0.0, 0.3])
+    density: Distribution = common.density("the ball")
+    elasticity: Distribution = common.elasticity("the ball", [0.2, 0.6])
+    friction: Distribution = common.friction("the ball", [0.0, 0.8])
+    ramp_elasticity: Distribution = common.elasticity("ramps and box", 0.7)
+    ramp_friction: Distribution = common.friction("ramps and box", 0.8)
+    gravity: tuple[Distribution, ...] = common.gravity()
+    color: tuple[Distribution, ...] = common.color("the ball")
+    ramp_color: tuple[Distribution, ...] = common.color("ramps", [170] * 3)
 
 
 def check(options: Options) -> None:
-    """ValueError where the ball could miss a ramp, or not pass between two."""
+    """Raises ValueError where the ball could miss a ramp, or not pass between two."""
     largest, (short, long) = options.radius.support[1], options.length.support
     ramps, steep = options.ramps.support[1], options.slope.support[1]
     if not short > 0.5:
@@ -79,9 +56,9 @@ def check(options: Options) -> None:
 
 
 def headroom(options: Options) -> float:
-    """What the ball needs above the first ramp's upper end, m."""
+    """Height that the ball needs above the first ramp's upper end, m."""
     largest = options.radius.support[1]
-    return largest * (1 + 1 / math.cos(options.slope.support[1])) + options.drop.support[1]
+    return largest * (1 + 1 / math.cos(options.slope.support[1])) + options.drop_height.support[1]
 
 
 def layout(options: Options) -> Layout:
@@ -95,7 +72,7 @@ def layout(options: Options) -> Layout:
 
 
 def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledScene:
-    """One video's scene and start: ramps as far below each other as the height allows, and the ball over the first.
+    """One video's scene and initial state: ramps as far apart as the height allows, and the ball over the first.
 
     The first begins at the left wall, the next at the right one, and so on.
     """
@@ -112,14 +89,13 @@ def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledSc
     begins, ends = (jnp.where(left, x, options.width - x) for x in (jnp.zeros_like(across), across))
 
     radius, slope = factors["radius"], factors["slope"][0]
-    x = radius + 1e-3 + factors["place"] * (across[0] / 2 - radius)
-    y = top - x * rise[0] + radius / jnp.cos(slope) + factors["drop"]
-    material = {name: factors[name] for name in ("density", "elasticity", "friction", "color")}
+    x = radius + 1e-3 + factors["relative_position"] * (across[0] / 2 - radius)
+    y = top - x * rise[0] + radius / jnp.cos(slope) + factors["drop_height"]
     board = {"elasticity": factors["ramp_elasticity"], "friction": factors["ramp_friction"]}
     starts, stops = (jnp.stack(point, axis=-1) for point in ((begins, upper), (ends, upper - falls)))
     parts = [
-        discs(jnp.stack([x, y])[None], radius, **material),
-        segments(starts, stops, present, color=factors["ramp_color"], **board),
-        box_walls(options.width, options.height, **board),
+        builder.discs(jnp.stack([x, y])[None], radius, **builder.material(factors)),
+        builder.segments(starts, stops, present, color=factors["ramp_color"], **board),
+        builder.box_walls(options.width, options.height, **board),
     ]
-    return SampledScene(*assemble(layout(options), parts, factors["gravity"]))
+    return SampledScene(*builder.assemble(layout(options), parts, factors["gravity"]))

@@ -8,41 +8,37 @@ import dataclasses
 
 import jax.numpy as jnp
 
-from gen2d.plugin import Array, Distribution, Layout, SampledScene, SlotGroup, assemble, discs, option, start_position
+from gen2d.plugin import Array, Distribution, Layout, SampledScene, SlotGroup, builder, common, option, start_position
 
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """The ball, how it is thrown, and the view."""
+    """The ball, its throw and the view."""
 
-    width: float = option(10.0, float, "m", "of the view", above=0, high=1000)
-    height: float = option(10.0, float, "m", "of the view", above=0, high=1000)
-    radius: Distribution = option([0.7, 1.4], float, "m", "of the ball", low=1e-3, draw=True)
-    density: Distribution = option(1.0, float, "kg/m^2", "of the ball", low=1e-6, high=1e6, draw=True)
-    speed: Distribution = option([1.0, 4.0], float, "m/s", "at which it is thrown", low=0, draw=True)
-    angle: Distribution = option(0.0, float, "rad", "at which it is thrown; 0: to the right, above: upwards", draw=True)
-    place: Distribution = option(
-        [0, 1], float, "1", "of the start among those possible, from left to right", draw=True, low=0, high=1
+    width: float = common.size("width of the view", 10.0)
+    height: float = common.size("height of the view", 10.0)
+    radius: Distribution = common.radius("the ball", [0.7, 1.4])
+    density: Distribution = common.density("the ball")
+    speed: Distribution = common.speed("the throw", [1.0, 4.0])
+    angle: Distribution = common.angle("angle of the throw, counter-clockwise; 0: to the right", 0.0)
+    relative_position: Distribution = common.fraction("position of the start among those possible, from left to right")
+    top_distance: Distribution = common.length("distance of the ball's start from the upper side", [0.5, 1.5])
+    duration: float = option(2.4, float, "s", "time for which the ball passes neither side, where there is room", low=0)
+    entry_distance: float = option(
+        0.5, float, "m", "largest distance of the start from the side, if there is no such room", low=0
     )
-    drop: Distribution = option(
-        [0.5, 1.5], float, "m", "from the upper side of the view to the top of the ball at the start", low=0, draw=True
-    )
-    seconds: float = option(2.4, float, "s", "for which it passes neither side, where there is room for that", low=0)
-    entry: float = option(0.5, float, "m", "from the side that it comes from, at most, where there is not", low=0)
-    gravity: tuple[Distribution, ...] = option([0, -2.5], float, "m/s^2", "x right, y up", parts=2, draw=True)
-    color: tuple[Distribution, ...] = option(
-        [[90, 254]] * 3, int, "sRGB", "of the ball", parts=3, draw=True, low=0, high=255
-    )
+    gravity: tuple[Distribution, ...] = common.gravity((0, -2.5))
+    color: tuple[Distribution, ...] = common.color("the ball")
 
 
 def check(options: Options) -> None:
-    """ValueError where the ball may start outside of the view."""
-    largest, drop = options.radius.support[1], options.drop.support[1]
+    """Raises ValueError where the ball may start outside of the view."""
+    largest, drop = options.radius.support[1], options.top_distance.support[1]
     if not 2 * largest < options.width:
         raise ValueError(f"radius may be {largest:g} m, but a ball must fit a view {options.width:g} m wide")
     if not 2 * largest + drop <= options.height:
         raise ValueError(
-            f"drop may be {drop:g} m, but a ball with a radius of {largest:g} m must start in a view "
+            f"top_distance may be {drop:g} m, but a ball with a radius of {largest:g} m must start in a view "
             f"{options.height:g} m high"
         )
 
@@ -53,13 +49,17 @@ def layout(options: Options) -> Layout:
 
 
 def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledScene:
-    """One video's scene and start: the ball where it stays in view long enough, if there is such a place."""
+    """One video's scene and initial state: the ball where it stays in view long enough, if such a position exists."""
     radius, angle = factors["radius"], factors["angle"]
     velocity = factors["speed"] * jnp.stack([jnp.cos(angle), jnp.sin(angle)])
     # Its way to the side is that of a ball without gravity, which is exact where gravity points down.
-    x = start_position(factors["place"], radius, options.width - radius, options.seconds * velocity[0], options.entry)
-    start = jnp.stack([x, options.height - radius - factors["drop"]])
-    ball = discs(
-        start[None], radius, density=factors["density"], velocity=velocity, elasticity=1.0, color=factors["color"]
+    x = start_position(
+        factors["relative_position"],
+        radius,
+        options.width - radius,
+        options.duration * velocity[0],
+        options.entry_distance,
     )
-    return SampledScene(*assemble(layout(options), [ball], factors["gravity"]))
+    start = jnp.stack([x, options.height - radius - factors["top_distance"]])
+    ball = builder.discs(start[None], radius, velocity=velocity, elasticity=1.0, **builder.material(factors))
+    return SampledScene(*builder.assemble(layout(options), [ball], factors["gravity"]))

@@ -6,65 +6,40 @@ import math
 import jax
 import jax.numpy as jnp
 
-from gen2d.plugin import (
-    STATIC,
-    Array,
-    Distribution,
-    Layout,
-    SampledScene,
-    SlotGroup,
-    assemble,
-    box_walls,
-    boxes,
-    capsules,
-    discs,
-    option,
-    place,
-)
+from gen2d.plugin import STATIC, Array, Distribution, Layout, SampledScene, SlotGroup, builder, common, option, place
 
-COLOR = [[90, 254]] * 3
 TURN = [-math.pi, math.pi]
 
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """What is drawn at random, and the bin."""
+    """The objects and the bin."""
 
-    discs: Distribution = option([2, 8], int, "discs", "in a video", low=1, high=64, draw=True)
-    boxes: Distribution = option([2, 6], int, "boxes", "in a video", low=1, high=64, draw=True)
-    capsules: Distribution = option([2, 6], int, "capsules", "in a video", low=1, high=64, draw=True)
-    width: float = option(6.0, float, "m", "of the bin, inside", above=0, high=1000)
-    height: float = option(9.0, float, "m", "of the bin, inside; objects begin at all heights", above=0, high=1000)
-    disc_radius: Distribution = option([0.25, 0.5], float, "m", "of each disc", low=1e-3, draw=True, each="discs")
+    discs: Distribution = common.count("discs", [2, 8])
+    boxes: Distribution = common.count("boxes", [2, 6])
+    capsules: Distribution = common.count("capsules", [2, 6])
+    width: float = common.size("width of the bin, inside", 6.0)
+    height: float = common.size("height of the bin, inside; objects begin at all heights", 9.0)
+    disc_radius: Distribution = common.radius("each disc", [0.25, 0.5], each="discs")
     box_size: tuple[Distribution, ...] = option(
         [[0.4, 0.9]] * 2, float, "m", "width and height of each box", parts=2, low=1e-3, draw=True, each="boxes"
     )
-    capsule_radius: Distribution = option(
-        [0.15, 0.3], float, "m", "of each capsule", low=1e-3, draw=True, each="capsules"
-    )
-    capsule_half_length: Distribution = option(
-        [0.15, 0.4], float, "m", "of each capsule, between the centres of its ends", low=1e-3,
-        draw=True, each="capsules",
+    capsule_radius: Distribution = common.radius("each capsule", [0.15, 0.3], each="capsules")
+    capsule_half_length: Distribution = common.length(
+        "half the distance between the ends' centres", [0.15, 0.4],
+        each="capsules", low=1e-3,
     )  # fmt: skip
-    box_angle: Distribution = option(TURN, float, "rad", "of each box at the start", draw=True, each="boxes")
-    capsule_angle: Distribution = option(TURN, float, "rad", "of each capsule at the start", draw=True, each="capsules")
-    density: Distribution = option(1.0, float, "kg/m^2", "of every object", low=1e-6, high=1e6, draw=True)
-    elasticity: Distribution = option([0.0, 0.5], float, "1", "of every object", low=0, high=1, draw=True)
-    friction: Distribution = option([0.2, 0.8], float, "1", "of every object", low=0, high=100, draw=True)
-    bin_elasticity: Distribution = option(0.5, float, "1", "of the bin", low=0, high=1, draw=True)
-    bin_friction: Distribution = option(0.6, float, "1", "of the bin", low=0, high=100, draw=True)
-    gravity: tuple[Distribution, ...] = option(
-        [0, -9.8], float, "m/s^2", "x right, y up; the same for a whole video", parts=2, draw=True
-    )
-    disc_color: tuple[Distribution, ...] = option(
-        COLOR, int, "sRGB", "of each disc", parts=3, draw=True, low=0, high=255, each="discs"
-    )
-    box_color: tuple[Distribution, ...] = option(
-        COLOR, int, "sRGB", "of each box", parts=3, draw=True, low=0, high=255, each="boxes"
-    )
-    capsule_color: tuple[Distribution, ...] = option(
-        COLOR, int, "sRGB", "of each capsule", parts=3, draw=True, low=0, high=255, each="capsules"
-    )
+    box_angle: Distribution = common.angle("angle of each box at the start", TURN, each="boxes")
+    capsule_angle: Distribution = common.angle("angle of each capsule at the start", TURN, each="capsules")
+    density: Distribution = common.density("every object")
+    elasticity: Distribution = common.elasticity("every object", [0.0, 0.5])
+    friction: Distribution = common.friction("every object", [0.2, 0.8])
+    bin_elasticity: Distribution = common.elasticity("the bin", 0.5)
+    bin_friction: Distribution = common.friction("the bin", 0.6)
+    gravity: tuple[Distribution, ...] = common.gravity()
+    disc_color: tuple[Distribution, ...] = common.color("each disc", each="discs")
+    box_color: tuple[Distribution, ...] = common.color("each box", each="boxes")
+    capsule_color: tuple[Distribution, ...] = common.color("each capsule", each="capsules")
 
 
 CROWDED_BY = ("discs", "boxes", "capsules", "disc_radius", "box_size", "capsule_half_length", "width", "height")
@@ -77,7 +52,7 @@ def reach(options: Options) -> float:
 
 
 def check(options: Options) -> None:
-    """ValueError where the bin cannot hold an object."""
+    """Raises ValueError where the bin cannot hold an object."""
     if not 2 * reach(options) < min(options.width, options.height):
         raise ValueError(
             f"disc_radius, box_size and capsule_half_length allow an object {2 * reach(options):g} m across, but it "
@@ -98,25 +73,21 @@ def layout(options: Options) -> Layout:
 
 
 def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledScene:
-    """One video's scene and start: everything at rest in the air, so far apart that it may be turned as it likes."""
+    """One video's scene and initial state: everything at rest in the air, so far apart that it may have any angle."""
     radius, size, half = factors["disc_radius"], factors["box_size"], factors["capsule_half_length"]
     kinds = ("discs", "boxes", "capsules")
     around = [radius, jnp.linalg.norm(size, axis=-1) / 2, half + factors["capsule_radius"]]
     there = [jnp.arange(len(r)) < factors[kind] for r, kind in zip(around, kinds, strict=True)]
-    box = jnp.asarray([options.width, options.height])
-    places, rejected, fits = place(
-        jax.random.fold_in(key, 0), jnp.concatenate(around), jnp.concatenate(there), jnp.zeros(2), box
-    )
+    radii, present, room = jnp.concatenate(around), jnp.concatenate(there), jnp.asarray([options.width, options.height])
+    places, rejected, fits = place(jax.random.fold_in(key, 0), radii, present, jnp.zeros(2), room)
     at = jnp.split(places, [len(there[0]), len(there[0]) + len(there[1])])
-    material = {name: factors[name] for name in ("density", "elasticity", "friction")}
-    walls = {"elasticity": factors["bin_elasticity"], "friction": factors["bin_friction"]}
+    disc, box, capsule = (
+        builder.material(factors) | builder.material(factors, of) for of in ("disc", "box", "capsule")
+    )
     parts = [
-        discs(at[0], radius, there[0], color=factors["disc_color"], **material),
-        boxes(at[1], factors["box_angle"], size[:, 0], size[:, 1], there[1], color=factors["box_color"], **material),
-        capsules(
-            at[2], factors["capsule_angle"], half, factors["capsule_radius"], there[2],
-            color=factors["capsule_color"], **material,
-        ),
-        box_walls(options.width, options.height, **walls),
-    ]  # fmt: skip
-    return SampledScene(*assemble(layout(options), parts, factors["gravity"]), rejected, fits)
+        builder.discs(at[0], radius, there[0], **disc),
+        builder.boxes(at[1], factors["box_angle"], size[:, 0], size[:, 1], there[1], **box),
+        builder.capsules(at[2], factors["capsule_angle"], half, factors["capsule_radius"], there[2], **capsule),
+        builder.box_walls(options.width, options.height, **builder.material(factors, "bin")),
+    ]
+    return SampledScene(*builder.assemble(layout(options), parts, factors["gravity"]), rejected, fits)

@@ -4,21 +4,8 @@ import dataclasses
 
 import jax.numpy as jnp
 
-from gen2d.plugin import (
-    STATIC,
-    Array,
-    Distribution,
-    Field,
-    Layout,
-    SampledScene,
-    SlotGroup,
-    assemble,
-    boxes,
-    option,
-    segments,
-)
+from gen2d.plugin import STATIC, Array, Distribution, Field, Layout, SampledScene, SlotGroup, builder, common, option
 
-FAR = 4.0  # the floor's length, over the view's width
 AROUND = 0.75  # of the tower's height: how much is seen on either side, for what falls
 
 DERIVED = {
@@ -30,25 +17,21 @@ DERIVED = {
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """What is drawn at random."""
+    """The blocks of the tower."""
 
-    blocks: Distribution = option([3, 6], int, "blocks", "in a tower", low=1, high=32, draw=True)
-    width: Distribution = option([1.2, 2.0], float, "m", "of each block", low=1e-2, high=100, draw=True, each="blocks")
-    height: Distribution = option([0.6, 1.0], float, "m", "of each block", low=1e-2, high=100, draw=True, each="blocks")
+    blocks: Distribution = common.count("blocks", [3, 6], "number of blocks in the tower", high=32)
+    width: Distribution = common.length("width of each block", [1.2, 2.0], each="blocks", low=1e-2, high=100)
+    height: Distribution = common.length("height of each block", [0.6, 1.0], each="blocks", low=1e-2, high=100)
     offset: Distribution = option(
-        [-0.7, 0.7], float, "1", "of each block from the middle of the one below, over half of that one's width",
+        [-0.7, 0.7], float, "1", "offset of each block from the one below, over half of the latter's width",
         low=-1, high=1, draw=True, each="blocks",
     )  # fmt: skip
-    density: Distribution = option(
-        {"log_uniform": [0.5, 2.0]}, float, "kg/m^2", "of each block", low=1e-6, high=1e6, draw=True, each="blocks"
-    )
-    elasticity: Distribution = option(0.0, float, "1", "of each block", low=0, high=1, draw=True, each="blocks")
-    friction: Distribution = option([0.7, 0.9], float, "1", "of each block", low=0, high=100, draw=True, each="blocks")
-    floor_friction: Distribution = option(0.8, float, "1", "of the floor", low=0, high=100, draw=True)
-    gravity: tuple[Distribution, ...] = option([0, -9.8], float, "m/s^2", "x right, y up", parts=2, draw=True)
-    color: tuple[Distribution, ...] = option(
-        [[60, 254]] * 3, int, "sRGB", "of each block", parts=3, draw=True, low=0, high=255, each="blocks"
-    )
+    density: Distribution = common.density("each block", {"log_uniform": [0.5, 2.0]}, each="blocks")
+    elasticity: Distribution = common.elasticity("each block", 0.0, each="blocks")
+    friction: Distribution = common.friction("each block", [0.7, 0.9], each="blocks")
+    floor_friction: Distribution = common.friction("the floor", 0.8)
+    gravity: tuple[Distribution, ...] = common.gravity()
+    color: tuple[Distribution, ...] = common.color("each block", [[60, 254]] * 3, each="blocks")
 
 
 def layout(options: Options) -> Layout:
@@ -61,7 +44,7 @@ def layout(options: Options) -> Layout:
 
 
 def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledScene:
-    """One video's scene and start: the tower at rest in the middle of the view."""
+    """One video's scene and initial state: the tower at rest in the middle of the view."""
     width, height = factors["width"], factors["height"]
     present = jnp.arange(len(width)) < factors["blocks"]
     steps = jnp.concatenate([jnp.zeros(1), factors["offset"][1:] * width[:-1] / 2])
@@ -69,17 +52,15 @@ def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledSc
     left, right = (jnp.where(present, x + s * width / 2, s * -jnp.inf) for s in (-1, 1))
     x = x - (left.min() + right.max()) / 2
     layers = layout(options)
-    reach = FAR * layers.bounds[2]
-    floor = segments([(-reach, 0.0)], [(reach, 0.0)], friction=factors["floor_friction"])
-    material = {name: factors[name] for name in ("density", "elasticity", "friction", "color")}
-    blocks = boxes(jnp.stack([x, y], -1), 0.0, width, height, present, **material)
+    ground = builder.floor(layers, **builder.material(factors, "floor"))
+    blocks = builder.boxes(jnp.stack([x, y], -1), 0.0, width, height, present, **builder.material(factors))
     margin = _margin(x, width, blocks.objects["mass"], present)
     derived = {"stable": (margin > 0).astype(jnp.float32), "margin": margin}
-    return SampledScene(*assemble(layers, [floor, blocks], factors["gravity"]), derived=derived)
+    return SampledScene(*builder.assemble(layers, [ground, blocks], factors["gravity"]), derived=derived)
 
 
 def _margin(x: Array, width: Array, mass: Array, present: Array) -> Array:
-    """The least distance in m of the centre of mass of all above a joint from the edges of what carries it.
+    """Smallest distance in m, over all joints, of the centre of mass above the joint from the edge of its support.
 
     A stack in which each block lies on one other stands if, and only if, it is above 0 at every joint (the floor's
     too), as long as gravity is upright.

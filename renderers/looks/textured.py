@@ -14,10 +14,10 @@ class Options(PlainOptions):
 
     background_kind: str = option("noise", str, "", "what is behind everything", choices=("plain", "gradient", "noise"))
     background_to: tuple = option([64, 64, 84], int, "sRGB", "where it ends", parts=3, low=0, high=255)
-    spots: float = option(
-        0.8, float, "1", "how far spots go to black or white, whichever differs more from the background", low=0, high=1
+    contrast: float = option(
+        0.8, float, "1", "contrast of the spots; 1: black or white, the farther from the background", low=0, high=1
     )
-    cell: float = option(0.6, float, "1", "size of a spot, over the largest object's reach", above=0)
+    cell_size: float = option(0.6, float, "1", "size of a spot, over the largest object's reach", above=0)
 
 
 def paint(scene: Scene, layout: Layout, options: Options, key: Array) -> Paint:
@@ -26,7 +26,7 @@ def paint(scene: Scene, layout: Layout, options: Options, key: Array) -> Paint:
     far = contrasting(mean_color(begun.background))
     texture = Texture(
         seed=jax.random.bits(jax.random.fold_in(key, 2), (layout.slots,), jnp.uint32),
-        cell=jnp.full(layout.slots, options.cell * layout.reach),
-        color=begun.color + options.spots * (far - begun.color),
+        cell=jnp.full(layout.slots, options.cell_size * layout.reach),
+        color=begun.color + options.contrast * (far - begun.color),
     )
     return begun._replace(texture=texture)

@@ -141,6 +141,17 @@ def test_every_option_says_its_unit_and_meaning():
             assert field.metadata["option"].allowed
 
 
+@pytest.mark.parametrize("quantity", ["density", "elasticity", "color", "gravity"])
+def test_a_quantity_has_one_unit_and_range_in_all_families(quantity):
+    options = [
+        field.metadata["option"]
+        for family in plugins.names("scene")
+        for field in dataclasses.fields(load_config(f"{family}.yaml").scene.module.Options)
+        if field.name == quantity or field.name.endswith(f"_{quantity}")
+    ]
+    assert len({(option.unit, option.low, option.high, option.draw) for option in options}) == 1
+
+
 def test_a_family_of_ones_own_is_a_file(tmp_path):
     own = tmp_path / "own.py"
     own.write_text("from gen2d.scenes.bouncing import *\nfrom gen2d.scenes.bouncing import Options\n")

@@ -126,7 +126,7 @@ def when(angle: np.ndarray, time: np.ndarray) -> np.ndarray:
 
 
 def test_a_seesaw_tips_to_the_side_of_the_larger_torque():
-    made = film("seesaw", 32, 1.5, 20, "scene.drop=0", "scene.plank_density=0.2", energy=True)
+    made = film("seesaw", 32, 1.5, 20, "scene.drop_height=0", "scene.plank_density=0.2", energy=True)
     torque, angle = made.factors["torque"], made.states.angle[:, -1, slots(made, 2)][:, 0]
     clear = np.abs(torque) > 2.0
     assert clear.sum() > 12

@@ -132,7 +132,7 @@ def test_exactly_n_videos_none_alike_over_shards_seeds_and_splits(family, tmp_pa
 
 BROKEN = {
     "uniform_motion": ("radius", [4, 5], "must fit a view of 10 x 10 m"),
-    "parabola": ("drop", 9, "must start in a view 10 m high"),
+    "parabola": ("top_distance", 9, "must start in a view 10 m high"),
     "collision": ("contact_frames", [24, 8], "must have the first frame first"),
     "billiards": ("rows", [3, 12], "must fit a table of 10 x 5 m"),
     "ramp": ("slope", [0.2, 1.0], "must fit a view 6 m high"),
@@ -268,7 +268,7 @@ def test_balls_part_as_they_must_down_to_a_centimetre_a_second():
 def test_contact_frames_count_the_frames_of_the_video():
     for name in ("collision", "phyworld_collision"):
         config = load_config(f"{name}.yaml")
-        assert config.scene.options.frame * config.video.fps == 1
+        assert config.scene.options.frame_interval * config.video.fps == 1
 
 
 # Billiards ----------------------------------------------------------------------------------------------------------
@@ -286,7 +286,7 @@ def test_rack_is_whole_and_its_balls_are_a_gap_apart():
     off = made.start.velocity[:, 0] / made.factors["speed"][:, None]
     way = x[:, 1] - x[:, 0]
     sine = (way[:, 0] * off[:, 1] - way[:, 1] * off[:, 0]) / np.linalg.norm(way, axis=-1)
-    holds("aim, rad", np.arcsin(sine) - made.factors["aim"], 1e-5)
+    holds("aim_angle, rad", np.arcsin(sine) - made.factors["aim_angle"], 1e-5)
 
 
 def test_break_keeps_momentum_until_a_cushion_is_hit_and_never_gains_energy():
@@ -319,7 +319,7 @@ def downhill(made: Played) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     slope, half = made.factors["slope"], made.scene.objects.half_length[:, 0]
     down = np.stack([np.cos(slope), -np.sin(slope)], -1)[:, None]
     way = ((made.states.position[:, :, 0] - made.start.position[:, None, 0]) * down).sum(-1)
-    end = (1 - made.factors["place"]) * (made.factors["length"] - 2 * (half + made.factors["radius"]))
+    end = (1 - made.factors["relative_position"]) * (made.factors["length"] - 2 * (half + made.factors["radius"]))
     return way, (made.states.velocity[:, :, 0] * down).sum(-1), way < end[:, None]
 
 

@@ -26,10 +26,10 @@ LAWS = {
     "hidden_mass": ["storage.batch_size=256"],
 }
 WRONG = {
-    "galton": ["radius=0.35", "radius={normal: [0.2, 0.1]}", "apart=0.3", "jitter=[-3, 0]"],
+    "galton": ["radius=0.35", "radius={normal: [0.2, 0.1]}", "ball_spacing=0.3", "jitter=[-3, 0]"],
     "funnel": ["gap=[1, 9]", "radius=5", "angle=[0.5, 1.2]"],
     "marble_run": ["length=[0.4, 0.7]", "length=[0.6, 0.95]", "slope=[0.1, 0.5]", "ramps=9"],
-    "cradle": ["moving=[1, 3]", "radius=3", "width=8"],
+    "cradle": ["moving_balls=[1, 3]", "radius=3", "width=8"],
     "pile": ["disc_radius=4", "box_size=[5, 7]"],
     "occluder": ["screen_width=[1, 3]", "screen_height=3", "screen_width=8", "screen_height=9"],
     "hidden_mass": ["radius=2", "pairs=5", "width=3"],
@@ -125,13 +125,13 @@ def test_funnel_lets_pass_what_fits_through_its_gap_and_gains_no_energy():
     ours = runs("funnel")[0]
     there, gap = columns["objects/present"][:, ours] > 0, columns["factors/gap"]
     x, y = np.moveaxis(columns["states/position"][:, :, ours], -1, 0)
-    fell = (y[:, :-1] >= options.neck) & (y[:, 1:] < options.neck) & there[:, None]
+    fell = (y[:, :-1] >= options.neck_height) & (y[:, 1:] < options.neck_height) & there[:, None]
     passed = fell.any(1)
-    share = np.where(fell, (options.neck - y[:, :-1]) / np.where(fell, y[:, 1:] - y[:, :-1], 1), 0)
+    share = np.where(fell, (options.neck_height - y[:, :-1]) / np.where(fell, y[:, 1:] - y[:, :-1], 1), 0)
     at = x[:, :-1] + share * np.diff(x, axis=1)
     room = np.abs(at - options.width / 2) - gap[:, None, None] / 2
     holds("funnel: beyond the gap's sides, m", np.maximum(0, room[fell]), 0)
-    assert_array_equal(passed, (y.min(1) < options.neck) & there)
+    assert_array_equal(passed, (y.min(1) < options.neck_height) & there)
     assert not passed[gap < 2 * options.radius.support[0]].any()
     assert passed[gap > 2].sum() > 0.5 * there[gap > 2].sum()
     energy = np.sum([columns[f"energy/{part}"] for part in ("kinetic", "rotational", "potential")], axis=0)
@@ -159,7 +159,7 @@ def test_cradle_hands_its_speed_to_as_many_as_came():
     columns = made("cradle")
     v, there = columns["states/velocity"] / columns["factors/speed"][:, None, None, None], columns["objects/present"]
     number, balls = np.arange(v.shape[2]), columns["factors/balls"][:, None]
-    moving, elastic = columns["factors/moving"][:, None], columns["factors/elasticity"] == 1
+    moving, elastic = columns["factors/moving_balls"][:, None], columns["factors/elasticity"] == 1
     leave = (number >= balls - moving) & (number < balls)
     holds("cradle: speeds at the end, of the first", (v[:, -1, :, 0] - leave)[elastic], 1e-3)
     holds("cradle: sideways, of the first", v[..., 1], 1e-6)

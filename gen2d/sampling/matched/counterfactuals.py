@@ -1,4 +1,4 @@
-"""Counterfactual members: another factor."""
+"""Counterfactual members: one factor has another value."""
 
 from collections.abc import Callable
 from typing import Any
@@ -13,29 +13,32 @@ from gen2d.records.keys import key_for
 from gen2d.records.scene import Objects, State
 from gen2d.sampling.matched.sets import SetMember, along_slots
 
-# ---- Counterfactuals: other factors
 
-
-def changed_factors(member: SetMember, config: Any, found: dict[str, Array], draw: Callable) -> dict[str, Array]:
-    """The factors, with the one that the set is about drawn anew or scaled; `draw(key)` draws all."""
-    specs, matched, again, made = drawn_options(config.scene.module), config.matched, draw(member.own_key), dict(found)
-    for place, name in enumerate(matched.change):
+def changed_factors(member: SetMember, config: Any, factors: dict[str, Array], draw: Callable) -> dict[str, Array]:
+    """The factors, of which the one that the set changes is scaled or drawn anew; `draw(key)` draws all."""
+    specs, matched, redrawn, changed = (
+        drawn_options(config.scene.module),
+        config.matched,
+        draw(member.own_key),
+        dict(factors),
+    )
+    for index, name in enumerate(matched.change):
         if name in INTERVENTIONS:
             continue
-        spec, new = specs[name], again[name]
+        spec, new = specs[name], redrawn[name]
         if matched.scale is not None:
             scale = matched.scale.sample(key_for(member.own_key, "scale"), ())
-            new = jnp.clip(found[name] * scale, spec.low, spec.high)
+            new = jnp.clip(factors[name] * scale, spec.low, spec.high)
         if spec.each and matched.objects == "one":
-            count = jnp.maximum(found.get(spec.each, len(new)), 1)
+            count = jnp.maximum(factors.get(spec.each, len(new)), 1)
             one = jax.random.randint(key_for(member.set_key, "one"), (), 0, count)
-            new = jnp.where(along_slots(jnp.arange(len(new)) == one, new), new, found[name])
-        made[name] = jnp.where(member.changed & (member.kind == place), new, found[name])
-    return made
+            new = jnp.where(along_slots(jnp.arange(len(new)) == one, new), new, factors[name])
+        changed[name] = jnp.where(member.changed & (member.kind == index), new, factors[name])
+    return changed
 
 
 def changed_slot(one: tuple[Objects, State], other: tuple[Objects, State]) -> Array:
-    """The only slot that holds something else in two scenes at their start; -1 where there are none or several."""
+    """The only slot in which two scenes differ at their start; -1 where none or several do."""
     differ = jnp.zeros(one[0].present.shape, bool)
     for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True):
         differ |= (a != b).reshape(len(differ), -1).any(axis=1)
