@@ -7,16 +7,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gen2d.plugin import Array, Field, FramePlan, RenderScene, SlotGroup, fraction, hashed, pixel_at, to_pixels
-
-OWNERS = True
-FIELDS = {
-    "tracks/points": Field(
-        "float32", "n T P 2", "px", "x right, y down, of points fixed to objects, even in their area"
-    ),
-    "tracks/visible": Field("bool", "n T P", "1", "whether the point lies in a pixel that shows its object"),
-    "tracks/object": Field("int16", "n P", "object", "slot that the point is fixed to, -1 where there is none"),
-}
+from gen2d.plugin import (
+    Annotation,
+    Array,
+    Field,
+    FramePlan,
+    RenderScene,
+    SlotGroup,
+    fraction,
+    hashed,
+    option,
+    pixel_at,
+    to_pixels,
+)
 
 
 def sizes(plan: FramePlan, options: Any) -> dict[str, int]:
@@ -81,3 +84,19 @@ def _in_polygon(vertices: Array, u: Array, v: Array, w: Array) -> Array:
     one, other = (jnp.take_along_axis(a, side[..., None], axis=1) for a in (corner, following))
     far = jnp.sqrt(u)[..., None]
     return vertices[:, :1] + far * (one + v[..., None] * (other - one))
+
+
+ANNOTATION = Annotation(
+    options=option(0, int, "points", "fixed to each object and followed; 0: none", low=0, high=1024),
+    fields={
+        "tracks/points": Field(
+            "float32", "n T P 2", "px", "x right, y down, of points fixed to objects, even in their area"
+        ),
+        "tracks/visible": Field("bool", "n T P", "1", "whether the point lies in a pixel that shows its object"),
+        "tracks/object": Field("int16", "n P", "object", "slot that the point is fixed to, -1 where there is none"),
+    },
+    annotate=annotate,
+    sizes=sizes,
+    owners=True,
+    usual=8,
+)

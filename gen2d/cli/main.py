@@ -19,7 +19,7 @@ from gen2d.storage.paths import Network, Place, place, reading
 VERBS = {
     "verify": "check a dataset against its checksums, or its recipe, and repair it",
     "info": "tell what a dataset holds",
-    "list": "list scene families, looks and configs, with all options",
+    "list": "list scene families, looks, annotations, formats of exports and configs, with all options",
     "preview": "draw a contact sheet and an animation of a dataset or a config",
     "clean": "remove earlier snapshots of a dataset, and temporary files that nobody writes any more",
     "export": "write a dataset as films, tar files, NumPy archives or in another program's layout",
@@ -101,7 +101,7 @@ def generating() -> Parser:
 def _verb_parser(verb: str) -> Parser:
     parser = Parser(prog=f"python -m gen2d {verb}", description=VERBS[verb].capitalize() + ".")
     if verb == "list":
-        parser.add_argument("name", nargs="?", help="a family, look or config: only this one")
+        parser.add_argument("name", nargs="?", help="a family, look, annotation, format or config: only this one")
         return parser
     more = ", or a config; with --gallery also 'all': every scene family" if verb == "preview" else ""
     help_text = f"a dataset's folder or URL{more}"
@@ -156,9 +156,11 @@ def _add_network(parser: Parser) -> None:
 
 
 def _add_export(parser: Parser) -> None:
-    from gen2d.exports.export import formats
+    from gen2d.config.plugins import names
 
-    parser.add_argument("--to", required=True, metavar="FORMAT", help=f"one of {', '.join(formats())}")
+    parser.add_argument(
+        "--to", required=True, metavar="FORMAT", help=f"one of {', '.join(names('export'))}, or a Python file"
+    )
     parser.add_argument(
         "--out", type=Path, metavar="PATH", help="what to make (default: DIR-FORMAT, beside the dataset)"
     )
@@ -167,7 +169,7 @@ def _add_export(parser: Parser) -> None:
         "--fields",
         nargs="+",
         metavar="NAME",
-        help="names or patterns such as 'states/*' (npz, webdataset; default: all)",
+        help="names or patterns such as 'states/*', where the format can hold any (default: all)",
     )
     parser.add_argument("--overwrite", action="store_true", help="replace an export of another dataset")
 

@@ -81,40 +81,56 @@ def _flat(about: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
             yield key, value
 
 
+TITLES = {
+    "scene": "Scene families",
+    "look": "Looks",
+    "annotation": "Annotations of pixels",
+    "export": "Formats of exports",
+}
+
+
 def plugins_text(name: str | None = None) -> str:
-    """Families, looks and configs with their options; only `name` if it is given."""
-    from gen2d.config import (
-        config,  # imports jax
-        plugins,
-    )
+    """Plug-ins and configs with their options; only `name` if it is given."""
+    from gen2d.config import config, plugins  # imports jax
+    from gen2d.config.sections import SimulationAnnotations
 
     lines: list[str] = []
-    for kind, title in (("scene", "Scene families"), ("look", "Looks")):
-        found = [n for n in plugins.names(kind) if name in (None, n)]
-        lines += [f"{title}:"] if found else []
-        for plugin in found:
-            module = plugins.load(kind, plugin)
-            lines += [
-                f" {plugin}: {(module.__doc__ or '').strip().splitlines()[0]}",
-                *_options(kind, module.Options),
-                "",
-            ]
+    for kind, title in TITLES.items():
+        known = [n for n in plugins.names(kind) if name in (None, n)]
+        lines += [f"{title}:"] if known else []
+        for plugin in known:
+            rows = _options(*_declared(kind, plugin, plugins.load(kind, plugin)))
+            lines += [f" {plugin}: {plugins.summary(kind, plugin)}", *rows, *([""] if rows else [])]
+        lines += [""] if known and lines[-1] else []
     configs = [c for c in plugins.config_names() if name in (None, c, c.removesuffix(".yaml"))]
     if configs:
         lines += [f"Configs (in {plugins.config_folder()}):", *(f"  {c}" for c in configs), ""]
     if name is None:
         lines.append("Sections that every config has:")
-        for section, options in config.SECTIONS.items():
-            lines += [f" {section}: {(options.__doc__ or '').strip().splitlines()[0]}", *_options(section, options), ""]
+        for section, options in {**config.SECTIONS, "annotations": SimulationAnnotations}.items():
+            about = (options.__doc__ or "").strip().partition("\n")[0]
+            lines += [f" {section}: {about}", *_options(section, dataclasses.fields(options)), ""]
     if not lines:
-        names = [*plugins.names("scene"), *plugins.names("look"), *plugins.config_names()]
+        names = [*(known for kind in TITLES for known in plugins.names(kind)), *plugins.config_names()]
         raise ConfigError(f"{name!r} is not known; {plugins.nearest(name or '', names)}")
     return "\n".join(lines).rstrip()
 
 
-def _options(where: str, options: type) -> list[str]:
+def _declared(kind: str, name: str, contract: Any) -> tuple[str, Sequence[dataclasses.Field]]:
+    """Where the options of a plug-in stand in a config, and what they are."""
+    if kind == "export":
+        return "", ()
+    if kind != "annotation":
+        return kind, dataclasses.fields(contract.options)
+    if isinstance(contract.options, dataclasses.Field):
+        contract.options.name = name
+        return "annotations", [contract.options]
+    return f"annotations.{name}", dataclasses.fields(contract.options)
+
+
+def _options(where: str, fields: Sequence[dataclasses.Field]) -> list[str]:
     rows = []
-    for field in dataclasses.fields(options):
+    for field in fields:
         spec = field.metadata["option"]
         unit = f" {spec.unit}" if spec.unit not in ("", "1") else ""
         about = f"{spec.meaning}; {spec.allowed}" + (", drawn" if spec.draw else "")

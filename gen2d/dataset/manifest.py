@@ -54,7 +54,7 @@ DEPTH = 64  # levels of a config
 FIELD = re.compile(r"[a-z][a-z0-9_]{0,63}(/[a-z][a-z0-9_]{0,99}){0,2}")
 AXIS = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,63}")
 HASH = re.compile(r"[0-9a-f]{64}")
-PLUGIN = re.compile(rf"plugins/(scene|look|splits/{SPLIT.pattern}/look)/[^/\x00-\x1f\x7f]{{1,200}}\.py")
+PLUGIN = re.compile(rf"plugins/(scene|look|annotation|splits/{SPLIT.pattern}/look)/[^/\x00-\x1f\x7f]{{1,200}}\.py")
 
 
 @dataclasses.dataclass(frozen=True)

@@ -23,7 +23,7 @@ def check_block_placed(rollout: Rollout, batch: DeviceBatch, firsts: list[int], 
 def check_placed(scene: Plugin, placed: np.ndarray, numbers: np.ndarray) -> None:
     """Returns nothing; raises NoPlaceError if the scene of one of the videos with these numbers did not fit."""
     if not placed.all():
-        options = [f"scene.{name}" for name in getattr(scene.module, "CROWDED_BY", ())]
+        options = [f"scene.{name}" for name in scene.contract.crowded_by]
         cause = f": it depends on {', '.join(options)}" if options else ""
         raise NoPlaceError(
             f"scene: video {numbers[np.argmin(placed)]} could not be placed without overlap in 100 attempts{cause}; "

@@ -75,7 +75,7 @@ class Rollout:
     def __init__(self, config: Config, devices: Sequence[Any]) -> None:
         self.config, self.devices = config, list(devices)
         video = config.video
-        self.layout = config.scene.module.layout(config.scene.options)
+        self.layout = config.scene.contract.layout(config.scene.options)
         self.sampler, self.wanted = Sampler(config), quality.ranges(config.quality)
         self.plan = render.plan_of(config, self.layout)
         self.steps = substeps(video.fps, config.physics.substeps, config.physics.max_step)
@@ -112,8 +112,7 @@ class Rollout:
         own |= {"J": len(self.layout.joints)} if self.layout.joints else {}
         corners = max(run.vertices for run in self.layout.runs)
         own |= {"V": corners} if corners else {}
-        own |= annotations.sizes(self.config.annotations, self.plan)
-        return own | self.sampler.lengths
+        return annotations.sizes(self.config.annotations, self.plan, own | self.sampler.lengths)
 
     @property
     def fields(self) -> dict[str, Field]:
@@ -129,8 +128,8 @@ class Rollout:
             del fields[name]
         if self.plan.frames:
             fields["frames"] = Field("uint8", "n T H W 3", "sRGB", "the video")
-        fields |= annotations.fields(self.config.annotations) | self.word_fields
-        if self.config.annotations.lyapunov:
+        fields |= self.word_fields
+        if self.config.annotations.simulated.lyapunov:
             fields |= lyapunov.FIELDS
         fields["index"] = Field("int64", "n", "1", "the video's number in its split")
         fields["time"] = Field("float64", "T", "s", "of each frame; frame 0 is the initial state")
@@ -142,7 +141,7 @@ class Rollout:
         for name, axes, unit, meaning in CAMERA:
             fields[f"camera/{name}"] = Field("float32", axes, unit, meaning)
         fields |= sampler.fields(self.config) | sets.fields(self.config.matched)
-        return dict(sorted(fields.items()))
+        return dict(sorted(annotations.fields(self.config.annotations, fields).items()))
 
     @property
     def constants(self) -> dict[str, np.ndarray]:
@@ -162,7 +161,7 @@ class Rollout:
         """Those fields that are made on the host."""
         longest = max((len(split.name) for split in self.config.splits), default=0)
         found = {"split": Field(f"S{longest}", "n", "", "the split that the video belongs to")} if longest else {}
-        spoken = self.config.annotations.captions
+        spoken = self.config.annotations.simulated.captions
         return found | (caption.fields(self.layout.slots, self.config.video.frames) if spoken else {})
 
     def host_fields(self, columns: dict[str, np.ndarray], split: str) -> dict[str, np.ndarray]:
@@ -170,7 +169,9 @@ class Rollout:
         count = len(columns["objects/present"])
         fields = self.word_fields
         named = {"split": np.full(count, split.encode(), fields["split"].dtype)} if self.config.splits else {}
-        return named | (caption.caption_fields(columns, self.config.video) if self.config.annotations.captions else {})
+        return named | (
+            caption.caption_fields(columns, self.config.video) if self.config.annotations.simulated.captions else {}
+        )
 
     @property
     def time(self) -> np.ndarray:
@@ -280,7 +281,7 @@ class Rollout:
         columns |= {f"factors/{name}": values.astype(jnp.float32) for name, values in drawn.items()}
         columns |= jax.vmap(self.sampler.outside)(drawn)
         columns["quality/rejected_draws"] = own.rejected
-        if config.annotations.lyapunov:
+        if config.annotations.simulated.lyapunov:
             columns["quality/lyapunov"] = self._growth(keys, own)
         columns = {name: values for name, values in columns.items() if name not in sets.omitted_fields(config.matched)}
         return DeviceBatch(columns | told, stages, own.fits)
@@ -337,5 +338,5 @@ def per_device(array: Array) -> list[np.ndarray]:
 
 def save_at(config: Config, layout: layout_module.Layout) -> SaveAt:
     """What is kept of a simulation beyond its states."""
-    rows = config.annotations.contacts * math.ceil(config.video.frames / 16) * layout.slots
-    return SaveAt(rows, config.annotations.energy, between=config.image.exposure > 0)
+    rows = config.annotations.simulated.contacts * math.ceil(config.video.frames / 16) * layout.slots
+    return SaveAt(rows, config.annotations.simulated.energy, between=config.image.exposure > 0)

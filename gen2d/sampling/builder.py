@@ -39,7 +39,7 @@ class SampledScene(NamedTuple):
     state: State
     rejected: Any = 0  # places drawn again, as they did not fit
     fits: Any = True  # whether everything found a place
-    derived: Mapping[str, Array] = MappingProxyType({})  # what follows from the drawn numbers; the family's DERIVED
+    derived: Mapping[str, Array] = MappingProxyType({})  # what follows from the drawn numbers; the family's `derived`
 
 
 class BodyGroup(NamedTuple):

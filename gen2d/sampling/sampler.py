@@ -32,23 +32,22 @@ FactorChange = Callable[[SampledFactors, Callable[[Array], SampledFactors]], Sam
 
 def sizes(scene: Plugin) -> dict[str, int]:
     """The lengths of the factors' axes: the most there may be of what is counted, and those that the family fixes."""
-    fixed = scene.module.sizes(scene.options) if hasattr(scene.module, "sizes") else {}
-    counted = {spec.each for spec in drawn_options(scene.module).values() if spec.each} - fixed.keys()
+    fixed = dict(scene.contract.sizes(scene.options))
+    counted = {spec.each for spec in drawn_options(scene.contract).values() if spec.each} - fixed.keys()
     return fixed | {each: int(getattr(scene.options, each).support[1]) for each in sorted(counted)}
 
 
 def fields(config: Config) -> dict[str, Field]:
     """What is stored of the factors, of the numbers that the family derives from them, and of splits."""
     found, splits = {}, {}
-    for name, spec in drawn_options(config.scene.module).items():
+    for name, spec in drawn_options(config.scene.contract).items():
         axes = " ".join(["n", *([spec.each] if spec.each else []), *([str(spec.parts)] if spec.parts else [])])
         unit = spec.unit or "1"
         found[f"factors/{name}"] = Field("float32", axes, unit, f"as drawn: {spec.meaning}")
         splits[f"ood_distance/{name}"] = Field(
             "float32", axes, unit, f"from the training split's nearest: {spec.meaning}"
         )
-    derived = getattr(config.scene.module, "DERIVED", {})
-    found |= {f"factors/{name}": field for name, field in derived.items()}
+    found |= {f"factors/{name}": field for name, field in config.scene.contract.derived.items()}
     joint = Field("bool", "n", "1", "whether the training split could not have drawn these factors")
     return found | (splits | {"out_of_distribution": joint} if config.splits else {})
 
@@ -57,7 +56,7 @@ class Sampler:
     """The draws of a config's scenes, whatever their split."""
 
     def __init__(self, config: Config) -> None:
-        self.scene, self.laws, self.options = config.scene, config.laws, drawn_options(config.scene.module)
+        self.scene, self.laws, self.options = config.scene, config.laws, drawn_options(config.scene.contract)
         self.training = config.training.law if config.training else None
         self.lengths = sizes(config.scene)
         self.products = [product for law in self.laws for product in law.products]
@@ -91,7 +90,7 @@ class Sampler:
         """
         draw_key, place_key = jax.random.split(key)
         drawn = self.drawn(draw_key, row, given, change)
-        made: Any = self.scene.module.sample(place_key, drawn, self.scene.options)
+        made: Any = self.scene.contract.sample(place_key, drawn, self.scene.options)
         rejected, fits = jnp.asarray(made.rejected, jnp.int32), jnp.asarray(made.fits, bool)
         return {**drawn, **made.derived}, made._replace(rejected=rejected, fits=fits, derived={})
 

@@ -13,6 +13,7 @@ from gen2d.plugin import (
     STATIC,
     Array,
     Distribution,
+    Family,
     Layout,
     SampledScene,
     SlotGroup,
@@ -114,3 +115,6 @@ def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledSc
 def _triangle(rows: int) -> np.ndarray:
     """Places [rows (rows + 1) / 2, 2] a unit apart, row by row from the one at the origin to the right."""
     return np.array([[math.sqrt(0.75) * row, k - row / 2] for row in range(rows) for k in range(row + 1)], np.float32)
+
+
+FAMILY = Family(options=Options, layout=layout, sample=sample, check=check, sizes=sizes)

@@ -9,6 +9,7 @@ from gen2d.plugin import (
     STATIC,
     Array,
     Distribution,
+    Family,
     Layout,
     SampledScene,
     SlotGroup,
@@ -46,9 +47,6 @@ class Options:
     )
 
 
-CROWDED_BY = ("balls", "radius", "width", "height")  # the options that decide whether everything finds a place
-
-
 def check(options: Options) -> None:
     """ValueError where the box cannot hold a ball."""
     largest = options.radius.support[1]
@@ -75,3 +73,8 @@ def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledSc
     )
     parts = [discs(places, radius, present, **material), walls]
     return SampledScene(*assemble(layout(options), parts, factors["gravity"]), rejected, fits)
+
+
+FAMILY = Family(
+    options=Options, layout=layout, sample=sample, check=check, crowded_by=("balls", "radius", "width", "height")
+)

@@ -4,9 +4,7 @@ import dataclasses
 
 import jax.numpy as jnp
 
-from gen2d.plugin import Array, Distribution, Field, Layout, SampledScene, SlotGroup, assemble, discs, option
-
-DERIVED = {"contact_time": Field("float32", "n", "s", "at which the first of those that move meets one at rest")}
+from gen2d.plugin import Array, Distribution, Family, Field, Layout, SampledScene, SlotGroup, assemble, discs, option
 
 
 @dataclasses.dataclass(frozen=True)
@@ -72,3 +70,12 @@ def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledSc
     balls = discs(places, radius, number < factors["balls"], velocity=velocity, **material)
     derived = {"contact_time": factors["approach"] / factors["speed"]}
     return SampledScene(*assemble(layout(options), [balls], jnp.zeros(2)), derived=derived)
+
+
+FAMILY = Family(
+    options=Options,
+    layout=layout,
+    sample=sample,
+    check=check,
+    derived={"contact_time": Field("float32", "n", "s", "at which the first of those that move meets one at rest")},
+)

@@ -8,6 +8,7 @@ from gen2d.plugin import (
     STATIC,
     Array,
     Distribution,
+    Family,
     Layout,
     SampledScene,
     SlotGroup,
@@ -99,3 +100,6 @@ def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledSc
     wide = FAR * layers.bounds[2]
     floor = segments([(-wide, 0.0)], [(wide, 0.0)], friction=factors["floor_friction"])
     return SampledScene(*assemble(layers, [floor, ball, row], factors["gravity"]))
+
+
+FAMILY = Family(options=Options, layout=layout, sample=sample, check=check)

@@ -10,6 +10,7 @@ from gen2d.plugin import (
     STATIC,
     Array,
     Distribution,
+    Family,
     Layout,
     SampledScene,
     SlotGroup,
@@ -46,9 +47,6 @@ class Options:
     color: tuple[Distribution, ...] = option(
         [[90, 254]] * 3, int, "sRGB", "of each ball", parts=3, draw=True, low=0, high=255, each="balls"
     )
-
-
-CROWDED_BY = ("balls", "radius", "width", "height", "neck", "angle", "gap")  # whether everything finds a place
 
 
 def check(options: Options) -> None:
@@ -94,3 +92,12 @@ def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledSc
         segments(upper, lower, **walls),
     ]
     return SampledScene(*assemble(layout(options), parts, factors["gravity"]), rejected, fits)
+
+
+FAMILY = Family(
+    options=Options,
+    layout=layout,
+    sample=sample,
+    check=check,
+    crowded_by=("balls", "radius", "width", "height", "neck", "angle", "gap"),
+)

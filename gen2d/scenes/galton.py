@@ -9,6 +9,7 @@ from gen2d.plugin import (
     STATIC,
     Array,
     Distribution,
+    Family,
     Layout,
     SampledScene,
     SlotGroup,
@@ -116,3 +117,6 @@ def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledSc
     bins = segments(feet, feet + jnp.asarray([0.0, options.bin_height]), **board)
     parts = [balls, lattice, bins, box_walls(right, top, **board)]
     return SampledScene(*assemble(here, parts, factors["gravity"]))
+
+
+FAMILY = Family(options=Options, layout=layout, sample=sample, check=check)

@@ -8,6 +8,7 @@ from gen2d.plugin import (
     STATIC,
     Array,
     Distribution,
+    Family,
     Field,
     Layout,
     SampledScene,
@@ -17,11 +18,6 @@ from gen2d.plugin import (
     discs,
     option,
 )
-
-DERIVED = {
-    "contact_time": Field("float32", "n pairs", "s", "at which the two of a pair meet, if nothing else does before"),
-    "mass_ratio": Field("float32", "n pairs", "1", "mass of the left ball over that of the right one"),
-}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -113,3 +109,17 @@ def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledSc
         "mass_ratio": jnp.where(present, density[:, 0] / jnp.where(present, density[:, 1], 1.0), 0.0),
     }
     return SampledScene(*assemble(layout(options), [balls, walls], jnp.zeros(2)), derived=derived)
+
+
+FAMILY = Family(
+    options=Options,
+    layout=layout,
+    sample=sample,
+    check=check,
+    derived={
+        "contact_time": Field(
+            "float32", "n pairs", "s", "at which the two of a pair meet, if nothing else does before"
+        ),
+        "mass_ratio": Field("float32", "n pairs", "1", "mass of the left ball over that of the right one"),
+    },
+)

@@ -9,6 +9,7 @@ from gen2d.plugin import (
     STATIC,
     Array,
     Distribution,
+    Family,
     Layout,
     SampledScene,
     SlotGroup,
@@ -123,3 +124,6 @@ def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledSc
         box_walls(options.width, options.height, **board),
     ]
     return SampledScene(*assemble(layout(options), parts, factors["gravity"]))
+
+
+FAMILY = Family(options=Options, layout=layout, sample=sample, check=check)

@@ -8,6 +8,7 @@ from gen2d.plugin import (
     STATIC,
     Array,
     Distribution,
+    Family,
     Field,
     Layout,
     SampledScene,
@@ -18,13 +19,6 @@ from gen2d.plugin import (
     discs,
     option,
 )
-
-DERIVED = {
-    "hidden_from": Field(
-        "float32", "n balls", "s", "when the ball is first wholly behind the screen, if nothing hits it"
-    ),
-    "hidden_for": Field("float32", "n balls", "s", "how long it then is"),
-}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -128,3 +122,17 @@ def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledSc
     derived = {"hidden_from": hidden_from, "hidden_for": (size[0] - 2 * radius) / there}
     derived = {name: jnp.where(present, values, 0.0) for name, values in derived.items()}
     return SampledScene(*assemble(layout(options), [balls, *walls, screen], factors["gravity"]), derived=derived)
+
+
+FAMILY = Family(
+    options=Options,
+    layout=layout,
+    sample=sample,
+    check=check,
+    derived={
+        "hidden_from": Field(
+            "float32", "n balls", "s", "when the ball is first wholly behind the screen, if nothing hits it"
+        ),
+        "hidden_for": Field("float32", "n balls", "s", "how long it then is"),
+    },
+)

@@ -10,6 +10,7 @@ from gen2d.plugin import (
     STATIC,
     Array,
     Distribution,
+    Family,
     Layout,
     SampledScene,
     SlotGroup,
@@ -67,9 +68,6 @@ class Options:
     )
 
 
-CROWDED_BY = ("discs", "boxes", "capsules", "disc_radius", "box_size", "capsule_half_length", "width", "height")
-
-
 def reach(options: Options) -> float:
     """The largest distance of a rim from its centre, m."""
     stadium = options.capsule_radius.support[1] + options.capsule_half_length.support[1]
@@ -120,3 +118,12 @@ def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledSc
         box_walls(options.width, options.height, **walls),
     ]  # fmt: skip
     return SampledScene(*assemble(layout(options), parts, factors["gravity"]), rejected, fits)
+
+
+FAMILY = Family(
+    options=Options,
+    layout=layout,
+    sample=sample,
+    check=check,
+    crowded_by=("discs", "boxes", "capsules", "disc_radius", "box_size", "capsule_half_length", "width", "height"),
+)

@@ -13,6 +13,7 @@ from gen2d.plugin import (
     STATIC,
     Array,
     Distribution,
+    Family,
     Field,
     Layout,
     SampledScene,
@@ -23,8 +24,6 @@ from gen2d.plugin import (
     option,
     segments,
 )
-
-DERIVED = {"length": Field("float32", "n", "m", "of the slope")}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -103,3 +102,12 @@ def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledSc
         color=factors["ground_color"],
     )  # fmt: skip
     return SampledScene(*assemble(layout(options), [body, ground], factors["gravity"]), derived={"length": length})
+
+
+FAMILY = Family(
+    options=Options,
+    layout=layout,
+    sample=sample,
+    check=check,
+    derived={"length": Field("float32", "n", "m", "of the slope")},
+)

@@ -8,6 +8,7 @@ from gen2d.plugin import (
     STATIC,
     Array,
     Distribution,
+    Family,
     Field,
     JointSpec,
     Layout,
@@ -22,8 +23,6 @@ from gen2d.plugin import (
 )
 
 FAR = 4.0  # the floor's length, over the view's width
-
-DERIVED = {"torque": Field("float32", "n", "N m", "of all weights about the pivot while the plank is level")}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -114,3 +113,12 @@ def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledSc
     scene, state = assemble(layers, [floor, stand, plank, weights], factors["gravity"], joint)
     torque = factors["gravity"][1] * jnp.sum(weights.objects["mass"] * x)
     return SampledScene(scene, state, derived={"torque": torque})
+
+
+FAMILY = Family(
+    options=Options,
+    layout=layout,
+    sample=sample,
+    check=check,
+    derived={"torque": Field("float32", "n", "N m", "of all weights about the pivot while the plank is level")},
+)

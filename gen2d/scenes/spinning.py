@@ -8,7 +8,19 @@ import dataclasses
 
 import jax.numpy as jnp
 
-from gen2d.plugin import STATIC, Array, Distribution, Layout, SampledScene, SlotGroup, assemble, discs, option, segments
+from gen2d.plugin import (
+    STATIC,
+    Array,
+    Distribution,
+    Family,
+    Layout,
+    SampledScene,
+    SlotGroup,
+    assemble,
+    discs,
+    option,
+    segments,
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,3 +81,6 @@ def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledSc
     left, right = (jnp.stack([jnp.full(most, end * options.width), floor], 1) for end in (-9.0, 10.0))
     floors = segments(left, right, present, friction=factors["floor_friction"], color=factors["floor_color"])
     return SampledScene(*assemble(layout(options), [balls, floors], factors["gravity"]))
+
+
+FAMILY = Family(options=Options, layout=layout, sample=sample, check=check)

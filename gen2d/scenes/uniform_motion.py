@@ -9,7 +9,18 @@ import math
 
 import jax.numpy as jnp
 
-from gen2d.plugin import Array, Distribution, Layout, SampledScene, SlotGroup, assemble, discs, option, start_position
+from gen2d.plugin import (
+    Array,
+    Distribution,
+    Family,
+    Layout,
+    SampledScene,
+    SlotGroup,
+    assemble,
+    discs,
+    option,
+    start_position,
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -62,3 +73,6 @@ def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledSc
         start[None], radius, density=factors["density"], velocity=velocity, elasticity=1.0, color=factors["color"]
     )
     return SampledScene(*assemble(layout(options), [ball], jnp.zeros(2)))
+
+
+FAMILY = Family(options=Options, layout=layout, sample=sample, check=check)

@@ -8,6 +8,7 @@ from gen2d.plugin import (
     STATIC,
     Array,
     Distribution,
+    Family,
     JointSpec,
     Layout,
     SampledScene,
@@ -110,3 +111,6 @@ def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledSc
     )  # fmt: skip
     parts = [floor, pin, links, ball, blocks]
     return SampledScene(*assemble(layers, parts, factors["gravity"], hinge_chain(links, tail=True)))
+
+
+FAMILY = Family(options=Options, layout=layout, sample=sample, check=check)

@@ -53,7 +53,7 @@ def program(family: str) -> tuple[Plugin, Layout, Any]:
     """A family's config, its layout, and the one program that a test of it compiles."""
     config = load_config(f"{family}.yaml")
     scene = config.scene
-    layout = scene.module.layout(scene.options)
+    layout = scene.contract.layout(scene.options)
 
     def run(keys: jax.Array) -> Made:
         factors, begun = jax.vmap(Sampler(config).sampled)(keys)
@@ -155,7 +155,7 @@ def test_everything_finds_a_place_without_overlap(family):
 @pytest.mark.parametrize("family", FAMILIES)
 def test_what_moves_begins_in_view(family):
     scene, layout, _ = program(family)
-    if getattr(scene.module, "BEGINS_OUTSIDE", False):
+    if getattr(scene.contract, "BEGINS_OUTSIDE", False):
         return
     left, bottom, right, top = made(family).extent.T
     bounds = layout.bounds
@@ -178,7 +178,7 @@ def test_factors_are_what_they_are_declared_to_be(family):
 def check_factors(scene: Plugin, found: dict[str, np.ndarray], doubt: float = 1e-3) -> None:
     """Asserts that factors are in their support, and drawn as they are declared to be (A. Kolmogorov, N. Smirnov)."""
     most = np.sqrt(-np.log(doubt / 2) / 2)
-    for name, spec in drawn_options(scene.module).items():
+    for name, spec in drawn_options(scene.contract).items():
         source, values = getattr(scene.options, name), found[name]
         parts = source if spec.parts else [source]
         values = values if spec.parts else values[..., None]
@@ -189,7 +189,7 @@ def check_factors(scene: Plugin, found: dict[str, np.ndarray], doubt: float = 1e
         for part, drawn in zip(parts, np.moveaxis(values, -1, 0), strict=True):
             assert part.contains(drawn[there]).all(), name
             assert distance(part, drawn[there]) < most / np.sqrt(there.sum()), name
-    for name in getattr(scene.module, "DERIVED", {}):
+    for name in getattr(scene.contract, "DERIVED", {}):
         assert np.isfinite(found[name]).all(), name
 
 
@@ -208,7 +208,7 @@ def test_a_key_is_a_scene(family):
 def test_a_hundred_thousand_videos_are_numbers_begin_apart_and_stay_within_walls(family):
     config = load_config(f"{family}.yaml")
     scene, video, physics = config.scene, config.video, config.physics
-    layout, steps = scene.module.layout(scene.options), substeps(video.fps, physics.substeps, physics.max_step)
+    layout, steps = scene.contract.layout(scene.options), substeps(video.fps, physics.substeps, physics.max_step)
     rules = solver_params(physics, video.fps, steps)
 
     @jax.jit

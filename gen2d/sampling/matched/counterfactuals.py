@@ -18,7 +18,12 @@ from gen2d.sampling.matched.sets import SetMember, along_slots
 
 def changed_factors(member: SetMember, config: Any, found: dict[str, Array], draw: Callable) -> dict[str, Array]:
     """The factors, with the one that the set is about drawn anew or scaled; `draw(key)` draws all."""
-    specs, matched, again, made = drawn_options(config.scene.module), config.matched, draw(member.own_key), dict(found)
+    specs, matched, again, made = (
+        drawn_options(config.scene.contract),
+        config.matched,
+        draw(member.own_key),
+        dict(found),
+    )
     for place, name in enumerate(matched.change):
         if name in INTERVENTIONS:
             continue
