@@ -73,7 +73,9 @@ _HOMES = {
     "gen2d.renderers": "extents",
     "gen2d.renderers.camera": "pixel_at to_pixels",
     "gen2d.renderers.compositing": "OCCLUDER",
-    "gen2d.renderers.look": "LineOptions PlainOptions are_lines are_moving contrasting line_fields line_margin mean_color plain",
+    "gen2d.renderers.look": (
+        "LineOptions PlainOptions are_lines are_moving contrasting line_fields line_margin mean_color plain"
+    ),
     "gen2d.renderers.noise": "fraction hashed",
     "gen2d.renderers.paint": "Background Paint Texture",
     "gen2d.renderers.plan": "FramePlan RenderScene tile_windows",

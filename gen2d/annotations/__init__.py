@@ -13,7 +13,8 @@ A file ends with an `ANNOTATION`, whose members `gen2d.plugin.Annotation` descri
         annotate=annotate,
     )
 
-In this folder as turn.py it is asked for by `annotations: {turn: true}`, from elsewhere by `annotations: {my/turn.py: true}`.
+A config asks for turn.py in this folder by `annotations: {turn: true}`, and for one elsewhere by its path, as in
+`annotations: {my/turn.py: true}`.
 """
 
 from collections.abc import Mapping
@@ -32,7 +33,7 @@ def need_owners(annotations: Annotations) -> bool:
 
 
 def fields(annotations: Annotations, others: Mapping[str, Field]) -> dict[str, Field]:
-    """All stored fields by name: the others, and those of the annotations. Raises ConfigError for one declared twice."""
+    """All stored fields by name: the others and the annotations'. Raises ConfigError for a name declared twice."""
     return _joined(others, {plugin.name: plugin.contract.fields for plugin in annotations.wanted}, "field")
 
 
@@ -77,8 +78,8 @@ def annotated(scenes: RenderScene, owners: Array | None, plan: FramePlan, annota
             shape = (count, *field.shape(known))
             if (array.shape, array.dtype.name) != (shape, field.dtype):
                 raise ConfigError(
-                    f"annotations.{plugin.name}: {name} is {array.dtype.name}{[*array.shape]}, but must be as declared, "
-                    f"{field.dtype}{[*shape]}"
+                    f"annotations.{plugin.name}: {name} is {array.dtype.name}{[*array.shape]}, but must be as "
+                    f"declared, {field.dtype}{[*shape]}"
                 )
         arrays |= own
     return arrays

@@ -99,7 +99,7 @@ def plugins_text(name: str | None = None) -> str:
         known = [n for n in plugins.names(kind) if name in (None, n)]
         lines += [f"{title}:"] if known else []
         for plugin in known:
-            rows = _options(*_declared(kind, plugin, plugins.load(kind, plugin)))
+            rows = _options(_declared(kind, plugin, plugins.load(kind, plugin)))
             lines += [f" {plugin}: {plugins.summary(kind, plugin)}", *rows, *([""] if rows else [])]
         lines += [""] if known and lines[-1] else []
     configs = [c for c in plugins.config_names() if name in (None, c, c.removesuffix(".yaml"))]
@@ -109,33 +109,35 @@ def plugins_text(name: str | None = None) -> str:
         lines.append("Sections that every config has:")
         for section, options in {**config.SECTIONS, "annotations": SimulationAnnotations}.items():
             about = (options.__doc__ or "").strip().partition("\n")[0]
-            lines += [f" {section}: {about}", *_options(section, dataclasses.fields(options)), ""]
+            lines += [f" {section}: {about}", *_options(_named(section, options)), ""]
     if not lines:
         names = [*(known for kind in TITLES for known in plugins.names(kind)), *plugins.config_names()]
         raise ConfigError(f"{name!r} is not known; {plugins.nearest(name or '', names)}")
     return "\n".join(lines).rstrip()
 
 
-def _declared(kind: str, name: str, contract: Any) -> tuple[str, Sequence[dataclasses.Field]]:
-    """Where the options of a plug-in stand in a config, and what they are."""
+def _declared(kind: str, name: str, contract: Any) -> dict[str, dataclasses.Field]:
+    """The options of a plug-in, by where they stand in a config."""
     if kind == "export":
-        return "", ()
+        return {}
     if kind != "annotation":
-        return kind, dataclasses.fields(contract.options)
-    if isinstance(contract.options, dataclasses.Field):
-        contract.options.name = name
-        return "annotations", [contract.options]
-    return f"annotations.{name}", dataclasses.fields(contract.options)
+        return _named(kind, contract.options)
+    where, options = f"annotations.{name}", contract.options
+    return {where: options} if isinstance(options, dataclasses.Field) else _named(where, options)
 
 
-def _options(where: str, fields: Sequence[dataclasses.Field]) -> list[str]:
+def _named(where: str, options: type) -> dict[str, dataclasses.Field]:
+    return {f"{where}.{field.name}": field for field in dataclasses.fields(options)}
+
+
+def _options(fields: Mapping[str, dataclasses.Field]) -> list[str]:
     rows = []
-    for field in fields:
+    for name, field in fields.items():
         spec = field.metadata["option"]
         unit = f" {spec.unit}" if spec.unit not in ("", "1") else ""
         about = f"{spec.meaning}; {spec.allowed}" + (", drawn" if spec.draw else "")
-        rows.append((f"{where}.{field.name}", f"{_shown(field.default)}{unit}", about))
-    return _table(rows)
+        rows.append((name, f"{_shown(field.default)}{unit}", about))
+    return _table(rows) if rows else []
 
 
 def _shown(value: Any) -> str:

@@ -1,4 +1,4 @@
-"""The section `annotations`: an option of each file in gen2d/annotations/, files of the user's own, and what is simulated."""
+"""The section `annotations`: options of the files in gen2d/annotations/, of the user's own, and of the simulation."""
 
 import collections
 import dataclasses
@@ -39,8 +39,11 @@ class Annotations:
 def _plain(plugin: Plugin) -> Any:
     """`value` or `{option: value, ...}`; of a file of the user's own always a mapping, with its sha256."""
     single = not dataclasses.is_dataclass(plugin.contract.options)
-    plain = plain_value(plugin.options) if single else plain_of(plugin.options) if plugin.options else False
-    return plain if not plugin.sha256 else {"sha256": plugin.sha256, **({"value": plain} if single else plain)}
+    if single:
+        value = plain_value(plugin.options)
+        return {"sha256": plugin.sha256, "value": value} if plugin.sha256 else value
+    own = {"sha256": plugin.sha256} if plugin.sha256 else {}
+    return own | plain_of(plugin.options) if plugin.options else False
 
 
 def annotations_of(values: Any, source: str, copies: Copies) -> Annotations:

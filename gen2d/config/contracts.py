@@ -22,18 +22,14 @@ class _Contract:
             kind: Any = field.type if union else typing.get_origin(field.type) or field.type
             if kind is not Any and not isinstance(value, kind):
                 raise TypeError(f"{type(self).__name__}.{field.name} is {value!r}, but must be of type {field.type}")
-            if field.name == "options" and not _is_declared(value):
-                raise TypeError(
-                    f"{type(self).__name__}.options is {value!r}, of which not every field is an option(...)"
-                )
+        options: Any = getattr(self, "options", None)
+        if options is not None and not all("option" in field.metadata for field in option_fields(options)):
+            raise TypeError(f"{type(self).__name__}.options is {options!r}, of which not every field is an option(...)")
 
 
-def _is_declared(options: Any) -> bool:
-    if isinstance(options, dataclasses.Field):
-        return "option" in options.metadata
-    return dataclasses.is_dataclass(options) and all(
-        "option" in field.metadata for field in dataclasses.fields(options)
-    )
+def option_fields(options: Any) -> tuple[dataclasses.Field, ...]:
+    """The fields of a dataclass of options, or a single option itself."""
+    return (options,) if isinstance(options, dataclasses.Field) else dataclasses.fields(options)
 
 
 def _nothing(options: Any) -> None:
@@ -93,9 +89,9 @@ class Annotation(_Contract):
     options: one `option`, written `NAME: value` in a config and off where it is false or 0; or a frozen dataclass of
         several, written `NAME: {...}`, with `NAME: true` for the defaults. None of them is drawn.
     fields: what is stored, by its full name. The axes begin with n; T, K, H and W are known, others are in `sizes`.
-    annotate(scenes, owners, plan, value): an array for each field, with the n videos first, traced by jax. `scenes` is a
-        `RenderScene` of n videos, `owners` [n, T, H, W] uint8 says which slot + 1 a pixel shows (0 background, 255 an
-        occluder), `plan` is the `FramePlan` and `value` that of the option, or the dataclass.
+    annotate(scenes, owners, plan, value): an array for each field, with the n videos first, traced by jax. `scenes` is
+        a `RenderScene` of n videos, `owners` [n, T, H, W] uint8 holds the slot + 1 that a pixel shows (0 background,
+        255 an occluder), `plan` is the `FramePlan` and `value` that of the option, or the dataclass.
     sizes(plan, value): the lengths of the axes that no other field has, by their letters.
     owners: whether `annotate` needs `owners`, which is None otherwise unless another annotation needs them.
     usual: the value in a config with which `gen2d.render` switches the annotation on where its fields are asked for.
@@ -107,6 +103,13 @@ class Annotation(_Contract):
     sizes: Callable[[Any, Any], Mapping[str, int]] = _no_sizes
     owners: bool = False
     usual: Any = True
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if any(field.metadata["option"].draw for field in option_fields(self.options)):
+            raise TypeError(
+                f"Annotation.options is {self.options!r}, but an annotation draws nothing: remove draw=True"
+            )
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -35,7 +35,8 @@ def names(kind: str) -> list[str]:
 def load(kind: str, name: str, where: str = "--set", content: bytes = b"") -> Any:
     """The contract that a name's file declares, or the Python file of the user's own at a path, which holds `content`.
 
-    Raises ConfigError for an unknown name, and for a file that cannot be run or declares nothing. It begins with `where`.
+    Raises ConfigError, which begins with `where`, for an unknown name and for a file that cannot be run or declares
+    nothing.
     """
     if not is_own(name) and name not in names(kind):
         raise ConfigError(f"{where} is {name!r}, which is not known; {nearest(name, names(kind))}")

@@ -45,13 +45,13 @@ def export(
     timeout: float = 30.0,
     deadline: float = 300.0,
 ) -> Exported:
-    """Writes a split of a complete dataset in another format, and returns what was made.
+    """The export of a split of a complete dataset in another format.
 
-    `to` names the format, or a Python file that declares one (`gen2d.plugin.Export`); `out` is the folder (for phyworld the file) that is made: ROOT-FORMAT by default. `split` may be
-    left out as in `open`; `fields` are names or patterns, all unless told otherwise, and only for formats such as npz and webdataset, which can hold any.
-    Frames that are not stored are drawn. It appears when it is whole; what an earlier export of the same dataset made
-    is replaced, what another made only with `overwrite`. `say` takes lines for a person; `trust` is that of `render`,
-    `timeout` and `deadline` are those of `open`.
+    `to` names the format, or a Python file that declares one (`gen2d.plugin.Export`). `out` is the folder (for
+    phyworld the file) that is made, ROOT-FORMAT by default; it appears when it is whole. An earlier export of the same
+    dataset is replaced, another one only with `overwrite`. `split` may be left out as in `open`. `fields` are names or
+    patterns, for formats that can hold any, such as npz and webdataset (default: all). Frames that are not stored are
+    drawn. `say` takes lines for a person; `trust` is that of `render`, `timeout` and `deadline` are those of `open`.
     Raises ConfigError, FolderError and UntrustedError (UserErrors) with one sentence, DamagedError, UnreachableError.
     """
     began, form, name = time.perf_counter(), _format(to), Path(to).name
