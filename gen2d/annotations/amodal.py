@@ -5,12 +5,12 @@ import jax.numpy as jnp
 from gen2d.plugin import Annotation, Array, Field, FramePlan, RenderScene, alone, each_video, option
 
 
-def sizes(plan: FramePlan, options: object) -> dict[str, int]:
+def sizes(plan: FramePlan, on: bool) -> dict[str, int]:
     """B, the bytes of a mask: numpy.unpackbits(mask)[: H * W].reshape(H, W) is the mask."""
     return {"B": -(-plan.height * plan.width // 8)}
 
 
-def annotate(stages: RenderScene, owners: Array | None, plan: FramePlan, options: object) -> dict[str, Array]:
+def annotate(stages: RenderScene, owners: Array | None, plan: FramePlan, on: bool) -> dict[str, Array]:
     """The packed masks of every slot."""
     pixels = plan.height * plan.width
     weights = jnp.asarray([128, 64, 32, 16, 8, 4, 2, 1], jnp.uint8)

@@ -11,7 +11,7 @@ from gen2d.plugin import Annotation, Array, Field, FramePlan, RenderScene, exten
 WORD = 32  # slots that are looked at together, a bit each
 
 
-def annotate(stages: RenderScene, owners: Array, plan: FramePlan, options: object) -> dict[str, Array]:
+def annotate(stages: RenderScene, owners: Array, plan: FramePlan, on: bool) -> dict[str, Array]:
     """Both kinds of boxes."""
     seen = seen_boxes(owners.reshape(-1, *owners.shape[2:]), plan.layout.slots)
     return {

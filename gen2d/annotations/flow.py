@@ -28,7 +28,7 @@ from gen2d.plugin import (
 _VALID = "1 where the flow ends in the frame, at a pixel of the same object"
 
 
-def annotate(stages: RenderScene, owners: Array, plan: FramePlan, options: object) -> dict[str, Array]:
+def annotate(stages: RenderScene, owners: Array, plan: FramePlan, on: bool) -> dict[str, Array]:
     """Both flows and where they are valid."""
     found, flow_of = {}, _by_patches if on_cpu() else _by_pixels
     for name, step in (("forward", 1), ("backward", -1)):

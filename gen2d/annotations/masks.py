@@ -3,7 +3,7 @@
 from gen2d.plugin import Annotation, Array, Field, FramePlan, RenderScene, option
 
 
-def annotate(stages: RenderScene, owners: Array, plan: FramePlan, options: object) -> dict[str, Array]:
+def annotate(stages: RenderScene, owners: Array, plan: FramePlan, on: bool) -> dict[str, Array]:
     """The mask itself."""
     return {"masks/instance": owners}
 

@@ -1,7 +1,6 @@
 """Points that are fixed to objects, followed through the video."""
 
 import functools
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -22,14 +21,14 @@ from gen2d.plugin import (
 )
 
 
-def sizes(plan: FramePlan, options: Any) -> dict[str, int]:
+def sizes(plan: FramePlan, count: int) -> dict[str, int]:
     """P, so many points for every slot."""
-    return {"P": plan.layout.slots * options.tracks}
+    return {"P": plan.layout.slots * count}
 
 
-def annotate(stages: RenderScene, owners: Array, plan: FramePlan, options: Any) -> dict[str, Array]:
+def annotate(stages: RenderScene, owners: Array, plan: FramePlan, count: int) -> dict[str, Array]:
     """The points, where they are seen, and whose they are."""
-    return jax.vmap(functools.partial(_followed, plan=plan, count=options.tracks))(stages, owners)
+    return jax.vmap(functools.partial(_followed, plan=plan, count=count))(stages, owners)
 
 
 def _followed(stage: RenderScene, owners: Array, plan: FramePlan, count: int) -> dict[str, Array]:

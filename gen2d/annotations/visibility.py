@@ -20,7 +20,7 @@ from gen2d.plugin import (
 )
 
 
-def annotate(stages: RenderScene, owners: Array, plan: FramePlan, options: object) -> dict[str, Array]:
+def annotate(stages: RenderScene, owners: Array, plan: FramePlan, on: bool) -> dict[str, Array]:
     """The number of pixels and the part seen, and the least of it."""
     pixels = each_video(functools.partial(counts, slots=plan.layout.slots), owners)
     area = jax.vmap(functools.partial(extents.areas, plan=plan))(stages)

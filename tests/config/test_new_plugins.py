@@ -1,10 +1,13 @@
 """One new file is a plug-in: in its folder by its name, anywhere else by its path; and nothing else is touched."""
 
+import importlib
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
+import textwrap
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +17,7 @@ import yaml
 from tiny import ran
 
 import gen2d
+from gen2d.config import plugins
 from gen2d.core.errors import ConfigError, UserError
 
 ROOT = Path(gen2d.__file__).parent.parent
@@ -118,6 +122,7 @@ ANNOTATION = Annotation(
 ''',
     "export": '''"""One JSON file with the mean level of each frame."""
 
+import importlib
 import json
 import os
 
@@ -281,3 +286,24 @@ def test_an_annotation_that_returns_something_else_is_one_sentence(returned: str
         gen2d.generate(CONFIG | {"annotations": {str(path): True}}, 1, tmp_path / "data")
     assert "\n" not in str(caught.value)
     assert not (tmp_path / "data" / "manifest.json").exists()
+
+
+@pytest.mark.parametrize("kind", SOURCES)
+def test_the_smallest_example_of_each_kind_runs(kind: str, plain: Path, tmp_path: Path) -> None:
+    """The one in the docstring of the folder."""
+    package = importlib.import_module(plugins.KINDS[kind][0])
+    code = re.findall(r"\n\n((?:    .*\n|\n)+)", package.__doc__ or "")[0]
+    path = tmp_path / "own.py"
+    path.write_text(textwrap.dedent(code))
+    if kind == "export":
+        made = gen2d.export(plain, str(path), tmp_path / "out")
+        np.testing.assert_array_equal(np.load(made.out / "train-000000003.npy"), gen2d.open(plain)[3]["frames"])
+        return
+    config = {"annotations": {str(path): True}} if kind == "annotation" else {kind: str(path)}
+    batch = next(iter(gen2d.stream(CONFIG | config, batch_size=4, device="cpu", fields=["*"])))
+    if kind == "look":
+        np.testing.assert_array_equal(batch["objects/color"], 255 - gen2d.open(plain, fields=["*"])[:]["objects/color"])
+    if kind == "scene":
+        np.testing.assert_array_equal(batch["states/position"], np.full((4, 6, 1, 2), 0.5))
+    if kind == "annotation":
+        np.testing.assert_array_equal(batch["motion/turn"], abs(batch["states/angle"]))
