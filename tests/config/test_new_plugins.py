@@ -247,6 +247,9 @@ def test_one_file_anywhere_is_a_plug_in(kind: str, plain: Path, tmp_path: Path) 
     check_dataset(kind, tmp_path / "data")
     copy = tmp_path / "data" / "plugins" / kind / "own.py"
     assert copy.read_text() == SOURCES[kind]
+    code = "import sys, gen2d; root = sys.argv[1]; gen2d.open(root)[:]; gen2d.info(root); assert not gen2d.verify(root)"
+    code += "; assert 'jax' not in sys.modules"
+    subprocess.run([sys.executable, "-c", code, str(tmp_path / "data")], check=True)
     path.unlink()
     assert gen2d.verify(tmp_path / "data", "regen", videos=4) == []
 
