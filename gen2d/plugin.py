@@ -9,6 +9,7 @@ from gen2d.core.lazy import attach
 
 if TYPE_CHECKING:
     from gen2d.config import common
+    from gen2d.config.contracts import Annotation, Export, Family, Look
     from gen2d.config.distributions import Distribution
     from gen2d.config.options import option
     from gen2d.core.enums import CIRCLE, DYNAMIC, KINEMATIC, STATIC
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
         are_moving,
         contrasting,
         line_fields,
+        line_margin,
         mean_color,
         plain,
     )
@@ -47,6 +49,7 @@ if TYPE_CHECKING:
 
 _HOMES = {
     "gen2d.config": "common",
+    "gen2d.config.contracts": "Annotation Export Family Look",
     "gen2d.config.distributions": "Distribution",
     "gen2d.config.options": "option",
     "gen2d.core.enums": "CIRCLE DYNAMIC KINEMATIC STATIC",
@@ -62,7 +65,9 @@ _HOMES = {
     "gen2d.renderers": "extents",
     "gen2d.renderers.camera": "pixel_at to_pixels",
     "gen2d.renderers.compositing": "OCCLUDER",
-    "gen2d.renderers.look": "LineOptions PlainOptions are_lines are_moving contrasting line_fields mean_color plain",
+    "gen2d.renderers.look": (
+        "LineOptions PlainOptions are_lines are_moving contrasting line_fields line_margin mean_color plain"
+    ),
     "gen2d.renderers.noise": "fraction hashed",
     "gen2d.renderers.paint": "Background Paint Texture",
     "gen2d.renderers.plan": "FramePlan RenderScene tile_windows",
@@ -82,17 +87,21 @@ __all__ = [
     "KINEMATIC",
     "OCCLUDER",
     "STATIC",
+    "Annotation",
     "Array",
     "Background",
     "Batch",
     "ConfigError",
     "Distribution",
+    "Export",
+    "Family",
     "Field",
     "FramePlan",
     "Instants",
     "JointSpec",
     "Layout",
     "LineOptions",
+    "Look",
     "Paint",
     "PixelWindow",
     "PlainOptions",
@@ -116,6 +125,7 @@ __all__ = [
     "fraction",
     "hashed",
     "line_fields",
+    "line_margin",
     "mean_color",
     "on_cpu",
     "option",

@@ -21,11 +21,6 @@ class LineOptions:
 
     wall_width: float = option(1.5, float, "px", "of a segment's line, beyond its own radius; 0: not drawn", low=0)
 
-    @property
-    def margin(self) -> float:
-        """How far an object may be drawn beyond its rim, px."""
-        return self.wall_width / 2
-
 
 @dataclasses.dataclass(frozen=True)
 class PlainOptions(LineOptions):
@@ -43,6 +38,11 @@ class PlainOptions(LineOptions):
     contrast: float = option(
         120.0, float, "1", "least difference of random colours and of the background, 0 to 765", low=0, high=765
     )
+
+
+def line_margin(options: LineOptions) -> float:
+    """How far an object may be drawn beyond its rim, px: half a segment's line."""
+    return options.wall_width / 2
 
 
 def plain(scene: Scene, layout: Layout, options: PlainOptions, key: Array) -> Paint:
@@ -89,7 +89,7 @@ def line_fields(scene: Scene, options: LineOptions) -> tuple[Array, Array]:
     radius, and are not drawn if they have neither."""
     line, objects = are_lines(scene), scene.objects
     drawn = objects.present & ~(line & (objects.radius + options.wall_width <= 0))
-    return drawn, jnp.where(line, options.margin, 0.0)
+    return drawn, jnp.where(line, line_margin(options), 0.0)
 
 
 def are_lines(scene: Scene) -> Array:

@@ -1,53 +1,85 @@
 """What is true of a video's pixels: one file for each annotation, named like the option that asks for it.
 
-A file has `FIELDS`, what it stores, by name; `OWNERS`, whether it needs to know which object each pixel shows; and
-`annotate(stages, owners, plan, options)`, which gives an array for each field of some videos. Axes that others do not
-have are in `sizes(plan, options)`.
+A file ends with an `ANNOTATION`, whose members `gen2d.plugin.Annotation` describes. The smallest one:
+
+    from gen2d.plugin import Annotation, Field, option
+
+    def annotate(scenes, owners, plan, value):
+        return {"motion/turn": abs(scenes.instants.angle)}
+
+    ANNOTATION = Annotation(
+        options=option(False, bool, "", "how far each object has turned"),
+        fields={"motion/turn": Field("float32", "n T K", "rad", "from its start, either way")},
+        annotate=annotate,
+    )
+
+A config asks for turn.py in this folder by `annotations: {turn: true}`, and for one elsewhere by its path, as in
+`annotations: {my/turn.py: true}`.
 """
 
-import importlib
-import pkgutil
-from types import ModuleType
+from collections.abc import Mapping
 from typing import Any
 
+from gen2d.config.annotations import Annotations
+from gen2d.core.errors import ConfigError
 from gen2d.core.schema import Field
 from gen2d.records.axes import Array
 from gen2d.renderers.plan import FramePlan, RenderScene
 
 
-def modules() -> dict[str, ModuleType]:
-    """All annotations, by the option that asks for each."""
-    names = sorted(module.name for module in pkgutil.iter_modules(__path__))
-    return {name: importlib.import_module(f"{__name__}.{name}") for name in names}
+def need_owners(annotations: Annotations) -> bool:
+    """Whether any annotation needs to know which object each pixel shows."""
+    return any(plugin.contract.owners for plugin in annotations.wanted)
 
 
-def wanted(options: Any) -> list[ModuleType]:
-    """The annotations that the options ask for."""
-    return [module for name, module in modules().items() if getattr(options, name)]
+def fields(annotations: Annotations, others: Mapping[str, Field]) -> dict[str, Field]:
+    """All stored fields by name: the others and the annotations'. Raises ConfigError for a name declared twice."""
+    return _joined(others, {plugin.name: plugin.contract.fields for plugin in annotations.wanted}, "field")
 
 
-def need_owners(options: Any) -> bool:
-    """Whether it must be known which object each pixel shows."""
-    return any(module.OWNERS for module in wanted(options))
+def sizes(annotations: Annotations, plan: FramePlan, others: Mapping[str, int]) -> dict[str, int]:
+    """The lengths of all axes by letter, as `fields`."""
+    own = {plugin.name: plugin.contract.sizes(plan, plugin.options) for plugin in annotations.wanted}
+    return _joined(others, own, "axis")
 
 
-def fields(options: Any) -> dict[str, Field]:
-    """Everything that is stored for these options."""
-    return {name: field for module in wanted(options) for name, field in module.FIELDS.items()}
+def _joined(others: Mapping[str, Any], own: Mapping[str, Mapping[str, Any]], what: str) -> dict[str, Any]:
+    joined = dict(others)
+    for name, members in own.items():
+        twice = members.keys() & joined.keys()
+        if twice:
+            raise ConfigError(f"annotations.{name} has a {what} {min(twice)!r}, but there is one of that name already")
+        joined |= members
+    return joined
 
 
-def sizes(options: Any, plan: FramePlan) -> dict[str, int]:
-    """The sizes of the axes that annotations bring with them."""
-    found: dict[str, int] = {}
-    for module in wanted(options):
-        if hasattr(module, "sizes"):
-            found |= module.sizes(plan, options)
-    return found
+def annotated(scenes: RenderScene, owners: Array | None, plan: FramePlan, annotations: Annotations) -> dict[str, Array]:
+    """The annotations of some videos, by their stored names; owners [n, T, H, W] uint8 as rasterizer.draw gives them.
 
-
-def annotated(stages: RenderScene, owners: Array | None, plan: FramePlan, options: Any) -> dict[str, Array]:
-    """The annotations of some videos, by their stored names; owners [n, T, H, W] uint8 as raster.draw gives them."""
-    found: dict[str, Array] = {}
-    for module in wanted(options):
-        found |= module.annotate(stages, owners, plan, options)
-    return found
+    Raises ConfigError where an annotation returns something else than it declares.
+    """
+    count, frames, slots = scenes.instants.angle.shape
+    arrays: dict[str, Array] = {}
+    for plugin in annotations.wanted:
+        own, declared = plugin.contract.annotate(scenes, owners, plan, plugin.options), plugin.contract.fields
+        known = {"T": frames, "K": slots, "H": plan.height, "W": plan.width}
+        known |= plugin.contract.sizes(plan, plugin.options)
+        for name in sorted(own.keys() | declared.keys()):
+            if name not in own or name not in declared:
+                verb = "declares" if name in declared else "returns"
+                raise ConfigError(f"annotations.{plugin.name} {verb} {name!r}, but must declare what it returns")
+            field, array = declared[name], own[name]
+            unknown = [axis for axis in field.axes.split()[1:] if not axis.isdigit() and axis not in known]
+            if not field.per_video or unknown:
+                raise ConfigError(
+                    f"annotations.{plugin.name}: the axes of {name} are {field.axes!r}, but must begin with n, and the "
+                    f"others be numbers or of {', '.join(known)}"
+                )
+            shape = (count, *field.shape(known))
+            if (array.shape, array.dtype.name) != (shape, field.dtype):
+                raise ConfigError(
+                    f"annotations.{plugin.name}: {name} is {array.dtype.name}{[*array.shape]}, but must be as "
+                    f"declared, {field.dtype}{[*shape]}"
+                )
+        arrays |= own
+    return arrays

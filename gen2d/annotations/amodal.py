@@ -2,22 +2,15 @@
 
 import jax.numpy as jnp
 
-from gen2d.plugin import Array, Field, FramePlan, RenderScene, alone, each_video
-
-OWNERS = False
-FIELDS = {
-    "masks/amodal": Field(
-        "uint8", "n T K B", "1", "pixels half covered or more, seen or not; bits in rows, first pixel highest"
-    )
-}
+from gen2d.plugin import Annotation, Array, Field, FramePlan, RenderScene, alone, each_video, option
 
 
-def sizes(plan: FramePlan, options: object) -> dict[str, int]:
+def sizes(plan: FramePlan, on: bool) -> dict[str, int]:
     """B, the bytes of a mask: numpy.unpackbits(mask)[: H * W].reshape(H, W) is the mask."""
     return {"B": -(-plan.height * plan.width // 8)}
 
 
-def annotate(stages: RenderScene, owners: Array | None, plan: FramePlan, options: object) -> dict[str, Array]:
+def annotate(stages: RenderScene, owners: Array | None, plan: FramePlan, on: bool) -> dict[str, Array]:
     """The packed masks of every slot."""
     pixels = plan.height * plan.width
     weights = jnp.asarray([128, 64, 32, 16, 8, 4, 2, 1], jnp.uint8)
@@ -28,3 +21,15 @@ def annotate(stages: RenderScene, owners: Array | None, plan: FramePlan, options
         return jnp.where(bits, weights, 0).astype(jnp.uint8).sum(-1, dtype=jnp.uint8)
 
     return {"masks/amodal": each_video(lambda stage: alone(stage, plan, packed), stages)}
+
+
+ANNOTATION = Annotation(
+    options=option(False, bool, "", "where each object is, seen or not, a bit a pixel"),
+    fields={
+        "masks/amodal": Field(
+            "uint8", "n T K B", "1", "pixels half covered or more, seen or not; bits in rows, first pixel highest"
+        )
+    },
+    annotate=annotate,
+    sizes=sizes,
+)

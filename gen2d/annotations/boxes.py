@@ -6,21 +6,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gen2d.plugin import Array, Field, FramePlan, RenderScene, extents, reduce_halves
+from gen2d.plugin import Annotation, Array, Field, FramePlan, RenderScene, extents, option, reduce_halves
 
-OWNERS = True
-FIELDS = {
-    "boxes/visible": Field(
-        "float32", "n T K 4", "px", "x0 y0 x1 y1 around the pixels of the instance mask; 0 where nothing is seen"
-    ),
-    "boxes/amodal": Field(
-        "float32", "n T K 4", "px", "x0 y0 x1 y1 around the whole object, also beyond the frame, to a part of a pixel"
-    ),
-}
 WORD = 32  # slots that are looked at together, a bit each
 
 
-def annotate(stages: RenderScene, owners: Array, plan: FramePlan, options: object) -> dict[str, Array]:
+def annotate(stages: RenderScene, owners: Array, plan: FramePlan, on: bool) -> dict[str, Array]:
     """Both kinds of boxes."""
     seen = seen_boxes(owners.reshape(-1, *owners.shape[2:]), plan.layout.slots)
     return {
@@ -55,3 +46,21 @@ def _ends(bit: Array, words: Array) -> tuple[Array, Array]:
     last = reduce_halves(jnp.where(there, place + 1, 0.0), 0, jnp.maximum)
     first = len(words) - reduce_halves(jnp.where(there, len(words) - place, 0.0), 0, jnp.maximum)
     return jnp.minimum(first, last), last
+
+
+ANNOTATION = Annotation(
+    options=option(False, bool, "", "around what is seen of each object, and around all of it"),
+    fields={
+        "boxes/visible": Field(
+            "float32", "n T K 4", "px", "x0 y0 x1 y1 around the pixels of the instance mask; 0 where nothing is seen"
+        ),
+        "boxes/amodal": Field(
+            "float32",
+            "n T K 4",
+            "px",
+            "x0 y0 x1 y1 around the whole object, also beyond the frame, to a part of a pixel",
+        ),
+    },
+    annotate=annotate,
+    owners=True,
+)

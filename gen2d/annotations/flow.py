@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from gen2d.plugin import (
     OCCLUDER,
     STATIC,
+    Annotation,
     Array,
     Field,
     FramePlan,
@@ -18,22 +19,16 @@ from gen2d.plugin import (
     RenderScene,
     SlotGroup,
     on_cpu,
+    option,
     pixel_at,
     tile_windows,
     to_pixels,
 )
 
-OWNERS = True
 _VALID = "1 where the flow ends in the frame, at a pixel of the same object"
-FIELDS = {
-    "flow/forward": Field("float16", "n T H W 2", "px/frame", "dx right, dy down, to frame t + 1; 0 in the last"),
-    "flow/backward": Field("float16", "n T H W 2", "px/frame", "dx right, dy down, to frame t - 1; 0 in the first"),
-    "flow/forward_valid": Field("uint8", "n T H W", "1", _VALID),
-    "flow/backward_valid": Field("uint8", "n T H W", "1", _VALID),
-}
 
 
-def annotate(stages: RenderScene, owners: Array, plan: FramePlan, options: object) -> dict[str, Array]:
+def annotate(stages: RenderScene, owners: Array, plan: FramePlan, on: bool) -> dict[str, Array]:
     """Both flows and where they are valid."""
     found, flow_of = {}, _by_patches if on_cpu() else _by_pixels
     for name, step in (("forward", 1), ("backward", -1)):
@@ -169,3 +164,16 @@ def _stroke(
     both = jnp.where(jnp.broadcast_to(mine[..., None], (*size, 2)).reshape(twice), new, old)
     flow = jax.lax.dynamic_update_slice(flow, both, beside)
     return flow, jax.lax.dynamic_update_slice(valid, jnp.where(mine, seen, was), place)
+
+
+ANNOTATION = Annotation(
+    options=option(False, bool, "", "where each pixel goes to in the next frame, and came from"),
+    fields={
+        "flow/forward": Field("float16", "n T H W 2", "px/frame", "dx right, dy down, to frame t + 1; 0 in the last"),
+        "flow/backward": Field("float16", "n T H W 2", "px/frame", "dx right, dy down, to frame t - 1; 0 in the first"),
+        "flow/forward_valid": Field("uint8", "n T H W", "1", _VALID),
+        "flow/backward_valid": Field("uint8", "n T H W", "1", _VALID),
+    },
+    annotate=annotate,
+    owners=True,
+)

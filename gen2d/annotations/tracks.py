@@ -1,32 +1,34 @@
 """Points that are fixed to objects, followed through the video."""
 
 import functools
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gen2d.plugin import Array, Field, FramePlan, RenderScene, SlotGroup, fraction, hashed, pixel_at, to_pixels
+from gen2d.plugin import (
+    Annotation,
+    Array,
+    Field,
+    FramePlan,
+    RenderScene,
+    SlotGroup,
+    fraction,
+    hashed,
+    option,
+    pixel_at,
+    to_pixels,
+)
 
-OWNERS = True
-FIELDS = {
-    "tracks/points": Field(
-        "float32", "n T P 2", "px", "x right, y down, of points fixed to objects, even in their area"
-    ),
-    "tracks/visible": Field("bool", "n T P", "1", "whether the point lies in a pixel that shows its object"),
-    "tracks/object": Field("int16", "n P", "object", "slot that the point is fixed to, -1 where there is none"),
-}
 
-
-def sizes(plan: FramePlan, options: Any) -> dict[str, int]:
+def sizes(plan: FramePlan, count: int) -> dict[str, int]:
     """P, so many points for every slot."""
-    return {"P": plan.layout.slots * options.tracks}
+    return {"P": plan.layout.slots * count}
 
 
-def annotate(stages: RenderScene, owners: Array, plan: FramePlan, options: Any) -> dict[str, Array]:
+def annotate(stages: RenderScene, owners: Array, plan: FramePlan, count: int) -> dict[str, Array]:
     """The points, where they are seen, and whose they are."""
-    return jax.vmap(functools.partial(_followed, plan=plan, count=options.tracks))(stages, owners)
+    return jax.vmap(functools.partial(_followed, plan=plan, count=count))(stages, owners)
 
 
 def _followed(stage: RenderScene, owners: Array, plan: FramePlan, count: int) -> dict[str, Array]:
@@ -81,3 +83,19 @@ def _in_polygon(vertices: Array, u: Array, v: Array, w: Array) -> Array:
     one, other = (jnp.take_along_axis(a, side[..., None], axis=1) for a in (corner, following))
     far = jnp.sqrt(u)[..., None]
     return vertices[:, :1] + far * (one + v[..., None] * (other - one))
+
+
+ANNOTATION = Annotation(
+    options=option(0, int, "points", "fixed to each object and followed; 0: none", low=0, high=1024),
+    fields={
+        "tracks/points": Field(
+            "float32", "n T P 2", "px", "x right, y down, of points fixed to objects, even in their area"
+        ),
+        "tracks/visible": Field("bool", "n T P", "1", "whether the point lies in a pixel that shows its object"),
+        "tracks/object": Field("int16", "n P", "object", "slot that the point is fixed to, -1 where there is none"),
+    },
+    annotate=annotate,
+    sizes=sizes,
+    owners=True,
+    usual=8,
+)

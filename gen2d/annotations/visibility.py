@@ -6,17 +6,21 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gen2d.plugin import Array, Field, FramePlan, RenderScene, are_moving, each_video, extents, reduce_halves
+from gen2d.plugin import (
+    Annotation,
+    Array,
+    Field,
+    FramePlan,
+    RenderScene,
+    are_moving,
+    each_video,
+    extents,
+    option,
+    reduce_halves,
+)
 
-OWNERS = True
-FIELDS = {
-    "visibility/pixels": Field("int32", "n T K", "px", "pixels of the instance mask"),
-    "visibility/fraction": Field("float32", "n T K", "1", "those over the area of the whole object, 1 at most"),
-    "quality/min_visibility": Field("float32", "n", "1", "least visibility/fraction of what moves, in any frame"),
-}
 
-
-def annotate(stages: RenderScene, owners: Array, plan: FramePlan, options: object) -> dict[str, Array]:
+def annotate(stages: RenderScene, owners: Array, plan: FramePlan, on: bool) -> dict[str, Array]:
     """The number of pixels and the part seen, and the least of it."""
     pixels = each_video(functools.partial(counts, slots=plan.layout.slots), owners)
     area = jax.vmap(functools.partial(extents.areas, plan=plan))(stages)
@@ -39,3 +43,15 @@ def counts(owners: Array, slots: int) -> Array:
         return reduce_halves(columns, 2, jnp.add).sum(1)
 
     return jax.lax.map(of, np.arange(1, slots + 1, dtype=np.uint8)).T
+
+
+ANNOTATION = Annotation(
+    options=option(False, bool, "", "how many pixels of each object are seen, and which part of it"),
+    fields={
+        "visibility/pixels": Field("int32", "n T K", "px", "pixels of the instance mask"),
+        "visibility/fraction": Field("float32", "n T K", "1", "those over the area of the whole object, 1 at most"),
+        "quality/min_visibility": Field("float32", "n", "1", "least visibility/fraction of what moves, in any frame"),
+    },
+    annotate=annotate,
+    owners=True,
+)

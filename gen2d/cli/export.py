@@ -4,13 +4,15 @@ import argparse
 from pathlib import Path
 
 from gen2d.cli.parser import Parser, add_dataset, add_network, add_trust, limits
+from gen2d.config.plugins import names
 from gen2d.core.humanize import in_bytes, in_time
-from gen2d.exports import formats
 
 
 def add_arguments(parser: Parser) -> None:
     add_dataset(parser)
-    parser.add_argument("--to", required=True, metavar="FORMAT", help=f"one of {', '.join(formats.names())}")
+    parser.add_argument(
+        "--to", required=True, metavar="FORMAT", help=f"one of {', '.join(names('export'))}, or a Python file"
+    )
     parser.add_argument(
         "--out", type=Path, metavar="PATH", help="the folder or file to make (default: DIR-FORMAT, beside the dataset)"
     )
@@ -19,7 +21,7 @@ def add_arguments(parser: Parser) -> None:
         "--fields",
         nargs="+",
         metavar="NAME",
-        help="fields to export, by name or pattern such as 'states/*'; for npz and webdataset only (default: all)",
+        help="fields to export, by name or pattern such as 'states/*'; where the format can hold any (default: all)",
     )
     parser.add_argument("--overwrite", action="store_true", help="replace an export of another dataset")
     add_trust(parser)

@@ -1,4 +1,4 @@
-"""List scene families, looks and configs, with all their options."""
+"""List scene families, looks, annotations, formats of exports and configs, with all their options."""
 
 import argparse
 
@@ -6,7 +6,7 @@ from gen2d.cli.parser import Parser
 
 
 def add_arguments(parser: Parser) -> None:
-    parser.add_argument("name", nargs="?", metavar="NAME", help="show only this family, look or config")
+    parser.add_argument("name", nargs="?", metavar="NAME", help="show only the plug-in or config of this name")
 
 
 def run(options: argparse.Namespace) -> int:

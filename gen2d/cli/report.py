@@ -80,44 +80,66 @@ def _fingerprint(entries: Mapping[str, Any], prefix: str = "") -> Iterator[tuple
             yield f"{prefix}{key}", (text[:16] if prefix else text) or "-"
 
 
+TITLES = {
+    "scene": "Scene families",
+    "look": "Looks",
+    "annotation": "Annotations of pixels",
+    "export": "Formats of exports",
+}
+
+
 def plugins(name: str | None = None) -> str:
-    """Scene families, looks and configs with their options as text; only the one called `name`, if it is given.
+    """Plug-ins and configs with their options as text; only the one called `name`, if it is given.
 
     Raises ConfigError for an unknown name.
     """
-    from gen2d.config import plugins
-    from gen2d.config.config import SECTIONS  # imports jax
+    from gen2d.config import config, plugins  # imports jax
+    from gen2d.config.sections import SimulationAnnotations
 
     lines: list[str] = []
-    for kind, title in (("scene", "Scene families"), ("look", "Looks")):
-        chosen = [plugin for plugin in plugins.names(kind) if name in (None, plugin)]
-        lines += [f"{title}:"] if chosen else []
-        for plugin in chosen:
-            module = plugins.load(kind, plugin)
-            lines += [*_section(plugin, module.__doc__, kind, module.Options), ""]
-    configs = [config for config in plugins.config_names() if name in (None, config, config.removesuffix(".yaml"))]
+    for kind, title in TITLES.items():
+        known = [n for n in plugins.names(kind) if name in (None, n)]
+        lines += [f"{title}:"] if known else []
+        for plugin in known:
+            rows = _options(_declared(kind, plugin, plugins.load(kind, plugin)))
+            lines += [f" {plugin}: {plugins.summary(kind, plugin)}", *rows, *([""] if rows else [])]
+        lines += [""] if known and lines[-1] else []
+    configs = [c for c in plugins.config_names() if name in (None, c, c.removesuffix(".yaml"))]
     if configs:
         lines += [f"Configs (in {plugins.config_folder()}):", *(f"  {config}" for config in configs), ""]
     if name is None:
         lines.append("Sections of every config:")
-        for section, options in SECTIONS.items():
-            lines += [*_section(section, options.__doc__, section, options), ""]
+        for section, options in {**config.SECTIONS, "annotations": SimulationAnnotations}.items():
+            about = (options.__doc__ or "").strip().partition("\n")[0]
+            lines += [f" {section}: {about}", *_options(_named(section, options)), ""]
     if not lines:
-        known = [*plugins.names("scene"), *plugins.names("look"), *plugins.config_names()]
-        raise ConfigError(f"{name!r} is not known; {plugins.nearest(name or '', known)}")
+        names = [*(known for kind in TITLES for known in plugins.names(kind)), *plugins.config_names()]
+        raise ConfigError(f"{name!r} is not known; {plugins.nearest(name or '', names)}")
     return "\n".join(lines).rstrip()
 
 
-def _section(title: str, doc: str | None, prefix: str, options: type) -> list[str]:
-    """A title with the first line of a docstring, and a table of options: name, default, meaning and allowed values."""
+def _declared(kind: str, name: str, contract: Any) -> dict[str, dataclasses.Field]:
+    """The options of a plug-in, by where they stand in a config."""
+    if kind == "export":
+        return {}
+    if kind != "annotation":
+        return _named(kind, contract.options)
+    where, options = f"annotations.{name}", contract.options
+    return {where: options} if isinstance(options, dataclasses.Field) else _named(where, options)
+
+
+def _named(where: str, options: type) -> dict[str, dataclasses.Field]:
+    return {f"{where}.{field.name}": field for field in dataclasses.fields(options)}
+
+
+def _options(fields: Mapping[str, dataclasses.Field]) -> list[str]:
     rows = []
-    for field in dataclasses.fields(options):
+    for name, field in fields.items():
         spec = field.metadata["option"]
         unit = f" {spec.unit}" if spec.unit not in ("", "1") else ""
-        meaning = f"{spec.meaning}; {spec.allowed}" + (", or a distribution" if spec.draw else "")
-        rows.append((f"{prefix}.{field.name}", f"{_default(field.default)}{unit}", meaning))
-    summary = (doc or "").strip().partition("\n")[0]
-    return [f" {title}: {summary}", *_table(rows)]
+        about = f"{spec.meaning}; {spec.allowed}" + (", or a distribution" if spec.draw else "")
+        rows.append((name, f"{_default(field.default)}{unit}", about))
+    return _table(rows) if rows else []
 
 
 def _default(value: Any) -> str:

@@ -14,12 +14,12 @@ from typing import Any
 from gen2d.config import matched as matched_module
 from gen2d.config import plugins
 from gen2d.config import quality as quality_module
+from gen2d.config.annotations import Annotations, annotations_of
 from gen2d.config.joint_distribution import JointDistribution
 from gen2d.config.options import build, coordinates, plain_of
 from gen2d.config.plugin_options import NO_COPIES, Copies, Plugin, StoredCopies, named, plugin_of
 from gen2d.config.reading import YAML_BYTES, overridden, parse_yaml, yaml_text
 from gen2d.config.sections import (
-    AnnotationOptions,
     CameraOptions,
     ImageOptions,
     MatchedOptions,
@@ -48,7 +48,7 @@ class Config:
     camera: CameraOptions
     image: ImageOptions
     look: Plugin
-    annotations: AnnotationOptions
+    annotations: Annotations
     matched: MatchedOptions
     quality: QualityOptions
     storage: StorageOptions
@@ -56,7 +56,7 @@ class Config:
 
     def plain(self) -> dict[str, Any]:
         """The config as YAML and JSON hold it, every default filled in."""
-        sections = {s: plain_of(getattr(self, s)) for s in SECTIONS}
+        sections = {s: plain_of(getattr(self, s)) for s in SECTIONS} | {"annotations": self.annotations.plain()}
         plugs = {p: getattr(self, p).plain() for p in PLUGINS}
         splits = {"splits": {split.name: split.plain() for split in self.splits}} if self.splits else {}
         return {"name": self.name, "seed": self.seed, **sections, **plugs, **splits}
@@ -73,7 +73,8 @@ class Config:
     def copies(self) -> Copies:
         """What the files of the user's own hold, by their names in the config."""
         looks = [split.own["look"] for split in self.splits if "look" in split.own]
-        return {plugin.name: plugin.content for plugin in (self.scene, self.look, *looks) if plugin.sha256}
+        every = self.scene, self.look, *looks, *self.annotations.pixels
+        return {plugin.name: plugin.content for plugin in every if plugin.sha256}
 
     def recipe(self) -> dict[str, Any]:
         """The config without its seed, which a dataset keeps and compares by itself, and without numbers of videos."""
@@ -118,7 +119,6 @@ SECTIONS = {
     "physics": PhysicsOptions,
     "camera": CameraOptions,
     "image": ImageOptions,
-    "annotations": AnnotationOptions,
     "matched": MatchedOptions,
     "quality": QualityOptions,
     "storage": StorageOptions,
@@ -145,6 +145,8 @@ def _section(name: str, values: Any, source: str, copies: Copies) -> Any:
     """The options of a section, or a plug-in."""
     if name in PLUGINS:
         return plugin_of(name, values, PLUGINS[name], source, copies)
+    if name == "annotations":
+        return annotations_of({} if values is None else values, source, copies)
     return build(SECTIONS[name], {} if values is None else values, name, source)
 
 
@@ -152,7 +154,8 @@ def from_mapping(values: Any, source: str, name: str = "dataset", copies: Copies
     """The config that a mapping stands for; every error names `source`."""
     if not isinstance(values, Mapping):
         raise ConfigError(f"{source}: holds {type(values).__name__}, but must hold a mapping of sections")
-    known = ["name", "seed", *SECTIONS, *PLUGINS, "splits"]
+    read = (*SECTIONS, "annotations", *PLUGINS)
+    known = ["name", "seed", *read, "splits"]
     for key in values:
         if key not in known:
             raise ConfigError(f"{source}: {key} is not a section; {plugins.nearest(key, known)}")
@@ -160,19 +163,19 @@ def from_mapping(values: Any, source: str, name: str = "dataset", copies: Copies
     if not isinstance(name, str) or not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}", name):
         raise ConfigError(f"{source}: name is {name!r}, but must be letters, digits, '.', '_' and '-', 100 at most")
     seed = checked_seed(values.get("seed", 0), f"{source}: seed")
-    sections: dict[str, Any] = {s: _section(s, values.get(s), source, copies) for s in (*SECTIONS, *PLUGINS)}
+    sections: dict[str, Any] = {s: _section(s, values.get(s), source, copies) for s in read}
     frames, chunk = sections["video"].frames, sections["storage"].chunk_frames
     if chunk is not None and frames % chunk:
         raise ConfigError(f"{source}: storage.chunk_frames is {chunk}, but must divide video.frames, which is {frames}")
-    if sections["annotations"].captions and not sections["annotations"].contacts:
+    simulated = sections["annotations"].simulated
+    if simulated.captions and not simulated.contacts:
         raise ConfigError(
             f"{source}: annotations.contacts is 0, but annotations.captions needs them: 4 is a good number"
         )
     config = Config(name=name, seed=seed, **sections)
     _check_grids(config, source)
-    enabled = {f"annotations.{name}": bool(value) for name, value in vars(config.annotations).items()}
     try:
-        quality_module.check(config.quality, enabled)
+        quality_module.check(config.quality, {f"annotations.{name}" for name in config.annotations.enabled})
     except ValueError as error:
         raise ConfigError(f"{source}: quality.{error}") from None
     if values.get("splits"):
@@ -204,22 +207,24 @@ def _with_splits(config: Config, written: Any, source: str, copies: Copies) -> C
 
 def own_files(plain: Mapping[str, Any]) -> dict[str, str]:
     """The names of the user's own files in a config (`Config.plain`), by where a dataset keeps their copies."""
-    splits = plain.get("splits")
-    written = {f"splits/{name}/look": split for name, split in (splits or {}).items()} if _is_mapping(splits) else {}
-    looks = {place: split["look"] for place, split in written.items() if _is_mapping(split) and "look" in split}
-    places = {kind: plain[kind] for kind in PLUGINS if kind in plain} | looks
-    names = {kind: named(look).get("name", "") for kind, look in places.items() if _is_mapping(named(look))}
-    own = {kind: name for kind, name in names.items() if isinstance(name, str) and plugins.is_own(name)}
-    return {plugins.copy_name(kind, name): name for kind, name in own.items()}
+    places = [(kind, plain.get(kind)) for kind in PLUGINS]
+    places += [
+        (f"splits/{name}/look", _mapping(own).get("look")) for name, own in _mapping(plain.get("splits")).items()
+    ]
+    names = [(kind, _mapping(named(plugin)).get("name")) for kind, plugin in places]
+    names += [("annotation", name) for name in _mapping(plain.get("annotations"))]
+    own = [(kind, name) for kind, name in names if isinstance(name, str) and plugins.is_own(name)]
+    return {plugins.copy_name(kind, name): name for kind, name in own}
 
 
-def _is_mapping(value: Any) -> bool:
-    return isinstance(value, Mapping)
+def _mapping(value: Any) -> Mapping[Any, Any]:
+    """The value if it is a mapping, else an empty one."""
+    return value if isinstance(value, Mapping) else {}
 
 
 def _check_sets(config: Config, source: str) -> None:
     """Raises ConfigError for matched sets that cannot be made."""
-    about = config.scene, config.video, config.annotations, config.camera
+    about = config.scene, config.video, config.annotations.simulated, config.camera
     try:
         matched_module.check(config.matched, MatchedOptions(), *about)
         if config.matched.change and quality_module.ranges(config.quality):

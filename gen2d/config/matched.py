@@ -34,7 +34,7 @@ def check(options: Any, default: Any, scene: Any, video: Any, annotations: Any, 
         return
     if len(set(options.change)) < len(options.change):
         raise ValueError(f"change is {list(options.change)}, but must name each change once")
-    layout = scene.module.layout(scene.options)
+    layout = scene.contract.layout(scene.options)
     for name in options.change:
         if name in INTERVENTIONS:
             _check_act(name, scene, layout, video, camera)
@@ -60,7 +60,7 @@ def _check_act(name: str, scene: Any, layout: Layout, video: Any, camera: Any) -
 
 
 def _check_factor(name: str, options: Any, scene: Any, layout: Layout) -> None:
-    specs = drawn_options(scene.module)
+    specs = drawn_options(scene.contract)
     if name not in specs:
         raise ValueError(f"change is {name!r}, which is no factor; {plugins.nearest(name, [*INTERVENTIONS, *specs])}")
     value = getattr(scene.options, name)
@@ -73,9 +73,8 @@ def _check_factor(name: str, options: Any, scene: Any, layout: Layout) -> None:
         raise ValueError(f"scale is for numbers, but scene.{name} is a whole number, which can be drawn anew only")
     scaled = tuple(_scaled(part, options.scale, specs[name]) for part in parts)
     widened = dataclasses.replace(scene.options, **{name: scaled if isinstance(value, tuple) else scaled[0]})
-    if hasattr(scene.module, "check"):
-        scene.module.check(widened)
-    if scene.module.layout(widened) != layout:
+    scene.contract.check(widened)
+    if scene.contract.layout(widened) != layout:
         raise ValueError(f"scale is for what the scene is not built around, but scene.{name} is: draw it anew")
 
 

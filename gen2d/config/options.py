@@ -5,10 +5,10 @@ An error is one sentence with the file, the field, its value and what is allowed
 
 import dataclasses
 from collections.abc import Mapping
-from types import ModuleType
 from typing import Any
 
 from gen2d.config import plugins
+from gen2d.config.contracts import Family
 from gen2d.config.distribution_syntax import is_number, parse
 from gen2d.config.distributions import Distribution
 from gen2d.core.errors import ConfigError
@@ -61,15 +61,16 @@ def option(default: Any, kind: type, unit: str, meaning: str, **limits: Any) -> 
     return dataclasses.field(default=default, metadata={"option": spec})
 
 
+def plain_value(value: Any) -> Any:
+    """An option's value as YAML and JSON hold it."""
+    if isinstance(value, tuple):
+        return [plain_value(part) for part in value]
+    return value.plain() if isinstance(value, Distribution) else value
+
+
 def plain_of(options: Any) -> dict[str, Any]:
     """Options as YAML and JSON hold them."""
-
-    def value(v: Any) -> Any:
-        if isinstance(v, tuple):
-            return [value(x) for x in v]
-        return v.plain() if isinstance(v, Distribution) else v
-
-    return {f.name: value(getattr(options, f.name)) for f in dataclasses.fields(options)}
+    return {field.name: plain_value(getattr(options, field.name)) for field in dataclasses.fields(options)}
 
 
 def _check(spec: Option, low: float, high: float) -> bool:
@@ -135,7 +136,7 @@ def coordinates(name: str, value: Any) -> dict[str, Any]:
     return {f"{name}[{i}]": part for i, part in enumerate(value)} if isinstance(value, tuple) else {name: value}
 
 
-def drawn_options(module: ModuleType) -> dict[str, Option]:
+def drawn_options(family: Family) -> dict[str, Option]:
     """The option behind each factor of a family, by name."""
-    found = {field.name: field.metadata["option"] for field in dataclasses.fields(module.Options)}
-    return {name: spec for name, spec in found.items() if spec.draw}
+    specs = {field.name: field.metadata["option"] for field in dataclasses.fields(family.options)}
+    return {name: spec for name, spec in specs.items() if spec.draw}

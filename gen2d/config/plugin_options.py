@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Mapping
-from types import MappingProxyType, ModuleType
+from types import MappingProxyType
 from typing import Any
 
 from gen2d.config import plugins
@@ -23,7 +23,7 @@ class Plugin:
     """A named plug-in and its options. A scene's `options` can give whatever any split may draw."""
 
     name: str
-    module: ModuleType
+    contract: Any  # Family, Look or Annotation
     options: Any
     sha256: str | None = None  # of a file of the user's own, which may change
     content: bytes = b""  # of that file
@@ -48,30 +48,32 @@ def plugin_of(kind: str, values: Any, default: str, source: str, copies: Copies)
     name = values.get("name", default)
     if not isinstance(name, str):
         raise ConfigError(f"{source}: {kind}.name is {name!r}, but must be one of {', '.join(plugins.names(kind))}")
-    content, digest = _content(kind, name, values, source, copies) if plugins.is_own(name) else (b"", None)
-    if values.get("sha256", digest) != digest:
-        raise ConfigError(f"{source}: {kind}.sha256 is of another version of {name}")
-    module = plugins.load(kind, name, source, content)
-    options = build(module.Options, {k: v for k, v in values.items() if k not in ("name", "sha256")}, kind, source)
-    plugin = Plugin(name, module, options, digest, content)
+    contract, digest, content = contract_of(kind, name, values.get("sha256"), f"{source}: {kind}", copies)
+    options = build(contract.options, {k: v for k, v in values.items() if k not in ("name", "sha256")}, kind, source)
+    plugin = Plugin(name, contract, options, digest, content)
     check_plugin(plugin, kind, source)
     return plugin
 
 
-def _content(kind: str, name: str, values: Mapping, source: str, copies: Copies) -> tuple[bytes, str]:
-    """What a file of the user's own holds, and its sha256: of the copy if that is the version asked for."""
-    if name in copies and sha256(copies[name]) == values.get("sha256"):
-        return copies[name], values["sha256"]
-    if isinstance(copies, StoredCopies):
-        raise ConfigError(f"{source}: {kind} is {name!r}, of which the dataset holds no copy that is what was written")
-    content = plugins.content_of(kind, name, source)
-    return content, sha256(content)
+def contract_of(kind: str, name: str, digest: Any, where: str, copies: Copies) -> tuple[Any, str | None, bytes]:
+    """What a plug-in declares; of a file of the user's own also its sha256 and content, those of the copy with the
+    sha256 `digest` if there is one. Raises ConfigError, which begins with `where`."""
+    content, own = b"", None
+    if plugins.is_own(name):
+        content = copies.get(name, b"")
+        if name not in copies or sha256(content) != digest:
+            if isinstance(copies, StoredCopies):
+                raise ConfigError(f"{where} is {name!r}, of which the dataset holds no copy that is what was written")
+            content = plugins.content_of(name, where)
+        own = sha256(content)
+    if digest not in (None, own):
+        raise ConfigError(f"{where}.sha256 is of another version of {name}")
+    return plugins.load(kind, name, where, content), own, content
 
 
 def check_plugin(plugin: Plugin, kind: str, source: str) -> None:
-    """Returns nothing; raises ConfigError for options that the plug-in itself refuses."""
-    if hasattr(plugin.module, "check"):
-        try:
-            plugin.module.check(plugin.options)
-        except ValueError as error:
-            raise ConfigError(f"{source}: {kind}.{error}") from None
+    """Raises ConfigError for options that the plug-in itself refuses."""
+    try:
+        plugin.contract.check(plugin.options)
+    except ValueError as error:
+        raise ConfigError(f"{source}: {kind}.{error}") from None

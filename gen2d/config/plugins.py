@@ -1,4 +1,4 @@
-"""A name in a config is a file in a folder: find it, load it, or say which names there are."""
+"""A name in a config is a file in a folder, or the path of one: find it, load it, or say which names there are."""
 
 import difflib
 import functools
@@ -7,10 +7,18 @@ import pathlib
 import pkgutil
 import sys
 from types import ModuleType
+from typing import Any
 
+from gen2d.config.contracts import Annotation, Export, Family, Look
 from gen2d.core.errors import ConfigError
 
-FOLDERS = {"scene": "gen2d.scenes", "look": "gen2d.renderers.looks"}
+# The folder of each kind of plug-in and the type of the constant that a file ends with: FAMILY = Family(...).
+KINDS = {
+    "scene": ("gen2d.scenes", Family),
+    "look": ("gen2d.renderers.looks", Look),
+    "annotation": ("gen2d.annotations", Annotation),
+    "export": ("gen2d.exports.formats", Export),
+}
 
 
 def nearest(name: str, names: list[str]) -> str:
@@ -21,22 +29,39 @@ def nearest(name: str, names: list[str]) -> str:
 
 def names(kind: str) -> list[str]:
     """The names in the folder of a kind of plug-in."""
-    return sorted(module.name for module in pkgutil.iter_modules(importlib.import_module(FOLDERS[kind]).__path__))
+    return sorted(module.name for module in pkgutil.iter_modules(importlib.import_module(KINDS[kind][0]).__path__))
 
 
-def load(kind: str, name: str, source: str = "--set", content: bytes = b"") -> ModuleType:
-    """The module behind a name, or behind the path of a Python file of the user's own that holds `content`."""
-    if not is_own(name):
-        if name not in names(kind):
-            raise ConfigError(f"{source}: {kind} is {name!r}, which is not known; {nearest(name, names(kind))}")
-        return importlib.import_module(f"{FOLDERS[kind]}.{name}")
+def load(kind: str, name: str, where: str = "--set", content: bytes = b"") -> Any:
+    """The contract that a name's file declares, or the Python file of the user's own at a path, which holds `content`.
+
+    Raises ConfigError, which begins with `where`, for an unknown name and for a file that cannot be run or declares
+    nothing.
+    """
+    if not is_own(name) and name not in names(kind):
+        raise ConfigError(f"{where} is {name!r}, which is not known; {nearest(name, names(kind))}")
     try:
-        module = _run(kind, pathlib.Path(name).expanduser(), content)
+        module = _run(kind, pathlib.Path(name).expanduser(), content) if is_own(name) else _module(kind, name)
     except Exception as error:
-        raise ConfigError(f"{source}: {kind} is {name!r}, which cannot be run ({error!r})") from error
-    if not hasattr(module, "Options"):
-        raise ConfigError(f"{source}: {kind} is {name!r}, but it has no Options")
-    return module
+        raise ConfigError(f"{where} is {name!r}, which cannot be run ({error!r})") from error
+    contract = KINDS[kind][1]
+    constant = contract.__name__.upper()
+    declared = vars(module).get(constant)
+    if not isinstance(declared, contract):
+        own = (
+            f"its {constant} is of type {type(declared).__name__}" if constant in vars(module) else f"has no {constant}"
+        )
+        raise ConfigError(f"{where} is {name!r}, but {own}: it must end with {constant} = {contract.__name__}(...)")
+    return declared
+
+
+def summary(kind: str, name: str) -> str:
+    """The first line of the docstring of a file in a kind's folder."""
+    return (_module(kind, name).__doc__ or "").strip().partition("\n")[0]
+
+
+def _module(kind: str, name: str) -> ModuleType:
+    return importlib.import_module(f"{KINDS[kind][0]}.{name}")
 
 
 def is_own(name: str) -> bool:
@@ -49,14 +74,14 @@ def copy_name(kind: str, name: str) -> str:
     return f"plugins/{kind}/{pathlib.PurePath(name).name}"
 
 
-def content_of(kind: str, name: str, source: str) -> bytes:
-    """What a file of the user's own holds."""
+def content_of(name: str, where: str) -> bytes:
+    """The content of a file of the user's own. Raises ConfigError, which begins with `where`."""
     path = pathlib.Path(name).expanduser()
     try:
         return path.read_bytes()
     except OSError as error:
         told = "there is no such file" if isinstance(error, FileNotFoundError) else "it cannot be read"
-        raise ConfigError(f"{source}: {kind} is {str(path)!r}, but {told}") from None
+        raise ConfigError(f"{where} is {str(path)!r}, but {told}") from None
 
 
 @functools.lru_cache(maxsize=64)  # the same module each time, so that what was compiled for it is found again

@@ -1,6 +1,6 @@
 """Which videos are asked for: ranges of their quality measures, checked."""
 
-from collections.abc import Mapping
+from collections.abc import Set
 from typing import Any
 
 import numpy as np
@@ -26,11 +26,11 @@ def ranges(options: Any) -> dict[str, tuple[float, float]]:
     }
 
 
-def check(options: Any, enabled: Mapping[str, bool]) -> None:
-    """ValueError where a range holds nothing, or is of what is not stored; `enabled` says which options are on."""
+def check(options: Any, enabled: Set[str]) -> None:
+    """ValueError where a range holds nothing, or is of what is not stored; `enabled` names the options that are on."""
     for name, (_, needed) in MEASURES.items():
         low, high = (getattr(options, f"{end}_{name}") for end in ("min", "max"))
         if low is not None and high is not None and low > high:
             raise ValueError(f"min_{name} is {low:g}, but must be max_{name}, {high:g}, or less")
-        if needed and (low, high) != (None, None) and not enabled[needed]:
+        if needed and (low, high) != (None, None) and needed not in enabled:
             raise ValueError(f"{'min' if high is None else 'max'}_{name} is asked for, but needs {needed}: true")

@@ -84,7 +84,8 @@ def overridden(values: dict, overrides: Sequence[str]) -> dict:
     """The mapping with the value of each `a.b=value` in place."""
     for text in overrides:
         path, equals, value = text.partition("=")
-        keys = path.strip().split(".")
+        own = re.fullmatch(r"(annotations)\.(.+\.py)(?:\.([^.]+))?", path.strip())  # a file's path may have dots
+        keys = [key for key in own.groups() if key] if own else path.strip().split(".")
         if not equals or not all(keys):
             raise ConfigError(f"--set is {text!r}, but must be section.option=value, such as physics.substeps=8")
         place = values

@@ -96,15 +96,9 @@ class ImageOptions:
 
 
 @dataclasses.dataclass(frozen=True)
-class AnnotationOptions:
-    """What is stored beside frames and states."""
+class SimulationAnnotations:
+    """What is stored beside frames and states that follows from the simulation, not from the pixels."""
 
-    masks: bool = option(False, bool, "", "which object each pixel shows")
-    amodal: bool = option(False, bool, "", "where each object is, seen or not, a bit a pixel")
-    boxes: bool = option(False, bool, "", "around what is seen of each object, and around all of it")
-    visibility: bool = option(False, bool, "", "how many pixels of each object are seen, and which part of it")
-    flow: bool = option(False, bool, "", "where each pixel goes to in the next frame, and came from")
-    tracks: int = option(0, int, "points", "fixed to each object and followed; 0: none", low=0, high=1024)
     contacts: int = option(
         0, int, "rows", "of contacts, per object and 16 frames; 4 is a good number, 0: none", low=0, high=1000
     )

@@ -43,7 +43,7 @@ class Split:
 def _base(scene: Plugin) -> Weighted:
     """The distributions that a scene's options say."""
     own = scene.own or scene.options
-    return {k: v for name in drawn_options(scene.module) for k, v in coordinates(name, getattr(own, name)).items()}
+    return {k: v for name in drawn_options(scene.contract) for k, v in coordinates(name, getattr(own, name)).items()}
 
 
 def distributions_of_splits(scene: Plugin, splits: Sequence[Split]) -> list[JointDistribution]:
@@ -91,7 +91,7 @@ def _split(scene: Plugin, name: str, written: Any, training: Split | None, sourc
 
 
 def _distribution_of(scene: Plugin, written: Any, where: str, source: str) -> JointDistribution:
-    specs = drawn_options(scene.module)
+    specs = drawn_options(scene.contract)
 
     def read(values: Mapping[str, Any]) -> Weighted:
         found: Weighted = {}
@@ -133,7 +133,7 @@ def _hull(scene: Plugin, splits: Sequence[Split]) -> Any:
     """Options that can give whatever any of the splits may draw."""
     parts = union_support([split.law for split in splits])
     changes = {}
-    for name, spec in drawn_options(scene.module).items():
+    for name, spec in drawn_options(scene.contract).items():
         found = [parts[key] for key in coordinates(name, getattr(scene.options, name))]
         changes[name] = tuple(found) if spec.parts else found[0]
     return dataclasses.replace(scene.options, **changes)

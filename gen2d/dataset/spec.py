@@ -30,7 +30,7 @@ NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
 SPLIT = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 FILE_NAME = re.compile(r"(?P<split>[A-Za-z0-9][A-Za-z0-9._-]{0,63})-(?P<place>\d{5,10})(-n(?P<count>\d{1,6}))?\.h5")
 TABLE_NAME = re.compile(r"(?P<split>[A-Za-z0-9][A-Za-z0-9._-]{0,63})-(?P<count>\d{1,15})\.npy")
-PLUGIN = re.compile(rf"plugins/(scene|look|splits/{SPLIT.pattern}/look)/[^/\x00-\x1f\x7f]{{1,200}}\.py")
+PLUGIN = re.compile(rf"plugins/(scene|look|annotation|splits/{SPLIT.pattern}/look)/[^/\x00-\x1f\x7f]{{1,200}}\.py")
 
 
 @dataclasses.dataclass(frozen=True)

@@ -2,16 +2,15 @@
 
 import contextlib
 import dataclasses
-import importlib
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
+from gen2d.config import plugins
+from gen2d.config.contracts import Export
 from gen2d.core.errors import ConfigError, FolderError
 from gen2d.core.progress import progress, stopping_on_sigterm
-from gen2d.exports import formats
 from gen2d.exports.source import Source, source_of
 from gen2d.storage.atomic import publishing, publishing_folder, sweep_beside
 from gen2d.storage.explain import writing_error
@@ -46,40 +45,45 @@ def export(
     timeout: float = 30.0,
     deadline: float = 300.0,
 ) -> Exported:
-    """Writes a split of a complete dataset in another format, and returns what was made.
+    """The export of a split of a complete dataset in another format.
 
-    `to` names the format, `out` the folder (for phyworld the file) that is made: ROOT-FORMAT by default. `split` may be
-    left out as in `open`; `fields` are names or patterns, all unless told otherwise, and only for npz and webdataset.
-    Frames that are not stored are drawn. It appears when it is whole; what an earlier export of the same dataset made
-    is replaced, what another made only with `overwrite`. `say` takes lines for a person; `trust` is that of `render`,
-    `timeout` and `deadline` are those of `open`.
+    `to` names the format, or a Python file that declares one (`gen2d.plugin.Export`). `out` is the folder (for
+    phyworld the file) that is made, ROOT-FORMAT by default; it appears when it is whole. An earlier export of the same
+    dataset is replaced, another one only with `overwrite`. `split` may be left out as in `open`. `fields` are names or
+    patterns, for formats that can hold any, such as npz and webdataset (default: all). Frames that are not stored are
+    drawn. `say` takes lines for a person; `trust` is that of `render`, `timeout` and `deadline` are those of `open`.
     Raises ConfigError, FolderError and UntrustedError (UserErrors) with one sentence, DamagedError, UnreachableError.
     """
-    began, module = time.perf_counter(), _module(to)
+    began, form, name = time.perf_counter(), _format(to), Path(to).name
     where = place(root, Network(timeout, deadline))
-    source = source_of(where, split, _patterns(to, module, fields), trust)
-    out = Path(out) if out is not None else _beside(where, f"{to}{module.SUFFIX}")
-    about = _about(source, to)
-    module.check(source)
-    _check_out(out, module, about, overwrite)
+    source = source_of(where, split, _patterns(to, form, fields), trust)
+    out = Path(out) if out is not None else _beside(where, f"{name.removesuffix('.py')}{form.suffix}")
+    about = _about(source, name)
+    form.check(source)
+    _check_out(out, form, about, overwrite)
     say = say or (lambda line: None)
     with _explained(out), stopping_on_sigterm(say), progress(len(source), say) as advance:
-        size = _written(out, module, dataclasses.replace(source, advance=advance), about)
-    return Exported(out, len(source), size, time.perf_counter() - began, module.LOSS)
+        size = _written(out, form, dataclasses.replace(source, advance=advance), about)
+    return Exported(out, len(source), size, time.perf_counter() - began, form.loss)
 
 
-def _module(to: str) -> ModuleType:
-    if to not in formats.names():
-        raise ConfigError(f"--to is {to!r}, but must be one of {', '.join(formats.names())}")
-    return importlib.import_module(f"gen2d.exports.formats.{to}")
+def _format(to: str) -> Export:
+    """The format of a name, or of a Python file of the user's own."""
+    if plugins.is_own(to):
+        return plugins.load("export", to, "--to", plugins.content_of(to, "--to"))
+    known = plugins.names("export")
+    if to not in known:
+        raise ConfigError(f"--to is {to!r}, but must be one of {', '.join(known)}, or a Python file")
+    return plugins.load("export", to, "--to")
 
 
-def _patterns(to: str, module: ModuleType, fields: Sequence[str] | None) -> Sequence[str]:
+def _patterns(to: str, form: Export, fields: Sequence[str] | None) -> Sequence[str]:
     fields = [fields] if isinstance(fields, str) else fields
-    if fields is None or list(fields) == list(module.FIELDS):
-        return module.FIELDS
-    if module.FIXED:
-        raise ConfigError(f"--fields is {' '.join(fields)}, but {to} has its own: choose npz or webdataset")
+    if fields is None or list(fields) == list(form.fields):
+        return form.fields
+    if form.fixed:
+        free = [name for name in plugins.names("export") if not plugins.load("export", name).fixed]
+        raise ConfigError(f"--fields is {' '.join(fields)}, but {to} has its own: choose {' or '.join(free)}")
     if not fields:
         raise ConfigError("--fields is empty, but must name one field or more")
     return fields
@@ -108,12 +112,12 @@ def _about(source: Source, to: str) -> dict[str, Any]:
 # ---- Where it goes
 
 
-def _check_out(out: Path, module: ModuleType, about: Mapping[str, Any], overwrite: bool) -> None:
+def _check_out(out: Path, form: Export, about: Mapping[str, Any], overwrite: bool) -> None:
     """Returns nothing; raises FolderError where `out` holds what must stay."""
     with _explained(out):
         if not out.exists():
             return
-        if out.is_dir() == bool(module.SUFFIX):
+        if out.is_dir() == bool(form.suffix):
             kinds = ("folder", "file") if out.is_dir() else ("file", "folder")
             raise FolderError(f"{out} is a {kinds[0]}, but {about['format']} makes a {kinds[1]}: choose another --out")
         if out.is_dir():
@@ -144,16 +148,16 @@ def _described(out: Path) -> dict[str, Any]:
     return there if there.get("schema") == SCHEMA and isinstance(there.get("files"), dict) else {}
 
 
-def _written(out: Path, module: ModuleType, source: Source, about: Mapping[str, Any]) -> int:
+def _written(out: Path, form: Export, source: Source, about: Mapping[str, Any]) -> int:
     """The bytes written; afterwards `out` is there, whole, and what a killed export left beside it is not."""
     out.parent.mkdir(parents=True, exist_ok=True)
     sweep_beside(out)
-    if module.SUFFIX:
+    if form.suffix:
         with publishing(out) as temporary:
-            module.write(temporary, source)
+            form.write(temporary, source)
         return out.stat().st_size
     with publishing_folder(out) as temporary:
-        module.write(temporary, source)
+        form.write(temporary, source)
         files = {path.name: path.stat().st_size for path in sorted(temporary.iterdir())}
         (temporary / ABOUT).write_bytes(as_json({**about, "files": files}))
     return sum(files.values())

@@ -95,7 +95,7 @@ def _remembered(rollout: Rollout) -> dict[str, str]:
 
 def _hashes(rollout: Rollout) -> dict[str, str]:
     found = {name: sha256(canonical(text).encode()) for name, text in rollout.lowered().items()}
-    if rollout.config.annotations.captions:
+    if rollout.config.annotations.simulated.captions:
         found["captions"] = code_hash(caption)
     if rollout.sampler.gridded:
         found["grids"] = code_hash(

@@ -17,9 +17,9 @@ import numpy as np
 
 from gen2d import annotations
 from gen2d.config import matched
+from gen2d.config.annotations import Annotations
 from gen2d.config.config import Config, load_config
 from gen2d.config.plugin_options import named
-from gen2d.config.sections import AnnotationOptions
 from gen2d.core.errors import ConfigError
 from gen2d.loading.dataset import Dataset
 from gen2d.loading.protocols import Numbers
@@ -41,7 +41,6 @@ from gen2d.sampling.matched import sets as sets_module
 from gen2d.xla import on_cpu
 
 FieldColumns = Mapping[str, Any]
-POINTS = 8  # of each object, where tracks are asked for that the config does not have
 
 
 @overload
@@ -206,9 +205,11 @@ def _recipes(
     """The dataset's config, that of the frames that are asked for, and the numbers of their videos."""
     base, numbers = config_of(ds, (), trust), ds.numbers(np.atleast_1d(indices))
     config = load_config(base, [*overrides, *_changed(height, width), "storage.frames=video"])
-    config = load_config(config, _asked(fields, config.annotations))
-    if look is not None:
-        config = load_config(config.plain() | {"look": named(look)}, copies=config.copies)
+    changed: dict[str, Any] = {} if look is None else {"look": named(look)}
+    if asked := _asked(fields, config.annotations):
+        changed["annotations"] = config.annotations.plain() | asked
+    if changed:
+        config = load_config(config.plain() | changed, copies=config.copies)
     return base, config, numbers
 
 
@@ -216,14 +217,11 @@ def _changed(height: int | None, width: int | None) -> list[str]:
     return [f"video.{name}={value}" for name, value in (("height", height), ("width", width)) if value is not None]
 
 
-def _asked(fields: Sequence[str] | None, options: AnnotationOptions) -> list[str]:
-    """What switches those annotations on that these fields belong to."""
-    off = [
-        name
-        for name, module in annotations.modules().items()
-        if not getattr(options, name) and set(fields or ()) & set(module.FIELDS)
-    ]
-    return [f"annotations.{name}={'true' if getattr(options, name) is False else POINTS}" for name in off]
+def _asked(fields: Sequence[str] | None, section: Annotations) -> dict[str, Any]:
+    """The options that switch on those annotations that these fields belong to."""
+    wanted = set(fields or ())
+    off = [plugin for plugin in section.pixels if not plugin.options and wanted & plugin.contract.fields.keys()]
+    return {plugin.name: plugin.contract.usual for plugin in off}
 
 
 def _check_frames(columns: FieldColumns, states: FieldColumns | None) -> None:
@@ -286,7 +284,7 @@ class _Settings:
 
     @property
     def layout(self) -> Layout:
-        return self.config.scene.module.layout(self.config.scene.options)
+        return self.config.scene.contract.layout(self.config.scene.options)
 
     @property
     def plan(self) -> FramePlan:
@@ -349,5 +347,5 @@ def _again(ds: Dataset, config: Config, numbers: np.ndarray) -> dict[str, Array]
     """Videos simulated from their keys again, as they were: what blurs them is not stored."""
     config = load_config(config, [f"storage.batch_size={ds.manifest.fingerprint['batch_size']}"])
     with contextlib.closing(VideoSource(config, jax.devices()[:1])) as source:
-        names = ["frames", *annotations.fields(config.annotations)]
+        names = ["frames", *annotations.fields(config.annotations, {})]
         return {name: jnp.asarray(values) for name, values in source.videos(ds.options.split, numbers, names).items()}

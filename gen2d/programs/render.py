@@ -3,12 +3,11 @@
 Each has a key of its own, so that another look or another camera changes nothing else.
 """
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 
 from gen2d import annotations
+from gen2d.config.annotations import Annotations
 from gen2d.config.config import Config
 from gen2d.config.sections import ImageOptions
 from gen2d.records.axes import Array
@@ -32,7 +31,7 @@ def plan_of(config: Config, layout: Layout) -> FramePlan:
         height=video.height,
         width=video.width,
         scale=camera.largest_scale(config.camera, layout, video.height, video.width, seconds),
-        grow=getattr(look.options, "margin", 0.0),
+        grow=look.contract.margin(look.options),
         still=not camera.moves(config.camera),
         linear=image.blending == "linear",
         frames=config.storage.frames != "none",
@@ -43,7 +42,7 @@ def plan_of(config: Config, layout: Layout) -> FramePlan:
 
 def paint_of(key: Array, config: Config, scene: Scene, layout: Layout) -> Paint:
     """One video's paint."""
-    return config.look.module.paint(scene, layout, config.look.options, key_for(key, "look"))
+    return config.look.contract.paint(scene, layout, config.look.options, key_for(key, "look"))
 
 
 def view_of(key: Array, config: Config, layout: Layout, states: State) -> CameraView:
@@ -130,7 +129,7 @@ def _occluders(key: Array, config: Config, plan: FramePlan) -> Occluders:
     return Occluders(jnp.concatenate([center - size / 2, center + size / 2], -1), jnp.stack(parts, -1), rank)
 
 
-def render_frames(stages: RenderScene, plan: FramePlan, options: Any) -> dict[str, Array]:
+def render_frames(stages: RenderScene, plan: FramePlan, options: Annotations) -> dict[str, Array]:
     """Frames and annotations of some videos, by the names that they are stored under."""
     frames, owners = draw(stages, plan)
     found = {} if frames is None else {"frames": frames}

@@ -70,7 +70,7 @@ class Rollout:
     def __init__(self, config: Config, devices: Sequence[Any]) -> None:
         self.config, self.devices = config, list(devices)
         video = config.video
-        self.layout = config.scene.module.layout(config.scene.options)
+        self.layout = config.scene.contract.layout(config.scene.options)
         self.sampler, self.wanted = Sampler(config), quality.ranges(config.quality)
         self.plan = render.plan_of(config, self.layout)
         self.steps = substeps(video.fps, config.physics.substeps, config.physics.max_step)
@@ -197,7 +197,7 @@ class Rollout:
         columns |= {f"factors/{name}": values.astype(jnp.float32) for name, values in drawn.items()}
         columns |= jax.vmap(self.sampler.outside)(drawn)
         columns["quality/rejected_draws"] = own.rejected
-        if config.annotations.lyapunov:
+        if config.annotations.simulated.lyapunov:
             columns["quality/lyapunov"] = self._growth(keys, own)
         columns = {name: values for name, values in columns.items() if name not in sets.omitted_fields(config.matched)}
         return DeviceBatch(columns | told, stages, own.fits)
@@ -243,5 +243,5 @@ def per_device(array: Array) -> list[np.ndarray]:
 
 def save_at(config: Config, layout: layout_module.Layout) -> SaveAt:
     """What is kept of a simulation beyond its states."""
-    rows = config.annotations.contacts * math.ceil(config.video.frames / 16) * layout.slots
-    return SaveAt(rows, config.annotations.energy, between=config.image.exposure > 0)
+    rows = config.annotations.simulated.contacts * math.ceil(config.video.frames / 16) * layout.slots
+    return SaveAt(rows, config.annotations.simulated.energy, between=config.image.exposure > 0)

@@ -46,8 +46,7 @@ class VideoSchema:
         sizes |= {"J": len(self.layout.joints)} if self.layout.joints else {}
         corners = max(group.vertices for group in self.layout.runs)
         sizes |= {"V": corners} if corners else {}
-        sizes |= annotations.sizes(self.config.annotations, self.plan)
-        return sizes | self.sampler.lengths
+        return annotations.sizes(self.config.annotations, self.plan, sizes | self.sampler.lengths)
 
     @property
     def fields(self) -> dict[str, Field]:
@@ -63,8 +62,8 @@ class VideoSchema:
             del fields[name]
         if self.plan.frames:
             fields["frames"] = Field("uint8", "n T H W 3", "sRGB", "the video")
-        fields |= annotations.fields(config.annotations) | self.host_fields
-        if config.annotations.lyapunov:
+        fields |= self.host_fields
+        if config.annotations.simulated.lyapunov:
             fields |= lyapunov.FIELDS
         fields["index"] = Field("int64", "n", "1", "the video's number in its split")
         fields["time"] = Field("float64", "T", "s", "of each frame; frame 0 is the initial state")
@@ -76,7 +75,7 @@ class VideoSchema:
         for name, axis_names, unit, meaning in CAMERA:
             fields[f"camera/{name}"] = Field("float32", axis_names, unit, meaning)
         fields |= sampler.fields(config) | sets.fields(config.matched)
-        return dict(sorted(fields.items()))
+        return dict(sorted(annotations.fields(config.annotations, fields).items()))
 
     def _scene(self, key: jax.Array) -> scene.Scene:
         return self.sampler.sampled(key, given=jnp.zeros(len(self.sampler.gridded)))[1].scene
@@ -101,7 +100,7 @@ class VideoSchema:
         """The fields that are made on the host, from the others."""
         longest = max((len(split.name) for split in self.config.splits), default=0)
         fields = {"split": Field(f"S{longest}", "n", "", "the split that the video belongs to")} if longest else {}
-        described = self.config.annotations.captions
+        described = self.config.annotations.simulated.captions
         return fields | (caption.fields(self.layout.slots, self.config.video.frames) if described else {})
 
     def host_columns(self, columns: dict[str, np.ndarray], split: str) -> dict[str, np.ndarray]:
@@ -110,4 +109,4 @@ class VideoSchema:
         found = {}
         if config.splits:
             found["split"] = np.full(count, split.encode(), self.host_fields["split"].dtype)
-        return found | (caption.caption_fields(columns, config.video) if config.annotations.captions else {})
+        return found | (caption.caption_fields(columns, config.video) if config.annotations.simulated.captions else {})

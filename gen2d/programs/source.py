@@ -180,7 +180,7 @@ class VideoSource:
 
 
 def _misplaced(scene: Plugin, number: int) -> str:
-    options = [f"scene.{name}" for name in getattr(scene.module, "CROWDED_BY", ())]
+    options = [f"scene.{name}" for name in scene.contract.crowded_by]
     cause = f": it depends on {', '.join(options)}" if options else ""
     return (
         f"scene: video {number} could not be placed without overlap in 100 attempts{cause}; ask for fewer or smaller "

@@ -34,23 +34,22 @@ FactorChange = Callable[[SampledFactors, Callable[[Array], SampledFactors]], Sam
 
 def sizes(scene: Plugin) -> dict[str, int]:
     """Lengths of the factors' axes: the largest counts that may be drawn, and the sizes that the family fixes."""
-    fixed = scene.module.sizes(scene.options) if hasattr(scene.module, "sizes") else {}
-    counted = {spec.each for spec in drawn_options(scene.module).values() if spec.each} - fixed.keys()
+    fixed = dict(scene.contract.sizes(scene.options))
+    counted = {spec.each for spec in drawn_options(scene.contract).values() if spec.each} - fixed.keys()
     return fixed | {each: int(getattr(scene.options, each).support[1]) for each in sorted(counted)}
 
 
 def fields(config: Config) -> dict[str, Field]:
     """Stored fields of the factors, of the numbers that the family derives from them, and of splits."""
     stored, splits = {}, {}
-    for name, spec in drawn_options(config.scene.module).items():
+    for name, spec in drawn_options(config.scene.contract).items():
         axes = " ".join(["n", *([spec.each] if spec.each else []), *([str(spec.parts)] if spec.parts else [])])
         unit = spec.unit or "1"
         stored[f"factors/{name}"] = Field("float32", axes, unit, f"as drawn: {spec.meaning}")
         splits[f"ood_distance/{name}"] = Field(
             "float32", axes, unit, f"distance from what the training split can draw: {spec.meaning}"
         )
-    derived = getattr(config.scene.module, "DERIVED", {})
-    stored |= {f"factors/{name}": field for name, field in derived.items()}
+    stored |= {f"factors/{name}": field for name, field in config.scene.contract.derived.items()}
     joint = Field("bool", "n", "1", "whether the training split could not have drawn these factors")
     return stored | (splits | {"out_of_distribution": joint} if config.splits else {})
 
@@ -59,7 +58,7 @@ class Sampler:
     """Draws of a config's scenes, in every split."""
 
     def __init__(self, config: Config) -> None:
-        self.scene, self.laws, self.options = config.scene, config.laws, drawn_options(config.scene.module)
+        self.scene, self.laws, self.options = config.scene, config.laws, drawn_options(config.scene.contract)
         self.training = config.training.law if config.training else None
         self.lengths = sizes(config.scene)
         self.products = [product for law in self.laws for product in law.products]
@@ -93,7 +92,7 @@ class Sampler:
         """
         draw_key, place_key = jax.random.split(key)
         factors = self.drawn(draw_key, row, given, change)
-        scene: Any = self.scene.module.sample(place_key, factors, self.scene.options)
+        scene: Any = self.scene.contract.sample(place_key, factors, self.scene.options)
         rejected, fits = jnp.asarray(scene.rejected, jnp.int32), jnp.asarray(scene.fits, bool)
         return {**factors, **scene.derived}, scene._replace(rejected=rejected, fits=fits, derived={})
 

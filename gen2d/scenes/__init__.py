@@ -1,1 +1,21 @@
-"""Scene families: one file each, found by name. A family has `Options`, `layout`, `factors` and `sample`."""
+"""Scene families: one file each, named like the family; a config asks for one by `scene: NAME`, or `scene: my/NAME.py`.
+
+A file ends with a `FAMILY`, whose members `gen2d.plugin.Family` describes. The smallest one:
+
+    import dataclasses
+    import jax.numpy as jnp
+    from gen2d.plugin import Family, Layout, SampledScene, SlotGroup, assemble, discs, option
+
+    @dataclasses.dataclass(frozen=True)
+    class Options:
+        radius: object = option([0.2, 0.4], float, "m", "of the disc", above=0, high=0.5, draw=True)
+
+    def layout(options):
+        return Layout((SlotGroup("circle", 1),), bounds=(0, 0, 1, 1), reach=options.radius.support[1])
+
+    def sample(key, factors, options):
+        disc = discs(jnp.array([[0.5, 0.5]]), factors["radius"][None], True)
+        return SampledScene(*assemble(layout(options), [disc], gravity=jnp.zeros(2)))
+
+    FAMILY = Family(options=Options, layout=layout, sample=sample)
+"""

@@ -9,7 +9,7 @@ import math
 import jax.numpy as jnp
 import numpy as np
 
-from gen2d.plugin import STATIC, Array, Distribution, Layout, SampledScene, SlotGroup, builder, common, option
+from gen2d.plugin import STATIC, Array, Distribution, Family, Layout, SampledScene, SlotGroup, builder, common, option
 
 
 @dataclasses.dataclass(frozen=True)
@@ -93,3 +93,6 @@ def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledSc
 def _triangle(rows: int) -> np.ndarray:
     """Points [rows (rows + 1) / 2, 2] of a triangle, a unit apart, row by row from the origin to the right."""
     return np.array([[math.sqrt(0.75) * row, k - row / 2] for row in range(rows) for k in range(row + 1)], np.float32)
+
+
+FAMILY = Family(options=Options, layout=layout, sample=sample, check=check, sizes=sizes)

@@ -5,7 +5,19 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 
-from gen2d.plugin import STATIC, Array, Distribution, Layout, SampledScene, SlotGroup, builder, common, option, place
+from gen2d.plugin import (
+    STATIC,
+    Array,
+    Distribution,
+    Family,
+    Layout,
+    SampledScene,
+    SlotGroup,
+    builder,
+    common,
+    option,
+    place,
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -28,9 +40,6 @@ class Options:
     wall_friction: Distribution = common.friction("the box", 0.2)
     gravity: tuple[Distribution, ...] = common.gravity()
     color: tuple[Distribution, ...] = common.color("each ball", [[40, 254]] * 3, each="balls")
-
-
-CROWDED_BY = ("balls", "radius", "width", "height")  # the options that decide whether everything finds a place
 
 
 def check(options: Options) -> None:
@@ -58,3 +67,8 @@ def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledSc
     )
     walls = builder.box_walls(options.width, options.height, **builder.material(factors, "wall"))
     return SampledScene(*builder.assemble(layout(options), [balls, walls], factors["gravity"]), rejected, fits)
+
+
+FAMILY = Family(
+    options=Options, layout=layout, sample=sample, check=check, crowded_by=("balls", "radius", "width", "height")
+)

@@ -12,6 +12,7 @@ from gen2d.plugin import (
     STATIC,
     Array,
     Distribution,
+    Family,
     Field,
     JointSpec,
     Layout,
@@ -21,8 +22,6 @@ from gen2d.plugin import (
     common,
     option,
 )
-
-DERIVED = {"kink": Field("float32", "n", "1", "joint that it is pulled by at the start, counted from the left pin")}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -119,3 +118,13 @@ def _pulled(factors: dict[str, Array], n: int) -> tuple[Array, Array]:
     corners = corners - jnp.stack([apart / 2, zero])
     cos, sin = jnp.cos(factors["slope"]), jnp.sin(factors["slope"])
     return factors["length"] * corners @ jnp.stack([jnp.stack([cos, sin]), jnp.stack([-sin, cos])]), kink
+
+
+FAMILY = Family(
+    options=Options,
+    layout=layout,
+    sample=sample,
+    check=check,
+    sizes=sizes,
+    derived={"kink": Field("float32", "n", "1", "joint that it is pulled by at the start, counted from the left pin")},
+)

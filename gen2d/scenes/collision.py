@@ -11,17 +11,21 @@ import dataclasses
 
 import jax.numpy as jnp
 
-from gen2d.plugin import CLEARANCE, Array, Distribution, Field, Layout, SampledScene, SlotGroup, builder, common, option
+from gen2d.plugin import (
+    CLEARANCE,
+    Array,
+    Distribution,
+    Family,
+    Field,
+    Layout,
+    SampledScene,
+    SlotGroup,
+    builder,
+    common,
+    option,
+)
 
 NEVER = -1.0  # the contact frame of balls that do not approach
-DERIVED = {
-    "contact_frame": Field(
-        "float32",
-        "n",
-        "frames",
-        "when the balls touch, from the start, in units of scene.frame_interval; -1: they never do",
-    )
-}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -104,3 +108,20 @@ def _contact(share: Array, closing: Array, room: Array, options: Options) -> tup
     earliest = jnp.where(latest >= first, first, latest / 2)
     time = earliest + share * (latest - earliest)
     return time, jnp.where(closing > 0, closing * time, CLEARANCE + share * (room - CLEARANCE))
+
+
+FAMILY = Family(
+    options=Options,
+    layout=layout,
+    sample=sample,
+    check=check,
+    sizes=sizes,
+    derived={
+        "contact_frame": Field(
+            "float32",
+            "n",
+            "frames",
+            "contact of the balls, in units of scene.frame_interval; -1: never",
+        )
+    },
+)

@@ -4,9 +4,7 @@ import dataclasses
 
 import jax.numpy as jnp
 
-from gen2d.plugin import Array, Distribution, Field, Layout, SampledScene, SlotGroup, builder, common
-
-DERIVED = {"contact_time": Field("float32", "n", "s", "at which the first of those that move meets one at rest")}
+from gen2d.plugin import Array, Distribution, Family, Field, Layout, SampledScene, SlotGroup, builder, common
 
 
 @dataclasses.dataclass(frozen=True)
@@ -65,3 +63,12 @@ def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledSc
     balls = builder.discs(places, radius, number < factors["balls"], velocity=velocity, **builder.material(factors))
     derived = {"contact_time": factors["approach_distance"] / factors["speed"]}
     return SampledScene(*builder.assemble(layout(options), [balls], jnp.zeros(2)), derived=derived)
+
+
+FAMILY = Family(
+    options=Options,
+    layout=layout,
+    sample=sample,
+    check=check,
+    derived={"contact_time": Field("float32", "n", "s", "at which the first of those that move meets one at rest")},
+)

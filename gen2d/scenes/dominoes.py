@@ -4,7 +4,7 @@ import dataclasses
 
 import jax.numpy as jnp
 
-from gen2d.plugin import STATIC, Array, Distribution, Layout, SampledScene, SlotGroup, builder, common
+from gen2d.plugin import STATIC, Array, Distribution, Family, Layout, SampledScene, SlotGroup, builder, common
 
 
 @dataclasses.dataclass(frozen=True)
@@ -77,3 +77,6 @@ def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledSc
     )  # fmt: skip
     ground = builder.floor(layers, 2.0, **builder.material(factors, "floor"))
     return SampledScene(*builder.assemble(layers, [ground, ball, row], factors["gravity"]))
+
+
+FAMILY = Family(options=Options, layout=layout, sample=sample, check=check)

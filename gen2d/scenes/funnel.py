@@ -6,7 +6,7 @@ import math
 import jax
 import jax.numpy as jnp
 
-from gen2d.plugin import STATIC, Array, Distribution, Layout, SampledScene, SlotGroup, builder, common, place
+from gen2d.plugin import STATIC, Array, Distribution, Family, Layout, SampledScene, SlotGroup, builder, common, place
 
 
 @dataclasses.dataclass(frozen=True)
@@ -27,9 +27,6 @@ class Options:
     wall_friction: Distribution = common.friction("box and slopes", 0.3)
     gravity: tuple[Distribution, ...] = common.gravity()
     color: tuple[Distribution, ...] = common.color("each ball", each="balls")
-
-
-CROWDED_BY = ("balls", "radius", "width", "height", "neck_height", "angle", "gap")  # whether everything finds a place
 
 
 def check(options: Options) -> None:
@@ -73,3 +70,12 @@ def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledSc
         builder.segments(upper, lower, **builder.material(factors, "wall")),
     ]
     return SampledScene(*builder.assemble(layout(options), parts, factors["gravity"]), rejected, fits)
+
+
+FAMILY = Family(
+    options=Options,
+    layout=layout,
+    sample=sample,
+    check=check,
+    crowded_by=("balls", "radius", "width", "height", "neck_height", "angle", "gap"),
+)

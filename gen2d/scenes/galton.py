@@ -5,7 +5,7 @@ import math
 
 import jax.numpy as jnp
 
-from gen2d.plugin import STATIC, Array, Distribution, Layout, SampledScene, SlotGroup, builder, common, option
+from gen2d.plugin import STATIC, Array, Distribution, Family, Layout, SampledScene, SlotGroup, builder, common, option
 
 
 @dataclasses.dataclass(frozen=True)
@@ -101,3 +101,6 @@ def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledSc
     bins = builder.segments(feet, feet + jnp.asarray([0.0, options.bin_height]), **board)
     parts = [balls, lattice, bins, builder.box_walls(right, top, **board)]
     return SampledScene(*builder.assemble(here, parts, factors["gravity"]))
+
+
+FAMILY = Family(options=Options, layout=layout, sample=sample, check=check)

@@ -4,12 +4,19 @@ import dataclasses
 
 import jax.numpy as jnp
 
-from gen2d.plugin import STATIC, Array, Distribution, Field, Layout, SampledScene, SlotGroup, builder, common, option
-
-DERIVED = {
-    "contact_time": Field("float32", "n pairs", "s", "at which the two of a pair meet, if nothing else does before"),
-    "mass_ratio": Field("float32", "n pairs", "1", "mass of the left ball over that of the right one"),
-}
+from gen2d.plugin import (
+    STATIC,
+    Array,
+    Distribution,
+    Family,
+    Field,
+    Layout,
+    SampledScene,
+    SlotGroup,
+    builder,
+    common,
+    option,
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -97,3 +104,17 @@ def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledSc
         "mass_ratio": jnp.where(present, density[:, 0] / jnp.where(present, density[:, 1], 1.0), 0.0),
     }
     return SampledScene(*builder.assemble(layout(options), [balls, walls], jnp.zeros(2)), derived=derived)
+
+
+FAMILY = Family(
+    options=Options,
+    layout=layout,
+    sample=sample,
+    check=check,
+    derived={
+        "contact_time": Field(
+            "float32", "n pairs", "s", "at which the two of a pair meet, if nothing else does before"
+        ),
+        "mass_ratio": Field("float32", "n pairs", "1", "mass of the left ball over that of the right one"),
+    },
+)

@@ -5,7 +5,7 @@ import math
 
 import jax.numpy as jnp
 
-from gen2d.plugin import STATIC, Array, Distribution, Layout, SampledScene, SlotGroup, builder, common, option
+from gen2d.plugin import STATIC, Array, Distribution, Family, Layout, SampledScene, SlotGroup, builder, common, option
 
 CLEARANCE = 0.02  # m: how much more room than it needs the ball has between two ramps, at least
 
@@ -99,3 +99,6 @@ def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledSc
         builder.box_walls(options.width, options.height, **board),
     ]
     return SampledScene(*builder.assemble(layout(options), parts, factors["gravity"]))
+
+
+FAMILY = Family(options=Options, layout=layout, sample=sample, check=check)

@@ -4,14 +4,19 @@ import dataclasses
 
 import jax.numpy as jnp
 
-from gen2d.plugin import STATIC, Array, Distribution, Field, Layout, SampledScene, SlotGroup, builder, common, option
-
-DERIVED = {
-    "hidden_from": Field(
-        "float32", "n balls", "s", "when the ball is first wholly behind the screen, if nothing hits it"
-    ),
-    "hidden_for": Field("float32", "n balls", "s", "how long it then is"),
-}
+from gen2d.plugin import (
+    STATIC,
+    Array,
+    Distribution,
+    Family,
+    Field,
+    Layout,
+    SampledScene,
+    SlotGroup,
+    builder,
+    common,
+    option,
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -104,3 +109,17 @@ def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledSc
     return SampledScene(
         *builder.assemble(layout(options), [balls, *walls, screen], factors["gravity"]), derived=derived
     )
+
+
+FAMILY = Family(
+    options=Options,
+    layout=layout,
+    sample=sample,
+    check=check,
+    derived={
+        "hidden_from": Field(
+            "float32", "n balls", "s", "when the ball is first wholly behind the screen, if nothing hits it"
+        ),
+        "hidden_for": Field("float32", "n balls", "s", "how long it then is"),
+    },
+)

@@ -8,7 +8,18 @@ import dataclasses
 
 import jax.numpy as jnp
 
-from gen2d.plugin import Array, Distribution, Layout, SampledScene, SlotGroup, builder, common, option, start_position
+from gen2d.plugin import (
+    Array,
+    Distribution,
+    Family,
+    Layout,
+    SampledScene,
+    SlotGroup,
+    builder,
+    common,
+    option,
+    start_position,
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -63,3 +74,6 @@ def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledSc
     start = jnp.stack([x, options.height - radius - factors["top_distance"]])
     ball = builder.discs(start[None], radius, velocity=velocity, elasticity=1.0, **builder.material(factors))
     return SampledScene(*builder.assemble(layout(options), [ball], factors["gravity"]))
+
+
+FAMILY = Family(options=Options, layout=layout, sample=sample, check=check)

@@ -9,6 +9,7 @@ from gen2d.plugin import (
     STATIC,
     Array,
     Distribution,
+    Family,
     Field,
     JointSpec,
     Layout,
@@ -21,8 +22,6 @@ from gen2d.plugin import (
 
 PIN = 0.08  # m, radius of the disc that the pendulum hangs from
 ROD = 0.04  # m, radius of a rod
-
-DERIVED = {"period": Field("float32", "n", "s", "of small swings of the first link alone")}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -94,3 +93,12 @@ def _period(rods: dict[str, Array], bobs: dict[str, Array], length: Array, gravi
     rod, bob = rods["mass"][0], bobs["mass"][0]
     inertia = rods["moment"][0] + bobs["moment"][0] + (rod / 4 + bob) * length[0] ** 2
     return 2 * jnp.pi * jnp.sqrt(inertia / ((rod / 2 + bob) * length[0] * jnp.maximum(jnp.linalg.norm(gravity), 1e-6)))
+
+
+FAMILY = Family(
+    options=Options,
+    layout=layout,
+    sample=sample,
+    sizes=sizes,
+    derived={"period": Field("float32", "n", "s", "of small swings of the first link alone")},
+)

@@ -6,7 +6,19 @@ import math
 import jax
 import jax.numpy as jnp
 
-from gen2d.plugin import STATIC, Array, Distribution, Layout, SampledScene, SlotGroup, builder, common, option, place
+from gen2d.plugin import (
+    STATIC,
+    Array,
+    Distribution,
+    Family,
+    Layout,
+    SampledScene,
+    SlotGroup,
+    builder,
+    common,
+    option,
+    place,
+)
 
 TURN = [-math.pi, math.pi]
 
@@ -40,9 +52,6 @@ class Options:
     disc_color: tuple[Distribution, ...] = common.color("each disc", each="discs")
     box_color: tuple[Distribution, ...] = common.color("each box", each="boxes")
     capsule_color: tuple[Distribution, ...] = common.color("each capsule", each="capsules")
-
-
-CROWDED_BY = ("discs", "boxes", "capsules", "disc_radius", "box_size", "capsule_half_length", "width", "height")
 
 
 def reach(options: Options) -> float:
@@ -91,3 +100,12 @@ def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledSc
         builder.box_walls(options.width, options.height, **builder.material(factors, "bin")),
     ]
     return SampledScene(*builder.assemble(layout(options), parts, factors["gravity"]), rejected, fits)
+
+
+FAMILY = Family(
+    options=Options,
+    layout=layout,
+    sample=sample,
+    check=check,
+    crowded_by=("discs", "boxes", "capsules", "disc_radius", "box_size", "capsule_half_length", "width", "height"),
+)

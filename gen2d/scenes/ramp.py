@@ -9,9 +9,19 @@ import math
 
 import jax.numpy as jnp
 
-from gen2d.plugin import STATIC, Array, Distribution, Field, Layout, SampledScene, SlotGroup, builder, common, option
-
-DERIVED = {"length": Field("float32", "n", "m", "of the slope")}
+from gen2d.plugin import (
+    STATIC,
+    Array,
+    Distribution,
+    Family,
+    Field,
+    Layout,
+    SampledScene,
+    SlotGroup,
+    builder,
+    common,
+    option,
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -82,3 +92,12 @@ def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledSc
     return SampledScene(
         *builder.assemble(layout(options), [body, ground], factors["gravity"]), derived={"length": length}
     )
+
+
+FAMILY = Family(
+    options=Options,
+    layout=layout,
+    sample=sample,
+    check=check,
+    derived={"length": Field("float32", "n", "m", "of the slope")},
+)

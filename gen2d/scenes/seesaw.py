@@ -4,9 +4,19 @@ import dataclasses
 
 import jax.numpy as jnp
 
-from gen2d.plugin import STATIC, Array, Distribution, Field, JointSpec, Layout, SampledScene, SlotGroup, builder, common
-
-DERIVED = {"torque": Field("float32", "n", "N m", "of all weights about the pivot while the plank is level")}
+from gen2d.plugin import (
+    STATIC,
+    Array,
+    Distribution,
+    Family,
+    Field,
+    JointSpec,
+    Layout,
+    SampledScene,
+    SlotGroup,
+    builder,
+    common,
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -83,3 +93,12 @@ def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledSc
     scene, state = builder.assemble(layers, [ground, stand, plank, weights], factors["gravity"], joint)
     torque = factors["gravity"][1] * jnp.sum(weights.objects["mass"] * x)
     return SampledScene(scene, state, derived={"torque": torque})
+
+
+FAMILY = Family(
+    options=Options,
+    layout=layout,
+    sample=sample,
+    check=check,
+    derived={"torque": Field("float32", "n", "N m", "of all weights about the pivot while the plank is level")},
+)

@@ -8,7 +8,7 @@ import dataclasses
 
 import jax.numpy as jnp
 
-from gen2d.plugin import STATIC, Array, Distribution, Layout, SampledScene, SlotGroup, builder, common
+from gen2d.plugin import STATIC, Array, Distribution, Family, Layout, SampledScene, SlotGroup, builder, common
 
 
 @dataclasses.dataclass(frozen=True)
@@ -61,3 +61,6 @@ def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledSc
     left, right = (jnp.stack([jnp.full(most, end * options.width), floor], 1) for end in (-9.0, 10.0))
     floors = builder.segments(left, right, present, **builder.material(factors, "floor"))
     return SampledScene(*builder.assemble(layout(options), [balls, floors], factors["gravity"]))
+
+
+FAMILY = Family(options=Options, layout=layout, sample=sample, check=check)

@@ -4,15 +4,21 @@ import dataclasses
 
 import jax.numpy as jnp
 
-from gen2d.plugin import STATIC, Array, Distribution, Field, Layout, SampledScene, SlotGroup, builder, common, option
+from gen2d.plugin import (
+    STATIC,
+    Array,
+    Distribution,
+    Family,
+    Field,
+    Layout,
+    SampledScene,
+    SlotGroup,
+    builder,
+    common,
+    option,
+)
 
 AROUND = 0.75  # of the tower's height: how much is seen on either side, for what falls
-
-DERIVED = {
-    "stable": Field("float32", "n", "1", "1 where statics says that the tower stands, else 0"),
-    "margin": Field("float32", "n", "m", "from the centre of mass above a joint to its edge, at the joint where that is"
-                    " least; below 0: beyond it"),
-}  # fmt: skip
 
 
 @dataclasses.dataclass(frozen=True)
@@ -73,3 +79,19 @@ def _margin(x: Array, width: Array, mass: Array, present: Array) -> Array:
         for end, choose in ((left, jnp.maximum), (right, jnp.minimum))
     )
     return jnp.where(present, jnp.minimum(centre - left, right - centre), jnp.inf).min()
+
+
+FAMILY = Family(
+    options=Options,
+    layout=layout,
+    sample=sample,
+    derived={
+        "stable": Field("float32", "n", "1", "1 where statics says that the tower stands, else 0"),
+        "margin": Field(
+            "float32",
+            "n",
+            "m",
+            "from the centre of mass above a joint to its edge, at the joint where that is least; below 0: beyond it",
+        ),
+    },
+)

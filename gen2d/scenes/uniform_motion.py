@@ -9,7 +9,18 @@ import math
 
 import jax.numpy as jnp
 
-from gen2d.plugin import Array, Distribution, Layout, SampledScene, SlotGroup, builder, common, option, start_position
+from gen2d.plugin import (
+    Array,
+    Distribution,
+    Family,
+    Layout,
+    SampledScene,
+    SlotGroup,
+    builder,
+    common,
+    option,
+    start_position,
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,3 +68,6 @@ def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledSc
     )
     ball = builder.discs(start[None], radius, velocity=velocity, elasticity=1.0, **builder.material(factors))
     return SampledScene(*builder.assemble(layout(options), [ball], jnp.zeros(2)))
+
+
+FAMILY = Family(options=Options, layout=layout, sample=sample, check=check)

@@ -8,6 +8,7 @@ from gen2d.plugin import (
     STATIC,
     Array,
     Distribution,
+    Family,
     JointSpec,
     Layout,
     SampledScene,
@@ -93,3 +94,6 @@ def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledSc
     blocks = builder.boxes(places, 0.0, width, height, numbers < factors["blocks"], **builder.material(factors))
     parts = [ground, pin, links, ball, blocks]
     return SampledScene(*builder.assemble(layers, parts, factors["gravity"], builder.hinge_chain(links, tail=True)))
+
+
+FAMILY = Family(options=Options, layout=layout, sample=sample, check=check)

@@ -2,7 +2,7 @@
 
 import dataclasses
 
-from gen2d.plugin import Array, Layout, Paint, PlainOptions, Scene, plain
+from gen2d.plugin import Array, Layout, Look, Paint, PlainOptions, Scene, line_margin, plain
 
 
 @dataclasses.dataclass(frozen=True)
@@ -13,3 +13,6 @@ class Options(PlainOptions):
 def paint(scene: Scene, layout: Layout, options: Options, key: Array) -> Paint:
     """What one video's slots are painted with."""
     return plain(scene, layout, options, key)
+
+
+LOOK = Look(options=Options, paint=paint, margin=line_margin)

@@ -4,7 +4,20 @@ import dataclasses
 
 import jax.numpy as jnp
 
-from gen2d.plugin import Array, Layout, Paint, PlainOptions, Scene, are_lines, are_moving, contrasting, option, plain
+from gen2d.plugin import (
+    Array,
+    Layout,
+    Look,
+    Paint,
+    PlainOptions,
+    Scene,
+    are_lines,
+    are_moving,
+    contrasting,
+    line_margin,
+    option,
+    plain,
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -25,3 +38,6 @@ def paint(scene: Scene, layout: Layout, options: Options, key: Array) -> Paint:
         return marked
     rim_color = jnp.broadcast_to(jnp.asarray(options.rim_color, jnp.float32), begun.color.shape)
     return marked._replace(rim=jnp.where(are_lines(scene), 0.0, options.rim_width), rim_color=rim_color)
+
+
+LOOK = Look(options=Options, paint=paint, margin=line_margin)

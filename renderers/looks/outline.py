@@ -4,7 +4,19 @@ import dataclasses
 
 import jax.numpy as jnp
 
-from gen2d.plugin import Array, Layout, Paint, PlainOptions, Scene, are_lines, mean_color, option, plain
+from gen2d.plugin import (
+    Array,
+    Layout,
+    Look,
+    Paint,
+    PlainOptions,
+    Scene,
+    are_lines,
+    line_margin,
+    mean_color,
+    option,
+    plain,
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -23,3 +35,6 @@ def paint(scene: Scene, layout: Layout, options: Options, key: Array) -> Paint:
     behind = mean_color(begun.background)
     within = jnp.where(line[:, None], begun.color, behind + options.fill * (begun.color - behind))
     return begun._replace(fill=within, rim=jnp.where(line, 0.0, options.width), rim_color=begun.color)
+
+
+LOOK = Look(options=Options, paint=paint, margin=line_margin)

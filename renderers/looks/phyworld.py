@@ -8,7 +8,19 @@ import dataclasses
 import jax.numpy as jnp
 import numpy as np
 
-from gen2d.plugin import Array, Background, Layout, LineOptions, Paint, Scene, are_moving, line_fields, option
+from gen2d.plugin import (
+    Array,
+    Background,
+    Layout,
+    LineOptions,
+    Look,
+    Paint,
+    Scene,
+    are_moving,
+    line_fields,
+    line_margin,
+    option,
+)
 
 WHITE, RED, BLUE = (255.0, 255.0, 255.0), (255.0, 0.0, 0.0), (0.0, 0.0, 255.0)
 
@@ -26,3 +38,6 @@ def paint(scene: Scene, layout: Layout, options: Options, key: Array) -> Paint:
     turn = jnp.asarray([RED, BLUE])[(np.cumsum(moving) - 1) % 2]
     colors = jnp.where(moving[:, None], turn, scene.objects.color.astype(jnp.float32))
     return Paint(Background(jnp.asarray(WHITE)), colors, *line_fields(scene, options))
+
+
+LOOK = Look(options=Options, paint=paint, margin=line_margin)

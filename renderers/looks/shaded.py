@@ -4,7 +4,7 @@ import dataclasses
 
 import jax.numpy as jnp
 
-from gen2d.plugin import Array, Layout, Paint, PlainOptions, Scene, are_lines, option, plain
+from gen2d.plugin import Array, Layout, Look, Paint, PlainOptions, Scene, are_lines, line_margin, option, plain
 
 
 @dataclasses.dataclass(frozen=True)
@@ -18,3 +18,6 @@ def paint(scene: Scene, layout: Layout, options: Options, key: Array) -> Paint:
     """What one video's slots are painted with; lines have no shade."""
     shade = jnp.where(are_lines(scene), 0.0, options.shade)
     return plain(scene, layout, options, key)._replace(shade=shade)
+
+
+LOOK = Look(options=Options, paint=paint, margin=line_margin)

@@ -5,7 +5,20 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 
-from gen2d.plugin import Array, Layout, Paint, PlainOptions, Scene, Texture, contrasting, mean_color, option, plain
+from gen2d.plugin import (
+    Array,
+    Layout,
+    Look,
+    Paint,
+    PlainOptions,
+    Scene,
+    Texture,
+    contrasting,
+    line_margin,
+    mean_color,
+    option,
+    plain,
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -30,3 +43,6 @@ def paint(scene: Scene, layout: Layout, options: Options, key: Array) -> Paint:
         color=begun.color + options.contrast * (far - begun.color),
     )
     return begun._replace(texture=texture)
+
+
+LOOK = Look(options=Options, paint=paint, margin=line_margin)

@@ -9,13 +9,14 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
+from gen2d.config import plugins
 from gen2d.config.config import load_config
 from gen2d.programs import redraw, render
 from gen2d.programs.rollout import Rollout, per_device
 from gen2d.records import keys as keys_module
 from gen2d.records import scene as scene_module
 
-ALL = [f"annotations.{name}=true" for name in ("masks", "amodal", "boxes", "visibility", "flow")]
+ALL = [f"annotations.{name}={plugins.load('annotation', name).usual}" for name in plugins.names("annotation")]
 SMALL = [
     "storage.batch_size=4",
     "video.frames=12",

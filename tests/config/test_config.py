@@ -42,6 +42,12 @@ BAD = {
     "seed: -1": ("seed is -1", "0 to 2**63 - 1"),
     "seed: 9223372036854775808": ("seed is 9223372036854775808", "0 to 2**63 - 1"),
     "name: a/b": ("name is 'a/b'", "letters"),
+    "annotations: {mask: true}": ("annotations.mask is not an option", "did you mean masks?"),
+    "annotations: {masks: 2}": ("annotations.masks is 2", "true or false"),
+    "annotations: {tracks: {points: 2}}": ("annotations.tracks is {'points': 2}", "a whole number"),
+    "annotations: [masks]": ("annotations is ['masks']", "a mapping"),
+    "annotations: {a/turn.py: true}": ("an annotation is 'a/turn.py'", "there is no such file"),
+    "annotations: {a/turn.py: true, b/turn.py: true}": ("annotations has 2 files named turn.py", "one only"),
     "video: {frames: 3, frames: 4}": ('duplicate key "frames"', "line 1"),
     "video: {frames: [3": ("not valid YAML", "line"),
     "- 1": ("holds list", "mapping of sections"),
@@ -146,7 +152,7 @@ def test_a_quantity_has_one_unit_and_range_in_all_families(quantity):
     options = [
         field.metadata["option"]
         for family in plugins.names("scene")
-        for field in dataclasses.fields(load_config(f"{family}.yaml").scene.module.Options)
+        for field in dataclasses.fields(load_config(f"{family}.yaml").scene.contract.options)
         if field.name == quantity or field.name.endswith(f"_{quantity}")
     ]
     assert len({(option.unit, option.low, option.high, option.draw) for option in options}) == 1

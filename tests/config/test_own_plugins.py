@@ -1,4 +1,4 @@
-"""A family or look of one's own goes with the dataset: its videos are made again after the file is gone or changed."""
+"""A family, look or annotation of one's own goes with the dataset: it makes its videos again after the file is gone."""
 
 import importlib
 import shutil
@@ -14,6 +14,7 @@ from synthetic import contents, flip
 from tiny import changed, ran_here
 
 import gen2d
+from gen2d.annotations import tracks
 from gen2d.config import plugins
 from gen2d.config.config import load_config
 from gen2d.config.trust import list_path
@@ -27,14 +28,15 @@ from gen2d.storage.sealed import sha256
 from gen2d.tools.verify import verify
 
 flat = importlib.import_module("gen2d.renderers.looks.flat")
-COPIES = ["plugins/look/mine.py", "plugins/scene/mine.py"]
+COPIES = ["plugins/annotation/mine.py", "plugins/look/mine.py", "plugins/scene/mine.py"]
+FOLDERS = {"annotations": tracks, "looks": flat, "families": bouncing}  # in the order of COPIES
 
 
 @pytest.fixture(scope="module")
 def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with a family and a look of one name, and a dataset of them."""
+    """A folder with a family, a look and an annotation of one name, and a dataset of them."""
     home = tmp_path_factory.mktemp("home")
-    for folder, module in (("families", bouncing), ("looks", flat)):
+    for folder, module in FOLDERS.items():
         (home / folder).mkdir()
         shutil.copy(str(module.__file__), home / folder / "mine.py")
     generate(config(home), 6, home / "data")
@@ -45,6 +47,7 @@ def config(home: Path) -> dict:
     names = {
         "scene": {"name": f"{home}/families/mine.py", "balls": 2},
         "look": {"name": f"{home}/looks/mine.py"},
+        "annotations": {f"{home}/annotations/mine.py": 2},
     }
     return changed(video={"frames": 3}, physics={"substeps": 1}, storage={"videos_per_shard": 4}, **names)
 
@@ -59,7 +62,7 @@ GONE = {
 @pytest.fixture(params=["there", *GONE])
 def root(request: pytest.FixtureRequest, home: Path, tmp_path: Path) -> Iterator[Path]:
     """The dataset, its originals there, gone, or something else."""
-    originals = [home / "families" / "mine.py", home / "looks" / "mine.py"]
+    originals = [home / folder / "mine.py" for folder in FOLDERS]
     kept = [path.read_bytes() for path in originals]
     if request.param != "there":
         for path in originals:
@@ -73,7 +76,7 @@ def root(request: pytest.FixtureRequest, home: Path, tmp_path: Path) -> Iterator
 def test_the_files_lie_in_the_folder_and_in_its_manifest(home: Path) -> None:
     files = read_manifest(home / "data").files
     assert sorted(name for name in files if name.startswith("plugins/")) == COPIES
-    for name, kind in zip(COPIES, ("looks", "families"), strict=True):
+    for name, kind in zip(COPIES, FOLDERS, strict=True):
         assert (home / "data" / name).read_bytes() == (home / kind / "mine.py").read_bytes()
     assert verify(home / "data", "full") == []
 
@@ -83,6 +86,8 @@ def test_videos_are_made_again(root: Path) -> None:
     ds = gen2d.open(root)
     expected = ds[[1, 5]]["frames"]
     assert_array_equal(np.asarray(gen2d.render(ds, [1, 5])), expected)
+    points = gen2d.open(root, fields=["tracks/points"])[[1, 5]]["tracks/points"]
+    assert_array_equal(np.asarray(gen2d.render(ds, [1, 5], fields=["tracks/points"])["tracks/points"]), points)
     look = config_of(ds).plain()["look"]
     assert_array_equal(np.asarray(gen2d.render(ds, [1, 5], look=look)), expected)
     assert config_of(ds, ["look.background=[9, 9, 9]"]).look.content == config_of(ds).look.content
@@ -115,14 +120,16 @@ def test_a_damaged_copy_is_found_and_comes_back_where_the_original_is_there(
 SEEN = "seen.txt"  # written by the look below when it runs
 
 
-@pytest.fixture
-def foreign(home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A dataset whose look leaves a trace when it runs, for a user who has never generated with it."""
+@pytest.fixture(params=["look", "annotation"])
+def foreign(request: pytest.FixtureRequest, home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A dataset whose look or annotation leaves a trace when it runs, for a user who has never generated with it."""
     trace = f"import pathlib\npathlib.Path({str(tmp_path / SEEN)!r}).touch()\n"
-    (tmp_path / "mine.py").write_bytes((home / "looks" / "mine.py").read_bytes() + trace.encode())
+    (tmp_path / "mine.py").write_bytes((home / f"{request.param}s" / "mine.py").read_bytes() + trace.encode())
+    path = str(tmp_path / "mine.py")
+    own = {"look": path} if request.param == "look" else {"annotations": {path: 1}}
     states = changed(video={"frames": 3}, physics={"substeps": 1}, storage={"frames": "none"})
     monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "of whoever made it"))
-    generate(states | {"look": str(tmp_path / "mine.py")}, 3, tmp_path / "data")
+    generate(states | own, 3, tmp_path / "data")
     assert sha256((tmp_path / "mine.py").read_bytes()) in list_path().read_text()
     (tmp_path / SEEN).unlink()
     monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "of another"))
@@ -131,7 +138,8 @@ def foreign(home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path
 
 
 def test_what_came_with_a_dataset_runs_only_if_it_is_trusted(foreign: Path, tmp_path: Path) -> None:
-    ds, digest = gen2d.open(foreign), sha256((foreign / "plugins" / "look" / "mine.py").read_bytes())
+    ds, copy = gen2d.open(foreign), next(foreign.glob("plugins/*/mine.py"))
+    digest = sha256(copy.read_bytes())
     assert len(ds[:]) == 4
     assert verify(foreign, "full") == []
     for words in (
@@ -152,7 +160,7 @@ def test_what_came_with_a_dataset_runs_only_if_it_is_trusted(foreign: Path, tmp_
         done = ran_here(*words)
         assert done.returncode == 2
         assert done.stderr.count("\n") == 1
-        assert f"{foreign}/plugins/look/mine.py" in done.stderr
+        assert f"{copy}" in done.stderr
         assert f"--trust {digest}" in done.stderr
     for call in (lambda: gen2d.render(ds, [0]), lambda: gen2d.simulate_again(ds, [0]), lambda: repair(foreign)):
         with pytest.raises(UntrustedError, match=digest):

@@ -20,9 +20,10 @@ import tiny
 from numpy.testing import assert_allclose, assert_array_equal
 
 import gen2d
+from gen2d.config import plugins
 from gen2d.core.errors import ConfigError, FolderError, UserError
 from gen2d.core.schema import Field
-from gen2d.exports import export, formats
+from gen2d.exports import export
 from gen2d.exports import source as source_module
 
 SIZES = {"T": 6, "H": 64, "W": 48, "K": 3}
@@ -374,13 +375,15 @@ def test_a_file_is_replaced_only_when_asked(balls: Path, tmp_path: Path) -> None
 # ---- Bad input
 
 
-def test_every_format_keeps_the_contract() -> None:
-    for name in formats.names():
-        module = export._module(name)
-        assert (module.__doc__ or "").strip()
-        assert isinstance(module.LOSS, str)
-        assert isinstance(module.FIXED, bool)
-        assert all(callable(getattr(module, function)) for function in ("check", "write"))
+@pytest.mark.parametrize("name", plugins.names("export"))
+def test_every_format_keeps_the_contract(name: str, balls: Path, tmp_path: Path) -> None:
+    """It makes the folder or the file that it declares, and tells what is lost."""
+    form = plugins.load("export", name)
+    done = gen2d.export(balls, name, tmp_path / f"out{form.suffix}")
+    assert done.loss == form.loss
+    assert done.out.is_file() == bool(form.suffix)
+    assert done.bytes > 0
+    assert form.suffix or (done.out / export.ABOUT).is_file()
 
 
 @pytest.mark.parametrize(

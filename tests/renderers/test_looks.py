@@ -23,7 +23,7 @@ from gen2d.renderers import color as color_module
 from gen2d.renderers import look, rasterizer
 
 LOOKS = plugins.names("look")
-RANDOM = [name for name in LOOKS if hasattr(plugins.load("look", name).Options, "palette")]
+RANDOM = [name for name in LOOKS if issubclass(plugins.load("look", name).options, look.PlainOptions)]
 FREE = {"palette": "random", "contrast": 150.0}
 HEIGHT, WIDTH = 40, 44
 PATCHES, DENSE = (jax.jit(form, static_argnums=1) for form in (rasterizer.draw_tiles, rasterizer.draw_dense))

@@ -2,7 +2,7 @@
 start, factors within what they are declared to be, and scenes that depend on their keys alone; over 100,000 keys also
 that whole videos are numbers and that nothing gets out of walls (`pytest -m slow tests/scenes/test_families.py`).
 
-What moves begins inside the layout's bounds; a family where some of it comes from outside says `BEGINS_OUTSIDE = True`.
+What moves begins inside the layout's bounds; a family where some of it comes from outside declares `begins_outside`.
 """
 
 import functools
@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from gen2d.config import plugins, truncation
-from gen2d.config.config import load_config
+from gen2d.config.config import Config, load_config
 from gen2d.config.distributions import Distribution, Span, after
 from gen2d.config.options import drawn_options
 from gen2d.config.plugin_options import Plugin
@@ -48,12 +48,17 @@ class Made(NamedTuple):
     extent: Any  # [n, 4] m: left, bottom, right and top end of all that moves
 
 
+def config_of(family: str) -> Config:
+    """The config of a family's name, or else its defaults."""
+    return load_config(f"{family}.yaml" if f"{family}.yaml" in plugins.config_names() else {"scene": family})
+
+
 @functools.cache
 def program(family: str) -> tuple[Plugin, Layout, Any]:
     """A family's config, its layout, and the one program that a test of it compiles."""
-    config = load_config(f"{family}.yaml")
+    config = config_of(family)
     scene = config.scene
-    layout = scene.module.layout(scene.options)
+    layout = scene.contract.layout(scene.options)
 
     def run(keys: jax.Array) -> Made:
         factors, begun = jax.vmap(Sampler(config).sampled)(keys)
@@ -155,7 +160,7 @@ def test_everything_finds_a_place_without_overlap(family):
 @pytest.mark.parametrize("family", FAMILIES)
 def test_what_moves_begins_in_view(family):
     scene, layout, _ = program(family)
-    if getattr(scene.module, "BEGINS_OUTSIDE", False):
+    if scene.contract.begins_outside:
         return
     left, bottom, right, top = made(family).extent.T
     bounds = layout.bounds
@@ -178,7 +183,7 @@ def test_factors_are_what_they_are_declared_to_be(family):
 def check_factors(scene: Plugin, found: dict[str, np.ndarray], doubt: float = 1e-3) -> None:
     """Asserts that factors are in their support, and drawn as they are declared to be (A. Kolmogorov, N. Smirnov)."""
     most = np.sqrt(-np.log(doubt / 2) / 2)
-    for name, spec in drawn_options(scene.module).items():
+    for name, spec in drawn_options(scene.contract).items():
         source, values = getattr(scene.options, name), found[name]
         parts = source if spec.parts else [source]
         values = values if spec.parts else values[..., None]
@@ -189,7 +194,7 @@ def check_factors(scene: Plugin, found: dict[str, np.ndarray], doubt: float = 1e
         for part, drawn in zip(parts, np.moveaxis(values, -1, 0), strict=True):
             assert part.contains(drawn[there]).all(), name
             assert distance(part, drawn[there]) < most / np.sqrt(there.sum()), name
-    for name in getattr(scene.module, "DERIVED", {}):
+    for name in scene.contract.derived:
         assert np.isfinite(found[name]).all(), name
 
 
@@ -206,9 +211,9 @@ def test_a_key_is_a_scene(family):
 @pytest.mark.slow
 @pytest.mark.parametrize("family", FAMILIES)
 def test_a_hundred_thousand_videos_are_numbers_begin_apart_and_stay_within_walls(family):
-    config = load_config(f"{family}.yaml")
+    config = config_of(family)
     scene, video, physics = config.scene, config.video, config.physics
-    layout, steps = scene.module.layout(scene.options), substeps(video.fps, physics.substeps, physics.max_step)
+    layout, steps = scene.contract.layout(scene.options), substeps(video.fps, physics.substeps, physics.max_step)
     rules = solver_params(physics, video.fps, steps)
 
     @jax.jit

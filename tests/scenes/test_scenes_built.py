@@ -38,7 +38,7 @@ def film(family: str, videos: int, seconds: float, fps: float, *overrides: str, 
     """Some videos of a family's config, with some options changed."""
     config = load_config(f"{family}.yaml", [*overrides, f"video.fps={fps}"])
     scene, physics, frames = config.scene, config.physics, round(seconds * fps) + 1
-    layout, steps = scene.module.layout(scene.options), substeps(fps, physics.substeps, physics.max_step)
+    layout, steps = scene.contract.layout(scene.options), substeps(fps, physics.substeps, physics.max_step)
     rules = solver_params(physics, fps, steps)
 
     @jax.jit

@@ -50,7 +50,7 @@ def begun(config: Config, n: int, given: dict[str, Any] | None = None) -> Played
     def made(key: jax.Array, given: dict) -> tuple:
         draw_key, place_key = jax.random.split(key)
         drawn = sampler.drawn(draw_key) | given
-        found = config.scene.module.sample(place_key, drawn, config.scene.options)
+        found = config.scene.contract.sample(place_key, drawn, config.scene.options)
         return drawn | found.derived, found.scene, found.state
 
     given = {name: jnp.asarray(values, jnp.float32) for name, values in (given or {}).items()}
@@ -60,7 +60,7 @@ def begun(config: Config, n: int, given: dict[str, Any] | None = None) -> Played
 
 def played(config: Config, n: int, given: dict[str, Any] | None = None) -> Played:
     """n videos, simulated."""
-    start, layout = begun(config, n, given), config.scene.module.layout(config.scene.options)
+    start, layout = begun(config, n, given), config.scene.contract.layout(config.scene.options)
     steps = substeps(config.video.fps, config.physics.substeps, config.physics.max_step)
     rules = solver_params(config.physics, config.video.fps, steps)
 
@@ -101,7 +101,7 @@ def uniformly(shares: np.ndarray) -> None:
 def test_what_moves_starts_in_view_and_touches_nothing(name):
     config = load_config(f"{name}.yaml")
     made = begun(config, 256)
-    left, bottom, right, top = config.scene.module.layout(config.scene.options).bounds
+    left, bottom, right, top = config.scene.contract.layout(config.scene.options).bounds
     objects, x = made.scene.objects, made.start.position
     moving = (objects.present > 0) & (objects.kind == 0)
     rim = objects.radius + np.abs(objects.half_length)

@@ -48,7 +48,7 @@ def made(name: str) -> dict[str, np.ndarray]:
     batch = rollout.start("train", np.arange(rollout.batch_size))
     assert per_device(batch.placed)[0].all()
     columns = rollout.host_columns(batch)[0] | {"time": rollout.schema.time}
-    if rollout.config.annotations.visibility:
+    if "visibility" in rollout.config.annotations.enabled:
         columns |= rollout.draw(batch, 0, rollout.batch_size)[0]
     return {key: np.asarray(values, float) for key, values in columns.items() if key != "frames"}
 

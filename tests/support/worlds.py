@@ -194,7 +194,7 @@ def flown(config: Config | Mapping, count: int) -> tuple[RenderScene, FramePlan,
     """What `count` videos of a config are drawn from, their plan, scenes and states [n, T, ...]; from where the sampler
     puts it everything flies straight on, through walls too."""
     config = load_config(config)
-    layout = config.scene.module.layout(config.scene.options)
+    layout = config.scene.contract.layout(config.scene.options)
     keys = keys_module.video_keys(
         jnp.asarray(keys_module.seed_words(config.seed, 0)), jnp.arange(count, dtype=jnp.uint32)
     )

@@ -1,10 +1,18 @@
-"""Formats of other programs: one file per format, found by its name.
+"""Formats of other programs: one file each, named like the format: `--to NAME`, or `--to my/NAME.py`.
 
-Each has `LOSS`, what is not kept ("" where all of it is), `FIELDS`, the patterns of the fields that it holds, `FIXED`,
-whether it can hold no others, `SUFFIX`, the ending of the one file that it makes ("" where it fills a folder), and
+A file ends with an `EXPORT`, whose members `gen2d.plugin.Export` describes. The smallest one:
 
-    check(source)           raises ConfigError where this dataset cannot be held
-    write(target, source)   fills the folder, or the file
+    import numpy as np
+    from gen2d.plugin import Export
+
+    def write(target, source):
+        for number, video in enumerate(source.videos()):
+            np.save(target / f"{source.key(number)}.npy", video["frames"])
+            source.advance(1)
+
+    EXPORT = Export(fields=("frames",), write=write, fixed=True)
+
+`source.each(one)` calls `one(key, video)` for every video in several threads, and counts them itself.
 """
 
 import pkgutil

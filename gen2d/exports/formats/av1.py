@@ -2,11 +2,8 @@
 
 from pathlib import Path
 
-from gen2d.plugin import Source, films
+from gen2d.plugin import Export, Source, films
 
-LOSS = films.LOSS
-FIELDS, FIXED = ("frames",), True
-SUFFIX = ""
 FASTEST = 240  # frames/s, of this encoder
 OPTIONS = {"crf": "20", "preset": "8", "svtav1-params": "lp=1"}
 
@@ -25,3 +22,6 @@ def write(target: Path, source: Source) -> None:
         films.encode(target / f"{key}.mp4", video["frames"], source.fps, "libsvtav1", "yuv420p", OPTIONS)
 
     source.each(one)
+
+
+EXPORT = Export(fields=("frames",), write=write, check=check, fixed=True, loss=films.LOSS)

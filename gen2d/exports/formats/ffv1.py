@@ -2,11 +2,8 @@
 
 from pathlib import Path
 
-from gen2d.plugin import Source, films
+from gen2d.plugin import Export, Source, films
 
-LOSS = ""
-FIELDS, FIXED = ("frames",), True
-SUFFIX = ""
 FASTEST = 1000  # frames/s: Matroska tells times in milliseconds
 PIXELS = "bgr0"  # the stored bytes in another order; any form of YUV would round them
 OPTIONS = {"level": "3", "coder": "1", "context": "1", "slicecrc": "1"}
@@ -25,3 +22,6 @@ def write(target: Path, source: Source) -> None:
         films.encode(target / f"{key}.mkv", video["frames"], source.fps, "ffv1", PIXELS, OPTIONS)
 
     source.each(one)
+
+
+EXPORT = Export(fields=("frames",), write=write, check=check, fixed=True)

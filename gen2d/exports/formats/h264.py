@@ -2,11 +2,8 @@
 
 from pathlib import Path
 
-from gen2d.plugin import Source, films
+from gen2d.plugin import Export, Source, films
 
-LOSS = films.LOSS
-FIELDS, FIXED = ("frames",), True
-SUFFIX = ""
 # Flat discs need a better quality than the camera's pictures that the usual 23 is meant for. With mbtree (x264 as in
 # PyAV 18) small videos come out otherwise from run to run: 1 in 5 of 64 px and 32 frames.
 OPTIONS = {"crf": "12", "x264-params": "no-mbtree=1", "movflags": "+faststart"}
@@ -26,3 +23,6 @@ def write(target: Path, source: Source) -> None:
         films.encode(target / f"{key}.mp4", video["frames"], source.fps, "libx264", "yuv420p", OPTIONS)
 
     source.each(one)
+
+
+EXPORT = Export(fields=("frames",), write=write, check=check, fixed=True, loss=films.LOSS)

@@ -2,11 +2,7 @@
 
 from pathlib import Path
 
-from gen2d.plugin import Source, films
-
-LOSS = films.LOSS
-FIELDS, FIXED = ("frames",), True
-SUFFIX = ""
+from gen2d.plugin import Export, Source, films
 
 
 def check(source: Source) -> None:
@@ -18,3 +14,6 @@ def check(source: Source) -> None:
 def write(target: Path, source: Source) -> None:
     """Fills the folder with KEY.mp4."""
     source.each(lambda key, video: films.mp4v(target / f"{key}.mp4", video["frames"], source.fps))
+
+
+EXPORT = Export(fields=("frames",), write=write, check=check, fixed=True, loss=films.LOSS)

@@ -5,15 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gen2d.plugin import Source
-
-LOSS = ""
-FIELDS, FIXED = ("frames", "*"), False
-SUFFIX = ""
-
-
-def check(source: Source) -> None:
-    """Returns nothing: every dataset can be held."""
+from gen2d.plugin import Export, Source
 
 
 def write(target: Path, source: Source) -> None:
@@ -26,3 +18,6 @@ def write(target: Path, source: Source) -> None:
                     np.lib.format.write_array(file, np.asanyarray(values), allow_pickle=False)
 
     source.each(one)
+
+
+EXPORT = Export(fields=("frames", "*"), write=write)

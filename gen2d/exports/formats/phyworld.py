@@ -13,15 +13,11 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from gen2d.plugin import CIRCLE, STATIC, Batch, ConfigError, Source, films
+from gen2d.plugin import CIRCLE, STATIC, Batch, ConfigError, Export, Source, films
 from gen2d.plugin import dataset as loader
 
-LOSS = f"{films.LOSS}; positions and first speeds of the balls alone"
 CAMERA = ("camera/center", "camera/scale", "camera/angle")
 OBJECTS = ("objects/present", "objects/kind", "objects/shape")
-FIELDS = ("frames", "states/position", "states/velocity", "objects/radius", *OBJECTS, *CAMERA)
-FIXED = True
-SUFFIX = ".hdf5"
 UNITS = 10.0  # the frame's width
 GROUP = 1000  # videos in a dataset
 
@@ -89,3 +85,13 @@ def _motion(video: Batch, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray
     speed = np.linalg.norm(video["states/velocity"][0, balls].astype(np.float64), axis=-1)
     init = np.concatenate([video["objects/radius"][balls], speed]) * metre
     return (position[:, 0] if len(balls) == 1 else position), init
+
+
+EXPORT = Export(
+    fields=("frames", "states/position", "states/velocity", "objects/radius", *OBJECTS, *CAMERA),
+    write=write,
+    check=check,
+    fixed=True,
+    suffix=".hdf5",
+    loss=f"{films.LOSS}; positions and first speeds of the balls alone",
+)

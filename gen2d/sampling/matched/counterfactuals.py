@@ -17,7 +17,7 @@ from gen2d.sampling.matched.sets import SetMember, along_slots
 def changed_factors(member: SetMember, config: Any, factors: dict[str, Array], draw: Callable) -> dict[str, Array]:
     """The factors, of which the one that the set changes is scaled or drawn anew; `draw(key)` draws all."""
     specs, matched, redrawn, changed = (
-        drawn_options(config.scene.module),
+        drawn_options(config.scene.contract),
         config.matched,
         draw(member.own_key),
         dict(factors),

@@ -122,7 +122,9 @@ def _record_change(member: SetMember, before: MemberVideos, after: MemberVideos,
             record["object"] = jnp.where(on, slot, record["object"])
             change = (after.factors[name] - before.factors[name]).astype(jnp.float32)
             size = (
-                jnp.linalg.norm(change, axis=-1) if drawn_options(config.scene.module)[name].parts else jnp.abs(change)
+                jnp.linalg.norm(change, axis=-1)
+                if drawn_options(config.scene.contract)[name].parts
+                else jnp.abs(change)
             )
             record["size"] = jnp.where(on, jnp.max(size), record["size"])
     differ = jnp.zeros(len(after.trajectory.states.angle), bool)
