@@ -75,8 +75,8 @@ def drawn_as(case: str) -> Made:
 
 def test_fields_are_as_described(made):
     for name, array in made.of.items():
-        field = made.rollout.fields[name]
-        assert array.shape[1:] == field.shape(made.rollout.sizes), name
+        field = made.rollout.schema.fields[name]
+        assert array.shape[1:] == field.shape(made.rollout.schema.sizes), name
         assert array.dtype == field.dtype or name == "contacts/time", name
 
 

@@ -1,0 +1,53 @@
+"""A user's script with every public function, which `mypy --strict` checks and nothing runs."""
+
+from pathlib import Path
+from typing import assert_type
+
+import jax
+import numpy as np
+import torch
+
+import gen2d
+
+
+def train(root: Path) -> float:
+    config = gen2d.load_config("bouncing.yaml", ["video.fps=30"])
+    summary = gen2d.generate(config, n=64, out=root, seed=7)
+    print(summary.made, summary.out, summary.videos_per_second)
+    ds = gen2d.open(root, fields=["frames", "states/*"], window=16)
+    assert_type(ds, gen2d.Dataset)
+    assert_type(ds[0], dict[str, np.ndarray])
+    total = float(ds[0]["frames"].mean())
+    with gen2d.DataLoader(ds, batch_size=32, epochs=1) as loader:
+        for batch in loader:
+            assert_type(batch, dict[str, np.ndarray])
+            total += float(batch["states/position"].sum())
+        state = loader.state_dict()
+        loader.load_state_dict(state)
+    for tensors in gen2d.DataLoader(ds, batch_size=8, epochs=1, to="torch", device="cpu"):
+        assert_type(tensors, dict[str, torch.Tensor])
+        total += tensors["frames"].float().mean().item()
+    for arrays in gen2d.stream(config, batch_size=8, n=8, epochs=1, fields=["states/position"]):
+        total += float(arrays["states/position"].sum())
+    both = gen2d.open([root, root])
+    mixture = gen2d.mix({"one": ds, "other": both}, [3, 1])
+    print(len(mixture), mixture[0]["frames"].shape)
+    rendered = assert_type(gen2d.render(ds, [0, 1], height=32), jax.Array)
+    masks = assert_type(gen2d.render(ds, range(2), fields=["masks/instance"]), dict[str, jax.Array])
+    states = gen2d.simulate_again(ds, [0], fps=120.0)
+    soft = gen2d.render_soft(ds, [0], states=states, sigma=1.5)
+    print(rendered.shape, masks.keys(), assert_type(soft, jax.Array).dtype)
+    space = gen2d.Space(gravity=(0.0, -9.8))
+    ball = space.add_circle((0.0, 3.0), 0.5, elasticity=0.9)
+    space.add_segment((-5.0, 0.0), (5.0, 0.0))
+    video = space.simulate(2.0, fps=60.0)
+    print(video.position[:, ball], video.energy, video.contacts)
+    exported = gen2d.export(root, "npz", root / "npz")
+    problems: list[str] = gen2d.verify(root)
+    pictures: list[Path] = gen2d.preview(root, out=root)
+    try:
+        gen2d.open("nothing")
+    except gen2d.UserError as error:
+        print(error)
+    print(exported.videos, problems, pictures, gen2d.info(root))
+    return total
