@@ -4,7 +4,7 @@ A file ends with a `FAMILY`, whose members `gen2d.plugin.Family` describes. The 
 
     import dataclasses
     import jax.numpy as jnp
-    from gen2d.plugin import Family, Layout, SampledScene, SlotGroup, assemble, discs, option
+    from gen2d.plugin import Family, Layout, SampledScene, SlotGroup, builder, option
 
     @dataclasses.dataclass(frozen=True)
     class Options:
@@ -14,8 +14,8 @@ A file ends with a `FAMILY`, whose members `gen2d.plugin.Family` describes. The 
         return Layout((SlotGroup("circle", 1),), bounds=(0, 0, 1, 1), reach=options.radius.support[1])
 
     def sample(key, factors, options):
-        disc = discs(jnp.array([[0.5, 0.5]]), factors["radius"][None], True)
-        return SampledScene(*assemble(layout(options), [disc], gravity=jnp.zeros(2)))
+        disc = builder.discs(jnp.array([[0.5, 0.5]]), factors["radius"][None], True)
+        return SampledScene(*builder.assemble(layout(options), [disc], gravity=jnp.zeros(2)))
 
     FAMILY = Family(options=Options, layout=layout, sample=sample)
 """

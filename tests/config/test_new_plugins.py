@@ -41,7 +41,7 @@ import dataclasses
 
 import jax.numpy as jnp
 
-from gen2d.plugin import Family, Layout, SampledScene, SlotGroup, assemble, discs, option
+from gen2d.plugin import Family, Layout, SampledScene, SlotGroup, builder, option
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,7 +57,7 @@ def layout(options):
 def sample(key, factors, options):
     places = jnp.stack([jnp.arange(options.count) + 0.5, jnp.full(options.count, 0.5)], 1)
     radius = jnp.full(options.count, factors["radius"])
-    return SampledScene(*assemble(layout(options), [discs(places, radius, True)], jnp.zeros(2)))
+    return SampledScene(*builder.assemble(layout(options), [builder.discs(places, radius, True)], jnp.zeros(2)))
 
 
 FAMILY = Family(options=Options, layout=layout, sample=sample)
