@@ -13,11 +13,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-import yaml
 from tiny import ran
 
 import gen2d
 from gen2d.config import plugins
+from gen2d.config.reading import yaml_text
 from gen2d.core.errors import ConfigError, UserError
 
 ROOT = Path(gen2d.__file__).parent.parent
@@ -194,9 +194,8 @@ def plain(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.mark.parametrize("kind", SOURCES)
-def test_one_file_in_its_folder_adds_a_plug_in(kind: str, plain: Path, tmp_path: Path) -> None:
-    copy = tmp_path / "copy"
+def copy_with(kind: str, copy: Path) -> Path:
+    """A copy of the package with one file more."""
     skipped = shutil.ignore_patterns("__pycache__", "*.png")
     for name in ("gen2d", "renderers", "configs", "tests"):
         if (ROOT / name).is_dir():  # in a wheel the first holds the next two
@@ -204,7 +203,12 @@ def test_one_file_in_its_folder_adds_a_plug_in(kind: str, plain: Path, tmp_path:
     shutil.copy(Path(__file__).parent.parent.parent / "pyproject.toml", copy)
     folder = copy / FOLDERS[kind] if (copy / FOLDERS[kind]).is_dir() else copy / "gen2d" / FOLDERS[kind]
     (folder / "brandnew.py").write_text(SOURCES[kind])
+    return copy
 
+
+@pytest.mark.parametrize("kind", SOURCES)
+def test_one_file_in_its_folder_adds_a_plug_in(kind: str, plain: Path, tmp_path: Path) -> None:
+    copy = copy_with(kind, tmp_path / "copy")
     here = {"cwd": copy, "PYTHONPATH": str(copy)}
     listed = ran("list", "brandnew", **here)
     assert listed.returncode == 0, listed.stderr
@@ -215,17 +219,25 @@ def test_one_file_in_its_folder_adds_a_plug_in(kind: str, plain: Path, tmp_path:
         assert "brandnew is levels alone" in done.stdout
         check_export(tmp_path / "levels.json", plain)
     else:
-        (tmp_path / "new.yaml").write_text(yaml.safe_dump(config_with(kind, "brandnew")))
+        (tmp_path / "new.yaml").write_text(yaml_text(config_with(kind, "brandnew")))
         done = ran("--config", tmp_path / "new.yaml", "--n", 4, "--out", tmp_path / "data", **here)
         assert done.returncode == 0, done.stderr
         check_dataset(kind, tmp_path / "data")
-    contracts = ["tests/config/test_contracts.py", *(["tests/scenes/test_families.py"] if kind == "scene" else [])]
-    words = [sys.executable, "-m", "pytest", "-q", "-n", "0", "-p", "no:cacheprovider", "-k", "brandnew", *contracts]
-    tested = subprocess.run(
-        words, cwd=copy, env=os.environ | {"PYTHONPATH": str(copy)}, capture_output=True, text=True, check=False
-    )
-    assert tested.returncode == 0, tested.stdout
-    assert " passed" in tested.stdout
+    check_tests(copy, "tests/config/test_contracts.py")
+
+
+@pytest.mark.slow
+def test_a_family_in_its_folder_keeps_the_contract_of_all(tmp_path: Path) -> None:
+    check_tests(copy_with("scene", tmp_path / "copy"), "tests/scenes/test_families.py")
+
+
+def check_tests(copy: Path, tests: str) -> None:
+    """Asserts that those of the tests that are about the new plug-in pass in a copy of the package."""
+    words = [sys.executable, "-m", "pytest", "-q", "-n", "0", "-p", "no:cacheprovider", "-k", "brandnew", tests]
+    environment = os.environ | {"PYTHONPATH": str(copy)}
+    done = subprocess.run(words, cwd=copy, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout
+    assert " passed" in done.stdout
 
 
 @pytest.mark.parametrize("kind", SOURCES)

@@ -428,7 +428,7 @@ def test_forty_kills_leave_no_trace(tmp_path: Path) -> None:
 def test_the_manifest_keeps_to_the_schema_and_to_itself(tmp_path: Path) -> None:
     made = synthetic.make(synthetic.dataset(tmp_path))
     manifest = read_manifest(tmp_path)
-    assert manifest.plain["schema"] == "gen2d.dataset/2"
+    assert manifest.plain["schema"] == "gen2d.dataset/3"
     assert manifest.splits == {"train": 20, "test": 3}
     assert manifest.config == made.config
     assert socket.gethostname() not in json.dumps(manifest.plain)
