@@ -9,9 +9,9 @@ In a config a law is written relative to the scene's own distributions, the base
     {condition: [LAW, {when: REGION, then: {...}}]} the law, with other distributions for some factors in a region
 
 A region is a product or a mixture of products; factors that it does not name are unconstrained. Every law is stored as
-    {condition: [LAW, {when: REGION, then: {...}}]} the law, with other distributions of some factors in a region
-This is closed under all operations above, as products truncated by boxes are mixtures of products. Hence laws are
-sampled without rejection, and whether two laws have a point in common is decided exactly: they do if two of their
+a mixture of products of one-dimensional distributions, one for each coordinate (`radius`, or `velocity[0]` of a
+vector). This is closed under all operations above, as products truncated by boxes are mixtures of products. Hence laws
+are sampled without rejection, and whether two laws have a point in common is decided exactly: they do if two of their
 products overlap in every coordinate.
 """
 
