@@ -46,9 +46,9 @@ class Span(NamedTuple):
 
     def meet(self, other: "Span") -> "Span | None":
         """Intersection of two spans; None if it is empty."""
-        both = Span(max(self.low, other.low), min(self.high, other.high), self.whole or other.whole)
-        first = math.ceil(both.low) if both.whole and math.isfinite(both.low) else both.low
-        return both if first < both.high else None
+        overlap = Span(max(self.low, other.low), min(self.high, other.high), self.whole or other.whole)
+        first = math.ceil(overlap.low) if overlap.whole and math.isfinite(overlap.low) else overlap.low
+        return overlap if first < overlap.high else None
 
 
 def point(value: float) -> Span:

@@ -150,8 +150,8 @@ def _cut(products: list[Component], boxes: list[SupportBox], keep: bool) -> list
     inside, outside = [], products
     for box in boxes:
         split = [_split(product, box) for product in outside]
-        inside += [product for own, _ in split for product in own]
-        outside = [product for _, others in split for product in others]
+        inside += [product for kept, _ in split for product in kept]
+        outside = [product for _, left in split for product in left]
     return inside if keep else outside
 
 

@@ -1,7 +1,7 @@
 """Splits of a config: names, sizes, joint distributions of the factors, and changed sections.
 
-A split with its own factors is held out: its distribution must have no point in common with that of the training split.
-This is decided exactly on the supports of the two distributions (joint_distribution.py).
+A split with its own factors is held out: unless it says `overlaps: true`, its distribution must have no point in common
+with that of the training split. This is decided exactly on the two supports (joint_distribution.py).
 """
 
 import dataclasses

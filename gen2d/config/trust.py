@@ -37,12 +37,12 @@ def check_trusted(copies: Mapping[str, bytes], trust: str | Sequence[str], root:
     for entry in trusted:
         if not isinstance(entry, str) or not _HASH.fullmatch(entry):
             raise ConfigError(f"--trust is {entry!r}, but must be the sha256 of a file, 64 hexadecimal digits")
-    digests = {place: sha256(content) for place, content in copies.items()}
+    digests = {path: sha256(content) for path, content in copies.items()}
     allowed = trusted | _listed() if digests.keys() and not set(digests.values()) <= trusted else trusted
-    for place, digest in sorted(digests.items()):
+    for path, digest in sorted(digests.items()):
         if digest not in allowed:
             raise UntrustedError(
-                f"{root}/{place} is code that came with the dataset and would have to run: read it, and if you trust "
+                f"{root}/{path} is code that came with the dataset and would have to run: read it, and if you trust "
                 f"it say --trust {digest} (in Python trust={digest!r}), or add that line to {list_path()}"
             )
 
