@@ -1,4 +1,4 @@
-"""Rendered-video datasets of 2D rigid bodies, with every ground truth.
+"""Rendered-video datasets of 2D rigid bodies with complete ground truth.
 
     import gen2d
     gen2d.generate("bouncing.yaml", n=1000, out="datasets/bouncing")

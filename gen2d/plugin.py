@@ -1,6 +1,6 @@
-"""The public names for plug-ins: a scene family, look, annotation or export imports this module and no other of gen2d.
+"""Public API for plug-ins: a scene family, look, annotation or export needs to import no other module of gen2d.
 
-The names stay here when their modules move. Each is imported on first use, so an export does not import jax.
+Names stay available here when their modules move. Each is imported on first use, so an export does not import jax.
 """
 
 from typing import TYPE_CHECKING

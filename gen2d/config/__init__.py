@@ -1,1 +1,1 @@
-"""Configs: YAML to checked options, distributions and splits."""
+"""Configs: YAML files read into checked options, distributions and splits."""

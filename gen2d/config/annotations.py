@@ -1,4 +1,4 @@
-"""The section `annotations`: options of the files in gen2d/annotations/, of the user's own, and of the simulation."""
+"""The section `annotations`: options of the plug-ins in gen2d/annotations/, of user files, and of the simulation."""
 
 import collections
 import dataclasses
@@ -15,56 +15,68 @@ from gen2d.core.errors import ConfigError
 
 @dataclasses.dataclass(frozen=True)
 class Annotations:
-    """What is stored beside frames and states."""
+    """Annotations that a dataset stores beside frames and states."""
 
     simulated: SimulationAnnotations
-    pixels: tuple[Plugin, ...]  # their `options` are the single option's value, or the dataclass (None where it is off)
+    pixels: tuple[Plugin, ...]  # `options`: a single value, or a dataclass (None if off)
 
     @property
     def wanted(self) -> list[Plugin]:
-        """Those of the pixels that are on."""
+        """Pixel annotations that are switched on."""
         return [plugin for plugin in self.pixels if plugin.options]
 
     @property
     def enabled(self) -> set[str]:
-        """The names of all that is on."""
+        """Names of all annotations that are switched on."""
         simulated = {name for name, value in vars(self.simulated).items() if value}
         return simulated | {plugin.name for plugin in self.wanted}
 
     def plain(self) -> dict[str, Any]:
-        """The section as YAML and JSON hold it."""
+        """The section as plain YAML and JSON values."""
         return plain_of(self.simulated) | {plugin.name: _plain(plugin) for plugin in self.pixels}
 
 
 def _plain(plugin: Plugin) -> Any:
-    """`value` or `{option: value, ...}`; of a file of the user's own always a mapping, with its sha256."""
+    """`value` or `{option: value, ...}`; always a mapping for a user file, which adds its sha256."""
     single = not dataclasses.is_dataclass(plugin.contract.options)
     if single:
         value = plain_value(plugin.options)
         return {"sha256": plugin.sha256, "value": value} if plugin.sha256 else value
-    own = {"sha256": plugin.sha256} if plugin.sha256 else {}
-    return own | plain_of(plugin.options) if plugin.options else False
+    digest = {"sha256": plugin.sha256} if plugin.sha256 else {}
+    return digest | plain_of(plugin.options) if plugin.options else False
 
 
 def annotations_of(values: Any, source: str, copies: Copies) -> Annotations:
-    """The section that a mapping stands for. Raises ConfigError with one sentence that names `source`."""
+    """The section `annotations` of a config, from its mapping.
+
+    `copies` holds user files that the dataset stores. Raises ConfigError, naming `source`, if an option is unknown or
+    out of range, or if two user files share a file name.
+    """
     if not isinstance(values, Mapping):
         raise ConfigError(f"{source}: annotations is {values!r}, but must be a mapping of options")
     simulated = [field.name for field in dataclasses.fields(SimulationAnnotations)]
-    files = plugins.names("annotation")
-    own = [name for name, value in values.items() if _is_own(name) and value is not False]
+    built_in = plugins.names("annotation")
+    user_files = [name for name, value in values.items() if _is_own(name) and value is not False]
     for name in values:
-        if name not in (*simulated, *files) and not _is_own(name):
+        if name not in (*simulated, *built_in) and not _is_own(name):
             raise ConfigError(
-                f"{source}: annotations.{name} is not an option; {plugins.nearest(name, [*simulated, *files])}"
+                f"{source}: annotations.{name} is not an option; {plugins.nearest(name, [*simulated, *built_in])}"
             )
-    copied, count = (
-        collections.Counter(pathlib.PurePath(name).name for name in own).most_common(1)[0] if own else ("", 0)
+    filename, count = (
+        collections.Counter(pathlib.PurePath(name).name for name in user_files).most_common(1)[0]
+        if user_files
+        else ("", 0)
     )
     if count > 1:
-        raise ConfigError(f"{source}: annotations has {count} files named {copied}: a dataset keeps a copy of one only")
-    part = build(SimulationAnnotations, {k: v for k, v in values.items() if k in simulated}, "annotations", source)
-    return Annotations(part, tuple(_annotation(name, values, source, copies) for name in (*files, *own)))
+        raise ConfigError(
+            f"{source}: annotations has {count} files named {filename}: a dataset keeps a copy of one only"
+        )
+    simulation = build(
+        SimulationAnnotations, {k: v for k, v in values.items() if k in simulated}, "annotations", source
+    )
+    return Annotations(
+        simulation, tuple(_annotation(name, values, source, copies) for name in (*built_in, *user_files))
+    )
 
 
 def _is_own(name: Any) -> bool:
@@ -77,9 +89,9 @@ def _annotation(name: str, values: Mapping[str, Any], source: str, copies: Copie
     digest = given.pop("sha256", None)
     contract, digest, content = contract_of("annotation", name, digest, f"{source}: an annotation", copies)
     if isinstance(contract.options, dataclasses.Field):
-        spec, single = contract.options.metadata["option"], given["value"] if [*given] == ["value"] else value
+        spec, single_value = contract.options.metadata["option"], given["value"] if [*given] == ["value"] else value
         try:
-            options = value_of(spec, single) if name in values else contract.options.default
+            options = value_of(spec, single_value) if name in values else contract.options.default
         except ValueError as error:
             raise ConfigError(f"{source}: {where} is {value!r}, but must be {error}") from None
     elif isinstance(value, Mapping | bool):

@@ -1,6 +1,6 @@
-"""What a dataset is made from: every option with its unit, default and range, read from YAML and checked once, here.
+"""The Config: every option of a dataset, read from YAML and checked once, here.
 
-An error is one sentence with the file, the field, its value and what is allowed.
+Each error is one sentence that names the file, the field, its value and the values allowed.
 """
 
 import dataclasses
@@ -38,7 +38,7 @@ MAX_SEED = 2**63 - 1
 
 @dataclasses.dataclass(frozen=True)
 class Config:
-    """Everything that decides what a dataset holds, but for its number of videos."""
+    """All options that determine a dataset, except its number of videos."""
 
     name: str
     seed: int
@@ -55,29 +55,29 @@ class Config:
     splits: tuple[Split, ...] = ()
 
     def plain(self) -> dict[str, Any]:
-        """The config as YAML and JSON hold it, every default filled in."""
+        """The config as plain YAML and JSON values, with every default filled in."""
         sections = {s: plain_of(getattr(self, s)) for s in SECTIONS} | {"annotations": self.annotations.plain()}
         plugs = {p: getattr(self, p).plain() for p in PLUGINS}
         splits = {"splits": {split.name: split.plain() for split in self.splits}} if self.splits else {}
         return {"name": self.name, "seed": self.seed, **sections, **plugs, **splits}
 
     def text(self) -> str:
-        """The resolved config as YAML; read again it gives the same config."""
+        """The resolved config as YAML; reading it gives an equal config."""
         return yaml_text(self.plain())
 
     def recipe_text(self) -> str:
-        """The recipe with its seed as YAML: what a dataset keeps, however many videos it has."""
+        """The recipe and its seed as YAML, as a dataset stores them; the number of videos is not part of it."""
         return yaml_text({"name": self.name, "seed": self.seed, **self.recipe()})
 
     @property
     def copies(self) -> Copies:
-        """What the files of the user's own hold, by their names in the config."""
+        """Contents of the user's plug-in files, by their names in the config."""
         looks = [split.own["look"] for split in self.splits if "look" in split.own]
-        every = self.scene, self.look, *looks, *self.annotations.pixels
-        return {plugin.name: plugin.content for plugin in every if plugin.sha256}
+        used = self.scene, self.look, *looks, *self.annotations.pixels
+        return {plugin.name: plugin.content for plugin in used if plugin.sha256}
 
     def recipe(self) -> dict[str, Any]:
-        """The config without its seed, which a dataset keeps and compares by itself, and without numbers of videos."""
+        """The plain config without the splits' video counts and the seed, which a dataset compares separately."""
         plain = {key: value for key, value in self.plain().items() if key != "seed"}
         for split in plain.get("splits", {}).values():
             split.pop("videos", None)
@@ -85,32 +85,32 @@ class Config:
 
     @property
     def training(self) -> Split | None:
-        """The split that the others are compared with: `train`, or else the first; None where there are none."""
+        """The split that others are compared with: `train`, else the first; None if the config has no splits."""
         return next((split for split in self.splits if split.name == "train"), next(iter(self.splits), None))
 
     def row(self, split: str) -> int:
-        """The place of a split's law among the config's; any split has the only one where the config has none."""
-        names = [own.name for own in self.splits]
-        if names and split not in names:
-            raise ConfigError(f"--split is {split!r}, but must be one of the config's: {', '.join(names)}")
-        return names.index(split) if names else 0
+        """Index of a split in `laws`; 0 if the config has no splits. Raises ConfigError if the name is unknown."""
+        split_names = [s.name for s in self.splits]
+        if split_names and split not in split_names:
+            raise ConfigError(f"--split is {split!r}, but must be one of the config's: {', '.join(split_names)}")
+        return split_names.index(split) if split_names else 0
 
     @property
     def laws(self) -> list[JointDistribution]:
-        """The laws of the splits in order, or that of the scene alone."""
+        """Joint distributions of the splits, in order; that of the scene alone if there are no splits."""
         return distributions_of_splits(self.scene, self.splits)
 
     def frames_of(self, split: str) -> int:
-        """How many frames of a split's videos its reader gets, the first ones."""
-        own = self.splits[self.row(split)].frames if self.splits else None
-        return own or self.video.frames
+        """Number of leading frames of a split's videos that its reader gets."""
+        frames = self.splits[self.row(split)].frames if self.splits else None
+        return frames or self.video.frames
 
     def of_split(self, name: str) -> "Config":
-        """The config as it is for a split, with the look or the physics that this one has of its own."""
+        """The config of one split, with the split's own physics, camera, image or look in place."""
         return dataclasses.replace(self, **self.splits[self.row(name)].own) if self.splits else self
 
     def sha256(self) -> str:
-        """A hash of the recipe."""
+        """Hash of the recipe, in hexadecimal."""
         return hashlib.sha256(json.dumps(self.recipe(), sort_keys=True).encode()).hexdigest()
 
 
@@ -127,22 +127,22 @@ PLUGINS = {"scene": "bouncing", "look": "flat"}
 
 
 def _merged(own: Mapping[str, Any], other: Any) -> Any:
-    """A section with other options; another plug-in has its defaults."""
+    """A section with a split's changes; a split that names another plug-in starts from that one's defaults."""
     other = named(other)
     if not isinstance(other, Mapping):
-        return other  # reading it says what is wrong
+        return other  # reading it raises the error
     return dict(other) if other.get("name", own.get("name")) != own.get("name") else {**own, **other}
 
 
 def checked_seed(value: Any, what: str = "--seed") -> int:
-    """The seed, if it is one; `what` names it in the error."""
+    """The seed, an integer from 0 to 2**63 - 1. Raises ConfigError, naming `what`, if it is anything else."""
     if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value <= MAX_SEED:
         raise ConfigError(f"{what} is {value!r}, but must be a whole number from 0 to 2**63 - 1")
     return value
 
 
 def _section(name: str, values: Any, source: str, copies: Copies) -> Any:
-    """The options of a section, or a plug-in."""
+    """A section's options, or its plug-in."""
     if name in PLUGINS:
         return plugin_of(name, values, PLUGINS[name], source, copies)
     if name == "annotations":
@@ -151,11 +151,11 @@ def _section(name: str, values: Any, source: str, copies: Copies) -> Any:
 
 
 def from_mapping(values: Any, source: str, name: str = "dataset", copies: Copies = NO_COPIES) -> Config:
-    """The config that a mapping stands for; every error names `source`."""
+    """The Config of a mapping of sections. Raises ConfigError, naming `source`, if any part of it is invalid."""
     if not isinstance(values, Mapping):
         raise ConfigError(f"{source}: holds {type(values).__name__}, but must hold a mapping of sections")
-    read = (*SECTIONS, "annotations", *PLUGINS)
-    known = ["name", "seed", *read, "splits"]
+    section_names = (*SECTIONS, "annotations", *PLUGINS)
+    known = ["name", "seed", *section_names, "splits"]
     for key in values:
         if key not in known:
             raise ConfigError(f"{source}: {key} is not a section; {plugins.nearest(key, known)}")
@@ -163,7 +163,7 @@ def from_mapping(values: Any, source: str, name: str = "dataset", copies: Copies
     if not isinstance(name, str) or not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}", name):
         raise ConfigError(f"{source}: name is {name!r}, but must be letters, digits, '.', '_' and '-', 100 at most")
     seed = checked_seed(values.get("seed", 0), f"{source}: seed")
-    sections: dict[str, Any] = {s: _section(s, values.get(s), source, copies) for s in read}
+    sections: dict[str, Any] = {s: _section(s, values.get(s), source, copies) for s in section_names}
     frames, chunk = sections["video"].frames, sections["storage"].chunk_frames
     if chunk is not None and frames % chunk:
         raise ConfigError(f"{source}: storage.chunk_frames is {chunk}, but must divide video.frames, which is {frames}")
@@ -186,47 +186,47 @@ def from_mapping(values: Any, source: str, name: str = "dataset", copies: Copies
 
 def _with_splits(config: Config, written: Any, source: str, copies: Copies) -> Config:
     scene, splits = with_splits(config.scene, written, source)
-    together = {**copies, **config.copies}
-    copies = StoredCopies(together) if isinstance(copies, StoredCopies) else together
-    plain, made = config.plain(), []
+    all_copies = {**copies, **config.copies}
+    copies = StoredCopies(all_copies) if isinstance(copies, StoredCopies) else all_copies
+    plain, resolved = config.plain(), []
     for split in splits:
         if (split.frames or 0) > config.video.frames:
-            told = f"{source}: splits.{split.name}.frames is {split.frames}, but must be video.frames"
-            raise ConfigError(f"{told}, {config.video.frames}, or less")
-        changes, own = split.plain(), {}
+            message = f"{source}: splits.{split.name}.frames is {split.frames}, but must be video.frames"
+            raise ConfigError(f"{message}, {config.video.frames}, or less")
+        changes, split_sections = split.plain(), {}
         try:
             for name in (name for name in CHANGES if name in changes):
-                own[name] = _section(name, _merged(plain[name], changes[name]), "config", copies)
+                split_sections[name] = _section(name, _merged(plain[name], changes[name]), "config", copies)
         except ConfigError as error:
             raise ConfigError(f"{source}: splits.{split.name}: {str(error).removeprefix('config: ')}") from None
-        if "look" in own and own["look"].sha256:
-            changes["look"] = named(changes["look"]) | {"sha256": own["look"].sha256}
-        made.append(dataclasses.replace(split, written=json.dumps(changes), own=own))
-    return dataclasses.replace(config, scene=scene, splits=tuple(made))
+        if "look" in split_sections and split_sections["look"].sha256:
+            changes["look"] = named(changes["look"]) | {"sha256": split_sections["look"].sha256}
+        resolved.append(dataclasses.replace(split, written=json.dumps(changes), own=split_sections))
+    return dataclasses.replace(config, scene=scene, splits=tuple(resolved))
 
 
 def own_files(plain: Mapping[str, Any]) -> dict[str, str]:
-    """The names of the user's own files in a config (`Config.plain`), by where a dataset keeps their copies."""
-    places = [(kind, plain.get(kind)) for kind in PLUGINS]
-    places += [
+    """Names of the user's plug-in files in a config (`Config.plain`), by the paths of their copies in a dataset."""
+    declared = [(kind, plain.get(kind)) for kind in PLUGINS]
+    declared += [
         (f"splits/{name}/look", _mapping(own).get("look")) for name, own in _mapping(plain.get("splits")).items()
     ]
-    names = [(kind, _mapping(named(plugin)).get("name")) for kind, plugin in places]
+    names = [(kind, _mapping(named(plugin)).get("name")) for kind, plugin in declared]
     names += [("annotation", name) for name in _mapping(plain.get("annotations"))]
     own = [(kind, name) for kind, name in names if isinstance(name, str) and plugins.is_own(name)]
     return {plugins.copy_name(kind, name): name for kind, name in own}
 
 
 def _mapping(value: Any) -> Mapping[Any, Any]:
-    """The value if it is a mapping, else an empty one."""
+    """The value if it is a mapping, else an empty mapping."""
     return value if isinstance(value, Mapping) else {}
 
 
 def _check_sets(config: Config, source: str) -> None:
-    """Raises ConfigError for matched sets that cannot be made."""
-    about = config.scene, config.video, config.annotations.simulated, config.camera
+    """Raise ConfigError if the matched sets are impossible for this scene."""
+    sections = config.scene, config.video, config.annotations.simulated, config.camera
     try:
-        matched_module.check(config.matched, MatchedOptions(), *about)
+        matched_module.check(config.matched, MatchedOptions(), *sections)
         if config.matched.change and quality_module.ranges(config.quality):
             raise ValueError("change is given, but a set has one scene: quality must ask for nothing")
         if config.matched.change and any(law.combinations()[0] for law in config.laws):
@@ -236,14 +236,14 @@ def _check_sets(config: Config, source: str) -> None:
 
 
 def _check_grids(config: Config, source: str) -> None:
-    """Raises ConfigError for a grid that is not of a scene's factor, one number a video."""
+    """Raise ConfigError if a grid is given for anything but a scene's factor with one number per video."""
     sections = {name: getattr(config, name) for name in SECTIONS} | {p: getattr(config, p).options for p in PLUGINS}
     for section, options in sections.items():
         for field in dataclasses.fields(options):
             spec, value = field.metadata["option"], getattr(options, field.name)
             parts = coordinates(field.name, value).values() if spec.draw and value is not None else ()
-            gridded = any(simple.kind == "grid" for part in parts for _, simple in part.weighted)
-            if gridded and (section != "scene" or spec.each):
+            on_grid = any(simple.kind == "grid" for part in parts for _, simple in part.weighted)
+            if on_grid and (section != "scene" or spec.each):
                 raise ConfigError(
                     f"{source}: {section}.{field.name} is on a grid, but only a scene's numbers of a whole video can be"
                 )
@@ -252,9 +252,10 @@ def _check_grids(config: Config, source: str) -> None:
 def load_config(
     config: "Config | Mapping | str | pathlib.Path", overrides: Sequence[str] = (), copies: Copies = NO_COPIES
 ) -> Config:
-    """A Config from a file's name or path, from a mapping, or from a Config, with `overrides` ('physics.substeps=8').
+    """The Config of a file's name or path, of a mapping, or of a Config, with `overrides` such as 'physics.substeps=8'.
 
-    `copies` are of families and looks of the user's own, by their names, for where these are gone or have changed.
+    `copies` holds the contents of user plug-ins by name; they serve when the files are gone or have changed. Raises
+    ConfigError, in one sentence, if the config is invalid.
     """
     if isinstance(config, Config):
         return load_config(config.plain(), overrides, config.copies) if overrides else config

@@ -1,6 +1,7 @@
-"""What a plug-in declares: the file of a family, look, annotation or export ends with one constant of these types.
+"""Plug-in contracts: the file of a family, look, annotation or export ends with one constant of these types.
 
-Arrays are jax's. [] is a scalar; K is the number of slots, T of frames, H and W the frame's size in pixels.
+Arrays are jax arrays. [] is a scalar, K the number of slots, T that of frames, and H and W are the frame's height and
+width in pixels.
 """
 
 import dataclasses
@@ -16,7 +17,7 @@ from gen2d.core.schema import Field
 @dataclasses.dataclass(frozen=True, eq=False)
 class _Contract:
     def __post_init__(self) -> None:
-        """Raises TypeError for a member of the wrong type, with one sentence."""
+        """Raise TypeError, in one sentence, if a member has the wrong type."""
         for field in dataclasses.fields(self):
             value, union = getattr(self, field.name), isinstance(field.type, types.UnionType)
             kind: Any = field.type if union else typing.get_origin(field.type) or field.type
@@ -28,16 +29,16 @@ class _Contract:
 
 
 def option_fields(options: Any) -> tuple[dataclasses.Field, ...]:
-    """The fields of a dataclass of options, or a single option itself."""
+    """Fields of a dataclass of options; a single option is its own field."""
     return (options,) if isinstance(options, dataclasses.Field) else dataclasses.fields(options)
 
 
 def _nothing(options: Any) -> None:
-    """No check."""
+    """Accept all options."""
 
 
 def _no_sizes(*_: Any) -> dict[str, int]:
-    """No axes of its own."""
+    """No further axes."""
     return {}
 
 
@@ -45,15 +46,17 @@ def _no_sizes(*_: Any) -> dict[str, int]:
 class Family(_Contract):
     """A scene family: `FAMILY = Family(options=Options, layout=layout, sample=sample)` in gen2d/scenes/NAME.py.
 
-    options: a frozen dataclass whose fields are made by `option`. Those with `draw=True` are the factors.
-    layout(options): the `Layout`, which must hold whatever `sample` may return.
-    sample(key, factors, options): the `SampledScene` of one video, traced by jax. `factors` holds an array for each
-        drawn option: [], with `each` [count], with `parts` [parts] or [count, parts].
-    check(options): raises ValueError where these options cannot make a scene. Its message begins with an option's name.
-    sizes(options): the lengths of the axes that `each` names, where that is no drawn option.
-    derived: the fields stored as factors/NAME that follow from the factors, by NAME: `SampledScene.derived` has them.
-    crowded_by: the options that decide whether every object finds a place, for the error where one does not.
-    begins_outside: whether objects that move may start outside the layout's bounds.
+    options: frozen dataclass with fields declared by `option`. Options with `draw=True` are sampled: the factors.
+    layout(options): the `Layout`, large enough for every scene that `sample` may return.
+    sample(key, factors, options): the `SampledScene` of one video, traced by jax. `factors` has one array per factor:
+        [], or [count] with `each`, [parts] with `parts`, [count, parts] with both.
+    check(options): raises ValueError if no scene is possible with these options; the message begins with an option's
+        name.
+    sizes(options): lengths of the axes named by `each`, for names that are not factors themselves.
+    derived: fields computed from the factors and stored as factors/NAME, by NAME; `SampledScene.derived` holds the
+        values.
+    crowded_by: options to name in the error when an object finds no free position.
+    begins_outside: whether moving objects may start outside the layout's bounds.
     """
 
     options: type
@@ -70,10 +73,11 @@ class Family(_Contract):
 class Look(_Contract):
     """A look: `LOOK = Look(options=Options, paint=paint, margin=line_margin)` in renderers/looks/NAME.py.
 
-    options: a frozen dataclass whose fields are made by `option`, often a subclass of `PlainOptions`.
-    paint(scene, layout, options, key): the `Paint` of one video, with an entry for each of the K slots, traced by jax.
-    margin(options): px, the farthest that an object is drawn beyond its own rim: `line_margin` for `LineOptions`.
-    check(options): raises ValueError for options that cannot be. Its message begins with an option's name.
+    options: frozen dataclass with fields declared by `option`, often a subclass of `PlainOptions`.
+    paint(scene, layout, options, key): the `Paint` of one video, with one entry per slot (K), traced by jax.
+    margin(options): largest distance, in px, to which an object is rendered beyond its outline; `line_margin` for
+        `LineOptions`.
+    check(options): raises ValueError if the options are invalid; the message begins with an option's name.
     """
 
     options: type
@@ -84,17 +88,17 @@ class Look(_Contract):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Annotation(_Contract):
-    """What is true of a video's pixels: `ANNOTATION = Annotation(...)` in gen2d/annotations/NAME.py.
+    """A pixel annotation: `ANNOTATION = Annotation(...)` in gen2d/annotations/NAME.py.
 
-    options: one `option`, written `NAME: value` in a config and off where it is false or 0; or a frozen dataclass of
-        several, written `NAME: {...}`, with `NAME: true` for the defaults. None of them is drawn.
-    fields: what is stored, by its full name. The axes begin with n; T, K, H and W are known, others are in `sizes`.
-    annotate(scenes, owners, plan, value): an array for each field, with the n videos first, traced by jax. `scenes` is
-        a `RenderScene` of n videos, `owners` [n, T, H, W] uint8 holds the slot + 1 that a pixel shows (0 background,
-        255 an occluder), `plan` is the `FramePlan` and `value` that of the option, or the dataclass.
-    sizes(plan, value): the lengths of the axes that no other field has, by their letters.
-    owners: whether `annotate` needs `owners`, which is None otherwise unless another annotation needs them.
-    usual: the value in a config with which `gen2d.render` switches the annotation on where its fields are asked for.
+    options: one `option`, written `NAME: value` in a config and off if false or 0; or a frozen dataclass of options,
+        written `NAME: {...}`, with `NAME: true` for the defaults. None of them may be sampled (`draw=True`).
+    fields: stored fields by full name. Their axes begin with n; T, K, H and W are known, `sizes` gives all others.
+    annotate(scenes, owners, plan, value): one array per field, with the n videos first, traced by jax. `scenes` is a
+        `RenderScene` of n videos. `owners` [n, T, H, W] uint8 is the slot + 1 visible at each pixel (0 background, 255
+        occluder). `plan` is the `FramePlan`; `value` is the option's value, or the dataclass.
+    sizes(plan, value): lengths of further axes, by letter.
+    owners: whether `annotate` needs `owners`; without it `owners` is None, unless another annotation needs it.
+    usual: value with which `gen2d.render` switches the annotation on when its fields are requested.
     """
 
     options: type | dataclasses.Field
@@ -114,15 +118,15 @@ class Annotation(_Contract):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Export(_Contract):
-    """A format of another program: `EXPORT = Export(fields=..., write=write)` in gen2d/exports/formats/NAME.py.
+    """An export format: `EXPORT = Export(fields=..., write=write)` in gen2d/exports/formats/NAME.py.
 
-    fields: names of fields, or patterns such as "states/*", that are exported unless others are asked for. Frames that
-        are not stored are drawn where "frames" is among them.
-    write(target, source): fills the folder `target` with the videos of the `Source`, or writes the file of that name.
-    check(source): raises ConfigError where the format cannot hold these videos, before anything is written.
-    fixed: whether the format can hold no other fields.
-    suffix: the ending of the one file that is written; "" where it is a folder.
-    loss: what is not kept, for a person; "" if all is.
+    fields: names of the fields exported by default, or patterns such as "states/*". If "frames" is among them, frames
+        that are not stored are rendered.
+    write(target, source): writes the videos of the `Source` to the folder, or to the single file, `target`.
+    check(source): raises ConfigError, before anything is written, if the format cannot hold these videos.
+    fixed: whether the format holds these fields only.
+    suffix: suffix of the single file written; "" for a folder.
+    loss: description of the information that the format drops; "" if it drops none.
     """
 
     fields: tuple[str, ...]

@@ -1,9 +1,13 @@
-"""Every number that a sampler draws, by name: what a config says of it, and the one place where all are drawn.
+"""The syntax of distributions in a config.
 
-In a config a number is a constant, `[low, high]` a uniform range (whole numbers with both ends where the option is a
-whole number), `{log_uniform: [low, high]}` and so on a named distribution, `{mixture: [...], weights: [...]}` one of
-several, `{minus: [one, others...]}` what of one lies outside the others' supports, `{intersection: [one, others...]}`
-what lies inside. A vector is a list of such values.
+    0.5                                      a constant
+    [low, high]                              a uniform range (for a whole-number option: integers, both ends included)
+    {log_uniform: [low, high]}               a named distribution, one of KINDS
+    {mixture: [A, B, ...], weights: [...]}   a mixture
+    {minus: [A, B, ...]}                     A restricted to values outside the supports of B, ...
+    {intersection: [A, B, ...]}              A restricted to values inside the supports of B, ...
+
+A vector is a list of such values.
 """
 
 from collections.abc import Mapping
@@ -19,25 +23,28 @@ COMPOSED = ("mixture", "minus", "intersection")
 FORMS = "a number, [low, high], or one of " + ", ".join(f"{{{kind}: [...]}}" for kind in (*KINDS[1:], *COMPOSED))
 
 
-MOST = 10_000  # numbers in a list
-PARTS = 200  # that a distribution is put together from
-LARGEST = 1e12  # in any unit: the square of a larger number leaves no room in a float32
+MOST = 10_000  # numbers in a list, at most
+PARTS = 200  # components of a distribution, at most
+LARGEST = 1e12  # in any unit; its square, times other quantities, still fits in a float32
 
 
 def is_number(value: Any) -> bool:
-    """Whether the value is a real number that a simulation can take."""
-    if isinstance(value, int):  # which may be too large for a float
+    """Whether the value is a real number of magnitude `LARGEST` at most."""
+    if isinstance(value, int):  # may be too large for float()
         return not isinstance(value, bool) and abs(value) <= LARGEST
     return isinstance(value, Real) and abs(float(value)) <= LARGEST
 
 
 def _far_in_the_tail(mean: float, deviation: float, low: float, high: float) -> bool:
-    """Where float32 has no probabilities left to draw from."""
+    """Whether a truncated normal lies so far in its tail that float32 cannot resolve its probabilities."""
     return low > mean + 4 * deviation or high < mean - 4 * deviation
 
 
 def parse(value: Any, whole: bool = False) -> Distribution:
-    """The distribution that a config's value stands for; ValueError with what is allowed where it stands for none."""
+    """The Distribution written as `value` in a config; `whole` allows whole numbers only.
+
+    Raises ValueError, whose message is the syntax allowed, if the value is no distribution.
+    """
     if isinstance(value, dict) and value.keys() & set(COMPOSED):
         return _composed(value, whole)
     kind: str
@@ -73,13 +80,13 @@ def parse(value: Any, whole: bool = False) -> Distribution:
 
 
 def _composed(value: Mapping[str, Any], whole: bool) -> Distribution:
-    """A mixture, or one distribution cut by the supports of others."""
-    kind, written = next((kind, value[kind]) for kind in COMPOSED if kind in value)
+    """A mixture, or a distribution restricted by the supports of others."""
+    kind, operands = next((kind, value[kind]) for kind in COMPOSED if kind in value)
     if value.keys() - {kind, *(["weights"] if kind == "mixture" else [])}:
         raise ValueError(FORMS)
-    if not isinstance(written, list | tuple) or not 0 < len(written) <= PARTS:
+    if not isinstance(operands, list | tuple) or not 0 < len(operands) <= PARTS:
         raise ValueError(f"{kind} of a list of distributions, {PARTS} at most")
-    parts = [parse(part, whole) for part in written]
+    parts = [parse(part, whole) for part in operands]
     if kind == "mixture":
         return truncation.mixture(list(zip(checked_weights(value.get("weights"), len(parts)), parts, strict=True)))
     cut, source = (truncation.outside if kind == "minus" else truncation.inside), parts[0]
@@ -94,7 +101,7 @@ def _composed(value: Mapping[str, Any], whole: bool) -> Distribution:
 
 
 def checked_weights(weights: Any, count: int) -> list[float]:
-    """The weights of so many things, all equal where none are given; ValueError with what is allowed."""
+    """`count` weights, all 1 if `weights` is None. Raises ValueError if they are not `count` numbers above 0."""
     weights = [1] * count if weights is None else weights
     fits = isinstance(weights, list | tuple) and len(weights) == count and all(map(is_number, weights))
     if not fits or min(weights) <= 0:

@@ -1,8 +1,8 @@
-"""Distributions over numbers: where their values lie, and draws from them.
+"""Distributions over numbers: their supports and samples.
 
-What is drawn is a float32, so all ends are. A range holds its lower end and not its upper one: then ranges that meet
-have nothing in common, and what is left of one without another is a range again. So supports are compared and cut
-exactly (cuts.py), not by drawing from them.
+Samples are float32, and so are the ends of every range. A range includes its lower end and excludes its upper end, so
+adjacent ranges are disjoint and the difference of two ranges consists of ranges. Supports can therefore be compared and
+truncated exactly (truncation.py), without sampling.
 """
 
 import dataclasses
@@ -27,7 +27,7 @@ def after(value: float) -> float:
 
 
 class Span(NamedTuple):
-    """The numbers from `low` on and below `high`; of these the whole ones, if `whole`."""
+    """The half-open interval [low, high); its whole numbers only, if `whole`."""
 
     low: float
     high: float
@@ -35,24 +35,24 @@ class Span(NamedTuple):
 
     @property
     def last(self) -> float:
-        """The largest of its numbers."""
+        """Largest number of the span, as float32."""
         below = float(np.nextafter(np.float32(self.high), np.float32(-np.inf)))
         return max(math.ceil(self.high) - 1, math.ceil(self.low)) if self.whole else below
 
     def contains(self, values: Any) -> np.ndarray:
-        """For each value whether it is one of these numbers, as float32."""
+        """Whether each value, rounded to float32, lies in the span."""
         x = np.asarray(values, np.float32).astype(np.float64)
         return (x >= self.low) & (x < self.high) & (~np.asarray(self.whole) | (x == np.floor(x)))
 
     def meet(self, other: "Span") -> "Span | None":
-        """What both hold; None if that is nothing."""
-        both = Span(max(self.low, other.low), min(self.high, other.high), self.whole or other.whole)
-        first = math.ceil(both.low) if both.whole and math.isfinite(both.low) else both.low
-        return both if first < both.high else None
+        """Intersection of two spans; None if it is empty."""
+        overlap = Span(max(self.low, other.low), min(self.high, other.high), self.whole or other.whole)
+        first = math.ceil(overlap.low) if overlap.whole and math.isfinite(overlap.low) else overlap.low
+        return overlap if first < overlap.high else None
 
 
 def point(value: float) -> Span:
-    """A number alone."""
+    """Span of a single float32."""
     return Span(single(value), after(value))
 
 
@@ -61,7 +61,10 @@ EVERYTHING = Span(-math.inf, math.inf)
 
 @dataclasses.dataclass(frozen=True)
 class Distribution:
-    """A named distribution over numbers. A mixture's `numbers` are the weights of its `parts`."""
+    """A distribution over numbers: a kind and its parameters.
+
+    `numbers` holds the parameters in the order of a config; for a mixture, the weights of its `parts`.
+    """
 
     kind: str
     numbers: tuple[float, ...]
@@ -69,7 +72,7 @@ class Distribution:
 
     @property
     def support(self) -> tuple[float, float]:
-        """The closed interval that it never leaves."""
+        """Closed interval (low, high) that contains all values."""
         if self.kind == "mixture":
             ends = [part.support for part in self.parts]
             return min(low for low, _ in ends), max(high for _, high in ends)
@@ -79,7 +82,7 @@ class Distribution:
 
     @property
     def spans(self) -> tuple[Span, ...]:
-        """Where its values lie; each number at least once."""
+        """Spans whose union is the support; spans of a mixture may overlap."""
         if self.kind == "mixture":
             return tuple(dict.fromkeys(span for part in self.parts for span in part.spans))
         if self.kind in ("constant", "choice", "grid"):
@@ -90,18 +93,18 @@ class Distribution:
         return (point(low),) if low == high else (Span(single(low), single(high)),)
 
     def contains(self, values: Any) -> np.ndarray:
-        """For each value whether the distribution can give it."""
+        """Whether each value lies in the support."""
         return np.any([span.contains(values) for span in self.spans], axis=0)
 
     def plain(self) -> Any:
-        """The value as it is written in a config."""
+        """The distribution as a plain value, as written in a config."""
         numbers = [int(x) if self.kind == "integer" or float(x).is_integer() else x for x in self.numbers]
         if self.kind == "mixture":
             return {"mixture": [part.plain() for part in self.parts], "weights": list(self.numbers)}
         return numbers[0] if self.kind == "constant" else {self.kind: numbers}
 
     def sample(self, key: Array, shape: tuple[int, ...]) -> Array:
-        """Independent draws, float32 (int32 for `integer`)."""
+        """Independent samples of this shape, float32 (int32 for `integer`)."""
         n = self.numbers
         if self.kind == "mixture":
             return self._mixed(key, shape)
@@ -114,24 +117,24 @@ class Distribution:
         if self.kind == "normal" and len(n) == 2:
             return n[0] + n[1] * jax.random.normal(key, shape)
         if self.kind == "uniform":
-            draws = jax.random.uniform(key, shape, minval=n[0], maxval=n[1])
+            samples = jax.random.uniform(key, shape, minval=n[0], maxval=n[1])
         elif self.kind == "log_uniform":
-            draws = jnp.exp(jax.random.uniform(key, shape, minval=math.log(n[0]), maxval=math.log(n[1])))
+            samples = jnp.exp(jax.random.uniform(key, shape, minval=math.log(n[0]), maxval=math.log(n[1])))
         else:
             low, high = ((end - n[0]) / n[1] for end in n[2:])
-            draws = n[0] + n[1] * jax.random.truncated_normal(key, low, high, shape)
-        return jnp.clip(draws, self.spans[0].low, self.spans[0].last)  # rounding must not leave the support
+            samples = n[0] + n[1] * jax.random.truncated_normal(key, low, high, shape)
+        return jnp.clip(samples, self.spans[0].low, self.spans[0].last)  # rounding may leave the support
 
     @property
     def weighted(self) -> list[tuple[float, "Distribution"]]:
-        """The parts of a mixture, or the distribution alone, each with its share of all."""
+        """Components of a mixture, or the distribution itself, each with its probability."""
         if self.kind != "mixture":
             return [(1.0, self)]
         return [(weight / sum(self.numbers), part) for weight, part in zip(self.numbers, self.parts, strict=True)]
 
     def _mixed(self, key: Array, shape: tuple[int, ...]) -> Array:
-        choice, draw = jax.random.split(key)
-        ends = np.cumsum(self.numbers)[:-1] / sum(self.numbers)
-        chosen = (jax.random.uniform(choice, shape)[..., None] >= jnp.asarray(ends, jnp.float32)).sum(-1)
-        draws = [part.sample(draw, shape) for part in self.parts]
-        return jnp.select([chosen == i for i in range(len(draws))], draws)
+        component_key, value_key = jax.random.split(key)
+        thresholds = np.cumsum(self.numbers)[:-1] / sum(self.numbers)
+        chosen = (jax.random.uniform(component_key, shape)[..., None] >= jnp.asarray(thresholds, jnp.float32)).sum(-1)
+        samples = [part.sample(value_key, shape) for part in self.parts]
+        return jnp.select([chosen == i for i in range(len(samples))], samples)

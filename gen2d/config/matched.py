@@ -1,4 +1,4 @@
-"""Which matched sets are asked for, checked."""
+"""Checks of the section `matched`, the options of matched sets."""
 
 import dataclasses
 import math
@@ -13,21 +13,18 @@ from gen2d.core.enums import DYNAMIC
 from gen2d.records.layout import Layout
 
 INTERVENTIONS = ("remove", "teleport", "identity_swap", "gravity_flip", "ghost_contact", "energy_gain")
-VIOLATIONS = INTERVENTIONS[1:]  # they happen in the middle of a video, and are impossible
+VIOLATIONS = INTERVENTIONS[1:]  # physically impossible events in the middle of a video
 
 
 def free_slots(layout: Layout) -> np.ndarray:
-    """Which slots [K] hold what moves and is on no joint."""
+    """Whether each slot [K] holds a dynamic object without joints."""
     free = np.concatenate([np.full(run.count, run.kind == DYNAMIC) for run in layout.runs])
-    free[[slot for tie in layout.joints for slot in (tie.a, tie.b)]] = False
+    free[[slot for joint in layout.joints for slot in (joint.a, joint.b)]] = False
     return free
 
 
-# ---- What is asked, checked
-
-
 def check(options: Any, default: Any, scene: Any, video: Any, annotations: Any, camera: Any) -> None:
-    """ValueError where these sets cannot be made: one sentence that begins with the option's name."""
+    """Raise ValueError, beginning with the option's name, if matched sets with these options are impossible."""
     if not options.change:
         if options != default:
             raise ValueError("change is null, but other options are given: name what a set's members differ in")
@@ -40,16 +37,16 @@ def check(options: Any, default: Any, scene: Any, video: Any, annotations: Any, 
             _check_act(name, scene, layout, video, camera)
         else:
             _check_factor(name, options, scene, layout)
-    asked = [name for name in ("contacts", "energy", "lyapunov") if getattr(annotations, name)]
+    annotated = [name for name in ("contacts", "energy", "lyapunov") if getattr(annotations, name)]
     violations = [name for name in options.change if name in VIOLATIONS]
-    if asked and violations:
-        raise ValueError(f"change is {violations[0]}, which has no books: annotations.{asked[0]} must be off")
+    if annotated and violations:
+        raise ValueError(f"change is {violations[0]}, which has no books: annotations.{annotated[0]} must be off")
 
 
 def _check_act(name: str, scene: Any, layout: Layout, video: Any, camera: Any) -> None:
-    least = {"gravity_flip": 0, "identity_swap": 2}.get(name, 1)
-    if free_slots(layout).sum() < least:
-        raise ValueError(f"change is {name}, but the scene has no {least} that move and are on no joint")
+    min_objects = {"gravity_flip": 0, "identity_swap": 2}.get(name, 1)
+    if free_slots(layout).sum() < min_objects:
+        raise ValueError(f"change is {name}, but the scene has no {min_objects} that move and are on no joint")
     if name in VIOLATIONS and video.frames < 2:
         raise ValueError(f"change is {name}, but video.frames is {video.frames}, and that happens on the way")
     if name == "remove" and camera.follow is not None:
@@ -79,7 +76,7 @@ def _check_factor(name: str, options: Any, scene: Any, layout: Layout) -> None:
 
 
 def _scaled(part: Distribution, scale: Distribution, spec: Any) -> Distribution:
-    """What a part of a factor may be when it is scaled."""
+    """A uniform distribution over the range of a factor's part after scaling, within the option's limits."""
     ends = [end * factor for end in part.support for factor in scale.support]
     low, high = (-math.inf if spec.low is None else spec.low), (math.inf if spec.high is None else spec.high)
     return Distribution("uniform", (max(min(ends), low), min(max(ends), high)))

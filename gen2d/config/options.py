@@ -1,6 +1,6 @@
-"""What an option may be: its unit, default and range, said once where it is declared, and checked where it is read.
+"""Options: unit, default and range, declared once with the option and checked when a config is read.
 
-An error is one sentence with the file, the field, its value and what is allowed.
+Each error is one sentence that names the file, the field, its value and the values allowed.
 """
 
 import dataclasses
@@ -16,8 +16,12 @@ from gen2d.core.errors import ConfigError
 
 @dataclasses.dataclass(frozen=True)
 class Option:
-    """What an option may be. `parts` > 0: a list of so many values. `draw`: a distribution, else a single value; of a
-    scene family a factor, `each` names what every one has a draw of its own for."""
+    """Type, unit and range of an option.
+
+    draw: the value is a distribution, not a single number; such an option of a scene family is a factor.
+    parts: length of a list of values; 0 for a single value.
+    each: plural name of the objects for each of which a factor is sampled separately; "" for once per video.
+    """
 
     kind: type  # int, float, str or bool
     unit: str
@@ -29,12 +33,12 @@ class Option:
     draw: bool = False
     parts: int = 0
     each: str = ""
-    optional: bool = False  # may be null: decided by the program
-    several: bool = False  # may be a list of such values
+    optional: bool = False  # may be null: gen2d decides
+    several: bool = False  # may also be a list of values
 
     @property
     def allowed(self) -> str:
-        """What the option may be, for a sentence."""
+        """Description of the values allowed, for error messages and help."""
         if self.choices:
             return "one of " + ", ".join(self.choices)
         if self.kind is bool:
@@ -52,7 +56,7 @@ class Option:
 
 
 def option(default: Any, kind: type, unit: str, meaning: str, **limits: Any) -> Any:
-    """A dataclass field that is an option; a drawn one's default is written as in a config."""
+    """A dataclass field that declares an option. With `draw=True` the default is written as in a config."""
     spec = Option(kind, unit, meaning, **limits)
     if spec.draw and default is not None:
         default = [parse(v, kind is int) for v in default] if spec.parts else parse(default, kind is int)
@@ -62,14 +66,14 @@ def option(default: Any, kind: type, unit: str, meaning: str, **limits: Any) -> 
 
 
 def plain_value(value: Any) -> Any:
-    """An option's value as YAML and JSON hold it."""
+    """An option's value as a plain YAML and JSON value."""
     if isinstance(value, tuple):
         return [plain_value(part) for part in value]
     return value.plain() if isinstance(value, Distribution) else value
 
 
 def plain_of(options: Any) -> dict[str, Any]:
-    """Options as YAML and JSON hold them."""
+    """Options as plain YAML and JSON values, by name."""
     return {field.name: plain_value(getattr(options, field.name)) for field in dataclasses.fields(options)}
 
 
@@ -82,7 +86,7 @@ def _check(spec: Option, low: float, high: float) -> bool:
 
 
 def _single(spec: Option, value: Any) -> Any:
-    """A checked value, or ValueError with what is allowed."""
+    """The checked value. Raises ValueError, whose message is the values allowed."""
     if spec.draw:
         distribution = parse(value, spec.kind is int)
         if not _check(spec, *distribution.support):
@@ -102,7 +106,10 @@ def _single(spec: Option, value: Any) -> Any:
 
 
 def value_of(spec: Option, value: Any) -> Any:
-    """A checked value, in a tuple if it has parts; ValueError with what is allowed."""
+    """The checked value of an option; a tuple if the option has several values or parts.
+
+    Raises ValueError, whose message is the values allowed.
+    """
     if value is None and spec.optional:
         return None
     if spec.several:
@@ -116,7 +123,10 @@ def value_of(spec: Option, value: Any) -> Any:
 
 
 def build(cls: type, values: Any, where: str, source: str) -> Any:
-    """An options dataclass from a mapping; `where` is the path of the mapping in the config."""
+    """An instance of an options dataclass, from a mapping at the path `where` of the config.
+
+    Raises ConfigError, naming `source` and the option, if an option is unknown or its value not allowed.
+    """
     if not isinstance(values, Mapping):
         raise ConfigError(f"{source}: {where} is {values!r}, but must be a mapping of options")
     known = {f.name: f.metadata["option"] for f in dataclasses.fields(cls)}
@@ -132,11 +142,11 @@ def build(cls: type, values: Any, where: str, source: str) -> Any:
 
 
 def coordinates(name: str, value: Any) -> dict[str, Any]:
-    """The single numbers that an option's value is made of, by name: `radius`, or `velocity[0]` and `velocity[1]`."""
+    """The scalar components of an option's value, by name: `radius`, or `velocity[0]` and `velocity[1]`."""
     return {f"{name}[{i}]": part for i, part in enumerate(value)} if isinstance(value, tuple) else {name: value}
 
 
 def drawn_options(family: Family) -> dict[str, Option]:
-    """The option behind each factor of a family, by name."""
+    """Options of a family that are factors, by name."""
     specs = {field.name: field.metadata["option"] for field in dataclasses.fields(family.options)}
     return {name: spec for name, spec in specs.items() if spec.draw}

@@ -1,4 +1,4 @@
-"""A plug-in with its options, and the hash and content of a user's own file."""
+"""Plug-ins with their options; for user files also the hash and content."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -10,38 +10,41 @@ from gen2d.config.options import build, plain_of
 from gen2d.core.errors import ConfigError
 from gen2d.storage.sealed import sha256
 
-Copies = Mapping[str, bytes]  # what files of the user's own held, by their names in the config
+Copies = Mapping[str, bytes]  # contents of user files, by their names in the config
 NO_COPIES: Copies = MappingProxyType({})
 
 
 class StoredCopies(dict[str, bytes]):
-    """Those that a dataset holds: its config names no other file, least of all one that lies here by chance."""
+    """Copies stored in a dataset. Its config must use these only, never a file that happens to exist here."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Plugin:
-    """A named plug-in and its options. A scene's `options` can give whatever any split may draw."""
+    """A named plug-in and its options. The supports of a scene's `options` contain those of all splits."""
 
     name: str
     contract: Any  # Family, Look or Annotation
     options: Any
-    sha256: str | None = None  # of a file of the user's own, which may change
-    content: bytes = b""  # of that file
-    own: Any = None  # the options as written, where splits draw others
+    sha256: str | None = None  # of a user file, which may change
+    content: bytes = b""  # of a user file
+    own: Any = None  # the options as written, if the splits widen them
 
     def plain(self) -> dict[str, Any]:
-        """The plug-in as YAML and JSON hold it."""
-        own = {"sha256": self.sha256} if self.sha256 else {}
-        return {"name": self.name, **own, **plain_of(self.own or self.options)}
+        """The plug-in as plain YAML and JSON values."""
+        digest = {"sha256": self.sha256} if self.sha256 else {}
+        return {"name": self.name, **digest, **plain_of(self.own or self.options)}
 
 
 def named(values: Any) -> Any:
-    """A plug-in as a mapping with its name; in a config its bare name is enough."""
+    """A plug-in's mapping with its name; a bare name is expanded."""
     return {"name": values} if isinstance(values, str) else values
 
 
 def plugin_of(kind: str, values: Any, default: str, source: str, copies: Copies) -> Plugin:
-    """A plug-in with its options."""
+    """The plug-in of a config's section `kind`, from the section's value.
+
+    Raises ConfigError, naming `source`, if the plug-in is unknown or its options are invalid.
+    """
     values = {} if values is None else named(values)
     if not isinstance(values, Mapping):
         raise ConfigError(f"{source}: {kind} is {values!r}, but must be a name, or a mapping with a name and options")
@@ -56,23 +59,26 @@ def plugin_of(kind: str, values: Any, default: str, source: str, copies: Copies)
 
 
 def contract_of(kind: str, name: str, digest: Any, where: str, copies: Copies) -> tuple[Any, str | None, bytes]:
-    """What a plug-in declares; of a file of the user's own also its sha256 and content, those of the copy with the
-    sha256 `digest` if there is one. Raises ConfigError, which begins with `where`."""
-    content, own = b"", None
+    """The contract of a plug-in and, for a user file, its sha256 and content.
+
+    The content is that of the copy with the sha256 `digest`, if there is one, else that of the file itself. Raises
+    ConfigError, beginning with `where`, if the file has another sha256 than `digest`, or if it is not a plug-in.
+    """
+    content, actual_digest = b"", None
     if plugins.is_own(name):
         content = copies.get(name, b"")
         if name not in copies or sha256(content) != digest:
             if isinstance(copies, StoredCopies):
                 raise ConfigError(f"{where} is {name!r}, of which the dataset holds no copy that is what was written")
             content = plugins.content_of(name, where)
-        own = sha256(content)
-    if digest not in (None, own):
+        actual_digest = sha256(content)
+    if digest not in (None, actual_digest):
         raise ConfigError(f"{where}.sha256 is of another version of {name}")
-    return plugins.load(kind, name, where, content), own, content
+    return plugins.load(kind, name, where, content), actual_digest, content
 
 
 def check_plugin(plugin: Plugin, kind: str, source: str) -> None:
-    """Raises ConfigError for options that the plug-in itself refuses."""
+    """Raise ConfigError if the plug-in's own check rejects its options."""
     try:
         plugin.contract.check(plugin.options)
     except ValueError as error:

@@ -1,4 +1,4 @@
-"""A name in a config is a file in a folder, or the path of one: find it, load it, or say which names there are."""
+"""Plug-ins and configs by name or path: finding, loading and listing them."""
 
 import difflib
 import functools
@@ -12,7 +12,7 @@ from typing import Any
 from gen2d.config.contracts import Annotation, Export, Family, Look
 from gen2d.core.errors import ConfigError
 
-# The folder of each kind of plug-in and the type of the constant that a file ends with: FAMILY = Family(...).
+# For each kind of plug-in, its package and the type of the constant that declares it, such as FAMILY = Family(...).
 KINDS = {
     "scene": ("gen2d.scenes", Family),
     "look": ("gen2d.renderers.looks", Look),
@@ -22,21 +22,21 @@ KINDS = {
 
 
 def nearest(name: str, names: list[str]) -> str:
-    """' Did you mean X?' or the names there are: the end of a sentence about an unknown name."""
+    """'did you mean X?', or the list of known names: the end of an error about an unknown name."""
     close = difflib.get_close_matches(str(name), names, n=1)
     return f"did you mean {close[0]}?" if close else "there are: " + ", ".join(sorted(names))
 
 
 def names(kind: str) -> list[str]:
-    """The names in the folder of a kind of plug-in."""
+    """Sorted names of the built-in plug-ins of a kind."""
     return sorted(module.name for module in pkgutil.iter_modules(importlib.import_module(KINDS[kind][0]).__path__))
 
 
 def load(kind: str, name: str, where: str = "--set", content: bytes = b"") -> Any:
-    """The contract that a name's file declares, or the Python file of the user's own at a path, which holds `content`.
+    """The contract declared by a built-in plug-in, or by the user file with this path and `content`.
 
-    Raises ConfigError, which begins with `where`, for an unknown name and for a file that cannot be run or declares
-    nothing.
+    Raises ConfigError, beginning with `where`, if the name is unknown, or if the file fails to run or does not declare
+    a contract of this kind.
     """
     if not is_own(name) and name not in names(kind):
         raise ConfigError(f"{where} is {name!r}, which is not known; {nearest(name, names(kind))}")
@@ -48,15 +48,15 @@ def load(kind: str, name: str, where: str = "--set", content: bytes = b"") -> An
     constant = contract.__name__.upper()
     declared = vars(module).get(constant)
     if not isinstance(declared, contract):
-        own = (
+        problem = (
             f"its {constant} is of type {type(declared).__name__}" if constant in vars(module) else f"has no {constant}"
         )
-        raise ConfigError(f"{where} is {name!r}, but {own}: it must end with {constant} = {contract.__name__}(...)")
+        raise ConfigError(f"{where} is {name!r}, but {problem}: it must end with {constant} = {contract.__name__}(...)")
     return declared
 
 
 def summary(kind: str, name: str) -> str:
-    """The first line of the docstring of a file in a kind's folder."""
+    """First line of a built-in plug-in's docstring."""
     return (_module(kind, name).__doc__ or "").strip().partition("\n")[0]
 
 
@@ -65,47 +65,50 @@ def _module(kind: str, name: str) -> ModuleType:
 
 
 def is_own(name: str) -> bool:
-    """Whether it is the path of a file of the user's own."""
+    """Whether a plug-in's name is the path of a user file."""
     return name.endswith(".py")
 
 
 def copy_name(kind: str, name: str) -> str:
-    """Where in a dataset's folder the copy of a file of the user's own lies."""
+    """Path of the copy of a user file, relative to the dataset's folder."""
     return f"plugins/{kind}/{pathlib.PurePath(name).name}"
 
 
 def content_of(name: str, where: str) -> bytes:
-    """The content of a file of the user's own. Raises ConfigError, which begins with `where`."""
+    """The content of a user file. Raises ConfigError, beginning with `where`, if it cannot be read."""
     path = pathlib.Path(name).expanduser()
     try:
         return path.read_bytes()
     except OSError as error:
-        told = "there is no such file" if isinstance(error, FileNotFoundError) else "it cannot be read"
-        raise ConfigError(f"{where} is {str(path)!r}, but {told}") from None
+        problem = "there is no such file" if isinstance(error, FileNotFoundError) else "it cannot be read"
+        raise ConfigError(f"{where} is {str(path)!r}, but {problem}") from None
 
 
-@functools.lru_cache(maxsize=64)  # the same module each time, so that what was compiled for it is found again
+@functools.lru_cache(maxsize=64)  # one module per content, so that jax finds its compiled programs again
 def _run(kind: str, path: pathlib.Path, content: bytes) -> ModuleType:
-    """The module that the content is, as if it stood at the path: of a copy, where it was copied from."""
+    """The module of a user file's content, with `path` as its file; for a copy, the path of the original."""
     module = ModuleType(f"gen2d_user_{kind}_{path.stem}")
     module.__file__ = str(path)
-    sys.modules[module.__name__] = module  # dataclasses look their module up
+    sys.modules[module.__name__] = module  # dataclasses look up their module here
     exec(compile(content, path, "exec"), vars(module))
     return module
 
 
 def config_folder() -> pathlib.Path:
-    """Where the configs that come with gen2d lie."""
+    """Folder of the configs that come with gen2d."""
     return pathlib.Path(next(iter(importlib.import_module("gen2d.configs").__path__)))
 
 
 def config_names() -> list[str]:
-    """The configs that come with gen2d."""
+    """Sorted file names of the configs that come with gen2d."""
     return sorted(path.name for path in config_folder().glob("*.yaml"))
 
 
 def find_config(name: str) -> pathlib.Path:
-    """A YAML file by its path or, failing that, by its name among those that come with gen2d."""
+    """Path of a YAML file, given by that path or by the name of a config that comes with gen2d.
+
+    Raises ConfigError if there is no such file.
+    """
     path = pathlib.Path(name).expanduser()
     if path.is_file():
         return path

@@ -1,12 +1,12 @@
-"""Which videos are asked for: ranges of their quality measures, checked."""
+"""The section `quality`: accepted ranges of the videos' quality measures."""
 
 from collections.abc import Set
 from typing import Any
 
 import numpy as np
 
-VISIBILITY = "quality/min_visibility"  # the one that is known only when a video is drawn
-# Options of a config's section `quality`: the field that each is about, and the option that makes it be stored.
+VISIBILITY = "quality/min_visibility"  # the only measure that needs rendering
+# For each measure (options min_NAME and max_NAME): its stored field, and the option that switches the field on.
 MEASURES = {
     "contacts": ("quality/contacts", ""),
     "penetration": ("quality/max_penetration", ""),
@@ -17,17 +17,17 @@ MEASURES = {
 
 
 def ranges(options: Any) -> dict[str, tuple[float, float]]:
-    """The least and the largest value of each field that is asked for, by its stored name."""
-    asked = {name: tuple(getattr(options, f"{end}_{name}") for end in ("min", "max")) for name in MEASURES}
+    """Accepted interval (low, high) of each restricted measure, by its stored field."""
+    limits = {name: tuple(getattr(options, f"{end}_{name}") for end in ("min", "max")) for name in MEASURES}
     return {
         MEASURES[name][0]: (-np.inf if low is None else low, np.inf if high is None else high)
-        for name, (low, high) in asked.items()
+        for name, (low, high) in limits.items()
         if (low, high) != (None, None)
     }
 
 
 def check(options: Any, enabled: Set[str]) -> None:
-    """ValueError where a range holds nothing, or is of what is not stored; `enabled` names the options that are on."""
+    """Raise ValueError if a range is empty or its measure is not stored. `enabled` names the options that are on."""
     for name, (_, needed) in MEASURES.items():
         low, high = (getattr(options, f"{end}_{name}") for end in ("min", "max"))
         if low is not None and high is not None and low > high:

@@ -1,4 +1,4 @@
-"""YAML 1.2 as plain values, of bounded size; `--set`; and plain values as YAML."""
+"""YAML 1.2 texts of bounded size, read and written as plain values; `--set` overrides."""
 
 import io
 import re
@@ -12,13 +12,13 @@ from ruamel.yaml.events import AliasEvent, CollectionEndEvent, CollectionStartEv
 from gen2d.config.plugin_options import named
 from gen2d.core.errors import ConfigError
 
-YAML_BYTES = 2**20  # size of a config file
-YAML_DEPTH, YAML_NODES = 40, 50_000  # levels and nodes of a text; an alias counts as the nodes that it stands for
-YAML_DIGITS = 1000  # characters of a number; Python prints no integer of more than 4300 digits
+YAML_BYTES = 2**20  # size of a config file, at most
+YAML_DEPTH, YAML_NODES = 40, 50_000  # levels and nodes of a text, at most; an alias counts as its expanded nodes
+YAML_DIGITS = 1000  # characters of a number, at most; Python prints no integer of more than 4300 digits
 
 
 def parse_yaml(text: str, source: str) -> Any:
-    """Plain value of a YAML text; raises ConfigError, which names `source`, if the text is invalid or too large."""
+    """Plain value of a YAML text. Raises ConfigError, naming `source`, if the text is invalid or too large."""
     try:
         _check_events(text)
         yaml = _yaml()
@@ -28,12 +28,12 @@ def parse_yaml(text: str, source: str) -> Any:
         mark = getattr(error, "problem_mark", None)
         where = f" in line {mark.line + 1}" if mark else ""
         raise ConfigError(f"{source}: not valid YAML{where}: {getattr(error, 'problem', None) or error}") from None
-    except (ValueError, AssertionError) as error:  # a date that does not exist, a version of YAML that does not
+    except (ValueError, AssertionError) as error:  # an impossible date, an unknown YAML version
         raise ConfigError(f"{source}: not valid YAML: {error}") from None
 
 
 def _check_events(text: str) -> None:
-    """Raise YAMLError, before any value is constructed, for a text beyond the bounds or with features of no config."""
+    """Raise YAMLError, before any value is constructed, if a text exceeds the limits or uses features not allowed."""
     sizes: dict[str, int] = {}  # nodes under each anchor
     open_nodes: list[tuple[str | None, int]] = []  # anchor of each open collection, and the number of nodes before it
     nodes = 0
@@ -66,34 +66,34 @@ def _check_events(text: str) -> None:
 
 
 def yaml_text(values: Mapping[str, Any]) -> str:
-    """The YAML text of plain values, in their order; `parse_yaml` reads the same values from it."""
+    """YAML text of plain values, in their order; `parse_yaml` reads equal values from it."""
     yaml, text = _yaml(), io.StringIO()
     yaml.default_flow_style = yaml.allow_unicode = False
-    yaml.width = 2**31  # characters of a line: a text that ruamel.yaml folds may be read with other spaces
+    yaml.width = 2**31  # characters of a line; texts folded by ruamel.yaml may be read back with other spaces
     yaml.representer.sort_base_mapping_type_on_output = False
     yaml.dump(values, text)
     return text.getvalue()
 
 
 def _yaml() -> YAML:
-    """A reader and writer of plain values; one for each text, since it keeps state."""
+    """A YAML reader and writer of plain values; it keeps state, so each text needs a new one."""
     return YAML(typ="safe", pure=True)
 
 
 def overridden(values: dict, overrides: Sequence[str]) -> dict:
-    """The mapping with the value of each `a.b=value` in place."""
+    """The mapping, changed in place by overrides `section.option=value`. Raises ConfigError if one is malformed."""
     for text in overrides:
         path, equals, value = text.partition("=")
-        own = re.fullmatch(r"(annotations)\.(.+\.py)(?:\.([^.]+))?", path.strip())  # a file's path may have dots
-        keys = [key for key in own.groups() if key] if own else path.strip().split(".")
+        user_file = re.fullmatch(r"(annotations)\.(.+\.py)(?:\.([^.]+))?", path.strip())  # a file's path may have dots
+        keys = [key for key in user_file.groups() if key] if user_file else path.strip().split(".")
         if not equals or not all(keys):
             raise ConfigError(f"--set is {text!r}, but must be section.option=value, such as physics.substeps=8")
-        place = values
+        mapping = values
         for key in keys[:-1]:
-            inner = place.get(key)
+            inner = mapping.get(key)
             if not isinstance(inner, str | Mapping | None):
                 raise ConfigError(f"--set is {text!r}, but {key} is {inner!r}, which has no options of its own")
-            place[key] = dict(named(inner) or {})
-            place = place[key]
-        place[keys[-1]] = parse_yaml(value, f"--set {path}")
+            mapping[key] = dict(named(inner) or {})
+            mapping = mapping[key]
+        mapping[keys[-1]] = parse_yaml(value, f"--set {path}")
     return values

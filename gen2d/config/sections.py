@@ -1,4 +1,4 @@
-"""The options of every section of a config."""
+"""Options of every section of a config, except those of plug-ins."""
 
 import dataclasses
 
@@ -7,12 +7,12 @@ from gen2d.config.distributions import Distribution
 from gen2d.config.options import option
 from gen2d.storage.codecs import CODECS
 
-MAX_SLOTS = 254  # a slot's mask id is one byte, 0 is the background
+MAX_SLOTS = 254  # mask ids (slot + 1) are one byte; 0 is the background, 255 an occluder
 
 
 @dataclasses.dataclass(frozen=True)
 class VideoOptions:
-    """How long, how fast and how large."""
+    """Length, frame rate and size of videos."""
 
     frames: int = option(64, int, "frames", "in a video, the initial state included", low=1, high=100_000)
     fps: float = option(30.0, float, "1/s", "frames per second of the world's time", above=0, high=100_000)
@@ -22,7 +22,7 @@ class VideoOptions:
 
 @dataclasses.dataclass(frozen=True)
 class PhysicsOptions:
-    """How the world is stepped, and how two materials make one contact."""
+    """Time steps, damping and contact parameters of the simulation."""
 
     substeps: int | None = option(
         None, int, "steps/frame", "null: as many as max_step asks for", low=1, high=10_000, optional=True
@@ -44,7 +44,7 @@ class PhysicsOptions:
 
 @dataclasses.dataclass(frozen=True)
 class CameraOptions:
-    """What part of the world a frame shows, and how the camera moves."""
+    """View of the world and motion of the camera."""
 
     center: tuple[float, ...] | None = option(
         None, float, "m", "world point in the middle of the frame; null: the scene's", parts=2, optional=True
@@ -66,7 +66,7 @@ class CameraOptions:
 
 @dataclasses.dataclass(frozen=True)
 class ImageOptions:
-    """How an image forms: how colours mix, how long the shutter is open, what stands before it, and how it is read."""
+    """Image formation: blending of colours, motion blur, occluders and sensor noise."""
 
     blending: str = option(
         "srgb", str, "", "of a pixel's colours: as most tools do, or in linear light", choices=("srgb", "linear")
@@ -97,7 +97,7 @@ class ImageOptions:
 
 @dataclasses.dataclass(frozen=True)
 class SimulationAnnotations:
-    """What is stored beside frames and states that follows from the simulation, not from the pixels."""
+    """Annotations computed from the simulation, stored beside frames and states."""
 
     contacts: int = option(
         0, int, "rows", "of contacts, per object and 16 frames; 4 is a good number, 0: none", low=0, high=1000
@@ -109,7 +109,7 @@ class SimulationAnnotations:
 
 @dataclasses.dataclass(frozen=True)
 class QualityOptions:
-    """Which videos are kept: those within these ranges, others are made instead (null: any)."""
+    """Accepted ranges of quality measures (null: no limit); videos outside are replaced by new samples."""
 
     min_contacts: int | None = option(None, int, "contacts", "that begin in a video", low=0, optional=True)
     max_contacts: int | None = option(None, int, "contacts", "that begin in a video", low=0, optional=True)
@@ -138,7 +138,7 @@ class QualityOptions:
 
 @dataclasses.dataclass(frozen=True)
 class MatchedOptions:
-    """Sets of videos that share a scene and differ in one thing (matched.py); without `change` there are none."""
+    """Matched sets: videos that share a scene and differ in one factor or event; off if `change` is null."""
 
     change: tuple[str, ...] | None = option(
         None,
@@ -165,7 +165,7 @@ class MatchedOptions:
 
 @dataclasses.dataclass(frozen=True)
 class StorageOptions:
-    """How videos lie on disk."""
+    """Storage of videos on disk."""
 
     frames: str = option(
         "video",

@@ -1,7 +1,7 @@
-"""A config's splits: names, sizes, the laws that their factors are drawn from, and what else is different in them.
+"""Splits of a config: names, sizes, joint distributions of the factors, and changed sections.
 
-Videos of a split whose factors are others than those of the training split are held out: that no video of one can be a
-video of the other is proved on the supports of the two laws (laws.py).
+A split with its own factors is held out: unless it says `overlaps: true`, its distribution must have no point in common
+with that of the training split. This is decided exactly on the two supports (joint_distribution.py).
 """
 
 import dataclasses
@@ -16,49 +16,54 @@ from gen2d.config.options import coordinates, drawn_options, value_of
 from gen2d.config.plugin_options import Plugin, check_plugin
 from gen2d.core.errors import ConfigError
 
-MOST = 100  # splits of a config
-CHANGES = ("physics", "camera", "image", "look")  # sections that a split may have its own options of
+MOST = 100  # splits of a config, at most
+CHANGES = ("physics", "camera", "image", "look")  # sections that a split may change
 
 
 @dataclasses.dataclass(frozen=True)
 class Split:
-    """Some of a dataset's videos: how many, the law that their factors are drawn from, and what else is different."""
+    """A split of a dataset: number of videos, joint distribution of their factors, and changed sections."""
 
     name: str
-    videos: int | None  # null: as many as are asked for
-    written: str  # the split as in a config, as JSON
+    videos: int | None  # None: the number requested at generation
+    written: str  # the split's mapping in the config, as JSON
     law: JointDistribution = dataclasses.field(compare=False)
-    own: Mapping[str, Any] = dataclasses.field(default_factory=dict, compare=False)  # sections
+    own: Mapping[str, Any] = dataclasses.field(default_factory=dict, compare=False)  # changed sections, by name
 
     @property
     def frames(self) -> int | None:
-        """How many frames of a video its reader gets, the first ones; None: all."""
+        """Number of leading frames of a video that its reader gets; None for all."""
         return self.plain().get("frames")
 
     def plain(self) -> dict[str, Any]:
-        """The split as YAML and JSON hold it."""
+        """The split as plain YAML and JSON values."""
         return json.loads(self.written)
 
 
 def _base(scene: Plugin) -> Weighted:
-    """The distributions that a scene's options say."""
-    own = scene.own or scene.options
-    return {k: v for name in drawn_options(scene.contract) for k, v in coordinates(name, getattr(own, name)).items()}
+    """Distributions of the scene's factors as written in its options, by coordinate."""
+    options = scene.own or scene.options
+    return {
+        k: v for name in drawn_options(scene.contract) for k, v in coordinates(name, getattr(options, name)).items()
+    }
 
 
 def distributions_of_splits(scene: Plugin, splits: Sequence[Split]) -> list[JointDistribution]:
-    """The laws of the splits in order, or that of the scene alone where there are none."""
+    """Joint distributions of the splits, in order; that of the scene alone if there are no splits."""
     return [split.law for split in splits] or [joint_distribution_of({}, _base(scene), lambda written: {})]
 
 
 def with_splits(scene: Plugin, written: Any, source: str) -> tuple[Plugin, tuple[Split, ...]]:
-    """The splits that a config has, and a scene that can hold all of them. Raises ConfigError with one sentence."""
+    """The scene, with supports widened to contain those of all splits, and the splits in the order written.
+
+    Raises ConfigError, naming `source`, if a split is invalid or shares points with the training split.
+    """
     if not isinstance(written, Mapping):
         raise ConfigError(f"{source}: splits is {written!r}, but must be a mapping from names to what they are")
     if len(written) > MOST:
         raise ConfigError(f"{source}: splits has {len(written)} names, but must have {MOST} at most")
     splits: dict[str, Split] = {}
-    for name in sorted(written, key=lambda name: name != "train"):  # so that others may be like it
+    for name in sorted(written, key=lambda name: name != "train"):  # first, as others inherit from it
         training = next(iter(splits.values()), None)
         splits[name] = _split(scene, name, written[name], training, source)
         if training is not None:
@@ -85,8 +90,10 @@ def _split(scene: Plugin, name: str, written: Any, training: Split | None, sourc
             raise ConfigError(f"{source}: {where}.{key} is {count!r}, but must be a whole number from 1 to 2**32 - 1")
     if not isinstance(written.get("overlaps", False), bool):
         raise ConfigError(f"{source}: {where}.overlaps is {written['overlaps']!r}, but must be true or false")
-    like = None if "factors" in written else training
-    law = like.law if like else _distribution_of(scene, written.get("factors", {}), f"{where}.factors", source)
+    inherited = None if "factors" in written else training
+    law = (
+        inherited.law if inherited else _distribution_of(scene, written.get("factors", {}), f"{where}.factors", source)
+    )
     return Split(name, written.get("videos"), json.dumps(written), law)
 
 
@@ -94,15 +101,15 @@ def _distribution_of(scene: Plugin, written: Any, where: str, source: str) -> Jo
     specs = drawn_options(scene.contract)
 
     def read(values: Mapping[str, Any]) -> Weighted:
-        found: Weighted = {}
+        distributions: Weighted = {}
         for name, value in values.items():
             if name not in specs:
                 raise ConfigError(f"{source}: {where}.{name} is not a factor; {plugins.nearest(name, list(specs))}")
             try:
-                found |= coordinates(name, value_of(specs[name], value))
+                distributions |= coordinates(name, value_of(specs[name], value))
             except ValueError as error:
                 raise ConfigError(f"{source}: {where}.{name} is {value!r}, but must be {error}") from None
-        return found
+        return distributions
 
     try:
         return joint_distribution_of(written, _base(scene), read)
@@ -111,7 +118,7 @@ def _distribution_of(scene: Plugin, written: Any, where: str, source: str) -> Jo
 
 
 def _check_held_out(training: Split, split: Split, source: str) -> None:
-    """Raises ConfigError where a split of other factors has videos that the training split has, too."""
+    """Raise ConfigError if a split with its own factors has a point in common with the training split."""
     written = split.plain()
     try:
         shared = intersect(training.law, split.law) if "factors" in written and not written.get("overlaps") else None
@@ -130,10 +137,10 @@ def _differ(one: Split, other: Split, name: str) -> bool:
 
 
 def _hull(scene: Plugin, splits: Sequence[Split]) -> Any:
-    """Options that can give whatever any of the splits may draw."""
-    parts = union_support([split.law for split in splits])
+    """The scene's options, with supports that contain those of all splits."""
+    supports = union_support([split.law for split in splits])
     changes = {}
     for name, spec in drawn_options(scene.contract).items():
-        found = [parts[key] for key in coordinates(name, getattr(scene.options, name))]
-        changes[name] = tuple(found) if spec.parts else found[0]
+        components = [supports[key] for key in coordinates(name, getattr(scene.options, name))]
+        changes[name] = tuple(components) if spec.parts else components[0]
     return dataclasses.replace(scene.options, **changes)

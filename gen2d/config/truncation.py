@@ -1,6 +1,7 @@
-"""Distributions cut by supports, exactly: what lies within some spans of numbers, and what lies without.
+"""Exact truncation of distributions: their parts inside and outside given spans.
 
-A cut is a list of pieces, none of them a mixture, each with the share of all draws that it is.
+A truncated distribution is a list of pieces, none of them a mixture, each with its probability under the original
+distribution.
 """
 
 import math
@@ -11,13 +12,13 @@ import numpy as np
 from gen2d.config.distributions import Distribution, Span
 
 Intervals = list[tuple[float, Distribution]]
-MOST_POINTS = 1000  # whole numbers that are cut out of a range one by one
-FAR = 10.0  # deviations from the mean, beyond which a normal in float32 has nothing
-LEAST = 1e-7  # of a piece that a normal is cut into: less is not drawn
+MOST_POINTS = 1000  # whole numbers removed from a continuous range, at most
+FAR = 10.0  # standard deviations; a float32 normal never gets farther from its mean
+LEAST = 1e-7  # probability of a piece of a normal; less likely pieces are dropped
 
 
 def mixture(pieces: Sequence[tuple[float, Distribution]]) -> Distribution:
-    """Weighted distributions as one, equal ones together."""
+    """Mixture of weighted distributions, with equal components merged."""
     shares: dict[Distribution, float] = {}
     for weight, part in pieces:
         for share, simple in part.weighted:
@@ -28,25 +29,25 @@ def mixture(pieces: Sequence[tuple[float, Distribution]]) -> Distribution:
 
 
 def total(pieces: Intervals) -> float:
-    """The share of all draws that these pieces are."""
+    """Total probability of the pieces."""
     return sum(share for share, _ in pieces)
 
 
 def inside(source: Distribution, spans: Iterable[Span]) -> Intervals:
-    """What of a distribution lies within any of these spans."""
-    found, rest = [], source.weighted
+    """Pieces of a distribution inside the union of the spans."""
+    kept, remaining = [], source.weighted
     for span in spans:
-        found += _within(rest, span)
-        rest = _without(rest, span)
-    return found
+        kept += _within(remaining, span)
+        remaining = _without(remaining, span)
+    return kept
 
 
 def outside(source: Distribution, spans: Iterable[Span]) -> Intervals:
-    """What of a distribution lies within none of these spans."""
-    rest = source.weighted
+    """Pieces of a distribution outside all spans."""
+    remaining = source.weighted
     for span in spans:
-        rest = _without(rest, span)
-    return rest
+        remaining = _without(remaining, span)
+    return remaining
 
 
 def _within(pieces: Intervals, span: Span) -> Intervals:
@@ -54,19 +55,19 @@ def _within(pieces: Intervals, span: Span) -> Intervals:
 
 
 def _without(pieces: Intervals, span: Span) -> Intervals:
-    """Below the span and above it; also between whole numbers, if it is one of those."""
-    found = []
+    """Pieces below and above the span and, for a span of whole numbers, between these numbers."""
+    remaining = []
     for share, piece in pieces:
         holes = [span] if not span.whole or piece.kind == "integer" else _points(span)
-        rest = [(share, piece)]
+        parts = [(share, piece)]
         for hole in holes:
-            rest = [*_within(rest, Span(-math.inf, hole.low)), *_within(rest, Span(hole.high, math.inf))]
-        found += rest
-    return found
+            parts = [*_within(parts, Span(-math.inf, hole.low)), *_within(parts, Span(hole.high, math.inf))]
+        remaining += parts
+    return remaining
 
 
 def _points(span: Span) -> list[Span]:
-    """The whole numbers of a span one by one."""
+    """One span for each whole number of a span. Raises ValueError if there are too many."""
     first = math.ceil(span.low)
     if not span.last - first < MOST_POINTS:
         raise ValueError(f"of at most {MOST_POINTS} whole numbers where they are cut out of a range")
@@ -76,30 +77,33 @@ def _points(span: Span) -> list[Span]:
 
 
 def _meeting(piece: Distribution, span: Span) -> Intervals:
-    """The part of one piece that lies within a span, if any."""
+    """The part of a piece inside a span; an empty list if there is none."""
     if piece.kind in ("constant", "choice", "grid"):
         kept = np.asarray(piece.numbers)[span.contains(piece.numbers)].tolist()
         return [(len(kept) / len(piece.numbers), Distribution(piece.kind, tuple(kept)))] if kept else []
-    own = piece.spans[0]
-    both = own.meet(span)
-    if both is None or (both.whole and not own.whole):  # single numbers of a range are never drawn
+    support = piece.spans[0]
+    overlap = support.meet(span)
+    # Single numbers have probability 0 in a continuous range.
+    if overlap is None or (overlap.whole and not support.whole):
         return []
-    if both == own:
+    if overlap == support:
         return [(1.0, piece)]
     if piece.kind == "integer":
-        low, high = math.ceil(both.low), math.ceil(both.high)
-        return [((high - low) / (own.high - own.low), Distribution("integer", (low, high - 1)))]
-    share = (_rises(piece, both.high) - _rises(piece, both.low)) / (_rises(piece, own.high) - _rises(piece, own.low))
+        low, high = math.ceil(overlap.low), math.ceil(overlap.high)
+        return [((high - low) / (support.high - support.low), Distribution("integer", (low, high - 1)))]
+    share = (_rises(piece, overlap.high) - _rises(piece, overlap.low)) / (
+        _rises(piece, support.high) - _rises(piece, support.low)
+    )
     if piece.kind == "normal":
         mean, deviation = piece.numbers[:2]
-        low, high = max(both.low, mean - FAR * deviation), min(both.high, mean + FAR * deviation)
+        low, high = max(overlap.low, mean - FAR * deviation), min(overlap.high, mean + FAR * deviation)
         cut = Distribution("normal", (mean, deviation, low, high))
         return [(share, cut)] if share > LEAST else []
-    return [(share, Distribution(piece.kind, (both.low, both.high)))]
+    return [(share, Distribution(piece.kind, (overlap.low, overlap.high)))]
 
 
 def _rises(piece: Distribution, x: float) -> float:
-    """What grows with x as the probability of a smaller value does."""
+    """The cumulative distribution function at x, up to a constant factor and offset."""
     if piece.kind == "uniform":
         return x
     if piece.kind == "log_uniform":

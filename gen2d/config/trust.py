@@ -1,8 +1,8 @@
-"""Which code that came with a dataset may run: none, unless this user made it, or has said so.
+"""Trust in the code that comes with a dataset: it runs only if this user generated with it or declared it trusted.
 
-A dataset keeps copies of the families and looks of its maker's own. Loading, checking, exporting and previewing what is
-stored never run them; drawing and simulating again must. The user's list holds the sha256 of every file that this user
-has generated with, and of those added by hand, a line each.
+A dataset keeps copies of its author's plug-in files. Loading, verifying, exporting and previewing stored data never run
+them; rendering and simulating again do. The user's list of trusted files holds one sha256 per line: those of all files
+that this user has generated with, and those added by hand.
 """
 
 import contextlib
@@ -17,35 +17,38 @@ from gen2d.core.errors import ConfigError, UntrustedError
 from gen2d.storage.sealed import open_regular, sha256
 
 _HASH = re.compile(r"[0-9a-f]{64}")
-_BYTES = 2**20  # of the list, at most
+_BYTES = 2**20  # read from the list, at most
 
 
 def list_path() -> Path:
-    """Where the user's list lies."""
+    """Path of the user's list of trusted files."""
     home = Path(os.environ.get("XDG_CONFIG_HOME") or "~/.config")
-    with contextlib.suppress(RuntimeError):  # a user without a home
+    with contextlib.suppress(RuntimeError):  # a user without a home folder
         home = home.expanduser()
     return home / "gen2d" / "trusted"
 
 
 def check_trusted(copies: Mapping[str, bytes], trust: str | Sequence[str], root: object) -> None:
-    """Raises UntrustedError for the first of the files (by their place in the dataset) that must not run."""
-    said = {trust} if isinstance(trust, str) else set(trust)
-    for word in said:
-        if not isinstance(word, str) or not _HASH.fullmatch(word):
-            raise ConfigError(f"--trust is {word!r}, but must be the sha256 of a file, 64 hexadecimal digits")
-    unknown = {place: sha256(content) for place, content in copies.items()}
-    known = said | _listed() if unknown.keys() and not set(unknown.values()) <= said else said
-    for place, digest in sorted(unknown.items()):
-        if digest not in known:
+    """Raise UntrustedError for the first file, by its path in the dataset, that is not trusted.
+
+    copies: contents by path. trust: one or more sha256 given by the user; ConfigError is raised if one is malformed.
+    """
+    trusted = {trust} if isinstance(trust, str) else set(trust)
+    for entry in trusted:
+        if not isinstance(entry, str) or not _HASH.fullmatch(entry):
+            raise ConfigError(f"--trust is {entry!r}, but must be the sha256 of a file, 64 hexadecimal digits")
+    digests = {path: sha256(content) for path, content in copies.items()}
+    allowed = trusted | _listed() if digests.keys() and not set(digests.values()) <= trusted else trusted
+    for path, digest in sorted(digests.items()):
+        if digest not in allowed:
             raise UntrustedError(
-                f"{root}/{place} is code that came with the dataset and would have to run: read it, and if you trust "
+                f"{root}/{path} is code that came with the dataset and would have to run: read it, and if you trust "
                 f"it say --trust {digest} (in Python trust={digest!r}), or add that line to {list_path()}"
             )
 
 
 def remember(contents: Iterable[bytes]) -> None:
-    """Adds files that this user generates with to the list; where it cannot be written nothing is remembered."""
+    """Add files that this user generates with to the list; do nothing if the list cannot be written."""
     try:
         path, known = list_path(), _listed()
         new = sorted({sha256(content) for content in contents} - known)
@@ -60,11 +63,11 @@ def remember(contents: Iterable[bytes]) -> None:
 
 
 def _listed() -> set[str]:
-    """The hashes in the user's list; none where somebody else can write it."""
+    """Hashes in the user's list; none if another user owns it or can write to it."""
     try:
         with os.fdopen(open_regular(list_path()), "rb") as file:
-            about = os.fstat(file.fileno())
-            if about.st_uid != os.getuid() or about.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
+            status = os.fstat(file.fileno())
+            if status.st_uid != os.getuid() or status.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
                 return set()
             lines = file.read(_BYTES).decode("utf-8", "replace").splitlines()
     except OSError:

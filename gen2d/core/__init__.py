@@ -1,1 +1,1 @@
-"""What every other package may use: errors, descriptions of fields, progress."""
+"""Basics that every other package may import: errors, field descriptions, progress."""

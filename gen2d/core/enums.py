@@ -1,4 +1,4 @@
-"""Codes in stored fields, each defined once and without jax."""
+"""Integer codes of stored fields, importable without jax."""
 
 DYNAMIC, STATIC, KINEMATIC = range(3)  # objects/kind
 SHAPES = ("circle", "segment", "capsule", "polygon")  # objects/shape is an index into this

@@ -1,10 +1,10 @@
 """Errors that end a command: one sentence each, and an exit code."""
 
-LONGEST = 800  # characters of a sentence; longer ones lose their middle
+LONGEST = 800  # characters of a message; longer messages lose their middle
 
 
 def one_line(text: str) -> str:
-    """The text on one line of at most about `LONGEST` printable characters; others are escaped."""
+    """The text on one line of about `LONGEST` characters at most, with unprintable characters escaped."""
     text = "".join(c if c.isprintable() else _escaped(c) for c in text)
     return text if len(text) <= LONGEST else f"{text[: LONGEST // 2]} ... {text[-LONGEST // 2 :]}"
 
@@ -14,7 +14,7 @@ def _escaped(character: str) -> str:
 
 
 class Error(Exception):
-    """An error with one sentence for the user, and the exit code of the command that it ends."""
+    """Base class of gen2d's errors: one sentence for the user, and the exit code of the command."""
 
     exit_code = 1
 
@@ -23,32 +23,32 @@ class Error(Exception):
 
 
 class UserError(Error):
-    """An error that the user can correct; exit code 2."""
+    """An error that the user can correct. Exit code 2."""
 
     exit_code = 2
 
 
 class ConfigError(UserError):
-    """An option that is not allowed; the sentence names file, field, value and what is allowed."""
+    """An invalid option; the sentence names the file, the field, its value and the values allowed."""
 
 
 class FolderError(UserError):
-    """A dataset folder that cannot be used as asked."""
+    """A dataset folder that cannot be used as requested."""
 
 
 class IncompleteError(FolderError):
-    """A folder without a complete dataset: none was begun there, or it is unfinished."""
+    """A folder that holds no dataset, or an unfinished one."""
 
 
 class UntrustedError(UserError):
-    """Code that came with a dataset and would have to run, but that the user does not trust."""
+    """Untrusted code that came with a dataset and would have to run."""
 
 
 class DamagedError(Error):
-    """Stored data that differs from what was written; the sentence names the file and the damage; exit code 1."""
+    """Stored data that has changed since it was written; the sentence names the file and the damage. Exit code 1."""
 
 
 class UnreachableError(Error):
-    """A server or disk that does not answer, which says nothing about the data; exit code 3."""
+    """A server or disk that does not respond; the data itself may be intact. Exit code 3."""
 
     exit_code = 3

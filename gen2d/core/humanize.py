@@ -2,7 +2,7 @@
 
 
 def in_bytes(size: float) -> str:
-    """A number of bytes as text, such as '7.6 GB'."""
+    """Number of bytes as text, such as '7.6 GB'."""
     for unit in ("B", "kB", "MB", "GB", "TB"):
         if size < 1000 or unit == "TB":
             break
@@ -11,7 +11,7 @@ def in_bytes(size: float) -> str:
 
 
 def in_time(seconds: float) -> str:
-    """A number of seconds as text, such as '2 min 5 s'."""
+    """Number of seconds as text, such as '2 min 5 s'."""
     if seconds < 59.5:
         return f"{seconds:.0f} s" if seconds >= 10 else f"{seconds:.1f} s"
     minutes, seconds = divmod(round(seconds), 60)

@@ -7,9 +7,9 @@ from typing import Any
 
 
 def attach(package: str, homes: Mapping[str, str]) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
-    """`__getattr__` and `__dir__` of a module whose names live in others.
+    """`__getattr__` and `__dir__` for a module that re-exports names of other modules.
 
-    `homes` maps a module to the names in it, separated by spaces; a name may be that of a submodule.
+    `homes` maps each of these modules to its names, separated by spaces; a name may also be a submodule.
     """
     home = {name: module for module, names in homes.items() for name in names.split()}
 

@@ -1,9 +1,10 @@
-"""Random permutations and hashes of integers that need no state: SplitMix64 and a Feistel network."""
+"""Stateless pseudo-random permutations and hashes of integers: a Feistel network and SplitMix64."""
 
 import numpy as np
 
 
 def feistel(values: np.ndarray, keys: list[np.ndarray], half: np.uint64) -> np.ndarray:
+    """Image of each value, uint64 below 2**(2 * half), under a Feistel network with one round per key."""
     mask = (np.uint64(1) << half) - np.uint64(1)
     left, right = values >> half, values & mask
     for key in keys:
@@ -12,7 +13,7 @@ def feistel(values: np.ndarray, keys: list[np.ndarray], half: np.uint64) -> np.n
 
 
 def hashed(*parts: int | np.ndarray) -> np.ndarray:
-    """64 random bits that the parts decide, uint64, for each element of the parts."""
+    """Hash of the parts, elementwise: 64 pseudo-random bits, uint64."""
     bits = np.zeros(1, np.uint64)
     for part in parts:
         bits = splitmix64(bits ^ np.asarray(part).astype(np.uint64))
@@ -20,7 +21,7 @@ def hashed(*parts: int | np.ndarray) -> np.ndarray:
 
 
 def splitmix64(bits: np.ndarray) -> np.ndarray:
-    """The next output of SplitMix64 (Steele, Lea and Flood, OOPSLA 2014), for each element."""
+    """Output of SplitMix64 (Steele, Lea and Flood, OOPSLA 2014) for each state, uint64."""
     bits = bits + np.uint64(0x9E3779B97F4A7C15)
     bits = (bits ^ (bits >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     bits = (bits ^ (bits >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)

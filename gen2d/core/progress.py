@@ -1,4 +1,4 @@
-"""Progress of long work on a terminal, and interruption by a signal."""
+"""Progress display of long tasks, and interruption by signals."""
 
 import signal
 import sys
@@ -14,15 +14,15 @@ from gen2d.core.humanize import in_time
 
 
 def to_stderr(line: str) -> None:
-    """Prints a line on standard error, at once."""
+    """Print a line to standard error and flush."""
     print(line, file=sys.stderr, flush=True)
 
 
 @contextmanager
 def progress(count: int, say: Callable[[str], None]) -> Iterator[Callable[[int], None]]:
-    """A progress bar on a terminal; elsewhere one line every ten seconds, passed to `say`.
+    """Progress bar on a terminal; elsewhere one line every ten seconds, passed to `say`.
 
-    Yields the function to call with each number of videos done.
+    Yields a function that advances the progress by a number of videos.
     """
     if sys.stderr.isatty():
         with tqdm(total=count, unit=" videos", smoothing=0.1, dynamic_ncols=True) as bar:
@@ -48,7 +48,10 @@ def progress(count: int, say: Callable[[str], None]) -> Iterator[Callable[[int],
 
 @contextmanager
 def stopping_on_sigterm(say: Callable[[str], None]) -> Iterator[None]:
-    """A block that SIGTERM interrupts as Ctrl-C does; a second signal of either kind ends the process at once."""
+    """Raise KeyboardInterrupt on SIGTERM or SIGINT inside the block; a second signal ends the process at once.
+
+    Without effect outside the main thread.
+    """
     if threading.current_thread() is not threading.main_thread():
         yield
         return

@@ -1,10 +1,10 @@
-"""What a stored field is: its type, axes, unit and meaning, said once and read by the checks, the files and the cards.
+"""Stored fields: type, axes, unit and meaning, declared once for checks, files and dataset cards.
 
-Axes are written as in the ground-truth table: ``n T K 2`` is video, frame, object slot, (x, y). A letter stands for a
-size that the dataset fixes (`sizes` in its manifest), a number for itself, and ``n`` for the videos, always first
-where it occurs. A field whose axes hold ``H W`` is an image: it is stored compressed, one chunk a video. Text is UTF-8
-in a fixed number of bytes, padded with zeros: type ``S100`` holds 100 of them. It is never more than NumPy's bytes, as
-neither torch nor jax has arrays of text.
+Axes are written as in the ground-truth table: ``n T K 2`` means video, frame, object slot, (x, y). A letter stands for
+a length fixed by the dataset (`sizes` in its manifest), a number for itself. ``n`` stands for the videos and, where it
+occurs, comes first. A field with the axes ``H W`` is an image and is stored compressed, by default in one chunk per
+video. Text is UTF-8, zero-padded to a fixed number of bytes: 100 for the type ``S100``. Readers get it as NumPy bytes,
+because neither torch nor jax has text arrays.
 """
 
 import dataclasses
@@ -13,28 +13,28 @@ from collections.abc import Mapping
 
 @dataclasses.dataclass(frozen=True)
 class Field:
-    """One stored field."""
+    """A stored field."""
 
-    dtype: str  # NumPy's name for it
+    dtype: str  # NumPy's name of the type
     axes: str
     unit: str
     meaning: str
 
     @property
     def per_video(self) -> bool:
-        """Whether each video has its own value (`time` is one for all)."""
+        """Whether each video has its own value; `time`, for example, is shared by all videos."""
         return self.axes.split()[:1] == ["n"]
 
     @property
     def is_image(self) -> bool:
-        """Whether it is stored compressed, one chunk a video."""
+        """Whether the field is an image, stored compressed."""
         return "H" in self.axes.split()
 
     @property
     def is_text(self) -> bool:
-        """Whether it is text, in bytes."""
+        """Whether the field is text, stored as bytes."""
         return self.dtype.startswith("S")
 
     def shape(self, sizes: Mapping[str, int]) -> tuple[int, ...]:
-        """The shape of one video's value, without ``n``."""
+        """Shape of one video's value, without ``n``."""
         return tuple(int(axis) if axis.isdigit() else sizes[axis] for axis in self.axes.split() if axis != "n")

@@ -1,1 +1,1 @@
-"""Records that travel between sampler, solver, renderer and files; they may import `core` alone."""
+"""Records passed between sampler, solver, renderer and files. This package imports `gen2d.core` only."""

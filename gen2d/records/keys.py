@@ -1,4 +1,4 @@
-"""Random keys by name and by video."""
+"""Random keys by purpose and by video."""
 
 import functools
 import zlib
@@ -11,23 +11,23 @@ from gen2d.records.axes import Array
 
 
 def key_for(key: Array, what: str) -> Array:
-    """The key of one of the things that numbers are drawn for."""
+    """The key for one named purpose, such as the name of a factor."""
     return keys_for(key, [what])[0]
 
 
 def keys_for(key: Array, whats: Sequence[str]) -> list[Array]:
-    """The keys of some of the things that numbers are drawn for, all made by one compiled loop."""
+    """The keys for several named purposes, from one vmapped `fold_in`."""
     codes = np.array([zlib.crc32(what.encode()) for what in whats], np.uint32)
     return list(jax.vmap(functools.partial(jax.random.fold_in, key))(codes))
 
 
 def seed_words(seed: int, split: int) -> np.ndarray:
-    """A seed up to 2**63 - 1 and a split's number as three 32-bit words, so that jax needs no 64-bit mode."""
+    """A seed up to 2**63 - 1 and a split's number as uint32 [3], so that jax needs no 64-bit mode."""
     return np.array([seed >> 32, seed & 0xFFFFFFFF, split], np.uint32)
 
 
 def video_keys(words: Array, numbers: Array) -> Array:
-    """A key per video: `fold_in(fold_in(key(seed), split), i)`; `words` as `seed_words` gives them."""
+    """One key per video, `fold_in(fold_in(key(seed), split), i)`, from `words = seed_words(seed, split)`."""
     root = jax.random.fold_in(jax.random.wrap_key_data(words[:2], impl="threefry2x32"), words[2])
     return jax.vmap(lambda i: jax.random.fold_in(root, i))(numbers)
 

@@ -1,4 +1,4 @@
-"""What is known of a family's slots before anything is sampled."""
+"""Layouts: the slots and joints of a scene family, fixed before any video is sampled."""
 
 import dataclasses
 import itertools
@@ -10,25 +10,25 @@ from gen2d.core.enums import DYNAMIC, STATIC
 
 @dataclasses.dataclass(frozen=True)
 class SlotGroup:
-    """Some slots in a row that hold one shape: "circle", "segment", "capsule" or "polygon"."""
+    """Consecutive slots of one shape: "circle", "segment", "capsule" or "polygon"."""
 
     shape: str
     count: int
     kind: int = DYNAMIC
-    vertices: int = 0  # of each polygon, at most
+    vertices: int = 0  # per polygon, at most
     rounded: bool = False  # whether polygons have a radius
-    layer: int | None = None  # lower layers are drawn first; None: 0 for static objects, 1 for those that move
-    collides: bool = True  # False: it is drawn, and joints may hold on to it, but it meets nothing
+    layer: int | None = None  # lower layers are rendered first; None: 0 for static objects, 1 for others
+    collides: bool = True  # False: rendered, and joints may attach to it, but without contacts
 
     @property
     def painted(self) -> int:
-        """The layer that it is drawn in."""
+        """Layer in which the group is rendered."""
         return (0 if self.kind == STATIC else 1) if self.layer is None else self.layer
 
 
 @dataclasses.dataclass(frozen=True)
 class JointSpec:
-    """A joint between two slots: "distance" or "revolute"; the two do not collide unless they shall."""
+    """A joint between slots `a` and `b`: "distance" or "revolute". The two bodies collide only if `collide`."""
 
     kind: str
     a: int
@@ -38,10 +38,11 @@ class JointSpec:
 
 @dataclasses.dataclass(frozen=True)
 class Layout:
-    """What is known of a family's slots before anything is drawn.
+    """Slots, joints and bounds of a scene family, the same for all videos of a config.
 
-    `bounds` is the part of the world worth seeing: (left, bottom, right, top) in metres.
-    `reach` is the largest distance from the centre of a moving object to its rim, in metres.
+    runs: groups of slots, in slot order.
+    bounds: region of the world that the default camera shows, (left, bottom, right, top) in m.
+    reach: largest distance from the centre of a moving object to its outline, m.
     """
 
     runs: tuple[SlotGroup, ...]
@@ -51,22 +52,22 @@ class Layout:
 
     @property
     def slots(self) -> int:
-        """The length of the axis K."""
-        return sum(run.count for run in self.runs)
+        """Number of slots, the length of the axis K."""
+        return sum(group.count for group in self.runs)
 
     @property
     def spans(self) -> tuple[tuple[SlotGroup, int], ...]:
-        """Each run and its first slot."""
-        starts = itertools.accumulate((run.count for run in self.runs), initial=0)
+        """Each group of slots with its first slot."""
+        starts = itertools.accumulate((group.count for group in self.runs), initial=0)
         return tuple(zip(self.runs, starts, strict=False))
 
     @property
     def painted(self) -> tuple[tuple[SlotGroup, int], ...]:
-        """The same from back to front: lower layers first, slots of one layer in their order."""
+        """The groups of `spans` in rendering order, back to front: by layer, then by slot."""
         return tuple(sorted(self.spans, key=lambda span: (span[0].painted, span[1])))
 
     @property
     def depths(self) -> np.ndarray:
-        """Each slot's place in the drawing order, [K] int16, 0 is farthest back: what `objects/depth` holds."""
-        order = [slot for run, first in self.painted for slot in range(first, first + run.count)]
+        """Rank of each slot in the rendering order, int16 [K], 0 farthest back; stored as `objects/depth`."""
+        order = [slot for group, first in self.painted for slot in range(first, first + group.count)]
         return np.argsort(order).astype(np.int16)

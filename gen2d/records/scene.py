@@ -1,11 +1,11 @@
-"""A scene and its state: objects, joints, gravity, and where everything is."""
+"""Scenes (objects, joints, gravity) and their states (positions and velocities)."""
 
 from gen2d.records.axes import Array, axes, record
 
 
 @record
 class Objects:
-    """What the slots of a scene are; an empty slot is zero everywhere."""
+    """Properties of a scene's slots; all fields of an empty slot are zero."""
 
     present: Array = axes("objects/present", "n K", "1", "whether the slot holds an object", "bool")
     kind: Array = axes("objects/kind", "n K", "1", "0 dynamic, 1 static, 2 kinematic", "uint8")
@@ -31,7 +31,7 @@ class Objects:
 
 @record
 class Joints:
-    """What ties two objects together; which two, and how, is in the layout."""
+    """Parameters of the joints; the layout holds their kinds and the slots that they connect."""
 
     anchor_a: Array = axes("joints/anchor_a", "n J 2", "m", "in the frame of object a")
     anchor_b: Array = axes("joints/anchor_b", "n J 2", "m", "in the frame of object b")
@@ -46,7 +46,7 @@ class Joints:
 
 @record
 class Scene:
-    """What stays the same for the length of a video."""
+    """Quantities that are constant during a video."""
 
     objects: Objects
     gravity: Array = axes("world/gravity", "n 2", "m/s^2", "acceleration of free fall, y up")
@@ -55,7 +55,7 @@ class Scene:
 
 @record
 class State:
-    """Where everything is and how it moves, at one instant or (with T) at every frame."""
+    """Positions and velocities of all objects, at one instant or (with axis T) at every frame."""
 
     position: Array = axes("states/position", "n T K 2", "m", "of the centre of mass, y up")
     angle: Array = axes("states/angle", "n T K", "rad", "counter-clockwise, not wrapped")

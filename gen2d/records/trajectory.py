@@ -6,7 +6,7 @@ from gen2d.records.scene import State
 
 @record
 class Quality:
-    """What a video was like to make."""
+    """Per-video quality measures of the simulation."""
 
     max_penetration: Array = axes("quality/max_penetration", "n", "m", "deepest overlap of two objects at any step")
     contacts: Array = axes("quality/contacts", "n", "1", "contacts that began, bounces included", "int32")
@@ -21,7 +21,7 @@ class Quality:
 
 @record
 class Contacts:
-    """What touched what: a row for each pair and frame in which it did, in time's order; empty rows are zero."""
+    """Contact log: one row for each pair and frame in which the pair touched, ordered by time; unused rows are zero."""
 
     time: Array = axes("contacts/time", "n C", "s", "of the first touch in the frame's interval", "float64")
     frame: Array = axes("contacts/frame", "n C", "1", "at whose end, or just before, the touch was", "int32")
@@ -39,7 +39,7 @@ class Contacts:
 
 @record
 class Energy:
-    """Where the energy is and where it went, at every frame; the last four count from frame 0."""
+    """Energy and momentum at every frame. Losses, work and residual are cumulative from frame 0."""
 
     kinetic: Array = axes("energy/kinetic", "n T", "J", "of motion of the centres of mass")
     rotational: Array = axes("energy/rotational", "n T", "J", "of spin")
@@ -56,10 +56,10 @@ class Energy:
 
 @record
 class Trajectory:
-    """A simulated video before it is drawn."""
+    """A simulated video before rendering."""
 
     states: State
     quality: Quality
     contacts: Contacts | None = None
     energy: Energy | None = None
-    between: State | None = None  # at every step, [T, steps, ...]; not stored
+    between: State | None = None  # at every step, [T - 1, steps, ...]; not stored
