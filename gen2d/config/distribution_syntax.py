@@ -35,11 +35,6 @@ def is_number(value: Any) -> bool:
     return isinstance(value, Real) and abs(float(value)) <= LARGEST
 
 
-def _far_in_the_tail(mean: float, deviation: float, low: float, high: float) -> bool:
-    """Whether a truncated normal lies so far in its tail that float32 cannot resolve its probabilities."""
-    return low > mean + 4 * deviation or high < mean - 4 * deviation
-
-
 def parse(value: Any, whole: bool = False) -> Distribution:
     """The Distribution written as `value` in a config; `whole` allows whole numbers only.
 
@@ -66,12 +61,14 @@ def parse(value: Any, whole: bool = False) -> Distribution:
         raise ValueError("a range with its lower end first")
     if kind == "log_uniform" and numbers[0] <= 0:
         raise ValueError("a log_uniform range above 0")
-    if len(numbers) == 4 and kind == "normal" and _far_in_the_tail(*numbers):
+    if len(numbers) == 4 and kind == "normal" and truncation.far_in_tail(*numbers):
         raise ValueError("a normal cut off within 4 deviations of its mean")
     if kind == "normal" and (numbers[1] <= 0 or (len(numbers) == 4 and numbers[2] >= numbers[3])):
         raise ValueError("normal: [mean, deviation above 0] or [mean, deviation, low, high]")
     if (whole or kind == "integer") and not all(float(x).is_integer() for x in numbers):
         raise ValueError("whole numbers")
+    if kind == "integer" and not all(abs(x) < 2**31 - 1 for x in numbers):
+        raise ValueError("whole numbers between -2**31 and 2**31")
     if kind == "grid" and len(set(numbers)) < len(numbers):
         raise ValueError("a grid of different numbers")
     if whole and kind in ("log_uniform", "normal"):
@@ -93,7 +90,7 @@ def _composed(value: Mapping[str, Any], whole: bool) -> Distribution:
     for part in parts[1:]:
         pieces = cut(source, part.spans)
         if not pieces:
-            raise ValueError(f"a {kind} that leaves something")
+            raise ValueError(f"{'an' if kind == 'intersection' else 'a'} {kind} that leaves something")
         source = truncation.mixture(pieces)
         if len(source.weighted) > PARTS:
             raise ValueError(f"a {kind} that leaves {PARTS} parts at most")

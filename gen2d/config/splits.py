@@ -90,11 +90,17 @@ def _split(scene: Plugin, name: str, written: Any, training: Split | None, sourc
             raise ConfigError(f"{source}: {where}.{key} is {count!r}, but must be a whole number from 1 to 2**32 - 1")
     if not isinstance(written.get("overlaps", False), bool):
         raise ConfigError(f"{source}: {where}.overlaps is {written['overlaps']!r}, but must be true or false")
+    try:
+        text = json.dumps(written)
+    except TypeError:
+        raise ConfigError(
+            f"{source}: {where} must hold nothing but texts, numbers, lists and mappings of these"
+        ) from None
     inherited = None if "factors" in written else training
     law = (
         inherited.law if inherited else _distribution_of(scene, written.get("factors", {}), f"{where}.factors", source)
     )
-    return Split(name, written.get("videos"), json.dumps(written), law)
+    return Split(name, written.get("videos"), text, law)
 
 
 def _distribution_of(scene: Plugin, written: Any, where: str, source: str) -> JointDistribution:

@@ -14,7 +14,12 @@ from gen2d.config.distributions import Distribution, Span
 Intervals = list[tuple[float, Distribution]]
 MOST_POINTS = 1000  # whole numbers removed from a continuous range, at most
 FAR = 10.0  # standard deviations; a float32 normal never gets farther from its mean
-LEAST = 1e-7  # probability of a piece of a normal; less likely pieces are dropped
+LEAST = 1e-7  # probability of a piece of a normal; less likely pieces are dropped, and those far in a tail
+
+
+def far_in_tail(mean: float, deviation: float, low: float, high: float) -> bool:
+    """Whether a truncated normal is so far in its tail that float32 cannot resolve its probabilities."""
+    return low > mean + 4 * deviation or high < mean - 4 * deviation
 
 
 def mixture(pieces: Sequence[tuple[float, Distribution]]) -> Distribution:
@@ -98,7 +103,7 @@ def _meeting(piece: Distribution, span: Span) -> Intervals:
         mean, deviation = piece.numbers[:2]
         low, high = max(overlap.low, mean - FAR * deviation), min(overlap.high, mean + FAR * deviation)
         cut = Distribution("normal", (mean, deviation, low, high))
-        return [(share, cut)] if share > LEAST else []
+        return [(share, cut)] if share > LEAST and not far_in_tail(*cut.numbers) else []
     return [(share, Distribution(piece.kind, (overlap.low, overlap.high)))]
 
 

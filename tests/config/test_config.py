@@ -60,6 +60,10 @@ BAD = {
     "video: {frames: 2001-99-99}": ("not valid YAML", "month"),
     "scene: {velocity: [1e40, 0]}": ("scene.velocity is", "number"),
     "scene: {spin: {normal: [0, 1, 6, 7]}}": ("scene.spin is", "within 4 deviations"),
+    "scene: {spin: {intersection: [{normal: [0, 3]}, [13.5, 100]]}}": ("scene.spin is", "an intersection that leaves"),
+    "scene: {balls: {integer: [1, 10000000000]}}": ("scene.balls is", "between -2**31 and 2**31"),
+    "splits: {train: {}, test: {look: {background: 2020-01-01}}}": ("splits.test must hold nothing but texts",),
+    "splits: {train: {}, test: {physics: {1: 2020-01-01}}}": ("splits.test must hold nothing but texts",),
 }
 
 
