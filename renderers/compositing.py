@@ -50,7 +50,7 @@ def to_ink(color: Array) -> Array:
 
 
 def over(under: Array, cover: Array, color: Array, linear: bool) -> Array:
-    """Composite of a layer over a uint8 image [..., 3]; coverage [...] is from `to_levels`, the colour from `to_ink`."""
+    """Composite of a layer over a uint8 image [..., 3]; `to_levels` gives the coverage [...], `to_ink` the colour."""
     cover = cover[..., None]
     if linear:
         light = jnp.asarray(LINEAR)[under.astype(jnp.int32)]

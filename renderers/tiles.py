@@ -1,6 +1,6 @@
 """Rendering on CPUs: each object is painted into a tile of its own size, one after the other.
 
-Loops over videos, frames and objects keep the memory that each step touches small; `vmap` would turn them into scatters.
+Each step of the loops over videos, frames and objects touches little memory; `vmap` would turn them into scatters.
 """
 
 import functools
@@ -207,9 +207,7 @@ class _Video:
         occluders = self.stage.occluders
         done: Array | int = 0
         if occluders is not None:
-            is_last = (
-                rank + count == self.plan.moving
-            )  # the last group also paints the occluders in front of everything
+            is_last = rank + count == self.plan.moving  # also paints the occluders before all slots
             for i, below in enumerate(occluders.rank):
                 until = jnp.clip(below - rank, 0, count)
                 canvas = jax.lax.fori_loop(done, until, stroke, canvas)

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 
 from gen2d.records.axes import Array
 
-LARGE = 64.0  # px, radius from which on a disc's rim is a line within a pixel, corrected for curvature
+LARGE = 64.0  # px; discs of this radius or more have a straight rim in each pixel, corrected for curvature
 QUARTER = math.pi / 4
 FAR = 1e12  # px or px^2, beyond every arc
 THIN = 1e-6  # px, width in a row of a vertical line

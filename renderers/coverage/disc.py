@@ -33,8 +33,10 @@ class PixelDisc(NamedTuple):
 
 
 def disc_cuts(x: Array, y: Array, radius: Array) -> PixelDisc:
-    """Edge terms of discs of `radius` [...] px, for pixels with left edges x [..., columns] and top edges y [..., rows]
-    relative to the centre of the disc."""
+    """Edge terms of discs of `radius` [...] px.
+
+    The pixels have left edges x [..., columns] and top edges y [..., rows], relative to the centre of the disc.
+    """
     radius = jnp.maximum(radius, 1e-6)[..., None]
     square = radius * radius
 

@@ -59,7 +59,7 @@ class RoundedPolygon(NamedTuple):
 def rounded_cuts(x: Array, y: Array, vertices: Array, radius: Array | None) -> RoundedPolygon:
     """Edge terms of convex polygons, for pixels with left edges x [..., columns] and top edges y [..., rows].
 
-    The polygons have `vertices` [..., V, 2] px and are grown by `radius` [...] px with round corners; None adds nothing.
+    The polygons have `vertices` [..., V, 2] px and grow by `radius` [...] px with round corners; None adds nothing.
     Vertices may be repeated. Two vertices and a radius are a capsule. A shape without area covers nothing.
     """
     count = vertices.shape[-2]
@@ -114,8 +114,7 @@ def _line(y: Array, begin: Array, end: Array) -> PolygonSide:
 
 
 def _arc_ends(before: Array, after: Array) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
-    """Sines of both ends of the right half and of the left half of an arc from one normal to the next, of at most half a
-    turn."""
+    """Sines of both ends of the right and of the left half of the arc between two normals, of at most half a turn."""
     (c0, s0), (c1, s1) = ((n[..., 0], n[..., 1]) for n in (before, after))
     straight = (c0 * s1 - c1 * s0 <= 0) & (c0 * c1 + s0 * s1 > 0)  # parallel normals up to rounding: no arc
     turn = jnp.where(straight, -1.0, 1.0)
@@ -134,8 +133,8 @@ def _arc(x: Array, y: Array, radius: Array, begin: Array, end: Array, side: int)
     low, high = (radius * sine[..., None] for sine in ((begin, end) if side > 0 else (end, begin)))
     (top, bottom) = (jnp.clip(edge, low, high) for edge in shift(y))
     columns = shift(x)
-    # The point where a column leaves the arc has no first-order effect: stop its gradient. A column on the other side of
-    # the centre never leaves it: its bound is FAR, as a value equal to its bound would lose half of its derivative.
+    # The point where a column leaves the arc has no first-order effect, so stop its gradient. A column on the other
+    # side of the centre never does: its bound is FAR, since a value equal to its bound loses half of its derivative.
     distances = [jnp.maximum(side * at, 0.0) for at in columns]
     leave = [jax.lax.stop_gradient(jnp.sqrt(jnp.maximum(radius**2 - at**2, 0.0))) for at in distances]
     areas = [jnp.where(at > 0, under_arc(value, radius), FAR) for at, value in zip(distances, leave, strict=True)]
