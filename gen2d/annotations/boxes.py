@@ -41,7 +41,7 @@ def _words(owners: Array, first: int) -> tuple[Array, Array]:
 
 
 def _ends(bit: Array, words: Array) -> tuple[Array, Array]:
-    """First index of words [L, T] with `bit` set, and the index after the last, [T] float32; both 0 if there is none."""
+    """First index of words [L, T] with `bit` set, and the index after the last, [T] float32; both 0 if none has it."""
     present, position = (words >> bit) & 1 > 0, jnp.arange(len(words), dtype=jnp.float32)[:, None]
     last = reduce_halves(jnp.where(present, position + 1, 0.0), 0, jnp.maximum)
     first = len(words) - reduce_halves(jnp.where(present, len(words) - position, 0.0), 0, jnp.maximum)

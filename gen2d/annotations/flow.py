@@ -41,15 +41,15 @@ def _tables(at: Instants, step: int, plan: FramePlan) -> Array:
 
     A pixel at (x, y) moves by dx = a x + b y + c, dy = d x + e y + f. Past the ends of the video nothing moves.
     """
-    target = jnp.clip(jnp.arange(len(at.angle)) + step, 0, len(at.angle) - 1)
-    later = jax.tree.map(lambda a: a[target], at)
-    start, end = (to_pixels(i.view, i.position, plan.height, plan.width) for i in (at, later))
-    zoom = later.view.scale / at.view.scale
-    turn = (at.angle - later.angle) - (at.view.angle - later.view.angle)[:, None]  # clockwise as seen
+    target_frames = jnp.clip(jnp.arange(len(at.angle)) + step, 0, len(at.angle) - 1)
+    target = jax.tree.map(lambda a: a[target_frames], at)
+    start, end = (to_pixels(i.view, i.position, plan.height, plan.width) for i in (at, target))
+    zoom = target.view.scale / at.view.scale
+    turn = (at.angle - target.angle) - (at.view.angle - target.view.angle)[:, None]  # clockwise as seen
     bodies = _motion(start, end, turn, zoom[:, None])
     origin = jnp.broadcast_to(at.view.center[:, None], (*at.view.scale.shape, 1, 2))
-    origin_start, origin_end = (to_pixels(view, origin, plan.height, plan.width) for view in (at.view, later.view))
-    ground = _motion(origin_start, origin_end, (later.view.angle - at.view.angle)[:, None], zoom[:, None])
+    origin_start, origin_end = (to_pixels(view, origin, plan.height, plan.width) for view in (at.view, target.view))
+    ground = _motion(origin_start, origin_end, (target.view.angle - at.view.angle)[:, None], zoom[:, None])
     return jnp.concatenate([ground, bodies], axis=1)
 
 
@@ -92,11 +92,11 @@ def _by_pixels(
         table = jnp.broadcast_to(table[:, :1], table.shape) if ground else table
 
         def frame(t: Array) -> tuple[Array, Array]:
-            owner, later = owners[t], owners[t + step].reshape(-1)
+            owner, target_owners = owners[t], owners[t + step].reshape(-1)
             known = owner < OCCLUDER
             motion = table[t, jnp.where(known, owner, 0).astype(jnp.int32)]
             flow, end_pixel, inside = _ends(jnp.where(known[..., None], motion, 0.0), x, y, *owner.shape)
-            return flow, (inside & (later[end_pixel] == owner)).astype(jnp.uint8)
+            return flow, (inside & (target_owners[end_pixel] == owner)).astype(jnp.uint8)
 
         padding = (begin, owners.shape[0] - end)
         return jax.tree.map(

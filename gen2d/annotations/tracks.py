@@ -76,7 +76,7 @@ def _inside(stage: RenderScene, run: SlotGroup, first: int, count: int) -> Array
 
 
 def _in_polygon(vertices: Array, u: Array, v: Array, w: Array) -> Array:
-    """Points [k, P, 2] uniform in polygons: each is in a triangle at the first vertex, chosen in proportion to its area."""
+    """Points [k, P, 2] uniform in polygons, which are cut into triangles at the first vertex, chosen by area."""
     corners = vertices - vertices[:, :1]
     following = jnp.roll(corners, -1, axis=1)
     area = corners[..., 0] * following[..., 1] - corners[..., 1] * following[..., 0]
