@@ -77,7 +77,7 @@ def ownership(owner: Array, cover: Array, name: Array | int) -> Array:
 
 
 def hard(linear: bool) -> Painter:
-    """Painter of a `LayerCanvas`, in integers."""
+    """Painter of a `LayerCanvas`, which rounds each layer to integers."""
 
     def paint(canvas: LayerCanvas, cover: Array, color: Array, name: Any) -> LayerCanvas:
         image, owner = canvas
@@ -114,7 +114,7 @@ def blurred(cover: Array, sigma: float) -> Array:
 
 
 def background_image(stage: RenderScene, at: Instants, plan: FramePlan) -> Array:
-    """Background [I, H, W, 3] at the instants `at`, in floats; [1, H, W, 3] for a plain colour."""
+    """Background [I, H, W, 3] in floats at the instants `at`; [1, H, W, 3] if it is a plain colour."""
     background, first = stage.paint.background, stage.instants.view
     color, height, width = background.color, plan.height, plan.width
     if background.to_color is None and background.texture is None:
@@ -135,7 +135,7 @@ def background_image(stage: RenderScene, at: Instants, plan: FramePlan) -> Array
 
 
 def background_layer(stage: RenderScene, at: Instants, plan: FramePlan) -> LayerCanvas:
-    """Canvas of the background alone at the instants `at`; [1, ...] for a plain colour."""
+    """Canvas of the background alone at the instants `at`; its arrays are [1, ...] if they do not change."""
     return LayerCanvas(
         (background_image(stage, at, plan) + 0.5).astype(jnp.uint8) if plan.frames else None,
         jnp.full((1, plan.height, plan.width), NOBODY, jnp.int32) if plan.owners else None,

@@ -13,7 +13,7 @@ from gen2d.renderers.camera import to_pixels
 from gen2d.renderers.paint import Paint
 from gen2d.renderers.primitives import BodyGeometry, Instants, PixelWindow
 
-LANES = 8  # px, divides the width of a tile: its rows fill whole SIMD vectors
+LANES = 8  # px; tile widths are rounded up to multiples of this, whole SIMD vectors
 
 
 class Occluders(NamedTuple):
@@ -21,7 +21,7 @@ class Occluders(NamedTuple):
 
     box: Array  # [O, 4] px: left, top, right, bottom
     color: Array  # [O, 3] sRGB
-    rank: Array  # [O] number of moving slots behind them, in drawing order
+    rank: Array  # [O] number of slots of `FramePlan.groups` behind them, in drawing order
 
 
 class RenderScene(NamedTuple):
@@ -33,7 +33,7 @@ class RenderScene(NamedTuple):
     paint: Paint
     occluders: Occluders | None
     noise: Array | None  # sRGB, standard deviation of the sensor noise
-    seed: Array  # uint32, of the sensor noise
+    seed: Array  # uint32, of the sensor noise and the track points
 
 
 @dataclasses.dataclass(frozen=True)
@@ -76,12 +76,12 @@ class FramePlan:
         return sum(len(group.slots) for group in self.groups)
 
     def _reach(self, run: SlotGroup) -> float:
-        """Bound of the distance from centre to rim (px); infinite if a tile would be as large as the frame."""
+        """`largest`, but infinite if a tile would be as large as the frame."""
         reach = self.largest(run)
         return reach if 2 * reach + 2 < max(self.height, self.width) else math.inf
 
     def largest(self, run: SlotGroup) -> float:
-        """Upper bound of the radius (px) of a disc of a run; infinite for static runs."""
+        """Upper bound of the distance from centre to rim (px) of a run's objects; infinite for static runs."""
         return math.inf if run.kind == STATIC else self.layout.reach * self.scale + self.grow
 
 

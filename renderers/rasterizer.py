@@ -4,9 +4,10 @@ An object's colour contributes to a pixel in proportion to the exact area that t
 uses sRGB values, as most tools do, or linear light. Each layer is rounded, as in a frame buffer. The same pass finds
 the owner of each pixel, the object that it shows most of.
 
-The static layer is rendered once per video. Moving slots are rendered in one of two forms, with the same result: on a
-CPU (tiles.py) each object is painted into a tile of its own size, one after the other; on a GPU (`draw_dense`) each
-pixel evaluates every object, which fuses. `draw_soft` is the dense form without rounding, for gradients.
+The static layer is rendered once per video. Moving slots are rendered in one of two forms, whose frames differ by at
+most one grey level. On a CPU (tiles.py) each object is painted into a tile of its own size, one after the other. On a
+GPU (`draw_dense`) each pixel evaluates every object, which fuses. `draw_soft` is the dense form without rounding, for
+gradients.
 """
 
 import dataclasses
