@@ -1,1 +1,1 @@
-"""The rasterizer: objects in world units to frames, with exact coverage; looks lie in `looks/`."""
+"""Rasterizer: scenes in metres to frames in pixels, with exact coverage. The looks are in `looks/`."""

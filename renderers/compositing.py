@@ -1,7 +1,8 @@
-"""Layers: how one is painted over an image, and those that cover all of it, back to front.
+"""Compositing: layers painted over full-size images, back to front.
 
-Images are uint8 frames, owners (which object each pixel shows most of), or floats; what paints one is a function
-`paint(image, cover, color, name)`: coverage [I, H, W] from 0 to 1, sRGB colour, and the id of what is painted.
+A `Painter` is a function `paint(canvas, cover, color, name)` that paints one layer: its coverage [I, H, W] from 0 to 1,
+its sRGB colour, and its id. The canvas is a `LayerCanvas` of frames and owners, or a float image. The owner of a pixel
+is the object that the pixel shows most of.
 """
 
 import math
@@ -21,15 +22,15 @@ from gen2d.renderers.plan import FramePlan, RenderScene
 from gen2d.renderers.primitives import Instants, PixelWindow, object_parts
 from gen2d.renderers.shading import EdgeSamples, covered_color, edge_samples, fills_of
 
-FULL = 2**15 - 1  # a pixel's coverage is a whole number up to this
-NOBODY = FULL << 8  # owner of the background
-OCCLUDER = 255  # what a mask says of a pixel that shows an occluder
+FULL = 2**15 - 1  # a quantised coverage of 1
+NOBODY = FULL << 8  # owner of a pixel that shows only background
+OCCLUDER = 255  # id of all occluders
 
 Painter = Callable[[Any, Array, Array, Any], Any]
 
 
 class LayerCanvas(NamedTuple):
-    """Images that are painted on, uint8 [I, H, W, 3] and int32 [I, H, W], if they are wanted."""
+    """Frames, uint8 [I, H, W, 3], and owners, int32 [I, H, W] as in `ownership`; None where they are not wanted."""
 
     image: Array | None
     owner: Array | None
@@ -39,35 +40,36 @@ class LayerCanvas(NamedTuple):
 
 
 def to_levels(cover: Array) -> Array:
-    """A coverage from 0 to 1 as whole numbers up to FULL, int16."""
+    """Coverage from 0 to 1 as int16 from 0 to FULL."""
     return (cover * FULL + 0.5).astype(jnp.int32).astype(jnp.int16)
 
 
 def to_ink(color: Array) -> Array:
-    """A colour as whole numbers, int16."""
+    """Colour rounded to int16."""
     return (color + 0.5).astype(jnp.int32).astype(jnp.int16)
 
 
 def over(under: Array, cover: Array, color: Array, linear: bool) -> Array:
-    """The uint8 image [..., 3] after a layer of `to_levels` coverage [...] and of an `to_ink` that fits it."""
+    """Composite of a layer over a uint8 image [..., 3]; `to_levels` gives the coverage [...], `to_ink` the colour."""
     cover = cover[..., None]
     if linear:
         light = jnp.asarray(LINEAR)[under.astype(jnp.int32)]
-        share = cover.astype(jnp.float32) * (1 / FULL)
-        mixed = light + share * (to_linear(color.astype(jnp.float32)) - light)
+        alpha = cover.astype(jnp.float32) * (1 / FULL)
+        mixed = light + alpha * (to_linear(color.astype(jnp.float32)) - light)
         return (to_srgb(mixed) + 0.5).astype(jnp.uint8)
-    # Fixed point, so that both forms round alike: 5 bits below one, products of 16 bits, of which a vector has many.
+    # Fixed point, so that tiles and dense rendering round alike: 5 fractional bits, in 16-bit integers, of which a
+    # SIMD vector holds many.
     under = under.astype(jnp.int16)
-    apart = (color - under) << 6
-    product = ((apart.astype(jnp.int32) * cover.astype(jnp.int32)) >> 16).astype(jnp.int16)
+    difference = (color - under) << 6
+    product = ((difference.astype(jnp.int32) * cover.astype(jnp.int32)) >> 16).astype(jnp.int16)
     return (under + ((product + 16) >> 5)).astype(jnp.uint8)
 
 
 def ownership(owner: Array, cover: Array, name: Array | int) -> Array:
-    """Who is seen most of in each pixel, after a layer of `to_levels` coverage.
+    """Owner of each pixel after a layer of coverage by `to_levels` and id `name` is painted over the current owners.
 
-    An owner is an id and, above its 8 bits, how much of the pixel its object shows, up to FULL; what comes on top
-    leaves the same share of all that was there, so only the best so far has to be known.
+    An owner packs the id of an object into its low 8 bits, and the visible share of the pixel, up to FULL, above them.
+    A layer scales the visible shares of everything below it by the same factor, so only the largest share is kept.
     """
     cover = cover.astype(jnp.int32)
     best = ((owner >> 8) * (FULL - cover) + FULL // 2) // FULL
@@ -75,7 +77,7 @@ def ownership(owner: Array, cover: Array, name: Array | int) -> Array:
 
 
 def hard(linear: bool) -> Painter:
-    """What paints on a canvas, in whole numbers."""
+    """Painter of a `LayerCanvas`, which rounds each layer to integers."""
 
     def paint(canvas: LayerCanvas, cover: Array, color: Array, name: Any) -> LayerCanvas:
         image, owner = canvas
@@ -88,7 +90,7 @@ def hard(linear: bool) -> Painter:
 
 
 def soft(linear: bool, sigma: float = 0.0) -> Painter:
-    """What paints on an image of floats, sRGB or linear light; `sigma` (px) blurs every coverage."""
+    """Painter of a float image in sRGB or linear light, without rounding; `sigma` (px) blurs each layer's coverage."""
 
     def paint(image: Array, cover: Array, color: Array, name: Any) -> Array:
         cover = blurred(cover, sigma) if sigma else cover
@@ -98,7 +100,7 @@ def soft(linear: bool, sigma: float = 0.0) -> Painter:
 
 
 def blurred(cover: Array, sigma: float) -> Array:
-    """Coverage [I, H, W] under a Gaussian of standard deviation `sigma` (px), to 4 sigma; the edge goes on outside."""
+    """Coverage [I, H, W] blurred by a Gaussian of standard deviation `sigma` (px), cut off at 4 sigma; edges repeat."""
     reach = math.ceil(4 * sigma)
     kernel = np.exp(-0.5 * (np.arange(-reach, reach + 1) / sigma) ** 2)
     kernel = jnp.asarray(kernel / kernel.sum(), cover.dtype)
@@ -108,11 +110,11 @@ def blurred(cover: Array, sigma: float) -> Array:
     return images[:, 0]
 
 
-# ---- What covers all of an image
+# ---- Full-size layers
 
 
 def background_image(stage: RenderScene, at: Instants, plan: FramePlan) -> Array:
-    """The background [I, H, W, 3] at some instants, as floats; [1, H, W, 3] where it is the same at all."""
+    """Background [I, H, W, 3] in floats at the instants `at`; [1, H, W, 3] if it is a plain colour."""
     background, first = stage.paint.background, stage.instants.view
     color, height, width = background.color, plan.height, plan.width
     if background.to_color is None and background.texture is None:
@@ -121,7 +123,7 @@ def background_image(stage: RenderScene, at: Instants, plan: FramePlan) -> Array
     rows, columns = (a.reshape(-1) for a in jnp.meshgrid(rows, columns, indexing="ij"))
     x, y = (a.reshape(-1, height, width) for a in to_world(at.view, columns, rows, height, width))
     if background.to_color is not None and background.direction is not None:
-        # From one end of what the first frame shows to the other.
+        # The gradient spans the view of the first frame.
         cos, sin = jnp.cos(background.direction), jnp.sin(background.direction)
         center, scale = first.center[0], first.scale[0]
         reach = (jnp.abs(cos) * width + jnp.abs(sin) * height) / (2 * scale)
@@ -133,8 +135,7 @@ def background_image(stage: RenderScene, at: Instants, plan: FramePlan) -> Array
 
 
 def background_layer(stage: RenderScene, at: Instants, plan: FramePlan) -> LayerCanvas:
-    """The background alone at some instants, if its image and owners are wanted; [1, ...] where it is always the
-    same."""
+    """Canvas of the background alone at the instants `at`; its arrays are [1, ...] if they do not change."""
     return LayerCanvas(
         (background_image(stage, at, plan) + 0.5).astype(jnp.uint8) if plan.frames else None,
         jnp.full((1, plan.height, plan.width), NOBODY, jnp.int32) if plan.owners else None,
@@ -142,7 +143,7 @@ def background_layer(stage: RenderScene, at: Instants, plan: FramePlan) -> Layer
 
 
 def static_layer(stage: RenderScene, plan: FramePlan) -> LayerCanvas:
-    """What never moves, [1, ...], without the occluders: these stand before what moves."""
+    """Canvas [1, ...] of the background and of static slots behind all moving ones, without occluders."""
     first = jax.tree.map(lambda a: a[:1], stage.instants)
     alone = stage._replace(occluders=None)
     return all_over(background_layer(stage, first, plan), alone, plan, first, plan.behind, hard(plan.linear))
@@ -151,36 +152,36 @@ def static_layer(stage: RenderScene, plan: FramePlan) -> LayerCanvas:
 def all_over(
     canvas: Any, stage: RenderScene, plan: FramePlan, at: Instants, runs: list[tuple[SlotGroup, int]], paint: Painter
 ) -> Any:
-    """The canvas after some runs' slots and what stands before them were painted over all of it.
+    """Canvas with the slots of `runs`, and the occluders between them, painted over its full size.
 
-    A loop over the slots: what depends on rows or columns alone is then computed before it, once, and not again for
-    every pixel, as it would be where the compiler fused all.
+    The loop over slots keeps the compiler from fusing terms that depend on a row or a column alone into the
+    computation of each pixel: they are computed once, before the loop.
     """
     window = PixelWindow(0, 0, plan.height, plan.width)
     rank = 0
     for run, first in runs:
         slots = slice(first, first + run.count)
 
-        def all_of(
+        def paint_run(
             canvas: Any, run: SlotGroup = run, first: int = first, slots: slice = slots, rank: int = rank
         ) -> Any:
-            def one(canvas: Any, entry: tuple) -> tuple[Any, None]:
-                cuts, inks, slot, rank = entry
+            def paint_slot(canvas: Any, entry: tuple) -> tuple[Any, None]:
+                edges, fills, slot, rank = entry
                 canvas = static_objects(canvas, stage, plan, lambda of: of == rank, paint)
-                return paint(canvas, *covered_color(cuts, inks, window, plan.largest(run)), slot + 1), None
+                return paint(canvas, *covered_color(edges, fills, window, plan.largest(run)), slot + 1), None
 
-            numbers = jnp.arange(run.count)
+            offsets = jnp.arange(run.count)
             entries = cut_of(stage, plan, at, run, first, window), fills_of(stage.paint, slots)
-            return jax.lax.scan(one, canvas, (*entries, first + numbers, rank + numbers))[0]
+            return jax.lax.scan(paint_slot, canvas, (*entries, first + offsets, rank + offsets))[0]
 
-        some = stage.occluders is not None or stage.paint.drawn[slots].any()
-        canvas = jax.lax.cond(some, all_of, lambda same: same, canvas)
+        needed = stage.occluders is not None or stage.paint.drawn[slots].any()
+        canvas = jax.lax.cond(needed, paint_run, lambda same: same, canvas)
         rank += run.count
     return canvas
 
 
 def moving_objects(canvas: Any, stage: RenderScene, plan: FramePlan, at: Instants, paint: Painter) -> Any:
-    """The canvas after what moves and the occluders between were painted over all of it."""
+    """Canvas with all moving slots and all occluders painted over its full size."""
     canvas = all_over(canvas, stage, plan, at, [span for group in plan.groups for span in group.runs], paint)
     return static_objects(canvas, stage, plan, lambda rank: rank >= plan.moving, paint)
 
@@ -188,7 +189,7 @@ def moving_objects(canvas: Any, stage: RenderScene, plan: FramePlan, at: Instant
 def static_objects(
     canvas: Any, stage: RenderScene, plan: FramePlan, here: Callable[[Array], Array], paint: Painter
 ) -> Any:
-    """The canvas after those occluders whose rank is `here`."""
+    """Canvas with the occluders painted whose rank satisfies `here`."""
     if stage.occluders is None:
         return canvas
     for i, rank in enumerate(stage.occluders.rank):
@@ -198,7 +199,7 @@ def static_objects(
 
 
 def occluder(stage: RenderScene, plan: FramePlan, i: int, here: Array) -> tuple[Array, Array]:
-    """Coverage [1, H, W], none unless it is `here`, and colour [3] of an occluder."""
+    """Coverage [1, H, W] and colour [3] of occluder `i`; the coverage is 0 unless `here` is true."""
     assert stage.occluders is not None
     left, top, right, bottom = stage.occluders.box[i]
 
@@ -213,16 +214,16 @@ def occluder(stage: RenderScene, plan: FramePlan, i: int, here: Array) -> tuple[
 def cut_of(
     stage: RenderScene, plan: FramePlan, at: Instants, run: SlotGroup, first: int, window: PixelWindow
 ) -> EdgeSamples:
-    """The parts of a run's slots at some instants, cut by their windows; arrays [k, I, ...].
+    """Edge samples of a run's slots in their windows at the instants `at`; arrays [k, I, ...].
 
-    In a loop of its own, for what is the same for all rows and columns to be there before it.
+    The loop over slots keeps the compiler from computing the parts again for each row and column.
     """
     parts = object_parts(run, first, stage.bodies, at, stage.paint, plan.height, plan.width)
     toned = stage.paint.shade is not None or stage.paint.texture is not None
-    begin = [jnp.broadcast_to(jnp.asarray(edge), parts.turn.column.shape) for edge in (window.top, window.left)]
+    corners = [jnp.broadcast_to(jnp.asarray(edge), parts.turn.column.shape) for edge in (window.top, window.left)]
 
-    def one(entry: tuple) -> EdgeSamples:
-        of, top, left = entry
-        return edge_samples(of, PixelWindow(top, left, window.rows, window.columns), run.shape == "circle", toned)
+    def sample(entry: tuple) -> EdgeSamples:
+        part, top, left = entry
+        return edge_samples(part, PixelWindow(top, left, window.rows, window.columns), run.shape == "circle", toned)
 
-    return jax.lax.map(one, (parts, *begin))
+    return jax.lax.map(sample, (parts, *corners))

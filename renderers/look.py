@@ -1,4 +1,4 @@
-"""What looks have in common: options of backgrounds, colours and lines, and a paint of plain shapes to begin with."""
+"""Shared parts of looks: options of backgrounds, colours and lines, and the paint of plain shapes."""
 
 import dataclasses
 
@@ -17,14 +17,14 @@ from gen2d.renderers.paint import Background, Paint, Texture
 
 @dataclasses.dataclass(frozen=True)
 class LineOptions:
-    """How segments are drawn."""
+    """Options of segments, which are rendered as lines."""
 
     wall_width: float = option(1.5, float, "px", "of a segment's line, beyond its own radius; 0: not drawn", low=0)
 
 
 @dataclasses.dataclass(frozen=True)
 class PlainOptions(LineOptions):
-    """Background, colours and lines of plain shapes."""
+    """Options of the background, colours and lines of plain shapes."""
 
     background_kind: str = option("plain", str, "", "what is behind everything", choices=("plain", "gradient", "noise"))
     background: tuple = option(
@@ -41,19 +41,19 @@ class PlainOptions(LineOptions):
 
 
 def line_margin(options: LineOptions) -> float:
-    """How far an object may be drawn beyond its rim, px: half a segment's line."""
+    """Largest distance (px) that an object is rendered beyond its own rim: half the line width of segments."""
     return options.wall_width / 2
 
 
 def plain(scene: Scene, layout: Layout, options: PlainOptions, key: Array) -> Paint:
-    """Every slot in one colour on the background. One key gives the same colours in all looks."""
+    """Paint with one colour per slot. The same key gives the same colours in all looks."""
     background = background_of(options, layout, jax.random.fold_in(key, 1))
     colors = colors_of(scene, layout, options, key, background)
     return Paint(background, colors, *line_fields(scene, options))
 
 
 def background_of(options: PlainOptions, layout: Layout, key: Array) -> Background:
-    """The background that is asked for: plain, a gradient in a random direction, or noise."""
+    """Background by `background_kind`: plain, a gradient in a random direction, or noise."""
     color, to_color = (jnp.asarray(c, jnp.float32) for c in (options.background, options.background_to))
     if options.background_kind == "plain":
         return Background(color)
@@ -65,19 +65,19 @@ def background_of(options: PlainOptions, layout: Layout, key: Array) -> Backgrou
 
 
 def shades(background: Background) -> Array:
-    """The colours [B, 3] of a background: its own, or both that it goes between and what is halfway."""
-    color, other = background.color, background.to_color if background.texture is None else background.texture.color
-    return color[None] if other is None else jnp.stack([color, (color + other) / 2, other])
+    """Colours [B, 3] that represent a background: its only colour, or its two end colours and their mean."""
+    color, end = background.color, background.to_color if background.texture is None else background.texture.color
+    return color[None] if end is None else jnp.stack([color, (color + end) / 2, end])
 
 
 def mean_color(background: Background) -> Array:
-    """The colour [3] halfway between the two of a background."""
+    """Mean colour [3] of a background."""
     return shades(background).mean(0)
 
 
 def colors_of(scene: Scene, layout: Layout, options: PlainOptions, key: Array, background: Background) -> Array:
-    """The colours [K, 3] of the slots: the scene's, or random ones for all that moves, which differ from one another
-    and from the background's."""
+    """Colours [K, 3] of the slots: those of the scene, or for moving slots a random palette that contrasts with itself
+    and with the background."""
     colors, moving = scene.objects.color.astype(jnp.float32), np.flatnonzero(are_moving(layout))
     if options.palette == "scene" or not len(moving):
         return colors
@@ -85,25 +85,25 @@ def colors_of(scene: Scene, layout: Layout, options: PlainOptions, key: Array, b
 
 
 def line_fields(scene: Scene, options: LineOptions) -> tuple[Array, Array]:
-    """Which slots are drawn [K], and what is added to their rims [K] px: segments are lines of a width beyond their own
-    radius, and are not drawn if they have neither."""
+    """The fields `drawn` [K] and `grow` [K] px of a `Paint`: segments grow by half the line width, and are not rendered
+    if both their radius and the line width are 0."""
     line, objects = are_lines(scene), scene.objects
     drawn = objects.present & ~(line & (objects.radius + options.wall_width <= 0))
     return drawn, jnp.where(line, line_margin(options), 0.0)
 
 
 def are_lines(scene: Scene) -> Array:
-    """Which slots are segments [K], in whatever runs they are."""
+    """Mask [K] of the slots that hold segments, by the shapes of the scene."""
     return scene.objects.shape == SHAPES.index("segment")
 
 
 def are_moving(layout: Layout) -> np.ndarray:
-    """Which slots are not static [K]."""
+    """Mask [K] of the slots that are not static."""
     return np.repeat([run.kind != STATIC for run in layout.runs], [run.count for run in layout.runs])
 
 
 def contrasting(colors: Array) -> Array:
-    """Nearly black or nearly white [..., 3], whichever differs more in lightness from the colours [..., 3]."""
+    """Near-black or near-white [..., 3], whichever has the higher contrast ratio to the colours [..., 3]."""
     luminance = to_linear(colors) @ jnp.asarray([0.2126, 0.7152, 0.0722])
-    # At 0.175 the ratios of luminances, both with 0.05 added, are equal (WCAG 2.2, 'contrast ratio').
+    # At a luminance of 0.175 the contrast ratios to the two are equal (WCAG 2.2, 'contrast ratio').
     return jnp.where((luminance > 0.175)[..., None], 16.0, 240.0) + jnp.zeros_like(colors)

@@ -9,28 +9,27 @@ from gen2d.renderers.paint import Texture
 
 
 def _hashed(x: Array) -> Array:
-    """A well-mixed 32-bit word of another (the finalizer 'lowbias32' of C. Wellons, 2018)."""
+    """Well-mixed 32-bit hash of a 32-bit word (the finalizer 'lowbias32' of C. Wellons, 2018)."""
     x = (x ^ (x >> 16)) * jnp.uint32(0x7FEB352D)
     x = (x ^ (x >> 15)) * jnp.uint32(0x846CA68B)
     return x ^ (x >> 16)
 
 
 def hashed(*words: Any) -> Array:
-    """A random 32-bit word for each combination of integers."""
-    total = jnp.uint32(0x9E3779B9)
+    """Random 32-bit words, uint32, of combinations of integers; the arguments are broadcast."""
+    state = jnp.uint32(0x9E3779B9)
     for word in words:
-        total = _hashed(total ^ jnp.asarray(word).astype(jnp.uint32))
-    return total
+        state = _hashed(state ^ jnp.asarray(word).astype(jnp.uint32))
+    return state
 
 
 def fraction(word: Array) -> Array:
-    """A word as a number from 0 to below 1: its first 24 bits."""
+    """Upper 24 bits of a 32-bit word as a float32 in [0, 1)."""
     return (word >> 8).astype(jnp.float32) * (1 / 2**24)
 
 
 def noise(x: Array, y: Array, seed: Array) -> Array:
-    """Smooth noise between 0 and 1, with a cell of 1: random values at whole numbers, between them a cubic blend; two
-    octaves."""
+    """Value noise in [0, 1] with a cell of 1: two octaves of random values on the integers, with cubic blending."""
     fine = _octave(2 * x + 0.37, 2 * y + 0.71, hashed(seed, 1))
     return (2 * _octave(x, y, seed) + fine) / 3
 
@@ -48,6 +47,6 @@ def _octave(x: Array, y: Array, seed: Array) -> Array:
 
 
 def textured(color: Array, texture: Texture, x: Array, y: Array) -> Array:
-    """The colours [..., 3] of a texture at x and y [...] in m, on something of `color` [..., 3] or what fits it."""
+    """Colours [..., 3] of a texture at x and y [...] in m, on a base of `color` [..., 3] (broadcast)."""
     share = noise(x / texture.cell, y / texture.cell, texture.seed)[..., None]
     return color + share * (texture.color - color)

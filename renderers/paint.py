@@ -1,5 +1,6 @@
-"""What a look gives for a video: what each slot is painted with, and what is behind everything. Colours are sRGB, 0 to
-255 as floats; what a look leaves None does not exist and costs nothing.
+"""Paint: the result of a look for one video.
+
+Colours are sRGB from 0 to 255 in floats. A part that is None is not rendered and costs nothing.
 """
 
 from typing import NamedTuple
@@ -8,33 +9,33 @@ from gen2d.records.axes import Array
 
 
 class Texture(NamedTuple):
-    """A pattern of procedural noise that sticks to what it is on."""
+    """Procedural noise that is fixed to an object or to the background."""
 
     seed: Array  # [...] uint32
     cell: Array  # [...] m, size of the coarsest spots
-    color: Array  # [..., 3] of the brightest spots; the darkest have the colour of what it is on
+    color: Array  # [..., 3] where the noise is 1; where it is 0 the base colour shows
 
 
 class Background(NamedTuple):
-    """Behind everything."""
+    """Background: a colour, a gradient, or noise."""
 
     color: Array  # [3]
-    to_color: Array | None = None  # [3] of a gradient's other end
-    direction: Array | None = None  # rad, in which a gradient goes
+    to_color: Array | None = None  # [3] at the end of a gradient
+    direction: Array | None = None  # rad, of a gradient, from `color` to `to_color`
     texture: Texture | None = None
 
 
 class Paint(NamedTuple):
-    """What a look gives for one video."""
+    """Paint of one video's slots and background."""
 
     background: Background
     color: Array  # [K, 3]
-    drawn: Array  # [K] bool
-    grow: Array | None = None  # [K] px, beyond the object's own rim: the width of a line without one
-    fill: Array | None = None  # [K, 3] of the inside, where that is not of the object's colour
+    drawn: Array  # [K] bool, whether the slot is rendered
+    grow: Array | None = None  # [K] px, added to the object's radius: half a line's width
+    fill: Array | None = None  # [K, 3] of the interior, instead of `color`
     rim: Array | None = None  # [K] px, width of a line along the inside of the rim
     rim_color: Array | None = None  # [K, 3]
-    mark: Array | None = None  # [K] half the width of a bar from the centre to the rim, over the way to the nearest rim
+    mark: Array | None = None  # [K] half width of a bar from centre to rim, over the distance of the nearest rim
     mark_color: Array | None = None  # [K, 3]
-    shade: Array | None = None  # [K] how much darker the rim is than the middle, 0 to 1
-    texture: Texture | None = None  # of [K]
+    shade: Array | None = None  # [K] relative darkening opposite the light, 0 to 1
+    texture: Texture | None = None  # arrays [K, ...]

@@ -1,4 +1,4 @@
-"""What a picture is made from: all that one video is drawn from, and what is known of its pictures before that."""
+"""Render scene of a video, and the frame plan: image properties that are known before rendering."""
 
 import dataclasses
 import math
@@ -13,91 +13,91 @@ from gen2d.renderers.camera import to_pixels
 from gen2d.renderers.paint import Paint
 from gen2d.renderers.primitives import BodyGeometry, Instants, PixelWindow
 
-LANES = 8  # pixels: a patch's rows are whole SIMD vectors
+LANES = 8  # px; tile widths are rounded up to multiples of this, whole SIMD vectors
 
 
 class Occluders(NamedTuple):
-    """Rectangles that stand still in the picture, back to front."""
+    """Rectangles that are fixed in the image, back to front."""
 
     box: Array  # [O, 4] px: left, top, right, bottom
     color: Array  # [O, 3] sRGB
-    rank: Array  # [O] how many of the moving slots, in drawing order, they stand before
+    rank: Array  # [O] number of slots of `FramePlan.groups` behind them, in drawing order
 
 
 class RenderScene(NamedTuple):
-    """All that one video is drawn from; any number of them have their axes before these."""
+    """Input of the rasterizer for one video; batches add leading axes."""
 
     bodies: BodyGeometry
     instants: Instants  # at the T frames
     exposed: Instants | None  # [T, S, ...] at the S instants of each exposure
     paint: Paint
     occluders: Occluders | None
-    noise: Array | None  # sRGB, standard deviation
-    seed: Array  # uint32, of the noise
+    noise: Array | None  # sRGB, standard deviation of the sensor noise
+    seed: Array  # uint32, of the sensor noise and the track points
 
 
 @dataclasses.dataclass(frozen=True)
 class FramePlan:
-    """What is known of a picture before anything is drawn."""
+    """Static properties of the frames: size, scale, camera, and which outputs are wanted."""
 
     layout: Layout
     height: int  # px
     width: int
-    scale: float  # px/m at most
-    grow: float = 0.0  # px at most, that a look adds to an object's rim
+    scale: float  # px/m, upper bound
+    grow: float = 0.0  # px, upper bound of what the look adds to an object's rim
     still: bool = True  # whether the camera never moves
     linear: bool = False  # whether colours mix in linear light
     frames: bool = True  # whether frames are wanted
-    owners: bool = False  # whether it is wanted which object each pixel shows
-    exposed: int = 0  # instants of an exposure; 0: no motion blur
+    owners: bool = False  # whether owners are wanted: the object that each pixel shows
+    exposed: int = 0  # instants per exposure; 0: no motion blur
 
     @property
     def behind(self) -> list[tuple[SlotGroup, int]]:
-        """The runs of the unmoving layer, back to front."""
+        """Runs of the static layer, each with its first slot, back to front; empty if the camera moves."""
         spans = self.layout.painted
         first = next((i for i, (run, _) in enumerate(spans) if not self.still or run.kind != STATIC), len(spans))
         return list(spans[:first])
 
     @property
     def groups(self) -> "list[TileGroup]":
-        """The others, in groups that share a size of patch."""
-        found: list[TileGroup] = []
+        """Remaining runs, in consecutive groups that share a tile size."""
+        groups: list[TileGroup] = []
         for run, first in self.layout.painted[len(self.behind) :]:
             reach = self._reach(run)
-            if found and found[-1].reach == reach:
-                found[-1] = TileGroup((*found[-1].runs, (run, first)), reach)
+            if groups and groups[-1].reach == reach:
+                groups[-1] = TileGroup((*groups[-1].runs, (run, first)), reach)
             else:
-                found.append(TileGroup(((run, first),), reach))
-        return found
+                groups.append(TileGroup(((run, first),), reach))
+        return groups
 
     @property
     def moving(self) -> int:
-        """How many slots those are."""
+        """Number of slots in `groups`."""
         return sum(len(group.slots) for group in self.groups)
 
     def _reach(self, run: SlotGroup) -> float:
-        """Of an object from its centre, px; as large as the picture where that is not known to be less."""
+        """`largest`, but infinite if a tile would be as large as the frame."""
         reach = self.largest(run)
         return reach if 2 * reach + 2 < max(self.height, self.width) else math.inf
 
     def largest(self, run: SlotGroup) -> float:
-        """No disc of a run is larger, px."""
+        """Upper bound of the distance from centre to rim (px) of a run's objects; infinite for static runs."""
         return math.inf if run.kind == STATIC else self.layout.reach * self.scale + self.grow
 
 
 class TileGroup(NamedTuple):
-    """Runs that are drawn into patches of one size."""
+    """Consecutive runs that are rendered into tiles of one size."""
 
     runs: tuple[tuple[SlotGroup, int], ...]
     reach: float  # px
 
     @property
     def slots(self) -> list[int]:
-        """Its slots in drawing order."""
+        """Slots in drawing order."""
         return [slot for run, first in self.runs for slot in range(first, first + run.count)]
 
     def size(self, height: int, width: int) -> tuple[int, int]:
-        """Rows and columns of a patch."""
+        """Rows and columns of a tile."""
         if math.isinf(self.reach):
             return height, width
         side = math.floor(2 * self.reach) + 2
@@ -105,14 +105,14 @@ class TileGroup(NamedTuple):
 
 
 def tile_windows(plan: FramePlan, group: TileGroup, at: Instants, run: SlotGroup, first: int) -> PixelWindow:
-    """The patches of a run's slots at some instants, top and left [k, I]."""
+    """Tiles of a run's slots at the instants `at`, with top and left [k, I]."""
     height, width = plan.height, plan.width
     rows, columns = group.size(height, width)
-    places = to_pixels(at.view, at.position[:, first : first + run.count], height, width)
+    centers = to_pixels(at.view, at.position[:, first : first + run.count], height, width)
 
     def begin(center: Array, size: int, whole: int) -> Array:
         if size == whole:
             return jnp.zeros(center.T.shape, jnp.int32)
         return jnp.clip(jnp.floor(center.T - group.reach).astype(jnp.int32), 0, whole - size)
 
-    return PixelWindow(begin(places[..., 1], rows, height), begin(places[..., 0], columns, width), rows, columns)
+    return PixelWindow(begin(centers[..., 1], rows, height), begin(centers[..., 0], columns, width), rows, columns)

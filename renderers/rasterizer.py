@@ -1,12 +1,13 @@
-"""World to pixels: what each slot is painted as becomes uint8 frames, back to front, on the device.
+"""Rasterizer: render scenes to uint8 frames and owners, back to front, on the device.
 
-A pixel takes an object's colour in proportion to the exact area that the object covers of it (coverage.py), on sRGB
-values, as most tools do, or in linear light; each layer is rounded, as in a frame buffer. The same pass finds which
-object each pixel shows most of.
+An object's colour contributes to a pixel in proportion to the exact area that the object covers (coverage/). Blending
+uses sRGB values, as most tools do, or linear light. Each layer is rounded, as in a frame buffer. The same pass finds
+the owner of each pixel, the object that it shows most of.
 
-What never moves is drawn once a video. What moves is drawn in one of two forms that give the same image: on a CPU
-(patches.py) each object touches a patch of its own size, one after the other; on a GPU (`draw_dense`) every pixel looks
-at every object, which fuses. `draw_soft` is the latter without rounding, for gradients.
+The static layer is rendered once per video. Moving slots are rendered in one of two forms, whose frames differ by at
+most one grey level. On a CPU (tiles.py) each object is painted into a tile of its own size, one after the other. On a
+GPU (`draw_dense`) each pixel evaluates every object, which fuses. `draw_soft` is the dense form without rounding, for
+gradients.
 """
 
 import dataclasses
@@ -39,12 +40,15 @@ from gen2d.xla import on_cpu
 
 
 def draw(stages: RenderScene, plan: FramePlan) -> tuple[Array | None, Array | None]:
-    """Frames [n, T, H, W, 3] uint8 and owners [n, T, H, W] uint8, each if it is wanted, in the form for this device."""
+    """Frames [n, T, H, W, 3] uint8 and owners [n, T, H, W] uint8, None if `plan` does not want them.
+
+    Uses tiles on a CPU, and `draw_dense` elsewhere.
+    """
     return (draw_tiles if on_cpu() else draw_dense)(stages, plan)
 
 
 def draw_dense(stages: RenderScene, plan: FramePlan) -> tuple[Array | None, Array | None]:
-    """The same, every pixel looking at every object. The form for GPUs."""
+    """Frames and owners as from `draw`, with each object evaluated at every pixel. The form for GPUs."""
     return jax.vmap(functools.partial(_dense, plan=plan))(stages)
 
 
@@ -68,17 +72,17 @@ def _dense(stage: RenderScene, plan: FramePlan) -> tuple[Array | None, Array | N
 
 
 def _painted(stage: RenderScene, plan: FramePlan, at: Instants) -> LayerCanvas:
-    """All that is seen at some instants."""
+    """Canvas of all layers at the instants `at`."""
     start = static_layer(stage, plan) if plan.still else background_layer(stage, at, plan)
     canvas = jax.tree.map(lambda a: jnp.broadcast_to(a, (len(at.angle), *a.shape[1:])), start)
     return moving_objects(canvas, stage, plan, at, hard(plan.linear))
 
 
 def draw_soft(stage: RenderScene, plan: FramePlan, sigma: float = 0.0) -> Array:
-    """One video's frames [T, H, W, 3] as floats from 0 to 255, without rounding, noise or motion blur.
+    """Frames [T, H, W, 3] of one video as floats from 0 to 255, without rounding, noise or motion blur.
 
     They are differentiable in positions, angles, sizes, colours and the camera. `sigma` (px) blurs the coverage of each
-    object; with 0 the frames are those of `draw` but for rounding.
+    object; with 0 the frames are those of `draw` up to rounding.
     """
     at, paint = stage.instants, soft(plan.linear, sigma)
     image = background_image(stage, at, plan)
@@ -89,16 +93,16 @@ def draw_soft(stage: RenderScene, plan: FramePlan, sigma: float = 0.0) -> Array:
 
 
 def alone(stage: RenderScene, plan: FramePlan, measure: Callable[[Array], Array]) -> Array:
-    """What `measure` makes of the coverage [T, H, W] of each slot as if it were alone, [T, K, ...]."""
-    window, found = PixelWindow(0, 0, plan.height, plan.width), []
+    """Results [T, K, ...] of `measure` on the coverage [T, H, W] of each slot, rendered without any other slot."""
+    window, results = PixelWindow(0, 0, plan.height, plan.width), []
     for run, first in plan.layout.spans:
         stands = plan.still and run.kind == STATIC
         at = jax.tree.map(lambda a, stands=stands: a[:1] if stands else a, stage.instants)
-        cuts = cut_of(stage, plan, at, run, first, window)
-        inks = fills_of(stage.paint, slice(first, first + run.count))
+        edges = cut_of(stage, plan, at, run, first, window)
+        fills = fills_of(stage.paint, slice(first, first + run.count))
         largest = plan.largest(run)
-        made = jax.lax.map(
-            lambda one, most=largest: measure(covered_color(one[0], one[1], window, most)[0]), (cuts, inks)
+        values = jax.lax.map(
+            lambda one, most=largest: measure(covered_color(one[0], one[1], window, most)[0]), (edges, fills)
         )
-        found.append(jnp.broadcast_to(made, (run.count, len(stage.instants.angle), *made.shape[2:])))
-    return jnp.moveaxis(jnp.concatenate(found), 0, 1)
+        results.append(jnp.broadcast_to(values, (run.count, len(stage.instants.angle), *values.shape[2:])))
+    return jnp.moveaxis(jnp.concatenate(results), 0, 1)

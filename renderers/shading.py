@@ -1,4 +1,4 @@
-"""The coverage and colour of an object's parts: fill, rim, mark, shade, texture."""
+"""Coverage and colour of the parts of an object: fill, rim, mark, shade, texture."""
 
 from typing import Any, NamedTuple
 
@@ -14,7 +14,7 @@ from gen2d.renderers.primitives import BodyTransform, ObjectParts, PixelWindow, 
 
 
 class Fills(NamedTuple):
-    """What the parts of some slots are painted with; [...]."""
+    """Colours, shade and texture of the parts of some slots; arrays [..., 3] or [...]."""
 
     color: Array
     rim: Array | None
@@ -24,24 +24,23 @@ class Fills(NamedTuple):
 
 
 def fills_of(paint: Paint, slots: slice) -> Fills:
-    """What some slots are painted with; arrays [k, ...]."""
+    """Fills of some slots; arrays [k, ...]."""
     color = paint.color if paint.fill is None else paint.fill
-    inks = Fills(color, paint.rim_color, paint.mark_color, paint.shade, paint.texture)
-    return jax.tree.map(lambda a: a[slots], inks)
+    fills = Fills(color, paint.rim_color, paint.mark_color, paint.shade, paint.texture)
+    return jax.tree.map(lambda a: a[slots], fills)
 
 
 class EdgeSamples(NamedTuple):
-    """The parts of some slots, cut by the edges of their windows' pixels."""
+    """Terms of the coverage of some slots that depend on a row or a column of their windows alone."""
 
-    whole: Any  # coverage.Disc or coverage.Rounded
+    whole: Any  # disc.PixelDisc or polygon.RoundedPolygon
     inner: Any
     mark: Any
-    turn: BodyTransform | None  # from the window's corner, if it matters where in it a pixel is
+    turn: BodyTransform | None  # relative to the window, if the colour varies within it
 
 
 def edge_samples(parts: ObjectParts, window: PixelWindow, disc: bool, toned: bool) -> EdgeSamples:
-    """The parts cut by a window's rows and columns; `disc` says whether the whole is one, `toned` whether inks differ
-    from place to place."""
+    """Edge samples of parts in a window; `disc` for discs, `toned` if shade or texture varies the colour."""
     turn = parts.turn
     turn = turn._replace(column=turn.column - window.left, row=turn.row - window.top) if toned else None
     inner = None if parts.inner is None else _cuts_of(parts.inner, window, disc)
@@ -67,8 +66,10 @@ def _area_of(cuts: Any, largest: float) -> Array:
 
 
 def covered_color(cut: EdgeSamples, inks: Fills, window: PixelWindow, largest: float) -> tuple[Array, Array]:
-    """The coverage [..., rows, columns], and the mean colour [..., rows, columns, 3] of what is covered;
-    one colour [..., 1, 1, 3] where there is but one. No disc is larger than `largest` px."""
+    """Coverage [..., rows, columns] and mean colour [..., rows, columns, 3] of the covered area.
+
+    The colour is [..., 1, 1, 3] if it does not vary. `largest` (px) bounds the radius of discs.
+    """
     whole = _area_of(cut.whole, largest)
     color = inks.color[..., None, None, :]
     if cut.turn is not None:
@@ -86,7 +87,7 @@ def covered_color(cut: EdgeSamples, inks: Fills, window: PixelWindow, largest: f
 
 
 def _toned(color: Array, inks: Fills, turn: BodyTransform, window: PixelWindow) -> Array:
-    """The colours at the pixels' centres of slots that are textured or shaded."""
+    """Colours of textured or shaded slots at pixel centres."""
     x = jnp.arange(window.columns) + 0.5 - turn.column[..., None]
     y = (jnp.arange(window.rows) + 0.5 - turn.row[..., None])[..., :, None]
     x = x[..., None, :]
@@ -100,7 +101,7 @@ def _toned(color: Array, inks: Fills, turn: BodyTransform, window: PixelWindow) 
         color = textured(color, texture, (x * cos + y * sin) / scale, (y * cos - x * sin) / scale)
     if inks.shade is not None:
         reach = jnp.maximum(turn.reach, 1e-3)[..., None, None]
-        # As if lit from the upper left: darkest at the rim that is opposite.
+        # Lit from the upper left: darkest at the opposite rim.
         far = ((x / reach + 0.35) ** 2 + (y / reach + 0.35) ** 2) / 2.24
         color = color * (1 - inks.shade[..., None, None] * jnp.minimum(far, 1.0))[..., None]
     return color

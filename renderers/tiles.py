@@ -1,6 +1,6 @@
-"""The form of drawing for CPUs: each object is drawn into a patch of its own size, one after the other.
+"""Rendering on CPUs: each object is painted into a tile of its own size, one after the other.
 
-A loop over videos, frames and objects, each of which touches little memory; under `vmap` it would become a scatter.
+Each step of the loops over videos, frames and objects touches little memory; `vmap` would turn them into scatters.
 """
 
 import functools
@@ -30,29 +30,30 @@ from gen2d.renderers.shading import EdgeSamples, covered_color, fills_of
 
 
 def draw_tiles(stages: RenderScene, plan: FramePlan) -> tuple[Array | None, Array | None]:
-    """Frames [n, T, H, W, 3] uint8 and owners [n, T, H, W] uint8, each if it is wanted."""
+    """Frames [n, T, H, W, 3] uint8 and owners [n, T, H, W] uint8, None if `plan` does not want them."""
     videos, frames = stages.instants.angle.shape[:2]
-    backs = jax.lax.map(functools.partial(static_layer, plan=plan), stages)
+    layers = jax.lax.map(functools.partial(static_layer, plan=plan), stages)
     shape = videos, frames, plan.height, plan.width
-    image = None if backs.image is None else jnp.broadcast_to(backs.image, (*shape, 3)).reshape(-1, *shape[2:], 3)
+    image = None if layers.image is None else jnp.broadcast_to(layers.image, (*shape, 3)).reshape(-1, *shape[2:], 3)
     owner = jnp.zeros((videos * frames, *shape[2:]), jnp.uint8) if plan.owners else None
 
     def video(v: Array, canvas: LayerCanvas) -> LayerCanvas:
-        stage, back = (
-            jax.tree.map(lambda a: jax.lax.dynamic_index_in_dim(a, v, keepdims=False), of) for of in (stages, backs)
+        stage, layer = (
+            jax.tree.map(lambda a: jax.lax.dynamic_index_in_dim(a, v, keepdims=False), tree)
+            for tree in (stages, layers)
         )
-        draw = _Video(stage, plan, back, v * frames)
+        renderer = _Video(stage, plan, layer, v * frames)
         if plan.still and not plan.exposed and stages.noise is None:
-            return draw.straight(canvas)
-        canvas = draw.apart(canvas) if plan.frames else canvas
-        return draw.owners(canvas) if plan.owners else canvas
+            return renderer.straight(canvas)
+        canvas = renderer.apart(canvas) if plan.frames else canvas
+        return renderer.owners(canvas) if plan.owners else canvas
 
     canvas = jax.lax.fori_loop(0, videos, video, LayerCanvas(image, owner))
     return tuple(jax.tree.map(lambda a: a.reshape(videos, frames, *a.shape[1:]), canvas))
 
 
 class TileEdges(NamedTuple):
-    """A group's slots, cut by the pixels of their patches, at all instants; arrays [k, I, ...]."""
+    """Edge samples of a group's slots in their tiles at all instants; arrays [k, I, ...]."""
 
     group: TileGroup
     window: PixelWindow
@@ -60,39 +61,39 @@ class TileEdges(NamedTuple):
 
 
 class TileCoverage(NamedTuple):
-    """The patches of a group's slots at one instant."""
+    """Quantised tiles of a group's k slots at one instant."""
 
     cover: Array  # [k, rows, columns] int16
     color: Array  # [k, rows or 1, columns or 1, 3] int16
-    name: Array  # [k]
-    top: Array  # [k]
-    left: Array
+    name: Array  # [k] slot + 1
+    top: Array  # [k] first row
+    left: Array  # [k] first column
 
 
 class _Video:
-    """Draws one video, frame by frame, from frame `first` of a canvas on."""
+    """Renders one video, frame by frame, from frame `first` of a canvas on."""
 
     def __init__(self, stage: RenderScene, plan: FramePlan, back: LayerCanvas, first: Array) -> None:
         self.stage, self.plan, self.back, self.first = stage, plan, back, first
         self.frames = stage.instants.angle.shape[0]
 
     def straight(self, canvas: LayerCanvas) -> LayerCanvas:
-        """Frames, and owners if wanted, drawn where they belong, on unmoving layers that are there already."""
-        cuts = self._cuts(self.stage.instants)
+        """Frames, and owners if wanted, painted in place: the canvas already holds the static layer of its frames."""
+        edges = self._cuts(self.stage.instants)
 
         def frame(t: Array, canvas: LayerCanvas) -> LayerCanvas:
-            image, owner = self._painted(LayerCanvas(canvas.image, self.back.owner), self.first + t, cuts, t)
+            image, owner = self._painted(LayerCanvas(canvas.image, self.back.owner), self.first + t, edges, t)
             return LayerCanvas(image, self._kept(canvas.owner, owner, t))
 
         return jax.lax.fori_loop(0, self.frames, frame, canvas)
 
     def owners(self, canvas: LayerCanvas) -> LayerCanvas:
-        """Owners alone."""
-        cuts = self._cuts(self.stage.instants)
+        """Owners alone, without frames."""
+        edges = self._cuts(self.stage.instants)
 
         def frame(t: Array, canvas: LayerCanvas) -> LayerCanvas:
             start = self._behind(self.stage.instants, t)._replace(image=None)
-            owner = self._painted(start, jnp.int32(0), cuts, t).owner
+            owner = self._painted(start, jnp.int32(0), edges, t).owner
             return LayerCanvas(canvas.image, self._kept(canvas.owner, owner, t))
 
         return jax.lax.fori_loop(0, self.frames, frame, canvas)
@@ -103,25 +104,25 @@ class _Video:
         return jax.lax.dynamic_update_slice(owners, (owner & 255).astype(jnp.uint8), (self.first + t, 0, 0))
 
     def apart(self, canvas: LayerCanvas) -> LayerCanvas:
-        """Frames drawn on an image of their own: exposed more than once, with a camera that moves, or noisy."""
+        """Frames painted on a separate image: for motion blur, a moving camera, or noise."""
         stage, plan = self.stage, self.plan
-        shown = stage.instants if stage.exposed is None else jax.tree.map(_flat, stage.exposed)
-        samples, cuts = max(plan.exposed, 1), self._cuts(shown)
+        instants = stage.instants if stage.exposed is None else jax.tree.map(_flat, stage.exposed)
+        samples, edges = max(plan.exposed, 1), self._cuts(instants)
 
-        def once(i: Array) -> Array:
-            image = self._painted(self._behind(shown, i)._replace(owner=None), jnp.int32(0), cuts, i).image
+        def render_instant(i: Array) -> Array:
+            image = self._painted(self._behind(instants, i)._replace(owner=None), jnp.int32(0), edges, i).image
             assert image is not None
             return image
 
-        def exposed(t: Array) -> Array:
+        def average_exposure(t: Array) -> Array:
             def add(s: Array, total: Array) -> Array:
-                return total + once(t * samples + s).astype(jnp.uint16)
+                return total + render_instant(t * samples + s).astype(jnp.uint16)
 
             total = jnp.zeros((1, plan.height, plan.width, 3), jnp.uint16)
             return exposure_average(jax.lax.fori_loop(0, samples, add, total), samples)
 
         def frame(t: Array, canvas: LayerCanvas) -> LayerCanvas:
-            image = exposed(t) if plan.exposed else once(t)
+            image = average_exposure(t) if plan.exposed else render_instant(t)
             if stage.noise is not None:
                 image = add_noise(image, stage.noise, stage.seed, t[None])
             assert canvas.image is not None
@@ -132,7 +133,7 @@ class _Video:
         return jax.lax.fori_loop(0, self.frames, frame, canvas)
 
     def _behind(self, at: Instants, i: Array) -> LayerCanvas:
-        """What is behind all that moves at instant i."""
+        """Canvas behind the moving slots at instant i."""
         if self.plan.still:
             return self.back
         return background_layer(
@@ -140,22 +141,22 @@ class _Video:
         )
 
     def _cuts(self, at: Instants) -> list[TileEdges]:
-        """What of each group depends on rows or columns alone, for all instants."""
-        found = []
+        """Edge samples of each group at all instants."""
+        edges = []
         for group in self.plan.groups:
             windows = [tile_windows(self.plan, group, at, run, first) for run, first in group.runs]
-            spans = zip(group.runs, windows, strict=True)
-            cuts = [cut_of(self.stage, self.plan, at, run, first, window) for (run, first), window in spans]
+            pairs = zip(group.runs, windows, strict=True)
+            samples = [cut_of(self.stage, self.plan, at, run, first, window) for (run, first), window in pairs]
             top, left = (_joined([getattr(w, edge) for w in windows]) for edge in ("top", "left"))
-            found.append(TileEdges(group, PixelWindow(top, left, windows[0].rows, windows[0].columns), cuts))
-        return found
+            edges.append(TileEdges(group, PixelWindow(top, left, windows[0].rows, windows[0].columns), samples))
+        return edges
 
     def _painted(self, canvas: LayerCanvas, frame: Array, cuts: list[TileEdges], i: Array) -> LayerCanvas:
-        """The canvas with instant i of all that moves painted into its frame; owners have but one frame."""
+        """Canvas with all moving slots at instant i painted into image `frame`; owners hold a single frame."""
         rank = 0
-        for of_group in cuts:
-            count = len(of_group.group.slots)
-            stroke = functools.partial(self._stroke, strokes=self._strokes(of_group, i), frame=frame)
+        for group_edges in cuts:
+            count = len(group_edges.group.slots)
+            stroke = functools.partial(self._stroke, strokes=self._strokes(group_edges, i), frame=frame)
             canvas = self._interleaved(canvas, stroke, rank, count, frame)
             rank += count
         return canvas
@@ -165,9 +166,9 @@ class _Video:
             return jax.lax.dynamic_index_in_dim(a, i, 1, keepdims=False)
 
         covers, colors = [], []
-        for (run, first), of_run in zip(cuts.group.runs, cuts.of_runs, strict=True):
-            inks = fills_of(self.stage.paint, slice(first, first + run.count))
-            cover, color = covered_color(jax.tree.map(pick, of_run), inks, cuts.window, self.plan.largest(run))
+        for (run, first), samples in zip(cuts.group.runs, cuts.of_runs, strict=True):
+            fills = fills_of(self.stage.paint, slice(first, first + run.count))
+            cover, color = covered_color(jax.tree.map(pick, samples), fills, cuts.window, self.plan.largest(run))
             covers.append(to_levels(cover))
             colors.append(to_ink(color))
         shape = jnp.broadcast_shapes(*(color.shape[1:] for color in colors))
@@ -182,16 +183,16 @@ class _Video:
     def _put(
         self, canvas: LayerCanvas, cover: Array, color: Array, name: Array | int, frame: Array, top: Array, left: Array
     ) -> LayerCanvas:
-        """The canvas after a layer [1, rows, columns] in whole numbers was painted where it belongs."""
+        """Canvas with a quantised layer [1, rows, columns] painted at (frame, top, left)."""
         image, owner = canvas
         if image is not None:
-            place = (frame, top, left, 0)
-            under = jax.lax.dynamic_slice(image, place, (*cover.shape, 3))
-            image = jax.lax.dynamic_update_slice(image, over(under, cover, color, self.plan.linear), place)
+            start = (frame, top, left, 0)
+            under = jax.lax.dynamic_slice(image, start, (*cover.shape, 3))
+            image = jax.lax.dynamic_update_slice(image, over(under, cover, color, self.plan.linear), start)
         if owner is not None:
-            place = (0, top, left)
-            under = jax.lax.dynamic_slice(owner, place, cover.shape)
-            owner = jax.lax.dynamic_update_slice(owner, ownership(under, cover, name), place)
+            start = (0, top, left)
+            under = jax.lax.dynamic_slice(owner, start, cover.shape)
+            owner = jax.lax.dynamic_update_slice(owner, ownership(under, cover, name), start)
         return LayerCanvas(image, owner)
 
     def _interleaved(
@@ -202,17 +203,17 @@ class _Video:
         count: int,
         frame: Array,
     ) -> LayerCanvas:
-        """The canvas after so many strokes, the first of which has a rank, and the occluders between them."""
+        """Canvas after `count` strokes of ranks from `rank` on, and the occluders between them."""
         occluders = self.stage.occluders
         done: Array | int = 0
         if occluders is not None:
-            ends = rank + count == self.plan.moving  # those after all come with the last
-            for i, of in enumerate(occluders.rank):
-                until = jnp.clip(of - rank, 0, count)
+            is_last = rank + count == self.plan.moving  # also paints the occluders before all slots
+            for i, below in enumerate(occluders.rank):
+                until = jnp.clip(below - rank, 0, count)
                 canvas = jax.lax.fori_loop(done, until, stroke, canvas)
                 done = until
-                here = (of >= rank) & ((of < rank + count) | ends)
-                cover, color = occluder(self.stage, self.plan, i, here)
+                shown = (below >= rank) & ((below < rank + count) | is_last)
+                cover, color = occluder(self.stage, self.plan, i, shown)
                 canvas = self._put(canvas, to_levels(cover), to_ink(color), OCCLUDER, frame, jnp.int32(0), jnp.int32(0))
         return jax.lax.fori_loop(done, count, stroke, canvas)
 

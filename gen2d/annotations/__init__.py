@@ -1,4 +1,4 @@
-"""What is true of a video's pixels: one file for each annotation, named like the option that asks for it.
+"""Annotations: ground truth of a video's pixels, one file each, named like the option that switches it on.
 
 A file ends with an `ANNOTATION`, whose members `gen2d.plugin.Annotation` describes. The smallest one:
 
@@ -13,7 +13,7 @@ A file ends with an `ANNOTATION`, whose members `gen2d.plugin.Annotation` descri
         annotate=annotate,
     )
 
-A config asks for turn.py in this folder by `annotations: {turn: true}`, and for one elsewhere by its path, as in
+A config selects turn.py in this folder by `annotations: {turn: true}`, and a file elsewhere by its path, as in
 `annotations: {my/turn.py: true}`.
 """
 
@@ -28,58 +28,60 @@ from gen2d.renderers.plan import FramePlan, RenderScene
 
 
 def need_owners(annotations: Annotations) -> bool:
-    """Whether any annotation needs to know which object each pixel shows."""
+    """Whether any annotation needs the owners: the object that each pixel shows."""
     return any(plugin.contract.owners for plugin in annotations.wanted)
 
 
 def fields(annotations: Annotations, others: Mapping[str, Field]) -> dict[str, Field]:
-    """All stored fields by name: the others and the annotations'. Raises ConfigError for a name declared twice."""
+    """Stored fields by name: `others` and those of the annotations. Raises ConfigError if a name is declared twice."""
     return _joined(others, {plugin.name: plugin.contract.fields for plugin in annotations.wanted}, "field")
 
 
 def sizes(annotations: Annotations, plan: FramePlan, others: Mapping[str, int]) -> dict[str, int]:
-    """The lengths of all axes by letter, as `fields`."""
-    own = {plugin.name: plugin.contract.sizes(plan, plugin.options) for plugin in annotations.wanted}
-    return _joined(others, own, "axis")
+    """Lengths of axes by letter: `others` and those of the annotations. Raises ConfigError for a repeated letter."""
+    sizes_of = {plugin.name: plugin.contract.sizes(plan, plugin.options) for plugin in annotations.wanted}
+    return _joined(others, sizes_of, "axis")
 
 
 def _joined(others: Mapping[str, Any], own: Mapping[str, Mapping[str, Any]], what: str) -> dict[str, Any]:
-    joined = dict(others)
+    merged = dict(others)
     for name, members in own.items():
-        twice = members.keys() & joined.keys()
-        if twice:
-            raise ConfigError(f"annotations.{name} has a {what} {min(twice)!r}, but there is one of that name already")
-        joined |= members
-    return joined
+        duplicates = members.keys() & merged.keys()
+        if duplicates:
+            raise ConfigError(
+                f"annotations.{name} has a {what} {min(duplicates)!r}, but there is one of that name already"
+            )
+        merged |= members
+    return merged
 
 
 def annotated(scenes: RenderScene, owners: Array | None, plan: FramePlan, annotations: Annotations) -> dict[str, Array]:
-    """The annotations of some videos, by their stored names; owners [n, T, H, W] uint8 as rasterizer.draw gives them.
+    """Annotations of n videos by their stored names; owners [n, T, H, W] uint8 are from `rasterizer.draw`.
 
-    Raises ConfigError where an annotation returns something else than it declares.
+    Raises ConfigError if an annotation returns other names, shapes or types than it declares.
     """
     count, frames, slots = scenes.instants.angle.shape
     arrays: dict[str, Array] = {}
     for plugin in annotations.wanted:
-        own, declared = plugin.contract.annotate(scenes, owners, plan, plugin.options), plugin.contract.fields
-        known = {"T": frames, "K": slots, "H": plan.height, "W": plan.width}
-        known |= plugin.contract.sizes(plan, plugin.options)
-        for name in sorted(own.keys() | declared.keys()):
-            if name not in own or name not in declared:
+        returned, declared = plugin.contract.annotate(scenes, owners, plan, plugin.options), plugin.contract.fields
+        lengths = {"T": frames, "K": slots, "H": plan.height, "W": plan.width}
+        lengths |= plugin.contract.sizes(plan, plugin.options)
+        for name in sorted(returned.keys() | declared.keys()):
+            if name not in returned or name not in declared:
                 verb = "declares" if name in declared else "returns"
                 raise ConfigError(f"annotations.{plugin.name} {verb} {name!r}, but must declare what it returns")
-            field, array = declared[name], own[name]
-            unknown = [axis for axis in field.axes.split()[1:] if not axis.isdigit() and axis not in known]
+            field, array = declared[name], returned[name]
+            unknown = [axis for axis in field.axes.split()[1:] if not axis.isdigit() and axis not in lengths]
             if not field.per_video or unknown:
                 raise ConfigError(
                     f"annotations.{plugin.name}: the axes of {name} are {field.axes!r}, but must begin with n, and the "
-                    f"others be numbers or of {', '.join(known)}"
+                    f"others be numbers or of {', '.join(lengths)}"
                 )
-            shape = (count, *field.shape(known))
+            shape = (count, *field.shape(lengths))
             if (array.shape, array.dtype.name) != (shape, field.dtype):
                 raise ConfigError(
                     f"annotations.{plugin.name}: {name} is {array.dtype.name}{[*array.shape]}, but must be as "
                     f"declared, {field.dtype}{[*shape]}"
                 )
-        arrays |= own
+        arrays |= returned
     return arrays

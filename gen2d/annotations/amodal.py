@@ -1,4 +1,4 @@
-"""Where each object is in the picture, seen or not: pixels at least half of which it covers, a bit each."""
+"""Amodal masks: the pixels that an object covers by half or more, visible or not, as packed bits."""
 
 import jax.numpy as jnp
 
@@ -6,12 +6,12 @@ from gen2d.plugin import Annotation, Array, Field, FramePlan, RenderScene, alone
 
 
 def sizes(plan: FramePlan, on: bool) -> dict[str, int]:
-    """B, the bytes of a mask: numpy.unpackbits(mask)[: H * W].reshape(H, W) is the mask."""
+    """Length B of a packed mask in bytes: `numpy.unpackbits(packed)[: H * W].reshape(H, W)` is the mask."""
     return {"B": -(-plan.height * plan.width // 8)}
 
 
 def annotate(stages: RenderScene, owners: Array | None, plan: FramePlan, on: bool) -> dict[str, Array]:
-    """The packed masks of every slot."""
+    """Packed masks of every slot."""
     pixels = plan.height * plan.width
     weights = jnp.asarray([128, 64, 32, 16, 8, 4, 2, 1], jnp.uint8)
 

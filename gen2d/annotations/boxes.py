@@ -1,4 +1,4 @@
-"""Boxes: around what is seen of each object, and around all of it."""
+"""Bounding boxes: around the visible pixels of each object, and around the whole object."""
 
 import functools
 
@@ -8,11 +8,11 @@ import numpy as np
 
 from gen2d.plugin import Annotation, Array, Field, FramePlan, RenderScene, extents, option, reduce_halves
 
-WORD = 32  # slots that are looked at together, a bit each
+WORD = 32  # slots per word, one bit each
 
 
 def annotate(stages: RenderScene, owners: Array, plan: FramePlan, on: bool) -> dict[str, Array]:
-    """Both kinds of boxes."""
+    """Visible and amodal boxes."""
     seen = seen_boxes(owners.reshape(-1, *owners.shape[2:]), plan.layout.slots)
     return {
         "boxes/visible": seen.reshape(*owners.shape[:2], *seen.shape[1:]),
@@ -21,30 +21,30 @@ def annotate(stages: RenderScene, owners: Array, plan: FramePlan, on: bool) -> d
 
 
 def seen_boxes(owners: Array, slots: int) -> Array:
-    """The boxes [T, K, 4] around the pixels of each slot in masks [T, H, W]."""
-    found = []
+    """Boxes [T, K, 4] px (x0 y0 x1 y1) around the pixels of each slot in masks [T, H, W]; 0 for slots without any."""
+    boxes = []
     for first in range(0, slots, WORD):
         columns, rows = _words(owners, first)
-        # In a loop of its own: fused with what is before it, all pixels would be looked at again for each number. Over
-        # constants: over an iota XLA's CPU compiler makes another loop, which takes seven times as long.
+        # The loop keeps the compiler from scanning all pixels again for each slot. It runs over constants: for an iota
+        # XLA's CPU compiler generates a loop that takes seven times as long.
         bits = np.arange(min(WORD, slots - first), dtype=np.uint32)
         ends = [jax.lax.map(functools.partial(_ends, words=words.T), bits) for words in (columns, rows)]
-        found.append(jnp.stack([ends[0][0], ends[1][0], ends[0][1], ends[1][1]], -1))
-    return jnp.moveaxis(jnp.concatenate(found), 0, 1)
+        boxes.append(jnp.stack([ends[0][0], ends[1][0], ends[0][1], ends[1][1]], -1))
+    return jnp.moveaxis(jnp.concatenate(boxes), 0, 1)
 
 
 def _words(owners: Array, first: int) -> tuple[Array, Array]:
-    """For each column and row of masks [T, H, W] which of WORD slots are seen there, a bit each."""
+    """Words of the columns [T, W] and rows [T, H] of masks [T, H, W]: bit i is set where slot first + i is visible."""
     number = owners.astype(jnp.uint32) - (first + 1)  # wraps around below
     bits = jnp.where(number < WORD, jnp.uint32(1) << (number & (WORD - 1)), jnp.uint32(0))
     return reduce_halves(bits, 1, jnp.bitwise_or), reduce_halves(bits, 2, jnp.bitwise_or)
 
 
 def _ends(bit: Array, words: Array) -> tuple[Array, Array]:
-    """Of words [L, T], the first place that has a bit and the one after the last, [T], float32."""
-    there, place = (words >> bit) & 1 > 0, jnp.arange(len(words), dtype=jnp.float32)[:, None]
-    last = reduce_halves(jnp.where(there, place + 1, 0.0), 0, jnp.maximum)
-    first = len(words) - reduce_halves(jnp.where(there, len(words) - place, 0.0), 0, jnp.maximum)
+    """First index of words [L, T] with `bit` set, and the index after the last, [T] float32; both 0 if none has it."""
+    present, position = (words >> bit) & 1 > 0, jnp.arange(len(words), dtype=jnp.float32)[:, None]
+    last = reduce_halves(jnp.where(present, position + 1, 0.0), 0, jnp.maximum)
+    first = len(words) - reduce_halves(jnp.where(present, len(words) - position, 0.0), 0, jnp.maximum)
     return jnp.minimum(first, last), last
 
 

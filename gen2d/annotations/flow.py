@@ -1,7 +1,7 @@
-"""Optical flow: where what each pixel shows goes to in the next frame, and where it came from.
+"""Optical flow: displacement of the content of each pixel to the next frame and to the previous one.
 
-A pixel moves with the object that owns it, as a rigid body; the background with the camera; an occluder not at all. A
-flow is valid where its end lies in the picture and in a pixel that shows the same object.
+A pixel moves rigidly with the object that owns it; background moves with the camera; occluders do not move. A flow is
+valid where it ends inside the frame at a pixel that shows the same object.
 """
 
 import jax
@@ -29,30 +29,32 @@ _VALID = "1 where the flow ends in the frame, at a pixel of the same object"
 
 
 def annotate(stages: RenderScene, owners: Array, plan: FramePlan, on: bool) -> dict[str, Array]:
-    """Both flows and where they are valid."""
-    found, flow_of = {}, _by_patches if on_cpu() else _by_pixels
+    """Forward and backward flow and their validity."""
+    arrays, flow_of = {}, _by_patches if on_cpu() else _by_pixels
     for name, step in (("forward", 1), ("backward", -1)):
-        found[f"flow/{name}"], found[f"flow/{name}_valid"] = flow_of(stages, owners, plan, step)
-    return found
+        arrays[f"flow/{name}"], arrays[f"flow/{name}_valid"] = flow_of(stages, owners, plan, step)
+    return arrays
 
 
 def _tables(at: Instants, step: int, plan: FramePlan) -> Array:
-    """For each frame and id, 0 the background's, the motion of a pixel at (x, y) in so many frames: dx = a x + b y + c,
-    dy = d x + e y + f, as [T, K + 1, 6]; beyond the ends nothing moves."""
-    other = jnp.clip(jnp.arange(len(at.angle)) + step, 0, len(at.angle) - 1)
-    then = jax.tree.map(lambda a: a[other], at)
-    here, there = (to_pixels(i.view, i.position, plan.height, plan.width) for i in (at, then))
-    grown = then.view.scale / at.view.scale
-    turned = (at.angle - then.angle) - (at.view.angle - then.view.angle)[:, None]  # clockwise as seen
-    bodies = _motion(here, there, turned, grown[:, None])
+    """Affine motions [T, K + 1, 6] to the frame `step` later, by frame and id; id 0 is the background.
+
+    A pixel at (x, y) moves by dx = a x + b y + c, dy = d x + e y + f. Past the ends of the video nothing moves.
+    """
+    target_frames = jnp.clip(jnp.arange(len(at.angle)) + step, 0, len(at.angle) - 1)
+    target = jax.tree.map(lambda a: a[target_frames], at)
+    start, end = (to_pixels(i.view, i.position, plan.height, plan.width) for i in (at, target))
+    zoom = target.view.scale / at.view.scale
+    turn = (at.angle - target.angle) - (at.view.angle - target.view.angle)[:, None]  # clockwise as seen
+    bodies = _motion(start, end, turn, zoom[:, None])
     origin = jnp.broadcast_to(at.view.center[:, None], (*at.view.scale.shape, 1, 2))
-    middle, moved = (to_pixels(view, origin, plan.height, plan.width) for view in (at.view, then.view))
-    ground = _motion(middle, moved, (then.view.angle - at.view.angle)[:, None], grown[:, None])
+    origin_start, origin_end = (to_pixels(view, origin, plan.height, plan.width) for view in (at.view, target.view))
+    ground = _motion(origin_start, origin_end, (target.view.angle - at.view.angle)[:, None], zoom[:, None])
     return jnp.concatenate([ground, bodies], axis=1)
 
 
 def _motion(here: Array, there: Array, turned: Array, grown: Array) -> Array:
-    """The six numbers [..., 6] of points that move from `here` to `there` [..., 2] and turn about them."""
+    """Affine motion [..., 6] that moves `here` [..., 2] to `there`, turns by `turned` (rad) and scales by `grown`."""
     a, b = grown * jnp.cos(turned) - 1, grown * jnp.sin(turned)
     x, y = here[..., 0], here[..., 1]
     shift = there - here
@@ -60,25 +62,28 @@ def _motion(here: Array, there: Array, turned: Array, grown: Array) -> Array:
 
 
 def _ends(number: Array, x: Array, y: Array, height: int, width: int) -> tuple[Array, Array, Array]:
-    """The flow [..., 2] of pixels at x and y, the number of the pixel where it ends, and whether it ends inside."""
+    """Flow [..., 2] of pixels at x and y by affine motions `number` [..., 6]; index of the pixel where it ends, and
+    whether it ends inside the frame."""
     dx = number[..., 0] * x + number[..., 1] * y + number[..., 2]
     dy = number[..., 3] * x + number[..., 4] * y + number[..., 5]
     return jnp.stack([dx, dy], -1).astype(jnp.float16), *pixel_at(x + dx, y + dy, height, width)
 
 
 def _ends_of(frames: int, step: int) -> tuple[int, int]:
-    """The first frame from which such a step stays in the video, and the one after the last."""
+    """First frame, and the one after the last, from which a step stays in the video."""
     return max(0, -step), frames - max(0, step)
 
 
-# ---- Every pixel looks its motion up
+# ---- On a GPU: each pixel looks up its motion
 
 
 def _by_pixels(
     stages: RenderScene, owners: Array, plan: FramePlan, step: int, ground: bool = False
 ) -> tuple[Array, Array]:
-    """The flows [n, T, H, W, 2] and where they are valid [n, T, H, W]; with `ground` as if only the camera moved. The
-    form for GPUs."""
+    """Flow [n, T, H, W, 2] px and its validity [n, T, H, W] uint8, by lookup at every pixel; the form for GPUs.
+
+    With `ground` all pixels move with the background.
+    """
     x, y = jnp.arange(plan.width) + 0.5, (jnp.arange(plan.height) + 0.5)[:, None]
     begin, end = _ends_of(owners.shape[1], step)
 
@@ -87,32 +92,32 @@ def _by_pixels(
         table = jnp.broadcast_to(table[:, :1], table.shape) if ground else table
 
         def frame(t: Array) -> tuple[Array, Array]:
-            owner, then = owners[t], owners[t + step].reshape(-1)
+            owner, target_owners = owners[t], owners[t + step].reshape(-1)
             known = owner < OCCLUDER
-            number = table[t, jnp.where(known, owner, 0).astype(jnp.int32)]
-            flow, place, inside = _ends(jnp.where(known[..., None], number, 0.0), x, y, *owner.shape)
-            return flow, (inside & (then[place] == owner)).astype(jnp.uint8)
+            motion = table[t, jnp.where(known, owner, 0).astype(jnp.int32)]
+            flow, end_pixel, inside = _ends(jnp.where(known[..., None], motion, 0.0), x, y, *owner.shape)
+            return flow, (inside & (target_owners[end_pixel] == owner)).astype(jnp.uint8)
 
-        rest = (begin, owners.shape[0] - end)
+        padding = (begin, owners.shape[0] - end)
         return jax.tree.map(
-            lambda a: jnp.pad(a, [rest, *[(0, 0)] * (a.ndim - 1)]), jax.lax.map(frame, jnp.arange(begin, end))
+            lambda a: jnp.pad(a, [padding, *[(0, 0)] * (a.ndim - 1)]), jax.lax.map(frame, jnp.arange(begin, end))
         )
 
     return jax.vmap(video)(stages, owners)
 
 
-# ---- Each object's motion goes into a patch of its own
+# ---- On a CPU: each object's motion is written into its tile
 
 
 def _by_patches(stages: RenderScene, owners: Array, plan: FramePlan, step: int) -> tuple[Array, Array]:
-    """The same for a CPU: the background's motion everywhere, then each object's where it is seen in its patch."""
+    """Flow and validity as in `_by_pixels`: background motion everywhere, then each object's in its tile; for CPUs."""
     count, frames = owners.shape[:2]
     begin, end = _ends_of(frames, step)
     spans = [(group, *span) for group in plan.groups for span in group.runs if span[0].kind != STATIC]
-    everyone = owners.reshape(-1, *owners.shape[2:])
+    all_owners = owners.reshape(-1, *owners.shape[2:])
     flow, valid = _behind(stages, owners, plan, step)
-    # Both numbers of a pixel beside one another: rows of pairs are not written as vectors.
-    start = flow.reshape(-1, plan.height, 2 * plan.width), valid.reshape(everyone.shape)
+    # Interleave dx and dy in one axis: the compiler does not vectorize writes to a last axis of length 2.
+    start = flow.reshape(-1, plan.height, 2 * plan.width), valid.reshape(all_owners.shape)
 
     def video(v: Array, flows: tuple[Array, Array]) -> tuple[Array, Array]:
         at = jax.tree.map(lambda a: jax.lax.dynamic_index_in_dim(a, v, keepdims=False), stages.instants)
@@ -124,8 +129,10 @@ def _by_patches(stages: RenderScene, owners: Array, plan: FramePlan, step: int) 
                 t: Array, flows: tuple, window: PixelWindow = window, run: SlotGroup = run, first: int = first
             ) -> tuple:
                 def stroke(k: Array, flows: tuple) -> tuple:
-                    here = window._replace(top=window.top[k, t], left=window.left[k, t])
-                    return _stroke(flows, everyone, v * frames + t, step, first + k + 1, table[t, first + k + 1], here)
+                    tile = window._replace(top=window.top[k, t], left=window.left[k, t])
+                    return _stroke(
+                        flows, all_owners, v * frames + t, step, first + k + 1, table[t, first + k + 1], tile
+                    )
 
                 return jax.lax.fori_loop(0, run.count, stroke, flows)
 
@@ -137,7 +144,7 @@ def _by_patches(stages: RenderScene, owners: Array, plan: FramePlan, step: int) 
 
 
 def _behind(stages: RenderScene, owners: Array, plan: FramePlan, step: int) -> tuple[Array, Array]:
-    """The flows and where they are valid as if only the camera moved."""
+    """Flow and validity as if all pixels moved with the background."""
     if not plan.still:
         return _by_pixels(stages, owners, plan, step, ground=True)
     same = (owners[:, 1:] == owners[:, :-1]).astype(jnp.uint8)
@@ -148,22 +155,22 @@ def _behind(stages: RenderScene, owners: Array, plan: FramePlan, step: int) -> t
 def _stroke(
     flows: tuple[Array, Array], owners: Array, frame: Array, step: int, name: Array, number: Array, window: PixelWindow
 ) -> tuple[Array, Array]:
-    """The flows after those of one object were put where a frame shows it."""
+    """Flow and validity with the motion of one object written at the pixels that show it in a frame."""
     (flow, valid), (_, height, width) = flows, owners.shape
-    place, size = (frame, window.top, window.left), (1, window.rows, window.columns)
-    beside, twice = (frame, window.top, 2 * window.left), (1, window.rows, 2 * window.columns)
+    start, size = (frame, window.top, window.left), (1, window.rows, window.columns)
+    pair_start, pair_size = (frame, window.top, 2 * window.left), (1, window.rows, 2 * window.columns)
     x, y = jnp.arange(window.columns) + (window.left + 0.5), (jnp.arange(window.rows) + (window.top + 0.5))[:, None]
-    mine = jax.lax.dynamic_slice(owners, place, size) == name.astype(jnp.uint8)
+    owned = jax.lax.dynamic_slice(owners, start, size) == name.astype(jnp.uint8)
     _, end, inside = _ends(number, x, y, height, width)
-    shown = owners.reshape(-1)[(frame + step) * height * width + end]
-    seen = (inside & (shown == name.astype(jnp.uint8))).astype(jnp.uint8)
-    entry = jnp.arange(twice[-1])
-    a, b, c = (jnp.where(entry % 2 == 0, number[i], number[i + 3]) for i in range(3))
-    new = (a * (entry // 2 + (window.left + 0.5)) + b * y + c).astype(jnp.float16)[None]
-    old, was = jax.lax.dynamic_slice(flow, beside, twice), jax.lax.dynamic_slice(valid, place, size)
-    both = jnp.where(jnp.broadcast_to(mine[..., None], (*size, 2)).reshape(twice), new, old)
-    flow = jax.lax.dynamic_update_slice(flow, both, beside)
-    return flow, jax.lax.dynamic_update_slice(valid, jnp.where(mine, seen, was), place)
+    end_owner = owners.reshape(-1)[(frame + step) * height * width + end]
+    new_valid = (inside & (end_owner == name.astype(jnp.uint8))).astype(jnp.uint8)
+    index = jnp.arange(pair_size[-1])
+    a, b, c = (jnp.where(index % 2 == 0, number[i], number[i + 3]) for i in range(3))
+    new_flow = (a * (index // 2 + (window.left + 0.5)) + b * y + c).astype(jnp.float16)[None]
+    old_flow, old_valid = jax.lax.dynamic_slice(flow, pair_start, pair_size), jax.lax.dynamic_slice(valid, start, size)
+    merged = jnp.where(jnp.broadcast_to(owned[..., None], (*size, 2)).reshape(pair_size), new_flow, old_flow)
+    flow = jax.lax.dynamic_update_slice(flow, merged, pair_start)
+    return flow, jax.lax.dynamic_update_slice(valid, jnp.where(owned, new_valid, old_valid), start)
 
 
 ANNOTATION = Annotation(

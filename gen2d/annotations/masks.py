@@ -1,10 +1,10 @@
-"""Which object each pixel shows: the one of which most is seen in it."""
+"""Instance masks: the object that each pixel shows most of."""
 
 from gen2d.plugin import Annotation, Array, Field, FramePlan, RenderScene, option
 
 
 def annotate(stages: RenderScene, owners: Array, plan: FramePlan, on: bool) -> dict[str, Array]:
-    """The mask itself."""
+    """Instance masks, which are the owners."""
     return {"masks/instance": owners}
 
 

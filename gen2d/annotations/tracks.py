@@ -1,4 +1,4 @@
-"""Points that are fixed to objects, followed through the video."""
+"""Tracks of points that are fixed to objects."""
 
 import functools
 
@@ -22,67 +22,70 @@ from gen2d.plugin import (
 
 
 def sizes(plan: FramePlan, count: int) -> dict[str, int]:
-    """P, so many points for every slot."""
+    """Length of the axis P: `count` points for every slot."""
     return {"P": plan.layout.slots * count}
 
 
 def annotate(stages: RenderScene, owners: Array, plan: FramePlan, count: int) -> dict[str, Array]:
-    """The points, where they are seen, and whose they are."""
+    """Points, their visibility, and the slots that they are fixed to."""
     return jax.vmap(functools.partial(_followed, plan=plan, count=count))(stages, owners)
 
 
 def _followed(stage: RenderScene, owners: Array, plan: FramePlan, count: int) -> dict[str, Array]:
-    """So many points of each object of a video."""
-    own = jnp.concatenate([_inside(stage, run, first, count) for run, first in plan.layout.spans])  # [K, P, 2] m
+    """Tracks of `count` points of each slot of one video."""
+    local = jnp.concatenate([_inside(stage, run, first, count) for run, first in plan.layout.spans])  # [K, P, 2] m
     at = stage.instants
     cos, sin = jnp.cos(at.angle)[..., None], jnp.sin(at.angle)[..., None]
-    x, y = own[..., 0], own[..., 1]
+    x, y = local[..., 0], local[..., 1]
     world = at.position[:, :, None] + jnp.stack([x * cos - y * sin, x * sin + y * cos], -1)
     points = to_pixels(at.view, world.reshape(len(world), -1, 2), plan.height, plan.width)
     slots = np.repeat(np.arange(plan.layout.slots), count)
-    there = stage.paint.drawn[slots]
-    points = jnp.where(there[:, None], points, 0.0)
-    place, inside = pixel_at(points[..., 0], points[..., 1], plan.height, plan.width)
-    shown = jnp.take_along_axis(owners.reshape(len(owners), -1), place, axis=1)
+    drawn = stage.paint.drawn[slots]
+    points = jnp.where(drawn[:, None], points, 0.0)
+    pixel, inside = pixel_at(points[..., 0], points[..., 1], plan.height, plan.width)
+    shown = jnp.take_along_axis(owners.reshape(len(owners), -1), pixel, axis=1)
     return {
         "tracks/points": points,
-        "tracks/visible": there & inside & (shown == slots + 1),
-        "tracks/object": jnp.where(there, slots, -1).astype(jnp.int16),
+        "tracks/visible": drawn & inside & (shown == slots + 1),
+        "tracks/object": jnp.where(drawn, slots, -1).astype(jnp.int16),
     }
 
 
 def _inside(stage: RenderScene, run: SlotGroup, first: int, count: int) -> Array:
-    """Random points [k, P, 2] m in the shapes of a run, in their own frames, even in their area."""
+    """Random points [k, P, 2] m, uniform in the area of the shapes of a run, in the body frame.
+
+    Rounded polygons have points in their core only.
+    """
     slots = jnp.arange(first, first + run.count)[:, None]
-    words = (hashed(stage.seed, slots, jnp.arange(count), n) for n in range(1, 4))
-    u, v, w = map(fraction, words)
+    hashes = (hashed(stage.seed, slots, jnp.arange(count), n) for n in range(1, 4))
+    u, v, w = map(fraction, hashes)
     radius = stage.bodies.radius[slots]
-    reach, turn = radius * jnp.sqrt(u), 2 * jnp.pi * v
-    round_part = jnp.stack([reach * jnp.cos(turn), reach * jnp.sin(turn)], -1)
+    reach, angle = radius * jnp.sqrt(u), 2 * jnp.pi * v
+    disc = jnp.stack([reach * jnp.cos(angle), reach * jnp.sin(angle)], -1)
     if run.shape == "circle":
-        return round_part
+        return disc
     if run.shape == "polygon":
         assert stage.bodies.vertices is not None
         return _in_polygon(stage.bodies.vertices[first : first + run.count], u, v, w)
     half = stage.bodies.half_length[slots]
-    # A capsule: the rectangle by its share of the area, else the disc cut in two at its ends.
-    flat = w * (4 * half + jnp.pi * radius) < 4 * half
+    # A capsule: a point is in the rectangle or in the half discs at its ends, in proportion to their areas.
+    in_block = w * (4 * half + jnp.pi * radius) < 4 * half
     block = jnp.stack([half * (2 * u - 1), radius * (2 * v - 1)], -1)
-    ends = round_part + jnp.stack([jnp.where(round_part[..., 0] > 0, half, -half), jnp.zeros_like(reach)], -1)
-    return jnp.where(flat[..., None], block, ends)
+    caps = disc + jnp.stack([jnp.where(disc[..., 0] > 0, half, -half), jnp.zeros_like(reach)], -1)
+    return jnp.where(in_block[..., None], block, caps)
 
 
 def _in_polygon(vertices: Array, u: Array, v: Array, w: Array) -> Array:
-    """Points [k, P, 2] in triangles between the first vertex and the sides, each by its share of the area."""
-    corner = vertices - vertices[:, :1]
-    following = jnp.roll(corner, -1, axis=1)
-    area = corner[..., 0] * following[..., 1] - corner[..., 1] * following[..., 0]
+    """Points [k, P, 2] uniform in polygons, which are cut into triangles at the first vertex, chosen by area."""
+    corners = vertices - vertices[:, :1]
+    following = jnp.roll(corners, -1, axis=1)
+    area = corners[..., 0] * following[..., 1] - corners[..., 1] * following[..., 0]
     share = jnp.cumsum(area, axis=1)
     side = (w[..., None] * share[:, None, -1:] > share[:, None]).sum(-1)
     side = jnp.minimum(side, vertices.shape[1] - 1)
-    one, other = (jnp.take_along_axis(a, side[..., None], axis=1) for a in (corner, following))
-    far = jnp.sqrt(u)[..., None]
-    return vertices[:, :1] + far * (one + v[..., None] * (other - one))
+    first, second = (jnp.take_along_axis(a, side[..., None], axis=1) for a in (corners, following))
+    depth = jnp.sqrt(u)[..., None]
+    return vertices[:, :1] + depth * (first + v[..., None] * (second - first))
 
 
 ANNOTATION = Annotation(

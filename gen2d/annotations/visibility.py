@@ -1,4 +1,4 @@
-"""How much of each object is seen."""
+"""Visibility: number of visible pixels, and visible fraction, of each object."""
 
 import functools
 
@@ -21,7 +21,7 @@ from gen2d.plugin import (
 
 
 def annotate(stages: RenderScene, owners: Array, plan: FramePlan, on: bool) -> dict[str, Array]:
-    """The number of pixels and the part seen, and the least of it."""
+    """Visible pixels and fraction of each slot, and the least fraction over moving slots and frames."""
     pixels = each_video(functools.partial(counts, slots=plan.layout.slots), owners)
     area = jax.vmap(functools.partial(extents.areas, plan=plan))(stages)
     fraction = jnp.minimum(pixels / jnp.where(area > 0, area, 1.0), 1.0)
@@ -33,16 +33,16 @@ def annotate(stages: RenderScene, owners: Array, plan: FramePlan, on: bool) -> d
 
 
 def counts(owners: Array, slots: int) -> Array:
-    """How many pixels of masks [T, H, W] show each slot, [T, K] int32."""
+    """Numbers of pixels [T, K] int32 that show each slot in masks [T, H, W]."""
     frames, height, width = owners.shape
-    rows = next(n for n in range(min(height, 255), 0, -1) if height % n == 0)  # whose sum fits a byte
+    rows = next(n for n in range(min(height, 255), 0, -1) if height % n == 0)  # their sum fits a byte
     strips = owners.reshape(frames, height // rows, rows, width)
 
-    def of(name: Array) -> Array:
+    def count(name: Array) -> Array:
         columns = reduce_halves((strips == name).astype(jnp.uint8), 2, jnp.add).astype(jnp.int32)
         return reduce_halves(columns, 2, jnp.add).sum(1)
 
-    return jax.lax.map(of, np.arange(1, slots + 1, dtype=np.uint8)).T
+    return jax.lax.map(count, np.arange(1, slots + 1, dtype=np.uint8)).T
 
 
 ANNOTATION = Annotation(

@@ -1,1 +1,1 @@
-"""The share of each pixel that a shape covers, in closed form."""
+"""Pixel coverage of shapes, in closed form."""

@@ -1,4 +1,4 @@
-"""The area under a circle's arc, in closed form."""
+"""Area under a circular arc, in closed form."""
 
 import math
 
@@ -7,17 +7,18 @@ import jax.numpy as jnp
 
 from gen2d.records.axes import Array
 
-LARGE = 64.0  # px: from this radius on a disc's rim counts as straight within a pixel, but for its curvature
+LARGE = 64.0  # px; discs of this radius or more have a straight rim in each pixel, corrected for curvature
 QUARTER = math.pi / 4
-FAR = 1e12  # px, px^2: beyond every arc
-THIN = 1e-6  # px: a line's width in a row, where it is vertical
+FAR = 1e12  # px or px^2, beyond every arc
+THIN = 1e-6  # px, width in a row of a vertical line
 
-# Integral of sqrt(1 - s^2) from u to 1, over (1 - u)^1.5: a least-squares fit, off by 4e-8 in the integral.
+# Polynomial in 1 - u for the integral of sqrt(1 - s^2) from u to 1, divided by (1 - u)^1.5: a least-squares fit with an
+# error of 4e-8 in the integral.
 TAIL = (0.942809007, -0.141419555, -0.0126500054, -0.00233471418, -0.000931415786, 0.000194733329, -0.000269845138)
 
 
 def _tail(u: Array) -> Array:
-    """The integral of sqrt(1 - s^2) from u to 1, for u from 0 to 1."""
+    """Integral of sqrt(1 - s^2) from u to 1, for u from 0 to 1."""
     v = 1 - u
     total = jnp.full_like(v, TAIL[-1])
     for coefficient in TAIL[-2::-1]:
@@ -27,7 +28,7 @@ def _tail(u: Array) -> Array:
 
 @jax.custom_jvp
 def under_arc(t: Array, radius: Array) -> Array:
-    """U(t), the area px^2 under a circle's arc sqrt(r^2 - s^2) for s from 0 to t; beyond +-r as at +-r."""
+    """Area U(t) px^2 under the arc sqrt(r^2 - s^2) for s from 0 to t, constant beyond +-r."""
     u = jnp.minimum(jnp.abs(t) / radius, 1.0)
     return jnp.copysign(radius * radius * (QUARTER - _tail(u)), t)
 

@@ -1,4 +1,4 @@
-"""The share of each pixel that a disc covers, in closed form."""
+"""Pixel coverage of discs, in closed form."""
 
 from typing import NamedTuple
 
@@ -9,23 +9,21 @@ from gen2d.renderers.coverage.arc import LARGE, QUARTER, under_arc
 
 
 def shift(edges: Array) -> tuple[Array, Array]:
+    """Both edges, 1 px apart, of pixels given by their left or top edges."""
     return edges, edges + 1
 
 
-# ---- Discs
-
-
 class DiscEdge(NamedTuple):
-    """What a pixel's edge at some distance from a disc's centre brings to the corners on it."""
+    """Terms of the corner areas that depend on one edge, a column's or a row's, alone."""
 
-    at: Array
-    sign: Array
-    area: Array
-    square: Array
+    at: Array  # px from the centre
+    sign: Array  # of `at`
+    area: Array  # U(at); for a row less a signed quarter of the disc
+    square: Array  # at^2; for a column less radius^2
 
 
 class PixelDisc(NamedTuple):
-    """A disc cut by the edges of a grid's columns and rows."""
+    """Discs with the edge terms of the columns and rows of a pixel grid."""
 
     left: DiscEdge  # [..., columns]
     right: DiscEdge
@@ -35,8 +33,10 @@ class PixelDisc(NamedTuple):
 
 
 def disc_cuts(x: Array, y: Array, radius: Array) -> PixelDisc:
-    """The cuts of discs of `radius` [...] px by pixels with left edges x [..., columns] and top edges y [..., rows],
-    both from the disc's centre."""
+    """Edge terms of discs of `radius` [...] px.
+
+    The pixels have left edges x [..., columns] and top edges y [..., rows], relative to the centre of the disc.
+    """
     radius = jnp.maximum(radius, 1e-6)[..., None]
     square = radius * radius
 
@@ -52,13 +52,13 @@ def disc_cuts(x: Array, y: Array, radius: Array) -> PixelDisc:
 
 
 def _corner(x: DiscEdge, y: DiscEdge) -> Array:
-    """The disc's area in the rectangle between its centre and a corner, odd in both."""
+    """Signed area of the disc in the rectangle between its centre and a pixel corner, odd in both coordinates."""
     x, y = DiscEdge(*(a[..., None, :] for a in x)), DiscEdge(*(a[..., :, None] for a in y))
     return jnp.where(x.square + y.square < 0, x.at * y.at, y.sign * x.area + x.sign * y.area)
 
 
 def disc_area(disc: PixelDisc, largest: float) -> Array:
-    """The coverage [..., rows, columns] of discs of `largest` px at most."""
+    """Coverage [..., rows, columns] of discs whose radius is at most `largest` px."""
     upper = _corner(disc.right, disc.top) - _corner(disc.left, disc.top)
     area = (_corner(disc.right, disc.bottom) - _corner(disc.left, disc.bottom)) - upper
     if largest < LARGE:
@@ -68,10 +68,11 @@ def disc_area(disc: PixelDisc, largest: float) -> Array:
 
 
 def _large_disc(x: Array, y: Array, radius: Array) -> Array:
-    """The same from the centres of pixels, for a rim that is nearly straight in each.
+    """Coverage of large discs, whose rim is nearly straight in each pixel, from pixel centres x and y.
 
-    In a pixel's own coordinates the rim is f = (r^2 - |p|^2) / 2 - (x xi + y eta) - (xi^2 + eta^2) / 2 = 0; the last
-    term is replaced by its mean over the rim's chord, and the square is cut by the line that remains.
+    In coordinates (xi, eta) around a pixel's centre (x, y) the rim is f = (r^2 - x^2 - y^2) / 2 - (x xi + y eta)
+    - (xi^2 + eta^2) / 2 = 0. Replacing the last term by its mean over the chord of the rim leaves a line that cuts the
+    pixel.
     """
     x, y = jnp.abs(x)[..., None, :], jnp.abs(y)[..., :, None]
     small = jnp.maximum(jnp.minimum(x, y), 1e-3)

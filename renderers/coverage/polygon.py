@@ -1,19 +1,19 @@
-"""How much of each pixel a shape covers: the exact area of the shape in the pixel's square, between 0 and 1.
+"""Pixel coverage of convex polygons with rounded corners: the exact area of the shape in each pixel, from 0 to 1.
 
-The area left of a shape's right rim and right of its left one is an integral over y. For a pixel whose left and right
-edges are x0 and x1, and a boundary X(y) run through counter-clockwise,
+The area of a shape in a pixel is an integral over y along its boundary X(y), traversed counter-clockwise. For a pixel
+with left and right edges x0 and x1,
 
-    area = E(x0) - E(x1),   E(x) = closed integral of max(x - X(y), 0) dy over the pixel's row,
+    area = E(x0) - E(x1),   E(x) = closed integral of max(x - X(y), 0) dy over the pixel's row.
 
-and each E is a sum over the boundary's pieces, lines and arcs, in closed form (lines: a parabola in x between the
-piece's ends; arcs: by U(t) = integral of sqrt(r^2 - s^2) ds from 0 to t). Nothing is sampled. Whatever depends on a row
-or a column alone comes first (`disc_cuts`, `rounded_cuts`), so that what is left to do for each pixel is little.
+E is a sum over the lines and arcs of the boundary in closed form: a line adds a parabola in x between its ends, an arc
+adds U(t) = integral of sqrt(r^2 - s^2) ds from 0 to t. Nothing is sampled. Terms that depend on a row or a column alone
+are computed first (`disc_cuts`, `rounded_cuts`), which leaves little work per pixel.
 
-float32 sums of order r^2 lose digits: arcs are exact to .1 of 255 grey levels up to r = 64 px, and discs beyond that
-are taken as straight rims, corrected for their curvature, which is more exact the larger they are. Derivatives are
-those of the areas: U has its own, and where an arc leaves a column does not matter to first order.
+float32 sums of order r^2 lose digits: arcs are exact to .1 of 255 grey levels up to r = 64 px. Larger discs use a
+straight rim corrected for its curvature, which is more accurate the larger the disc. Derivatives are those of the exact
+areas: U has a custom derivative, and the point where an arc leaves a column has no first-order effect.
 
-Coordinates are pixels, x to the right and y down, with vertices in an order that is counter-clockwise in these.
+Coordinates are pixels, x to the right and y down; vertices are counter-clockwise in these coordinates.
 """
 
 import math
@@ -26,31 +26,29 @@ from gen2d.records.axes import Array
 from gen2d.renderers.coverage.arc import FAR, THIN, under_arc
 from gen2d.renderers.coverage.disc import shift
 
-# ---- Convex shapes with straight sides, their corners rounded
-
 
 class PolygonSide(NamedTuple):
-    """A side in each row: how far it goes down there, and between which x."""
+    """One side in each row."""
 
-    down: Array  # [..., rows]
-    low: Array
-    width: Array
+    down: Array  # [..., rows] signed height within the row
+    low: Array  # smallest x within the row
+    width: Array  # extent in x within the row
 
 
 class CornerArc(NamedTuple):
-    """One half, right or left, of a rounded corner: where it runs in each row, and where each column leaves it."""
+    """Right or left half of a rounded corner: its ends in each row, and its intersection with each column edge."""
 
-    begin: Array  # [..., rows] y from the centre, and U of it
-    begin_area: Array
+    begin: Array  # [..., rows] y relative to the centre
+    begin_area: Array  # U(begin)
     end: Array
     end_area: Array
-    at: tuple[Array, Array]  # [..., columns] x from the centre, of the left and the right edges of the pixels
-    leave: tuple[Array, Array]
+    at: tuple[Array, Array]  # [..., columns] x relative to the centre, of the left and right pixel edges
+    leave: tuple[Array, Array]  # |y| of the arc at these x
     leave_area: tuple[Array, Array]
 
 
 class RoundedPolygon(NamedTuple):
-    """A rounded polygon cut by the edges of a grid's columns and rows."""
+    """Rounded polygons with the edge terms of the columns and rows of a pixel grid."""
 
     x: Array  # [..., columns]
     lines: list[PolygonSide]
@@ -59,42 +57,44 @@ class RoundedPolygon(NamedTuple):
 
 
 def rounded_cuts(x: Array, y: Array, vertices: Array, radius: Array | None) -> RoundedPolygon:
-    """The cuts of convex polygons `vertices` [..., V, 2] px, grown by `radius` [...] px with round corners (None: not),
-    by pixels with left edges x [..., columns] and top edges y [..., rows]. Vertices may be repeated, and two are a
-    segment, with a radius a capsule; without an area there is nothing."""
+    """Edge terms of convex polygons, for pixels with left edges x [..., columns] and top edges y [..., rows].
+
+    The polygons have `vertices` [..., V, 2] px and grow by `radius` [...] px with round corners; None adds nothing.
+    Vertices may be repeated. Two vertices and a radius are a capsule. A shape without area covers nothing.
+    """
     count = vertices.shape[-2]
-    corner = [vertices[..., i, :] for i in range(count)]
-    normal = _normals(corner)
+    corners = [vertices[..., i, :] for i in range(count)]
+    normals = _normals(corners)
     lines, rights, lefts = [], [], []
     for i in range(count):
-        offset = 0.0 if radius is None else radius[..., None] * normal[i]
-        lines.append(_line(y, corner[i] + offset, corner[(i + 1) % count] + offset))
+        offset = 0.0 if radius is None else radius[..., None] * normals[i]
+        lines.append(_line(y, corners[i] + offset, corners[(i + 1) % count] + offset))
         if radius is not None:
-            arc = _arc_ends(normal[i - 1], normal[i])
-            u, v = x - corner[i][..., :1], y - corner[i][..., 1:]
-            rights.append(_arc(u, v, radius, *arc[0], side=1))
-            lefts.append(_arc(u, v, radius, *arc[1], side=-1))
-    return RoundedPolygon(x + jnp.zeros_like(corner[0][..., :1]), lines, rights, lefts)
+            arc = _arc_ends(normals[i - 1], normals[i])
+            from_left, from_top = x - corners[i][..., :1], y - corners[i][..., 1:]
+            rights.append(_arc(from_left, from_top, radius, *arc[0], side=1))
+            lefts.append(_arc(from_left, from_top, radius, *arc[1], side=-1))
+    return RoundedPolygon(x + jnp.zeros_like(corners[0][..., :1]), lines, rights, lefts)
 
 
 def _normals(corner: list[Array]) -> list[Array]:
-    """The outward normal of the side after each corner; of a side without length that of the side before."""
-    found = []
+    """Outward normal of the side after each corner; a side of length 0 takes that of the side before."""
+    sides = []
     count = len(corner)
     for i in range(count):
         side = corner[(i + 1) % count] - corner[i]
         square = (side * side).sum(-1, keepdims=True)
         length = jnp.sqrt(jnp.where(square > 0, square, 1.0))
-        found.append((square > 1e-12, jnp.stack([side[..., 1], -side[..., 0]], -1) / length))
-    normal = []
+        sides.append((square > 1e-12, jnp.stack([side[..., 1], -side[..., 0]], -1) / length))
+    normals = []
     for i in range(count):
-        turn = 2 * math.pi * i / count  # a point is a disc: all around it
+        turn = 2 * math.pi * i / count  # a single point is a disc: normals around the circle
         best = jnp.zeros_like(corner[0]) + jnp.asarray([math.cos(turn), math.sin(turn)], corner[0].dtype)
         for back in range(count - 1, -1, -1):
-            there, value = found[i - back]
-            best = jnp.where(there, value, best)
-        normal.append(best)
-    return normal
+            has_length, candidate = sides[i - back]
+            best = jnp.where(has_length, candidate, best)
+        normals.append(best)
+    return normals
 
 
 def _line(y: Array, begin: Array, end: Array) -> PolygonSide:
@@ -102,23 +102,21 @@ def _line(y: Array, begin: Array, end: Array) -> PolygonSide:
     rise = side[..., 1:]
     flat = jnp.abs(rise) < 1e-9
 
-    def part(edge: Array) -> Array:
-        """Which part of the side lies above an edge between rows."""
+    def crossing(edge: Array) -> Array:
+        """Position on the side, 0 at `begin` and 1 at `end`, where it crosses an edge between rows."""
         along = jnp.clip((edge - begin[..., 1:]) / jnp.where(flat, 1.0, rise), 0.0, 1.0)
         return jnp.where(flat, (edge > begin[..., 1:]).astype(along.dtype), along)
 
-    (first, second), across = map(part, shift(y)), side[..., :1]
-    one, other = begin[..., :1] + first * across, begin[..., :1] + second * across
-    low = jnp.minimum(one, other)
-    return PolygonSide(jnp.abs(second - first) * rise, low, jnp.maximum(jnp.abs(one - other), THIN))
+    (first, second), across = map(crossing, shift(y)), side[..., :1]
+    upper, lower = begin[..., :1] + first * across, begin[..., :1] + second * across
+    low = jnp.minimum(upper, lower)
+    return PolygonSide(jnp.abs(second - first) * rise, low, jnp.maximum(jnp.abs(upper - lower), THIN))
 
 
 def _arc_ends(before: Array, after: Array) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
-    """Between which sines the arc from one normal to the next, half a turn at most, runs in its right half, and in its
-    left one."""
-
+    """Sines of both ends of the right and of the left half of the arc between two normals, of at most half a turn."""
     (c0, s0), (c1, s1) = ((n[..., 0], n[..., 1]) for n in (before, after))
-    straight = (c0 * s1 - c1 * s0 <= 0) & (c0 * c1 + s0 * s1 > 0)  # no arc, but for rounding: it passes no end
+    straight = (c0 * s1 - c1 * s0 <= 0) & (c0 * c1 + s0 * s1 > 0)  # parallel normals up to rounding: no arc
     turn = jnp.where(straight, -1.0, 1.0)
 
     def half(sign: float) -> tuple[Array, Array]:
@@ -135,15 +133,15 @@ def _arc(x: Array, y: Array, radius: Array, begin: Array, end: Array, side: int)
     low, high = (radius * sine[..., None] for sine in ((begin, end) if side > 0 else (end, begin)))
     (top, bottom) = (jnp.clip(edge, low, high) for edge in shift(y))
     columns = shift(x)
-    # Where a column leaves the arc does not matter to first order. One on the other side of the centre never does: a
-    # bound that is never met, as halves of slopes would be lost where it is just met.
-    away = [jnp.maximum(side * at, 0.0) for at in columns]
-    leave = [jax.lax.stop_gradient(jnp.sqrt(jnp.maximum(radius**2 - at**2, 0.0))) for at in away]
-    areas = [jnp.where(at > 0, under_arc(value, radius), FAR) for at, value in zip(away, leave, strict=True)]
-    leave = [jnp.where(at > 0, value, FAR) for at, value in zip(away, leave, strict=True)]
+    # The point where a column leaves the arc has no first-order effect, so stop its gradient. A column on the other
+    # side of the centre never does: its bound is FAR, since a value equal to its bound loses half of its derivative.
+    distances = [jnp.maximum(side * at, 0.0) for at in columns]
+    leave = [jax.lax.stop_gradient(jnp.sqrt(jnp.maximum(radius**2 - at**2, 0.0))) for at in distances]
+    areas = [jnp.where(at > 0, under_arc(value, radius), FAR) for at, value in zip(distances, leave, strict=True)]
+    leave = [jnp.where(at > 0, value, FAR) for at, value in zip(distances, leave, strict=True)]
     begin, end = (top, bottom) if side > 0 else (bottom, top)
-    ends = begin, under_arc(begin, radius), end, under_arc(end, radius)
-    return CornerArc(*ends, (columns[0], columns[1]), (leave[0], leave[1]), (areas[0], areas[1]))
+    row_terms = begin, under_arc(begin, radius), end, under_arc(end, radius)
+    return CornerArc(*row_terms, (columns[0], columns[1]), (leave[0], leave[1]), (areas[0], areas[1]))
 
 
 def _grid(rows: Array) -> Array:
@@ -151,7 +149,7 @@ def _grid(rows: Array) -> Array:
 
 
 def rounded_area(cuts: RoundedPolygon) -> Array:
-    """The coverage [..., rows, columns] of rounded polygons."""
+    """Coverage [..., rows, columns] of rounded polygons."""
     area: Any = 0.0
     for line in cuts.lines:
         low, width = _grid(line.low), _grid(line.width)
@@ -164,26 +162,26 @@ def rounded_area(cuts: RoundedPolygon) -> Array:
 
 
 def _below(past: Array, width: Array) -> Array:
-    """The mean of max(x - X, 0) over a line from x = 0 to `width`, for an x that is `past` its begin."""
+    """Mean of max(past - X, 0) for X uniform from 0 to `width`."""
     inner = jnp.minimum(past, width)
     return inner * inner / (2 * width) + (past - inner)
 
 
 @jax.custom_jvp
 def _within(value: Array, end: Array) -> Array:
-    """The value, or the nearer end."""
+    """Value clipped to [-end, end]."""
     return jnp.clip(value, -end, end)
 
 
 @_within.defjvp
 def _within_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
     (value, end), (moved, stretched) = primals, tangents
-    # On an end, where rounding may put it, it moves as the end does.
+    # A value that rounding put on the bound has the derivative of the bound.
     return _within(value, end), jnp.where(jnp.abs(value) < end, moved, jnp.sign(value) * stretched)
 
 
 def _beyond_right(arc: CornerArc, edge: int) -> Array:
-    """The integral of max(x - sqrt(r^2 - y^2), 0) dy along an arc."""
+    """Integral of max(x - sqrt(r^2 - y^2), 0) dy along an arc in each row."""
     at, leave, area = (a[edge][..., None, :] for a in (arc.at, arc.leave, arc.leave_area))
 
     def to(y: Array, under: Array) -> Array:
@@ -194,7 +192,7 @@ def _beyond_right(arc: CornerArc, edge: int) -> Array:
 
 
 def _beyond_left(arc: CornerArc, edge: int) -> Array:
-    """The integral of max(x + sqrt(r^2 - y^2), 0) dy along an arc."""
+    """Integral of max(x + sqrt(r^2 - y^2), 0) dy along an arc in each row."""
     at, leave, area = (a[edge][..., None, :] for a in (arc.at, arc.leave, arc.leave_area))
 
     def to(y: Array, under: Array) -> Array:

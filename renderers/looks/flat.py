@@ -7,11 +7,11 @@ from gen2d.plugin import Array, Layout, Look, Paint, PlainOptions, Scene, line_m
 
 @dataclasses.dataclass(frozen=True)
 class Options(PlainOptions):
-    """What plain shapes have."""
+    """Options of plain shapes."""
 
 
 def paint(scene: Scene, layout: Layout, options: Options, key: Array) -> Paint:
-    """What one video's slots are painted with."""
+    """Paint of one video: one colour per slot."""
     return plain(scene, layout, options, key)
 
 

@@ -1,4 +1,4 @@
-"""Plain shapes with a bar from the centre to the rim, so that it can be seen how each has turned."""
+"""Plain shapes with a bar from the centre to the rim, which makes their rotation visible."""
 
 import dataclasses
 
@@ -22,7 +22,7 @@ from gen2d.plugin import (
 
 @dataclasses.dataclass(frozen=True)
 class Options(PlainOptions):
-    """Marks, and what plain shapes have."""
+    """Options of the marks, in addition to those of plain shapes."""
 
     mark_width: float = option(0.3, float, "1", "of an object's bar, over its radius", above=0, high=1)
     rim_width: float = option(0.0, float, "px", "of a dark line along the inside of a rim; 0: none", low=0)
@@ -30,13 +30,13 @@ class Options(PlainOptions):
 
 
 def paint(scene: Scene, layout: Layout, options: Options, key: Array) -> Paint:
-    """What one video's slots are painted with: bars, light or dark, on all that moves."""
-    begun = plain(scene, layout, options, key)
+    """Paint of one video: moving slots have a light or dark bar, whichever contrasts with their colour."""
+    base = plain(scene, layout, options, key)
     mark = jnp.where(are_moving(layout), options.mark_width / 2, 0.0)
-    marked = begun._replace(mark=mark, mark_color=contrasting(begun.color))
+    marked = base._replace(mark=mark, mark_color=contrasting(base.color))
     if not options.rim_width:
         return marked
-    rim_color = jnp.broadcast_to(jnp.asarray(options.rim_color, jnp.float32), begun.color.shape)
+    rim_color = jnp.broadcast_to(jnp.asarray(options.rim_color, jnp.float32), base.color.shape)
     return marked._replace(rim=jnp.where(are_lines(scene), 0.0, options.rim_width), rim_color=rim_color)
 
 

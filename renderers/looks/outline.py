@@ -1,4 +1,4 @@
-"""Objects as outlines: a line along the inside of each rim in the object's colour, and less of that colour within."""
+"""Objects as outlines: a line along the inside of the rim, and a fainter fill of the same colour."""
 
 import dataclasses
 
@@ -21,7 +21,7 @@ from gen2d.plugin import (
 
 @dataclasses.dataclass(frozen=True)
 class Options(PlainOptions):
-    """Outlines, and what plain shapes have."""
+    """Options of the outlines, in addition to those of plain shapes."""
 
     width: float = option(1.5, float, "px", "of the line along the inside of a rim", above=0)
     fill: float = option(
@@ -30,11 +30,11 @@ class Options(PlainOptions):
 
 
 def paint(scene: Scene, layout: Layout, options: Options, key: Array) -> Paint:
-    """What one video's slots are painted with; segments are lines anyway, in their own colour."""
-    begun, line = plain(scene, layout, options, key), are_lines(scene)
-    behind = mean_color(begun.background)
-    within = jnp.where(line[:, None], begun.color, behind + options.fill * (begun.color - behind))
-    return begun._replace(fill=within, rim=jnp.where(line, 0.0, options.width), rim_color=begun.color)
+    """Paint of one video. Segments are lines in their own colour, without an outline."""
+    base, lines = plain(scene, layout, options, key), are_lines(scene)
+    backdrop = mean_color(base.background)
+    fill = jnp.where(lines[:, None], base.color, backdrop + options.fill * (base.color - backdrop))
+    return base._replace(fill=fill, rim=jnp.where(lines, 0.0, options.width), rim_color=base.color)
 
 
 LOOK = Look(options=Options, paint=paint, margin=line_margin)

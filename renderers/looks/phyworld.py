@@ -1,6 +1,6 @@
-"""Red and blue shapes in turn on white, without walls: the look of PhyWorld's videos (Kang et al., arXiv 2411.02385).
+"""Alternating red and blue shapes on white, without walls: the look of PhyWorld (Kang et al., arXiv 2411.02385).
 
-Theirs have a rim that is soft over 1.5 % of the radius; here it is sharp.
+PhyWorld's rims are soft over 1.5 % of the radius; here they are sharp.
 """
 
 import dataclasses
@@ -27,16 +27,16 @@ WHITE, RED, BLUE = (255.0, 255.0, 255.0), (255.0, 0.0, 0.0), (0.0, 0.0, 255.0)
 
 @dataclasses.dataclass(frozen=True)
 class Options(LineOptions):
-    """Line widths."""
+    """Options of segments."""
 
     wall_width: float = option(0.0, float, "px", "of a segment's line, beyond its own radius; 0: not drawn", low=0)
 
 
 def paint(scene: Scene, layout: Layout, options: Options, key: Array) -> Paint:
-    """What one video's slots are painted with; what is static has the scene's colours."""
+    """Paint of one video: moving slots are red and blue in turn, static slots have the scene's colours."""
     moving = are_moving(layout)
-    turn = jnp.asarray([RED, BLUE])[(np.cumsum(moving) - 1) % 2]
-    colors = jnp.where(moving[:, None], turn, scene.objects.color.astype(jnp.float32))
+    alternating = jnp.asarray([RED, BLUE])[(np.cumsum(moving) - 1) % 2]
+    colors = jnp.where(moving[:, None], alternating, scene.objects.color.astype(jnp.float32))
     return Paint(Background(jnp.asarray(WHITE)), colors, *line_fields(scene, options))
 
 

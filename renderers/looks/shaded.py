@@ -1,4 +1,4 @@
-"""Softly shaded shapes, as if lit from the upper left."""
+"""Plain shapes with soft shading, lit from the upper left."""
 
 import dataclasses
 
@@ -9,13 +9,13 @@ from gen2d.plugin import Array, Layout, Look, Paint, PlainOptions, Scene, are_li
 
 @dataclasses.dataclass(frozen=True)
 class Options(PlainOptions):
-    """Shade, and what plain shapes have."""
+    """Options of the shading, in addition to those of plain shapes."""
 
     shade: float = option(0.6, float, "1", "how much darker an object is opposite the light; 0: not", low=0, high=1)
 
 
 def paint(scene: Scene, layout: Layout, options: Options, key: Array) -> Paint:
-    """What one video's slots are painted with; lines have no shade."""
+    """Paint of one video: all slots but segments are shaded."""
     shade = jnp.where(are_lines(scene), 0.0, options.shade)
     return plain(scene, layout, options, key)._replace(shade=shade)
 

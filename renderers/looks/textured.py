@@ -1,4 +1,4 @@
-"""Shapes with spots of random noise that turn with them, on noise."""
+"""Shapes with spots of random noise that turn with them, by default on a noise background."""
 
 import dataclasses
 
@@ -23,7 +23,7 @@ from gen2d.plugin import (
 
 @dataclasses.dataclass(frozen=True)
 class Options(PlainOptions):
-    """Spots, and what plain shapes have."""
+    """Options of the spots, in addition to those of plain shapes."""
 
     background_kind: str = option("noise", str, "", "what is behind everything", choices=("plain", "gradient", "noise"))
     background_to: tuple = option([64, 64, 84], int, "sRGB", "where it ends", parts=3, low=0, high=255)
@@ -34,15 +34,15 @@ class Options(PlainOptions):
 
 
 def paint(scene: Scene, layout: Layout, options: Options, key: Array) -> Paint:
-    """What one video's slots are painted with, each with spots of its own."""
-    begun = plain(scene, layout, options, key)
-    far = contrasting(mean_color(begun.background))
+    """Paint of one video: each slot has its own spots."""
+    base = plain(scene, layout, options, key)
+    extreme = contrasting(mean_color(base.background))
     texture = Texture(
         seed=jax.random.bits(jax.random.fold_in(key, 2), (layout.slots,), jnp.uint32),
         cell=jnp.full(layout.slots, options.cell_size * layout.reach),
-        color=begun.color + options.contrast * (far - begun.color),
+        color=base.color + options.contrast * (extreme - base.color),
     )
-    return begun._replace(texture=texture)
+    return base._replace(texture=texture)
 
 
 LOOK = Look(options=Options, paint=paint, margin=line_margin)
