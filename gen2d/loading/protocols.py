@@ -1,4 +1,4 @@
-"""Protocols of datasets, concatenations and mixtures, and the indexing that they share."""
+"""Protocols of datasets and concatenations, and the indexing that they share with mixtures."""
 
 from collections.abc import Mapping, Sequence
 from typing import Protocol, SupportsIndex, TypeAlias
@@ -25,7 +25,7 @@ class VideoSequence(Protocol):
 
 
 class VideoReader(Protocol):
-    """Source of videos for `DataLoader`: a Dataset, ConcatDataset or Mixture. `Dataset` describes the methods."""
+    """Source of videos for `DataLoader`: a Dataset or a ConcatDataset. `Dataset` describes the methods."""
 
     def __len__(self) -> int: ...
 
