@@ -33,6 +33,7 @@ class DataLoader(Generic[A]):
     position follow from (seed, epoch, position) alone, so a state is a few numbers and is valid for any world size. An
     iteration ends after `epochs` epochs, and the next iteration continues with the following epochs. After `break` or
     `load_state_dict`, the next iteration continues with the batch after the last one delivered.
+    Iterating raises the errors of `Dataset.batch` when videos cannot be read.
 
     Parameters
     ----------
@@ -71,8 +72,6 @@ class DataLoader(Generic[A]):
     ------
     ConfigError
         If an argument is invalid, or if the dataset has fewer videos than a batch needs.
-
-    Iteration raises the errors of reading of `Dataset.batch`.
 
     Examples
     --------

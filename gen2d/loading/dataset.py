@@ -349,7 +349,9 @@ class Dataset:
             raise UserError(f"{self.root}: {count} videos take {in_bytes(size)}, more than there is memory") from None
 
     def fill(self, out: Batch, rows: Numbers, indices: Numbers, starts: Numbers | None = None) -> None:
-        """Read the videos with these indices into `out`; several threads may fill different rows of one batch.
+        """Read the videos with these indices into `out`; raises the errors of `batch`.
+
+        Several threads may fill different rows of one batch.
 
         Parameters
         ----------
@@ -361,8 +363,6 @@ class Dataset:
             Indices of the videos; negative ones count from the end.
         starts : sequence of int [n], optional
             First frame of each video's window, as in `batch`.
-
-        Raises the errors of `batch`.
         """
         numbers = self.numbers(indices)
         first = np.full(len(numbers), self.options.first) if starts is None else np.asarray(starts)
