@@ -57,7 +57,7 @@ def write(target: Path, source: Source) -> None:
 
 
 def _balls(video: Batch) -> np.ndarray:
-    """Slots of the dynamic bodies."""
+    """Slots of the bodies that are not static."""
     return np.flatnonzero(video["objects/present"] & (video["objects/kind"] != STATIC))
 
 
