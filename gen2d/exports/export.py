@@ -144,8 +144,8 @@ def _beside(root: Place, ending: str) -> Path:
 def _about(source: Source, to: str) -> dict[str, Any]:
     """Contents of a folder's export.json, without the list of files."""
     manifest = source.ds.manifest
-    shown = ("name", "seed", "fps", "sizes", "conventions", "licence", "manifest_sha256", "config_sha256")
-    about = {key: manifest.plain[key] for key in shown} | {
+    keys = ("name", "seed", "fps", "sizes", "conventions", "licence", "manifest_sha256", "config_sha256")
+    about = {key: manifest.plain[key] for key in keys} | {
         "schema": SCHEMA,
         "format": to,
         "split": source.ds.options.split,

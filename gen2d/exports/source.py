@@ -60,8 +60,8 @@ class Source:
         """Videos one at a time, as dictionaries of arrays by field name."""
         frames = self._drawn() if self.draws else iter(())
         for number in range(len(self)):
-            drawn = {"frames": next(frames)} if self.draws else {}
-            yield drawn | self.ds[number]
+            rendered = {"frames": next(frames)} if self.draws else {}
+            yield rendered | self.ds[number]
 
     def each(self, write: Callable[[str, Batch], None]) -> None:
         """Call `write(key, video)` for every video in several threads, and report the progress to `advance`."""

@@ -134,9 +134,9 @@ class SplitFiles:
             for step, key in enumerate(wanted):
                 entries[step] = blocks[key][rows[step] % INDEX_BLOCK]
         else:
-            for place in np.unique(shards):
-                members = np.flatnonzero(shards == place)
-                entries[members] = self._index_rows(int(place), rows[members])
+            for shard in np.unique(shards):
+                members = np.flatnonzero(shards == shard)
+                entries[members] = self._index_rows(int(shard), rows[members])
         if self.checks:
             is_intact = intact(entries, self._origin, numbers.tolist())
             if not is_intact.all():
@@ -149,9 +149,9 @@ class SplitFiles:
         return DamagedError(f"{path}: the index of {self.split} video {number} is not what was written")
 
     def _index_rows(self, place: int, rows: np.ndarray) -> np.ndarray:
-        shard, size = self.shard(place), self._video_type.itemsize
-        file = self._open(shard)
-        parts = [file.read(shard.rows + row * size, size) for row in rows.tolist()]
+        shard_row, size = self.shard(place), self._video_type.itemsize
+        file = self._open(shard_row)
+        parts = [file.read(shard_row.rows + row * size, size) for row in rows.tolist()]
         return np.frombuffer(b"".join(parts), self._video_type)
 
     def _fetched_blocks(self, wanted: set[tuple[int, int]]) -> dict[tuple[int, int], np.ndarray]:
@@ -159,10 +159,10 @@ class SplitFiles:
         with _lock:
             blocks = {key: self._blocks[key] for key in wanted & self._blocks.keys()}
         missing, size, ranges = sorted(wanted - blocks.keys()), self._video_type.itemsize, []
-        for place, block in missing:
-            shard = self.shard(place)
-            first, last = block * INDEX_BLOCK, min((block + 1) * INDEX_BLOCK, shard.shard.count)
-            ranges.append((shard_name(shard.shard.name), shard.rows + first * size, shard.rows + last * size))
+        for shard, block in missing:
+            row = self.shard(shard)
+            first, last = block * INDEX_BLOCK, min((block + 1) * INDEX_BLOCK, row.shard.count)
+            ranges.append((shard_name(row.shard.name), row.rows + first * size, row.rows + last * size))
         for key, (name, *_), content in zip(missing, ranges, self._fetched(ranges), strict=True):
             if isinstance(content, Exception):
                 raise _reading_error(self.path(name), content)
@@ -178,17 +178,17 @@ class SplitFiles:
         shards, rows = np.divmod(numbers, self.manifest.videos_per_shard)
         if column.is_image:
             entries = zip(shards.tolist(), videos[column.name].tolist(), begins, strict=True)
-            return [[self._piece(column, place, chunks[i]) for i in column.needed(b)] for place, chunks, b in entries]
+            return [[self._piece(column, shard, chunks[i]) for i in column.needed(b)] for shard, chunks, b in entries]
         names = self._names
-        offsets = {place: int(self.shard(place).offsets[names[column.name]]) for place in np.unique(shards).tolist()}
+        offsets = {shard: int(self.shard(shard).offsets[names[column.name]]) for shard in np.unique(shards).tolist()}
         entries = zip(shards.tolist(), rows.tolist(), videos[column.name].tolist(), strict=True)
-        return [[Chunk(place, offsets[place] + row * column.size, column.size, crc)] for place, row, crc in entries]
+        return [[Chunk(shard, offsets[shard] + row * column.size, column.size, crc)] for shard, row, crc in entries]
 
     @functools.cached_property
     def _names(self) -> dict[str, int]:
         """Position of each uncompressed field in the sorted list of them."""
         sorted_names = sorted(n for n, field in self.manifest.fields.items() if field.per_video and not field.is_image)
-        return {name: place for place, name in enumerate(sorted_names)}
+        return {name: position for position, name in enumerate(sorted_names)}
 
     def _piece(self, column: Column, place: int, chunk: tuple[int, int, int]) -> Chunk:
         offset, size, crc = chunk
@@ -202,7 +202,7 @@ class SplitFiles:
         if isinstance(self.root, Path) or self.cache:
             file_of = functools.lru_cache(maxsize=16)(lambda place: self._open(self.shard(place)))
             return lambda column, piece, target: _piece_of(file_of(piece.shard), column, piece, target)
-        chunks = list({piece for own in places for video in own for piece in video})
+        chunks = list({piece for column_chunks in places for video in column_chunks for piece in video})
         names = {place: shard_name(self.shard(place).shard.name) for place in {piece.shard for piece in chunks}}
         data = self._fetched([(names[p.shard], p.offset, p.offset + p.size) for p in chunks])
         return functools.partial(_received, dict(zip(chunks, data, strict=True)))

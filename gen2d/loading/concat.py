@@ -99,7 +99,7 @@ class ConcatDataset:
         return shuffled(seed, epoch, positions, len(self))
 
     def starts(self, numbers: np.ndarray, bits: np.ndarray) -> np.ndarray | None:
-        """First frame of each video's window, sampled from random bits; None unless `start` is "random"."""
+        """First frame of each video's window, sampled from random bits; None if windows are not random."""
         starts = np.zeros(len(numbers), np.int64)
         for owner, members in self._shared(numbers):
             begins = self.datasets[owner].starts(numbers[members], bits[members])

@@ -86,7 +86,8 @@ def open(
 ) -> "Dataset | ConcatDataset":
     """Open one split of a complete dataset for reading.
 
-    A dataset may grow while it is read; the opened `Dataset` keeps the videos that it had when it was opened.
+    A dataset may grow while it is read; the opened `Dataset` keeps the videos that it had when it was opened. Files are
+    opened when videos are read, which raises the errors of `Dataset.batch`.
 
     Parameters
     ----------
@@ -136,7 +137,7 @@ def open(
     DamagedError
         If the manifest is damaged.
     UnreachableError
-        If a server or disk does not answer. Reading videos raises this error and DamagedError as well.
+        If a server or disk does not answer.
 
     Examples
     --------
@@ -182,7 +183,7 @@ class ViewOptions:
         return self.start if isinstance(self.start, int) else 0
 
     def starts(self, bits: np.ndarray, frames: int) -> np.ndarray | None:
-        """First frame of each window, int64 [n], sampled from random bits; None unless `start` is "random"."""
+        """First frame of each window, int64 [n], sampled from random bits; None if windows are not random."""
         if self.window is None or self.start != "random":
             return None
         return (bits % np.uint64(frames - self.span + 1)).astype(np.int64)
@@ -234,7 +235,9 @@ class Dataset:
     fields : dict of str to Field
         dtype, axes, unit and meaning of each field as stored, before window, layout and dtype are applied.
     stats : dict
-        Mean, std, min and max of each component of the frames and states, by field, over the split.
+        Mean, std, min and max of each component of the frames and states, by field. They are those of
+        the stored values (frames from 0 to 255, also with `dtype="float32"`), over the sample that
+        `manifest.stats_sampled` describes.
     time : ndarray, float64 [T]
         Times of the frames, s.
     snapshot : str
@@ -375,14 +378,14 @@ class Dataset:
             chunks = [self._files.pieces(column, numbers, videos, begins) for column in self._columns]
             read = self._files.reader(chunks)
         for column, column_chunks in zip(self._columns, chunks, strict=True):
-            whole = None if column.is_direct else np.empty((1, *column.stored), column.field.dtype)
+            scratch = None if column.is_direct else np.empty((1, *column.stored), column.field.dtype)
             for step, video_chunks in enumerate(column_chunks):
                 target = out[column.name][targets[step] : targets[step] + 1]
-                buffer, begin = target if whole is None else whole, begins[step]
+                buffer, begin = target if scratch is None else scratch, begins[step]
                 for number, chunk in zip(column.needed(begin), video_chunks, strict=True):
                     self._read(read, column, chunk, int(numbers[step]), column.part(buffer, number))
-                if whole is not None:
-                    column.convert(whole, begin, target)
+                if scratch is not None:
+                    column.convert(scratch, begin, target)
 
     @contextlib.contextmanager
     def _named(self, numbers: np.ndarray) -> Iterator[None]:
@@ -414,7 +417,7 @@ class Dataset:
         return shuffled(seed, epoch, positions, len(self))
 
     def starts(self, numbers: np.ndarray, bits: np.ndarray) -> np.ndarray | None:
-        """First frame of each video's window, int64 [n], sampled from random bits; None unless `start` is "random"."""
+        """First frame of each video's window, int64 [n], sampled from random bits; None if windows are not random."""
         return self.options.starts(bits, self._frames)
 
     def numbers(self, indices: Numbers) -> np.ndarray:

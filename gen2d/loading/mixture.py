@@ -157,7 +157,7 @@ class Mixture:
         return numbers
 
     def starts(self, numbers: np.ndarray, bits: np.ndarray) -> np.ndarray | None:
-        """First frame of each video's window, sampled from random bits; None unless `start` is "random"."""
+        """First frame of each video's window, sampled from random bits; None if windows are not random."""
         return self._joined.starts(numbers, bits)
 
     def source_of(self, positions: Numbers) -> list[str]:

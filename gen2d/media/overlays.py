@@ -1,4 +1,4 @@
-"""Annotations drawn over frames."""
+"""Annotations rendered over frames."""
 
 from collections.abc import Mapping
 
