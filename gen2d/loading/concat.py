@@ -75,7 +75,7 @@ class ConcatDataset:
     def at(self, snapshot: Snapshot) -> "ConcatDataset":
         """The same datasets at earlier snapshots.
 
-        Raises ConfigError if the snapshots belong to other datasets, FolderError if one is no longer in its folder.
+        Raises ConfigError if the number of snapshots differs, FolderError if a folder does not have its snapshot.
         """
         return self if snapshot == self.snapshot else ConcatDataset(at_snapshots(self.datasets, snapshot))
 

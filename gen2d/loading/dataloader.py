@@ -206,9 +206,9 @@ class DataLoader(Generic[A]):
         Raises
         ------
         ConfigError
-            If the state belongs to another dataset, or has another seed, shuffle or number of videos.
+            If the state has another seed, shuffle, number of videos or number of datasets.
         FolderError
-            If the folder no longer has the snapshot.
+            If the folder does not have the snapshot, because it was removed or belongs to another dataset.
         """
         self.close()
         snapshot = state.get("snapshot") if isinstance(state, Mapping) else None  # None in a stream's state

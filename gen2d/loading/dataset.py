@@ -235,9 +235,9 @@ class Dataset:
     fields : dict of str to Field
         dtype, axes, unit and meaning of each field as stored, before window, layout and dtype are applied.
     stats : dict
-        Mean, std, min and max of each component of the frames and states, by field. They are those of
-        the stored values (frames from 0 to 255, also with `dtype="float32"`), over the sample that
-        `manifest.stats_sampled` describes.
+        Mean, std, min and max of each component of the frames and states, by field, over the sample that
+        `manifest.stats_sampled` describes. Units are those of the stored values: frames are from 0 to 255 even with
+        `dtype="float32"`.
     time : ndarray, float64 [T]
         Times of the frames, s.
     snapshot : str
@@ -278,7 +278,7 @@ class Dataset:
     def at(self, snapshot: Snapshot) -> "Dataset":
         """The dataset at an earlier snapshot, with the same options.
 
-        Raises FolderError if the folder no longer has the snapshot, ConfigError if it belongs to another dataset.
+        Raises FolderError if the folder does not have the snapshot, ConfigError for the snapshots of several datasets.
         """
         if snapshot == self.snapshot:
             return self

@@ -113,7 +113,7 @@ class Mixture:
     def at(self, snapshot: Snapshot) -> "Mixture":
         """Mixture of the same datasets at earlier snapshots.
 
-        Raises ConfigError if the snapshots belong to other datasets, FolderError if one is no longer in its folder.
+        Raises ConfigError if the number of snapshots differs, FolderError if a folder does not have its snapshot.
         """
         if snapshot == self.snapshot:
             return self
