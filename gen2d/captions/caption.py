@@ -1,9 +1,10 @@
-"""What happens in a video, in words: a list of events as JSON, and a caption in English, both from the stored fields.
+"""Caption and event list of a video, computed from its stored fields: a JSON list and a text in English.
 
     [{"event":"hit","time":0.42,"frame":13,"a":0,"b":3,"point":[2.1,0.0],"speed":4.1}, ...]
     Two balls in a box under gravity. The red ball hits the floor at 0.42 s, then the blue ball at 0.8 s.
 
-A video's words depend on its own fields alone. NumPy, on the host, while the device goes on; jax is not imported.
+A video's texts depend on its own fields alone. NumPy computes them on the host, in parallel with the device; jax is not
+imported.
 """
 
 import math
@@ -42,14 +43,14 @@ COLORS = {
     "black": (20, 20, 20),
 }
 NOUNS = ("ball", "rod", "capsule", "polygon")  # by objects/shape
-FIXED_NOUNS = ("peg", "wall", "bar", "block")  # of what is static
+FIXED_NOUNS = ("peg", "wall", "bar", "block")  # of static bodies, by objects/shape
 CORNERS = {3: "triangle", 4: "box"}
 NUMBERS = ["no", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten", "eleven", "twelve"]
 BOX = ("floor", "ceiling", "left wall", "right wall")
 
 
 def fields(slots: int, frames: int) -> dict[str, Field]:
-    """What is stored, for so many objects and frames; this alone decides how wide the text is."""
+    """Stored text fields; the numbers of slots and frames alone determine their widths."""
     width = 2 + EVENT_BYTES * slots * math.ceil(frames / 16)
     return {
         "text/caption": Field(f"S{CAPTION_BYTES}", "n", "UTF-8", "what is there and what happens first"),
@@ -63,7 +64,7 @@ def fields(slots: int, frames: int) -> dict[str, Field]:
 
 
 def caption_fields(columns: EventColumns, video: Any) -> dict[str, np.ndarray]:
-    """The fields of some videos, from their others [n, ...]; `video` has frames, fps, and height and width in px."""
+    """Text fields [n] of videos, from their other fields [n, ...]; `video` has frames, fps, height and width (px)."""
     stored = fields(columns["objects/present"].shape[1], video.frames)
     rows = [
         captions_of({name: columns[name][i] for name in NEEDED if name in columns}, video, stored)
@@ -82,7 +83,7 @@ NEEDED = (
 
 
 def captions_of(made: EventColumns, video: Any, stored: Mapping[str, Field]) -> dict[str, Any]:
-    """One video's fields, from its others."""
+    """Text fields of one video, from its other fields."""
     events = events_of(made, video)
     missed = int(made["contacts/count"]) > len(made["contacts/kind"])
     width = np.dtype(stored["text/events"].dtype).itemsize
@@ -97,31 +98,31 @@ def captions_of(made: EventColumns, video: Any, stored: Mapping[str, Field]) -> 
 
 
 def caption(made: EventColumns, events: list[VideoEvent], fps: float, missed: bool = False) -> str:
-    """What is there and what happens first, in English; `missed`: whether there were more hits than are known."""
+    """Caption of the objects and the first events; `missed` says that there were more contacts than are stored."""
     names, decimals = names_of(made), max(2, math.ceil(math.log10(fps)))
 
-    def telling(shown: int) -> str:
-        left = len(events) - shown
-        more = [f"{'At least' if missed else 'And'} {left} more event{'s' if left > 1 else ''}."] if left else []
+    def text_of(shown: int) -> str:
+        extra = len(events) - shown
+        more = [f"{'At least' if missed else 'And'} {extra} more event{'s' if extra > 1 else ''}."] if extra else []
         return " ".join([opening(made, names), *sentences(made, names, events[:shown], decimals), *more])
 
-    texts = (telling(shown) for shown in range(min(MAX_EVENTS, len(events)), -1, -1))
+    texts = (text_of(shown) for shown in range(min(MAX_EVENTS, len(events)), -1, -1))
     return next(text for text in texts if len(text) <= CAPTION_BYTES)
 
 
 def opening(made: EventColumns, names: Mapping[int, str]) -> str:
-    """The sentence that says what is there."""
+    """First sentence: the objects, the box and gravity."""
     kinds = nouns(made)
-    ours = [kinds[slot] for slot in moving_slots(made)]
+    moving = [kinds[slot] for slot in moving_slots(made)]
     obstacles = [noun for slot, noun in kinds.items() if noun in FIXED_NOUNS and noun != "wall"]
     box = " in a box" if all(f"the {side}" in names.values() for side in BOX) else ""
     among = f" among {counted(obstacles)}" if obstacles else ""
-    text = f"{counted(ours)}{box}{among}{pulled(made['world/gravity'])}."
+    text = f"{counted(moving)}{box}{among}{pulled(made['world/gravity'])}."
     return text[0].upper() + text[1:]
 
 
 def counted(things: list[str]) -> str:
-    """Nouns with their numbers, such as: two balls and one box."""
+    """Nouns with their counts, such as: two balls and one box."""
     plural = {"box": "boxes"}
     parts = [
         f"{NUMBERS[n] if n < len(NUMBERS) else n} {noun if n == 1 else plural.get(noun, f'{noun}s')}"
@@ -131,7 +132,7 @@ def counted(things: list[str]) -> str:
 
 
 def pulled(gravity: np.ndarray) -> str:
-    """How gravity pulls, to end the first sentence with."""
+    """Phrase for the direction of gravity, for the end of the first sentence."""
     x, y = gravity.tolist()
     if not (x or y):
         return ""
@@ -141,50 +142,50 @@ def pulled(gravity: np.ndarray) -> str:
 
 
 def nouns(made: EventColumns) -> dict[int, str]:
-    """What each object is, by slot."""
-    found = {}
+    """Noun of each object, by slot."""
+    by_slot = {}
     for slot in np.flatnonzero(made["objects/present"]).tolist():
         shape = int(made["objects/shape"][slot])
         if made["objects/kind"][slot] == STATIC:
-            found[slot] = FIXED_NOUNS[shape]
+            by_slot[slot] = FIXED_NOUNS[shape]
         else:
             corners = int(made["objects/vertex_count"][slot]) if NOUNS[shape] == "polygon" else 0
-            found[slot] = CORNERS.get(corners, NOUNS[shape])
-    return found
+            by_slot[slot] = CORNERS.get(corners, NOUNS[shape])
+    return by_slot
 
 
 def names_of(made: EventColumns) -> dict[int, str]:
-    """What each object is called, by slot: with a colour, and with a number where two are alike."""
+    """Name of each object, by slot, with its colour, and with a number if several would have the same name."""
     kinds, walls = nouns(made), walls_of(made)
     bare = {
         slot: walls.get(slot, noun) if noun in FIXED_NOUNS else f"{color_name(made['objects/color'][slot])} {noun}"
         for slot, noun in kinds.items()
     }
-    many, seen, found = Counter(bare.values()), Counter(), {}
+    counts, seen, names = Counter(bare.values()), Counter(), {}
     for slot, name in bare.items():
         seen[name] += 1
-        found[slot] = f"the {name}" if many[name] == 1 else f"{name} {seen[name]}"
-    return found
+        names[slot] = f"the {name}" if counts[name] == 1 else f"{name} {seen[name]}"
+    return names
 
 
 def walls_of(made: EventColumns) -> dict[int, str]:
-    """What static segments are called, by slot: those level or upright by the side of all of them that they are on."""
+    """Names of static segments, by slot: slopes, and otherwise by their side of the bounding box of all of them."""
     static = made["objects/present"] & (made["objects/kind"] == STATIC) & (made["objects/shape"] == SEGMENT)
     slots = np.flatnonzero(static)
     if not len(slots):
         return {}
     ends = view_corners(made, slots)[0, :, :2]
     low, high = ends.min((0, 1)), ends.max((0, 1))
-    found = {}
+    names = {}
     for slot, (a, b) in zip(slots.tolist(), ends, strict=True):
         (width, height), (x, y) = abs(b - a), (a + b) / 2
-        if height <= width / 10:  # the floor, where it is alone
-            found[slot] = "floor" if y - low[1] <= (high - low)[1] / 10 else _either(y, high, low, 1, "ceiling")
+        if height <= width / 10:  # a single level segment is the floor
+            names[slot] = "floor" if y - low[1] <= (high - low)[1] / 10 else _either(y, high, low, 1, "ceiling")
         elif width <= height / 10:
-            found[slot] = "left wall" if x - low[0] <= (high - low)[0] / 10 else _either(x, high, low, 0, "right wall")
+            names[slot] = "left wall" if x - low[0] <= (high - low)[0] / 10 else _either(x, high, low, 0, "right wall")
         else:
-            found[slot] = "slope"
-    return found
+            names[slot] = "slope"
+    return names
 
 
 def _either(place: float, high: np.ndarray, low: np.ndarray, axis: int, name: str) -> str:
@@ -192,30 +193,30 @@ def _either(place: float, high: np.ndarray, low: np.ndarray, axis: int, name: st
 
 
 def color_name(color: np.ndarray) -> str:
-    """The name of the nearest colour; red and blue count for less than green, of which eyes see most."""
-    apart = np.array(list(COLORS.values())) - color.astype(int)
-    return list(COLORS)[int((apart**2 @ np.array([3, 4, 2])).argmin())]
+    """Name of the nearest colour, by squared distance weighted 3 : 4 : 2, as the eye is most sensitive to green."""
+    difference = np.array(list(COLORS.values())) - color.astype(int)
+    return list(COLORS)[int((difference**2 @ np.array([3, 4, 2])).argmin())]
 
 
 def sentences(made: EventColumns, names: Mapping[int, str], events: list[VideoEvent], decimals: int) -> list[str]:
-    """The events in English, with times in s; hits of one object in a row are one sentence."""
-    found: list[str] = []
-    hitting = -1  # the slot that the last sentence is about
+    """Sentences for the events, with times in s; successive hits by one object share a sentence."""
+    lines: list[str] = []
+    last_hitter = -1  # slot of the object that hits in the last sentence
     for event in events:
         at = f"at {event.time:.{decimals}f} s"
         if event.kind == "rest":
-            found, hitting = [*found, f"All is at rest {at}."], -1
+            lines, last_hitter = [*lines, f"All is at rest {at}."], -1
         elif event.kind != "hit":
-            way = f"{event.kind} the view {'at' if event.kind == 'leaves' else 'from'} the {event.about['side']}"
-            found, hitting = [*found, _capitalized(f"{names[event.about['a']]} {way} {at}.")], -1
+            action = f"{event.kind} the view {'at' if event.kind == 'leaves' else 'from'} the {event.about['side']}"
+            lines, last_hitter = [*lines, _capitalized(f"{names[event.about['a']]} {action} {at}.")], -1
         else:
-            who, whom = _who(made, event)
-            if who == hitting:
-                found[-1] = f"{found[-1][:-1]}, then {names[whom]} {at}."
+            hitter, target = _who(made, event)
+            if hitter == last_hitter:
+                lines[-1] = f"{lines[-1][:-1]}, then {names[target]} {at}."
             else:
-                found.append(_capitalized(f"{names[who]} hits {names[whom]} {at}."))
-            hitting = who
-    return found
+                lines.append(_capitalized(f"{names[hitter]} hits {names[target]} {at}."))
+            last_hitter = hitter
+    return lines
 
 
 def _capitalized(sentence: str) -> str:
@@ -223,7 +224,7 @@ def _capitalized(sentence: str) -> str:
 
 
 def _who(made: EventColumns, event: VideoEvent) -> tuple[int, int]:
-    """Who hits whom: what was faster in the frame before; what is static hits nothing."""
+    """Slots of the hitting object, which was faster one frame earlier, and of its target; static bodies never hit."""
     a, b = event.about["a"], event.about["b"]
     speed = np.linalg.norm(made["states/velocity"][event.frame - 1, [a, b]], axis=-1)
     speed[made["objects/kind"][[a, b]] == STATIC] = -1

@@ -1,4 +1,4 @@
-"""The list of a video's events, from its stored fields."""
+"""Events of a video (hits, leaving and entering the view, rest), computed from its stored fields."""
 
 import json
 from collections.abc import Mapping
@@ -10,31 +10,31 @@ from gen2d.core.enums import END, IMPACT, STATIC
 
 EventColumns = Mapping[str, np.ndarray]
 
-CAPTION_BYTES, EVENT_BYTES = 512, 128  # the second for each object and 16 frames
-MAX_EVENTS = 4  # events that a caption tells at most
-TOGETHER = 0.1  # s: impacts of a pair in frames that follow one another, and no further apart, are one hit
-STILL, STILL_SECONDS = 0.02, 0.1  # m/s of the fastest point; all is at rest if it stays below, for so long at least
-DIGITS = 6  # of the numbers in events
+CAPTION_BYTES, EVENT_BYTES = 512, 128  # the second per object and 16 frames
+MAX_EVENTS = 4  # maximum number of events in a caption
+TOGETHER = 0.1  # s; impacts of a pair in successive frames are one hit if they are closer than this
+STILL, STILL_SECONDS = 0.02, 0.1  # rest: all points stay slower than 0.02 m/s until the end, for 0.1 s at least
+DIGITS = 6  # significant digits of numbers in events
 SIDES = ("left", "right", "top", "bottom")
 
 
 class VideoEvent(NamedTuple):
-    """Something that happens, at a time in s; `about` is what else there is to say of it, as JSON has it."""
+    """Event of a video."""
 
-    time: float
-    kind: str
-    frame: int  # at which, or in the interval before which, it happens
-    about: dict[str, Any]
+    time: float  # s
+    kind: str  # hit, leaves, enters or rest
+    frame: int  # the event is at this frame, or in the interval before it
+    about: dict[str, Any]  # the other entries of its JSON
 
     @property
     def text(self) -> str:
         """The event as JSON."""
-        found = {"event": self.kind, "time": rounded(self.time), "frame": self.frame, **self.about}
-        return json.dumps(found, separators=(",", ":"))
+        entries = {"event": self.kind, "time": rounded(self.time), "frame": self.frame, **self.about}
+        return json.dumps(entries, separators=(",", ":"))
 
 
 def as_json(events: list[VideoEvent], width: int) -> str:
-    """The first of the events as JSON, as many as fit the width in bytes."""
+    """JSON list of the first events, as many as fit in `width` bytes."""
     texts, used = [], 2
     for event in events:
         used += len(event.text) + (1 if texts else 0)
@@ -45,7 +45,7 @@ def as_json(events: list[VideoEvent], width: int) -> str:
 
 
 def rounded(number: float) -> float:
-    """The number with few digits."""
+    """The number, rounded to DIGITS significant digits."""
     return float(f"{number:.{DIGITS}g}")
 
 
@@ -53,85 +53,85 @@ def rounded(number: float) -> float:
 
 
 def events_of(made: EventColumns, video: Any) -> list[VideoEvent]:
-    """All events of a video, in time's order."""
-    found = [*hit_events(made), *view_events(made, video), *rest_events(made, video.fps)]
-    return sorted(found, key=lambda event: event.time)  # of equal times as they come
+    """All events of a video, sorted by time."""
+    events = [*hit_events(made), *view_events(made, video), *rest_events(made, video.fps)]
+    return sorted(events, key=lambda event: event.time)  # stable at equal times
 
 
 def hit_events(made: EventColumns) -> list[VideoEvent]:
-    """Every impact that begins a touch."""
+    """Hits: the impacts that begin a contact."""
     rows = zip(*(made[f"contacts/{name}"].tolist() for name in ("kind", "frame", "time", "a", "b")), strict=True)
-    last: dict[tuple[int, int], tuple[int, int, float]] = {}  # of each pair its last row
-    found = []
+    last: dict[tuple[int, int], tuple[int, int, float]] = {}  # kind, frame and time of each pair's last row
+    events = []
     for row, (kind, frame, time, a, b) in enumerate(rows):
         if not kind:
             break
         if kind == IMPACT and not _still_touch(last.get((a, b)), frame, time):
             point, speed = made["contacts/point"][row].tolist(), float(made["contacts/approach_speed"][row])
-            about = {"a": a, "b": b, "point": [rounded(x) for x in point], "speed": rounded(speed)}
-            found.append(VideoEvent(time, "hit", frame, about))
+            details = {"a": a, "b": b, "point": [rounded(x) for x in point], "speed": rounded(speed)}
+            events.append(VideoEvent(time, "hit", frame, details))
         last[a, b] = kind, frame, time
-    return found
+    return events
 
 
 def _still_touch(last: tuple[int, int, float] | None, frame: int, time: float) -> bool:
-    """Whether a pair with this last row is in touch until an impact."""
+    """Whether a pair has stayed in contact from its `last` row until an impact at this frame and time."""
     if last is None or last[0] == END or last[1] < frame - 1:
         return False
-    # After an impact it may have left or not. At a few frames a second, it has.
+    # After an impact the pair may have separated. At low frame rates it has.
     return last[0] != IMPACT or time - last[2] < TOGETHER
 
 
 def moving_slots(made: EventColumns) -> np.ndarray:
-    """The slots of what moves."""
+    """Slots of the bodies that are not static."""
     return np.flatnonzero(made["objects/present"] & (made["objects/kind"] != STATIC))
 
 
 def view_events(made: EventColumns, video: Any) -> list[VideoEvent]:
-    """What leaves the view, or comes into it: the box around it lies outside, or no more."""
+    """Objects that leave or enter the view: their bounding boxes begin or cease to lie outside it."""
     slots = moving_slots(made)
-    beyond = _beyond(made, slots, video)  # [4, T, M] px, of the sides in their order
-    most = beyond.max(0)
-    out = most >= 0
-    found = []
-    for frame, k in zip(*np.nonzero(out[1:] != out[:-1]), strict=True):
-        before, after = most[frame, k], most[frame + 1, k]
-        time = (frame + before / (before - after)) / video.fps  # as if it moved evenly between frames
-        kind, outside = ("leaves", frame + 1) if out[frame + 1, k] else ("enters", frame)
-        side = SIDES[int(beyond[:, outside, k].argmax())]
-        found.append(VideoEvent(float(time), kind, int(frame) + 1, {"a": int(slots[k]), "side": side}))
-    return found
+    distance = _beyond(made, slots, video)  # px [4, T, M], by SIDES
+    farthest = distance.max(0)
+    is_outside = farthest >= 0
+    events = []
+    for frame, k in zip(*np.nonzero(is_outside[1:] != is_outside[:-1]), strict=True):
+        before, after = farthest[frame, k], farthest[frame + 1, k]
+        time = (frame + before / (before - after)) / video.fps  # linear between frames
+        kind, outside_frame = ("leaves", frame + 1) if is_outside[frame + 1, k] else ("enters", frame)
+        side = SIDES[int(distance[:, outside_frame, k].argmax())]
+        events.append(VideoEvent(float(time), kind, int(frame) + 1, {"a": int(slots[k]), "side": side}))
+    return events
 
 
 def _beyond(made: EventColumns, slots: np.ndarray, video: Any) -> np.ndarray:
-    """How far each object's box lies beyond each side of the view, px [4, T, M]; negative where it does not."""
+    """Distance of each object's bounding box beyond each side of the view, px [4, T, M]; negative if not beyond."""
     scale, angle = (made[f"camera/{name}"].astype(float)[:, None, None] for name in ("scale", "angle"))
-    away = view_corners(made, slots) - made["camera/center"].astype(float)[:, None, None]  # [T, M, P, 2]
+    offset = view_corners(made, slots) - made["camera/center"].astype(float)[:, None, None]  # [T, M, P, 2]
     cos, sin = np.cos(angle), np.sin(angle)
-    column = video.width / 2 + scale * (away[..., 0] * cos + away[..., 1] * sin)
-    row = video.height / 2 - scale * (away[..., 1] * cos - away[..., 0] * sin)
+    column = video.width / 2 + scale * (offset[..., 0] * cos + offset[..., 1] * sin)
+    row = video.height / 2 - scale * (offset[..., 1] * cos - offset[..., 0] * sin)
     radius = scale[..., 0] * made["objects/radius"][slots]
     left, right, top, bottom = (f(-1) for f in (column.min, column.max, row.min, row.max))
     return np.stack([-(right + radius), left - radius - video.width, -(bottom + radius), top - radius - video.height])
 
 
 def view_corners(made: EventColumns, slots: np.ndarray) -> np.ndarray:
-    """The corners of the objects' cores, m [T, M, P, 2]: a centre, two ends or a polygon's corners, some repeated."""
+    """Core points of the objects, m [T, M, P, 2]: centre, ends or vertices, with some of them repeated."""
     half = made["objects/half_length"][slots].astype(float)
-    own = np.stack([np.stack([-half, 0 * half], -1), np.stack([half, 0 * half], -1)], axis=1)
+    local = np.stack([np.stack([-half, 0 * half], -1), np.stack([half, 0 * half], -1)], axis=1)
     if "objects/vertices" in made:
         vertices = made["objects/vertices"][slots].astype(float)
-        own = np.concatenate(
-            [own, np.where((made["objects/shape"][slots] == 3)[:, None, None], vertices, own[:, :1])], 1
+        local = np.concatenate(
+            [local, np.where((made["objects/shape"][slots] == 3)[:, None, None], vertices, local[:, :1])], 1
         )
     angle = made["states/angle"][:, slots, None].astype(float)
     cos, sin = np.cos(angle), np.sin(angle)
-    turned = np.stack([cos * own[..., 0] - sin * own[..., 1], sin * own[..., 0] + cos * own[..., 1]], -1)
-    return made["states/position"][:, slots, None].astype(float) + turned
+    rotated = np.stack([cos * local[..., 0] - sin * local[..., 1], sin * local[..., 0] + cos * local[..., 1]], -1)
+    return made["states/position"][:, slots, None].astype(float) + rotated
 
 
 def rest_events(made: EventColumns, fps: float) -> list[VideoEvent]:
-    """That all has come to rest, if it does so and moved before."""
+    """Rest event, if all objects come to rest after some motion and stay at rest until the end."""
     slots = moving_slots(made)
     reach = np.linalg.norm(view_corners(made, slots)[0] - made["states/position"][0, slots, None], axis=-1).max(
         -1, initial=0

@@ -1,1 +1,1 @@
-"""Datasets in the formats of other programs."""
+"""Export of datasets to the formats of other programs."""

@@ -1,4 +1,4 @@
-"""Datasets for other programs: `export` writes one split in a format of `exports/`, whole or not at all."""
+"""Export of one split of a dataset to another format, written completely or not at all."""
 
 import contextlib
 import dataclasses
@@ -18,18 +18,18 @@ from gen2d.storage.paths import Network, Place, Url, place
 from gen2d.storage.sealed import JSON_BYTES, as_json, parsed, read_bytes
 
 SCHEMA = "gen2d.export/1"
-ABOUT = "export.json"  # in every folder that is made: what it is, and which files belong to it
+ABOUT = "export.json"  # in every exported folder: its origin, and the files that belong to it
 
 
 @dataclasses.dataclass(frozen=True)
 class Exported:
-    """What an export made."""
+    """Result of an export."""
 
-    out: Path  # a folder, or for phyworld a file
+    out: Path  # a folder, or a file for formats of one file
     videos: int
     bytes: int
     seconds: float
-    loss: str  # what the format does not keep; "" if it is exact
+    loss: str  # what the format does not preserve; "" if it preserves everything
 
 
 def export(
@@ -45,30 +45,75 @@ def export(
     timeout: float = 30.0,
     deadline: float = 300.0,
 ) -> Exported:
-    """The export of a split of a complete dataset in another format.
+    """Export one split of a complete dataset to another format.
 
-    `to` names the format, or a Python file that declares one (`gen2d.plugin.Export`). `out` is the folder (for
-    phyworld the file) that is made, ROOT-FORMAT by default; it appears when it is whole. An earlier export of the same
-    dataset is replaced, another one only with `overwrite`. `split` may be left out as in `open`. `fields` are names or
-    patterns, for formats that can hold any, such as npz and webdataset (default: all). Frames that are not stored are
-    drawn. `say` takes lines for a person; `trust` is that of `render`, `timeout` and `deadline` are those of `open`.
-    Raises ConfigError, FolderError and UntrustedError (UserErrors) with one sentence, DamagedError, UnreachableError.
+    The output appears when it is complete. Frames that are not stored are rendered, which imports jax.
+
+    Parameters
+    ----------
+    root : str or Path
+        Folder or URL of the dataset.
+    to : str
+        Name of a format, such as "mp4", "npz" or "webdataset", or path of a Python file that ends with an `EXPORT`
+        (`gen2d.plugin.Export`).
+    out : str or Path, optional
+        Folder to write, or the file for formats of one file, such as phyworld. The default is ROOT-FORMAT beside the
+        dataset, and in the current folder if the dataset is at a URL.
+    split : str, optional
+        Name of the split. The default is "train", or the only split.
+    fields : sequence of str, optional
+        Names or patterns of fields, only for formats that can hold any field, such as npz and webdataset. The default
+        is all fields.
+    overwrite : bool
+        Whether an existing file, or an export of another dataset, is replaced. A folder with an earlier export of the
+        same dataset is replaced in any case, and a folder with other files never.
+    say : callable, optional
+        Function that is called with each line of progress.
+    trust : sequence of str
+        sha256 of code that came with the dataset and may run to render frames, as in `render`.
+    timeout : float
+        Maximum time, in s, to wait for a server to connect or to send the next part of an answer.
+    deadline : float
+        Maximum time, in s, of a request with all its attempts. Large downloads may take longer.
+
+    Returns
+    -------
+    Exported
+        Path, number of videos, bytes, seconds, and what the format does not preserve.
+
+    Raises
+    ------
+    ConfigError
+        If an argument is invalid, or if the format cannot hold these videos.
+    FolderError
+        If the dataset cannot be read, or if `out` cannot be written or must not be replaced.
+    UntrustedError
+        If code that came with the dataset would have to run, but is not in `trust`.
+    UserError
+        If the format needs a package that is not installed.
+    DamagedError, UnreachableError
+        If stored data is damaged, or if a disk or server does not answer.
+
+    Examples
+    --------
+    >>> exported = gen2d.export("datasets/bouncing", "h264", "films", split="train")
+    >>> print(exported.videos, exported.bytes, exported.loss)
     """
-    began, form, name = time.perf_counter(), _format(to), Path(to).name
-    where = place(root, Network(timeout, deadline))
-    source = source_of(where, split, _patterns(to, form, fields), trust)
-    out = Path(out) if out is not None else _beside(where, f"{name.removesuffix('.py')}{form.suffix}")
-    about = _about(source, name)
-    form.check(source)
-    _check_out(out, form, about, overwrite)
+    start, format_, name = time.perf_counter(), _format(to), Path(to).name
+    folder = place(root, Network(timeout, deadline))
+    source = source_of(folder, split, _patterns(to, format_, fields), trust)
+    out = Path(out) if out is not None else _beside(folder, f"{name.removesuffix('.py')}{format_.suffix}")
+    description = _about(source, name)
+    format_.check(source)
+    _check_out(out, format_, description, overwrite)
     say = say or (lambda line: None)
     with _explained(out), stopping_on_sigterm(say), progress(len(source), say) as advance:
-        size = _written(out, form, dataclasses.replace(source, advance=advance), about)
-    return Exported(out, len(source), size, time.perf_counter() - began, form.loss)
+        size = _written(out, format_, dataclasses.replace(source, advance=advance), description)
+    return Exported(out, len(source), size, time.perf_counter() - start, format_.loss)
 
 
 def _format(to: str) -> Export:
-    """The format of a name, or of a Python file of the user's own."""
+    """Format with this name, or from this Python file."""
     if plugins.is_own(to):
         return plugins.load("export", to, "--to", plugins.content_of(to, "--to"))
     known = plugins.names("export")
@@ -97,10 +142,10 @@ def _beside(root: Place, ending: str) -> Path:
 
 
 def _about(source: Source, to: str) -> dict[str, Any]:
-    """What a folder's export.json says, but for its files."""
+    """Contents of a folder's export.json, without the list of files."""
     manifest = source.ds.manifest
-    shown = ("name", "seed", "fps", "sizes", "conventions", "licence", "manifest_sha256", "config_sha256")
-    about = {key: manifest.plain[key] for key in shown} | {
+    keys = ("name", "seed", "fps", "sizes", "conventions", "licence", "manifest_sha256", "config_sha256")
+    about = {key: manifest.plain[key] for key in keys} | {
         "schema": SCHEMA,
         "format": to,
         "split": source.ds.options.split,
@@ -109,11 +154,11 @@ def _about(source: Source, to: str) -> dict[str, Any]:
     return about | {"fields": fields, "videos": len(source)}
 
 
-# ---- Where it goes
+# ---- Output
 
 
 def _check_out(out: Path, form: Export, about: Mapping[str, Any], overwrite: bool) -> None:
-    """Returns nothing; raises FolderError where `out` holds what must stay."""
+    """Raise FolderError if `out` holds something that must not be replaced."""
     with _explained(out):
         if not out.exists():
             return
@@ -127,29 +172,29 @@ def _check_out(out: Path, form: Export, about: Mapping[str, Any], overwrite: boo
 
 
 def _check_folder(out: Path, about: Mapping[str, Any], overwrite: bool) -> None:
-    there = _described(out)
-    own = {ABOUT, *there["files"]} if there else set()
-    foreign = {path.name for path in out.iterdir()} - own
+    previous = _described(out)
+    known = {ABOUT, *previous["files"]} if previous else set()
+    foreign = {path.name for path in out.iterdir()} - known
     if foreign:
         raise FolderError(f"{out} holds {min(foreign)}, which no export made: choose another --out")
-    if not own:
+    if not known:
         return  # an empty folder
-    same = all(there.get(key) == about[key] for key in ("format", "split", "name", "seed", "config_sha256"))
+    same = all(previous.get(key) == about[key] for key in ("format", "split", "name", "seed", "config_sha256"))
     if not same and not overwrite:
         raise FolderError(f"{out} holds another export: choose another --out, or --overwrite to replace it")
 
 
 def _described(out: Path) -> dict[str, Any]:
-    """What the folder's export.json says; nothing if no export made it."""
+    """Contents of the folder's export.json; empty if there is no valid one."""
     try:
-        there = parsed(read_bytes(out / ABOUT, JSON_BYTES)) or {}
+        description = parsed(read_bytes(out / ABOUT, JSON_BYTES)) or {}
     except FileNotFoundError:
         return {}
-    return there if there.get("schema") == SCHEMA and isinstance(there.get("files"), dict) else {}
+    return description if description.get("schema") == SCHEMA and isinstance(description.get("files"), dict) else {}
 
 
 def _written(out: Path, form: Export, source: Source, about: Mapping[str, Any]) -> int:
-    """The bytes written; afterwards `out` is there, whole, and what a killed export left beside it is not."""
+    """Write `out` completely and return its size in bytes; also remove temporary files of killed exports."""
     out.parent.mkdir(parents=True, exist_ok=True)
     sweep_beside(out)
     if form.suffix:
@@ -165,7 +210,7 @@ def _written(out: Path, form: Export, source: Source, about: Mapping[str, Any]) 
 
 @contextlib.contextmanager
 def _explained(out: Path) -> Iterator[None]:
-    """A block whose OSError becomes one sentence."""
+    """Context that turns an OSError into a UserError with one sentence."""
     try:
         yield
     except OSError as error:

@@ -1,4 +1,4 @@
-"""Videos to export, one at a time, so that a dataset of any size is exported in little memory."""
+"""Videos to export, read one at a time, so that memory does not grow with the size of the dataset."""
 
 import dataclasses
 import fnmatch
@@ -16,25 +16,25 @@ from gen2d.loading.dataset import Dataset
 from gen2d.loading.protocols import Batch
 from gen2d.storage.paths import Place
 
-FRAMES = Field("uint8", "n T H W 3", "sRGB", "the video")  # as they are where they are stored
-DRAWN_BYTES = 2**26  # frames that are not stored are drawn so many at a time
+FRAMES = Field("uint8", "n T H W 3", "sRGB", "the video")  # equal to the field of stored frames
+DRAWN_BYTES = 2**26  # size of a batch of rendered frames
 
 
 @dataclasses.dataclass(frozen=True)
 class Source:
-    """The videos to export, in their order."""
+    """Videos of one split to export, in their order."""
 
     ds: Dataset
-    draws: bool  # frames, which are not stored
-    trust: Sequence[str]  # sha256 of code that came with the dataset and may run, if it draws
-    advance: Callable[[int], None]  # told of each video that is done
+    draws: bool  # whether frames are rendered, because they are not stored
+    trust: Sequence[str]  # sha256 of code that came with the dataset and may run to render
+    advance: Callable[[int], None]  # to be called with the number of videos just written
 
     def __len__(self) -> int:
         return len(self.ds)
 
     @property
     def fields(self) -> dict[str, Field]:
-        """What each video has, by name."""
+        """The fields of each video, by name."""
         return ({"frames": FRAMES} if self.draws else {}) | self.ds.fields
 
     @property
@@ -44,27 +44,27 @@ class Source:
 
     @property
     def frame_size(self) -> tuple[int, int]:
-        """Height and width, px."""
+        """Height and width of frames, px."""
         return self.ds.manifest.sizes["H"], self.ds.manifest.sizes["W"]
 
     @property
     def video_bytes(self) -> int:
-        """What one video takes before compression."""
+        """Size of one video before compression, bytes."""
         return sum(stored_bytes(field, self.ds.manifest.sizes) for field in self.fields.values())
 
     def key(self, number: int) -> str:
-        """A video's name in files: split and number, so that names sort as numbers do."""
+        """File name of a video, without suffix: the split and the index, padded so that names sort by index."""
         return f"{self.ds.options.split}-{number:09d}"
 
     def videos(self) -> Iterator[Batch]:
-        """The videos one by one, arrays by field."""
+        """Videos one at a time, as dictionaries of arrays by field name."""
         frames = self._drawn() if self.draws else iter(())
         for number in range(len(self)):
-            drawn = {"frames": next(frames)} if self.draws else {}
-            yield drawn | self.ds[number]
+            rendered = {"frames": next(frames)} if self.draws else {}
+            yield rendered | self.ds[number]
 
     def each(self, write: Callable[[str, Batch], None]) -> None:
-        """Returns nothing; calls `write(key, video)` for every video, several at once."""
+        """Call `write(key, video)` for every video in several threads, and report the progress to `advance`."""
         threads = min(os.cpu_count() or 1, 8)
         running: deque[Future[None]] = deque()
         with ThreadPoolExecutor(threads) as pool:
@@ -73,13 +73,13 @@ class Source:
                 if len(running) > threads:
                     running.popleft().result()
                     self.advance(1)
-            for left in running:
-                left.result()
+            for future in running:
+                future.result()
                 self.advance(1)
 
     def _drawn(self) -> Iterator[np.ndarray]:
-        """Frames of one video after the other, drawn several at a time, always as many: one program is compiled."""
-        from gen2d.programs.redraw import render  # imports jax: only now
+        """Rendered frames [T, H, W, 3] of each video; batches have equal sizes, so one program is compiled."""
+        from gen2d.programs.redraw import render  # imports jax
 
         count = max(1, min(128, len(self), DRAWN_BYTES // stored_bytes(FRAMES, self.ds.manifest.sizes)))
         for first in range(0, len(self), count):
@@ -88,7 +88,10 @@ class Source:
 
 
 def source_of(root: str | Place, split: str | None, patterns: Sequence[str], trust: Sequence[str] = ()) -> Source:
-    """The videos of a dataset's split with these fields; frames are drawn where they are asked for but not stored."""
+    """Videos of a split with the fields that match `patterns`; frames that match but are not stored are rendered.
+
+    Raises the errors of `open`.
+    """
     ds = loader.open(root, split, fields=())
     draws = "frames" not in ds.manifest.fields and any(fnmatch.fnmatch("frames", p) for p in patterns)
     stored = [pattern for pattern in patterns if pattern != "frames"] if draws else patterns

@@ -1,1 +1,1 @@
-"""Reading a complete dataset: videos by number, batches in order, several datasets as one. Imports no jax."""
+"""Readers of complete datasets: videos by index, shuffled batches, and several datasets as one. Imports no jax."""

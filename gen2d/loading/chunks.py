@@ -1,9 +1,9 @@
-"""The files of a dataset, read by offset, without h5py and its one lock per process.
+"""Chunks of shard files, read by offset. h5py is not used, because it has one lock per process.
 
-Every row of a table or an index is checked when it is read, and every offset against the file that it is in, so that
-nothing is mapped and no damage can do more than raise an error. No open file outlives a fork, nor the file that had its
-name. What growth has moved to a snapshot is found there. Of a remote dataset the pieces of all videos wanted at once
-are asked for at once, or whole shards are kept in a cache.
+Each row of a table or an index is verified when it is read, and each offset is checked against the size of its file.
+Files are never memory-mapped, so damage can only raise an error. File descriptors are not shared across a fork, and are
+not reused for another file of the same name. Files that growth moved into a snapshot folder are looked up there too.
+For a remote dataset, the chunks of one batch are requested in parallel, or whole shards are kept in a cache.
 """
 
 import contextlib
@@ -30,36 +30,36 @@ from gen2d.storage.ranges import Range, read_ranges
 from gen2d.storage.sealed import open_regular
 
 BLOCK = 256  # rows of a table that are read together
-INDEX_BLOCK = 1024  # rows of a remote index
-SHARDS = 65536  # rows of shards, of each dataset
-KEPT = 256  # blocks of tables and indices, of each dataset
-OPEN = 128  # files, of a process
+INDEX_BLOCK = 1024  # rows of a remote index that are read together
+SHARDS = 65536  # shard rows that each split keeps in memory
+KEPT = 256  # blocks of tables and indices that each split keeps in memory
+OPEN = 128  # files that a process keeps open
 
 
 class Chunk(NamedTuple):
-    """Where a piece lies, and the checksum of its bytes."""
+    """Location of a chunk in a shard file, and the checksum of its bytes."""
 
-    shard: int  # its place in the split
-    offset: int
-    size: int
+    shard: int  # the shard's position in the split
+    offset: int  # bytes from the start of the file
+    size: int  # bytes
     crc32: int
 
 
 class ShardRow(NamedTuple):
-    """A shard as its split's table has it."""
+    """A shard and its row in the table of the split."""
 
     shard: Shard
-    bytes: int
+    bytes: int  # of the file
     sha256: str
-    rows: int  # where its index begins
-    offsets: np.ndarray
+    rows: int  # offset of the shard's index
+    offsets: np.ndarray  # of each uncompressed field, in the order of the names
 
 
 Reader = Callable[[Column, Chunk, np.ndarray], bytes | memoryview]
 
 
 class SplitFiles:
-    """The table of one split of a snapshot, and its shards, read piece by piece."""
+    """Table and shards of one split of a snapshot, read chunk by chunk."""
 
     def __init__(self, root: Place, manifest: Manifest, split: str, cache: Cache | None, checks: bool) -> None:
         self.root, self.manifest, self.split, self.cache, self.checks = root, manifest, split, cache, checks
@@ -76,7 +76,7 @@ class SplitFiles:
     # ---- The table
 
     def shard(self, place: int) -> ShardRow:
-        """The shard at this place of the split. Raises DamagedError."""
+        """Row of the shard at position `place` of the split. Raises DamagedError if the row is damaged."""
         row = self._shards.get(place)
         if row is None:
             if len(self._shards) >= SHARDS:
@@ -87,16 +87,16 @@ class SplitFiles:
     def _checked_shard(self, place: int) -> ShardRow:
         per_shard, count = self.manifest.videos_per_shard, self.manifest.splits[self.split]
         first = place * per_shard
-        wanted = shard_of(self.split, first, min(per_shard, count - first), per_shard)
+        expected = shard_of(self.split, first, min(per_shard, count - first), per_shard)
         row = self._table_block(place // BLOCK)[place % BLOCK]
         path = f"{self.root / self.manifest.tables[self.split].file}"
         if self.checks and not intact(row.reshape(1), self._origin, [first]).all():
             raise DamagedError(f"{path} is not what was written, in row {place}")
         try:
-            check_shard(row, first, wanted.count, self._video_type.itemsize, self._row_bytes, self._raw_bytes)
+            check_shard(row, first, expected.count, self._video_type.itemsize, self._row_bytes, self._raw_bytes)
         except DamagedError as error:
             raise DamagedError(f"{path} cannot be right in row {place}: {error}") from None
-        return ShardRow(wanted, int(row["bytes"]), row["sha256"].tobytes().hex(), int(row["index"]), row["offsets"])
+        return ShardRow(expected, int(row["bytes"]), row["sha256"].tobytes().hex(), int(row["index"]), row["offsets"])
 
     def _table_block(self, number: int) -> np.ndarray:
         table, size = self.manifest.tables[self.split], self._shard_type.itemsize
@@ -110,7 +110,7 @@ class SplitFiles:
         return self._kept((-1, number), read)
 
     def _kept(self, key: tuple[int, int], read: Callable[[], np.ndarray]) -> np.ndarray:
-        """A block of rows; those used longest ago are forgotten."""
+        """Block of rows from memory, or from `read`; the least recently used blocks are dropped."""
         with _lock:
             if key in self._blocks:
                 self._blocks.move_to_end(key)
@@ -125,100 +125,100 @@ class SplitFiles:
     # ---- The index of each shard
 
     def videos(self, numbers: np.ndarray) -> np.ndarray:
-        """The rows of the videos with these numbers. Raises DamagedError."""
-        places, rows = np.divmod(numbers, self.manifest.videos_per_shard)
-        found = np.empty(len(numbers), self._video_type)
+        """Index rows of the videos with these indices. Raises DamagedError if a row is damaged."""
+        shards, rows = np.divmod(numbers, self.manifest.videos_per_shard)
+        entries = np.empty(len(numbers), self._video_type)
         if isinstance(self.root, Url) and self.cache is None:
-            wanted = list(zip(places.tolist(), (rows // INDEX_BLOCK).tolist(), strict=True))
+            wanted = list(zip(shards.tolist(), (rows // INDEX_BLOCK).tolist(), strict=True))
             blocks = self._fetched_blocks(set(wanted))
             for step, key in enumerate(wanted):
-                found[step] = blocks[key][rows[step] % INDEX_BLOCK]
+                entries[step] = blocks[key][rows[step] % INDEX_BLOCK]
         else:
-            for place in np.unique(places):
-                own = np.flatnonzero(places == place)
-                found[own] = self._index_rows(int(place), rows[own])
+            for shard in np.unique(shards):
+                members = np.flatnonzero(shards == shard)
+                entries[members] = self._index_rows(int(shard), rows[members])
         if self.checks:
-            right = intact(found, self._origin, numbers.tolist())
-            if not right.all():
-                wrong = int(np.argmin(right))
-                raise self._bad_index(int(places[wrong]), int(numbers[wrong]))
-        return found
+            is_intact = intact(entries, self._origin, numbers.tolist())
+            if not is_intact.all():
+                wrong = int(np.argmin(is_intact))
+                raise self._bad_index(int(shards[wrong]), int(numbers[wrong]))
+        return entries
 
     def _bad_index(self, place: int, number: int) -> DamagedError:
         path = self.path(shard_name(self.shard(place).shard.name))
         return DamagedError(f"{path}: the index of {self.split} video {number} is not what was written")
 
     def _index_rows(self, place: int, rows: np.ndarray) -> np.ndarray:
-        about, size = self.shard(place), self._video_type.itemsize
-        file = self._open(about)
-        parts = [file.read(about.rows + row * size, size) for row in rows.tolist()]
+        shard_row, size = self.shard(place), self._video_type.itemsize
+        file = self._open(shard_row)
+        parts = [file.read(shard_row.rows + row * size, size) for row in rows.tolist()]
         return np.frombuffer(b"".join(parts), self._video_type)
 
     def _fetched_blocks(self, wanted: set[tuple[int, int]]) -> dict[tuple[int, int], np.ndarray]:
-        """Blocks of the indices of remote shards; those that are not known are asked for all at once."""
+        """Index blocks of remote shards, by shard and block number; the missing ones are requested in parallel."""
         with _lock:
-            found = {key: self._blocks[key] for key in wanted & self._blocks.keys()}
-        missing, size, ranges = sorted(wanted - found.keys()), self._video_type.itemsize, []
-        for place, block in missing:
-            about = self.shard(place)
-            first, last = block * INDEX_BLOCK, min((block + 1) * INDEX_BLOCK, about.shard.count)
-            ranges.append((shard_name(about.shard.name), about.rows + first * size, about.rows + last * size))
+            blocks = {key: self._blocks[key] for key in wanted & self._blocks.keys()}
+        missing, size, ranges = sorted(wanted - blocks.keys()), self._video_type.itemsize, []
+        for shard, block in missing:
+            row = self.shard(shard)
+            first, last = block * INDEX_BLOCK, min((block + 1) * INDEX_BLOCK, row.shard.count)
+            ranges.append((shard_name(row.shard.name), row.rows + first * size, row.rows + last * size))
         for key, (name, *_), content in zip(missing, ranges, self._fetched(ranges), strict=True):
             if isinstance(content, Exception):
                 raise _reading_error(self.path(name), content)
-            found[key] = self._kept(key, functools.partial(np.frombuffer, content, self._video_type))
-        return found
+            blocks[key] = self._kept(key, functools.partial(np.frombuffer, content, self._video_type))
+        return blocks
 
-    # ---- Pieces
+    # ---- Chunks
 
     def pieces(
         self, column: Column, numbers: np.ndarray, videos: np.ndarray, begins: Sequence[int]
     ) -> list[list[Chunk]]:
-        """Where the pieces lie that are needed of each video; `begins` are the first frames of their windows."""
-        places, rows = np.divmod(numbers, self.manifest.videos_per_shard)
+        """Chunks of `column` that each video needs. `videos` are index rows, `begins` the first frames of windows."""
+        shards, rows = np.divmod(numbers, self.manifest.videos_per_shard)
         if column.is_image:
-            found = zip(places.tolist(), videos[column.name].tolist(), begins, strict=True)
-            return [[self._piece(column, place, chunks[i]) for i in column.needed(b)] for place, chunks, b in found]
+            entries = zip(shards.tolist(), videos[column.name].tolist(), begins, strict=True)
+            return [[self._piece(column, shard, chunks[i]) for i in column.needed(b)] for shard, chunks, b in entries]
         names = self._names
-        offsets = {place: int(self.shard(place).offsets[names[column.name]]) for place in np.unique(places).tolist()}
-        found = zip(places.tolist(), rows.tolist(), videos[column.name].tolist(), strict=True)
-        return [[Chunk(place, offsets[place] + row * column.size, column.size, crc)] for place, row, crc in found]
+        offsets = {shard: int(self.shard(shard).offsets[names[column.name]]) for shard in np.unique(shards).tolist()}
+        entries = zip(shards.tolist(), rows.tolist(), videos[column.name].tolist(), strict=True)
+        return [[Chunk(shard, offsets[shard] + row * column.size, column.size, crc)] for shard, row, crc in entries]
 
     @functools.cached_property
     def _names(self) -> dict[str, int]:
-        """The place of each field among those that are not compressed."""
-        names = sorted(n for n, field in self.manifest.fields.items() if field.per_video and not field.is_image)
-        return {name: place for place, name in enumerate(names)}
+        """Position of each uncompressed field in the sorted list of them."""
+        sorted_names = sorted(n for n, field in self.manifest.fields.items() if field.per_video and not field.is_image)
+        return {name: position for position, name in enumerate(sorted_names)}
 
     def _piece(self, column: Column, place: int, chunk: tuple[int, int, int]) -> Chunk:
         offset, size, crc = chunk
-        whole = column.size // column.pieces
-        if size > 2 * whole + 1024 or offset + size > self.shard(place).bytes:
+        raw_size = column.size // column.pieces
+        if size > 2 * raw_size + 1024 or offset + size > self.shard(place).bytes:
             raise DamagedError(f"{column.name} lies outside the file, by its index")
         return Chunk(place, offset, size, crc)
 
     def reader(self, places: Iterable[Iterable[Iterable[Chunk]]]) -> Reader:
-        """What gives the bytes of these pieces, by what the shards lie on."""
+        """Function that returns the bytes of these chunks, from the disk, the cache or one parallel download."""
         if isinstance(self.root, Path) or self.cache:
-            opened = functools.lru_cache(maxsize=16)(lambda place: self._open(self.shard(place)))
-            return lambda column, piece, target: _piece_of(opened(piece.shard), column, piece, target)
-        pieces = list({piece for own in places for video in own for piece in video})
-        names = {place: shard_name(self.shard(place).shard.name) for place in {piece.shard for piece in pieces}}
-        data = self._fetched([(names[p.shard], p.offset, p.offset + p.size) for p in pieces])
-        return functools.partial(_received, dict(zip(pieces, data, strict=True)))
+            file_of = functools.lru_cache(maxsize=16)(lambda place: self._open(self.shard(place)))
+            return lambda column, piece, target: _piece_of(file_of(piece.shard), column, piece, target)
+        chunks = list({piece for column_chunks in places for video in column_chunks for piece in video})
+        names = {place: shard_name(self.shard(place).shard.name) for place in {piece.shard for piece in chunks}}
+        data = self._fetched([(names[p.shard], p.offset, p.offset + p.size) for p in chunks])
+        return functools.partial(_received, dict(zip(chunks, data, strict=True)))
 
     # ---- Files
 
     def path(self, name: str) -> Place:
-        """Where a file lies, or lay when this snapshot was the last."""
+        """Path of a file of the latest snapshot; growth may have moved the file since."""
         return self.root / name
 
     def _places(self, name: str) -> tuple[Place, Place]:
-        """Where a file may lie: growth moves what only an earlier manifest names."""
+        """Both possible paths of a file: growth moves files that only an earlier manifest names."""
         return self.root / name, snapshot_path(self.root, self.manifest.sha256) / name
 
     def _read_table(self, begin: int, end: int) -> bytes:
-        """A range of the table's file."""
+        """Bytes `begin` to `end - 1` of the table's file."""
         table = self.manifest.tables[self.split]
         name = table.file
         if isinstance(self.root, Path):
@@ -233,18 +233,18 @@ class SplitFiles:
         return file.read(begin, end - begin)
 
     def _fetched(self, wanted: Sequence[tuple[str, int, int]]) -> list[bytes | Exception]:
-        """The bytes of ranges of remote files, or why there are none."""
-        found: list[bytes | Exception] = []
-        for step in (0, 1):
-            missing = [i for i in range(len(wanted)) if not step or isinstance(found[i], FileNotFoundError)]
-            urls = [self._places(wanted[i][0])[step] for i in missing]
+        """Bytes of each range (name, begin, end) of the remote files, or the error of reading it."""
+        contents: list[bytes | Exception] = []
+        for attempt in (0, 1):
+            missing = [i for i in range(len(wanted)) if not attempt or isinstance(contents[i], FileNotFoundError)]
+            urls = [self._places(wanted[i][0])[attempt] for i in missing]
             ranges = [Range(url, *wanted[i][1:]) for url, i in zip(urls, missing, strict=True) if isinstance(url, Url)]
             read = read_ranges(ranges) if ranges else []
-            if not step:
-                found = list(read)
+            if not attempt:
+                contents = list(read)
             for i, content in zip(missing, read, strict=True):
-                found[i] = content if not isinstance(content, FileNotFoundError) or not step else found[i]
-        return found
+                contents[i] = content if not isinstance(content, FileNotFoundError) or not attempt else contents[i]
+        return contents
 
     def _opened(self, name: str) -> "_File":
         for path in self._places(name):
@@ -258,14 +258,14 @@ class SplitFiles:
         return self._opened(name) if self.cache is None else self._cached(name, about.sha256, about.bytes)
 
     def _cached(self, name: str, sha256: str, size: int) -> "_File":
-        """A remote file, as the cache has it."""
+        """Remote file, opened in the cache."""
         assert self.cache
         for url in self._places(name):
             assert isinstance(url, Url)
             try:
                 while True:
                     path = self.cache.path(url, sha256, size)
-                    with contextlib.suppress(FileNotFoundError):  # another process made room just now
+                    with contextlib.suppress(FileNotFoundError):  # another process has just evicted it
                         return _File(path)
             except FileNotFoundError:
                 continue
@@ -275,7 +275,7 @@ class SplitFiles:
 
 
 class _File:
-    """A file that is open for reading, closed when nobody uses it any more."""
+    """File that is open for reading and closes with its last reference."""
 
     def __init__(self, path: Path) -> None:
         self.process, self.path = os.getpid(), path
@@ -288,7 +288,7 @@ class _File:
         self.about = _about(os.fstat(self.descriptor))
 
     def read(self, offset: int, size: int) -> bytes:
-        """The bytes from an offset on. Raises DamagedError where the file ends too early."""
+        """`size` bytes from `offset` on. Raises DamagedError if the file ends too early."""
         try:
             data = os.pread(self.descriptor, size, offset) if size else b""
         except OSError as error:
@@ -300,7 +300,7 @@ class _File:
         return data
 
     def _rest(self, offset: int, size: int) -> bytes:
-        """What one call did not give: 2 GiB are the most, and a signal may come between."""
+        """Remaining bytes after a short read: one call reads at most 2 GiB, and a signal may interrupt it."""
         parts = []
         while size and (part := os.pread(self.descriptor, size, offset)):
             parts.append(part)
@@ -308,48 +308,51 @@ class _File:
         return b"".join(parts)
 
     def read_into(self, target: memoryview, offset: int) -> None:
-        """Fills `target` with the bytes from an offset on."""
+        """Fill `target` with the bytes from `offset` on. Raises DamagedError if the file ends too early."""
         try:
-            got = os.preadv(self.descriptor, [target], offset) if target.nbytes else 0
+            count = os.preadv(self.descriptor, [target], offset) if target.nbytes else 0
         except OSError as error:
             raise reading_error(self.path, error) from error
-        if got != target.nbytes:
-            target.cast("B")[got:] = self.read(offset + got, target.nbytes - got)
+        if count != target.nbytes:
+            target.cast("B")[count:] = self.read(offset + count, target.nbytes - count)
 
     def __del__(self) -> None:
-        # A forked process has its own copies, and may have given the number to another file since.
+        # A forked process has copies of the descriptors, and may have reused the number for another file since.
         if hasattr(self, "descriptor") and self.process == os.getpid():
             os.close(self.descriptor)
 
 
 def _about(status: os.stat_result) -> tuple[int, ...]:
-    """What tells a file from another that has taken its name."""
+    """Identity of a file, which differs from that of a later file with the same name."""
     return status.st_dev, status.st_ino, status.st_size, status.st_mtime_ns
 
 
-# The files that this process has open, those used longest ago first.
+# Open files of this process, least recently used first.
 _files: OrderedDict[Path, _File] = OrderedDict()
-_lock = threading.Lock()  # of these, and of the blocks of every dataset; held for moments only
+_lock = threading.Lock()  # guards `_files` and the blocks of every dataset; only held briefly
 
 
 def open_file(path: Path) -> _File:
-    """The file that now has this name, open; it stays so for others. Raises FileNotFoundError, and ours."""
+    """Open file at this path, kept open for later calls.
+
+    Raises FileNotFoundError if there is no such file, and otherwise the errors of `reading_error`.
+    """
     try:
-        about = _about(path.stat())
+        identity = _about(path.stat())
     except FileNotFoundError:
         raise
     except OSError as error:
         raise reading_error(path, error) from error
     with _lock:
-        known = _files.get(path)
-        if known is not None and known.about == about and known.process == os.getpid():
+        cached = _files.get(path)
+        if cached is not None and cached.about == identity and cached.process == os.getpid():
             _files.move_to_end(path)
-            return known
+            return cached
     try:
         file = _File(path)
     except UserError:
         with _lock:
-            _files.clear()  # too many are open: ours need not be
+            _files.clear()  # there may be too many open files
         file = _File(path)
     with _lock:
         _files[path] = file
@@ -360,14 +363,14 @@ def open_file(path: Path) -> _File:
 
 def _after_fork() -> None:
     global _lock
-    _lock = threading.Lock()  # another thread may have held it
+    _lock = threading.Lock()  # another thread may have held the old one during the fork
 
 
 os.register_at_fork(after_in_child=_after_fork)
 
 
 def _piece_of(file: _File, column: Column, piece: Chunk, target: np.ndarray) -> bytes | memoryview:
-    """The bytes of a piece; one that is not compressed is read right into `target`."""
+    """Bytes of a chunk; an uncompressed chunk is read directly into `target`."""
     if column.codec != "none":
         return file.read(piece.offset, piece.size)
     data = target.data
@@ -380,7 +383,7 @@ def _piece_of(file: _File, column: Column, piece: Chunk, target: np.ndarray) -> 
 def _received(
     found: Mapping[Chunk, bytes | Exception], column: Column, piece: Chunk, target: np.ndarray
 ) -> bytes | memoryview:
-    """The bytes of a piece that has been asked for already."""
+    """Bytes of a chunk that has been downloaded; raises the error of its download."""
     data = found[piece]
     if isinstance(data, Exception):
         raise data

@@ -1,4 +1,4 @@
-"""One field on its way from the chunks of a file to a batch."""
+"""Conversion of one field from the chunks of a shard file to its array in a batch."""
 
 import numpy as np
 
@@ -9,7 +9,7 @@ LAYOUTS = {"THWC": (0, 1, 2, 3), "TCHW": (0, 3, 1, 2), "CTHW": (3, 0, 1, 2)}
 
 
 class Column:
-    """What a field is in the file, and what of it is wanted."""
+    """Stored form of a field, and the window, layout and dtype in which it is read."""
 
     def __init__(self, name: str, manifest: Manifest, layout: str, window: int | None, stride: int, dtype: str) -> None:
         field = manifest.fields[name]
@@ -17,7 +17,7 @@ class Column:
         self.codec = manifest.codec_of(name)
         self.stored = field.shape(manifest.sizes)
         self.size = stored_bytes(field, manifest.sizes)
-        self.frames = manifest.chunk_frames if field.is_image else None  # of a piece
+        self.frames = manifest.chunk_frames if field.is_image else None  # frames in a chunk
         self.pieces = manifest.pieces if field.is_image else 1
         axes = field.axes.split()[1:]
         self.order = LAYOUTS[layout] if self.is_image and len(axes) == 4 else tuple(range(len(axes)))
@@ -26,21 +26,21 @@ class Column:
         self.dtype = np.dtype("float32" if self.to_float else field.dtype)
         shape = self.stored if self.window is None else (self.window, *self.stored[1:])
         self.shape = tuple(shape[axis] for axis in self.order)
-        # Then a piece is read or decoded right where it is wanted.
+        # The chunks of a direct column are read or decoded in the batch itself.
         self.is_direct = not self.to_float and self.window is None and self.order == tuple(range(len(axes)))
 
     def needed(self, first: int) -> range:
-        """The pieces that the window which begins at frame `first` lies in."""
+        """Numbers of the chunks that hold the window beginning at frame `first`."""
         if self.window is None or self.frames is None:
             return range(self.pieces)
         return range(first // self.frames, (first + (self.window - 1) * self.stride) // self.frames + 1)
 
     def part(self, whole: np.ndarray, piece: int) -> np.ndarray:
-        """Where in a whole video a piece belongs, both with a leading 1."""
+        """View of chunk number `piece` in the array `whole` [1, T, ...] of a complete video."""
         return whole if self.frames is None else whole[:, piece * self.frames : (piece + 1) * self.frames]
 
     def convert(self, whole: np.ndarray, first: int, target: np.ndarray) -> None:
-        """Puts the window that begins at frame `first` into `target`, both with a leading 1."""
+        """Copy the window beginning at frame `first` of `whole` [1, T, ...] to `target` [1, ...]."""
         if self.window is not None:
             whole = whole[:, first : first + (self.window - 1) * self.stride + 1 : self.stride]
         whole = whole.transpose(0, *(1 + axis for axis in self.order))

@@ -1,6 +1,6 @@
-"""Batches for training, in an order that can be resumed: threads read ahead and fill each batch together.
+"""Data loader: shuffled batches for training, read ahead by threads, with a state that can be resumed.
 
-jax and torch are imported only if batches are wanted in them.
+jax and torch are imported only for batches of their arrays.
 """
 
 import importlib
@@ -23,23 +23,63 @@ if TYPE_CHECKING:
     import torch
 
 
-A = TypeVar("A")  # arrays of numpy, torch or jax
+A = TypeVar("A")  # array type of numpy, torch or jax
 
 
 class DataLoader(Generic[A]):
-    """Batches as dictionaries of arrays, each rank its slice of every global batch of `batch_size * world_size`.
+    """Iterable of batches for training, which are dictionaries of arrays [n, ...] by field name.
 
-    Unless given, rank and world size are those that torchrun sets in the environment, or one process is all.
+    Each rank receives its slice of every global batch of `batch_size * world_size` videos. The video and window at each
+    position follow from (seed, epoch, position) alone, so a state is a few numbers and is valid for any world size. An
+    iteration ends after `epochs` epochs, and the next iteration continues with the following epochs. After `break` or
+    `load_state_dict`, the next iteration continues with the batch after the last one delivered.
+    Iterating raises the errors of `Dataset.batch` when videos cannot be read.
 
-    Video and window at each position follow from (seed, epoch, position) alone, so a state is a few numbers and fits
-    another world size. An iteration ends when `epochs` epochs are through, and the next goes on with the epochs that
-    follow; after `break` or `load_state_dict` it goes on with the batch after the last one delivered.
+    Parameters
+    ----------
+    dataset : Dataset, ConcatDataset or Mixture
+        A dataset from `gen2d.open` or `gen2d.mix`.
+    batch_size : int
+        Number of videos in a batch of one rank.
+    seed : int
+        Seed of the shuffling and of random windows.
+    shuffle : "global" or bool
+        "global" and True permute all videos of the dataset anew in each epoch; False keeps their order.
+    epochs : int, optional
+        Number of epochs in an iteration. By default an iteration never ends.
+    rank, world_size : int, optional
+        Number of this process, and of all processes. If both are omitted, they are RANK and WORLD_SIZE of the
+        environment, which torchrun sets, and otherwise 0 and 1.
+    drop_last : bool
+        Whether the videos at the end of an epoch that do not fill a global batch are skipped. With False they form a
+        smaller one, of which the ranks' slices differ by at most one video and may be empty.
+    num_threads : int, optional
+        Number of reading threads. The default is the number of CPUs, at most 8.
+    prefetch : int
+        Number of batches to read ahead.
+    transform : callable, optional
+        Function from a NumPy batch to a batch of new arrays. It runs in the reading threads, so several calls may run
+        at once.
+    to : "numpy", "torch" or "jax"
+        Type of the arrays. jax has no 64-bit types by default. Text fields stay NumPy bytes.
+    device : torch.device, str or jax.Device, optional
+        Device of the batches, with `to="torch"` or `to="jax"`. The default is the CPU for torch, jax's default device
+        for jax.
+    sharding : jax.sharding.Sharding, optional
+        Placement of the batches on several devices, instead of `device`, with `to="jax"`.
 
-    `shuffle` is "global" (or True) or False. `drop_last=False` keeps the last videos of an epoch, which fill no global
-    batch: the ranks' shares of these may differ by one, or be empty. `transform` gets each batch in a thread, and gives
-    new arrays each time. `to` is "numpy", "torch" or "jax", which has no 64-bit numbers by default; text stays NumPy's
-    bytes in both. `device` is where batches are put, a torch device or its name or a jax device, and `sharding` how jax
-    lays them out on several. `dataset` is what `gen2d.open` or `gen2d.mix` gives.
+    Raises
+    ------
+    ConfigError
+        If an argument is invalid, or if the dataset has fewer videos than a batch needs.
+
+    Examples
+    --------
+    >>> ds = gen2d.open("datasets/bouncing", window=16, dtype="float32", layout="TCHW")
+    >>> with gen2d.DataLoader(ds, batch_size=32, epochs=10, to="torch", device="cuda") as loader:
+    ...     for batch in loader:
+    ...         loss = train_step(batch["frames"])  # [32, 16, 3, H, W]
+    ...         checkpoint = loader.state_dict()
     """
 
     @overload
@@ -141,27 +181,41 @@ class DataLoader(Generic[A]):
         self.close()
 
     def close(self) -> None:
-        """Ends the iteration in progress and waits for its threads."""
+        """Stop the iteration in progress and wait for its threads."""
         if self._running is not None:
             self._running.close()
 
     def state_dict(self) -> LoaderState:
-        """Where the iteration stands, and on which snapshot of the dataset: what has been delivered, not what was read
-        ahead."""
+        """State after the last batch delivered, as values that JSON can store; batches read ahead do not count.
+
+        It holds the epoch, the position, the values that determine the order, and the snapshot of the dataset.
+        """
         return self.walk.state_dict() | {"snapshot": self.dataset.snapshot}
 
     def load_state_dict(self, state: LoaderState) -> None:
-        """The next iteration goes on where `state` was taken, on whatever number of ranks.
+        """Let the next iteration continue from `state`, which may come from another number of ranks.
 
-        Where the dataset has grown since, that is the snapshot of the state, which is opened again. Raises FolderError
-        where it is no longer there, and ConfigError for the state of another dataset, or in another order.
+        If the dataset has grown since, the loader opens the snapshot of the state again. `gen2d.stream` has states of
+        the same form, without a snapshot.
+
+        Parameters
+        ----------
+        state : mapping
+            A result of `state_dict`.
+
+        Raises
+        ------
+        ConfigError
+            If the state has another seed, shuffle, number of videos or number of datasets.
+        FolderError
+            If the folder does not have the snapshot, because it was removed or belongs to another dataset.
         """
         self.close()
-        snapshot = state.get("snapshot") if isinstance(state, Mapping) else None  # None: of a stream
+        snapshot = state.get("snapshot") if isinstance(state, Mapping) else None  # None in a stream's state
         dataset = self.dataset.at(snapshot) if isinstance(snapshot, str | list) else self.dataset
-        walk = self.walk.over(len(dataset))
-        walk.load_state_dict(state)
-        self.dataset, self.walk = dataset, walk
+        sampler = self.walk.over(len(dataset))
+        sampler.load_state_dict(state)
+        self.dataset, self.walk = dataset, sampler
 
     def _batches(self) -> Generator[Any, None, None]:
         steps = self.walk.steps()
@@ -169,28 +223,28 @@ class DataLoader(Generic[A]):
         try:
             ahead = deque((step, self._submit(pool, step)) for step in itertools.islice(steps, self.prefetch))
             while ahead:
-                step, coming = ahead.popleft()
-                batch = _DELIVER[self.to](coming.result(), self.device, self.sharding)
-                # Asked for before this one is handed out, so that threads read while the caller trains.
-                ahead.extend((following, self._submit(pool, following)) for following in itertools.islice(steps, 1))
+                step, future = ahead.popleft()
+                batch = _DELIVER[self.to](future.result(), self.device, self.sharding)
+                # The next batch is requested before this one is delivered: threads read while the caller trains.
+                ahead.extend((next_step, self._submit(pool, next_step)) for next_step in itertools.islice(steps, 1))
                 self.walk.passed(step)
                 yield batch
         finally:
             pool.shutdown(cancel_futures=True)
 
     def _submit(self, pool: ThreadPoolExecutor, step: GlobalBatch) -> Future[Any]:
-        """This rank's slice of a global batch, being filled by all threads."""
+        """Future of this rank's slice of a global batch, which all threads fill together."""
         positions = self.walk.share(step)
         indices = self.dataset.numbers_at(positions, step.epoch, self.walk.shuffled_by)
         starts = self.dataset.starts(indices, self.walk.bits(step, positions))
-        # A new batch each time, never one used before: jax may keep the very memory that it is given.
+        # A new batch each time, because jax may keep the memory of the arrays that it receives.
         out = self.dataset.empty(len(indices))
         parts = [
             pool.submit(self.dataset.fill, out, part, indices[part], None if starts is None else starts[part])
             for part in np.array_split(np.arange(len(indices)), min(self.threads, len(indices) or 1))
             if len(part)
         ]
-        # Queued behind its parts, so they have all begun when a thread takes this up: it waits, but never for ever.
+        # No deadlock: this task is queued after its parts, so all of them have started when a thread waits for them.
         return pool.submit(self._whole, out, parts)
 
     def _whole(self, out: Batch, parts: list[Future[None]]) -> Any:
@@ -213,14 +267,14 @@ def _to_jax(batch: Any, device: Any, sharding: Any) -> Any:
 
 
 def without_text(batch: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
-    """The fields of a batch that are numbers, and those that are text, which stay in NumPy."""
+    """Numeric fields and text fields of a batch."""
     text = {
         name: values for name, values in batch.items() if isinstance(values, np.ndarray) and values.dtype.kind == "S"
     }
     return {name: values for name, values in batch.items() if name not in text}, text
 
 
-# How batches are handed out, by the value of `to`.
+# Conversion of a batch (batch, device, sharding), by the value of `to`.
 _DELIVER: dict[str, Callable[[Any, Any, Any], Any]] = {
     "numpy": lambda batch, device, sharding: batch,
     "torch": _to_torch,
@@ -229,7 +283,7 @@ _DELIVER: dict[str, Callable[[Any, Any, Any], Any]] = {
 
 
 def _check_place(to: str, device: Any, sharding: Any) -> None:
-    """Raises ConfigError for a place that such batches cannot have."""
+    """Raise ConfigError for a device or sharding that does not fit `to`."""
     if device is not None and to == "numpy":
         raise ConfigError(f"device is {device!r}, but must be None with to='numpy'")
     if sharding is not None and (to != "jax" or device is not None):

@@ -1,6 +1,6 @@
-"""A dataset: what `open` gives of a complete one, or of several as one, its videos one by one or as batches.
+"""Datasets for reading: `open`, and `Dataset` with videos by index and batches.
 
-Neither jax nor h5py is imported, and no open file outlives a fork, so fork and spawn are both safe.
+Neither jax nor h5py is imported, and no file descriptor is shared across a fork, so fork and spawn are both safe.
 """
 
 import contextlib
@@ -84,30 +84,74 @@ def open(
     timeout: float = 30.0,
     deadline: float = 300.0,
 ) -> "Dataset | ConcatDataset":
-    """The videos of one split of a complete dataset.
+    """Open one split of a complete dataset for reading.
 
-    `split` may be left out if there is only one, or one called train. `fields` are names or patterns: frames and
-    "states/*" unless told otherwise. `window` takes so many frames, `stride` apart, beginning at frame `start`: a
-    number, "first", or "random", which DataLoader draws anew for each video and epoch; the Dataset alone then begins at
-    the first. `layout` is of images with channels, `dtype`
-    of frames ("float32" is 0 to 1). With verify="checksum" nothing damaged is ever returned.
+    A dataset may grow while it is read; the opened `Dataset` keeps the videos that it had when it was opened. Files are
+    opened when videos are read, which raises the errors of `Dataset.batch`.
 
-    `path` is a folder or a URL that fsspec knows, or a list of them: datasets of one recipe, whose seeds may differ, as
-    one dataset, their videos one after the other. Of a URL `cache_dir` keeps whole shards in a folder, `cache_bytes` at
-    most besides those on their way, the ones used longest ago going first; several processes and datasets may share it.
+    Parameters
+    ----------
+    path : str, Path, or list or tuple of these
+        Folder, or URL of a protocol of fsspec. Several paths open as one concatenated dataset; the datasets must agree
+        in split, fields, sizes and frame rate, and may differ in their seeds.
+    split : str, optional
+        Name of the split. The default is "train", or the only split.
+    fields : sequence of str, optional
+        Names or patterns of fields, such as "states/*". The default is the frames, where stored, and all states.
+    window : int, optional
+        Number of frames in a window. By default a video is returned whole.
+    stride : int
+        Distance between the frames of a window, in frames of the video.
+    start : "random", "first" or int
+        First frame of a window. With "random", `DataLoader` samples it for each video and epoch; windows that are read
+        from the `Dataset` itself then begin at frame 0 unless `starts` is given.
+    layout : "THWC", "TCHW" or "CTHW"
+        Order of the axes of images with channels.
+    dtype : "uint8" or "float32"
+        Type of the frames; float32 values are from 0 to 1. Other fields keep their stored type.
+    verify : "checksum" or "none"
+        With "checksum", every chunk is verified when it is read, so damaged data is never returned.
+    cache_dir : str or Path, optional
+        Folder that keeps whole shards of a dataset at a URL. Several processes and datasets may share it.
+    cache_bytes : int, optional
+        Maximum size of the cache in bytes, without downloads in progress. The least recently used shards are removed
+        first. By default the size is not limited.
+    snapshot : str, optional
+        An earlier `Dataset.snapshot`, to open the dataset as it was before it grew last. Only for a single path.
+    timeout : float
+        Maximum time, in s, to wait for a server to connect or to send the next part of an answer.
+    deadline : float
+        Maximum time, in s, of a request with all its attempts. Large downloads may take longer.
 
-    A dataset may grow while it is read: what was opened stays as it was. `snapshot` opens it as it was before it grew
-    the last time (`Dataset.snapshot`, as a loader's state has it). Of a URL, `timeout` is how many seconds a server is
-    waited for at a time, and `deadline` how many a request may take in all.
+    Returns
+    -------
+    Dataset or ConcatDataset
+        A `Dataset` for one path, a `ConcatDataset` for a list or tuple of paths.
 
-    Raises FolderError, ConfigError, DamagedError, and UnreachableError where a server does not answer, then and
-    whenever videos are read.
+    Raises
+    ------
+    ConfigError
+        If an argument is invalid, or if the datasets of several paths do not agree.
+    FolderError
+        If the folder cannot be read, holds no complete dataset (IncompleteError), or no longer has the snapshot.
+    DamagedError
+        If the manifest is damaged.
+    UnreachableError
+        If a server or disk does not answer.
+
+    Examples
+    --------
+    >>> ds = gen2d.open("datasets/bouncing", fields=["frames", "states/position"], window=16, dtype="float32")
+    >>> ds[0]["frames"].shape  # [T, H, W, C]
+    (16, 64, 64, 3)
+    >>> ds[:32]["states/position"].shape  # m, [n, T, slot, (x, y)]
+    (32, 16, 12, 2)
     """
     if isinstance(path, list | tuple):
-        how = split, fields, window, stride, start, layout, dtype, verify, cache_dir, cache_bytes
+        view = split, fields, window, stride, start, layout, dtype, verify, cache_dir, cache_bytes
         if snapshot is not None:
             raise ConfigError("snapshot must be None for a list of datasets")
-        return _joined([open(one, *how, timeout=timeout, deadline=deadline) for one in path])
+        return _joined([open(one, *view, timeout=timeout, deadline=deadline) for one in path])
     root = place(path, Network(timeout, deadline))
     manifest = read_manifest(root, snapshot)
     split = _chosen_split(root, manifest, split)
@@ -120,7 +164,7 @@ def open(
 
 @dataclasses.dataclass(frozen=True)
 class ViewOptions:
-    """How a dataset was opened."""
+    """Options with which a dataset was opened; `open` describes them."""
 
     split: str
     fields: tuple[str, ...]
@@ -135,23 +179,26 @@ class ViewOptions:
 
     @property
     def first(self) -> int:
-        """The frame at which windows begin unless told otherwise."""
+        """First frame of windows that are read without `starts`."""
         return self.start if isinstance(self.start, int) else 0
 
     def starts(self, bits: np.ndarray, frames: int) -> np.ndarray | None:
-        """Where windows in so many frames begin, drawn by random bits; None if that is not random."""
+        """First frame of each window, int64 [n], sampled from random bits; None if windows are not random."""
         if self.window is None or self.start != "random":
             return None
         return (bits % np.uint64(frames - self.span + 1)).astype(np.int64)
 
     @property
     def span(self) -> int:
-        """How many frames a window reaches over."""
+        """Number of frames from the first to the last of a window, both included; 0 without a window."""
         return 0 if self.window is None else (self.window - 1) * self.stride + 1
 
     def within(self, frames: int, whole: int) -> "ViewOptions":
-        """The same for the first so many frames of whole videos, without a window a window of all of them. Raises
-        ConfigError for what cannot be."""
+        """Options for a split that has the first `frames` of the `whole` stored frames.
+
+        Without a window, a shorter split is read through a window of all its frames. Raises ConfigError for invalid
+        options, and for windows that are longer than the videos.
+        """
         self._check(frames)
         if self.window is not None or frames == whole:
             return self
@@ -177,7 +224,36 @@ _HINT = "gen2d verify finds all such damage"
 
 
 class Dataset:
-    """Videos by number, as dictionaries of NumPy arrays; also a map-style dataset for torch and grain."""
+    """One split of a dataset, as `gen2d.open` returns it; also a map-style dataset for torch and grain.
+
+    `ds[i]` is a video, a dictionary of NumPy arrays by field name; `ds[2:5]` and `ds[[2, 7]]` are batches, whose arrays
+    have a leading axis of videos. `info` lists the axes and the unit of each field. A `Dataset` can be pickled, and can
+    be read from several threads at once.
+
+    Attributes
+    ----------
+    fields : dict of str to Field
+        dtype, axes, unit and meaning of each field as stored, before window, layout and dtype are applied.
+    stats : dict
+        Mean, std, min and max of each component of the frames and states, by field, over the sample that
+        `manifest.stats_sampled` describes. Units are those of the stored values: frames are from 0 to 255 even with
+        `dtype="float32"`.
+    time : ndarray, float64 [T]
+        Times of the frames, s.
+    snapshot : str
+        sha256 of the manifest, which identifies the current state of a growing dataset.
+    manifest : Manifest
+        Contents of manifest.json: sizes, fps, config, splits, checksums and more.
+    options : ViewOptions
+        Options with which the dataset was opened.
+
+    Examples
+    --------
+    >>> ds = gen2d.open("datasets/bouncing")
+    >>> video = ds[0]
+    >>> video["frames"].shape, video["frames"].dtype
+    ((64, 64, 64, 3), dtype('uint8'))
+    """
 
     def __init__(self, root: Place, manifest: Manifest, options: ViewOptions) -> None:
         self.root, self.manifest, self.options = root, manifest, options
@@ -196,13 +272,13 @@ class Dataset:
 
     @property
     def snapshot(self) -> str:
-        """Which of the states of a dataset that grows this is: the manifest's sha256."""
+        """sha256 of the manifest, which identifies this state of a growing dataset."""
         return self.manifest.sha256
 
     def at(self, snapshot: Snapshot) -> "Dataset":
-        """The dataset as it was at an earlier snapshot, while that is there.
+        """The dataset at an earlier snapshot, with the same options.
 
-        Raises FolderError where it is not, and ConfigError where the snapshot is of another dataset.
+        Raises FolderError if the folder does not have the snapshot, ConfigError for the snapshots of several datasets.
         """
         if snapshot == self.snapshot:
             return self
@@ -217,11 +293,11 @@ class Dataset:
         return self._count
 
     def __getitem__(self, key: Key) -> Batch:
-        """One video, or for a slice or a sequence of numbers several, stacked."""
+        """One video for an integer, or a batch of videos for a slice or a sequence of integers."""
         return item(self, key)
 
     def __getitems__(self, indices: Numbers) -> list[Batch]:
-        """The videos one by one; torch's DataLoader asks for a whole batch so."""
+        """List of videos; torch's DataLoader calls this method once per batch."""
         return unbatch(self.batch(indices))
 
     def __repr__(self) -> str:
@@ -229,23 +305,68 @@ class Dataset:
 
     @property
     def time(self) -> np.ndarray:
-        """The time of every frame of a whole video, s, float64 [T]."""
+        """Times of all frames of a video, s, float64 [T]."""
         return self.manifest.constants["time"][: self._frames]
 
     def batch(self, indices: Numbers, starts: Numbers | None = None, out: Batch | None = None) -> Batch:
-        """The videos with these numbers, stacked; windows begin at `starts`; `out` is filled if given."""
+        """Batch of the videos with these indices.
+
+        Parameters
+        ----------
+        indices : sequence of int [n]
+            Indices of the videos; negative ones count from the end.
+        starts : sequence of int [n], optional
+            First frame of each video's window. The default is the `start` of `open`, and 0 for "random".
+        out : dict of str to ndarray, optional
+            Batch to fill, as `empty(n)` returns it. By default a new one is made.
+
+        Returns
+        -------
+        dict of str to ndarray
+            Arrays [n, ...] by field name; `out` if given.
+
+        Raises
+        ------
+        IndexError, TypeError
+            If an index is out of range, or not an integer.
+        ConfigError
+            If `starts` or `out` do not fit.
+        DamagedError
+            If stored data differs from what was written.
+        FolderError, UnreachableError
+            If a file has been moved or removed, or if the disk or server fails.
+
+        Examples
+        --------
+        >>> batch = ds.batch([3, 1, 4])
+        >>> ds.batch([5, 9, 2], out=batch)  # reuses the arrays
+        """
         return filled(self, self.numbers(indices), starts, out)
 
     def empty(self, count: int) -> Batch:
-        """A batch of `count` videos that is yet to be filled."""
+        """Uninitialised batch of `count` videos. Raises UserError if it does not fit in memory."""
         try:
             return {column.name: np.empty((count, *column.shape), column.dtype) for column in self._columns}
-        except (MemoryError, ValueError):  # NumPy's words for more than there is, and for more than can be
+        except (MemoryError, ValueError):  # too large for the memory, too large for NumPy
             size = sum(math.prod((count, *column.shape)) * column.dtype.itemsize for column in self._columns)
             raise UserError(f"{self.root}: {count} videos take {in_bytes(size)}, more than there is memory") from None
 
     def fill(self, out: Batch, rows: Numbers, indices: Numbers, starts: Numbers | None = None) -> None:
-        """Returns nothing; puts the videos into these rows of `out`. Threads may fill one batch together."""
+        """Read the videos with these indices into `out`; raises the errors of `batch`.
+
+        Several threads may fill different rows of one batch.
+
+        Parameters
+        ----------
+        out : dict of str to ndarray
+            Batch from `empty`; its shapes are not checked.
+        rows : sequence of int [n]
+            Row of `out`, 0 or more, for each video.
+        indices : sequence of int [n]
+            Indices of the videos; negative ones count from the end.
+        starts : sequence of int [n], optional
+            First frame of each video's window, as in `batch`.
+        """
         numbers = self.numbers(indices)
         first = np.full(len(numbers), self.options.first) if starts is None else np.asarray(starts)
         last = self._frames - self.options.span
@@ -254,21 +375,21 @@ class Dataset:
         begins, targets = first.tolist(), np.asarray(rows).tolist()
         with self._named(numbers):
             videos = self._files.videos(numbers)
-            places = [self._files.pieces(column, numbers, videos, begins) for column in self._columns]
-            read = self._files.reader(places)
-        for column, own in zip(self._columns, places, strict=True):
-            whole = None if column.is_direct else np.empty((1, *column.stored), column.field.dtype)
-            for step, pieces in enumerate(own):
+            chunks = [self._files.pieces(column, numbers, videos, begins) for column in self._columns]
+            read = self._files.reader(chunks)
+        for column, column_chunks in zip(self._columns, chunks, strict=True):
+            scratch = None if column.is_direct else np.empty((1, *column.stored), column.field.dtype)
+            for step, video_chunks in enumerate(column_chunks):
                 target = out[column.name][targets[step] : targets[step] + 1]
-                into, begin = target if whole is None else whole, begins[step]
-                for number, piece in zip(column.needed(begin), pieces, strict=True):
-                    self._read(read, column, piece, int(numbers[step]), column.part(into, number))
-                if whole is not None:
-                    column.convert(whole, begin, target)
+                buffer, begin = target if scratch is None else scratch, begins[step]
+                for number, chunk in zip(column.needed(begin), video_chunks, strict=True):
+                    self._read(read, column, chunk, int(numbers[step]), column.part(buffer, number))
+                if scratch is not None:
+                    column.convert(scratch, begin, target)
 
     @contextlib.contextmanager
     def _named(self, numbers: np.ndarray) -> Iterator[None]:
-        """A block that looks up videos; what goes wrong says of which."""
+        """Context of looking up videos, which adds their indices to the message of a DamagedError."""
         try:
             yield
         except DamagedError as error:
@@ -292,34 +413,39 @@ class Dataset:
             raise (FolderError if isinstance(error, FileNotFoundError) else UnreachableError)(where) from error
 
     def numbers_at(self, positions: np.ndarray, epoch: int = 0, seed: int | None = None) -> np.ndarray:
-        """The numbers of the videos at these positions of an epoch: in order, or as the seed shuffles them."""
+        """Indices of the videos at these positions of an epoch: shuffled by the seed, or in order if it is None."""
         return shuffled(seed, epoch, positions, len(self))
 
     def starts(self, numbers: np.ndarray, bits: np.ndarray) -> np.ndarray | None:
-        """Where the windows of these videos begin, drawn by random bits; None if that is not random."""
+        """First frame of each video's window, int64 [n], sampled from random bits; None if windows are not random."""
         return self.options.starts(bits, self._frames)
 
     def numbers(self, indices: Numbers) -> np.ndarray:
-        """Indices as the numbers of videos, int64: negative ones count from the end."""
+        """Indices from 0 to `len(self) - 1`, int64 [n]; negative indices count from the end.
+
+        Raises TypeError for indices that are not integers, IndexError for indices out of range.
+        """
         return checked_numbers(indices, len(self), self.options.split)
 
 
 def _joined(datasets: Sequence[Dataset]) -> ConcatDataset:
-    """The datasets as one. Raises ConfigError where they are not of one recipe."""
+    """Concatenation of the datasets. Raises ConfigError if they do not agree in the values of `_facts`."""
     if not datasets:
         raise ConfigError("path is an empty list, but must name one dataset or more")
     facts = [dict(_facts(ds)) for ds in datasets]
-    for ds, own in zip(datasets, facts, strict=True):
-        for name in sorted(facts[0].keys() | own.keys()):
-            here, first = own.get(name, "missing"), facts[0].get(name, "missing")
-            if here != first:
-                told = f"{ds.root}: {name} is {here}, but in {datasets[0].root} {first}"
-                raise ConfigError(f"{told}: what is opened as one dataset must agree in split, fields, sizes and fps")
+    for ds, other in zip(datasets, facts, strict=True):
+        for name in sorted(facts[0].keys() | other.keys()):
+            value, first = other.get(name, "missing"), facts[0].get(name, "missing")
+            if value != first:
+                difference = f"{ds.root}: {name} is {value}, but in {datasets[0].root} {first}"
+                raise ConfigError(
+                    f"{difference}: what is opened as one dataset must agree in split, fields, sizes and fps"
+                )
     return ConcatDataset(datasets)
 
 
 def _facts(ds: Dataset) -> Iterator[tuple[str, Any]]:
-    """What datasets that are opened as one must agree in, by name."""
+    """Names and values in which concatenated datasets must agree."""
     yield "split", ds.options.split
     yield "fps", ds.manifest.fps
     yield from ((f"size {axis}", size) for axis, size in ds.manifest.sizes.items())
@@ -338,16 +464,19 @@ def _chosen_split(root: Place, manifest: Manifest, split: str | None) -> str:
 
 
 def chosen_fields(source: str, fields: Mapping[str, Field], patterns: Sequence[str] | str | None) -> tuple[str, ...]:
-    """The names of the fields of each video that patterns ask for; without any, frames and states."""
+    """Names of the per-video fields that match the patterns; frames and states if `patterns` is None.
+
+    Raises ConfigError if a pattern matches no field.
+    """
     names = [name for name, field in fields.items() if field.per_video]
     if patterns is None:
         patterns = [*({"frames"} & fields.keys()), "states/*"]
     chosen: dict[str, None] = {}
     for pattern in [patterns] if isinstance(patterns, str) else patterns:
-        found = fnmatch.filter(names, pattern)
-        if not found:
+        matches = fnmatch.filter(names, pattern)
+        if not matches:
             raise ConfigError(f"{source} has no field {pattern!r}{_nearest(pattern, names)}")
-        chosen |= dict.fromkeys(found)
+        chosen |= dict.fromkeys(matches)
     return tuple(chosen)
 
 

@@ -1,7 +1,7 @@
-"""Which videos come when: the order of an epoch, each rank's share of it, and where a reader stands.
+"""Epoch sampler: the order of videos in an epoch, each rank's slice of it, and a state that can be resumed.
 
-Nothing is drawn from a generator that has a state: video and window at each position are computed from seed, epoch and
-position, so going on anywhere takes no replay.
+There is no random generator with a state. The video and window at each position are computed from the seed, the epoch
+and the position, so iteration resumes anywhere without replay.
 """
 
 import copy
@@ -16,18 +16,19 @@ from gen2d.core.permutation import feistel, hashed
 
 
 class GlobalBatch(NamedTuple):
-    """A global batch: positions from one on in an epoch."""
+    """Batch of all ranks together: consecutive positions of an epoch."""
 
     epoch: int
-    position: int
-    size: int
+    position: int  # the first one
+    size: int  # videos
 
 
 class EpochSampler:
-    """The way through a number of videos, and the place on it: each rank has its slice of every global batch.
+    """Global batches of successive epochs, the slice of this rank in each, and the current position.
 
-    The way ends when `epochs` epochs are through, and begins again with those that follow. The last videos of an epoch
-    that fill no global batch are left out, unless `drop_last` is False: then they make a smaller one.
+    Parameters are those of `DataLoader`; `videos` is the number of videos in the dataset. An iteration ends after
+    `epochs` epochs, and the next one continues with the following epochs. Raises ConfigError for values out of range,
+    and if there are too few videos for one global batch.
     """
 
     def __init__(
@@ -48,7 +49,7 @@ class EpochSampler:
             raise ConfigError("batch_size and world_size must be 1 or more, and rank from 0 to world_size - 1")
         self.videos, self.seed, self.shuffle, self.epochs = videos, seed, bool(shuffle), epochs
         self.rank, self.world_size, self.global_size = rank, world_size, batch_size * world_size
-        self.least = self.global_size if drop_last else 1  # how many videos still make a global batch
+        self.least = self.global_size if drop_last else 1  # the fewest videos in a global batch
         self.epoch = self.position = 0
         self._check_size()
 
@@ -58,20 +59,23 @@ class EpochSampler:
 
     def __len__(self) -> int:
         """The number of global batches in one epoch."""
-        whole, rest = divmod(self.videos, self.global_size)
-        return whole + (rest >= self.least)
+        full, remainder = divmod(self.videos, self.global_size)
+        return full + (remainder >= self.least)
 
     def state_dict(self) -> dict[str, int | bool | None]:
-        """Where it stands, and what decides the order."""
+        """Current epoch and position, and the values that determine the order."""
         fixed = {"seed": self.seed, "shuffle": self.shuffle, "videos": self.videos}
         return fixed | {"epoch": self.epoch, "position": self.position}
 
     def load_state_dict(self, state: Mapping[str, object]) -> None:
-        """Goes to where `state` was taken, on whatever number of ranks. Raises ConfigError for what is no state."""
-        here = self.state_dict()
-        if not isinstance(state, Mapping) or not here.keys() <= state.keys():
-            raise ConfigError(f"the state must be one that state_dict gave, with {', '.join(here)}")
-        for name, value in here.items():
+        """Continue from `state`, which may come from another number of ranks.
+
+        Raises ConfigError if `state` is not a state of a sampler, or has another seed, shuffle or number of videos.
+        """
+        current = self.state_dict()
+        if not isinstance(state, Mapping) or not current.keys() <= state.keys():
+            raise ConfigError(f"the state must be one that state_dict gave, with {', '.join(current)}")
+        for name, value in current.items():
             if name not in ("epoch", "position") and state[name] != value:
                 raise ConfigError(
                     f"the state has {name} {state[name]}, but this loader has {value}: orders would differ"
@@ -82,14 +86,14 @@ class EpochSampler:
         self.epoch, self.position = self._resolved(epoch, position)
 
     def over(self, videos: int) -> "EpochSampler":
-        """The same way through another number of videos, from its beginning."""
+        """Sampler with the same options for another number of videos, at its beginning."""
         other = copy.copy(self)
         other.videos, other.epoch, other.position = videos, 0, 0
         other._check_size()
         return other
 
     def steps(self) -> Iterator[GlobalBatch]:
-        """The global batches to come."""
+        """Global batches from the current position on, until `epochs` epochs are complete."""
         epoch, position = self.epoch, self.position
         end = None if self.epochs is None else (epoch // self.epochs + 1) * self.epochs
         while end is None or epoch < end:
@@ -98,58 +102,58 @@ class EpochSampler:
             epoch, position = self._resolved(epoch, position + size)
 
     def passed(self, step: GlobalBatch) -> None:
-        """Returns nothing; the place is then after that global batch."""
+        """Move the current position to the end of a global batch."""
         self.epoch, self.position = self._resolved(step.epoch, step.position + step.size)
 
     def _resolved(self, epoch: int, position: int) -> tuple[int, int]:
-        """Where the next global batch begins."""
+        """Epoch and position of the next global batch, from a position that may be at the end of an epoch."""
         return (epoch, position) if self.videos - position >= self.least else (epoch + 1, 0)
 
     def share(self, step: GlobalBatch) -> np.ndarray:
-        """The positions of this rank's slice of a global batch."""
+        """Positions of this rank's slice of a global batch, int64 [n]."""
         begin, end = (step.size * rank // self.world_size for rank in (self.rank, self.rank + 1))
         return step.position + np.arange(begin, end)
 
     @property
     def shuffled_by(self) -> int | None:
-        """The seed that shuffles; None where nothing does."""
+        """Seed of the shuffling; None without shuffling."""
         return self.seed if self.shuffle else None
 
     def bits(self, step: GlobalBatch, positions: np.ndarray) -> np.ndarray:
-        """Random bits for the window at each position."""
+        """Random bits for the window at each position, uint64."""
         return hashed(WINDOWS, self.seed, step.epoch, positions)
 
 
 def _ranks(rank: int | None, world_size: int | None) -> tuple[int, int]:
-    """Which of how many processes this is: as told, else as torchrun says in RANK and WORLD_SIZE, else the only one."""
+    """Rank and world size: the arguments, else RANK and WORLD_SIZE as torchrun sets them, else 0 and 1."""
     if rank is None and world_size is None and {"RANK", "WORLD_SIZE"} <= os.environ.keys():
-        told = os.environ["RANK"], os.environ["WORLD_SIZE"]
-        if not all(word.isdecimal() for word in told):
-            raise ConfigError(f"RANK and WORLD_SIZE are {told[0]!r} and {told[1]!r}, but must be whole numbers")
-        return int(told[0]), int(told[1])
+        values = os.environ["RANK"], os.environ["WORLD_SIZE"]
+        if not all(word.isdecimal() for word in values):
+            raise ConfigError(f"RANK and WORLD_SIZE are {values[0]!r} and {values[1]!r}, but must be whole numbers")
+        return int(values[0]), int(values[1])
     return 0 if rank is None else rank, 1 if world_size is None else world_size
 
 
 def one_of(name: str, value: Any, allowed: tuple) -> None:
-    """Returns nothing; raises ConfigError for a value that is none of those allowed."""
+    """Raise ConfigError unless the value is one of the allowed ones."""
     if value not in allowed:
         raise ConfigError(f"{name} is {value!r}, but must be one of {', '.join(map(str, allowed))}")
 
 
-# What a random number is for, so that no two uses share one.
+# Streams of random numbers, so that no two uses share any.
 ORDER, WINDOWS, SOURCES = 0, 1, 2
 
 
 def shuffled(seed: int | None, epoch: int, positions: np.ndarray, count: int) -> np.ndarray:
-    """The numbers of the videos at these positions of an epoch, as the seed shuffles them; in order without one."""
+    """Indices of the videos at these positions of an epoch: shuffled by the seed, or in order if it is None."""
     return positions if seed is None else order(seed, epoch, positions, count)
 
 
 def order(seed: int, epoch: int, positions: np.ndarray, count: int) -> np.ndarray:
-    """The numbers of the videos at these positions of an epoch: a permutation of 0 to count - 1, nowhere stored.
+    """Random permutation of 0 to `count - 1`, evaluated at these positions without storing it, int64 [n].
 
-    A Feistel network permutes the smallest square power of two that holds `count`; what falls outside goes through
-    again until it falls inside (Black and Rogaway, CT-RSA 2002).
+    A Feistel network permutes the integers below the smallest power of four that is at least `count`. A value of
+    `count` or more is permuted again until it is below `count` (cycle walking; Black and Rogaway, CT-RSA 2002).
     """
     half = np.uint64(max(1, ((count - 1).bit_length() + 1) // 2))
     keys = [hashed(ORDER, seed, epoch, step) for step in range(8)]

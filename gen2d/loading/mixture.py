@@ -1,8 +1,8 @@
-"""Several datasets as one, in exact proportions: which source each position takes follows from the position alone.
+"""Mixture of datasets in exact proportions; the dataset of each position is a function of the position alone.
 
-Among the first p positions each source has its share of p within 1, for any number of sources and any weights
-(Tijdeman, Discrete Mathematics 32, 1980). Shuffling takes each source's videos in another order and leaves the
-positions of the sources as they are, so that every batch holds its shares, too.
+Among the first p positions, the count of each dataset differs from its share of p by less than 1, for any number of
+datasets and any weights (Tijdeman, Discrete Mathematics 32, 1980). Shuffling permutes the videos inside each dataset
+and keeps the dataset of each position, so every batch has the proportions of the mixture, up to rounding.
 """
 
 import math
@@ -17,16 +17,40 @@ from gen2d.loading.concat import ConcatDataset, at_snapshots, groups_of
 from gen2d.loading.epochs import SOURCES
 from gen2d.loading.protocols import Batch, Key, Numbers, Snapshot, VideoReader, checked_numbers, item, unbatch
 
-FINEST = 1000  # a weight is taken as the nearest fraction with a denominator up to this
+FINEST = 1000  # largest denominator of a weight; weights are rounded to such a fraction
 Weights = Mapping[str, float] | Sequence[float]
 
 
 def mix(datasets: Mapping[str, VideoReader], weights: Weights | None = None) -> "Mixture":
-    """The datasets as one, for DataLoader, torch and grain; `weights` are their shares, equal unless told otherwise.
+    """Mixture of datasets in exact proportions.
 
-    An epoch is as long as no dataset has to give a video twice, and the next goes on with the videos that follow, so
-    that a large dataset is read through in several epochs. Raises ConfigError where the datasets' fields, shapes or
-    types differ, and where weights are not positive or not of these datasets.
+    An epoch ends before any dataset would repeat a video. The next epoch continues with the following videos of each
+    dataset, so a large dataset is read completely over several epochs.
+
+    Parameters
+    ----------
+    datasets : mapping of str to Dataset or ConcatDataset
+        The datasets by name. Their fields, shapes and dtypes must be equal.
+    weights : mapping of str to float, sequence of float, or None
+        Relative share of each dataset: by name, or in the order of `datasets`. Weights need not sum to 1; they are
+        rounded to fractions with denominators up to 1000. None means equal shares.
+
+    Returns
+    -------
+    Mixture
+        A map-style dataset for `DataLoader`, torch and grain.
+
+    Raises
+    ------
+    ConfigError
+        If the fields, shapes or dtypes of the datasets differ, or if `weights` are not positive numbers, one for each
+        dataset.
+
+    Examples
+    --------
+    >>> easy, hard = gen2d.open("datasets/easy"), gen2d.open("datasets/hard")
+    >>> mixture = gen2d.mix({"easy": easy, "hard": hard}, {"easy": 3, "hard": 1})
+    >>> loader = gen2d.DataLoader(mixture, batch_size=32)  # 24 videos of easy and 8 of hard in each batch
     """
     if not datasets:
         raise ConfigError("datasets is empty, but must name one dataset or more")
@@ -37,9 +61,17 @@ def mix(datasets: Mapping[str, VideoReader], weights: Weights | None = None) -> 
 
 
 class Mixture:
-    """Videos of several datasets by position, as dictionaries of NumPy arrays; a map-style dataset itself.
+    """Mixture of datasets, as `gen2d.mix` returns it; also a map-style dataset for torch and grain.
 
-    A position's video has a number, which `fill` takes: the datasets' own, counted on from one dataset to the next.
+    `mixture[i]` is the video at position i of the first epoch, without shuffling. `fill` takes indices into the
+    concatenation of the datasets instead; `numbers_at` converts positions to these indices.
+
+    Parameters
+    ----------
+    datasets : mapping of str to VideoReader
+        The datasets by name. `gen2d.mix` checks that they match; the constructor does not.
+    shares : sequence of int
+        Number of positions that each dataset has in one period of `sum(shares)` positions.
     """
 
     def __init__(self, datasets: Mapping[str, VideoReader], shares: Sequence[int]) -> None:
@@ -48,23 +80,25 @@ class Mixture:
         self._joined = ConcatDataset(list(datasets.values()))
         sizes = self._joined.sizes
         self._turns = turns(self.shares, sizes.tolist())
-        taken = np.cumsum(self._turns[:, None] == np.arange(len(shares)), axis=0)
-        self._taken = np.concatenate([np.zeros_like(taken[:1]), taken])  # of each dataset before each turn
-        whole = len(self._turns) == sum(shares)
-        periods = min(size // share for size, share in zip(sizes.tolist(), shares, strict=True)) if whole else 0
-        rest = (self._taken <= sizes - periods * self._taken[-1]).all(axis=1).sum() - 1
-        self._count = periods * len(self._turns) + int(rest)
-        self._each = periods * self._taken[-1] + self._taken[rest]  # of each dataset in an epoch
+        counts = np.cumsum(self._turns[:, None] == np.arange(len(shares)), axis=0)
+        self._taken = np.concatenate(
+            [np.zeros_like(counts[:1]), counts]
+        )  # videos of each dataset before each position of the period
+        is_full = len(self._turns) == sum(shares)
+        periods = min(size // share for size, share in zip(sizes.tolist(), shares, strict=True)) if is_full else 0
+        remainder = (self._taken <= sizes - periods * self._taken[-1]).all(axis=1).sum() - 1
+        self._count = periods * len(self._turns) + int(remainder)
+        self._each = periods * self._taken[-1] + self._taken[remainder]  # videos of each dataset in an epoch
 
     def __len__(self) -> int:
         return self._count
 
     def __getitem__(self, key: Key) -> Batch:
-        """The video at a position, or for a slice or a sequence of positions several, stacked."""
+        """One video for an integer, or a batch of videos for a slice or a sequence of integers."""
         return item(self, key)
 
     def __getitems__(self, positions: Numbers) -> list[Batch]:
-        """The videos one by one; torch's DataLoader asks for a whole batch so."""
+        """List of videos; torch's DataLoader calls this method once per batch."""
         return unbatch(self.batch(positions))
 
     def __repr__(self) -> str:
@@ -73,84 +107,93 @@ class Mixture:
 
     @property
     def snapshot(self) -> Snapshot:
-        """The snapshot of each dataset, in their order."""
+        """Snapshots of the datasets, in their order."""
         return self._joined.snapshot
 
     def at(self, snapshot: Snapshot) -> "Mixture":
-        """The mixture of the same datasets at earlier snapshots, while these are there."""
+        """Mixture of the same datasets at earlier snapshots.
+
+        Raises ConfigError if the number of snapshots differs, FolderError if a folder does not have its snapshot.
+        """
         if snapshot == self.snapshot:
             return self
         datasets = at_snapshots(list(self.datasets.values()), snapshot)
         return Mixture(dict(zip(self.datasets, datasets, strict=True)), self.shares)
 
     def batch(self, positions: Numbers) -> Batch:
-        """The videos at these positions of the first epoch, not shuffled, stacked."""
-        places = checked_numbers(positions, len(self), "the mixture")
-        out = self.empty(len(places))
-        self.fill(out, range(len(places)), self.numbers_at(places))
+        """Batch of the videos at these positions of the first epoch, without shuffling.
+
+        Raises IndexError for positions beyond the epoch, and the errors of reading of `Dataset.batch`.
+        """
+        checked = checked_numbers(positions, len(self), "the mixture")
+        out = self.empty(len(checked))
+        self.fill(out, range(len(checked)), self.numbers_at(checked))
         return out
 
     def empty(self, count: int) -> Batch:
-        """A batch of `count` videos that is yet to be filled."""
+        """Uninitialised batch of `count` videos."""
         return self._joined.empty(count)
 
     def fill(self, out: Batch, rows: Numbers, indices: Numbers, starts: Numbers | None = None) -> None:
-        """Returns nothing; puts the videos with these numbers into these rows of `out`, windows from `starts` on."""
+        """Read videos of the concatenated datasets into these rows of `out`. Parameters are those of `Dataset.fill`."""
         self._joined.fill(out, rows, indices, starts)
 
     def numbers_at(self, positions: np.ndarray, epoch: int = 0, seed: int | None = None) -> np.ndarray:
-        """The numbers of the videos at these positions of an epoch: each dataset's one after the other, or as the seed
-        shuffles them; what an epoch leaves of a dataset comes in the next."""
+        """Indices into the concatenated datasets, int64 [n], of the videos at these positions of an epoch.
+
+        Each dataset is shuffled by a seed of its own, or read in order if `seed` is None. An epoch continues in each
+        dataset where the previous epoch stopped.
+        """
         periods, turn = np.divmod(positions, len(self._turns))
         owners, numbers = self._turns[turn], np.empty(len(positions), np.int64)
-        for owner, own in groups_of(owners):
-            place = epoch * self._each[owner] + periods[own] * self._taken[-1, owner] + self._taken[turn[own], owner]
-            source, rounds = self._joined.datasets[owner], place // self._joined.sizes[owner]
-            own_seed = None if seed is None else int(hashed(SOURCES, seed, owner)[0])
-            for number in np.unique(rounds):
-                now = own[rounds == number]
-                found = source.numbers_at(place[rounds == number] % len(source), int(number), own_seed)
-                numbers[now] = self._joined.firsts[owner] + found
+        for owner, rows in groups_of(owners):
+            offset = epoch * self._each[owner] + periods[rows] * self._taken[-1, owner] + self._taken[turn[rows], owner]
+            source, cycles = self._joined.datasets[owner], offset // self._joined.sizes[owner]
+            source_seed = None if seed is None else int(hashed(SOURCES, seed, owner)[0])
+            for cycle in np.unique(cycles):
+                selected = rows[cycles == cycle]
+                indices = source.numbers_at(offset[cycles == cycle] % len(source), int(cycle), source_seed)
+                numbers[selected] = self._joined.firsts[owner] + indices
         return numbers
 
     def starts(self, numbers: np.ndarray, bits: np.ndarray) -> np.ndarray | None:
-        """Where the windows of these videos begin, drawn by random bits; None if that is not random."""
+        """First frame of each video's window, sampled from random bits; None if windows are not random."""
         return self._joined.starts(numbers, bits)
 
     def source_of(self, positions: Numbers) -> list[str]:
-        """The names of the datasets that the videos at these positions are of, the same in every epoch."""
+        """Name of the dataset at each of these positions, which is the same in every epoch."""
         names = list(self.datasets)
         return [names[owner] for owner in self._turns[np.asarray(positions) % len(self._turns)]]
 
 
 def turns(shares: Sequence[int], sizes: Sequence[int]) -> np.ndarray:
-    """Whose turn it is at each position of a period of sum(shares); shorter where one of these sizes is used up.
+    """Position of the dataset at each step of a period of sum(shares) steps, shorter if a dataset runs out of videos.
 
-    After p positions each of K has had its share within 1 - 1 / (2K - 2): of those that are that far behind, the one
-    goes first that will be too late first (Tijdeman 1980). In whole numbers, so that it is the same everywhere.
+    Of the datasets that are due, the one with the earliest deadline comes next (Tijdeman 1980). This keeps the count of
+    each of K datasets within 1 - 1 / (2K - 2) of its share. Integer arithmetic makes the result the same everywhere.
     """
     period, scale, unit = sum(shares), max(2 * len(shares) - 2, 1), math.lcm(*shares)
-    taken, found = [0] * len(shares), []
-    for place in range(1, period + 1):
-        behind = [k for k, share in enumerate(shares) if scale * (share * place - period * taken[k]) >= period]
+    taken, schedule = [0] * len(shares), []
+    for length in range(1, period + 1):
+        behind = [k for k, share in enumerate(shares) if scale * (share * length - period * taken[k]) >= period]
         owner = min(behind, key=lambda k: (scale - 1 + scale * taken[k]) * (unit // shares[k]))
         if taken[owner] == sizes[owner]:
             break
         taken[owner] += 1
-        found.append(owner)
-    return np.array(found)
+        schedule.append(owner)
+    return np.array(schedule)
 
 
 def _shares(names: list[str], weights: Weights | None) -> list[int]:
-    """The weights as the smallest whole numbers in the same proportions."""
+    """Smallest integers in the same proportions as the weights."""
     if isinstance(weights, Mapping):
         if weights.keys() != set(names):
             raise ConfigError(f"weights has the names {', '.join(weights)}, but must have {', '.join(names)}")
         weights = [weights[name] for name in names]
-    given = [1.0] * len(names) if weights is None else list(weights)
-    if len(given) != len(names):
-        raise ConfigError(f"weights has {len(given)} numbers, but there are {len(names)} datasets")
-    fractions = [_fraction(name, weight) for name, weight in zip(names, given, strict=True)]
+    values = [1.0] * len(names) if weights is None else list(weights)
+    if len(values) != len(names):
+        raise ConfigError(f"weights has {len(values)} numbers, but there are {len(names)} datasets")
+    fractions = [_fraction(name, weight) for name, weight in zip(names, values, strict=True)]
     unit = math.lcm(*(fraction.denominator for fraction in fractions))
     shares = [int(fraction * unit) for fraction in fractions]
     return [share // math.gcd(*shares) for share in shares]
@@ -167,12 +210,12 @@ def _fraction(name: str, weight: float) -> Fraction:
 
 
 def _compare(first: str, one: VideoReader, name: str, other: VideoReader) -> None:
-    """Raises ConfigError where videos of two datasets cannot stand in one batch."""
-    here, there = one.empty(1), other.empty(1)
-    for field in sorted(here.keys() ^ there.keys()):
-        has, lacks = (first, name) if field in here else (name, first)
+    """Raise ConfigError if videos of two datasets do not fit in one batch."""
+    one_batch, other_batch = one.empty(1), other.empty(1)
+    for field in sorted(one_batch.keys() ^ other_batch.keys()):
+        has, lacks = (first, name) if field in one_batch else (name, first)
         raise ConfigError(f"dataset {lacks} has no field {field!r}, but {has} has: open both with the same fields")
-    for field, values in here.items():
-        kinds = [f"{array.dtype} {array.shape[1:]}" for array in (values, there[field])]
-        if kinds[0] != kinds[1]:
-            raise ConfigError(f"{field} of dataset {name} is {kinds[1]}, but of {first} {kinds[0]}")
+    for field, values in one_batch.items():
+        types = [f"{array.dtype} {array.shape[1:]}" for array in (values, other_batch[field])]
+        if types[0] != types[1]:
+            raise ConfigError(f"{field} of dataset {name} is {types[1]}, but of {first} {types[0]}")

@@ -1,4 +1,4 @@
-"""Videos by number: what datasets and mixtures have in common, and several datasets as one, one after the other."""
+"""Protocols of datasets and concatenations, and the indexing that they share with mixtures."""
 
 from collections.abc import Mapping, Sequence
 from typing import Protocol, SupportsIndex, TypeAlias
@@ -10,14 +10,14 @@ from gen2d.core.schema import Field
 
 Batch = dict[str, np.ndarray]
 Numbers = Sequence[int] | np.ndarray
-Key = SupportsIndex | slice | Numbers  # of one video, or of several
-Snapshot: TypeAlias = "str | list[Snapshot]"  # of a dataset, or of each of several
-LoaderState: TypeAlias = "Mapping[str, int | bool | Snapshot | None]"  # plain values, as JSON has them
-FieldStats = dict[str, dict[str, list[float] | None]]  # of each field: mean, std, min and max of each component
+Key = SupportsIndex | slice | Numbers  # index of one video, or of several
+Snapshot: TypeAlias = "str | list[Snapshot]"  # of one dataset, or of each of several
+LoaderState: TypeAlias = "Mapping[str, int | bool | Snapshot | None]"  # values that JSON can store
+FieldStats = dict[str, dict[str, list[float] | None]]  # mean, std, min and max of each component, by field
 
 
 class VideoSequence(Protocol):
-    """What gives batches by number."""
+    """Source of batches by index."""
 
     def __len__(self) -> int: ...
 
@@ -25,7 +25,7 @@ class VideoSequence(Protocol):
 
 
 class VideoReader(Protocol):
-    """What fills batches that others have begun: a Dataset, or several."""
+    """Source of videos for `DataLoader`: a Dataset or a ConcatDataset. `Dataset` describes the methods."""
 
     def __len__(self) -> int: ...
 
@@ -53,7 +53,7 @@ class VideoReader(Protocol):
 
 
 def item(videos: VideoSequence, key: Key) -> Batch:
-    """`videos[key]`: one video, or for a slice or a sequence of numbers several, stacked."""
+    """One video for an integer key, or a batch of videos for a slice or a sequence of integers."""
     if isinstance(key, slice):
         return videos.batch(range(*key.indices(len(videos))))
     numbers = np.asarray(key)
@@ -62,12 +62,15 @@ def item(videos: VideoSequence, key: Key) -> Batch:
 
 
 def unbatch(batch: Batch) -> list[Batch]:
-    """The videos of a batch one by one."""
+    """List of the videos in a batch."""
     return [dict(zip(batch, values, strict=True)) for values in zip(*batch.values(), strict=True)]
 
 
 def checked_numbers(indices: Numbers, count: int, whose: str) -> np.ndarray:
-    """Indices as numbers from 0 to count - 1, int64: negative ones count from the end."""
+    """Indices from 0 to count - 1, int64 [n]; negative indices count from the end.
+
+    Raises TypeError for indices that are not integers, IndexError for indices out of range.
+    """
     numbers = np.asarray(indices)
     if not np.issubdtype(numbers.dtype, np.integer) and len(numbers):
         raise TypeError(f"a video's number must be an integer, not {numbers.dtype}")
@@ -78,7 +81,7 @@ def checked_numbers(indices: Numbers, count: int, whose: str) -> np.ndarray:
 
 
 def filled(source: VideoReader, numbers: np.ndarray, starts: Numbers | None, out: Batch | None) -> Batch:
-    """The source's videos with these numbers, stacked: in `out` if given, which must fit."""
+    """Batch of the source's videos with these indices, in `out` if given. Raises ConfigError if `out` does not fit."""
     if out is None:
         out = source.empty(len(numbers))
     else:
@@ -88,7 +91,7 @@ def filled(source: VideoReader, numbers: np.ndarray, starts: Numbers | None, out
 
 
 def _check_out(out: Batch, like: Batch, count: int) -> None:
-    """Raises ConfigError unless `out` can take `count` videos such as those of the batch `like`."""
+    """Raise ConfigError unless `out` has the fields of the batch `like`, with room for `count` videos."""
     for name, values in like.items():
         given, shape = out.get(name), (count, *values.shape[1:])
         if given is None or given.shape != shape or given.dtype != values.dtype or not given.flags.c_contiguous:

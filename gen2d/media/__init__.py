@@ -1,1 +1,1 @@
-"""Pictures and films as files, independent of simulations."""
+"""Image and film files, independent of simulation."""

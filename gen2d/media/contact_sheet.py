@@ -1,12 +1,12 @@
-"""Contact sheets: videos down, time across."""
+"""Contact sheets: one row per video, time from left to right."""
 
 import cv2
 import numpy as np
 
 COLUMNS = 10  # frames across the sheet
-LARGEST = 192  # px: of a frame on a dataset's card
-GAP, GREY = 2, 170  # px between pictures, and its sRGB
-SMALLEST = 96  # px: smaller frames are enlarged by whole factors, so that pixels stay pixels
+LARGEST = 192  # px; maximum side of a frame on a dataset card
+GAP, GREY = 2, 170  # width of a frame's border in px, and its sRGB value
+SMALLEST = 96  # px; smaller frames are enlarged by integer factors, which keeps pixels sharp
 
 
 def shown(frames: int) -> np.ndarray:
@@ -15,13 +15,13 @@ def shown(frames: int) -> np.ndarray:
 
 
 def contact_sheet(frames: np.ndarray) -> np.ndarray:
-    """A picture [H, W, 3] of videos [n, T, H, W, 3]: a row for each, with time from left to right."""
+    """Contact sheet [H, W, 3] of videos [n, T, H, W, 3], uint8."""
     rows = [np.concatenate([framed(video[t]) for t in shown(len(video))], axis=1) for video in frames]
     return np.concatenate(rows)
 
 
 def reduced(video: np.ndarray) -> np.ndarray:
-    """Frames of a video [T, H, W, 3] that a sheet shows, at most LARGEST pixels a side by averaging."""
+    """Frames of a video [T, H, W, 3] for a sheet, averaged over blocks of pixels to at most LARGEST pixels a side."""
     frames = video[shown(len(video))]
     factor = -(-max(frames.shape[1:3]) // LARGEST)
     if factor == 1:
@@ -31,11 +31,11 @@ def reduced(video: np.ndarray) -> np.ndarray:
 
 
 def enlarged(image: np.ndarray) -> np.ndarray:
-    """An image [H, W] or [H, W, 3] repeated by a whole factor until no side is below SMALLEST."""
+    """Image [H, W] or [H, W, 3] with its pixels repeated by an integer factor, so that no side is below SMALLEST."""
     factor = -(-SMALLEST // min(image.shape[:2]))
     return np.repeat(np.repeat(image, factor, axis=0), factor, axis=1)
 
 
 def framed(frame: np.ndarray) -> np.ndarray:
-    """An enlarged frame with a grey border."""
+    """Enlarged frame with a grey border."""
     return np.pad(enlarged(frame), [(GAP, GAP), (GAP, GAP), (0, 0)], constant_values=GREY)

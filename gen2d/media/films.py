@@ -1,4 +1,4 @@
-"""Film files: MPEG-4 by OpenCV, which is always installed, and other codecs by PyAV, an optional dependency."""
+"""Film files: MPEG-4 by OpenCV, a required dependency, and other codecs by PyAV, an optional one."""
 
 import os
 from collections.abc import Mapping
@@ -17,7 +17,7 @@ FASTEST = 2**16 - 1  # frames/s; MPEG-4 stores 16 bits
 
 
 def mp4v(path: Path, frames: np.ndarray, fps: float) -> None:
-    """Write frames [T, H, W, 3], H and W even, as MPEG-4; raises OSError if the file lacks any of them."""
+    """Write frames [T, H, W, 3], uint8 RGB with H and W even, as MPEG-4; raises OSError if the file lacks a frame."""
     height, width = frames.shape[1:3]
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), fps, (width, height))
     if not writer.isOpened():
@@ -25,7 +25,7 @@ def mp4v(path: Path, frames: np.ndarray, fps: float) -> None:
     for image in frames:
         writer.write(np.ascontiguousarray(image[..., ::-1]))
     writer.release()
-    # OpenCV reports no error, not even a full disk.
+    # OpenCV reports no error, not even for a full disk.
     film = cv2.VideoCapture(str(path))
     properties = cv2.CAP_PROP_FRAME_COUNT, cv2.CAP_PROP_FRAME_HEIGHT, cv2.CAP_PROP_FRAME_WIDTH
     sizes = [film.get(number) for number in properties]
@@ -35,14 +35,17 @@ def mp4v(path: Path, frames: np.ndarray, fps: float) -> None:
 
 
 def encode(path: Path, frames: np.ndarray, fps: float, codec: str, pixels: str, options: Mapping[str, str]) -> None:
-    """Write frames [T, H, W, 3] by a codec of PyAV; raises OSError. `pixels` and `options` are FFmpeg's."""
+    """Write frames [T, H, W, 3], uint8 RGB, with a codec of PyAV. Raises OSError, and UserError without PyAV.
+
+    `codec`, `pixels` (the pixel format) and `options` are FFmpeg's.
+    """
     av = pyav()
-    # Bit-exact: the file holds no versions and no random numbers.
+    # Bit-exact: no library versions or random numbers in the file.
     try:
         with av.open(str(path), "w", options={"fflags": "+bitexact"}) as file:
             stream = file.add_stream(codec, rate=rate_of(fps), options=dict(options))
             stream.height, stream.width, stream.pix_fmt = *frames.shape[1:3], pixels
-            stream.codec_context.thread_count = 1  # videos are encoded side by side
+            stream.codec_context.thread_count = 1  # several videos are encoded in parallel
             for image in frames:
                 file.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24")))
             file.mux(stream.encode(None))
@@ -51,7 +54,7 @@ def encode(path: Path, frames: np.ndarray, fps: float, codec: str, pixels: str, 
 
 
 def pyav() -> ModuleType:
-    """The module of PyAV; raises a UserError that says how to install it."""
+    """The module of PyAV; raises UserError if it is not installed."""
     os.environ.setdefault("SVT_LOG", "1")  # AV1's encoder prints errors only
     try:
         import av

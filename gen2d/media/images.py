@@ -1,4 +1,4 @@
-"""PNG and animated WebP files, and the folders that they go into."""
+"""PNG and animated WebP files, and their folders."""
 
 import contextlib
 import errno
@@ -16,18 +16,18 @@ from gen2d.media.contact_sheet import framed
 from gen2d.storage.atomic import publish
 
 WEBP_SIDE = 16383  # px, the largest height and width of the format
-SHORTEST = 11  # ms of a frame; browsers show a shorter one for 100 ms
+SHORTEST = 11  # ms, the minimum duration of a frame; browsers show shorter ones for 100 ms
 
 
 def check_folder(out: Path) -> None:
-    """Make the folder for pictures; raises FolderError, before any is drawn, if none can be written there."""
+    """Make the folder for pictures; raises FolderError if no file can be written there."""
     with writing(out), tempfile.TemporaryFile(dir=out):
         pass
 
 
 @contextlib.contextmanager
 def writing(out: Path) -> Iterator[None]:
-    """Context that makes a folder and turns each OSError of writing there into a FolderError."""
+    """Context that makes a folder and turns an OSError of writing there into a FolderError."""
     try:
         out.mkdir(parents=True, exist_ok=True)
         yield
@@ -58,7 +58,7 @@ def write(path: Path, image: np.ndarray) -> None:
 
 def png(image: np.ndarray) -> bytes:
     """The bytes of a PNG file that holds a picture [H, W, 3], uint8 RGB."""
-    done, content = cv2.imencode(".png", image[..., ::-1])
-    if not done:
+    is_encoded, content = cv2.imencode(".png", image[..., ::-1])
+    if not is_encoded:
         raise OSError("OpenCV could not write a PNG")
     return content.tobytes()

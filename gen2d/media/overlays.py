@@ -1,4 +1,4 @@
-"""Annotations drawn over frames."""
+"""Annotations rendered over frames."""
 
 from collections.abc import Mapping
 
@@ -14,8 +14,8 @@ VideoFields = Mapping[str, np.ndarray]
 def colors(count: int) -> np.ndarray:
     """Distinct colours of ids [count, 3], uint8: 0 is black, 255 grey."""
     hue = np.arange(count) * 0.618034 % 1 * 180  # golden section: neighbours differ, and no hue repeats
-    full = np.stack([hue, np.full(count, 170), np.full(count, 255)], -1).astype(np.uint8)
-    rgb = cv2.cvtColor(full[None], cv2.COLOR_HSV2RGB)[0]
+    hsv = np.stack([hue, np.full(count, 170), np.full(count, 255)], -1).astype(np.uint8)
+    rgb = cv2.cvtColor(hsv[None], cv2.COLOR_HSV2RGB)[0]
     rgb[0], rgb[255:] = 0, 128
     return rgb
 

@@ -1,1 +1,1 @@
-"""Files and folders, here or at a URL: published whole or not at all, hashed, cached, compressed."""
+"""Files and folders, local or at a URL: atomic publication, hashes, a cache, compression."""

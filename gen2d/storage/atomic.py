@@ -1,4 +1,4 @@
-"""Files and folders that appear whole or not at all: written under a temporary name, synced, renamed.
+"""Atomic publication of files and folders: written under a temporary name, synced, renamed.
 
 A file for a URL is written in the system's temporary folder and uploaded.
 """
@@ -21,7 +21,7 @@ _OLD = ".old"  # part of the temporary name of a folder that is being replaced
 
 @contextlib.contextmanager
 def publishing(path: Place) -> Iterator[Path]:
-    """A locked temporary file to write in; it becomes `path` when the block ends without an error."""
+    """Context with a locked temporary file, which becomes `path` when the block ends without an error."""
     folder = Path(tempfile.gettempdir()) if isinstance(path, Url) else path.parent
     prefix = "gen2d-" if isinstance(path, Url) else ""
     temporary = folder / temporary_name(prefix + path.name)
@@ -40,7 +40,7 @@ def publishing(path: Place) -> Iterator[Path]:
 
 @contextlib.contextmanager
 def publishing_folder(path: Path) -> Iterator[Path]:
-    """A temporary folder to write in; it replaces `path` when the block ends without an error."""
+    """Context with a temporary folder, which replaces `path` when the block ends without an error."""
     temporary, replaced = (path.with_name(temporary_name(path.name + old)) for old in ("", _OLD))
     with _leased_folder(temporary), _leased_folder(replaced):
         try:
@@ -61,7 +61,7 @@ def publishing_folder(path: Path) -> Iterator[Path]:
 
 @contextlib.contextmanager
 def _leased_folder(folder: Path) -> Iterator[None]:
-    """A block during which this process owns the temporary folder, by a locked file beside it."""
+    """Context in which this process owns the temporary folder, by a locked file beside it."""
     lock = folder.with_name(folder.name + LOCK)
     with leased(lock):
         try:
@@ -71,7 +71,7 @@ def _leased_folder(folder: Path) -> Iterator[None]:
 
 
 def publish(path: Place, content: bytes) -> None:
-    """Write a file atomically; on return the disk or server has it."""
+    """Write a file atomically; on return it is stored on the disk or server."""
     with publishing(path) as temporary:
         temporary.write_bytes(content)
 
@@ -100,7 +100,7 @@ def link_or_copy(source: Path, target: Path) -> None:
 
 
 def work_folder(root: Place) -> Path:
-    """The folder on disk in which files for `root` are written first."""
+    """Local folder in which files for `root` are written first."""
     return Path(tempfile.gettempdir()) if isinstance(root, Url) else root
 
 
@@ -113,12 +113,12 @@ def sweep(root: Place, folders: tuple[str, ...], force: bool = False) -> list[Pa
 
 def sweep_beside(path: Path) -> None:
     """Remove abandoned temporary files of `path`; restore a folder whose replacement was interrupted."""
-    for left in temporaries(path.parent, f"{path.name}{_OLD}."):
-        if not left.is_dir():
+    for folder in temporaries(path.parent, f"{path.name}{_OLD}."):
+        if not folder.is_dir():
             continue
-        with abandoned(left) as is_abandoned:
+        with abandoned(folder) as is_abandoned:
             if is_abandoned and not path.exists():
-                left.rename(path)
+                folder.rename(path)
     remove_abandoned(temporaries(path.parent, f"{path.name}."))
 
 

@@ -22,7 +22,7 @@ _OURS = re.compile(r"[0-9a-f]{64}")
 
 @dataclasses.dataclass(frozen=True)
 class Cache:
-    """Files by their sha256 in `folder`; the least recently used are removed beyond `limit` bytes in all."""
+    """Files in `folder` by their sha256, at most `limit` bytes in total; the least recently used are removed first."""
 
     folder: Path
     limit: int | None
@@ -46,7 +46,7 @@ class Cache:
         return path
 
     def _holds(self, path: Path) -> bool:
-        """Whether the file is there and has its sha256; sets its time of last use."""
+        """Whether the file exists and has its sha256; sets its time of last use."""
         try:
             if path.name not in self.verified and file_sha256(path) != path.name:
                 return False
@@ -58,7 +58,7 @@ class Cache:
 
     @contextlib.contextmanager
     def _locked(self, part: Path) -> Iterator[Path]:
-        """The temporary name of a file, locked until the block ends."""
+        """Context that locks the temporary file `part`, which the block may rename."""
         self.folder.mkdir(parents=True, exist_ok=True)
         while True:
             with part.open("ab") as file:
@@ -82,9 +82,9 @@ class Cache:
                 with contextlib.suppress(FileNotFoundError):
                     status = path.stat()
                     files.append((status.st_mtime_ns, status.st_size, path))
-        total = size + sum(own for _, own, _ in files)
-        for _, own, path in sorted(files):
+        total = size + sum(file_size for _, file_size, _ in files)
+        for _, file_size, path in sorted(files):
             if total <= self.limit:
                 break
             path.unlink(missing_ok=True)
-            total -= own
+            total -= file_size

@@ -1,9 +1,9 @@
-"""Compression of images: gzip (read by every HDF5 program), zstd (smaller) or none. All of it releases the GIL.
+"""Compression of images: gzip (every HDF5 program reads it), zstd (smaller) or none. All codecs release the GIL.
 
 gzip is ordinary deflate in a zlib envelope, which HDF5's own filter reads. isal writes it several times faster than
-zlib. Its level 0 compresses, unlike zlib's, as fast as its level 1 and into 15-20 % more bytes. Levels 1 and 2 were
-seen to return different, valid streams for the same input in one of some hundreds of calls, which would give a
-regenerated shard other bytes. Levels 0 and 3 never did so; level 3 is three times slower.
+zlib. Its level 0 compresses too, unlike zlib's: as fast as its level 1, into 15-20 % more bytes. Levels 1 and 2
+returned different, valid streams for the same input in one of some hundreds of calls, which would give a regenerated
+shard other bytes. Levels 0 and 3 never did so; level 3 is three times slower.
 
 Each zstd frame contains its size and a checksum, because HDF5's zstd filter checks nothing by itself.
 """
@@ -34,7 +34,7 @@ _contexts = threading.local()
 
 
 def encode(codec: str, array: np.ndarray) -> bytes:
-    """The array's bytes in C order, compressed."""
+    """Compressed bytes of an array in C order."""
     data = np.ascontiguousarray(array).data
     if codec == "gzip":
         return isal_zlib.compress(data, _ISAL_LEVEL)
@@ -44,7 +44,7 @@ def encode(codec: str, array: np.ndarray) -> bytes:
 
 
 def decode_into(codec: str, data: bytes | memoryview, out: np.ndarray) -> None:
-    """Fill the contiguous array `out` with the array that `encode` compressed into `data`.
+    """Decompress `data`, a result of `encode`, into the contiguous array `out`.
 
     Raises DamagedError unless `data` is intact, ends where it should and fills `out` exactly.
     """
@@ -71,7 +71,7 @@ def _inflated(data: bytes | memoryview, size: int) -> bytes:
 
 
 def _unzstd(data: bytes | memoryview, out: np.ndarray) -> None:
-    # Checked before decompressing, so that a damaged size cannot claim all memory.
+    # Checked before decompressing, so that a damaged size cannot exhaust the memory.
     if zstandard.frame_content_size(data) != out.nbytes:
         raise DamagedError(f"compressed data does not hold {out.nbytes} bytes, as it must")
     if _frame_end(data) != len(data):
@@ -85,15 +85,15 @@ def _unzstd(data: bytes | memoryview, out: np.ndarray) -> None:
 
 def _frame_end(data: bytes | memoryview) -> int:
     """The end of a zstd frame, from the headers of its blocks (RFC 8878, 3.1.1.2), one per 128 kB."""
-    place = zstandard.frame_header_size(data)
+    position = zstandard.frame_header_size(data)
     last = False
     while not last:
-        header = int.from_bytes(data[place : place + 3], "little")
+        header = int.from_bytes(data[position : position + 3], "little")
         last, repeats, size = bool(header & 1), header >> 1 & 3 == 1, header >> 3
-        place += 3 + (1 if repeats else size)
-        if place > len(data):
+        position += 3 + (1 if repeats else size)
+        if position > len(data):
             break
-    return place + 4  # the checksum
+    return position + 4  # the checksum
 
 
 def _compressor() -> zstandard.ZstdCompressor:

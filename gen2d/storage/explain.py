@@ -1,4 +1,4 @@
-"""Errors with one sentence for a person, from the OSErrors of a disk."""
+"""Errors with one sentence for the user, made from OSErrors of reading and writing."""
 
 import contextlib
 import errno
@@ -20,7 +20,7 @@ _NO_FILE = (errno.ENXIO, errno.EISDIR, errno.ENOTDIR, errno.ELOOP)
 
 
 def reason(error: Exception) -> str:
-    """The message of an error, without the file's name."""
+    """Message of an error, without the file's name."""
     return str(getattr(error, "strerror", None) or error)
 
 
@@ -49,7 +49,7 @@ def reading_error(path: object, error: OSError) -> Exception:
 
 @contextlib.contextmanager
 def explained_reading(path: object) -> Iterator[None]:
-    """A block that reads a file; its OSError becomes the error of `reading_error`."""
+    """Context that turns an OSError into the error of `reading_error`."""
     try:
         yield
     except OSError as error:
@@ -59,8 +59,8 @@ def explained_reading(path: object) -> Iterator[None]:
 def writing_error(where: Path, error: OSError, again: str = "run the same command again", need: str = "") -> UserError:
     """The error to raise when a file cannot be written in the folder `where`.
 
-    `again` says how to go on, `need` how much space is needed. The exit code is 1 for a disk that is full or fails, and
-    2 for errors that another folder avoids.
+    `again` is the advice for continuing, `need` a phrase for the space needed. The exit code is 1 for a disk that is
+    full or fails, and 2 for errors that another folder avoids.
     """
     if isinstance(error, FileExistsError | NotADirectoryError):
         return FolderError(f"{error.filename} is a file, not a folder: choose another --out")
@@ -91,7 +91,7 @@ def writing_error(where: Path, error: OSError, again: str = "run the same comman
 
 
 def _space(where: Path) -> str:
-    """The space that is left on a disk, for a sentence."""
+    """Phrase for the free space on a disk."""
     try:
         disk = os.statvfs(next(folder for folder in (where, *where.absolute().parents) if folder.exists()))
     except (OSError, StopIteration):

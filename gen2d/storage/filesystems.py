@@ -11,13 +11,13 @@ _COMMON = ("s3", "gs", "az", "http", "https", "sftp", "memory", "file")
 
 def shown(text: str) -> str:
     """A URL without its secrets: user name, password and query."""
-    start, mark, rest = text.partition("://")
-    if not mark:
+    start, separator, remainder = text.partition("://")
+    if not separator:
         return text
-    rest, question, _ = rest.partition("?")
-    host, slash, path = rest.partition("/")
-    _, at, bare = host.rpartition("@")
-    return f"{start}://{'***@' if at else ''}{bare}{slash}{path}{'?***' if question else ''}"
+    remainder, question, _ = remainder.partition("?")
+    host, slash, path = remainder.partition("/")
+    _, at_sign, host_only = host.rpartition("@")
+    return f"{start}://{'***@' if at_sign else ''}{host_only}{slash}{path}{'?***' if question else ''}"
 
 
 def without_secrets(sentence: str, url: str, query: str = "") -> str:

@@ -17,9 +17,9 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 TEMPORARY = re.compile(r"\.tmp\.[0-9a-f]{16}(\.lock)?$")  # the end of a temporary name
-LOCK = ".lock"  # suffix of the file whose lock stands for a temporary folder
+LOCK = ".lock"  # suffix of the lock file of a temporary folder
 
-# File systems whose locks hold for everybody who sees a file; NFS and Lustre may be mounted without.
+# File systems whose locks hold for all processes that see a file; NFS and Lustre may be mounted without locks.
 _ON_DISK = frozenset(
     ("ext2", "ext3", "ext4", "xfs", "btrfs", "zfs", "f2fs", "bcachefs", "jfs", "reiserfs", "apfs", "hfs")
 )
@@ -35,9 +35,9 @@ def temporary_name(name: str) -> str:
 
 @contextlib.contextmanager
 def leased(path: Path) -> Iterator[int]:
-    """A descriptor of a new, empty file with this name, locked until the block ends.
+    """Descriptor of a new, empty file with this name, locked until the block ends.
 
-    Without locks the file is made all the same. Raises OSError.
+    On a file system without locks, the file is created but not locked. Raises OSError.
     """
     while True:
         descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
@@ -52,10 +52,10 @@ def leased(path: Path) -> Iterator[int]:
 
 @contextlib.contextmanager
 def exclusive(path: Path, seconds: float) -> Iterator[None]:
-    """A block that one process at a time runs, by a lock on the file `path`, which stays.
+    """Context that one process at a time enters, by a lock on the file `path`, which is not removed.
 
-    Without locks the block runs all the same. Raises TimeoutError if another process holds the lock longer than
-    `seconds`.
+    On a file system without locks, any number of processes enter. Raises TimeoutError if another process holds the lock
+    for longer than `seconds`.
     """
     end = time.monotonic() + seconds
     descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o666)
@@ -108,7 +108,7 @@ def remove_abandoned(paths: Iterable[Path], force: bool = False) -> list[Path]:
 
 @contextlib.contextmanager
 def abandoned(path: Path, force: bool = False) -> Iterator[bool]:
-    """Whether no process holds the file or folder; none can take it during the block."""
+    """Context whose value is whether the file or folder has no owner; if so, none can take it during the block."""
     if not force and not has_locks(path.parent):
         yield False
         return

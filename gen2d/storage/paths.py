@@ -156,7 +156,7 @@ def place(path: str | Place, network: Network | None = None) -> Place:
 
 @contextlib.contextmanager
 def reading(root: Place) -> Iterator[None]:
-    """A block that reads a dataset; its OSError becomes a FolderError if the dataset is at a URL."""
+    """Context of reading a dataset, which turns an OSError into a FolderError if the dataset is at a URL."""
     try:
         yield
     except OSError as error:
@@ -166,7 +166,7 @@ def reading(root: Place) -> Iterator[None]:
 
 
 def upload(source: Path, url: Url) -> None:
-    """Upload a file; on return the server has it whole."""
+    """Upload a file; on return the server has all of it."""
     size = source.stat().st_size
 
     def put(system: Any, path: str) -> None:

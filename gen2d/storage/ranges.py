@@ -38,9 +38,9 @@ def read_ranges(ranges: Sequence[Range]) -> list[bytes | Exception]:
 
 
 def _spans(ranges: Sequence[Range]) -> dict[Range, list[Range]]:
-    """The range of each request, and the ranges inside it.
+    """Range of each request, and the ranges inside it.
 
-    Not fsspec's `merge_offset_ranges`, which in its older versions loses the end of a range that contains another.
+    fsspec's `merge_offset_ranges` is not used, as older versions lose the end of a range that contains another.
     """
     spans: dict[Range, list[Range]] = {}
     span, members = None, []

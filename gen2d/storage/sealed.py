@@ -34,8 +34,8 @@ def _refuse(name: str) -> NoReturn:
 
 def sealed(values: Mapping[str, Any], key: str) -> dict[str, Any]:
     """The values, with the sha256 of all others under `key`."""
-    rest = {name: value for name, value in values.items() if name != key}
-    return rest | {key: sha256(as_json(rest))}
+    others = {name: value for name, value in values.items() if name != key}
+    return others | {key: sha256(as_json(others))}
 
 
 def unsealed(content: bytes, key: str) -> dict[str, Any] | None:

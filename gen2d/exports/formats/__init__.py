@@ -1,6 +1,6 @@
-"""Formats of other programs: one file each, named like the format: `--to NAME`, or `--to my/NAME.py`.
+"""Formats of other programs, one file each: `--to NAME` selects NAME.py in this folder, `--to my/NAME.py` any file.
 
-A file ends with an `EXPORT`, whose members `gen2d.plugin.Export` describes. The smallest one:
+Each file ends with an `EXPORT`; `gen2d.plugin.Export` describes its members. The smallest example:
 
     import numpy as np
     from gen2d.plugin import Export
@@ -12,12 +12,12 @@ A file ends with an `EXPORT`, whose members `gen2d.plugin.Export` describes. The
 
     EXPORT = Export(fields=("frames",), write=write, fixed=True)
 
-`source.each(one)` calls `one(key, video)` for every video in several threads, and counts them itself.
+`source.each(function)` calls `function(key, video)` for every video in several threads, and reports the progress.
 """
 
 import pkgutil
 
 
 def names() -> list[str]:
-    """The names of the formats."""
+    """Names of the formats, sorted."""
     return sorted(module.name for module in pkgutil.iter_modules(__path__))

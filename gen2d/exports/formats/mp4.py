@@ -1,4 +1,4 @@
-"""A film per video by OpenCV (MPEG-4 part 2): always available, for desktop players, not for browsers."""
+"""One MPEG-4 part 2 film (MP4) per video, encoded by OpenCV: needs no extra package; browsers do not play it."""
 
 from pathlib import Path
 
@@ -6,13 +6,13 @@ from gen2d.plugin import Export, Source, films
 
 
 def check(source: Source) -> None:
-    """ConfigError for sizes and rates that it cannot have."""
+    """Raise ConfigError for unsupported frame sizes and rates."""
     films.check_size("mp4", source.frame_size)
     films.check_rate("mp4", source.fps, films.FASTEST)
 
 
 def write(target: Path, source: Source) -> None:
-    """Fills the folder with KEY.mp4."""
+    """Write KEY.mp4 for each video to the folder."""
     source.each(lambda key, video: films.mp4v(target / f"{key}.mp4", video["frames"], source.fps))
 
 

@@ -1,9 +1,10 @@
-"""One HDF5 file as the study 'How Far is Video Generation from World Model' (phyworld) has them: one or two balls.
+"""One HDF5 file in the format of the study 'How Far is Video Generation from World Model' (phyworld): one or two balls.
 
 The groups `video_streams`, `position_streams` and `init_streams` hold datasets 00000, 00001, ... of 1000 videos each:
-films as bytes (MPEG-4, as `--to mp4` makes them); positions [n, T, 2], or [n, T, 2, 2] of two balls; and what was
-drawn, [r, v] or [r1, r2, v1, v2], with speeds at the first frame. The frame is 10 units wide, its lower left corner is
-0, 0, y up. Balls are in the order of their slots. What stands still is not told of, but seen.
+films as bytes (MPEG-4, as from `--to mp4`); positions [n, T, 2], or [n, T, 2, 2] for two balls; and initial values,
+[r, v] or [r1, r2, v1, v2], with radii and with speeds at the first frame. Lengths are in tenths of the frame's width;
+the origin is the lower left corner, y up. Balls are in the order of their slots. Static bodies appear in the films, but
+not in the positions.
 """
 
 import tempfile
@@ -18,32 +19,35 @@ from gen2d.plugin import dataset as loader
 
 CAMERA = ("camera/center", "camera/scale", "camera/angle")
 OBJECTS = ("objects/present", "objects/kind", "objects/shape")
-UNITS = 10.0  # the frame's width
-GROUP = 1000  # videos in a dataset
+UNITS = 10.0  # width of the frame, in units of the file
+GROUP = 1000  # videos in an HDF5 dataset
 
 
 def check(source: Source) -> None:
-    """ConfigError where a film cannot be, or a video has other than one or two moving balls or a moving camera."""
+    """Raise ConfigError for unsupported frame sizes and rates, and for videos that the format cannot represent.
+
+    Each video must have one or two moving balls, as many as the first one, and a camera that is upright and at rest.
+    """
     films.check_size("phyworld", source.frame_size)
     films.check_rate("phyworld", source.fps, films.FASTEST)
     ds = loader.open(source.ds.root, source.ds.options.split, (*OBJECTS, *CAMERA))
     usual = len(_balls(ds[0]))
     for number in range(len(ds)):
-        wrong = _wrong(ds[number], usual)
-        if wrong:
-            raise ConfigError(f"phyworld cannot hold {ds.options.split} video {number} of {ds.root}: {wrong}")
+        problem = _wrong(ds[number], usual)
+        if problem:
+            raise ConfigError(f"phyworld cannot hold {ds.options.split} video {number} of {ds.root}: {problem}")
 
 
 def write(target: Path, source: Source) -> None:
-    """Writes the file."""
+    """Write the HDF5 file."""
     videos = source.videos()
     with h5py.File(target, "w", locking=False) as file, tempfile.TemporaryDirectory() as folder:
         for first in range(0, len(source), GROUP):
             name, count = f"{first // GROUP:05d}", min(GROUP, len(source) - first)
-            held = file.create_dataset(f"video_streams/{name}", (count,), h5py.vlen_dtype(np.uint8))
+            films_dataset = file.create_dataset(f"video_streams/{name}", (count,), h5py.vlen_dtype(np.uint8))
             positions, inits = [], []
             for row, video in enumerate(islice(videos, count)):
-                held[row] = _film(Path(folder) / "film.mp4", video, source.fps)
+                films_dataset[row] = _film(Path(folder) / "film.mp4", video, source.fps)
                 position, init = _motion(video, source.frame_size)
                 positions.append(position)
                 inits.append(init)
@@ -53,12 +57,12 @@ def write(target: Path, source: Source) -> None:
 
 
 def _balls(video: Batch) -> np.ndarray:
-    """The slots of what moves."""
+    """Slots of the bodies that are not static."""
     return np.flatnonzero(video["objects/present"] & (video["objects/kind"] != STATIC))
 
 
 def _wrong(video: Batch, usual: int) -> str:
-    """Why a video cannot be held, in words; "" if it can. `usual` is how many balls the first one has."""
+    """Reason why the format cannot represent a video, or ""; `usual` is the number of balls in the first video."""
     balls = _balls(video)
     if (video["objects/shape"][balls] != CIRCLE).any():
         return "something else than a ball moves in it"
@@ -76,7 +80,7 @@ def _film(path: Path, video: Batch, fps: float) -> np.ndarray:
 
 
 def _motion(video: Batch, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
-    """Positions [T, 2] or [T, 2, 2] and [r, v] or [r1, r2, v1, v2], in units of a tenth of the frame's width."""
+    """Positions [T, 2] or [T, 2, 2], and initial values [r, v] or [r1, r2, v1, v2], in units of the file."""
     balls, (height, width) = _balls(video), size
     pixel = UNITS / width
     metre = float(video["camera/scale"][0]) * pixel

@@ -1,7 +1,7 @@
-"""Tar files of whole videos, as WebDataset reads them: KEY.frames.npy, KEY.states.position.npy, ... and KEY.json;
-text is KEY.text.caption.txt and KEY.text.events.json.
+"""Tar files for WebDataset, with KEY.json and a file per field of each video: KEY.frames.npy, KEY.states.position.npy.
 
-A key is followed by a dot and the field's name, whose slashes become dots, as a key's files must lie in one folder.
+Text fields are KEY.text.caption.txt and KEY.text.events.json. Slashes in field names become dots, because all files of
+a key must be in one folder.
 """
 
 import dataclasses
@@ -15,16 +15,16 @@ import numpy as np
 
 from gen2d.plugin import Batch, Export, Source, as_json
 
-TAR_BYTES, TAR_VIDEOS = 2**28, 1000  # a tar file holds so much at most, but at least one video
+TAR_BYTES, TAR_VIDEOS = 2**28, 1000  # maximum of a tar file, which holds one video at least
 
 
 def write(target: Path, source: Source) -> None:
-    """Fills the folder with SPLIT-000000.tar and so on, equal bytes for equal datasets."""
+    """Write SPLIT-000000.tar, SPLIT-000001.tar, ... to the folder; equal datasets give equal bytes."""
     videos = enumerate(source.videos())
-    each = max(1, min(TAR_VIDEOS, TAR_BYTES // source.video_bytes))
-    for number in range(-(-len(source) // each)):
+    per_file = max(1, min(TAR_VIDEOS, TAR_BYTES // source.video_bytes))
+    for number in range(-(-len(source) // per_file)):
         with tarfile.open(target / f"{source.ds.options.split}-{number:06d}.tar", "w") as tar:
-            for index, video in islice(videos, each):
+            for index, video in islice(videos, per_file):
                 _add_video(tar, source, index, video)
                 source.advance(1)
 
@@ -43,17 +43,17 @@ def _add_video(tar: tarfile.TarFile, source: Source, number: int, video: Batch) 
 
 
 def _about(source: Source, number: int) -> dict[str, Any]:
-    """What a video's JSON says: where it comes from, and what each field is."""
+    """Contents of a video's JSON: its origin, and the dtype, axes, unit and meaning of each field."""
     about = {key: source.ds.manifest.plain[key] for key in ("name", "seed", "fps")}
     fields = {name: dataclasses.asdict(field) for name, field in source.fields.items()}
     return about | {"split": source.ds.options.split, "number": number, "fields": fields}
 
 
 def _add(tar: tarfile.TarFile, name: str, content: bytes) -> None:
-    """Adds a file without time and owner."""
-    about = tarfile.TarInfo(name)  # whose times and owners are 0
-    about.size = len(content)
-    tar.addfile(about, io.BytesIO(content))
+    """Add a file to the archive."""
+    member = tarfile.TarInfo(name)  # time and owner are 0, so that equal contents give equal bytes
+    member.size = len(content)
+    tar.addfile(member, io.BytesIO(content))
 
 
 EXPORT = Export(fields=("frames", "*"), write=write)
