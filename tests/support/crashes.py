@@ -25,7 +25,7 @@ def _dying(call: Callable[..., Any], left: list[int], after: bool) -> Callable[.
 
 
 def died_at(change: int, work: Callable[[], Any], after: bool = False) -> bool:
-    """Whether a fork that runs `work` reaches this change (counted from 1), right before or after which it is killed."""
+    """Whether a fork that runs `work` reaches this change (counted from 1), right before or after which it dies."""
     pid = os.fork()
     if not pid:
         remaining = [change]
