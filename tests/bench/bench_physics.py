@@ -228,9 +228,8 @@ def phyjax2d_program(case: Case) -> tuple[Callable, Any]:
     parts = [(space.shaped, space._ci, space._ci_total) for space in spaces]
     tree, leaves = jax.tree.structure(parts[0]), zip(*map(jax.tree.leaves, parts), strict=True)
     arrays = {i: np.stack(values) for i, values in enumerate(leaves)}
-    own = {
-        i: array for i, array in arrays.items() if (array != array[:1]).any()
-    }  # arrays that differ between scenes: radii and masses
+    # Arrays that differ between scenes: radii and masses.
+    own = {i: array for i, array in arrays.items() if (array != array[:1]).any()}
 
     def video(own: Any, place: Any, velocity: Any) -> Any:
         space = copy.copy(first)  # a Space cannot be built under jit, so all were built before

@@ -87,9 +87,8 @@ def works(case: Case, rollout: Any) -> dict[str, Callable[[], float]]:
 def annotating(rollouts: Mapping[str, Any]) -> tuple[dict[str, Callable[[], float]], dict[str, int]]:
     """By annotation, functions that render with it and return the CPU seconds per frame; its bytes per frame."""
     first = next(iter(rollouts.values()))
-    batch = first.start(
-        "train", np.tile(np.arange(first.batch_size), len(first.devices))
-    )  # annotations do not affect the simulation
+    # Annotations do not affect the simulation.
+    batch = first.start("train", np.tile(np.arange(first.batch_size), len(first.devices)))
     frames = first.config.video.frames
     works_by_name = {
         name: timed(_drawing(rollout, batch), first.batch_size * frames) for name, rollout in rollouts.items()
@@ -177,10 +176,11 @@ def table_of_annotations(found: Sequence[Annotated]) -> list[str]:
 
 
 COLORS = {"gen2d": "#114499", "opencv": "#dd6622"}
+# The label of a line: index of its point, and alignment.
 ENDS = {
     "gen2d": (0, "right"),
     "opencv": (-1, "left"),
-}  # label of a line: index of its point, and alignment
+}
 
 
 def chart(drawings: Sequence[Drawing], path: Path) -> None:
