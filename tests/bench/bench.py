@@ -1,15 +1,15 @@
-"""How fast gen2d is, part by part, beside peer.py, and whether it keeps what it promises.
+"""Speed of each stage of gen2d beside peer.py, compared with the project's targets.
 
-    python tests/bench/bench.py                 # all, about 10 minutes
-    python tests/bench/bench.py --quick         # only what a change to the code should be tried on
-    python tests/bench/bench.py --only physics  # what it costs against the number of objects: bench_physics.py
-    python tests/bench/bench.py --only render   # what drawing costs, and annotations: bench_render.py
-    python tests/bench/bench.py --only families # what sampling costs, for every scene family
-    python tests/bench/bench.py --only storage  # what writing and reading cost: bench_storage.py
-    python tests/bench/bench.py --only shards   # what a folder of 100,000 shards costs
+    python tests/bench/bench.py                 # everything, about 10 minutes
+    python tests/bench/bench.py --quick         # short run, to check a change of the code
+    python tests/bench/bench.py --only physics  # cost of physics against the number of objects: bench_physics.py
+    python tests/bench/bench.py --only render   # cost of rendering and annotations: bench_render.py
+    python tests/bench/bench.py --only families # cost of sampling, for every scene family
+    python tests/bench/bench.py --only storage  # cost of writing and reading: bench_storage.py
+    python tests/bench/bench.py --only shards   # cost of a folder of 100,000 shards
 
-Machines are noisy, so whatever is compared is measured in turns, and a ratio is the median of the ratios of the turns.
-Every measurement runs in a process of its own, on the cores that it is given, and in folders that vanish.
+Machines are noisy, so quantities that are compared are measured in turns, and a ratio is the median over the turns.
+Every measurement runs in a separate process, on the cores that it is given, and in temporary folders.
 """
 
 import argparse
@@ -46,22 +46,22 @@ from gen2d.dataset.shard_writer import ShardWriter
 from gen2d.generation.complete import complete
 
 CONFIG = "benchmark.yaml"
-FRAMES_BYTES = 64 * 64 * 64 * 3  # of a raw video
+FRAMES_BYTES = 64 * 64 * 64 * 3  # of an uncompressed video
 CORES = sorted(os.sched_getaffinity(0))
-Turns = Mapping[str, Sequence[float]]  # by name: what was measured in each turn
+Turns = Mapping[str, Sequence[float]]  # measurements by name, one per turn
 
 
-# ---- Measurements, each in a process of its own
+# ---- Measurements, each in a separate process
 
 
 def in_turns(works: Mapping[str, Callable[[], float]], turns: int) -> dict[str, list[float]]:
-    """What each of the works returns, in each turn; one round before them is not counted."""
-    found = [{name: work() for name, work in works.items()} for _ in range(turns + 1)][1:]
-    return {name: [turn[name] for turn in found] for name in works}
+    """Results of each function in each turn, after one round of warm-up."""
+    rounds = [{name: work() for name, work in works.items()} for _ in range(turns + 1)][1:]
+    return {name: [turn[name] for turn in rounds] for name in works}
 
 
 def stages(folder: Path, turns: int = 5, peer_videos: int = 32, overrides: Sequence[str] = ()) -> Turns:
-    """Seconds a video of each stage of gen2d, and of the peer's stepping and drawing, on this process's cores."""
+    """Seconds per video of each stage of gen2d, and of the peer's stepping and rendering, on this process's cores."""
     import cv2
     import peer
 
@@ -74,7 +74,7 @@ def stages(folder: Path, turns: int = 5, peer_videos: int = 32, overrides: Seque
 
 
 def _parts(folder: Path, overrides: Sequence[str], config: str = CONFIG) -> dict[str, tuple[Callable[[], Any], int]]:
-    """For each stage of gen2d what does it for a batch, and of how many videos."""
+    """For each stage of gen2d, a function that runs it on a batch, and its number of videos."""
     import jax
 
     from gen2d.generation import encoder as encoder_module
@@ -86,8 +86,8 @@ def _parts(folder: Path, overrides: Sequence[str], config: str = CONFIG) -> dict
     rollout = source.rollout
     sample, simulate, numbers = _physics(rollout)
     start, batch = sample(numbers), rollout.start("train", np.tile(np.arange(rollout.batch_size), len(rollout.devices)))
-    whole = rollout.videos_per_shard // rollout.batch_size * rollout.batch_size
-    dataset = dataset_of(source, folder / "data", {"train": whole}, {})
+    shard_videos = rollout.videos_per_shard // rollout.batch_size * rollout.batch_size
+    dataset = dataset_of(source, folder / "data", {"train": shard_videos}, {})
     shard, *_ = open_folder(dataset)
     encoder = encoder_module.Encoder(source, dataset, encoder_module.threads_for(devices.cores()))
     slices = [jax.block_until_ready(videos) for videos in source.slices([VideoRange("train", 0, rollout.batch_size)])]
@@ -95,7 +95,7 @@ def _parts(folder: Path, overrides: Sequence[str], config: str = CONFIG) -> dict
     def encode() -> list[Any]:
         return [encoder.encode(videos) for videos in slices]
 
-    blocks = encode() * (whole // rollout.batch_size)
+    blocks = encode() * (shard_videos // rollout.batch_size)
 
     def draw() -> None:
         for videos in slices:
@@ -113,12 +113,12 @@ def _parts(folder: Path, overrides: Sequence[str], config: str = CONFIG) -> dict
         "render": (draw, rollout.batch_size),
         "transfer": (transfer, rollout.batch_size),
         "compress": (encode, rollout.batch_size),
-        "write": (lambda: ShardWriter(dataset).write(shard, blocks), whole),
+        "write": (lambda: ShardWriter(dataset).write(shard, blocks), shard_videos),
     }
 
 
 def source_of(overrides: Sequence[str] = (), config: str = CONFIG) -> Any:
-    """The videos of the benchmark's or another config, on all devices of this process."""
+    """Video source of a config, on all devices of this process."""
     from gen2d.config.config import load_config
     from gen2d.programs import devices
     from gen2d.programs.source import VideoSource
@@ -127,7 +127,7 @@ def source_of(overrides: Sequence[str] = (), config: str = CONFIG) -> Any:
 
 
 def _physics(rollout: Any) -> tuple[Callable, Callable, np.ndarray]:
-    """The sampler and the simulation alone, as programs of their own, and the numbers of a batch of videos."""
+    """Separate programs of sampling and simulation, and the numbers of a batch of videos."""
     import jax
     import jax.numpy as jnp
 
@@ -137,21 +137,21 @@ def _physics(rollout: Any) -> tuple[Callable, Callable, np.ndarray]:
 
     config = rollout.config
     root, length = keys.seed_words(0, 0), (config.video.frames, rollout.steps)
-    rules = solver_params(config.physics, config.video.fps, rollout.steps)
+    params = solver_params(config.physics, config.video.fps, rollout.steps)
 
-    def sampled(numbers: Any) -> Any:
-        made = jax.vmap(rollout.sampler.sampled)(keys.video_keys(jnp.asarray(root), numbers))[1]
-        return made.scene, made.state
+    def sample_batch(numbers: Any) -> Any:
+        sampled_scene = jax.vmap(rollout.sampler.sampled)(keys.video_keys(jnp.asarray(root), numbers))[1]
+        return sampled_scene.scene, sampled_scene.state
 
-    def simulated(scene: Any, state: Any) -> Any:
+    def simulate_batch(scene: Any, state: Any) -> Any:
         device = axes.to_device(scene), axes.to_device(state)
-        return axes.to_stored(simulate(*device, rollout.layout, rules, *length, sparse=True))
+        return axes.to_stored(simulate(*device, rollout.layout, params, *length, sparse=True))
 
-    return jax.jit(sampled), jax.jit(simulated), np.arange(rollout.batch_size, dtype=np.uint32)
+    return jax.jit(sample_batch), jax.jit(simulate_batch), np.arange(rollout.batch_size, dtype=np.uint32)
 
 
 def steady(folder: Path, videos: int = 4096, turns: int = 3, peer_videos: int = 0) -> Turns:
-    """Videos/s of gen2d once it is compiled, first batch to manifest, and of the peer; the cores' use meanwhile."""
+    """Videos/s of compiled gen2d, from first batch to manifest, and of the peer; shares of cores used and idle."""
     source, used, idle = source_of(), [], []
 
     def ours() -> float:
@@ -159,9 +159,9 @@ def steady(folder: Path, videos: int = 4096, turns: int = 3, peer_videos: int = 
             before, began = _cpu_seconds(), time.perf_counter()
             make(source, videos, Path(out))
             seconds = time.perf_counter() - began
-        own, nobody = (after - b for after, b in zip(_cpu_seconds(), before, strict=True))
-        used.append(own / seconds / len(os.sched_getaffinity(0)))
-        idle.append(nobody / seconds / (os.cpu_count() or 1))
+        used_seconds, idle_seconds = (after - b for after, b in zip(_cpu_seconds(), before, strict=True))
+        used.append(used_seconds / seconds / len(os.sched_getaffinity(0)))
+        idle.append(idle_seconds / seconds / (os.cpu_count() or 1))
         return videos / seconds
 
     reads = ("body", "batch") if peer_videos else ()
@@ -170,7 +170,7 @@ def steady(folder: Path, videos: int = 4096, turns: int = 3, peer_videos: int = 
 
 
 def make(source: Any, videos: int, out: Path) -> None:
-    """Returns nothing; makes a dataset as `gen2d.generate` does, with programs that are compiled already."""
+    """Generate a dataset as `gen2d.generate` does, with programs that are already compiled."""
     from gen2d.generation import encoder as encoder_module
     from gen2d.generation import writers as writers_module
     from gen2d.generation.run import dataset_of
@@ -187,13 +187,13 @@ def make(source: Any, videos: int, out: Path) -> None:
 
 
 def _cpu_seconds() -> tuple[float, float]:
-    """What this process has used, and what nobody on this machine has."""
+    """CPU seconds that this process has used, and idle seconds of all cores of this machine."""
     idle = sum(map(int, Path("/proc/stat").read_text().split()[4:6])) / os.sysconf("SC_CLK_TCK")
     return sum(resource.getrusage(resource.RUSAGE_SELF)[:2]), idle
 
 
 def bounds(folder: Path) -> dict[str, float]:
-    """How many videos are broken: a state is not finite, or a centre nearer to a wall than 3/4 of the radius."""
+    """Number of broken videos: a state is not finite, or a centre is nearer to a wall than 3/4 of the radius."""
     import gen2d
 
     dataset = gen2d.open(folder, fields=("states/*", "objects/radius", "objects/kind", "objects/present", "quality/*"))
@@ -201,8 +201,8 @@ def bounds(folder: Path) -> dict[str, float]:
     for first in range(0, len(dataset), 500):
         videos = dataset[first : first + 500]
         balls = (videos["objects/present"] & (videos["objects/kind"] == 0))[:, None]
-        place, radius = videos["states/position"], videos["objects/radius"][:, None]
-        gap = np.where(balls, np.minimum(place, 10.0 - place).min(-1) - radius, 0.0)
+        position, radius = videos["states/position"], videos["objects/radius"][:, None]
+        gap = np.where(balls, np.minimum(position, 10.0 - position).min(-1) - radius, 0.0)
         states = [values for name, values in videos.items() if name.startswith("states/")]
         finite = np.all([np.isfinite(values.reshape(len(values), -1)).all(1) for values in states], axis=0)
         bad += int((~((gap >= -0.25 * radius).all((1, 2)) & finite)).sum())
@@ -211,27 +211,27 @@ def bounds(folder: Path) -> dict[str, float]:
 
 
 def physics(folder: Path, scene: str, turns: int) -> Turns:
-    """CPU seconds a video of gen2d, pymunk and phyjax2d (where it is installed), and of compiling gen2d."""
+    """CPU seconds per video of gen2d, pymunk and phyjax2d (if installed), and of gen2d's compilation."""
     works, compiled = bench_physics.works(CASES[scene])
     return in_turns(works, turns) | {name: [seconds] for name, seconds in compiled.items()}
 
 
 def render(folder: Path, case: str, turns: int) -> Turns:
-    """CPU seconds a frame of gen2d, of OpenCV and of a copy."""
-    of = bench_render.CASES[case]
-    return in_turns(bench_render.works(of, source_of(of.overrides).rollout), turns)
+    """CPU seconds per frame of gen2d, OpenCV and a copy."""
+    bench_case = bench_render.CASES[case]
+    return in_turns(bench_render.works(bench_case, source_of(bench_case.overrides).rollout), turns)
 
 
 def annotated(folder: Path, turns: int) -> Turns:
-    """CPU seconds a frame of drawing with each of the annotations, and the bytes of it."""
-    asked = {name: [f"annotations.{part}" for part in parts] for name, parts in bench_render.ANNOTATIONS.items()}
-    rollouts = {name: source_of((*bench_render.ANNOTATED.overrides, *parts)).rollout for name, parts in asked.items()}
+    """CPU seconds per frame of rendering with each annotation, and the bytes per frame of the annotation."""
+    options = {name: [f"annotations.{part}" for part in parts] for name, parts in bench_render.ANNOTATIONS.items()}
+    rollouts = {name: source_of((*bench_render.ANNOTATED.overrides, *parts)).rollout for name, parts in options.items()}
     works, sizes = bench_render.annotating(rollouts)
     return in_turns(works, turns) | {f"bytes {name}": [size] for name, size in sizes.items()}
 
 
 def family(folder: Path, name: str, turns: int) -> Turns:
-    """Seconds a video of each stage, of a scene family's own config."""
+    """Seconds per video of each stage, with the config of a scene family."""
     works = {
         part: timed(work, videos, time.perf_counter)
         for part, (work, videos) in _parts(folder, (), f"{name}.yaml").items()
@@ -240,7 +240,7 @@ def family(folder: Path, name: str, turns: int) -> Turns:
 
 
 def storage(folder: Path, case: str, turns: int) -> Turns:
-    """CPU seconds of writing, reading and copying all videos of a case."""
+    """CPU seconds to write, read and copy all videos of a case."""
     return in_turns(bench_storage.works(bench_storage.CASES[case], folder), turns)
 
 
@@ -251,15 +251,15 @@ MEASUREMENTS = {work.__name__: work for work in (stages, steady, bounds, physics
 
 
 class Ran(NamedTuple):
-    """A command that has run."""
+    """A completed command."""
 
     seconds: float
-    peak: int  # bytes of memory
+    peak: int  # memory, bytes
     text: str
 
 
 def run(command: Sequence[object], cores: Sequence[int] = CORES, env: Mapping[str, str] | None = None) -> Ran:
-    """Runs a command on these cores to its end; taskset, as a fork of a process that runs jax may hang."""
+    """Run a command on these cores; by taskset, as forks of a process with jax may hang. Exits if the command fails."""
     path = os.pathsep.join([str(HERE.parents[2]), str(SUPPORT), os.environ.get("PYTHONPATH", "")])
     env = {**os.environ, "PYTHONPATH": path, **(env or {})}
     line = ["taskset", "-c", ",".join(map(str, cores)), *map(str, command)]
@@ -277,20 +277,20 @@ def run(command: Sequence[object], cores: Sequence[int] = CORES, env: Mapping[st
 
 
 def measured(work: Callable, folder: Path, cores: Sequence[int] = CORES, **options: Any) -> Any:
-    """What one of MEASUREMENTS gives in a process of its own."""
+    """Result of one of MEASUREMENTS, run in a separate process."""
     ran = run([sys.executable, HERE, "--measure", work.__name__, folder, json.dumps(options)], cores)
     return json.loads(next(line for line in ran.text.splitlines() if line.startswith("{")))
 
 
 def command(videos: int, out: Path, *overrides: str, cache: Path | None = None) -> Ran:
-    """The product's own command, on a dataset that is not there yet."""
+    """Run `python -m gen2d` to generate a new dataset."""
     arguments = ["--config", CONFIG, "--n", videos, "--out", out, *(part for s in overrides for part in ("--set", s))]
     env = {"JAX_COMPILATION_CACHE_DIR": str(cache)} if cache else {}
     return run([sys.executable, "-m", "gen2d", *arguments], env=env)
 
 
 def peer_command(videos: int, read: str = "body") -> tuple[float, float]:
-    """The peer's videos a second with gzip, and the seconds of its start."""
+    """Videos/s of the peer with gzip, and the seconds of its start-up."""
     with tempfile.TemporaryDirectory() as out:
         ran = run([sys.executable, HERE.with_name("peer.py"), "--n", videos, "--read", read, "--out", out])
     seconds = float(re.findall(r"in ([\d.]+) s", ran.text)[-1])
@@ -301,28 +301,28 @@ def peer_command(videos: int, read: str = "body") -> tuple[float, float]:
 
 
 class Row(NamedTuple):
-    """A line of the table of speeds."""
+    """A row of the table of speeds."""
 
     name: str
     rate: float  # videos/s
     peer: float | None = None
-    share: float | None = None  # of the time of one core
+    share: float | None = None  # of the total time on one core
     note: str = ""
 
 
 class Promise(NamedTuple):
-    """What the project promises, and what came of it; without a target it is told for information."""
+    """A measured figure and its target; without a target it is reported for information."""
 
     name: str
     value: float
     unit: str = "x"
     target: float | None = None
-    most: bool = False  # the target is the most, not the least
+    most: bool = False  # the target is a maximum, not a minimum
     note: str = ""
 
     @property
     def verdict(self) -> str:
-        """The target, and whether it is reached; nothing where there is none."""
+        """The target and whether it is met; empty without a target."""
         if self.target is None:
             return ""
         kept = self.value <= self.target if self.most else self.value >= self.target
@@ -340,7 +340,7 @@ def _ratio(of: Sequence[float], to: Sequence[float]) -> float:
 
 
 def parts_section(folder: Path, quick: bool) -> Found:
-    """Every stage on one core, and physics and drawing beside the peer's."""
+    """Every stage on one core; physics and rendering beside the peer's."""
     turns = measured(stages, folder, CORES[:1], turns=4 if quick else 9)
     middle = {name: statistics.median(values) for name, values in turns.items()}
     peers = {"simulate": middle["peer body"], "render": middle["peer draw"]}
@@ -355,7 +355,7 @@ def parts_section(folder: Path, quick: bool) -> Found:
 
 
 def steady_section(folder: Path, quick: bool) -> Found:
-    """The whole path once it is compiled."""
+    """End-to-end generation with compiled programs."""
     count, repeats = (2048, 2) if quick else (4096, 5)
     turns = measured(steady, folder, videos=count, turns=repeats, peer_videos=256 if quick else 512)
     middle = {name: statistics.median(values) for name, values in turns.items()}
@@ -366,7 +366,7 @@ def steady_section(folder: Path, quick: bool) -> Found:
 
 
 def command_section(folder: Path, quick: bool) -> Found:
-    """The whole command, with programs compiled by an earlier run."""
+    """The whole command, with programs cached by an earlier run."""
     count, peer_count, ours, theirs = 8192, 512, [], []
     for turn in range(4):
         with tempfile.TemporaryDirectory(dir=folder) as out:
@@ -380,17 +380,17 @@ def command_section(folder: Path, quick: bool) -> Found:
 
 
 def memory_section(folder: Path, quick: bool) -> Found:
-    """Peak memory of a small and a large dataset, and whether the large one's physics holds."""
+    """Peak memory of a small and a large dataset, and broken videos of the large one."""
     small, large = command(2000, folder / "small"), command(20000, folder / "large")
     yield Promise("5 peak memory, 20,000 videos", large.peak / 2**30, "GiB", 3, most=True)
     yield Promise("  the same, against 2,000 videos", large.peak / small.peak, target=1.1, most=True)
-    found = measured(bounds, folder / "large")
-    note = f"deepest: {found['walls']:.3f} m into a wall, {found['overlap']:.3f} m at any step between any two"
-    yield Promise(f"8 broken of {found['videos']:,} videos", found["bad"], "videos", 0, most=True, note=note)
+    checks = measured(bounds, folder / "large")
+    note = f"deepest: {checks['walls']:.3f} m into a wall, {checks['overlap']:.3f} m at any step between any two"
+    yield Promise(f"8 broken of {checks['videos']:,} videos", checks["bad"], "videos", 0, most=True, note=note)
 
 
 def scaling_section(folder: Path, quick: bool) -> Found:
-    """One core against two, end to end."""
+    """End-to-end speed on two cores against one."""
     if len(CORES) < 2:
         return
     runs = [measured(steady, folder, CORES[:k], videos=2048, turns=2) for _ in range(3) for k in (1, 2)]
@@ -401,7 +401,7 @@ def scaling_section(folder: Path, quick: bool) -> Found:
 
 
 def start_section(folder: Path, quick: bool) -> Found:
-    """From the start of the process to the first finished shard, with programs not compiled yet, and compiled."""
+    """Time from process start to the first complete shard, with a cold and a warm compilation cache."""
     seconds = []
     for turn in range(4):
         out, began = folder / f"start{turn}", time.time()
@@ -412,15 +412,15 @@ def start_section(folder: Path, quick: bool) -> Found:
 
 
 def physics_section(folder: Path, quick: bool) -> Found:
-    """Scenes of 4 to 64 discs and of 8 boxes, one core, beside pymunk and phyjax2d."""
+    """Physics of 4 to 64 discs and of 8 boxes on one core, beside pymunk and phyjax2d."""
     if not bench_physics.has_phyjax2d():
         print(bench_physics.INSTALL)
     for case in CASES.values():
         turns = measured(physics, folder, CORES[:1], scene=case.name, turns=1 if quick else case.turns)
         cost = bench_physics.cost_of(case, {name: statistics.median(values) for name, values in turns.items()})
-        least, note = (5 if case.objects <= 32 and case.shape == "discs" else 1), "contacts and energy written"
+        floor, note = (5 if case.objects <= 32 and case.shape == "discs" else 1), "contacts and energy written"
         yield cost
-        for other, target in {"pymunk": least, "phyjax2d": least if least > 1 else None}.items():
+        for other, target in {"pymunk": floor, "phyjax2d": floor if floor > 1 else None}.items():
             if other in turns:
                 ratio = _ratio(turns[other], turns["all"])
                 yield Promise(f"physics, {case.name}, against {other}", ratio, target=target, note=note)
@@ -428,28 +428,28 @@ def physics_section(folder: Path, quick: bool) -> Found:
 
 
 def render_section(folder: Path, quick: bool) -> Found:
-    """Frames of 64 to 256 px with 2 to 32 discs, one core, beside OpenCV and a copy; then what annotations add."""
+    """Rendering of 2 to 32 discs at 64 to 256 px on one core, beside OpenCV and a copy; cost of annotations."""
     repeats = 5 if quick else 15
     for case in bench_render.CASES.values():
         turns = measured(render, folder, CORES[:1], case=case.name, turns=repeats)
         yield bench_render.drawing_of(case, {name: statistics.median(values) for name, values in turns.items()})
-        least, name = 5 if case.pixels == 64 else None, f"render {case.name} against"
-        yield Promise(f"{name} OpenCV", _ratio(turns["opencv"], turns["gen2d"]), target=least)
+        target, name = 5 if case.pixels == 64 else None, f"render {case.name} against"
+        yield Promise(f"{name} OpenCV", _ratio(turns["opencv"], turns["gen2d"]), target=target)
         if case.name == bench_render.COPIED:
             yield Promise(f"{name} a copy", _ratio(turns["gen2d"], turns["copy"]), target=4, most=True)
     yield from annotations_told(measured(annotated, folder, CORES[:1], turns=repeats))
 
 
 def annotations_told(turns: Turns) -> Found:
-    """What drawing with annotations costs beside drawing alone."""
-    frames, most = turns["frames"], {"masks, boxes, visibility": 1.5}
+    """Cost of rendering with annotations, relative to frames alone."""
+    frames, limits = turns["frames"], {"masks, boxes, visibility": 1.5}
     for name in bench_render.ANNOTATIONS:
         added = [a - b for a, b in zip(turns[name], frames, strict=True)]
         (size,) = turns[f"bytes {name}"]
         yield Annotated(name, statistics.median(turns[name]) * 1e6, statistics.median(added) * 1e6, int(size))
         if name != "frames":
             yield Promise(
-                f"render with {name}", _ratio(turns[name], frames), target=most.get(name), most=True, note=ALONE
+                f"render with {name}", _ratio(turns[name], frames), target=limits.get(name), most=True, note=ALONE
             )
         if name == "flow":
             each = _ratio(added, frames) * bench_render.ANNOTATED.frame_bytes / size
@@ -457,20 +457,24 @@ def annotations_told(turns: Turns) -> Found:
 
 
 def storage_section(folder: Path, quick: bool) -> Found:
-    """Videos of three sizes, one core: the loader beside a plain h5py loop and a copy, writing beside its codec."""
+    """Videos of three sizes on one core: loader against an h5py loop and a copy, writing against its codec."""
     for number, case in enumerate(bench_storage.CASES.values()):
-        own = folder / str(number)
-        own.mkdir()
-        turns = measured(storage, own, CORES[:1], case=case.name, turns=3 if quick else 9)
+        case_folder = folder / str(number)
+        case_folder.mkdir()
+        turns = measured(storage, case_folder, CORES[:1], case=case.name, turns=3 if quick else 9)
         yield bench_storage.stored_of(case, {name: statistics.median(values) for name, values in turns.items()})
         for codec in ("zstd", "gzip"):
-            least = case.against_gzip4, case.against_same, case.against_copy
-            of = turns[f"loader {codec}"]
+            targets = case.against_gzip4, case.against_same, case.against_copy
+            loader_seconds = turns[f"loader {codec}"]
             yield Promise(
-                f"{case.name}, {codec}: loader against h5py, gzip-4", _ratio(turns["h5py gzip-4"], of), target=least[0]
+                f"{case.name}, {codec}: loader against h5py, gzip-4",
+                _ratio(turns["h5py gzip-4"], loader_seconds),
+                target=targets[0],
             )
-            yield Promise("  against h5py on the same files", _ratio(turns[f"h5py {codec}"], of), target=least[1])
-            yield Promise("  against a copy", _ratio(turns["copy"], of), target=least[2])
+            yield Promise(
+                "  against h5py on the same files", _ratio(turns[f"h5py {codec}"], loader_seconds), target=targets[1]
+            )
+            yield Promise("  against a copy", _ratio(turns["copy"], loader_seconds), target=targets[2])
             yield Promise(
                 "  writing against the codec alone",
                 _ratio(turns[f"codec {codec}"], turns[f"write {codec}"]),
@@ -482,20 +486,20 @@ def storage_section(folder: Path, quick: bool) -> Found:
 
 
 def shards_section(folder: Path, quick: bool) -> Found:
-    """What a folder of many shards costs at every worker's start and end, CPU s."""
+    """CPU seconds of a worker's start and end in a folder of many shards."""
     count = 10_000 if quick else 100_000
     for name, seconds in bench_storage.of_many_shards(folder / "many", count).items():
         yield Promise(f"{count:,} shards: {name}", seconds, "CPU s", target=5, most=True)
 
 
 def families_section(folder: Path, quick: bool) -> Found:
-    """What sampling a scene costs of all that its video does, for every family."""
+    """Cost of sampling, relative to all other stages, for every scene family."""
     from gen2d.config import plugins
 
     for name in plugins.names("scene"):
-        own = folder / name
-        own.mkdir()
-        turns = measured(family, own, CORES[:1], name=name, turns=2 if quick else 5)
+        family_folder = folder / name
+        family_folder.mkdir()
+        turns = measured(family, family_folder, CORES[:1], name=name, turns=2 if quick else 5)
         shares = [
             turns["sampler"][i] / sum(of[i] for part, of in turns.items() if part != "sampler")
             for i in range(len(turns["sampler"]))
@@ -511,11 +515,11 @@ SECTIONS = {
 QUICK = ("parts", "steady")
 
 
-# ---- What is told
+# ---- Report
 
 
 def machine() -> dict[str, Any]:
-    """The facts that explain the figures."""
+    """Processor, number of cores, load and versions, which explain the figures."""
     lines = Path("/proc/cpuinfo").read_text().splitlines() if Path("/proc/cpuinfo").exists() else []
     model = next((line.partition(": ")[2] for line in lines if line.startswith("model name")), platform.machine())
     packages = ("jax", "jaxlib", "numpy", "h5py", "isal", "pymunk", "opencv-python-headless")
@@ -523,7 +527,7 @@ def machine() -> dict[str, Any]:
     return {"cpu": model, "cores": len(CORES), "load": os.getloadavg()[0], **versions}
 
 
-# What JSON calls each kind of line, which of them have a table of their own, and which sections a chart.
+# Keys of the results in JSON; kinds of results with a table of their own; sections with a chart.
 KINDS = {
     "rows": Row,
     "promises": Promise,
@@ -545,7 +549,7 @@ CHARTS: Mapping[str, tuple[type, Callable[[Any, Path], None]]] = {
 
 
 def text_of(facts: Mapping[str, Any], found: Sequence[Told]) -> str:
-    """The tables."""
+    """Tables of the results, as text."""
     lines = [", ".join(f"{key} {value}" for key, value in facts.items())]
     rows, promises = [f for f in found if isinstance(f, Row)], [f for f in found if isinstance(f, Promise)]
     if rows:
@@ -556,8 +560,8 @@ def text_of(facts: Mapping[str, Any], found: Sequence[Told]) -> str:
         speed = f"{row.rate:9,.0f} {row.rate * FRAMES_BYTES / 1e6:8,.0f}"
         lines += [f"{row.name:21} {speed} {share:>6} {peer:>7} {ratio:>6}  {row.note}".rstrip()]
     for kind, table in TABLES.items():
-        told = [f for f in found if isinstance(f, kind)]
-        lines += ["", *table(told)] if told else []
+        results = [f for f in found if isinstance(f, kind)]
+        lines += ["", *table(results)] if results else []
     lines += [""]
     for p in promises:
         lines += [f"{p.name:38} {p.value:7.2f} {p.unit:7} {p.verdict:22} {p.note}".rstrip()]
@@ -565,7 +569,7 @@ def text_of(facts: Mapping[str, Any], found: Sequence[Told]) -> str:
 
 
 def main() -> None:
-    """Measures, prints the tables, and writes them as JSON if asked."""
+    """Run the measurements, print the tables and, on request, write JSON and a chart."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help=f"only {' and '.join(QUICK)}, with fewer turns")
     parser.add_argument("--only", nargs="+", choices=tuple(SECTIONS), help="only these sections")
@@ -583,17 +587,17 @@ def main() -> None:
         print(json.dumps(MEASUREMENTS[name](Path(folder), **json.loads(more))))
         return
     os.environ["JAX_PLATFORMS"] = options.device
-    facts, found = machine(), []
+    facts, results = machine(), []
     for name in names:
         with tempfile.TemporaryDirectory(prefix="gen2d-bench-") as folder:
-            found += SECTIONS[name](Path(folder), options.quick)
-    print(text_of(facts, found))
+            results += SECTIONS[name](Path(folder), options.quick)
+    print(text_of(facts, results))
     if options.json:
-        tables = {key: [f._asdict() for f in found if isinstance(f, kind)] for key, kind in KINDS.items()}
+        tables = {key: [f._asdict() for f in results if isinstance(f, kind)] for key, kind in KINDS.items()}
         options.json.write_text(json.dumps({"machine": facts} | tables, indent=1))
     if options.plot and plotted:
         kind, chart = CHARTS[plotted]
-        chart([f for f in found if isinstance(f, kind)], options.plot)
+        chart([f for f in results if isinstance(f, kind)], options.plot)
 
 
 if __name__ == "__main__":

@@ -1,13 +1,12 @@
-"""What physics costs against the number of objects: gen2d, Chipmunk (pymunk) and phyjax2d on the same scenes.
+"""Cost of physics against the number of objects: gen2d, Chipmunk (pymunk) and phyjax2d on the same scenes.
 
     python tests/bench/bench.py --only physics --plot gen2d/physics/physics_cost.png     # about 5 minutes
 
-A scene is a box of constant density: N discs of random radii, or 8 rectangles, that fall and bounce for 64 frames at
-60 Hz, of 4 steps each. Every engine has its own default number of iterations and makes the same states of every
-frame; pymunk is stepped, and read by each body's attributes, as its manual shows. phyjax2d steps its scenes under
-`jax.vmap`, 16 at once, as it is slower with more (8 discs: 13 microseconds a step with 16, 18 with 64). Times are of
-this process's CPU, which is on one core, so other work on the machine disturbs little. Most of what this takes is
-compiling.
+In each scene, N discs of random radii, or 8 rectangles, fall and bounce in a box with a constant area per object, for
+64 frames at 60 Hz with 4 steps each. Every engine has its default number of iterations and returns the states of all
+frames; pymunk is stepped, and read by the attributes of each body, as its manual shows. phyjax2d steps 16 scenes at
+once under `jax.vmap`, as it is slower with more (8 discs: 13 microseconds per step with 16, 18 with 64). Times are CPU
+times of this process on one core, so other work on the machine has little effect. Most of the run is compilation.
 """
 
 import copy
@@ -26,30 +25,30 @@ import pymunk
 from charts import FAINT, cost_chart, save
 
 FRAMES, STEPS, STEP = 64, 4, 1 / 240  # s
-GRAVITY, ELASTICITY, FRICTION = -9.81, 0.9, 0.2  # m/s^2; each body's, of which gen2d and Chipmunk make products
-AREA = 12.5  # m^2 of the box for each object, as 8 of them have in configs/benchmark.yaml
-RADIUS, SIDES, SPEED = (0.5, 1.0), (0.6, 1.4), 3.0  # m, m/s: uniform, uniform, and the deviation of each component
+GRAVITY, ELASTICITY, FRICTION = -9.81, 0.9, 0.2  # m/s^2; of each body: gen2d and Chipmunk multiply those of two
+AREA = 12.5  # m^2 of the box per object, as with the 8 of configs/benchmark.yaml
+RADIUS, SIDES, SPEED = (0.5, 1.0), (0.6, 1.4), 3.0  # m: uniform ranges; m/s: standard deviation of each component
 STEPPED = (FRAMES - 1) * STEPS
 INSTALL = "phyjax2d is not measured, as it is not installed here: pip install --no-deps phyjax2d==0.5.0"
 
 
 class Case(NamedTuple):
-    """A kind of scene, and how much of it is measured."""
+    """A kind of scene, and the numbers of videos and turns that are measured."""
 
     shape: str  # "discs" or "boxes"
     objects: int
-    lanes: int  # videos that gen2d simulates at once
+    lanes: int  # batch size of gen2d
     peers: tuple[int, int]  # videos that pymunk and phyjax2d simulate in a turn
     turns: int
 
     @property
     def name(self) -> str:
-        """As it stands in the tables."""
+        """Name in the tables."""
         return f"{self.objects} {self.shape}"
 
     @property
     def pairs(self) -> int:
-        """How many pairs of things can meet: two objects, or an object and a wall."""
+        """Number of pairs that can collide: two objects, or an object and a wall."""
         return self.objects * (self.objects - 1) // 2 + 4 * self.objects
 
 
@@ -67,7 +66,7 @@ CASES = {
 
 
 class Start(NamedTuple):
-    """What a video is made of; discs have a radius, boxes two sides."""
+    """Initial state of a video; discs have a radius, boxes two sides."""
 
     box: float  # m, its side
     places: np.ndarray  # [N, 2] m
@@ -77,18 +76,18 @@ class Start(NamedTuple):
 
     @property
     def masses(self) -> np.ndarray:
-        """kg [N], at a density of 1 kg/m^2."""
+        """Masses [N] in kg, at a density of 1 kg/m^2."""
         return np.pi * self.sizes**2 if self.sizes.ndim == 1 else self.sizes.prod(axis=1)
 
     @property
     def walls(self) -> list[tuple[tuple[float, float], tuple[float, float]]]:
-        """The ends of the box's four sides."""
+        """End points of the four sides of the box."""
         corners = [(0.0, 0.0), (self.box, 0.0), (self.box, self.box), (0.0, self.box), (0.0, 0.0)]
         return list(itertools.pairwise(corners))
 
 
 def sampled(case: Case, number: int) -> Start:
-    """The start of video `number`: objects in a square grid, so that none overlap."""
+    """Initial state of video `number`: objects on a square grid, so that none overlap."""
     rng, box, columns = (
         np.random.default_rng([1, number]),
         math.sqrt(AREA * case.objects),
@@ -109,7 +108,7 @@ def sampled(case: Case, number: int) -> Start:
 
 
 def works(case: Case) -> tuple[dict[str, Callable[[], float]], dict[str, float]]:
-    """By engine what simulates some videos and returns the CPU seconds of one, and gen2d's seconds to compile."""
+    """By engine, functions that simulate videos and return the CPU seconds per video; gen2d's compile times, s."""
     ours, seconds = {}, {}
     for name, everything in (("states", False), ("all", True)):
         program, inputs, seconds[f"compile {name}"] = gen2d_program(case, everything)
@@ -122,7 +121,7 @@ def works(case: Case) -> tuple[dict[str, Callable[[], float]], dict[str, float]]
 
 
 def has_phyjax2d() -> bool:
-    """Whether it can be imported."""
+    """Whether phyjax2d is installed."""
     return importlib.util.find_spec("phyjax2d") is not None
 
 
@@ -138,8 +137,10 @@ def _ready(program: Callable, inputs: Any, videos: int) -> Callable[[], float]:
 
 
 def gen2d_program(case: Case, everything: bool) -> tuple[Callable, Any, float]:
-    """The compiled program, what it takes, and the CPU seconds that compiling took; with `everything` it also writes
-    contacts, in as many rows as configs/README.md calls a good number, and the books of energy."""
+    """Compiled program, its inputs, and the CPU seconds of its compilation.
+
+    With `everything`, it also records energy and contacts, in as many rows as `annotations.contacts: 4` gives.
+    """
     import jax
     from worlds import rules
 
@@ -148,16 +149,16 @@ def gen2d_program(case: Case, everything: bool) -> tuple[Callable, Any, float]:
     from gen2d.records import axes, trajectory
     from gen2d.records import scene as scene_module
 
-    devices.keep_freed_memory()  # as the product does
+    devices.keep_freed_memory()  # as in a run
     jax.config.update("jax_enable_compilation_cache", False)
-    made = [gen2d_scene(sampled(case, number)) for number in range(case.lanes)]
-    layout = made[0][2]
-    inputs = jax.tree.map(lambda *x: np.stack(x), *(scene[:2] for scene in made))
-    keep = SaveAt(4 * layout.slots * math.ceil(FRAMES / 16), energy=True) if everything else SaveAt()
+    scenes = [gen2d_scene(sampled(case, number)) for number in range(case.lanes)]
+    layout = scenes[0][2]
+    inputs = jax.tree.map(lambda *x: np.stack(x), *(scene[:2] for scene in scenes))
+    save_at = SaveAt(4 * layout.slots * math.ceil(FRAMES / 16), energy=True) if everything else SaveAt()
 
     def run(scene: scene_module.Scene, state: scene_module.State) -> trajectory.Trajectory:
         device = axes.to_device(scene), axes.to_device(state)
-        return axes.to_stored(simulate(*device, layout, rules(STEP), FRAMES, STEPS, keep, sparse=True))
+        return axes.to_stored(simulate(*device, layout, rules(STEP), FRAMES, STEPS, save_at, sparse=True))
 
     began = time.process_time()
     program = jax.jit(run).lower(*inputs).compile()
@@ -165,7 +166,7 @@ def gen2d_program(case: Case, everything: bool) -> tuple[Callable, Any, float]:
 
 
 def gen2d_scene(start: Start) -> Any:
-    """Scene, state and layout."""
+    """Scene, initial state and layout."""
     from gen2d.space.space import Space
 
     space = Space((0, GRAVITY))
@@ -180,7 +181,7 @@ def gen2d_scene(start: Start) -> Any:
 
 
 def chipmunk_seconds(case: Case) -> float:
-    """CPU seconds of one video, without building the scenes."""
+    """CPU seconds per video, without building the scenes."""
     spaces = [chipmunk_space(sampled(case, number)) for number in range(case.peers[0])]
     began = time.process_time()
     for space in spaces:
@@ -189,7 +190,7 @@ def chipmunk_seconds(case: Case) -> float:
 
 
 def chipmunk_space(start: Start) -> pymunk.Space:
-    """The scene, of Chipmunk's usual 10 iterations."""
+    """The scene, with Chipmunk's default of 10 iterations."""
     space = pymunk.Space()
     space.gravity = 0, GRAVITY
     shapes: list[pymunk.Shape] = [pymunk.Segment(space.static_body, a, b, 0) for a, b in start.walls]
@@ -208,7 +209,7 @@ def chipmunk_space(start: Start) -> pymunk.Space:
 
 
 def stepped(space: pymunk.Space) -> np.ndarray:
-    """The states [T, N, 6], float32: x, y, angle, their velocities and the spin."""
+    """States [T, N, 6], float32: position, angle, velocity and angular velocity."""
     states, take = [], peer.READERS["body"](space)
     for t in range(FRAMES):
         for _ in range(STEPS if t else 0):
@@ -218,7 +219,7 @@ def stepped(space: pymunk.Space) -> np.ndarray:
 
 
 def phyjax2d_program(case: Case) -> tuple[Callable, Any]:
-    """The compiled program for discs, with phyjax2d's usual 6 and 2 iterations, and what it takes."""
+    """Compiled program for discs, with phyjax2d's default of 6 and 2 iterations, and its inputs."""
     import jax
 
     starts = [sampled(case, number) for number in range(case.peers[1])]
@@ -227,10 +228,11 @@ def phyjax2d_program(case: Case) -> tuple[Callable, Any]:
     parts = [(space.shaped, space._ci, space._ci_total) for space in spaces]
     tree, leaves = jax.tree.structure(parts[0]), zip(*map(jax.tree.leaves, parts), strict=True)
     arrays = {i: np.stack(values) for i, values in enumerate(leaves)}
-    own = {i: array for i, array in arrays.items() if (array != array[:1]).any()}  # of each scene: radii and masses
+    # Arrays that differ between scenes: radii and masses.
+    own = {i: array for i, array in arrays.items() if (array != array[:1]).any()}
 
     def video(own: Any, place: Any, velocity: Any) -> Any:
-        space = copy.copy(first)  # a Space cannot be made under jit, so one of each scene has been
+        space = copy.copy(first)  # a Space cannot be built under jit, so all were built before
         space.shaped, space._ci, space._ci_total = tree.unflatten([own.get(i, all_[0]) for i, all_ in arrays.items()])
         state = first.zeros_state().nested_replace("circle.p.xy", place).nested_replace("circle.v.xy", velocity)
 
@@ -246,12 +248,15 @@ def phyjax2d_program(case: Case) -> tuple[Callable, Any]:
 
 
 def phyjax2d_space(start: Start) -> Any:
-    """The scene."""
+    """The scene in phyjax2d."""
     physics = importlib.import_module("phyjax2d")
     builder = physics.SpaceBuilder(
         gravity=(0, GRAVITY), dt=STEP, linear_damping=0.0, angular_damping=0.0, bounce_threshold=0.01
     )
-    material = {"elasticity": ELASTICITY**2, "friction": FRICTION**2}  # of which it takes the mean: others' products
+    material = {
+        "elasticity": ELASTICITY**2,
+        "friction": FRICTION**2,
+    }  # phyjax2d takes the mean of two bodies, the others the product
     for radius in start.sizes:
         builder.add_circle(radius=float(radius), **material)
     for a, b in start.walls:
@@ -259,16 +264,16 @@ def phyjax2d_space(start: Start) -> Any:
     return builder.build()
 
 
-# ---- What is told
+# ---- Results
 
 
 class Cost(NamedTuple):
-    """A line of the table of physics."""
+    """A row of the table of physics."""
 
     name: str
     objects: int
     pairs: int
-    micros: Mapping[str, float]  # CPU time of a video and step, by engine
+    micros: Mapping[str, float]  # CPU time per video and step, by engine
     compile: Mapping[str, float]  # s
 
 
@@ -281,14 +286,14 @@ LINES = {
 
 
 def cost_of(case: Case, seconds: Mapping[str, float]) -> Cost:
-    """The line, from the seconds of a video by engine, and gen2d's seconds to compile."""
+    """Row of the table, from the seconds per video by engine and gen2d's compile times in s."""
     micros = {name: seconds[name] / STEPPED * 1e6 for name in LINES if name in seconds}
     compiled = {name: seconds[f"compile {name}"] for name in ("states", "all")}
     return Cost(case.name, case.objects, case.pairs, micros, compiled)
 
 
 def table(costs: Sequence[Cost]) -> list[str]:
-    """Lines of text."""
+    """Lines of the table."""
     lines = [
         "one core, microseconds of CPU time a video and step; gen2d with states only, and with contacts and energy"
     ]
@@ -304,7 +309,7 @@ COLORS = {"states": "#44aadd", "all": "#114499", "pymunk": "#dd6622", "phyjax2d"
 
 
 def chart(costs: Sequence[Cost], path: Path) -> None:
-    """Write a chart of the cost of discs against their number as a PNG file."""
+    """Write a PNG chart of the cost against the number of discs."""
     costs = [cost for cost in costs if cost.name.endswith("discs")]
     counts = [cost.objects for cost in costs]
     axes = cost_chart("Physics on one core", "discs in a box, N", "microseconds a video and step", counts)

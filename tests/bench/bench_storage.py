@@ -1,9 +1,9 @@
-"""What it costs to write videos and to read them again: gen2d, a plain h5py loop and a plain copy.
+"""Cost of writing and reading videos: gen2d, a plain h5py loop and a plain copy.
 
     python tests/bench/bench.py --only storage     # about 2 minutes
 
-The videos are those of synthetic.discs, about 50 MB of frames, with a state beside each. They are read in one thread,
-from files that the system still has in memory, into a batch that is there already. Times are of this process's CPU.
+The videos are those of synthetic.discs, about 50 MB of frames, with states. They are read in one thread, from files in
+the system's page cache, into preallocated arrays. Times are CPU times of this process.
 """
 
 import time
@@ -35,7 +35,7 @@ FIELDS = {
 
 
 class Case(NamedTuple):
-    """A size of video, how many are 50 MB, and the least that is promised."""
+    """A size of videos, their number (50 MB of frames), and the targets as ratios of speeds."""
 
     pixels: int
     frames: int
@@ -43,11 +43,11 @@ class Case(NamedTuple):
     against_gzip4: float
     against_same: float
     against_copy: float
-    mapped: float  # without a codec, against a copy
+    mapped: float  # target without a codec, against a copy
 
     @property
     def name(self) -> str:
-        """As it stands in the tables."""
+        """Name in the tables."""
         return f"{self.pixels} px, {self.frames} frames"
 
 
@@ -59,21 +59,21 @@ CASES = {
         Case(256, 32, 8, 5, 2.8, 0.28, 0.45),
     )
 }
-WRITTEN = 0.8  # of the speed of the codec alone
-ROUNDS = 8  # how often a shard holds the videos when writing is measured: shards are large
+WRITTEN = 0.8  # target of writing, against the codec alone
+ROUNDS = 8  # copies of the videos in a shard where writing is measured, as shards are large
 
 
 class Stored(NamedTuple):
-    """A line of the table: MB of frames a second of CPU time."""
+    """A row of the table: MB of frames per second of CPU time, by method."""
 
     name: str
     rates: Mapping[str, float]
 
 
 def works(case: Case, folder: Path) -> dict[str, Callable[[], float]]:
-    """By name what reads, copies, compresses or writes all videos of a case and returns the CPU seconds.
+    """Functions by name that read, copy, compress or write all videos of a case and return the CPU seconds.
 
-    In a process of its own: where hdf5plugin is imported, HDF5 writes the filter's name into new zstd files.
+    Run this in a separate process: once hdf5plugin is imported, HDF5 writes the filter's name into new zstd files.
     """
     import hdf5plugin  # noqa: F401 (h5py reads zstd with it)
 
@@ -83,35 +83,35 @@ def works(case: Case, folder: Path) -> dict[str, Callable[[], float]]:
     with h5py.File(folder / "gzip-4.h5", "w") as file:
         for name, values in columns.items():
             file.create_dataset(name, data=values, chunks=(1, *values.shape[1:]), compression="gzip")
-    found: dict[str, Callable[[], Any]] = {
+    measurements: dict[str, Callable[[], Any]] = {
         "copy": lambda: np.copyto(out["frames"], frames),
         "h5py gzip-4": lambda: _looped(folder / "gzip-4.h5", out),
     }
     for codec in codecs.CODECS:
-        made = _dataset(case, folder / codec, codec)
-        _write(made, columns)
-        assert complete(made)
-        ds = loader.open(made.root, fields=tuple(columns))
+        spec = _dataset(case, folder / codec, codec)
+        _write(spec, columns)
+        assert complete(spec)
+        ds = loader.open(spec.root, fields=tuple(columns))
         shard = folder / codec / "shards" / "train-00000.h5"
-        found[f"loader {codec}"] = lambda ds=ds: ds.batch(range(case.videos), out=out)
-        found[f"h5py {codec}"] = lambda shard=shard: _looped(shard, out)
+        measurements[f"loader {codec}"] = lambda ds=ds: ds.batch(range(case.videos), out=out)
+        measurements[f"h5py {codec}"] = lambda shard=shard: _looped(shard, out)
         if codec != "none":
             large = _dataset(case, folder / f"{codec} again", codec, ROUNDS)
-            found[f"codec {codec}"] = lambda codec=codec: [codecs.encode(codec, video) for video in frames]
-            found[f"write {codec}"] = lambda large=large: _write(large, columns)
-    return {name: timed(work, ROUNDS if name.startswith("write") else 1) for name, work in found.items()}
+            measurements[f"codec {codec}"] = lambda codec=codec: [codecs.encode(codec, video) for video in frames]
+            measurements[f"write {codec}"] = lambda large=large: _write(large, columns)
+    return {name: timed(work, ROUNDS if name.startswith("write") else 1) for name, work in measurements.items()}
 
 
 def _dataset(case: Case, root: Path, codec: str, rounds: int = 1) -> DatasetSpec:
     sizes, count = {"T": case.frames, "H": case.pixels, "W": case.pixels, "K": 8}, rounds * case.videos
-    plan = {"splits": {"train": count}, "videos_per_shard": count}
-    made = synthetic.dataset(root, codec=codec, fields=FIELDS, sizes=sizes, **plan)
-    open_folder(made)
-    return made
+    counts = {"splits": {"train": count}, "videos_per_shard": count}
+    spec = synthetic.dataset(root, codec=codec, fields=FIELDS, sizes=sizes, **counts)
+    open_folder(spec)
+    return spec
 
 
 def _write(made: DatasetSpec, columns: Mapping[str, np.ndarray]) -> None:
-    """Writes the dataset's one shard, which holds the videos once or more."""
+    """Write the only shard of the dataset, which holds the videos once or more often."""
     (shard,) = plan(made.splits, made.videos_per_shard)
     starts = [*range(0, len(columns["frames"]), 4)] * (shard.count // len(columns["frames"]))
     numbers = np.arange(shard.count)
@@ -127,27 +127,27 @@ def _write(made: DatasetSpec, columns: Mapping[str, np.ndarray]) -> None:
 
 
 def of_many_shards(root: Path, count: int) -> dict[str, float]:
-    """CPU seconds to find out what is left to do in a folder of so many shards, and to complete it.
+    """CPU seconds to find the remaining shards in a folder of `count` shards, and to complete the dataset.
 
-    Most files hold nothing and have the size of a shard; the last shards are still to be made.
+    Most files are empty files of a shard's size; the last shards are still missing.
     """
-    made = synthetic.dataset(root, splits={"train": count}, videos_per_shard=1)
-    todo = open_folder(made)
-    with ShardWriter(made) as writer:
-        row = [writer.write(shard, synthetic.blocks(made, shard)) for shard in todo[:8]][-1]
+    spec = synthetic.dataset(root, splits={"train": count}, videos_per_shard=1)
+    remaining = open_folder(spec)
+    with ShardWriter(spec) as writer:
+        row = [writer.write(shard, synthetic.blocks(spec, shard)) for shard in remaining[:8]][-1]
     rows = np.repeat(row, count - 16)
     rows["first"] = np.arange(8, count - 8)
-    sealed_rows(rows, origin(made.identity_sha256, "train"), rows["first"].tolist())
+    sealed_rows(rows, origin(spec.identity_sha256, "train"), rows["first"].tolist())
     (root / RECORDS / "train.0123456789abcdef.1").write_bytes(rows.tobytes())
-    for shard in todo[8:-8]:
+    for shard in remaining[8:-8]:
         with (root / "shards" / f"{shard.name}.h5").open("wb") as file:
             file.truncate(int(row["bytes"][0]))
-    seconds = {"resuming": _cpu_seconds(lambda: open_folder(made))}
-    with ShardWriter(made) as writer:
-        for shard in open_folder(made):
-            writer.write(shard, synthetic.blocks(made, shard))
-    seconds["finishing"] = _cpu_seconds(lambda: complete(made))
-    seconds["resuming when all is done"] = _cpu_seconds(lambda: open_folder(made))
+    seconds = {"resuming": _cpu_seconds(lambda: open_folder(spec))}
+    with ShardWriter(spec) as writer:
+        for shard in open_folder(spec):
+            writer.write(shard, synthetic.blocks(spec, shard))
+    seconds["finishing"] = _cpu_seconds(lambda: complete(spec))
+    seconds["resuming when all is done"] = _cpu_seconds(lambda: open_folder(spec))
     seconds["opening and reading a video"] = _cpu_seconds(lambda: loader.open(root)[0])
     return seconds | {"all of it": sum(seconds.values())}
 
@@ -159,7 +159,7 @@ def _cpu_seconds(work: Callable[[], Any]) -> float:
 
 
 def _looped(path: Path, out: Mapping[str, np.ndarray]) -> None:
-    """Reads every video of a file as people do."""
+    """Read every video of a file in a plain loop."""
     with h5py.File(path) as file:
         for name, target in out.items():
             dataset: Any = file[name]
@@ -168,13 +168,13 @@ def _looped(path: Path, out: Mapping[str, np.ndarray]) -> None:
 
 
 def stored_of(case: Case, seconds: Mapping[str, float]) -> Stored:
-    """The line, from the seconds of all videos."""
+    """Row of the table, from the seconds for all videos."""
     size = case.videos * case.frames * case.pixels**2 * 3 / 1e6
     return Stored(case.name, {name: size / value for name, value in seconds.items()})
 
 
 def table(lines: Sequence[Stored]) -> list[str]:
-    """Lines of text."""
+    """Lines of the table."""
     names = list(lines[0].rates)
     head = ["one core, MB of frames a second of CPU time", f"{'':16} " + " ".join(f"{line.name:>17}" for line in lines)]
     return [*head, *(f"{name:16} " + " ".join(f"{line.rates[name]:17,.0f}" for line in lines) for name in names)]

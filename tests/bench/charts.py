@@ -1,4 +1,4 @@
-"""Charts of costs for the benchmark, both axes in logarithms."""
+"""Log-log charts of costs for the benchmark."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -11,7 +11,7 @@ FAINT = "#999999"
 
 
 def cost_chart(title: str, across: str, upwards: str, ticks: Sequence[int]) -> Axes:
-    """Empty axes of a chart of costs against numbers, of which `ticks` are marked."""
+    """Empty axes of a log-log chart with these ticks on the x axis."""
     figure = Figure((WIDTH / DPI, HEIGHT / DPI), DPI, layout="constrained")
     axes = figure.add_subplot(xscale="log", yscale="log", xlabel=across, ylabel=upwards)
     axes.set_title(title, loc="left")

@@ -1,4 +1,4 @@
-"""What a user would write today: Chipmunk (pymunk), OpenCV and h5py, one process a core; bench.py's yardstick.
+"""Reference implementation for bench.py: Chipmunk (pymunk), OpenCV and h5py in one process per core.
 
 python tests/bench/peer.py --n 512 --out /tmp/peer      # the scene of configs/benchmark.yaml
 """
@@ -20,19 +20,19 @@ import pymunk
 from pymunk import batch
 
 BALLS, SIDE, GRAVITY = 8, 10.0, -9.8  # m, m/s^2
-RADIUS, SPEED = (0.5, 1.0), 3.0  # m, m/s: uniform, and the deviation of each component
-ELASTICITY, FRICTION = 0.9, 0.2  # of balls and walls; Chipmunk multiplies
+RADIUS, SPEED = (0.5, 1.0), 3.0  # m: uniform range; m/s: standard deviation of each component
+ELASTICITY, FRICTION = 0.9, 0.2  # of balls and walls; Chipmunk multiplies those of two bodies
 FRAMES, SIZE, FPS, SUBSTEPS = 64, 64, 30, 4
 BACKGROUND, COLORS = 20, (40, 255)
 SHARD = 64  # videos
 STATE = (
     batch.BodyFields.POSITION | batch.BodyFields.ANGLE | batch.BodyFields.VELOCITY | batch.BodyFields.ANGULAR_VELOCITY
 )
-BITS = 4  # of a pixel's fraction
+BITS = 4  # fractional bits of OpenCV's coordinates
 
 
 class Start(NamedTuple):
-    """What a video is made of."""
+    """Initial state of a video."""
 
     radii: list[float]  # m
     places: list[tuple[float, float]]  # m
@@ -41,7 +41,7 @@ class Start(NamedTuple):
 
 
 def sampled(number: int) -> Start:
-    """The start of video `number`: balls that do not overlap, each placed anew until it fits."""
+    """Initial state of video `number`: balls at random positions, by rejection of those that overlap."""
     rng = np.random.default_rng([0, number])
     radii = rng.uniform(*RADIUS, BALLS).tolist()
     while (places := _places(rng, radii)) is None:
@@ -64,7 +64,7 @@ def _places(rng: np.random.Generator, radii: list[float]) -> list[tuple[float, f
 
 
 def space_of(start: Start) -> pymunk.Space:
-    """A closed box with the balls in it."""
+    """A closed box that contains the balls."""
     space = pymunk.Space()
     space.gravity = 0, GRAVITY
     corners = [(0, 0), (SIDE, 0), (SIDE, SIDE), (0, SIDE), (0, 0)]
@@ -82,7 +82,7 @@ def space_of(start: Start) -> pymunk.Space:
 
 
 def stepped(space: pymunk.Space, read: str = "body") -> np.ndarray:
-    """The states [T, N, 6], float32: x, y, angle, their velocities and the spin."""
+    """States [T, N, 6], float32: position, angle, velocity and angular velocity."""
     dt, states, take = 1 / FPS / SUBSTEPS, [], READERS[read](space)
     for t in range(FRAMES):
         for _ in range(SUBSTEPS if t else 0):
@@ -102,18 +102,18 @@ def _by_batch(space: pymunk.Space) -> Callable[[], Any]:
     def take() -> np.ndarray:
         buffer.clear()
         batch.get_space_bodies(space, STATE, buffer)
-        return np.frombuffer(buffer.float_buf()).reshape(-1, 6)[:BALLS].copy()  # then the body that bears the walls
+        return np.frombuffer(buffer.float_buf()).reshape(-1, 6)[:BALLS].copy()  # the last body holds the walls
 
     return take
 
 
-# How states leave Chipmunk: by each body's attributes, as pymunk's manual shows, or all by one call of pymunk.batch,
-# which calls itself 'highly experimental'.
+# How states are read from Chipmunk: by the attributes of each body, as in pymunk's manual, or by one call of
+# pymunk.batch, which its documentation calls 'highly experimental'.
 READERS = {"body": _by_body, "batch": _by_batch}
 
 
 def drawn(start: Start, states: np.ndarray, frames: np.ndarray) -> None:
-    """Returns nothing; fills frames [T, H, W, 3] uint8 with antialiased discs on a dark background."""
+    """Render antialiased discs on a dark background into frames [T, H, W, 3] uint8."""
     scale = SIZE / SIDE
     pixels = np.stack([states[..., 0] * scale - 0.5, (SIDE - states[..., 1]) * scale - 0.5], axis=-1)
     centers = np.rint(pixels * 2**BITS).astype(int).tolist()
@@ -125,7 +125,7 @@ def drawn(start: Start, states: np.ndarray, frames: np.ndarray) -> None:
 
 
 def write_shard(path: Path, numbers: range, compression: str = "gzip", read: str = "body") -> None:
-    """Returns nothing; makes these videos and writes them into one HDF5 file, a chunk each."""
+    """Generate these videos and write them to one HDF5 file, a chunk per video."""
     frames = np.empty((len(numbers), FRAMES, SIZE, SIZE, 3), np.uint8)
     states = np.empty((len(numbers), FRAMES, BALLS, 6), np.float32)
     for row, number in enumerate(numbers):
@@ -139,7 +139,7 @@ def write_shard(path: Path, numbers: range, compression: str = "gzip", read: str
 
 
 def make(count: int, workers: int, compression: str, read: str, out: Path) -> float:
-    """Makes the dataset and returns how many seconds it took, from the start of the workers to the last closed file."""
+    """Generate the dataset; the seconds from the start of the workers to the last closed file."""
     out.mkdir(parents=True, exist_ok=True)
     parts = [range(first, min(first + SHARD, count)) for first in range(0, count, SHARD)]
     jobs = [(out / f"shard-{part.start // SHARD:05d}.h5", part, compression, read) for part in parts]
@@ -150,7 +150,7 @@ def make(count: int, workers: int, compression: str, read: str, out: Path) -> fl
 
 
 def seconds_to_step(count: int, read: str = "body") -> float:
-    """How long stepping `count` videos takes, without sampling and building them."""
+    """Seconds to step `count` videos, without sampling and building the scenes."""
     spaces = [space_of(sampled(number)) for number in range(count)]
     began = time.perf_counter()
     for space in spaces:
@@ -159,18 +159,18 @@ def seconds_to_step(count: int, read: str = "body") -> float:
 
 
 def seconds_to_draw(count: int) -> float:
-    """How long drawing `count` videos takes, of which the states are there."""
+    """Seconds to render `count` videos from given states."""
     starts = [sampled(number) for number in range(count)]
     states = [stepped(space_of(start)) for start in starts]
     frames = np.zeros((FRAMES, SIZE, SIZE, 3), np.uint8)
     began = time.perf_counter()
-    for start, moved in zip(starts, states, strict=True):
-        drawn(start, moved, frames)
+    for start, trajectory in zip(starts, states, strict=True):
+        drawn(start, trajectory, frames)
     return time.perf_counter() - began
 
 
 def main() -> None:
-    """Makes a dataset as the command line says."""
+    """Generate a dataset from the options of the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--n", type=int, default=512)
     parser.add_argument("--workers", type=int, default=len(os.sched_getaffinity(0)))

@@ -1,4 +1,4 @@
-"""The benchmark measures what it says: the peer makes the same scene, and every measurement works."""
+"""The peer renders the scene of the benchmark's config, and every measurement of the benchmark works."""
 
 import json
 import os
@@ -56,21 +56,21 @@ from bench_storage import Case, works
 print(json.dumps({{name: work() for name, work in works({case}, Path({str(tmp_path)!r})).items()}}))
 """
     path = os.pathsep.join([str(bench.HERE.parent), str(bench.SUPPORT)])
-    done = subprocess.run(
+    process = subprocess.run(
         [sys.executable, "-c", code], env=os.environ | {"PYTHONPATH": path}, capture_output=True, check=True
     )
-    seconds = json.loads(done.stdout)
-    ways = {f"{what} {codec}" for what in ("loader", "h5py") for codec in ("gzip", "zstd", "none")}
-    assert ways | {"copy", "h5py gzip-4", "codec zstd", "write zstd", "codec gzip", "write gzip"} == seconds.keys()
+    seconds = json.loads(process.stdout)
+    names = {f"{what} {codec}" for what in ("loader", "h5py") for codec in ("gzip", "zstd", "none")}
+    assert names | {"copy", "h5py gzip-4", "codec zstd", "write zstd", "codec gzip", "write gzip"} == seconds.keys()
     assert all(value > 0 for value in seconds.values())
     assert bench_storage.table([bench_storage.stored_of(case, seconds)])
 
 
 def test_bounds_counts_whole_videos_only(tmp_path: Path) -> None:
     bench.make(bench.source_of(TINY), 8, tmp_path)
-    found = bench.bounds(tmp_path)
-    assert (found["videos"], found["bad"]) == (8, 0)
-    assert found["walls"] < 0.25
+    checks = bench.bounds(tmp_path)
+    assert (checks["videos"], checks["bad"]) == (8, 0)
+    assert checks["walls"] < 0.25
 
 
 def test_the_peer_makes_a_readable_shard(tmp_path: Path) -> None:
@@ -95,9 +95,9 @@ def test_the_engines_of_the_physics_section_start_from_the_same_scene(shape: str
     start = bench_physics.sampled(bench_physics.Case(shape, 5, 1, (1, 0), 1), 0)
     (scene, state, layout), space = bench_physics.gen2d_scene(start), bench_physics.chipmunk_space(start)
     assert [run.count for run in layout.runs] == [5, 4]
-    own = np.array([(*b.position, b.angle, *b.velocity, b.mass, b.moment) for b in space.bodies])
+    chipmunk = np.array([(*b.position, b.angle, *b.velocity, b.mass, b.moment) for b in space.bodies])
     columns = state.position, state.angle, state.velocity, scene.objects.mass, scene.objects.moment
-    np.testing.assert_allclose(np.column_stack([x[:5] for x in columns]), own, rtol=1e-6)
+    np.testing.assert_allclose(np.column_stack([x[:5] for x in columns]), chipmunk, rtol=1e-6)
 
 
 @pytest.mark.slow
@@ -113,7 +113,7 @@ def test_every_engine_of_the_physics_section_is_timed(monkeypatch: pytest.Monkey
 
 
 def has_color(image: np.ndarray, color: str) -> bool:
-    """Whether a pixel of an image, blue, green, red, has a colour such as '#114499'."""
+    """Whether a pixel of a BGR image has a colour such as '#114499'."""
     return bool((image[..., ::-1] == list(bytes.fromhex(color[1:]))).all(-1).any())
 
 
@@ -137,10 +137,10 @@ def test_opencv_draws_the_pictures_of_gen2d() -> None:
     theirs = np.empty_like(ours)
     bench_render.drawn(columns, 0, theirs)
     scale, middle = SMALL.pixels / peer.SIDE, np.arange(SMALL.pixels) + 0.5
-    place, radius = columns["states/position"][0, :, :2] * scale, columns["objects/radius"][0, :2] * scale
-    x, y = (place[..., i, None, None] for i in (0, 1))
-    to_rim = np.hypot(middle - x, SMALL.pixels - middle[:, None] - y) - radius[:, None, None]
-    inside = (np.abs(to_rim) > 3).all(1)  # pixels; OpenCV's discs are about one too large
+    position, radius = columns["states/position"][0, :, :2] * scale, columns["objects/radius"][0, :2] * scale
+    x, y = (position[..., i, None, None] for i in (0, 1))
+    rim_distance = np.hypot(middle - x, SMALL.pixels - middle[:, None] - y) - radius[:, None, None]
+    inside = (np.abs(rim_distance) > 3).all(1)  # px from the rims; OpenCV's discs are about 1 px too large
     assert 0.5 < inside.mean() < 1
     assert (ours[inside] == theirs[inside]).all()
     assert (ours != peer.BACKGROUND).any()

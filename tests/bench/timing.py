@@ -1,4 +1,4 @@
-"""Work that tells how long it took, for the benchmark."""
+"""Timing of functions for the benchmark."""
 
 import time
 from collections.abc import Callable
@@ -6,8 +6,7 @@ from typing import Any
 
 
 def timed(work: Callable[[], Any], count: int, clock: Callable[[], float] = time.process_time) -> Callable[[], float]:
-    """What does the work and returns the seconds for each of `count` things that it makes; of CPU time, unless told
-    otherwise."""
+    """A function that runs `work` on `count` items and returns the seconds per item, of CPU time by default."""
 
     def seconds() -> float:
         began = clock()

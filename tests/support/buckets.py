@@ -1,6 +1,6 @@
-"""An S3 server on this machine, and before it a proxy that notes what is asked and fails when told to.
+"""A local S3 server behind a proxy that records requests and injects faults, and plain web servers.
 
-The proxy also gives the files of a folder, as plain web servers do, with or without parts of them.
+The proxy also serves the files of a folder, as plain web servers do, with or without byte ranges.
 """
 
 import contextlib
@@ -22,18 +22,18 @@ BUCKET = "bucket"
 
 
 class Request(NamedTuple):
-    """What was asked of the server."""
+    """A request as the server received it."""
 
     method: str
     path: str
-    range: str  # as in the header; empty if all was asked for
+    range: str  # as in the header; empty: the whole file
 
 
-Fault = Callable[[Request], str]  # "fail" (503), "deny" (403), "cut" (half of the answer), or "" for an honest answer
+Fault = Callable[[Request], str]  # "fail" (503), "deny" (403), "cut" (half of the body) or "" (none)
 
 
 class Server(ThreadingHTTPServer):
-    """The proxy."""
+    """The proxy. `behind` is the port of the S3 server."""
 
     daemon_threads = True
 
@@ -42,7 +42,7 @@ class Server(ThreadingHTTPServer):
         self.behind = behind
         self.asked: list[Request] = []
         self.fault: Fault = lambda request: ""
-        self.folder = Path()  # of what lies under /files/
+        self.folder = Path()  # served as /files/
         self.gives_parts = True
 
     @property
@@ -50,15 +50,15 @@ class Server(ThreadingHTTPServer):
         return f"http://127.0.0.1:{self.server_address[1]}"
 
     def reset(self) -> None:
-        """Forgets what was asked, and is honest again."""
+        """Forget all requests and inject no more faults."""
         self.asked, self.fault = [], lambda request: ""
 
     def of(self, method: str, part: str = "") -> list[Request]:
-        """What was asked with this method of paths with this part."""
+        """Recorded requests with this method and this part in their path."""
         return [request for request in self.asked if request.method == method and part in request.path]
 
     def handle_error(self, request: object, client_address: object) -> None:
-        """Says nothing: clients may go away."""
+        """Ignore errors: clients may disconnect."""
 
 
 class _Handler(BaseHTTPRequestHandler):
@@ -68,21 +68,21 @@ class _Handler(BaseHTTPRequestHandler):
     def answer(self) -> None:
         proxy = self.server
         assert isinstance(proxy, Server)
-        asked = Request(self.command, self.path, self.headers.get("Range", ""))
-        proxy.asked.append(asked)
+        request = Request(self.command, self.path, self.headers.get("Range", ""))
+        proxy.asked.append(request)
         content = self._content()
-        fault = proxy.fault(asked)
+        fault = proxy.fault(request)
         if fault in ("fail", "deny"):
             return self._send(503 if fault == "fail" else 403, [], b"", cut=False)
-        if asked.path.startswith("/files/"):
-            path = proxy.folder / asked.path.removeprefix("/files/")
-            return self._send_file(path, asked.range if proxy.gives_parts else "")
-        back = http.client.HTTPConnection("127.0.0.1", proxy.behind, timeout=30)
+        if request.path.startswith("/files/"):
+            path = proxy.folder / request.path.removeprefix("/files/")
+            return self._send_file(path, request.range if proxy.gives_parts else "")
+        upstream = http.client.HTTPConnection("127.0.0.1", proxy.behind, timeout=30)
         headers = {key: value for key, value in self.headers.items() if key.lower() != "transfer-encoding"}
-        back.request(self.command, self.path, content, headers)
-        reply = back.getresponse()
+        upstream.request(self.command, self.path, content, headers)
+        reply = upstream.getresponse()
         self._send(reply.status, reply.getheaders(), reply.read(), fault == "cut")
-        back.close()
+        upstream.close()
 
     do_GET = do_PUT = do_POST = do_HEAD = do_DELETE = answer
 
@@ -118,11 +118,11 @@ class _Handler(BaseHTTPRequestHandler):
             self.close_connection = True
 
     def log_message(self, format: str, *args: object) -> None:
-        """Says nothing."""
+        """Log nothing."""
 
 
 class Files(ThreadingHTTPServer):
-    """A plain web server: the files of a folder, by ranges, and nothing about what is in it."""
+    """A plain web server: files of a folder, with byte ranges but without listings."""
 
     daemon_threads = True
 
@@ -134,7 +134,7 @@ class Files(ThreadingHTTPServer):
         return f"http://127.0.0.1:{self.server_address[1]}/{path.relative_to(self.folder)}"
 
     def handle_error(self, request: object, client_address: object) -> None:
-        """Says nothing: clients may go away."""
+        """Ignore errors: clients may disconnect."""
 
 
 class _FilesHandler(BaseHTTPRequestHandler):
@@ -144,15 +144,15 @@ class _FilesHandler(BaseHTTPRequestHandler):
     def do_GET(self) -> None:
         server = self.server
         assert isinstance(server, Files)
-        path, asked = server.folder / self.path.lstrip("/"), self.headers.get("Range", "")
+        path, range_header = server.folder / self.path.lstrip("/"), self.headers.get("Range", "")
         if not path.is_file() or path.is_symlink():
             return self._answer(404, 0)
         size = path.stat().st_size
-        first, last = map(int, asked.removeprefix("bytes=").split("-")) if asked else (0, size - 1)
-        if asked and first >= size:
+        first, last = map(int, range_header.removeprefix("bytes=").split("-")) if range_header else (0, size - 1)
+        if range_header and first >= size:
             return self._answer(416, 0)
         last = min(last, size - 1)
-        self._answer(206 if asked else 200, last + 1 - first)
+        self._answer(206 if range_header else 200, last + 1 - first)
         if self.command == "GET":
             with path.open("rb") as file:
                 file.seek(first)
@@ -167,12 +167,12 @@ class _FilesHandler(BaseHTTPRequestHandler):
         self.end_headers()
 
     def log_message(self, format: str, *args: object) -> None:
-        """Says nothing."""
+        """Log nothing."""
 
 
 @contextlib.contextmanager
 def serving_files(folder: Path) -> Iterator[Files]:
-    """A plain web server of the folder."""
+    """Context manager: a plain web server of the folder, in a thread."""
     with Files(folder) as server:
         threading.Thread(target=server.serve_forever, daemon=True).start()
         yield server
@@ -181,12 +181,12 @@ def serving_files(folder: Path) -> Iterator[Files]:
 
 @contextlib.contextmanager
 def serving() -> Iterator[Server]:
-    """The proxy before a server with one empty bucket; the environment says where it is."""
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
-    words = [sys.executable, "-W", "ignore", "-m", "moto.server", "-H", "127.0.0.1", "-p", str(port)]
-    with subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as moto:
+    """Context manager: the proxy of an S3 server with one empty bucket; `environment` leads clients to it."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    command = [sys.executable, "-W", "ignore", "-m", "moto.server", "-H", "127.0.0.1", "-p", str(port)]
+    with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as moto:
         try:
             _make_bucket(port)
             with Server(port) as proxy:
@@ -198,10 +198,10 @@ def serving() -> Iterator[Server]:
 
 
 def environment(server: Server) -> dict[str, str]:
-    """The variables that lead S3 clients to the server, and nowhere else."""
+    """Environment variables that lead S3 clients to this server only."""
     names = {"ACCESS_KEY_ID": "some", "SECRET_ACCESS_KEY": "one", "DEFAULT_REGION": "us-east-1"}
     names |= {"ENDPOINT_URL": server.address, "EC2_METADATA_DISABLED": "true"}
-    names |= {"MAX_ATTEMPTS": "1"}  # trying again is for gen2d
+    names |= {"MAX_ATTEMPTS": "1"}  # gen2d has its own retries
     names |= {"CONFIG_FILE": os.devnull, "SHARED_CREDENTIALS_FILE": os.devnull}
     return {f"AWS_{name}": value for name, value in names.items()}
 
@@ -222,13 +222,13 @@ def _make_bucket(port: int) -> None:
 
 
 def tree(url: str) -> dict[str, bytes]:
-    """Every published object below the URL and its bytes."""
+    """Bytes of every published object below the URL, by relative name."""
     system = s3fs.S3FileSystem(use_listings_cache=False)
-    found = {name.removeprefix(url.removeprefix("s3://") + "/"): name for name in system.find(url)}
-    content = {name: system.cat_file(path) for name, path in found.items() if not name.startswith(".gen2d")}
+    paths = {name.removeprefix(url.removeprefix("s3://") + "/"): name for name in system.find(url)}
+    content = {name: system.cat_file(path) for name, path in paths.items() if not name.startswith(".gen2d")}
     return {name: data for name, data in content.items() if isinstance(data, bytes)}
 
 
 def copied(root: Path, url: str) -> None:
-    """Returns when the dataset in the folder is at the URL too."""
+    """Copy the dataset in the folder to the URL."""
     s3fs.S3FileSystem().put(str(root), url, recursive=True)

@@ -1,4 +1,4 @@
-"""Datasets that a stranger made to do harm, every checksum in order: what each does is one line, chosen by a seed."""
+"""Hostile datasets with valid checksums. A seed selects the kind of attack and its parameters."""
 
 import contextlib
 import copy
@@ -72,7 +72,7 @@ def kind(make: Kind) -> Kind:
 
 
 def craft(pristine: Path, target: Path, seed: int) -> str:
-    """Makes a copy of the dataset and changes it; what was done to it, for a person."""
+    """Copy the dataset, manipulate the copy, and return a description of the change."""
     chance = random.Random(seed)
     shutil.copytree(pristine, target)
     name = sorted(KINDS)[seed % len(KINDS)]
@@ -133,9 +133,9 @@ def a_number_in_the_manifest(root: Path, chance: random.Random) -> str:
         if where in "TKHW":
             plain["sizes"][where] = number
             if chance.random() < 0.7:
-                for about in plain["fields"].values():
-                    axes = [axis for axis in about["axes"].split() if axis != "n"]
-                    about["shape"] = [int(axis) if axis.isdigit() else plain["sizes"][axis] for axis in axes]
+                for entry in plain["fields"].values():
+                    axes = [axis for axis in entry["axes"].split() if axis != "n"]
+                    entry["shape"] = [int(axis) if axis.isdigit() else plain["sizes"][axis] for axis in axes]
         elif where == "splits":
             plain["splits"]["train"] = number
         elif where in ("shards", "bytes", "largest"):
@@ -149,26 +149,26 @@ def a_number_in_the_manifest(root: Path, chance: random.Random) -> str:
 
 @kind
 def a_value_in_the_manifest(root: Path, chance: random.Random) -> str:
-    told = ""
+    changed_path = ""
 
     def change(plain: dict[str, Any]) -> None:
-        nonlocal told
-        place: Any = plain
+        nonlocal changed_path
+        container: Any = plain
         while True:
-            key = chance.choice(list(place)) if isinstance(place, dict) else chance.randrange(len(place))
-            told += f".{key}"
-            inner = place[key]
+            key = chance.choice(list(container)) if isinstance(container, dict) else chance.randrange(len(container))
+            changed_path += f".{key}"
+            inner = container[key]
             if not isinstance(inner, dict | list) or not inner or chance.random() < 0.3:
-                how = chance.random()
-                if how < 0.2 and isinstance(place, dict):
-                    del place[key]
+                action = chance.random()
+                if action < 0.2 and isinstance(container, dict):
+                    del container[key]
                 else:
-                    place[key] = copy.deepcopy(chance.choice(JUNK + HUGE))
+                    container[key] = copy.deepcopy(chance.choice(JUNK + HUGE))
                 return
-            place = inner
+            container = inner
 
     forged.seal(root, change)
-    return told
+    return changed_path
 
 
 @kind
@@ -298,7 +298,7 @@ def a_number_in_an_index(root: Path, chance: random.Random) -> str:
 
 @kind
 def a_chunk_that_grows(root: Path, chance: random.Random) -> str:
-    """A piece that is said to be small and is not, or is no piece at all."""
+    """A chunk that decompresses to more than its declared size, or is no valid chunk."""
     bombs = {
         "zeros": zlib.compress(bytes(10**8), 1),
         "nothing": b"",
@@ -311,8 +311,8 @@ def a_chunk_that_grows(root: Path, chance: random.Random) -> str:
     data = bombs[which]
 
     def change(content: bytearray, index: np.ndarray, row: np.void) -> None:
-        place = index["frames"][0, 0]
-        place["offset"], place["size"], place["crc32"] = len(content), len(data), zlib.crc32(data)
+        chunk = index["frames"][0, 0]
+        chunk["offset"], chunk["size"], chunk["crc32"] = len(content), len(data), zlib.crc32(data)
         content += data
 
     forged.change_shard(root, "train", 0, change)
@@ -328,13 +328,13 @@ def a_value_in_a_shard(root: Path, chance: random.Random) -> str:
 
 @kind
 def bytes_in_a_shard(root: Path, chance: random.Random) -> str:
-    """Anywhere: most of it is HDF5's own, which h5py then has to read."""
+    """Random bytes, mostly in the metadata of HDF5, which h5py then reads."""
     count = chance.choice([1, 2, 10, 100])
 
     def change(content: bytearray, index: np.ndarray, row: np.void) -> None:
         for _ in range(count):
-            place = chance.randrange(min(len(content), 4000) if chance.random() < 0.7 else len(content))
-            content[place] = chance.choice([0, 255, content[place] ^ 1 << chance.randrange(8), chance.randrange(256)])
+            offset = chance.randrange(min(len(content), 4000) if chance.random() < 0.7 else len(content))
+            content[offset] = chance.choice([0, 255, content[offset] ^ 1 << chance.randrange(8), chance.randrange(256)])
 
     forged.change_shard(root, "train", chance.randrange(2), change)
     return f"{count}"
@@ -342,7 +342,7 @@ def bytes_in_a_shard(root: Path, chance: random.Random) -> str:
 
 @kind
 def another_hdf5_file(root: Path, chance: random.Random) -> str:
-    """What HDF5 reads well, and should not be asked to: too large, packed, elsewhere, or in a circle."""
+    """Valid HDF5 that a reader must refuse: huge, compressed, external, virtual or circular datasets."""
     which = chance.choice(
         ["huge", "bomb", "external", "virtual", "soft", "circle", "group", "compound", "text", "attribute", "none"]
     )
@@ -399,38 +399,38 @@ def a_file_that_is_none(root: Path, chance: random.Random) -> str:
         "shards/train-00000.h5",
     ]
     files += ["index/train-10.npy", "shards", "index", ".gen2d", ".gen2d/records"]
-    name, which = (
+    name, kind_of_file = (
         chance.choice(files),
         chance.choice(["fifo", "zero", "folder", "socket", "loop", "broken", "gone", "empty", "passwd"]),
     )
     path = root / name
     shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
     path.parent.mkdir(exist_ok=True)
-    if which == "fifo":
+    if kind_of_file == "fifo":
         os.mkfifo(path)
-    elif which == "zero":
+    elif kind_of_file == "zero":
         path.symlink_to("/dev/zero")
-    elif which == "folder":
+    elif kind_of_file == "folder":
         path.mkdir()
-    elif which == "socket":
-        with socket.socket(socket.AF_UNIX) as made:
-            os.chdir(path.parent)  # the name of a socket must be short
-            made.bind(path.name)
+    elif kind_of_file == "socket":
+        with socket.socket(socket.AF_UNIX) as server:
+            os.chdir(path.parent)  # a socket's path must be short
+            server.bind(path.name)
             os.chdir("/")
-    elif which == "loop":
+    elif kind_of_file == "loop":
         path.symlink_to(path)
-    elif which == "broken":
+    elif kind_of_file == "broken":
         path.symlink_to("/nowhere/at/all")
-    elif which == "empty":
+    elif kind_of_file == "empty":
         path.touch()
-    elif which == "passwd":
+    elif kind_of_file == "passwd":
         path.symlink_to("/etc/passwd")
-    return f"{name} {which}"
+    return f"{name} {kind_of_file}"
 
 
 @kind
 def a_file_that_is_huge(root: Path, chance: random.Random) -> str:
-    """A hole takes no room on the disk, and hours to read."""
+    """A sparse file needs no disk space, but hours to read."""
     files = [
         "manifest.json",
         "config.yaml",
@@ -452,7 +452,7 @@ def a_file_that_is_huge(root: Path, chance: random.Random) -> str:
 
 @kind
 def a_folder_that_leads_away(root: Path, chance: random.Random) -> str:
-    """A repair that follows it would write there."""
+    """A symbolic link: a repair that follows it writes outside of the dataset."""
     name = chance.choice(["shards", "index", ".gen2d", ".gen2d/records", ".gen2d/snapshots", "plugins"])
     away = root.parent / "away"
     if (root / name).is_dir():
@@ -530,7 +530,7 @@ def a_name_on_the_disk(root: Path, chance: random.Random) -> str:
 
 @kind
 def a_picture_that_leads_away(root: Path, chance: random.Random) -> str:
-    """Who looks at a preview in the dataset's own folder would write there."""
+    """Symbolic links with the names of preview files: a preview that follows them overwrites another file."""
     (root.parent / "victim").write_bytes(b"precious")
     for name in ("toy-sheet.png", "toy.webp"):
         if chance.random() < 0.2:
@@ -542,7 +542,7 @@ def a_picture_that_leads_away(root: Path, chance: random.Random) -> str:
 
 @kind
 def a_manifest_that_swells(root: Path, chance: random.Random) -> str:
-    """Text becomes an array of as many letters in every place; what is deep is walked by recursion."""
+    """Long text, of which NumPy makes a wide array, or a deeply nested config, which exhausts recursion."""
     depth, how, inner = chance.choice([60, 70, 300, 900, 970, 990]), chance.choice(["text", "dict", "list"]), {}
     for _ in range(depth):
         inner = {"a": inner} if how == "dict" else [inner]
@@ -560,7 +560,7 @@ def a_manifest_that_swells(root: Path, chance: random.Random) -> str:
 
 @kind
 def fields_that_are_others(root: Path, chance: random.Random) -> str:
-    """A dataset that is right but for what its fields are."""
+    """A consistent dataset with unexpected fields."""
     which = chance.choice(
         ["no time", "time of each video", "time alone", "index of pairs", "file", "wide", "many", "T"]
     )
@@ -585,14 +585,14 @@ def fields_that_are_others(root: Path, chance: random.Random) -> str:
                 stats |= {name: dict.fromkeys(("mean", "std", "min", "max")) for name in added}
         elif which == "many":
             plain["chunk_frames"], plain["sizes"]["T"] = 1, 2**31 - 1
-            for about in fields.values():
-                about["shape"] = [2**31 - 1 if size == 5 else size for size in about["shape"]]
+            for entry in fields.values():
+                entry["shape"] = [2**31 - 1 if size == 5 else size for size in entry["shape"]]
         elif which == "T":
             plain["chunk_frames"], plain["constants"] = 5, {}
             del plain["sizes"]["T"]
-            plain["fields"] = {name: about for name, about in fields.items() if "T" not in about["axes"]}
+            plain["fields"] = {name: entry for name, entry in fields.items() if "T" not in entry["axes"]}
 
-    if which == "file":  # NumPy's own name for where to write
+    if which == "file":  # the name of np.savez's first parameter
         shutil.rmtree(root)
         more = synthetic.FIELDS | {"file": Field("int32", "n", "1", "x")}
         synthetic.make(synthetic.dataset(root, train=10, fields=more))

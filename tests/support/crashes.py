@@ -1,4 +1,4 @@
-"""A process that dies in the middle of what it does to the disk: at the first change, at the second, at every one."""
+"""Processes that are killed at a chosen change of the disk: the first, the second, and so on."""
 
 import os
 import signal
@@ -6,12 +6,12 @@ import traceback
 from collections.abc import Callable, Iterator
 from typing import Any
 
-# Whatever changes names or says that something is on the disk.
+# Calls that change names or contents on the disk, or flush them.
 CHANGES = ("replace", "rename", "unlink", "mkdir", "rmdir", "fsync", "ftruncate", "write", "link", "symlink")
 
 
 def _dying(call: Callable[..., Any], left: list[int], after: bool) -> Callable[..., Any]:
-    def changed(*arguments: Any, **named: Any) -> Any:
+    def counted(*arguments: Any, **named: Any) -> Any:
         left[0] -= 1
         if left[0] == 0 and not after:
             os.kill(os.getpid(), signal.SIGKILL)
@@ -21,30 +21,32 @@ def _dying(call: Callable[..., Any], left: list[int], after: bool) -> Callable[.
             if left[0] == 0:
                 os.kill(os.getpid(), signal.SIGKILL)
 
-    return changed
+    return counted
 
 
 def died_at(change: int, work: Callable[[], Any], after: bool = False) -> bool:
-    """Whether a forked process that does the work dies at its change with this number, right before or after it."""
-    process = os.fork()
-    if not process:
-        left = [change]
+    """Whether a fork that runs `work` reaches this change (counted from 1), right before or after which it dies."""
+    pid = os.fork()
+    if not pid:
+        remaining = [change]
         for name in CHANGES:
-            setattr(os, name, _dying(getattr(os, name), left, after))
+            setattr(os, name, _dying(getattr(os, name), remaining, after))
         try:
             work()
         except BaseException:
             traceback.print_exc()
             os._exit(1)
         os._exit(0)
-    code = os.waitstatus_to_exitcode(os.waitpid(process, 0)[1])
+    code = os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
     assert code in (0, -signal.SIGKILL), code
     return code != 0
 
 
 def every_crash(work: Callable[[], Any], step: int = 1) -> Iterator[int]:
-    """Does the work again and again in processes that die one change later each time; yields after each death. The
-    caller restores what was there. Ends when the work does."""
+    """Yield after each crash of a process that runs `work` and is killed `step` changes later each time.
+
+    The caller restores the initial state. The iteration ends when `work` completes.
+    """
     change, after = 1, False
     while died_at(change, work, after):
         yield change

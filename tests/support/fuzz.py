@@ -1,4 +1,4 @@
-"""Configs as nobody should write them: the shipped ones, with something changed at random."""
+"""Malformed configs: the shipped configs with random changes."""
 
 import copy
 import random
@@ -143,7 +143,7 @@ TEXTS = [
 
 
 def places(value: Any, path: tuple = ()) -> Iterator[tuple]:
-    """The path of every value in a config."""
+    """Paths of all values in a config, itself included."""
     yield path
     if isinstance(value, Mapping):
         for key, inner in value.items():
@@ -154,7 +154,7 @@ def places(value: Any, path: tuple = ()) -> Iterator[tuple]:
 
 
 def changed_configs(count: int, seed: int) -> Iterator[Any]:
-    """Mappings, most of which are no config."""
+    """Randomly changed configs, most of which are invalid."""
     chance = random.Random(seed)
     configs = [parse_yaml(path.read_text(), str(path)) for path in sorted(config_folder().glob("*.yaml"))]
     for _ in range(count):
@@ -165,21 +165,23 @@ def changed_configs(count: int, seed: int) -> Iterator[Any]:
 
 
 def change(config: dict, chance: random.Random) -> None:
-    """Changes something in a config: a value, a key, or what is nested in it."""
+    """Change one value, key or nesting of a config at random, in place."""
     path = chance.choice([path for path in places(config) if path])
-    place: Any = config
+    container: Any = config
     for key in path[:-1]:
-        place = place[key]
-    how = chance.random()
-    if how < 0.6 or not isinstance(place, dict):
-        place[path[-1]] = copy.deepcopy(chance.choice(JUNK))
-    elif how < 0.7:
-        del place[path[-1]]
-    elif how < 0.8:
-        place[chance.choice(["splits", "nope", "radius", "name", 7, "sha256", "factors", "matched", "quality"])] = (
+        container = container[key]
+    choice = chance.random()
+    if choice < 0.6 or not isinstance(container, dict):
+        container[path[-1]] = copy.deepcopy(chance.choice(JUNK))
+    elif choice < 0.7:
+        del container[path[-1]]
+    elif choice < 0.8:
+        container[chance.choice(["splits", "nope", "radius", "name", 7, "sha256", "factors", "matched", "quality"])] = (
             copy.deepcopy(chance.choice(JUNK))
         )
-    elif how < 0.9:
-        place[path[-1]] = [copy.deepcopy(place[path[-1]])] * chance.choice([1, 2, 3])
+    elif choice < 0.9:
+        container[path[-1]] = [copy.deepcopy(container[path[-1]])] * chance.choice([1, 2, 3])
     else:
-        place[path[-1]] = {chance.choice(["uniform", "minus", "mixture", "grid", "normal", "choice"]): place[path[-1]]}
+        container[path[-1]] = {
+            chance.choice(["uniform", "minus", "mixture", "grid", "normal", "choice"]): container[path[-1]]
+        }

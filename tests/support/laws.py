@@ -1,8 +1,8 @@
-"""What the law tests share: one scene seen from eight sides, and a figure held against its bound.
+"""Helpers of the law tests: one scene in eight poses, and assertions of a figure against its bound.
 
 A case is written once, in the frame of its closed form. `watch` simulates it at four orientations, each also mirrored,
-as lanes of one batch, and hands the motion back in the case's own frame. Cases are filled up with empty slots, segments
-far away and copies of the last lane, so that many tests share few compiled programs.
+in one batch, and returns the motion in the frame of the case. Cases are padded with empty slots, segments far away and
+copies of the last video, so that many tests share few compiled programs.
 """
 
 import math
@@ -17,15 +17,15 @@ from worlds import STEP, run, world
 GRAVITY = 9.81  # m/s^2
 DOWN = (0.0, -GRAVITY)
 FLOOR = {"a": (-50.0, 0.0), "b": (50.0, 0.0), "elasticity": 1.0, "friction": 1.0}
-FAR = 1000.0  # m: nothing gets there
-LANES = (64, 512)  # batches are filled up to one of these
+FAR = 1000.0  # m: out of reach of all bodies
+LANES = (64, 512)  # sizes that batches are padded to
 QUARTERS = [np.array([[c, -s], [s, c]]) for c, s in ((1, 0), (0, 1), (-1, 0), (0, -1))]
 MIRROR = np.diag([-1, 1])
 POSES = [*QUARTERS, *(turn @ MIRROR for turn in QUARTERS)]
 
 
 class Case(NamedTuple):
-    """A scene as `worlds.world` takes it."""
+    """A scene as arguments of `worlds.world`."""
 
     discs: Sequence[dict]
     segments: Sequence[dict] = ()
@@ -33,7 +33,7 @@ class Case(NamedTuple):
 
 
 class Motion(NamedTuple):
-    """What the discs did, in the frame of the cases: [case, pose, frame, slot] and, of vectors, [..., 2]."""
+    """Motion of the discs in the frame of the cases: [case, pose, frame, slot], vectors [..., 2]."""
 
     x: np.ndarray  # m
     angle: np.ndarray  # rad
@@ -42,56 +42,56 @@ class Motion(NamedTuple):
 
 
 def posed(case: Case, pose: np.ndarray, slots: int, walls: int) -> tuple:
-    """The world of a case turned and mirrored, with `slots` discs and `walls` segments."""
-    hand = round(float(np.linalg.det(pose)))
+    """World of a case, rotated or mirrored by `pose`, with `slots` disc slots and `walls` segments."""
+    handedness = round(float(np.linalg.det(pose)))
 
-    def there(row: dict, names: Sequence[str]) -> dict:
+    def transform(row: dict, names: Sequence[str]) -> dict:
         vectors = {name: tuple(pose @ np.array(row[name], float)) for name in names if name in row}
-        return {**row, **vectors, **{name: hand * row[name] for name in ("spin", "torque") if name in row}}
+        return {**row, **vectors, **{name: handedness * row[name] for name in ("spin", "torque") if name in row}}
 
-    away = [{"a": (-1.0, -FAR - k), "b": (1.0, -FAR - k)} for k in range(walls - len(case.segments))]
-    discs = [there(row, ("x", "v", "force")) for row in case.discs]
-    segments = [there(row, ("a", "b")) for row in [*case.segments, *away]]
+    padding = [{"a": (-1.0, -FAR - k), "b": (1.0, -FAR - k)} for k in range(walls - len(case.segments))]
+    discs = [transform(row, ("x", "v", "force")) for row in case.discs]
+    segments = [transform(row, ("a", "b")) for row in [*case.segments, *padding]]
     return world(discs, segments, tuple(pose @ np.array(case.gravity, float)), slots)
 
 
 def filled(worlds: Sequence[tuple]) -> list[tuple]:
-    """The worlds, and copies of the last up to one of the usual numbers of lanes."""
-    lanes = next(n for n in LANES if n >= len(worlds))
-    return [*worlds, *[worlds[-1]] * (lanes - len(worlds))]
+    """The worlds, padded with copies of the last one to a batch size in `LANES`."""
+    size = next(n for n in LANES if n >= len(worlds))
+    return [*worlds, *[worlds[-1]] * (size - len(worlds))]
 
 
 def watch(
     cases: Sequence[Case], frames: int = 721, steps: int = 1, slots: int = 2, walls: int = 2, **options: Any
 ) -> Motion:
-    """The motion of every case in every pose; `numbers` (Rules) as `worlds.run` takes them."""
+    """Motion of every case in every pose; `options` are those of `worlds.run`."""
     worlds = [posed(case, pose, slots, walls) for case in cases for pose in POSES]
     states = run(filled(worlds), frames, steps, **options).states
 
-    def back(values: np.ndarray, hand: bool) -> np.ndarray:
-        one = np.asarray(values, float)[: len(worlds), :, :slots]
-        one = one.reshape(len(cases), len(POSES), *one.shape[1:])
+    def to_case_frame(values: np.ndarray, hand: bool) -> np.ndarray:
+        in_world = np.asarray(values, float)[: len(worlds), :, :slots]
+        in_world = in_world.reshape(len(cases), len(POSES), *in_world.shape[1:])
         if not hand:
-            return np.stack([one[:, k] @ pose for k, pose in enumerate(POSES)], axis=1)
-        return one * np.array([np.linalg.det(pose) for pose in POSES]).round()[:, None, None]
+            return np.stack([in_world[:, k] @ pose for k, pose in enumerate(POSES)], axis=1)
+        return in_world * np.array([np.linalg.det(pose) for pose in POSES]).round()[:, None, None]
 
     return Motion(
-        back(states.position, False),
-        back(states.angle, True),
-        back(states.velocity, False),
-        back(states.angular_velocity, True),
+        to_case_frame(states.position, False),
+        to_case_frame(states.angle, True),
+        to_case_frame(states.velocity, False),
+        to_case_frame(states.angular_velocity, True),
     )
 
 
 def times(frames: int, step: float = STEP) -> np.ndarray:
-    """The times of the frames in s."""
+    """Times of the frames, s [frames]."""
     return np.arange(frames) * step
 
 
 def holds(law: str, measured: Any, bound: float, asked: float | None = None) -> None:
-    """Asserts that the worst of the measured figures keeps the bound; `pytest -rP` prints it.
+    """Assert that the largest magnitude in `measured` is within the bound; `pytest -rP` prints it.
 
-    Where the solver does not do what a law asks yet, `asked` says what that is, and the bound that it gets no worse.
+    Where the solver does not satisfy a law yet, `asked` is the law's bound, and `bound` prevents regressions.
     """
     worst = float(np.max(np.abs(measured)))
     print(f"{law}: {worst:.2g}, bound {bound:.2g}" + (f", asked {asked:.2g}" if asked is not None else ""))
@@ -100,7 +100,7 @@ def holds(law: str, measured: Any, bound: float, asked: float | None = None) -> 
 
 
 def doubled(worlds: Sequence[tuple]) -> list[tuple]:
-    """The worlds with their numbers in double precision."""
+    """The worlds in double precision."""
 
     def wide(x: jax.Array) -> jax.Array:
         return x.astype(jnp.float64) if jnp.issubdtype(x.dtype, jnp.floating) else x
@@ -109,18 +109,18 @@ def doubled(worlds: Sequence[tuple]) -> list[tuple]:
 
 
 def overlaps(one: tuple, position: np.ndarray) -> np.ndarray:
-    """The deepest overlap in m at each frame, [T], of a world whose discs stood at `position` [T, K, 2]."""
+    """Deepest overlap at each frame, m [T], of a world with its discs at `position` [T, K, 2]."""
     scene, state, layout = one
-    n, there = layout.runs[0].count, np.asarray(scene.objects.present)
+    n, present = layout.runs[0].count, np.asarray(scene.objects.present)
     radius, x = np.asarray(scene.objects.radius, float), np.asarray(position, float)[:, : layout.runs[0].count]
-    apart = np.linalg.norm(x[:, :, None] - x[:, None], axis=-1)
-    pairs = there[:n, None] & there[None, :n] & ~np.eye(n, dtype=bool)
-    deepest = np.where(pairs, radius[:n, None] + radius[None, :n] - apart, -np.inf).max((1, 2))
+    distance = np.linalg.norm(x[:, :, None] - x[:, None], axis=-1)
+    pairs = present[:n, None] & present[None, :n] & ~np.eye(n, dtype=bool)
+    depths = np.where(pairs, radius[:n, None] + radius[None, :n] - distance, -np.inf).max((1, 2))
     for k in range(n, layout.slots):
         centre, angle = np.asarray(state.position[k], float), float(state.angle[k])
         along = np.array([math.cos(angle), math.sin(angle)])
         half = float(scene.objects.half_length[k])
         nearest = centre + np.clip((x - centre) @ along, -half, half)[..., None] * along
         depth = radius[:n] + radius[k] - np.linalg.norm(x - nearest, axis=-1)
-        deepest = np.maximum(deepest, np.where(there[:n] & there[k], depth, -np.inf).max(1))
-    return deepest
+        depths = np.maximum(depths, np.where(present[:n] & present[k], depth, -np.inf).max(1))
+    return depths

@@ -1,8 +1,9 @@
-"""One scene in four hands: gen2d, Box2D 2.3, Chipmunk (pymunk) and, for flying discs, an exact event-driven path.
+"""One scene in four engines: gen2d, Box2D 2.3, Chipmunk (pymunk) and, for free discs, an exact event-driven simulation.
 
-A scene's bodies are numbered 0, 1, ...; its walls, which are segments, -1, -2, ... All bodies of a scene share one
-elasticity and one friction. Its pairs must have those too, but the engines mix them in different ways: gen2d and
-Chipmunk multiply, Box2D takes the larger elasticity and the geometric mean of the frictions. Densities are 1 kg/m^2.
+The bodies of a scene have the numbers 0, 1, ..., its walls, which are segments, -1, -2, ... All pairs of a scene have
+the same elasticity and friction. The engines mix the values of two bodies differently, so the bodies have different
+values in each: gen2d and Chipmunk multiply, Box2D takes the larger elasticity and the geometric mean of the frictions.
+Densities are 1 kg/m^2.
 """
 
 import dataclasses
@@ -19,18 +20,18 @@ from gen2d.records.layout import Layout
 from gen2d.records.scene import Scene, State
 from gen2d.space import space
 
-with warnings.catch_warnings():  # SWIG's own types, as Python sees them
+with warnings.catch_warnings():  # raised by types of SWIG
     warnings.filterwarnings("ignore", r"builtin type (SwigPy\w+|swigvarlink) has no __module__", DeprecationWarning)
     import Box2D
 
-SKIN = Box2D.b2_polygonRadius  # m: rounds Box2D's boxes and segments, so that they meet at a distance
-STILL = 1e-9  # m/s: rounding, where nothing approaches
+SKIN = Box2D.b2_polygonRadius  # m: Box2D's rounding of boxes and segments, which touch at this distance
+STILL = 1e-9  # m/s: slower approaches are rounding errors
 Pair = tuple[float, float]
 
 
 @dataclasses.dataclass(frozen=True)
 class Thing:
-    """A disc, or a box where `size` is given."""
+    """A disc, or a box if it has a `size`."""
 
     x: Pair  # m
     v: Pair = (0.0, 0.0)  # m/s
@@ -39,17 +40,17 @@ class Thing:
 
     @property
     def mass(self) -> float:
-        """In kg."""
+        """Mass in kg."""
         return math.pi * self.radius**2 if self.size is None else self.size[0] * self.size[1]
 
     @property
     def moment(self) -> float:
-        """In kg m^2."""
+        """Moment of inertia in kg m^2."""
         return self.mass * (self.radius**2 / 2 if self.size is None else (self.size[0] ** 2 + self.size[1] ** 2) / 12)
 
     @property
     def corners(self) -> np.ndarray:
-        """Of a box at angle 0, counter-clockwise, [4, 2] m from its centre."""
+        """Corners of a box at angle 0, relative to its centre, counter-clockwise, m [4, 2]."""
         return np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)]) * np.array(self.size) / 2
 
 
@@ -65,23 +66,23 @@ class Setting:
 
 
 class Event(NamedTuple):
-    """A contact that began."""
+    """The beginning of a contact."""
 
     time: float  # s
-    pair: tuple[int, int]  # in order
+    pair: tuple[int, int]  # in ascending order
 
 
 class Impact(NamedTuple):
-    """An event of the exact path."""
+    """An impact of the exact simulation."""
 
     time: float  # s
     pair: tuple[int, int]
     approach: float  # m/s, along the normal
-    after: np.ndarray  # [K, 2] m/s: all velocities
+    after: np.ndarray  # [K, 2] m/s: velocities of all discs after it
 
 
 class Path(NamedTuple):
-    """What an engine made of a scene."""
+    """Motion of a scene in an engine."""
 
     poses: np.ndarray  # [T, K, 3]: x, y in m, angle in rad
     speeds: np.ndarray  # [T, K, 3]: their velocities
@@ -89,7 +90,7 @@ class Path(NamedTuple):
 
 
 def pair_of(a: int, b: int) -> tuple[int, int]:
-    """Two numbers in order."""
+    """Two numbers in ascending order."""
     return min(a, b), max(a, b)
 
 
@@ -97,29 +98,29 @@ def pair_of(a: int, b: int) -> tuple[int, int]:
 
 
 def gen2d_world(setting: Setting, slots: int | None = None) -> tuple[Scene, State, Layout]:
-    """The scene for `worlds.run`; discs may leave some of the slots empty. gen2d mixes by the product."""
-    share = {"elasticity": math.sqrt(setting.elasticity), "friction": math.sqrt(setting.friction)}
+    """The scene for `worlds.run`; some of the `slots` for discs may stay empty. gen2d mixes by the product."""
+    material = {"elasticity": math.sqrt(setting.elasticity), "friction": math.sqrt(setting.friction)}
     if all(t.size is None for t in setting.things):
-        discs = [{"x": t.x, "v": t.v, "radius": t.radius, **share} for t in setting.things]
-        return world(discs, [{"a": a, "b": b, **share} for a, b in setting.walls], (0, -setting.gravity), slots)
-    made, rub = space.Space(gravity=(0, -setting.gravity)), math.sqrt(setting.friction)
+        discs = [{"x": t.x, "v": t.v, "radius": t.radius, **material} for t in setting.things]
+        return world(discs, [{"a": a, "b": b, **material} for a, b in setting.walls], (0, -setting.gravity), slots)
+    scene, friction = space.Space(gravity=(0, -setting.gravity)), math.sqrt(setting.friction)
     for t in setting.things:
         assert t.size is not None
-        made.add_box(t.x, *t.size, velocity=t.v, elasticity=math.sqrt(setting.elasticity), friction=rub)
+        scene.add_box(t.x, *t.size, velocity=t.v, elasticity=math.sqrt(setting.elasticity), friction=friction)
     for a, b in setting.walls:
-        made.add_segment(a, b, elasticity=math.sqrt(setting.elasticity), friction=rub)
-    return made.scene()
+        scene.add_segment(a, b, elasticity=math.sqrt(setting.elasticity), friction=friction)
+    return scene.scene()
 
 
 def gen2d_paths(made: Any, settings: Sequence[Setting]) -> list[Path]:
-    """The paths in what `worlds.run` made of some scenes; with contacts, if they were kept."""
+    """Paths from a trajectory of `worlds.run`, with events if it has contacts."""
     states, paths = made.states, []
     for i, setting in enumerate(settings):
-        own = slice(len(setting.things))
+        bodies = slice(len(setting.things))
         poses = np.concatenate([states.position[i], states.angle[i][..., None]], axis=-1)
         speeds = np.concatenate([states.velocity[i], states.angular_velocity[i][..., None]], axis=-1)
         events = [] if made.contacts is None else _gen2d_events(made.contacts, i, poses.shape[1], setting)
-        paths.append(Path(poses[:, own], speeds[:, own], events))
+        paths.append(Path(poses[:, bodies], speeds[:, bodies], events))
     return paths
 
 
@@ -144,60 +145,60 @@ class _Listener(Box2D.b2ContactListener):
         self.begin = begin
 
     def BeginContact(self, contact: Any) -> None:
-        """Box2D's callback."""
+        """Callback of Box2D."""
         self.begin(contact.fixtureA.body.userData, contact.fixtureB.body.userData)
 
 
 def box2d_path(setting: Setting, seconds: float, steps: int = 1, fps: int = 60, events: int | None = None) -> Path:
-    """Box2D's path at `fps`, in `steps` a frame of 8 and 3 iterations; until there have been so many events."""
-    made = Box2D.b2World(gravity=(0, -setting.gravity))
-    share = {"restitution": setting.elasticity, "friction": setting.friction}
+    """Box2D's path at `fps`, with `steps` per frame of 8 and 3 iterations; ends after this number of `events`."""
+    b2_world = Box2D.b2World(gravity=(0, -setting.gravity))
+    material = {"restitution": setting.elasticity, "friction": setting.friction}
     bodies = []
     for i, t in enumerate(setting.things):
-        body = made.CreateDynamicBody(position=t.x, linearVelocity=t.v, userData=i, allowSleep=False)
-        round_, square = Box2D.b2CircleShape, Box2D.b2PolygonShape
-        shape = round_(radius=t.radius) if t.size is None else square(vertices=t.corners.tolist())
-        body.CreateFixture(shape=shape, density=1.0, **share)
+        body = b2_world.CreateDynamicBody(position=t.x, linearVelocity=t.v, userData=i, allowSleep=False)
+        circle, polygon = Box2D.b2CircleShape, Box2D.b2PolygonShape
+        shape = circle(radius=t.radius) if t.size is None else polygon(vertices=t.corners.tolist())
+        body.CreateFixture(shape=shape, density=1.0, **material)
         bodies.append(body)
     for j, ends in enumerate(setting.walls):
-        body = made.CreateStaticBody(userData=-1 - j)
-        body.CreateFixture(shape=Box2D.b2EdgeShape(vertices=ends), **share)
+        body = b2_world.CreateStaticBody(userData=-1 - j)
+        body.CreateFixture(shape=Box2D.b2EdgeShape(vertices=ends), **material)
 
     def state() -> list:
         return [(*b.position, b.angle, *b.linearVelocity, b.angularVelocity) for b in bodies]
 
-    def heard(begin: Callable[[int, int], None]) -> None:
-        made.contactListener = _Listener(begin)
+    def listen(begin: Callable[[int, int], None]) -> None:
+        b2_world.contactListener = _Listener(begin)
 
-    return _path(lambda h: made.Step(h, 8, 3), state, heard, seconds, steps, fps, events)
+    return _path(lambda h: b2_world.Step(h, 8, 3), state, listen, seconds, steps, fps, events)
 
 
 def chipmunk_path(setting: Setting, seconds: float, steps: int = 4, fps: int = 60, events: int | None = None) -> Path:
-    """Chipmunk's path at `fps`, in `steps` a frame of 10 iterations; until there have been so many events."""
-    made = pymunk.Space()
-    made.gravity = 0, -setting.gravity
+    """Chipmunk's path at `fps`, with `steps` per frame of 10 iterations; ends after this number of `events`."""
+    pymunk_space = pymunk.Space()
+    pymunk_space.gravity = 0, -setting.gravity
     bodies, shapes, numbers = [], [], {}
     for i, t in enumerate(setting.things):
         body = pymunk.Body(t.mass, t.moment)
         body.position, body.velocity = t.x, t.v
         shapes.append(pymunk.Circle(body, t.radius) if t.size is None else pymunk.Poly(body, t.corners.tolist()))
         numbers[shapes[-1]] = i
-        made.add(body)
+        pymunk_space.add(body)
         bodies.append(body)
     for j, (a, b) in enumerate(setting.walls):
-        shapes.append(pymunk.Segment(made.static_body, a, b, 0))
+        shapes.append(pymunk.Segment(pymunk_space.static_body, a, b, 0))
         numbers[shapes[-1]] = -1 - j
     for shape in shapes:
         shape.elasticity, shape.friction = math.sqrt(setting.elasticity), math.sqrt(setting.friction)
-    made.add(*shapes)
+    pymunk_space.add(*shapes)
 
     def state() -> list:
         return [(*b.position, b.angle, *b.velocity, b.angular_velocity) for b in bodies]
 
-    def heard(begin: Callable[[int, int], None]) -> None:
-        made.on_collision(begin=lambda arbiter, *_: begin(*(numbers[s] for s in arbiter.shapes)))
+    def listen(begin: Callable[[int, int], None]) -> None:
+        pymunk_space.on_collision(begin=lambda arbiter, *_: begin(*(numbers[s] for s in arbiter.shapes)))
 
-    return _path(made.step, state, heard, seconds, steps, fps, events)
+    return _path(pymunk_space.step, state, listen, seconds, steps, fps, events)
 
 
 def _path(
@@ -214,28 +215,28 @@ def _path(
         states.append(state())
         if most is not None and len(events) >= most:
             break
-    found = np.array(states)
-    return Path(found[..., :3], found[..., 3:], events)
+    trajectory = np.array(states)
+    return Path(trajectory[..., :3], trajectory[..., 3:], events)
 
 
 # The exact path -----------------------------------------------------------------------------------------------------
 
 
 def exact_path(setting: Setting, count: int) -> list[Impact]:
-    """The impacts of smooth discs without gravity, in walls that run counter-clockwise, until so many pairs have met.
+    """Impacts of smooth discs without gravity, within counter-clockwise walls, until `count` pairs have collided.
 
-    Closed forms: between impacts discs fly straight, so two of them meet at a root of |d + u t| = r + s, and a disc and
-    a wall at gap / approach speed. An impact changes the normal speed by -(1 + e) times itself.
+    Closed forms: discs move in straight lines between impacts, so two of them touch at a root of |d + u t| = r + s, and
+    a disc touches a wall after gap / approach speed. An impact changes the normal speed v by -(1 + e) v.
     """
     x, v, r, mass = (np.array([getattr(t, n) for t in setting.things], float) for n in ("x", "v", "radius", "mass"))
     first, second = np.triu_indices(len(x), 1)
     start, end = np.array(setting.walls, float).transpose(1, 0, 2)
     along = (end - start) / np.linalg.norm(end - start, axis=1)[:, None]
     inward = np.stack([-along[:, 1], along[:, 0]], axis=1)
-    now, found = 0.0, []
-    while len({impact.pair for impact in found}) < count:
-        offset, over, reach = x[second] - x[first], v[second] - v[first], r[first] + r[second]
-        a, b, c = (over**2).sum(1), (offset * over).sum(1), (offset**2).sum(1) - reach**2
+    now, impacts = 0.0, []
+    while len({impact.pair for impact in impacts}) < count:
+        offset, relative, reach = x[second] - x[first], v[second] - v[first], r[first] + r[second]
+        a, b, c = (relative**2).sum(1), (offset * relative).sum(1), (offset**2).sum(1) - reach**2
         root = np.sqrt(np.maximum(b**2 - a * c, 0))
         discs = np.where((b < -STILL) & (root > 0), c / np.maximum(root - b, STILL), np.inf)
         approach, gap = -v @ inward.T, ((x[:, None] - start) * inward).sum(2) - r[:, None]
@@ -247,22 +248,22 @@ def exact_path(setting: Setting, count: int) -> list[Impact]:
         if discs.min() < walls.min():
             k = int(discs.argmin())
             i, j, normal = int(first[k]), int(second[k]), (x[second[k]] - x[first[k]]) / reach[k]
-            speed, pair = float(-over[k] @ normal), (i, j)
+            speed, pair = float(-relative[k] @ normal), (i, j)
             push = (1 + setting.elasticity) * speed / (1 / mass[i] + 1 / mass[j]) * normal
             v[i], v[j] = v[i] - push / mass[i], v[j] + push / mass[j]
         else:
             i, wall = divmod(int(walls.argmin()), len(along))
             speed, pair = float(approach[i, wall]), (-1 - wall, i)
             v[i] += (1 + setting.elasticity) * speed * inward[wall]
-        found.append(Impact(now, pair, speed, v.copy()))
-    return found
+        impacts.append(Impact(now, pair, speed, v.copy()))
+    return impacts
 
 
 # Overlaps -----------------------------------------------------------------------------------------------------------
 
 
 def deepest(setting: Setting, poses: np.ndarray, skin: float = 0.0) -> float:
-    """The deepest overlap in m at any of the poses [T, K, 3], by separating axes; `skin` rounds boxes and walls."""
+    """Deepest overlap in m over all poses [T, K, 3], by separating axes; `skin` is the rounding of boxes and walls."""
     things = [(_core(t, poses[:, k]), t.radius if t.size is None else skin) for k, t in enumerate(setting.things)]
     walls = [(np.broadcast_to(np.array(ends, float), (len(poses), 2, 2)), skin) for ends in setting.walls]
     pairs = [(a, b) for k, a in enumerate(things) for b in [*things[k + 1 :], *walls]]
@@ -270,7 +271,7 @@ def deepest(setting: Setting, poses: np.ndarray, skin: float = 0.0) -> float:
 
 
 def _core(thing: Thing, poses: np.ndarray) -> np.ndarray:
-    """A disc's centre [T, 1, 2], or a box's corners [T, 4, 2]."""
+    """Core of a body: the centre of a disc [T, 1, 2] or the corners of a box [T, 4, 2]."""
     if thing.size is None:
         return poses[:, None, :2]
     cos, sin = np.cos(poses[:, 2]), np.sin(poses[:, 2])
@@ -279,12 +280,12 @@ def _core(thing: Thing, poses: np.ndarray) -> np.ndarray:
 
 
 def _apart(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Of two convex cores [T, V, 2]: the largest separation along any face; of a disc's centre, its distance."""
+    """Largest separation of two convex cores [T, V, 2] along any face normal; for a disc's centre, its distance."""
     if a.shape[1] == 1:
         start, edge = b[:, 0], b[:, -1] - b[:, 0]
         along = np.einsum("ti,ti->t", a[:, 0] - start, edge) / np.maximum(np.einsum("ti,ti->t", edge, edge), 1e-12)
         return np.linalg.norm(a[:, 0] - start - np.clip(along, 0, 1)[:, None] * edge, axis=1)
     edges = np.concatenate([np.roll(core, -1, axis=1) - core for core in (a, b)], axis=1)
     normals = np.stack([edges[..., 1], -edges[..., 0]], axis=-1) / np.linalg.norm(edges, axis=-1, keepdims=True)
-    one, two = (np.einsum("tvi,tei->tev", core, normals) for core in (a, b))
-    return np.maximum(two.min(2) - one.max(2), one.min(2) - two.max(2)).max(1)
+    projected_a, projected_b = (np.einsum("tvi,tei->tev", core, normals) for core in (a, b))
+    return np.maximum(projected_b.min(2) - projected_a.max(2), projected_a.min(2) - projected_b.max(2)).max(1)

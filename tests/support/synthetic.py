@@ -1,4 +1,4 @@
-"""Small datasets for the tests of storage: every kind of field, and discs that move so that images compress."""
+"""Small datasets for the tests of storage: all kinds of fields, and moving discs, so that images compress."""
 
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
@@ -31,7 +31,7 @@ FIELDS = {
 
 
 def dataset(root: Place, train: int = 20, codec: str = "gzip", **changes: object) -> DatasetSpec:
-    """A dataset of `train` videos and 3 of a split called test, in shards of 8."""
+    """Spec of a dataset in shards of 8: `train` videos in the split train, 3 in the split test."""
     values: dict[str, object] = {
         "root": root,
         "name": "toy",
@@ -60,26 +60,26 @@ def dataset(root: Place, train: int = 20, codec: str = "gzip", **changes: object
 
 
 def small(root: Place, splits: Mapping[str, int], **changes: Any) -> DatasetSpec:
-    """A dataset with these splits and four of the fields, for tests that make many."""
+    """Spec of a dataset with these splits and only four fields, for tests that write many."""
     fields = {name: FIELDS[name] for name in ("frames", "index", "objects/mass", "time")}
     return dataset(root, fields=fields, splits=splits, **changes)
 
 
 def video(made: DatasetSpec, split: str, number: int) -> dict[str, np.ndarray]:
-    """One video, which depends on (seed, split, number) only."""
-    random = np.random.default_rng([made.seed, len(split), number])
+    """All fields of one video, a function of (seed, split, number) only."""
+    rng = np.random.default_rng([made.seed, len(split), number])
     frames, height, width, slots = (made.sizes[axis] for axis in "THWK")
     values: dict[str, np.ndarray] = {}
     for name, field in made.fields.items():
         shape = field.shape(made.sizes)
-        values[name] = (random.random(shape) * 100).astype(field.dtype)
-    place = random.random((slots, 2)) * (height, width) + np.arange(frames)[:, None, None] * random.random((slots, 2))
+        values[name] = (rng.random(shape) * 100).astype(field.dtype)
+    position = rng.random((slots, 2)) * (height, width) + np.arange(frames)[:, None, None] * rng.random((slots, 2))
     rows, columns = np.mgrid[:height, :width] + 0.5
     mask = np.zeros((frames, height, width), np.uint8)
     for slot in range(slots):
-        row, column = np.moveaxis(place[:, slot, :, None, None], 1, 0)
+        row, column = np.moveaxis(position[:, slot, :, None, None], 1, 0)
         mask[(rows - row % height) ** 2 + (columns - column % width) ** 2 < (height / 6) ** 2] = slot + 1
-    colors = random.integers(0, 256, (slots + 1, 3), np.uint8)
+    colors = rng.integers(0, 256, (slots + 1, 3), np.uint8)
     present = np.arange(slots) <= number % slots
     values |= {
         "index": np.full(made.fields["index"].shape(made.sizes), number),
@@ -92,7 +92,7 @@ def video(made: DatasetSpec, split: str, number: int) -> dict[str, np.ndarray]:
 
 
 def columns(made: DatasetSpec, shard: Shard, rows: range | None = None) -> dict[str, np.ndarray]:
-    """The shard's videos, or some of them, stacked."""
+    """Stacked fields of the shard's videos, or of some `rows`."""
     rows = range(shard.count) if rows is None else rows
     videos = [video(made, shard.split, shard.first + row) for row in rows]
     names = [name for name, field in made.fields.items() if field.per_video]
@@ -100,14 +100,14 @@ def columns(made: DatasetSpec, shard: Shard, rows: range | None = None) -> dict[
 
 
 def blocks(made: DatasetSpec, shard: Shard, size: int = 3) -> Iterator[Block]:
-    """The shard in blocks of `size` videos, made one at a time."""
+    """The shard in encoded blocks of `size` videos, one at a time."""
     for first in range(0, shard.count, size):
         rows = range(first, min(first + size, shard.count))
         yield encode(columns(made, shard, rows), made.fields, made.codec, made.chunk_frames)
 
 
 def make(made: DatasetSpec, size: int = 3, **options: bool) -> DatasetSpec:
-    """The dataset, complete on disk."""
+    """Write the complete dataset and return its spec."""
     todo = open_folder(made, **options)
     with ShardWriter(made) as writer:
         for shard in todo:
@@ -117,25 +117,25 @@ def make(made: DatasetSpec, size: int = 3, **options: bool) -> DatasetSpec:
 
 
 def write(made: DatasetSpec, shard: Shard, blocks: Iterable[Block]) -> None:
-    """Make the shard from these blocks."""
+    """Write the shard from these blocks."""
     with ShardWriter(made) as writer:
         writer.write(shard, blocks)
 
 
 def folder(made: DatasetSpec) -> Path:
-    """Where on this machine the dataset lies."""
+    """Local folder of the dataset."""
     assert isinstance(made.root, Path)
     return made.root
 
 
 def stored(root: Path, split: str = "train") -> dict[str, np.ndarray]:
-    """A split's fields as they lie on disk, read by h5py, all videos together."""
+    """Fields of all videos of a split, read by h5py."""
     files = [hdf5.read(path) for path in sorted((root / "shards").glob(f"{split}-*.h5"))]
     return {name: np.concatenate([file[name] for file in files]) for name in files[0] if name != "time"}
 
 
 def tree(root: Path) -> Mapping[str, bytes]:
-    """Every published file and its bytes."""
+    """Bytes of every published file, by relative path."""
     files = (path for path in root.rglob("*") if path.is_file() and ".gen2d" not in path.parts)
     return {path.relative_to(root).as_posix(): path.read_bytes() for path in files}
 
@@ -147,22 +147,22 @@ def flip(path: Path, bit: int) -> None:
 
 
 def contents(root: Path) -> dict[str, bytes]:
-    """Every file and its bytes, the program's own too, but for the log, which holds times."""
+    """Bytes of every file, including .gen2d, but without the run log, which holds times."""
     files = (path for path in root.rglob("*") if path.is_file() and path.name != "run.jsonl")
     return {path.relative_to(root).as_posix(): path.read_bytes() for path in files}
 
 
 def discs(count: int, frames: int = 64, size: int = 64, bodies: int = 8, seed: int = 0) -> np.ndarray:
-    """Videos of moving discs with soft edges, uint8 [count, frames, size, size, 3]; for measuring speed."""
-    random = np.random.default_rng(seed)
+    """Videos of moving discs with soft edges, uint8 [count, frames, size, size, 3], for the benchmark."""
+    rng = np.random.default_rng(seed)
     rows, columns_ = np.mgrid[:size, :size] + 0.5
-    out = np.full((count, frames, size, size, 3), 230, np.uint8)
-    for movie in out:
-        place, speed = random.uniform(0, size, (bodies, 2)), random.uniform(-2, 2, (bodies, 2))
-        color, radius = random.integers(0, 256, (bodies, 3)), random.uniform(size / 20, size / 8, bodies)
-        for step, image in enumerate(movie):
+    videos = np.full((count, frames, size, size, 3), 230, np.uint8)
+    for clip in videos:
+        position, speed = rng.uniform(0, size, (bodies, 2)), rng.uniform(-2, 2, (bodies, 2))
+        color, radius = rng.integers(0, 256, (bodies, 3)), rng.uniform(size / 20, size / 8, bodies)
+        for step, image in enumerate(clip):
             for body in range(bodies):
-                row, column = abs((place[body] + speed[body] * step) % (2 * size) - size)
-                cover = np.clip(radius[body] + 0.5 - np.hypot(rows - row, columns_ - column), 0, 1)[..., None]
-                image[...] = np.round(image * (1 - cover) + color[body] * cover)
-    return out
+                row, column = abs((position[body] + speed[body] * step) % (2 * size) - size)
+                coverage = np.clip(radius[body] + 0.5 - np.hypot(rows - row, columns_ - column), 0, 1)[..., None]
+                image[...] = np.round(image * (1 - coverage) + color[body] * coverage)
+    return videos

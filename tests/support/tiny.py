@@ -1,4 +1,4 @@
-"""A dataset small enough to be made in a test, and the command line run as people run it."""
+"""A config small enough to generate in a test, and helpers that run the command line."""
 
 import contextlib
 import io
@@ -20,22 +20,22 @@ CONFIG = {
     "storage": {"videos_per_shard": 8, "batch_size": 4},
 }
 
-CROWDED = {"balls": 6, "radius": 1.6, "width": 8, "height": 8}  # a scene in which the balls find no place
+CROWDED = {"balls": 6, "radius": 1.6, "width": 8, "height": 8}  # a scene in which the balls do not fit
 
 
 def changed(**sections: dict) -> dict:
-    """The tiny config with some options changed, by section."""
+    """The tiny config with changed options, by section."""
     return {**CONFIG, **{name: {**CONFIG.get(name, {}), **options} for name, options in sections.items()}}
 
 
 def everything(root: Path, split: str = "train") -> dict[str, np.ndarray]:
-    """Every field of every video of a dataset, read by gen2d."""
+    """All fields of all videos of a split, read by gen2d."""
     ds = gen2d.open(root, split=split, fields="*")
     return ds.batch(range(len(ds)))
 
 
 def same(one: dict[str, np.ndarray], other: dict[str, np.ndarray], count: int | None = None) -> None:
-    """Fails unless both hold the same bits in every field, for the first `count` videos."""
+    """Assert that both have the same fields with the same bits in the first `count` videos."""
     assert one.keys() == other.keys()
     for name, values in one.items():
         a, b = np.ascontiguousarray(values[:count]), np.ascontiguousarray(other[name][:count])
@@ -43,31 +43,31 @@ def same(one: dict[str, np.ndarray], other: dict[str, np.ndarray], count: int | 
 
 
 def command(*arguments: object, **changes: str) -> list:
-    """The arguments and environment of `python -m gen2d ...`."""
+    """Arguments and environment of `python -m gen2d ...`; `changes` are environment variables."""
     return [[sys.executable, "-m", "gen2d", *map(str, arguments)], {**os.environ, **changes}]
 
 
 def ran(*arguments: object, cwd: Path | None = None, **changes: str) -> subprocess.CompletedProcess[str]:
-    """What `python -m gen2d ...` printed, and its exit code."""
-    words, environment = command(*arguments, **changes)
-    return subprocess.run(words, env=environment, cwd=cwd, capture_output=True, text=True, timeout=300, check=False)
+    """Output and exit code of `python -m gen2d ...`."""
+    argv, environment = command(*arguments, **changes)
+    return subprocess.run(argv, env=environment, cwd=cwd, capture_output=True, text=True, timeout=300, check=False)
 
 
 def run_on(devices: int, code: str, **changes: str) -> None:
-    """Runs code in a process of its own that has so many CPU devices, in the folder of the tests; fails if it fails."""
-    first = f"import jax; jax.config.update('jax_num_cpu_devices', {devices}); jax.devices();"
-    words, environment = command(**changes)
-    words, here = [words[0], "-c", first + code], Path(__file__).parent
-    done = subprocess.run(words, env=environment, cwd=here, capture_output=True, text=True, timeout=300, check=False)
+    """Run code in a new process with this many CPU devices, in the folder of this file, and assert its success."""
+    prelude = f"import jax; jax.config.update('jax_num_cpu_devices', {devices}); jax.devices();"
+    argv, environment = command(**changes)
+    argv, folder = [argv[0], "-c", prelude + code], Path(__file__).parent
+    done = subprocess.run(argv, env=environment, cwd=folder, capture_output=True, text=True, timeout=300, check=False)
     assert done.returncode == 0, done.stderr
 
 
 def ran_here(*arguments: object, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
-    """What `ran` returns, of the same command line in this process: starting one takes seconds."""
-    words, out, told = [*map(str, arguments)], io.StringIO(), io.StringIO()
-    with contextlib.chdir(cwd or Path.cwd()), contextlib.redirect_stdout(out), contextlib.redirect_stderr(told):
+    """As `ran`, but in this process: starting another takes seconds."""
+    argv, stdout, stderr = [*map(str, arguments)], io.StringIO(), io.StringIO()
+    with contextlib.chdir(cwd or Path.cwd()), contextlib.redirect_stdout(stdout), contextlib.redirect_stderr(stderr):
         try:
-            code = main(words)
-        except SystemExit as end:
-            code = end.code
-    return subprocess.CompletedProcess(words, int(code or 0), out.getvalue(), told.getvalue())
+            code = main(argv)
+        except SystemExit as exit_:
+            code = exit_.code
+    return subprocess.CompletedProcess(argv, int(code or 0), stdout.getvalue(), stderr.getvalue())

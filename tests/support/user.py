@@ -1,4 +1,4 @@
-"""A user's script with every public function, which `mypy --strict` checks and nothing runs."""
+"""A user's script that calls every public function: `mypy --strict` checks it, nothing runs it."""
 
 from pathlib import Path
 from typing import assert_type
@@ -44,10 +44,10 @@ def train(root: Path) -> float:
     print(video.position[:, ball], video.energy, video.contacts)
     exported = gen2d.export(root, "npz", root / "npz")
     problems: list[str] = gen2d.verify(root)
-    pictures: list[Path] = gen2d.preview(root, out=root)
+    previews: list[Path] = gen2d.preview(root, out=root)
     try:
         gen2d.open("nothing")
     except gen2d.UserError as error:
         print(error)
-    print(exported.videos, problems, pictures, gen2d.info(root))
+    print(exported.videos, problems, previews, gen2d.info(root))
     return total
