@@ -190,7 +190,8 @@ class DataLoader(Generic[A]):
 
         It holds the epoch, the position, the values that determine the order, and the snapshot of the dataset.
         """
-        return self.walk.state_dict() | {"snapshot": self.dataset.snapshot}
+        shares = {"shares": self.dataset.shares} if isinstance(self.dataset, Mixture) else {}
+        return self.walk.state_dict() | {"snapshot": self.dataset.snapshot} | shares
 
     def load_state_dict(self, state: LoaderState) -> None:
         """Let the next iteration continue from `state`, which may come from another number of ranks.
@@ -206,12 +207,16 @@ class DataLoader(Generic[A]):
         Raises
         ------
         ConfigError
-            If the state has another seed, shuffle, number of videos or number of datasets.
+            If the state has another seed, shuffle, number of videos, number of datasets or shares of a mixture.
         FolderError
             If the folder does not have the snapshot, because it was removed or belongs to another dataset.
         """
         self.close()
-        snapshot = state.get("snapshot") if isinstance(state, Mapping) else None  # None in a stream's state
+        known = state if isinstance(state, Mapping) else {}
+        snapshot = known.get("snapshot")  # None in a stream's state
+        shares = self.dataset.shares if isinstance(self.dataset, Mixture) else None
+        if known.get("shares", shares) != shares:
+            raise ConfigError(f"the state has shares {known['shares']}, but the dataset {shares}: their orders differ")
         dataset = self.dataset.at(snapshot) if isinstance(snapshot, str | list) else self.dataset
         sampler = self.walk.over(len(dataset))
         sampler.load_state_dict(state)

@@ -152,7 +152,7 @@ def open(
         if snapshot is not None:
             raise ConfigError("snapshot must be None for a list of datasets")
         return _joined([open(one, *view, timeout=timeout, deadline=deadline) for one in path])
-    root = place(path, Network(timeout, deadline))
+    root = path if isinstance(path, Url) else place(path, Network(timeout, deadline))  # a Url has its limits
     manifest = read_manifest(root, snapshot)
     split = _chosen_split(root, manifest, split)
     names = chosen_fields(f"{root}", manifest.fields, fields)

@@ -56,6 +56,8 @@ def mix(datasets: Mapping[str, VideoReader], weights: Weights | None = None) -> 
         raise ConfigError("datasets is empty, but must name one dataset or more")
     first = next(iter(datasets))
     for name, other in datasets.items():
+        if isinstance(other, Mixture):
+            raise ConfigError(f"dataset {name} is a mixture, but must be a dataset: mix those that it consists of")
         _compare(first, datasets[first], name, other)
     return Mixture(datasets, _shares(list(datasets), weights))
 

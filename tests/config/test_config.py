@@ -3,7 +3,7 @@
 import dataclasses
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from tiny import CONFIG, changed
 
@@ -109,6 +109,7 @@ PLAIN = st.recursive(
 )
 
 
+@settings(deadline=None)
 @given(st.dictionaries(st.text(), PLAIN | st.sampled_from(["yes", "on", "1e-3", "017", "2001-01-01", "~", "=", "<<"])))
 def test_plain_values_survive_yaml_in_their_order(values):
     again = parse_yaml(yaml_text(values), "its text")

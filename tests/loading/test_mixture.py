@@ -100,6 +100,20 @@ def test_a_mixture_resumes_at_the_very_batch_on_any_world_size(sources: dict) ->
                 assert_array_equal(np.concatenate([share[name] for share in shares]), values)
 
 
+def test_a_state_of_other_weights_is_refused(sources: dict) -> None:
+    one, other = (gen2d.DataLoader(gen2d.mix(sources, weights), 6) for weights in (WEIGHTS, [1, 2, 3]))
+    state = one.state_dict()
+    other.walk.videos = one.walk.videos  # a mixture of the same length
+    with pytest.raises(ConfigError, match=r"the state has shares \[5, 3, 2\], but the dataset \[1, 2, 3\]"):
+        other.load_state_dict(state)
+
+
+def test_a_mixture_of_mixtures_is_refused(sources: dict) -> None:
+    inner: Any = gen2d.mix(sources)
+    with pytest.raises(ConfigError, match="dataset inner is a mixture, but must be a dataset"):
+        gen2d.mix({"inner": inner, **sources})
+
+
 def test_a_mixture_of_one_is_that_one(sources: dict) -> None:
     mixture = gen2d.mix({"a": sources["a"]}, {"a": 2.5})
     assert len(mixture) == 20
