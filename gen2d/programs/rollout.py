@@ -43,10 +43,8 @@ from gen2d.sampling.sampler import FactorChange, Sampler
 SLICE_BYTES = 16 * 2**20  # of raw frames rendered at once; larger buffers cost page faults
 SHARD_BYTES = 2**30  # of raw frames in a shard
 SHARD_VIDEOS = 1024  # largest default
-BATCH_SIZE, PAIRS = (
-    512,
-    2**20,
-)  # largest number of videos simulated at once, and of their pairs of bodies, 300 bytes each
+# Limits of a default batch: videos, and pairs of their bodies, which take 300 bytes each.
+BATCH_SIZE, PAIRS = 512, 2**20
 VIDEOS = PartitionSpec("videos")
 
 

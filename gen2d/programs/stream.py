@@ -33,9 +33,8 @@ from gen2d.records.axes import Array
 from gen2d.records.keys import MAX_VIDEOS
 
 Arrays = dict[str, Any]
-SHARES = np.arange(256, dtype=np.float32) / np.float32(
-    255
-)  # a table, as XLA would multiply by 1 / 255, which rounds differently
+# A table, because XLA would multiply by 1 / 255, which rounds differently.
+SHARES = np.arange(256, dtype=np.float32) / np.float32(255)
 
 
 def stream(
