@@ -47,7 +47,7 @@ class Video:
         return plot.overlay(self, **options)
 
     def save(self, path: str | Path, **options: Any) -> Path:
-        """Write a film (.webp or .mp4) or an image of all frames (.png), and return the path; options as in `plot.save`."""
+        """Write a film (.webp, .mp4) or an image of all frames (.png); return the path. Options as in `plot.save`."""
         from gen2d.space import plot
 
         return plot.save(self, path, **options)
