@@ -130,14 +130,20 @@ def generate(
         dataset = dataset_of(source, out, counts, fingerprint(source.rollout))
         remaining = [shard for shard in shards.open_folder(dataset, overwrite) if shard.split in counts]
         todo = shards_of_worker(remaining, *worker)
-        began, made = time.perf_counter(), sum(shard.count for shard in todo)
+        began, video_count = time.perf_counter(), sum(shard.count for shard in todo)
         size = make(source, dataset, todo, say)
     is_complete = complete(dataset)
     seconds = time.perf_counter() - began
     if todo:
-        entry = {"time": time.time(), "host": os.uname().nodename, "videos": made, "seconds": seconds, "bytes": size}
+        entry = {
+            "time": time.time(),
+            "host": os.uname().nodename,
+            "videos": video_count,
+            "seconds": seconds,
+            "bytes": size,
+        }
         shards.log(out, entry | {"devices": len(on), "platform": on[0].platform})
-    return Summary(out, made, sum(counts.values()), seconds, size, is_complete)
+    return Summary(out, video_count, sum(counts.values()), seconds, size, is_complete)
 
 
 def _counts(config: Config, n: int, split: str | None) -> dict[str, int]:
@@ -183,7 +189,7 @@ def dataset_of(
         constants=schema.constants,
         conventions=CONVENTIONS,
         command="python -m gen2d --config config.yaml",
-        copies={place: config.copies[name] for place, name in own_files(config.plain()).items()},
+        copies={path: config.copies[name] for path, name in own_files(config.plain()).items()},
     )
 
 

@@ -35,8 +35,8 @@ def config_from(root: Place, identity: Mapping[str, Any], trust: Trust = ()) -> 
     Raises ConfigError if the config cannot be used here, and UntrustedError if it needs code that is not trusted.
     """
     config = identity["config"]
-    copies = {where: copy for where, copy in _copies(root, config).items() if sha256(copy[1]) in _hashes(config)}
-    check_trusted({where: content for where, (_, content) in copies.items()}, trust, root)
+    copies = {path: copy for path, copy in _copies(root, config).items() if sha256(copy[1]) in _hashes(config)}
+    check_trusted({path: content for path, (_, content) in copies.items()}, trust, root)
     try:
         return load_config(config | {"seed": identity["seed"]}, copies=StoredCopies(copies.values()))
     except ConfigError as error:

@@ -297,8 +297,8 @@ def _changed(height: int | None, width: int | None) -> list[str]:
 
 def _asked(fields: Sequence[str] | None, section: Annotations) -> dict[str, Any]:
     """Options that switch on the annotations of these fields."""
-    wanted = set(fields or ())
-    off = [plugin for plugin in section.pixels if not plugin.options and wanted & plugin.contract.fields.keys()]
+    requested = set(fields or ())
+    off = [plugin for plugin in section.pixels if not plugin.options and requested & plugin.contract.fields.keys()]
     return {plugin.name: plugin.contract.usual for plugin in off}
 
 

@@ -145,13 +145,15 @@ class VideoSource:
                 batches.setdefault((own.split, first), []).append(own)
         for split, group in itertools.groupby(batches, key=lambda batch: batch[0]):
             firsts = [first for _, first in group]
-            for place in range(0, len(firsts), devices):
-                own = firsts[place : place + devices]
+            for position in range(0, len(firsts), devices):
+                own = firsts[position : position + devices]
                 parts = [
-                    Part(next(order), of, device, first, start, slice(max(low, start), min(high, start + step)))
+                    Part(
+                        next(order), video_range, device, first, start, slice(max(low, start), min(high, start + step))
+                    )
                     for device, first in enumerate(own)
-                    for of in batches[split, first]
-                    for low, high in [(max(of.first - first, 0), min(of.stop - first, size))]
+                    for video_range in batches[split, first]
+                    for low, high in [(max(video_range.first - first, 0), min(video_range.stop - first, size))]
                     for step in [self.rollout.slice]
                     for start in range(low // step * step, high, step)
                 ]

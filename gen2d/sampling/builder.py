@@ -248,10 +248,10 @@ def distance_joints(anchor_a: Any, anchor_b: Any, **numbers: Any) -> Joints:
     anchors = [jnp.asarray(x, jnp.float32) for x in (anchor_a, anchor_b)]
     defaults = {"rest": 0.0, "stiffness": jnp.inf, "damping": 0.0, "lower": -jnp.inf, "upper": jnp.inf}
     defaults |= {"motor_speed": 0.0, "motor_torque": 0.0}
-    known = [field.name for field in dataclasses.fields(Joints) if field.name in defaults]
-    assert not numbers.keys() - set(known), f"{numbers.keys() - set(known)} are not of {known}"
+    names = [field.name for field in dataclasses.fields(Joints) if field.name in defaults]
+    assert not numbers.keys() - set(names), f"{numbers.keys() - set(names)} are not of {names}"
     values = {
-        name: jnp.broadcast_to(jnp.asarray((defaults | numbers)[name], jnp.float32), len(anchors[0])) for name in known
+        name: jnp.broadcast_to(jnp.asarray((defaults | numbers)[name], jnp.float32), len(anchors[0])) for name in names
     }
     return Joints(*anchors, **values)
 

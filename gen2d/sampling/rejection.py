@@ -44,13 +44,13 @@ def accepted_batch(
     `make(rows, attempts)` returns a batch with these attempts at the videos in these rows; its `columns` have the rows
     first. Raises NoVideoError if a video has no accepted attempt among `options.attempts`.
     """
-    wanted, rows = ranges(options), np.arange(len(numbers))
+    limits, rows = ranges(options), np.arange(len(numbers))
     chosen = np.zeros(len(numbers), np.int64)
     batch = make(rows, chosen)
-    pending, tried = rows[~_fits(batch, wanted)], 1
+    pending, tried = rows[~_fits(batch, limits)], 1
     while len(pending):
         if tried > options.attempts:
-            required = ", ".join(f"{name} from {low:g} to {high:g}" for name, (low, high) in wanted.items())
+            required = ", ".join(f"{name} from {low:g} to {high:g}" for name, (low, high) in limits.items())
             raise NoVideoError(
                 f"quality: none of {options.attempts} attempts at video {numbers[pending[0]]} has {required}; ask for "
                 "less, or for more quality.attempts"
@@ -59,7 +59,7 @@ def accepted_batch(
         videos, attempts = np.repeat(pending, per_video), tried + np.tile(np.arange(per_video), len(pending))
         fill = np.resize(np.arange(len(videos)), len(rows))  # idle rows are padded with copies
         attempted = make(videos[fill], attempts[fill])
-        fits = (_fits(attempted, wanted)[: len(videos)] & (attempts <= options.attempts)).reshape(
+        fits = (_fits(attempted, limits)[: len(videos)] & (attempts <= options.attempts)).reshape(
             len(pending), per_video
         )
         accepted, first = fits.any(axis=1), fits.argmax(axis=1)

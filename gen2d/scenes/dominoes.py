@@ -68,8 +68,8 @@ def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledSc
     # The centre is above and left of the foot about which the first domino turns.
     velocity = factors["spin"] * jnp.stack([-height, -thickness]) / 2
     row = builder.boxes(
-        positions, 0.0, thickness, height, numbers < count, velocity=is_first[:, None] * velocity, spin=is_first * factors["spin"],
-        **builder.material(factors),
+        positions, 0.0, thickness, height, numbers < count,
+        velocity=is_first[:, None] * velocity, spin=is_first * factors["spin"], **builder.material(factors),
     )  # fmt: skip
     ball = builder.discs(
         jnp.stack([first - factors["ball_distance"] - radius, factors["ball_height"] * height])[None], radius,

@@ -329,25 +329,25 @@ class Space:
     ) -> int:  # fmt: skip
         if kind not in KINDS:
             raise ConfigError(f"{name}: kind is {kind!r}, but must be one of {', '.join(KINDS)}")
-        number, of = len(self.bodies), lambda option: f"{name}: {option}"
+        number, label = len(self.bodies), lambda option: f"{name}: {option}"
         body = Body(
             shape=shape,
             position=position,
-            angle=checked_number(of("angle"), angle),
+            angle=checked_number(label("angle"), angle),
             kind=KINDS[kind],
             radius=radius,
             half_length=half_length,
             vertices=np.zeros((0, 2)) if vertices is None else vertices,
-            velocity=checked_pair(of("velocity"), velocity),
-            spin=checked_number(of("spin"), spin),
+            velocity=checked_pair(label("velocity"), velocity),
+            spin=checked_number(label("spin"), spin),
             mass=math.inf,
             moment=math.inf,
-            elasticity=checked_number(of("elasticity"), elasticity, low=0),
-            friction=checked_number(of("friction"), friction, low=0),
-            rolling_resistance=checked_number(of("rolling_resistance"), rolling_resistance, low=0),
-            color=checked_color(of("color"), color, number, KINDS[kind]),
-            force=checked_pair(of("force"), (0.0, 0.0) if force is None else force),
-            torque=checked_number(of("torque"), 0.0 if torque is None else torque),
+            elasticity=checked_number(label("elasticity"), elasticity, low=0),
+            friction=checked_number(label("friction"), friction, low=0),
+            rolling_resistance=checked_number(label("rolling_resistance"), rolling_resistance, low=0),
+            color=checked_color(label("color"), color, number, KINDS[kind]),
+            force=checked_pair(label("force"), (0.0, 0.0) if force is None else force),
+            torque=checked_number(label("torque"), 0.0 if torque is None else torque),
         )
         if body.elasticity > 1:
             raise ConfigError(f"{name}: elasticity is {elasticity!r}, but must be a number from 0 to 1")
@@ -411,10 +411,8 @@ class Space:
         )
         state = State(column("position"), column("angle"), column("velocity"), column("spin"))
         scene = Scene(objects, jnp.asarray(self.gravity, real), self._joints(real))
-        slot_of = [
-            *number_of,
-            *(set(range(len(bodies))) - number_of.keys()),
-        ]  # the last one, -1, is the world's, if there is one
+        # The last one, -1, is the world's if a joint needs it.
+        slot_of = [*number_of, *(set(range(len(bodies))) - number_of.keys())]
         ties = tuple(JointSpec(j.kind, slot_of[j.a], slot_of[j.b], j.collide) for j in self.joints)
         return scene, state, Layout(runs, joints=ties)
 
@@ -573,17 +571,20 @@ class Space:
         exempt = {frozenset((tie.a, tie.b)) for tie in layout.joints if not tie.collide}
         body_poses = jnp.asarray(position.transpose(2, 1, 0)), jnp.asarray(angle.T)
         overlaps = []
-        for one, two in itertools.combinations_with_replacement(layout.spans, 2):
+        for span_a, span_b in itertools.combinations_with_replacement(layout.spans, 2):
             pairs = [
-                (i, j) for i in slots_of_span(one) for j in slots_of_span(two) if i < j and number[i] >= 0 <= number[j]
+                (i, j)
+                for i in slots_of_span(span_a)
+                for j in slots_of_span(span_b)
+                if i < j and number[i] >= 0 <= number[j]
             ]
             pairs = [pair for pair in pairs if frozenset(pair) not in exempt]
-            if not pairs or (one[0].kind != DYNAMIC and two[0].kind != DYNAMIC):
+            if not pairs or (span_a[0].kind != DYNAMIC and span_b[0].kind != DYNAMIC):
                 continue
             sides = [np.array(side) for side in zip(*pairs, strict=True)]
             first, second = (number[side] for side in sides)
             poses = [[x[..., who, :] for x in body_poses] for who in (first, second)]
-            for gap, point, normal in touching_points((one[0], two[0]), objects, sides, poses):
+            for gap, point, normal in touching_points((span_a[0], span_b[0]), objects, sides, poses):
                 pair, frame = np.nonzero(np.asarray(gap) < 0)
                 points, normals = (np.asarray(x)[:, pair, frame].T for x in (point, normal))
                 overlaps.append(

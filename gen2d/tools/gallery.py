@@ -53,8 +53,8 @@ def gallery(
         looks = _looks(config_of(ds, overrides, trust).plain()["look"])
         picture, name = _sheet(ds, videos, looks, overrides, trust), ds.manifest.name
     else:
-        with _annotated_video(source, videos, seed, overrides) as (ds, plain, own):
-            picture, name = _sheet(ds, videos, _looks(plain["look"]), (), own), plain["name"]
+        with _annotated_video(source, videos, seed, overrides) as (ds, plain, own_files):
+            picture, name = _sheet(ds, videos, _looks(plain["look"]), (), own_files), plain["name"]
     path = out / f"{name}-gallery.png"
     with writing(out):
         write(path, picture)
@@ -72,8 +72,8 @@ def families(
     check_folder(out)
     rows, paths = [], []
     for name in plugins.names("scene"):
-        own = f"{name}.yaml" in plugins.config_names()
-        with _annotated_video(name if own else {"name": name, "scene": name}, videos, seed, overrides) as (
+        has_config = f"{name}.yaml" in plugins.config_names()
+        with _annotated_video(name if has_config else {"name": name, "scene": name}, videos, seed, overrides) as (
             ds,
             plain,
             own_files,
