@@ -50,18 +50,18 @@ def publication(spec: DatasetSpec, shards: list[Shard], records: Records, old: M
     """
     tables, rows = {}, {}
     for split in sorted({shard.split for shard in shards}):
-        split_shards = [shard for shard in shards if shard.split == split]
-        rows[split] = records.table(split, split_shards)
-        content, name = npy(rows[split]), table_name(split, split_shards[-1].first + split_shards[-1].count)
+        of_split = [shard for shard in shards if shard.split == split]
+        rows[split] = records.table(split, of_split)
+        content, name = npy(rows[split]), table_name(split, of_split[-1].first + of_split[-1].count)
         publish_changed(spec.root / name, content)
         sizes = rows[split]["bytes"].tolist()
-        tables[split] = ShardTable(name, sha256(content), len(split_shards), sum(sizes), max(sizes))
+        tables[split] = ShardTable(name, sha256(content), len(of_split), sum(sizes), max(sizes))
     counts = {shard.split: shard.first + shard.count for shard in shards}
     if old and (old.identity_sha256, old.splits, old.tables) == (spec.identity_sha256, counts, tables):
         present = _present_publication(spec, old)
         if present is not None:
             return present
-    stats = {split: summary(split_shards["moments"], spec.fields) for split, split_shards in rows.items()}
+    stats = {split: summary(of_split["moments"], spec.fields) for split, of_split in rows.items()}
     files = spec.recipe_files
     hashes = {name: sha256(content) for name, content in files.items()}
     manifest = describe(spec, counts, tables, stats, hashes)

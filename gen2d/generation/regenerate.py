@@ -252,8 +252,8 @@ def _damaged_shards(
 def _staging(root: Place) -> Iterator[Path]:
     """Temporary folder for new shards, on the dataset's disk unless the dataset is at a URL."""
     if isinstance(root, Url):
-        with tempfile.TemporaryDirectory(prefix="gen2d-") as folder_path:
-            yield Path(folder_path)
+        with tempfile.TemporaryDirectory(prefix="gen2d-") as temporary:
+            yield Path(temporary)
         return
     (root / MARK).mkdir(exist_ok=True)
     stage = root / MARK / temporary_name(STAGED.name)

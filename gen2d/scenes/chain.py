@@ -106,16 +106,16 @@ def _pulled(factors: dict[str, Array], n: int) -> tuple[Array, Array]:
 
     The midpoint of the third side, from pin to pin, is the origin.
     """
-    apart = factors["span"] * n  # all in lengths of a link
-    first, last = jnp.ceil((n - apart) / 2 + 1e-3), jnp.floor((n + apart) / 2 - 1e-3)
+    span = factors["span"] * n  # all in lengths of a link
+    first, last = jnp.ceil((n - span) / 2 + 1e-3), jnp.floor((n + span) / 2 - 1e-3)
     kink = first + jnp.minimum(jnp.floor(factors["pulled_joint"] * (last - first + 1)), last - first)
-    along = (kink**2 - (n - kink) ** 2 + apart**2) / (2 * apart)
+    along = (kink**2 - (n - kink) ** 2 + span**2) / (2 * span)
     aside = jnp.sqrt(jnp.maximum(kink**2 - along**2, 0.0)) * (2 * factors["pulled_above"] - 1)
     number, zero = jnp.arange(n + 1.0), jnp.zeros(())
-    one, tip, other = jnp.stack([zero, zero]), jnp.stack([along, aside]), jnp.stack([apart, zero])
+    left_pin, tip, right_pin = jnp.stack([zero, zero]), jnp.stack([along, aside]), jnp.stack([span, zero])
     up, down = (number / kink)[:, None], ((number - kink) / (n - kink))[:, None]
-    corners = jnp.where(number[:, None] <= kink, one + up * (tip - one), tip + down * (other - tip))
-    corners = corners - jnp.stack([apart / 2, zero])
+    corners = jnp.where(number[:, None] <= kink, left_pin + up * (tip - left_pin), tip + down * (right_pin - tip))
+    corners = corners - jnp.stack([span / 2, zero])
     cos, sin = jnp.cos(factors["slope"]), jnp.sin(factors["slope"])
     return factors["length"] * corners @ jnp.stack([jnp.stack([cos, sin]), jnp.stack([-sin, cos])]), kink
 

@@ -394,8 +394,8 @@ class Space:
         corners = max((run.vertices for run in runs), default=0)
         vertices = np.array([fill_vertices(body.vertices, corners) for body in bodies])
         counts = np.array([len(body.vertices) for body in bodies], np.uint8)
-        number_of = {int(slot_of): number for number, slot_of in enumerate(slots)}  # ordered by number
-        depths = [number_of.get(slot_of, 0) for slot_of in range(len(bodies))]
+        number_of = {int(slot): number for number, slot in enumerate(slots)}  # ordered by number
+        depths = [number_of.get(slot, 0) for slot in range(len(bodies))]
         objects = Objects(
             present=jnp.ones(len(bodies), bool),
             shape=jnp.asarray([SHAPES.index(body.shape) for body in bodies], jnp.uint8),
@@ -412,8 +412,8 @@ class Space:
         state = State(column("position"), column("angle"), column("velocity"), column("spin"))
         scene = Scene(objects, jnp.asarray(self.gravity, real), self._joints(real))
         # The last one, -1, is the world's if a joint needs it.
-        slot_of = [*number_of, *(set(range(len(bodies))) - number_of.keys())]
-        ties = tuple(JointSpec(j.kind, slot_of[j.a], slot_of[j.b], j.collide) for j in self.joints)
+        slot = [*number_of, *(set(range(len(bodies))) - number_of.keys())]
+        ties = tuple(JointSpec(j.kind, slot[j.a], slot[j.b], j.collide) for j in self.joints)
         return scene, state, Layout(runs, joints=ties)
 
     def _joints(self, real: Any) -> Joints | None:

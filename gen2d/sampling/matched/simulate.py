@@ -113,14 +113,12 @@ def _spliced(frame: Array, before: State, after: State) -> State:
 
 def _record_change(member: SetMember, before: MemberVideos, after: MemberVideos, config: Any) -> dict[str, Array]:
     """Record of a video's change, including that of a factor, and of the first frame that differs."""
-    original, member_scene = before.sampled, after.sampled
-    record, both = dict(after.record), original.scene.objects.present & member_scene.scene.objects.present
+    original, changed = before.sampled, after.sampled
+    record, both = dict(after.record), original.scene.objects.present & changed.scene.objects.present
     for index, name in enumerate(config.matched.change):
         if name not in INTERVENTIONS:
             applies = member.changed & (member.kind == index)
-            slot = changed_slot(
-                (original.scene.objects, original.state), (member_scene.scene.objects, member_scene.state)
-            )
+            slot = changed_slot((original.scene.objects, original.state), (changed.scene.objects, changed.state))
             record["object"] = jnp.where(applies, slot, record["object"])
             change = (after.factors[name] - before.factors[name]).astype(jnp.float32)
             size = (
