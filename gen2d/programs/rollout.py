@@ -42,7 +42,7 @@ from gen2d.sampling.sampler import FactorChange, Sampler
 
 SLICE_BYTES = 16 * 2**20  # of raw frames rendered at once; larger buffers cost page faults
 SHARD_BYTES = 2**30  # of raw frames in a shard
-SHARD_VIDEOS = 1024  # largest default
+SHARD_VIDEOS = 1024  # largest default number of videos in a shard
 # Limits of a default batch: videos, and pairs of their bodies, which take 300 bytes each.
 BATCH_SIZE, PAIRS = 512, 2**20
 VIDEOS = PartitionSpec("videos")
@@ -88,7 +88,7 @@ class Rollout:
         self.slice = divisor(self.batch_size, max(1, SLICE_BYTES // frame_bytes))
         self.mesh = Mesh(np.array(self.devices), ("videos",))
         self._draws: dict[int, Any] = {}  # by number of videos
-        self._drawn: set[int] = set()  # numbers of videos whose program is compiled
+        self._drawn: set[int] = set()  # those numbers whose program is compiled
         program = (
             self._simulated_batch
             if len(self.devices) == 1

@@ -188,9 +188,7 @@ class Stream:
     def _batches(self) -> Generator[Arrays, None, None]:
         parts: list[Arrays] = []
         cells: deque[_Cell] = deque()
-        for _, batch in self.source.batches(
-            self._requests(cells), ahead=1
-        ):  # the next is simulated while this is rendered
+        for _, batch in self.source.batches(self._requests(cells), ahead=1):  # the next is simulated meanwhile
             for index in range(min(len(cells), self.source.rollout.batch_size // self.cell)):
                 cell = cells.popleft()
                 parts.append(self._drawn(batch, index * self.cell, cell))

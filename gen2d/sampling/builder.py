@@ -31,13 +31,7 @@ from gen2d.records.layout import Layout, SlotGroup
 from gen2d.records.scene import Joints, Objects, Scene, State
 
 GREY = (128.0, 128.0, 128.0)
-OPTIONAL = (
-    "vertices",
-    "vertex_count",
-    "rolling_resistance",
-    "force",
-    "torque",
-)  # fields of objects that only some scenes have
+OPTIONAL = ("vertices", "vertex_count", "rolling_resistance", "force", "torque")  # fields that scenes may lack
 
 
 class SampledScene(NamedTuple):

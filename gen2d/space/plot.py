@@ -176,9 +176,7 @@ def _arrows(canvas: PlotCanvas, of: Drawable, frame: int) -> None:
     if contacts is None:
         return
     points, normals = np.asarray(contacts.point), np.asarray(contacts.normal)
-    current = (np.asarray(contacts.frame) == frame) & normals.any(
-        axis=1
-    )  # a contact that ended before the frame has no normal
+    current = (np.asarray(contacts.frame) == frame) & normals.any(axis=1)  # no normal: ended before the frame
     for point, normal in zip(points[current], normals[current], strict=True):
         canvas.arrow(point, normal)
 
