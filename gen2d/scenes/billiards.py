@@ -59,7 +59,7 @@ def check(options: Options) -> None:
 
 
 def sizes(options: Options) -> dict[str, int]:
-    """The balls of the largest rack."""
+    """The number of balls in the largest rack."""
     rows = int(options.rows.support[1])
     return {"rack": rows * (rows + 1) // 2}
 

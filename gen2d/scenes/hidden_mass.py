@@ -81,9 +81,8 @@ def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledSc
     radius, density, pairs = factors["radius"], factors["density"], factors["pairs"]
     number, sides = jnp.arange(len(density)), jnp.asarray([1.0, -1.0])
     present = number < pairs
-    inwards = radius + factors["relative_position"] * (
-        options.width / 2 - 2 * radius
-    )  # m, from the ball's side of the box
+    # Distance in m from the ball's side of the box.
+    inwards = radius + factors["relative_position"] * (options.width / 2 - 2 * radius)
     x = jnp.where(sides > 0, inwards, options.width - inwards)
     aside = factors["offset"] * 2 * radius
     y = ((number + 0.5) / pairs * options.height)[:, None] - sides * aside[:, None] / 2

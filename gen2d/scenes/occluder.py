@@ -82,7 +82,7 @@ def layout(options: Options) -> Layout:
 
 
 def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledScene:
-    """One video's scene and initial state: balls that move towards the screen, each in its own part of its height."""
+    """One video's scene and initial state: balls that move towards the screen, each to its own part of it."""
     radius, side, speed = factors["radius"], factors["side"], factors["speed"]
     number, largest = jnp.arange(len(radius)), options.radius.support[1]
     present = number < factors["balls"]

@@ -68,8 +68,8 @@ def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledSc
 def _margin(x: Array, width: Array, mass: Array, present: Array) -> Array:
     """Smallest distance in m, over all joints, of the centre of mass above the joint from the edge of its support.
 
-    A stack in which each block lies on one other stands if and only if the margin is positive and gravity is vertical.
-    The contact with the floor counts as a joint.
+    The contact with the floor counts as a joint. Under vertical gravity, a stack in which each block lies on one other
+    stands if and only if the margin is positive.
     """
     above = jnp.cumsum(mass[::-1])[::-1]
     centre = jnp.cumsum((mass * x)[::-1])[::-1] / jnp.where(above > 0, above, 1.0)
