@@ -1,1 +1,1 @@
-"""The host's loop: encode, write and complete a dataset, and make parts of one again."""
+"""Host loop: encode, write and complete a dataset, and regenerate parts of one."""

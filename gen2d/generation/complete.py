@@ -1,4 +1,4 @@
-"""The completion of a dataset: from finished shards to tables, cards and, last, the manifest that readers open."""
+"""Completion of a dataset: tables and cards of its finished shards and, last, the manifest that readers open."""
 
 import numpy as np
 
@@ -24,9 +24,9 @@ ROWS = 4  # videos on a contact sheet
 
 
 def complete(spec: DatasetSpec) -> bool:
-    """Publish the dataset if all its shards are done; returns whether they are.
+    """Publish the dataset if all its shards are done, and return whether they are.
 
-    False means that other workers still make shards.
+    False means that other workers are still generating shards. Raises UnreachableError if a server does not answer.
     """
     root = spec.root
     with explained(root), locked(root):
@@ -44,24 +44,24 @@ def complete(spec: DatasetSpec) -> bool:
 
 
 def publication(spec: DatasetSpec, shards: list[Shard], records: Records, old: Manifest | None) -> Publication:
-    """The manifest and other files of a snapshot with these shards; writes its tables into the folder.
+    """Write the tables of these shards into the folder; return the manifest and other files of the snapshot.
 
-    The manifest is `old` if that describes the same shards, whichever version of gen2d made it.
+    The manifest is `old` if that describes the same shards, whichever version of gen2d wrote it.
     """
     tables, rows = {}, {}
     for split in sorted({shard.split for shard in shards}):
-        own = [shard for shard in shards if shard.split == split]
-        rows[split] = records.table(split, own)
-        content, name = npy(rows[split]), table_name(split, own[-1].first + own[-1].count)
+        of_split = [shard for shard in shards if shard.split == split]
+        rows[split] = records.table(split, of_split)
+        content, name = npy(rows[split]), table_name(split, of_split[-1].first + of_split[-1].count)
         publish_changed(spec.root / name, content)
         sizes = rows[split]["bytes"].tolist()
-        tables[split] = ShardTable(name, sha256(content), len(own), sum(sizes), max(sizes))
+        tables[split] = ShardTable(name, sha256(content), len(of_split), sum(sizes), max(sizes))
     counts = {shard.split: shard.first + shard.count for shard in shards}
     if old and (old.identity_sha256, old.splits, old.tables) == (spec.identity_sha256, counts, tables):
         present = _present_publication(spec, old)
         if present is not None:
             return present
-    stats = {split: summary(own["moments"], spec.fields) for split, own in rows.items()}
+    stats = {split: summary(of_split["moments"], spec.fields) for split, of_split in rows.items()}
     files = spec.recipe_files
     hashes = {name: sha256(content) for name, content in files.items()}
     manifest = describe(spec, counts, tables, stats, hashes)
@@ -76,7 +76,7 @@ def _cards(spec: DatasetSpec, manifest: Manifest) -> dict[str, bytes]:
 
 
 def _present_publication(spec: DatasetSpec, old: Manifest) -> Publication | None:
-    """The present manifest and the files to write again because they are damaged; None if one of them would differ."""
+    """The current manifest and the damaged files to rewrite; None if the content of one of them would differ."""
     recipe, files = spec.recipe_files, {}
     for name, digest in old.files.items():
         try:
@@ -93,7 +93,7 @@ def _present_publication(spec: DatasetSpec, old: Manifest) -> Publication | None
 
 
 def sheet(root: Place, manifest: Manifest) -> bytes:
-    """A contact sheet of the first videos, as PNG; the manifest need not be in the folder yet."""
+    """Contact sheet of the first videos, as PNG; the manifest need not be in the folder yet."""
     options = ViewOptions(shown_split(manifest), ("frames",), None, 1, "first", "THWC", "uint8", "checksum")
     ds = Dataset(root, manifest, options)
     # One video in memory at a time: they may be long and large.

@@ -1,7 +1,6 @@
-"""Between the device and the disk: host threads that compress, and writers that fill one shard after the other.
+"""Compression of rendered videos in host threads.
 
-The device is never waited for by the threads that write, nor they by it, beyond a fixed number of slices in flight, so
-memory is bounded by a batch and not by the number of videos.
+The number of slices in flight is limited, so memory is bounded by a batch and not by the number of videos.
 """
 
 import os
@@ -19,7 +18,7 @@ from gen2d.programs.source import VideoRange, VideoSlice, VideoSource
 
 
 class Encoder:
-    """Compresses videos in threads, as they are rendered; `blocks` gives them in order."""
+    """Compress videos in threads as they are rendered; `blocks` yields them in order."""
 
     def __init__(self, source: VideoSource, dataset: DatasetSpec, threads: int) -> None:
         self.source, self.dataset = source, dataset
@@ -28,20 +27,23 @@ class Encoder:
         self.running: deque[Future[Block]] = deque()
 
     def encode(self, videos: VideoSlice) -> Block:
-        """The block of some videos; waits until they are rendered."""
+        """Encode videos as a block, once they are rendered.
+
+        Raises NotFiniteError if a field has values that are not finite.
+        """
         block = encode(videos.fields(), self.dataset.fields, self.dataset.codec, self.dataset.chunk_frames)
         _check_finite(block, int(videos.part.numbers[0]))
         return block
 
     def blocks(self, ranges: Sequence[VideoRange]) -> Iterator[tuple[Any, Block]]:
-        """Every block of these ranges with the range's tag, in the order of the videos."""
+        """Blocks of these ranges in the order of the videos, each with the tag of its range."""
         waiting: dict[int, tuple[Any, Future[Block]]] = {}
-        following = 0
+        next_order = 0
         for videos in self.source.slices(ranges):
             waiting[videos.part.order] = videos.part.range.tag, self._submit(videos)
-            while following in waiting and waiting[following][1].done():
-                tag, future = waiting.pop(following)
-                following += 1
+            while next_order in waiting and waiting[next_order][1].done():
+                tag, future = waiting.pop(next_order)
+                next_order += 1
                 yield tag, future.result()
         for order in sorted(waiting):
             tag, future = waiting.pop(order)
@@ -54,17 +56,17 @@ class Encoder:
         return self.running[-1]
 
     def close(self) -> None:
-        """Drops what has not begun and waits for the rest."""
+        """Cancel pending tasks and wait for running ones."""
         self.pool.shutdown(wait=True, cancel_futures=True)
 
 
 def shard_ranges(shards: Iterable[Shard]) -> list[VideoRange]:
-    """The videos of each shard, which is their tag."""
+    """Ranges of the videos of these shards, each tagged with its shard."""
     return [VideoRange(shard.split, shard.first, shard.first + shard.count, shard) for shard in shards]
 
 
 def _check_finite(block: Block, first: int) -> None:
-    """Raises NotFiniteError where the sums of a field's values, which the block holds anyway, are not finite."""
+    """Raise NotFiniteError if a field has values that are not finite, by their sums, which the block holds anyway."""
     for name, moments in block.moments.items():
         finite = np.isfinite(moments[:, 1]).all(axis=-1)
         if not finite.all():
@@ -75,9 +77,9 @@ def _check_finite(block: Block, first: int) -> None:
 
 
 class NotFiniteError(UserError):
-    """A scene with numbers that a simulation cannot take."""
+    """A simulation gave values that are not finite."""
 
 
 def threads_for(cores: int) -> int:
-    """How many host threads compress."""
+    """Number of threads that compress: one per core, or fewer if GEN2D_THREADS says so."""
     return max(1, min(cores, int(os.environ.get("GEN2D_THREADS", cores))))

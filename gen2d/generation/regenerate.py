@@ -1,4 +1,4 @@
-"""Regeneration of a stored dataset from its recipe: videos to compare with, and damaged shards to replace."""
+"""Regeneration of a dataset from its recipe: videos for comparison, and shards that replace damaged ones."""
 
 import contextlib
 import dataclasses
@@ -49,30 +49,30 @@ CODECS = ("h5py", "hdf5", "isal", "zstandard", "numpy")
 
 
 def source_of(root: Place, identity: Identity, trust: Trust = ()) -> VideoSource:
-    """The videos of the recipe of the dataset in the folder.
+    """Source of the videos of the dataset in this folder.
 
-    Raises ConfigError if its config cannot be used here, and UntrustedError if it names untrusted code of the dataset.
+    Raises ConfigError if its config cannot be used here, and UntrustedError if it needs code that is not trusted.
     """
     on_cpu = str(identity["fingerprint"].get("device", "")).startswith("cpu")
     return _source(config_from(root, identity, trust), on_cpu)
 
 
-@functools.lru_cache(maxsize=1)  # a check, a repair and the check that follows compile once
+@functools.lru_cache(maxsize=1)  # so that check, repair and second check compile once
 def _source(config: Config, on_cpu: bool) -> VideoSource:
     return VideoSource(config, devices.prepare("cpu" if on_cpu else "auto"))
 
 
 def check_fingerprint(root: Place, source: VideoSource, identity: Identity) -> None:
-    """Check that this machine and these versions make the same bits; raises FolderError."""
-    there = dict(identity["fingerprint"])
-    programs = there.pop("programs", {})
-    _check_equal(root, there, machine(source.rollout))  # at once: tracing the programs takes long
+    """Raise FolderError unless this machine and these versions generate the same bits."""
+    stored = dict(identity["fingerprint"])
+    programs = stored.pop("programs", {})
+    _check_equal(root, stored, machine(source.rollout))  # first, because tracing the programs is slow
     _check_equal(root, {"programs": programs}, {"programs": fingerprint(source.rollout)["programs"]})
 
 
 def _check_equal(root: Place, there: Identity, here: Identity) -> None:
-    both = {"fingerprint": there}, {"fingerprint": here}
-    difference = folder.describe_differences(*both, folder.sources_of(root), sources())
+    fingerprints = {"fingerprint": there}, {"fingerprint": here}
+    difference = folder.describe_differences(*fingerprints, folder.sources_of(root), sources())
     if difference:
         raise FolderError(
             f"{root}: its videos can be neither compared nor repaired here, as bits would differ: {difference}"
@@ -82,7 +82,7 @@ def _check_equal(root: Place, there: Identity, here: Identity) -> None:
 def changed_videos(
     source: VideoSource, root: Place, manifest: Manifest, chosen: Sequence[tuple[str, int]]
 ) -> Iterator[tuple[str, str]]:
-    """The shard and a sentence for each field of the videos (split, number) that differs from its regenerated value.
+    """Shard and a sentence for each stored field of these videos (split, number) that differs when regenerated.
 
     Videos that cannot be read are skipped: the level "full" reports them. Raises FolderError if a constant differs.
     """
@@ -90,15 +90,15 @@ def changed_videos(
         if name not in manifest.constants or not np.array_equal(values, manifest.constants[name]):
             raise FolderError(f"{root}: its constant {name} differs from the one that its recipe makes")
     stored = {split: loader.open(root, split, fields=("*",)) for split in manifest.splits}
-    for own, splits in source.of_splits(split for split, _ in chosen):
+    for split_source, splits in source.of_splits(split for split, _ in chosen):
         ranges = [
             VideoRange(split, number, number + 1, _shard_name(manifest, split, number))
             for split, number in sorted(chosen)
             if split in splits
         ]
-        for videos in own.slices(ranges):
+        for videos in split_source.slices(ranges):
             split, number, _, shard = videos.part.range
-            fields = {name: column[0] for name, column in videos.fields().items() if name in own.schema.fields}
+            fields = {name: column[0] for name, column in videos.fields().items() if name in split_source.schema.fields}
             for name in _changed_fields(stored[split], number, fields) or ():
                 yield shard, f"{name} of {split} video {number} is not what its recipe makes"
 
@@ -131,14 +131,37 @@ def repair(
     timeout: float = 30.0,
     deadline: float = 300.0,
 ) -> list[str]:
-    """Make the shards called `bad` again, and all others without an intact row and file; returns their names.
+    """Regenerate damaged shards of a dataset.
 
-    The new shards are made and verified beside the dataset. Then they replace the old ones, and tables, cards, config
-    and manifest are written again where they differ. At no moment is the dataset worse than before. If the manifest is
-    damaged, the tables decide what the dataset holds.
+    These are the shards in `bad` and all others without an intact row and file. The new shards are generated and
+    verified beside the dataset. Then they replace the old ones, and tables, cards, config and manifest are rewritten
+    where they differ. At no moment is the dataset worse than before. If the manifest is damaged, the tables determine
+    what the dataset holds.
 
-    Raises FolderError, before anything changes, if a shard cannot be made again here, and UntrustedError if that needs
-    untrusted code of the dataset.
+    Parameters
+    ----------
+    root : str or path
+        The dataset's folder or URL.
+    bad : sequence of str
+        Names of shards to regenerate, as `verify` passes them.
+    say : callable, optional
+        Receives lines of progress for a person.
+    trust : str or sequence of str
+        sha256 of code in the dataset that may run.
+    timeout, deadline : float
+        Limits in s of a server's silence and of a whole request, as in `open`.
+
+    Returns
+    -------
+    list of str
+        Names of the regenerated shards.
+
+    Raises
+    ------
+    FolderError
+        If a shard cannot be regenerated here, before anything changes, or if the dataset changed during the repair.
+    UntrustedError
+        If that needs code of the dataset that is not trusted.
     """
     root = place(root, Network(timeout, deadline))
     folder.check_links(root)
@@ -169,7 +192,7 @@ def repair(
 
 
 def _tables_by_name(root: Place, spec: DatasetSpec) -> tuple[dict[str, int], dict[str, np.ndarray]]:
-    """The number of videos and the intact rows of each split, from the tables alone; raises FolderError."""
+    """Number of videos and intact rows of each split, from the tables alone; raises FolderError if none is intact."""
     counts, rows = tables_by_name(root, shard_type(spec.fields), spec.identity_sha256, spec.videos_per_shard)
     if not counts:
         raise FolderError(
@@ -180,7 +203,7 @@ def _tables_by_name(root: Place, spec: DatasetSpec) -> tuple[dict[str, int], dic
 
 
 def _manifest_and_identity(root: Place) -> tuple[Manifest | None, Identity]:
-    """The manifest, if it is intact, and the identity of the dataset; raises FolderError if neither is known."""
+    """Manifest, if it is intact, and identity of the dataset; raises FolderError if neither can be read."""
     try:
         manifest = read_manifest(root)
     except DamagedError:
@@ -194,9 +217,9 @@ def _manifest_and_identity(root: Place) -> tuple[Manifest | None, Identity]:
 
 
 def _original_spec(source: VideoSource, root: Place, identity: Identity, manifest: Manifest | None) -> DatasetSpec:
-    """The spec of the dataset without its splits, with the versions that its manifest names if that is intact.
+    """Spec of the dataset without its splits, with the versions in its manifest if that is intact.
 
-    Raises FolderError if the dataset's config makes another dataset here.
+    Raises FolderError if the dataset's config describes another dataset here.
     """
     spec = dataset_of(source, root, {}, identity["fingerprint"])
     difference = folder.describe_differences(identity, spec.identity, {}, {})
@@ -210,7 +233,7 @@ def _original_spec(source: VideoSource, root: Place, identity: Identity, manifes
 def _damaged_shards(
     root: Place, shards: Sequence[Shard], records: Records, bad: Sequence[str], every_byte: bool
 ) -> list[Shard]:
-    """The shards that must be made again; with `every_byte`, the sha256 of every file is compared with its row."""
+    """Shards to regenerate; with `every_byte`, the sha256 of every file is compared with its row."""
     sizes, damaged = folder.Sizes(root), set(bad)
     for shard in shards:
         row = records.row_of(shard)
@@ -227,10 +250,10 @@ def _damaged_shards(
 
 @contextlib.contextmanager
 def _staging(root: Place) -> Iterator[Path]:
-    """A temporary folder for new shards; on the dataset's disk, unless it is at a URL."""
+    """Temporary folder for new shards, on the dataset's disk unless the dataset is at a URL."""
     if isinstance(root, Url):
-        with tempfile.TemporaryDirectory(prefix="gen2d-") as home:
-            yield Path(home)
+        with tempfile.TemporaryDirectory(prefix="gen2d-") as temporary:
+            yield Path(temporary)
         return
     (root / MARK).mkdir(exist_ok=True)
     stage = root / MARK / temporary_name(STAGED.name)
@@ -251,7 +274,7 @@ def _remake(
     manifest: Manifest | None,
     say: Callable[[str], None],
 ) -> Records:
-    """Make the shards in the folder `stage` and verify them; returns their rows, or raises FolderError."""
+    """Generate these shards in the folder `stage`; return their rows, or raise FolderError if one is not right."""
     for name in ("shards", f"{RECORDS}"):
         (stage / name).mkdir(parents=True)
     staged_spec = dataclasses.replace(spec, root=stage)
@@ -274,7 +297,7 @@ def _remake(
 
 
 def _faults(path: Path, shard: Shard, row: np.void, manifest: Manifest | None) -> list[str]:
-    """The faults of a new shard on the disk, a sentence each."""
+    """Faults of a new shard on disk, a sentence each."""
     if file_sha256(path) != row["sha256"].tobytes().hex():
         return ["the disk does not hold what was written"]
     values = hdf5.read(path)
@@ -284,9 +307,9 @@ def _faults(path: Path, shard: Shard, row: np.void, manifest: Manifest | None) -
 
 
 def _reproduces(root: Place, shard: Shard, path: Path, manifest: Manifest | None) -> bool:
-    """Whether the new file `path` has some video of the stored shard, to the bit.
+    """Whether some video in the new file `path` equals the stored one to the bit.
 
-    If it has, this machine makes the right bits, and the stored videos that differ were wrong.
+    If so, this machine generates the right bits, and the stored videos that differ were damaged.
     """
     if manifest is None:
         return False
@@ -310,7 +333,7 @@ def _replace(source: Path, target: Place) -> None:
 def _merge(
     spec: DatasetSpec, shards: Sequence[Shard], records: Records, staged: Records, todo: Sequence[Shard]
 ) -> Records:
-    """The rows of all shards: `staged` for those in `todo`, `records` for the others."""
+    """Rows of all shards: from `staged` for those in `todo`, from `records` for the others."""
     remade = {shard.name for shard in todo}
     rows: dict[str, list[Any]] = {}
     for shard in shards:
@@ -318,4 +341,4 @@ def _merge(
         assert row is not None
         rows.setdefault(shard.split, []).append(row)
     kind = shard_type(spec.fields)
-    return Records(spec.videos_per_shard, {split: np.array(own, kind) for split, own in rows.items()})
+    return Records(spec.videos_per_shard, {split: np.array(split_rows, kind) for split, split_rows in rows.items()})

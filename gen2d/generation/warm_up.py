@@ -1,4 +1,4 @@
-"""Before a run: compile, measure a slice, estimate, and refuse what cannot be."""
+"""Start of a run: compile, time a slice, estimate size and duration, and refuse what does not fit the disk."""
 
 import time
 from collections.abc import Callable, Sequence
@@ -19,13 +19,16 @@ from gen2d.programs.source import Request, VideoRange, VideoSlice, VideoSource
 
 
 class DeviceMemoryError(UserError):
-    """A batch that does not fit the device."""
+    """A batch does not fit the memory of the device."""
 
 
 def warm_up(
     source: VideoSource, encoder: Encoder, ranges: Sequence[VideoRange], count: int, say: Callable[[str], None]
 ) -> None:
-    """Compiles, measures a slice, says how much and how long it will be, and refuses what the disk cannot hold."""
+    """Compile, and report the estimated size and duration of a run of `count` videos.
+
+    Raises FolderError if the disk is too small, and DeviceMemoryError if a batch does not fit the device.
+    """
     rollout = source.rollout
     name = f"{len(rollout.devices)} {rollout.devices[0].platform} device{'s' if len(rollout.devices) > 1 else ''}"
     say(f"Compiling for {name} (seconds; up to a minute for dozens of objects; kept for the next run) ...")
@@ -47,7 +50,7 @@ def warm_up(
 
 
 def _fit_slice(rollout: Rollout, batch: DeviceBatch) -> None:
-    """Compiles the rendering, of fewer videos at once where the device has no memory for more."""
+    """Compile the rendering, and halve the slice until it fits the memory of the device."""
     while True:
         try:
             jax.block_until_ready(rollout.draw(batch, 0, rollout.slice))
@@ -59,7 +62,7 @@ def _fit_slice(rollout: Rollout, batch: DeviceBatch) -> None:
 
 
 def _measured(source: VideoSource, encoder: Encoder, batch: DeviceBatch, request: Request) -> tuple[Block, float]:
-    """The first block, and about how many seconds a video takes."""
+    """The first block, and the estimated time for a video in s."""
     rollout, part, marks = source.rollout, request.parts[0], [time.perf_counter()]
     jax.block_until_ready(rollout.start(request.split, request.numbers))
     marks.append(time.perf_counter())
@@ -74,7 +77,7 @@ def _measured(source: VideoSource, encoder: Encoder, batch: DeviceBatch, request
 
 
 def _warn_of_ratio(dataset: DatasetSpec, block: Block, say: Callable[[str], None]) -> None:
-    """Says so, once, where gzip does not suit the frames."""
+    """Report if gzip compresses the frames badly."""
     if "frames" not in dataset.fields:
         return
     raw = len(block) * int(np.prod(dataset.fields["frames"].shape(dataset.sizes)))

@@ -1,4 +1,4 @@
-"""One thread per shard that is written."""
+"""Writing of shards, each in a thread."""
 
 import queue
 from collections import deque
@@ -13,11 +13,11 @@ from gen2d.dataset.spec import DatasetSpec, Shard
 
 
 class _Dropped(BaseException):
-    """Ends a writer whose shard is not wanted any more."""
+    """Ends the thread of a shard that is abandoned."""
 
 
 class ShardWriters:
-    """Writes blocks into shards, each in a thread, so that hashing and syncing one goes on while the next fills."""
+    """Write blocks into shards, each in a thread, so that one is hashed and synced while the next is filled."""
 
     def __init__(self, dataset: DatasetSpec) -> None:
         self.writer = ShardWriter(dataset)
@@ -27,7 +27,7 @@ class ShardWriters:
         self.futures: deque[Future[np.ndarray]] = deque()
 
     def put(self, shard: Shard, block: Block) -> None:
-        """Adds a block to its shard; blocks come in order, so another shard means that the last one is whole."""
+        """Add a block to its shard; blocks come in order, so a block of another shard ends the current one."""
         if shard != self.shard:
             self._end()
             while len(self.futures) > 1:
@@ -42,7 +42,7 @@ class ShardWriters:
                 return self.line.put(entry, timeout=0.1)
             except queue.Full:
                 if self.futures[-1].done():
-                    return  # it failed; whoever waits for it hears why
+                    return  # the writer failed; its future raises the error
 
     def _end(self) -> None:
         if self.shard is not None:
@@ -51,7 +51,7 @@ class ShardWriters:
             future.result()
 
     def finish(self) -> None:
-        """Waits until every shard is written."""
+        """Wait until all shards are written."""
         self._end()
         for future in self.futures:
             future.result()
@@ -59,7 +59,7 @@ class ShardWriters:
         self.writer.close()
 
     def drop(self) -> None:
-        """Leaves the current shard unwritten; those that are whole are finished."""
+        """Abandon the current shard and finish those before it."""
         if self.shard is not None:
             self._send(_Dropped())
         self.pool.shutdown(wait=True, cancel_futures=True)

@@ -1,1 +1,1 @@
-"""Compiled programs of a config: sample, simulate, render; and what uses them without a dataset."""
+"""Compiled programs of a config, which sample, simulate and render videos, and their uses without a dataset."""

@@ -1,4 +1,4 @@
-"""Which devices compute, and what identifies the bits that they give."""
+"""Choice of the devices that compute, and the software and hardware that determine their results to the bit."""
 
 import contextlib
 import ctypes
@@ -24,48 +24,53 @@ Device = Any  # jax.Device, which jax declares in a way that type checkers do no
 
 
 class DeviceError(UserError):
-    """A device that is not there."""
+    """A requested device is missing, or jax is in a mode that gen2d does not support."""
 
 
 def cores() -> int:
-    """How many CPU cores this process may use."""
+    """Number of CPU cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def keep_freed_memory() -> None:
-    """Returns nothing; has glibc keep what is freed, instead of returning the pages of every batch of frames to the
-    kernel and paying for them again (measured: 5 % of a run). Elsewhere nothing changes."""
-    trim_threshold, mmap_threshold = -1, -3  # the C library's names for them, in malloc.h
+    """Make glibc keep freed memory instead of returning the pages of every batch of frames to the kernel.
+
+    Page faults otherwise cost 5 % of a run (measured). Without glibc this has no effect.
+    """
+    trim_threshold, mmap_threshold = -1, -3  # M_TRIM_THRESHOLD and M_MMAP_THRESHOLD in malloc.h
     with contextlib.suppress(OSError, AttributeError):
         libc = ctypes.CDLL(None)
         libc.mallopt(trim_threshold, 2**30)
-        libc.mallopt(mmap_threshold, 2**25)  # the most that glibc takes
+        libc.mallopt(mmap_threshold, 2**25)  # glibc's maximum
 
 
 def prepare(device: str = "auto") -> list[Device]:
-    """The devices to compute on. CPU cores count as devices, one each, unless this process already runs jax.
+    """Devices to compute on: "cpu", "gpu", or "auto" for jax's default.
 
-    Also keeps compiled programs between runs, in $JAX_COMPILATION_CACHE_DIR or the user's cache folder.
+    Each CPU core counts as one device, unless jax already runs in this process. Compiled programs are cached between
+    runs in $JAX_COMPILATION_CACHE_DIR or the user's cache folder.
+
+    Raises DeviceError if there is no such device, or if jax is in 64-bit mode.
     """
     if device not in DEVICES:
         raise DeviceError(f"--device is {device!r}, but must be one of {', '.join(DEVICES)}")
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
     keep_freed_memory()
-    jax.config.update("jax_threefry_partitionable", True)  # the draws depend on it
+    jax.config.update("jax_threefry_partitionable", True)  # sampled values depend on it
     if jax.config.values["jax_enable_x64"]:
         raise DeviceError(
             "jax is in 64-bit mode (JAX_ENABLE_X64), but gen2d stores and computes in 32 bits: switch it off"
         )
     if jax.config.values["jax_compilation_cache_dir"] is None:
-        home = pathlib.Path(os.environ.get("XDG_CACHE_HOME") or pathlib.Path.home() / ".cache")
-        jax.config.update("jax_compilation_cache_dir", str(home / "gen2d" / instruction_set()))
+        cache = pathlib.Path(os.environ.get("XDG_CACHE_HOME") or pathlib.Path.home() / ".cache")
+        jax.config.update("jax_compilation_cache_dir", str(cache / "gen2d" / instruction_set()))
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
     try:
         jax.config.update("jax_num_cpu_devices", cores())
         if device == "cpu":
             jax.config.update("jax_platforms", "cpu")
     except RuntimeError:
-        pass  # jax already runs: its devices are what there is; the videos are the same on any number of them
+        pass  # jax already runs, with these devices; the videos are the same on any number of them
     if device == "auto":
         return jax.devices()
     if device == "cpu" and jax.default_backend() != "cpu":
@@ -80,7 +85,7 @@ def prepare(device: str = "auto") -> list[Device]:
 
 
 def instruction_set() -> str:
-    """The widest vector instructions of this CPU, which decide how sums are rounded."""
+    """Widest vector instruction set of this CPU, which affects how sums are rounded."""
     try:
         flags = set(pathlib.Path("/proc/cpuinfo").read_text().split())
     except OSError:
@@ -89,7 +94,7 @@ def instruction_set() -> str:
 
 
 def versions() -> dict[str, str]:
-    """The versions of all that makes a dataset."""
+    """Versions of gen2d, Python and the libraries that generate a dataset."""
     return {
         "gen2d": __version__,
         "python": ".".join(map(str, sys.version_info[:3])),

@@ -1,7 +1,8 @@
-"""What decides the bits of a dataset: the programs themselves, what compiles and runs them, and what the host makes.
+"""Fingerprint of everything that affects a dataset's bits: compiled programs, compiler, device and host code.
 
-Two runs may add to one dataset if their fingerprints agree. A program is known by its text, lowered for one device and
-freed of names and places in the source: an edited scene, look or solver is another program, a renamed function is not.
+Two runs may add to one dataset if their fingerprints agree. A program is identified by the hash of its text, lowered
+for one device, without names and source locations: editing a scene, look or solver changes it, renaming a function
+does not.
 """
 
 import ast
@@ -26,7 +27,7 @@ from gen2d.sampling.sampler import Sampler
 from gen2d.storage.atomic import publish
 from gen2d.storage.sealed import as_json, parsed, read_bytes, sha256
 
-# Flags of XLA that change no bit of a result, by how they begin; any other is taken to change some.
+# Prefixes of XLA flags that leave all results unchanged to the bit; any other flag is assumed to change some.
 HARMLESS = (
     "--xla_dump_",
     "--xla_force_host_platform_device_count",
@@ -39,12 +40,12 @@ HARMLESS = (
 
 
 def fingerprint(rollout: Rollout) -> dict[str, Any]:
-    """What decides the bits of the config's datasets, whichever split is made and on how many of these devices."""
+    """Fingerprint of the datasets of a config; it is the same for all its splits and any number of devices."""
     return machine(rollout) | {"programs": _of_splits(rollout)}
 
 
 def machine(rollout: Rollout) -> dict[str, Any]:
-    """The part of the fingerprint that is known before anything is traced."""
+    """Part of the fingerprint that is known before anything is traced."""
     device = rollout.devices[0]
     kind = device.device_kind if device.platform != "cpu" else f"cpu {instruction_set()}"
     flags = sorted(flag for flag in os.environ.get("XLA_FLAGS", "").split() if not flag.startswith(HARMLESS))
@@ -52,19 +53,24 @@ def machine(rollout: Rollout) -> dict[str, Any]:
 
 
 def _of_splits(rollout: Rollout) -> dict[str, str]:
-    """The hashes of all programs; those of a split with a look or physics of its own have its name before theirs."""
-    config, found, seen = rollout.config, {}, set()
+    """Hashes of all programs, by name.
+
+    If a split has its own look or physics, the names of its programs are prefixed with the split's name.
+    """
+    config, hashes, hashed = rollout.config, {}, set()
     for name in [split.name for split in config.splits] or [""]:
-        own = config.of_split(name)
-        if own not in seen:
-            seen.add(own)
-            programs = _remembered(rollout if own == config else Rollout(own, rollout.devices[:1]))
-            found |= {f"{name}.{kind}" if own != config else kind: digest for kind, digest in programs.items()}
-    return found
+        split_config = config.of_split(name)
+        if split_config not in hashed:
+            hashed.add(split_config)
+            programs = _remembered(rollout if split_config == config else Rollout(split_config, rollout.devices[:1]))
+            hashes |= {
+                f"{name}.{kind}" if split_config != config else kind: digest for kind, digest in programs.items()
+            }
+    return hashes
 
 
 def _remembered(rollout: Rollout) -> dict[str, str]:
-    """The hashes of a config's programs, of an earlier run of the same sources if there was one: tracing takes long."""
+    """Hashes of a config's programs, cached per version of the sources because tracing is slow."""
     folder = jax.config.values["jax_compilation_cache_dir"]
     platform = rollout.devices[0].platform
     key = [
@@ -78,34 +84,34 @@ def _remembered(rollout: Rollout) -> dict[str, str]:
     ]
     path = pathlib.Path(folder or "") / "fingerprints" / sha256(as_json(key))
     try:
-        known = parsed(read_bytes(path, 10**5)) if folder else None
+        cached = parsed(read_bytes(path, 10**5)) if folder else None
     except OSError:
-        known = None
-    if known is not None and all(isinstance(digest, str) for digest in known.values()):
-        return known
-    found = _hashes(rollout)
+        cached = None
+    if cached is not None and all(isinstance(digest, str) for digest in cached.values()):
+        return cached
+    hashes = _hashes(rollout)
     if folder:
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            publish(path, as_json(found))
+            publish(path, as_json(hashes))
         except OSError:
             pass
-    return found
+    return hashes
 
 
 def _hashes(rollout: Rollout) -> dict[str, str]:
-    found = {name: sha256(canonical(text).encode()) for name, text in rollout.lowered().items()}
+    hashes = {name: sha256(canonical(text).encode()) for name, text in rollout.lowered().items()}
     if rollout.config.annotations.simulated.captions:
-        found["captions"] = code_hash(caption)
+        hashes["captions"] = code_hash(caption)
     if rollout.sampler.gridded:
-        found["grids"] = code_hash(
+        hashes["grids"] = code_hash(
             Sampler.combination, epochs.order, permutation.hashed, permutation.feistel, permutation.splitmix64
         )
-    return found
+    return hashes
 
 
 def canonical(text: str) -> str:
-    """The text of a lowered program without names: those of functions are numbers, those of results are gone."""
+    """Text of a lowered program with functions renamed to numbers and names of arguments and results removed."""
     names = re.findall(r"func\.func (?:public |private )?@([\w.$-]+)\(", text)
     numbers = {name: f"@f{number}" for number, name in enumerate(dict.fromkeys(names))}
     text = re.sub(r"@([\w.$-]+)", lambda found: numbers.get(found[1], found[0]), text)
@@ -114,7 +120,7 @@ def canonical(text: str) -> str:
 
 
 def code_hash(*parts: Any) -> str:
-    """A hash of modules or functions that comments, docstrings and layout do not change."""
+    """Hash of modules or functions that ignores comments, docstrings and formatting."""
     digest = hashlib.sha256()
     for part in parts:
         tree = ast.parse(textwrap.dedent(inspect.getsource(part)))
@@ -129,11 +135,14 @@ def code_hash(*parts: Any) -> str:
 
 
 def sources() -> dict[str, str]:
-    """The beginning of the sha256 of every source file of gen2d; they tell which was edited where a program differs."""
+    """First 12 digits of the sha256 of each source file of gen2d, by path.
+
+    They only serve to name the edited files when a program differs.
+    """
     package = pathlib.Path(gen2d.__file__).parent
-    looks = package / "renderers" if (package / "renderers").is_dir() else package.parent / "renderers"
-    found = {f"gen2d/{path.relative_to(package).as_posix()}": path for path in package.rglob("*.py")}
-    found |= {f"renderers/{path.relative_to(looks).as_posix()}": path for path in looks.rglob("*.py")}
+    renderers = package / "renderers" if (package / "renderers").is_dir() else package.parent / "renderers"
+    files = {f"gen2d/{path.relative_to(package).as_posix()}": path for path in package.rglob("*.py")}
+    files |= {f"renderers/{path.relative_to(renderers).as_posix()}": path for path in renderers.rglob("*.py")}
     return {
-        name: sha256(path.read_bytes())[:12] for name, path in sorted(found.items()) if "gen2d/renderers/" not in name
+        name: sha256(path.read_bytes())[:12] for name, path in sorted(files.items()) if "gen2d/renderers/" not in name
     }

@@ -1,4 +1,4 @@
-"""The config that a stored dataset was made from."""
+"""Config that a stored dataset was generated from."""
 
 import contextlib
 from collections.abc import Mapping, Sequence
@@ -13,14 +13,15 @@ from gen2d.loading.dataset import Dataset
 from gen2d.storage.paths import Place, reading
 from gen2d.storage.sealed import read_bytes, sha256
 
-Trust = str | Sequence[str]  # sha256 of code that came with a dataset and may run
-SOURCE_BYTES = 2**24  # of a file of code, at most
+Trust = str | Sequence[str]  # sha256 of code from a dataset that may run
+SOURCE_BYTES = 2**24  # largest file of code
 
 
 def config_of(ds: Dataset, overrides: Sequence[str] = (), trust: Trust = ()) -> Config:
-    """The config that a dataset's split was made from, with `overrides` changed ('video.height=128').
+    """Config that a dataset's split was generated from, with `overrides` such as 'video.height=128' applied.
 
-    Raises UntrustedError where that would run code that came with the dataset and is not trusted.
+    Raises ConfigError if the dataset spans several folders or the config is invalid here, and UntrustedError if it
+    needs code from the dataset that is not trusted.
     """
     if not isinstance(ds, Dataset):
         raise ConfigError(f"ds is of {len(ds.datasets)} folders, but must be of one: give one of ds.datasets")
@@ -28,13 +29,14 @@ def config_of(ds: Dataset, overrides: Sequence[str] = (), trust: Trust = ()) -> 
 
 
 def config_from(root: Place, identity: Mapping[str, Any], trust: Trust = ()) -> Config:
-    """The config that the folder's manifest, or its mark, tells of.
+    """Config of the dataset with this identity, which comes from its manifest or mark.
 
-    A family or look that came with the dataset is the copy in the folder, and no other file of that name.
+    A family or look from a user's file is loaded from the copy in the dataset, never from another file of that name.
+    Raises ConfigError if the config cannot be used here, and UntrustedError if it needs code that is not trusted.
     """
     config = identity["config"]
-    copies = {where: copy for where, copy in _copies(root, config).items() if sha256(copy[1]) in _hashes(config)}
-    check_trusted({where: content for where, (_, content) in copies.items()}, trust, root)
+    copies = {path: copy for path, copy in _copies(root, config).items() if sha256(copy[1]) in _hashes(config)}
+    check_trusted({path: content for path, (_, content) in copies.items()}, trust, root)
     try:
         return load_config(config | {"seed": identity["seed"]}, copies=StoredCopies(copies.values()))
     except ConfigError as error:
@@ -42,7 +44,7 @@ def config_from(root: Place, identity: Mapping[str, Any], trust: Trust = ()) -> 
 
 
 def _hashes(value: Any) -> set[str]:
-    """Every sha256 that a config names."""
+    """All sha256 in a config."""
     if not isinstance(value, Mapping):
         return set()
     own = {value["sha256"]} if isinstance(value.get("sha256"), str) else set()
@@ -50,10 +52,10 @@ def _hashes(value: Any) -> set[str]:
 
 
 def _copies(root: Place, config: Mapping[str, Any]) -> dict[str, tuple[str, bytes]]:
-    """What the folder holds of files of its maker's own: the name in the config and the content, by place."""
-    found = {}
-    for where, name in own_files(config).items():
-        if PLUGIN.fullmatch(where):
+    """Copies of user files in the dataset: the name in the config and the content, by path."""
+    copies = {}
+    for path, name in own_files(config).items():
+        if PLUGIN.fullmatch(path):
             with reading(root), contextlib.suppress(FileNotFoundError, IsADirectoryError):
-                found[where] = name, read_bytes(root / where, SOURCE_BYTES)
-    return found
+                copies[path] = name, read_bytes(root / path, SOURCE_BYTES)
+    return copies

@@ -1,7 +1,8 @@
-"""Videos of a dataset drawn again, at any size and in any look, and simulated again from their stored scenes.
+"""Stored videos rendered again, at any size and in any look, or simulated again from their stored scenes.
 
-A dataset holds all that a frame depends on: what was drawn at random comes back from its key, the rest from its fields.
-So a dataset of states alone (`storage: {frames: none}`) is drawn inside the training loop, on its device.
+A dataset determines its frames completely: sampled values are recomputed from each video's key, everything else is
+stored. A dataset of states alone (`storage: {frames: none}`) can therefore be rendered inside the training loop, on its
+device.
 """
 
 import contextlib
@@ -85,31 +86,52 @@ def render(
     fields: Sequence[str] | None = None,
     trust: Trust = (),
 ) -> Array | dict[str, Array]:
-    """Frames [n, T, H, W, 3] uint8 of the videos with these numbers, as a jax array on jax's default device.
+    """Frames of stored videos, rendered from their stored scenes and states.
 
-    They are rendered from the stored scenes and states: at the stored settings and fingerprint they equal the stored
-    frames.
-
-        frames = gen2d.render(ds, [0, 1], height=256, width=256, look="shaded")
-        masks = gen2d.render(ds, range(8), fields=["masks/instance"])["masks/instance"]
+    With the stored settings and fingerprint, the frames equal the stored ones.
 
     Parameters
     ----------
-    ds : an opened dataset; with or without stored frames.
-    indices : numbers of videos [n], or one; negative ones count from the end.
-    height, width : size of the frames, px; those of the dataset unless given.
-    look : a look's name, or a mapping with its name and options.
-    overrides : other options of the config ('annotations.masks=true', 'image.noise=4').
-    states : fields as `simulate_again` returns them, in place of the stored ones.
-    fields : "frames" and names of annotations, which are switched on: the result is then a dictionary of these.
-    trust : sha256 of code that came with the dataset and may run. Without it a family or look from a file of the
-        dataset runs only if this user has generated with it.
+    ds : Dataset
+        An open dataset, with or without stored frames.
+    indices : int or sequence of int, [n]
+        Numbers of the videos; negative ones count from the end.
+    height, width : int, optional
+        Size of the frames in px; by default that of the dataset.
+    look : str or mapping, optional
+        Name of a look, or a mapping of its name and options.
+    overrides : sequence of str
+        Other options of the config, such as 'annotations.masks=true' or 'image.noise=4'.
+    states : mapping, optional
+        Fields by stored name [n, T, ...], as `simulate_again` returns them; they replace the stored ones.
+    fields : sequence of str, optional
+        "frames" and names of annotations, which are switched on.
+    trust : str or sequence of str
+        sha256 of code in the dataset that may run. Otherwise, a family or look from a file of the dataset runs only if
+        this user has generated with it.
+
+    Returns
+    -------
+    jax.Array, uint8 [n, T, H, W, 3]
+        The frames, on jax's default device; with `fields`, a dictionary of the named arrays instead.
 
     Raises
     ------
-    ConfigError, UntrustedError : where an option cannot be, or code is not trusted; both are UserErrors.
-    DamagedError : where a stored field cannot be read.
-    IndexError : where there is no such video.
+    ConfigError
+        If an option is invalid or there is no such field.
+    UntrustedError
+        If the dataset needs code that is not trusted.
+    DamagedError
+        If a stored field cannot be read.
+    UnreachableError
+        If a server does not answer.
+    IndexError
+        If there is no such video.
+
+    Examples
+    --------
+    >>> frames = gen2d.render(ds, [0, 1], height=256, width=256, look="shaded")
+    >>> masks = gen2d.render(ds, range(8), fields=["masks/instance"])["masks/instance"]
     """
     base, config, numbers = _recipes(ds, indices, height, width, look, overrides, fields, trust)
     if config.image.exposure and states is not None:
@@ -139,17 +161,39 @@ def render_soft(
     overrides: Sequence[str] = (),
     trust: Trust = (),
 ) -> Array:
-    """Frames [n, T, H, W, 3] float32 from 0 to 255 that are differentiable in `states`, without noise or motion blur.
+    """Frames that are differentiable in `states`, without noise or motion blur.
 
-        def loss(position):
-            return ((gen2d.render_soft(ds, [0], states={"states/position": position}, sigma=2.0) - target) ** 2).mean()
+    Parameters
+    ----------
+    ds : Dataset
+        An open dataset, with or without stored frames.
+    indices : int or sequence of int, [n]
+        Numbers of the videos; negative ones count from the end.
+    states : mapping, optional
+        Fields by stored name [n, T, ...]; they replace the stored ones.
+    sigma : float
+        Standard deviation, in px, of a Gaussian that blurs the coverage of each object, from 0 to 1000. With 0, the
+        frames are those of `render` before rounding, and only pixels that an edge crosses have a gradient. A larger
+        value extends the gradient to pixels up to 4 sigma away.
+    height, width, look, overrides, trust
+        As in `render`.
 
-        slope = jax.grad(loss)(position)
+    Returns
+    -------
+    jax.Array, float32 [n, T, H, W, 3]
+        The frames, from 0 to 255.
 
-    `sigma`, px, is the standard deviation of a Gaussian that blurs the coverage of each object: with 0 the frames are
-    those of `render` but for rounding, and an edge has a slope only in the pixels that it crosses; a larger one gives
-    slopes from as far as 4 sigma. `states` are fields by their stored names, [n, T, ...] each, in place of the stored
-    ones. The other parameters and errors are those of `render`.
+    Raises
+    ------
+    ConfigError
+        If sigma is out of range; otherwise as `render`.
+
+    Examples
+    --------
+    >>> def loss(position):
+    ...     frames = gen2d.render_soft(ds, [0], states={"states/position": position}, sigma=2.0)
+    ...     return ((frames - target) ** 2).mean()
+    >>> gradient = jax.grad(loss)(position)
     """
     if not 0 <= sigma <= 1000:
         raise ConfigError(f"sigma is {sigma!r}, but must be a number of pixels from 0 to 1000")
@@ -168,12 +212,46 @@ def simulate_again(
     overrides: Sequence[str] = (),
     trust: Trust = (),
 ) -> dict[str, Array]:
-    """The states of these videos at another frame rate or for another number of frames, from their stored scenes.
+    """States of stored videos, simulated again from their first frames.
 
-    Jax arrays by their stored names: "states/position" [n, T, K, 2] in m and so on, "time" [T] in s, and the camera's
-    fields; with contacts or energy if the config asks for them. `overrides` may change the physics
-    ('physics.damping=0.1').
-    At the stored settings the states agree with the stored ones to rounding. `trust` is that of `render`.
+    With the stored settings, the states agree with the stored ones up to rounding.
+
+    Parameters
+    ----------
+    ds : Dataset
+        An open dataset.
+    indices : int or sequence of int, [n]
+        Numbers of the videos; negative ones count from the end.
+    fps : float, optional
+        Frame rate in frames/s; by default that of the dataset.
+    frames : int, optional
+        Number of frames T; by default that of the dataset.
+    overrides : sequence of str
+        Other options of the config, such as 'physics.damping=0.1'.
+    trust : str or sequence of str
+        As in `render`.
+
+    Returns
+    -------
+    dict of jax.Array
+        Fields by stored name: "states/position" [n, T, K, 2] in m and the other states, "time" [T] in s, and the
+        camera's fields; contacts and energy if the config enables them.
+
+    Raises
+    ------
+    ConfigError
+        If an option is invalid, or the dataset has matched sets with violations.
+    UntrustedError
+        If the dataset needs code that is not trusted.
+    DamagedError
+        If a stored field cannot be read.
+    IndexError
+        If there is no such video.
+
+    Examples
+    --------
+    >>> states = gen2d.simulate_again(ds, [0, 1], fps=120, overrides=["physics.damping=0.1"])
+    >>> frames = gen2d.render(ds, [0, 1], states=states)
     """
     changes = [
         *overrides,
@@ -185,11 +263,11 @@ def simulate_again(
     if not set(matched.VIOLATIONS).isdisjoint(config.matched.change or ()):
         raise ConfigError(f"{ds.root}: matched.change has violations, which cannot be simulated again from a scene")
     simulated = _compiled(_simulated, _Settings(base, config))
-    made = simulated(_stored(ds, numbers), _key_words(ds), jnp.asarray(numbers, jnp.uint32))
-    return made | {"time": jnp.arange(config.video.frames) / config.video.fps}
+    columns = simulated(_stored(ds, numbers), _key_words(ds), jnp.asarray(numbers, jnp.uint32))
+    return columns | {"time": jnp.arange(config.video.frames) / config.video.fps}
 
 
-# ---- The recipe, with what is asked for
+# ---- Configs
 
 
 def _recipes(
@@ -202,12 +280,12 @@ def _recipes(
     fields: Sequence[str] | None,
     trust: Trust,
 ) -> tuple[Config, Config, np.ndarray]:
-    """The dataset's config, that of the frames that are asked for, and the numbers of their videos."""
+    """The dataset's config, the config of the requested frames, and the numbers of the videos."""
     base, numbers = config_of(ds, (), trust), ds.numbers(np.atleast_1d(indices))
     config = load_config(base, [*overrides, *_changed(height, width), "storage.frames=video"])
     changed: dict[str, Any] = {} if look is None else {"look": named(look)}
-    if asked := _asked(fields, config.annotations):
-        changed["annotations"] = config.annotations.plain() | asked
+    if switched_on := _asked(fields, config.annotations):
+        changed["annotations"] = config.annotations.plain() | switched_on
     if changed:
         config = load_config(config.plain() | changed, copies=config.copies)
     return base, config, numbers
@@ -218,9 +296,9 @@ def _changed(height: int | None, width: int | None) -> list[str]:
 
 
 def _asked(fields: Sequence[str] | None, section: Annotations) -> dict[str, Any]:
-    """The options that switch on those annotations that these fields belong to."""
-    wanted = set(fields or ())
-    off = [plugin for plugin in section.pixels if not plugin.options and wanted & plugin.contract.fields.keys()]
+    """Options that switch on the annotations of these fields."""
+    requested = set(fields or ())
+    off = [plugin for plugin in section.pixels if not plugin.options and requested & plugin.contract.fields.keys()]
     return {plugin.name: plugin.contract.usual for plugin in off}
 
 
@@ -240,9 +318,9 @@ def _whole(ds: Dataset) -> Dataset:
     """The same dataset with every field but images and text."""
     fields = ds.manifest.fields
     names = tuple(name for name, f in fields.items() if f.per_video and not f.is_image and not f.is_text)
-    whole = dataclasses.replace(ds.options, fields=names, window=None, stride=1, start="first", layout="THWC")
+    options = dataclasses.replace(ds.options, fields=names, window=None, stride=1, start="first", layout="THWC")
     frames = ds.manifest.frames[ds.options.split]
-    return Dataset(ds.root, ds.manifest, whole.within(frames, ds.manifest.sizes["T"]))
+    return Dataset(ds.root, ds.manifest, options.within(frames, ds.manifest.sizes["T"]))
 
 
 def _stored(ds: Dataset, numbers: np.ndarray) -> dict[str, np.ndarray]:
@@ -250,13 +328,13 @@ def _stored(ds: Dataset, numbers: np.ndarray) -> dict[str, np.ndarray]:
 
 
 def from_columns(cls: type, columns: FieldColumns) -> Any:
-    """The record that holds these fields, arrays by stored name."""
+    """A record of class `cls` from arrays by stored name."""
     known = axes.described(cls).items()
     return cls(**{attribute: jnp.asarray(columns[name]) for name, (attribute, _) in known if name in columns})
 
 
 def scene_of(columns: FieldColumns) -> Scene:
-    """The scenes that these fields are of."""
+    """The scenes that these fields describe."""
     joints = from_columns(Joints, columns) if "joints/rest" in columns else None
     return Scene(from_columns(Objects, columns), jnp.asarray(columns["world/gravity"]), joints)
 
@@ -267,7 +345,7 @@ def _key_words(ds: Dataset) -> np.ndarray:
 
 @dataclasses.dataclass(frozen=True)
 class _Settings:
-    """What decides a compiled program: a dataset's config, and that of what is made again."""
+    """Key of a compiled program: the config of the dataset and that of the requested videos."""
 
     base: Config
     config: Config
@@ -291,13 +369,13 @@ class _Settings:
         return render_module.plan_of(self.config, self.layout)
 
     def resized(self, view: CameraView) -> CameraView:
-        """A stored view for frames of another size: all that was seen is."""
+        """A stored view, scaled to frames of another size so that everything stays in view."""
         old, new = self.base.video, self.config.video
         return view._replace(scale=view.scale * min(new.height / old.height, new.width / old.width))
 
 
 def _stages(ds: Dataset, settings: "_Settings", numbers: np.ndarray, states: FieldColumns | None) -> RenderScene:
-    """What these videos are rendered from, with these states instead of the stored ones."""
+    """Render scenes of these videos; `states` replace the stored ones."""
     columns = dict(_stored(ds, numbers)) | dict(states or {})
     _check_frames(columns, states)
     return _compiled(_staged, settings)(columns, _key_words(ds), jnp.asarray(numbers, jnp.uint32))
@@ -315,7 +393,7 @@ def _staged(columns: FieldColumns, words: Array, numbers: Array, settings: _Sett
 
 
 def _pictures(stages: RenderScene, settings: _Settings) -> dict[str, Array]:
-    """What a run draws, in a program of its own, as there: so that its rounding is the same."""
+    """Frames and annotations, from a separate program as in a run, so that they round alike."""
     return render_module.render_frames(stages, settings.plan, settings.config.annotations)
 
 
@@ -329,22 +407,22 @@ def _simulated(columns: FieldColumns, words: Array, numbers: Array, settings: _S
     first = jax.tree.map(lambda a: a[:, 0], from_columns(State, columns))
     steps = substeps(config.video.fps, config.physics.substeps, config.physics.max_step)
     rules = solver_params(config.physics, config.video.fps, steps)
-    keep = dataclasses.replace(save_at(config, layout), between=False)
-    device = axes.to_device(scene), axes.to_device(first)
-    made = axes.to_stored(simulate(*device, layout, rules, config.video.frames, steps, keep, sparse=on_cpu()))
+    kept = dataclasses.replace(save_at(config, layout), between=False)
+    start = axes.to_device(scene), axes.to_device(first)
+    trajectory = axes.to_stored(simulate(*start, layout, rules, config.video.frames, steps, kept, sparse=on_cpu()))
     keys = sets_module.keys_of(words, numbers, settings.base.matched)
-    view = jax.vmap(lambda key, states: render_module.view_of(key, config, layout, states))(keys, made.states)
-    return axes.columns(made) | render_module.camera_columns(view)
+    view = jax.vmap(lambda key, states: render_module.view_of(key, config, layout, states))(keys, trajectory.states)
+    return axes.columns(trajectory) | render_module.camera_columns(view)
 
 
 @functools.lru_cache(maxsize=16)  # a program takes up to thousands of memory maps, of which a process has some 60,000
 def _compiled(program: Callable, settings: _Settings, *more: float) -> Callable:
-    """One of the programs above for these settings."""
+    """One of the functions above, compiled for these settings."""
     return jax.jit(lambda *arrays: program(*arrays, settings, *more))
 
 
 def _again(ds: Dataset, config: Config, numbers: np.ndarray) -> dict[str, Array]:
-    """Videos simulated from their keys again, as they were: what blurs them is not stored."""
+    """Frames and annotations of videos that are sampled and simulated again, as motion blur needs unsaved states."""
     config = load_config(config, [f"storage.batch_size={ds.manifest.fingerprint['batch_size']}"])
     with contextlib.closing(VideoSource(config, jax.devices()[:1])) as source:
         names = ["frames", *annotations.fields(config.annotations, {})]

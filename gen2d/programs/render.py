@@ -1,6 +1,6 @@
-"""From a simulated video to what it is drawn from: its camera, its paint, its occluders, all from the video's key.
+"""Render scenes of simulated videos: camera, paint and occluders, sampled from each video's key.
 
-Each has a key of its own, so that another look or another camera changes nothing else.
+Each of them has its own key, so changing the look or the camera changes nothing else.
 """
 
 import jax
@@ -23,7 +23,7 @@ from gen2d.renderers.rasterizer import draw
 
 
 def plan_of(config: Config, layout: Layout) -> FramePlan:
-    """What is known of a config's pictures before anything is drawn."""
+    """Frame plan of a config: everything static that rendering needs."""
     video, image, look = config.video, config.image, config.look
     seconds = video.frames / video.fps
     return FramePlan(
@@ -41,12 +41,12 @@ def plan_of(config: Config, layout: Layout) -> FramePlan:
 
 
 def paint_of(key: Array, config: Config, scene: Scene, layout: Layout) -> Paint:
-    """One video's paint."""
+    """Paint of one video with this key."""
     return config.look.contract.paint(scene, layout, config.look.options, key_for(key, "look"))
 
 
 def view_of(key: Array, config: Config, layout: Layout, states: State) -> CameraView:
-    """One video's view."""
+    """Camera view of one video with this key."""
     video = config.video
     return camera.filmed(key_for(key, "camera"), config.camera, layout, states, video.fps, video.height, video.width)
 
@@ -60,8 +60,11 @@ def render_scene(
     view: CameraView | None = None,
     between: State | None = None,
 ) -> RenderScene:
-    """All that one video is drawn from; `between` holds its states [T - 1, steps, K ...] at every step. Its view is
-    that of its key, if none is given."""
+    """Render scene of one video.
+
+    `states` [T, K, ...] are those at the frames, `between` [T - 1, steps, K, ...] those after each step, which motion
+    blur needs. By default, the view comes from the key.
+    """
     paint = paint_of(key, config, scene, plan.layout)
     view = view_of(key, config, plan.layout, states) if view is None else view
     objects, image = scene.objects, config.image
@@ -79,29 +82,30 @@ def render_scene(
 
 
 def _exposed(image: ImageOptions, fps: float, states: State, between: State, view: CameraView) -> Instants:
-    """Where everything is at the middles of the parts of each exposure, which ends at the frame's instant.
+    """Positions, angles and views at the samples of each exposure [T, samples, ...].
 
-    Between the ends of steps everything moves evenly; before the first frame it has moved as it does then.
+    An exposure ends at the frame's instant; its samples are the midpoints of equal parts. Motion is linear between
+    steps, and is extrapolated before the first frame.
     """
     steps, samples = between.angle.shape[1], image.exposure_samples
     before = image.exposure * (1 - (jnp.arange(samples) + 0.5) / samples)  # frames
 
     def at(now: Array, rate: Array, ends: Array) -> Array:
-        """Of [T, ...] at frames and [T - 1, steps, ...] at the ends of steps, [T, samples, ...]."""
-        early = now[0] - rate[0] / fps  # before the first frame: a straight line
-        share = (jnp.arange(steps + 1) / steps).reshape(-1, *[1] * (now.ndim - 1))
-        line = jnp.concatenate([now[:-1, None], ends], axis=1)
-        line = jnp.concatenate([(early + share * (now[0] - early))[None], line])
-        place = (1 - before) * steps
-        low = jnp.clip(jnp.floor(place).astype(jnp.int32), 0, steps - 1)
-        share = (place - low).reshape(-1, *[1] * (now.ndim - 1))
-        return line[:, low] * (1 - share) + line[:, low + 1] * share
+        """Values [T, samples, ...], interpolated between frames [T, ...] and steps [T - 1, steps, ...]."""
+        previous = now[0] - rate[0] / fps  # one frame before the first
+        weight = (jnp.arange(steps + 1) / steps).reshape(-1, *[1] * (now.ndim - 1))
+        path = jnp.concatenate([now[:-1, None], ends], axis=1)
+        path = jnp.concatenate([(previous + weight * (now[0] - previous))[None], path])
+        time = (1 - before) * steps
+        low = jnp.clip(jnp.floor(time).astype(jnp.int32), 0, steps - 1)
+        weight = (time - low).reshape(-1, *[1] * (now.ndim - 1))
+        return path[:, low] * (1 - weight) + path[:, low + 1] * weight
 
     def even(values: Array) -> Array:
-        """A camera's number, as if it changed evenly between frames."""
+        """A camera parameter [T, samples, ...], interpolated linearly between frames."""
         last = jnp.concatenate([2 * values[:1] - values[1:2] if len(values) > 1 else values[:1], values[:-1]])
-        share = before.reshape(-1, *[1] * (values.ndim - 1))
-        return values[:, None] * (1 - share) + last[:, None] * share
+        weight = before.reshape(-1, *[1] * (values.ndim - 1))
+        return values[:, None] * (1 - weight) + last[:, None] * weight
 
     position = at(states.position, states.velocity, between.position)
     angle = at(states.angle, states.angular_velocity, between.angle)
@@ -122,26 +126,26 @@ def _occluders(key: Array, config: Config, plan: FramePlan) -> Occluders:
     center = jax.random.uniform(keys["place"], (count, 2)) * jnp.asarray([video.width, video.height])
     front = image.occluder_front.sample(keys["front"], (count,))
     rank = jnp.sort(jnp.round(front * plan.moving).astype(jnp.int32))
-    parts = [
+    channels = [
         part.sample(k, (count,)).astype(jnp.float32)
         for part, k in zip(image.occluder_color, jax.random.split(keys["color"], 3), strict=True)
     ]
-    return Occluders(jnp.concatenate([center - size / 2, center + size / 2], -1), jnp.stack(parts, -1), rank)
+    return Occluders(jnp.concatenate([center - size / 2, center + size / 2], -1), jnp.stack(channels, -1), rank)
 
 
 def render_frames(stages: RenderScene, plan: FramePlan, options: Annotations) -> dict[str, Array]:
-    """Frames and annotations of some videos, by the names that they are stored under."""
+    """Frames and annotations [n, ...] of these videos, by stored name."""
     frames, owners = draw(stages, plan)
-    found = {} if frames is None else {"frames": frames}
-    return found | annotations.annotated(stages, owners, plan, options)
+    rendered = {} if frames is None else {"frames": frames}
+    return rendered | annotations.annotated(stages, owners, plan, options)
 
 
 def painted_colors(paint: Paint, scene: Scene) -> Array:
-    """The colours [K, 3] uint8 that the slots are painted with; zero where there is nothing."""
+    """Rendered colours [K, 3] uint8 of the slots; zero for empty slots."""
     present = scene.objects.present[:, None]
     return jnp.where(present, jnp.clip(jnp.round(paint.color), 0, 255), 0).astype(jnp.uint8)
 
 
 def camera_columns(view: CameraView) -> dict[str, Array]:
-    """A view by its stored names."""
+    """The parameters of a view, by stored name."""
     return {f"camera/{name}": values for name, values in view._asdict().items()}

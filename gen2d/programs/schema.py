@@ -1,4 +1,4 @@
-"""The fields that a config's videos have, the sizes of their axes, and the fields that the host fills in."""
+"""Stored fields of a config's videos, the sizes of their axes, and the fields computed on the host."""
 
 import dataclasses
 
@@ -29,7 +29,7 @@ CAMERA = (
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class VideoSchema:
-    """Fields, sizes and constants of a config's videos."""
+    """Fields, axis sizes and constants of a config's videos."""
 
     config: Config
     layout: Layout
@@ -39,7 +39,7 @@ class VideoSchema:
 
     @property
     def sizes(self) -> dict[str, int]:
-        """The sizes of the lettered axes of every field."""
+        """Sizes of the named axes of all fields (T, K, H, W and so on)."""
         video = self.config.video
         sizes = {"T": video.frames, "K": self.layout.slots, "H": video.height, "W": video.width}
         sizes |= {"C": self.save_at.contacts} if self.save_at.contacts else {}
@@ -50,7 +50,7 @@ class VideoSchema:
 
     @property
     def fields(self) -> dict[str, Field]:
-        """Every stored field, by name."""
+        """All stored fields, by name."""
         config = self.config
         records = [scene.State, trajectory.Quality, *([trajectory.Contacts] if self.save_at.contacts else [])]
         records += [trajectory.Energy] if self.save_at.energy else []
@@ -82,7 +82,7 @@ class VideoSchema:
 
     @property
     def constants(self) -> dict[str, np.ndarray]:
-        """The stored fields that are the same for all videos."""
+        """Values of the stored fields that are the same for all videos."""
         joints = self.layout.joints
         if not joints:
             return {"time": self.time}
@@ -92,21 +92,23 @@ class VideoSchema:
 
     @property
     def time(self) -> np.ndarray:
-        """The time of each frame [T] in s: t / fps exactly."""
+        """Time of each frame [T] in s, exactly t / fps."""
         return np.arange(self.config.video.frames, dtype=np.float64) / self.config.video.fps
 
     @property
     def host_fields(self) -> dict[str, Field]:
-        """The fields that are made on the host, from the others."""
+        """Fields that the host computes from the others: split and captions."""
         longest = max((len(split.name) for split in self.config.splits), default=0)
         fields = {"split": Field(f"S{longest}", "n", "", "the split that the video belongs to")} if longest else {}
-        described = self.config.annotations.simulated.captions
-        return fields | (caption.fields(self.layout.slots, self.config.video.frames) if described else {})
+        captioned = self.config.annotations.simulated.captions
+        return fields | (caption.fields(self.layout.slots, self.config.video.frames) if captioned else {})
 
     def host_columns(self, columns: dict[str, np.ndarray], split: str) -> dict[str, np.ndarray]:
-        """The host's fields of some videos of a split, from their other fields there."""
+        """Values of the host's fields for videos of one split, from their other fields [n, ...]."""
         count, config = len(columns["objects/present"]), self.config
-        found = {}
+        host_columns = {}
         if config.splits:
-            found["split"] = np.full(count, split.encode(), self.host_fields["split"].dtype)
-        return found | (caption.caption_fields(columns, config.video) if config.annotations.simulated.captions else {})
+            host_columns["split"] = np.full(count, split.encode(), self.host_fields["split"].dtype)
+        return host_columns | (
+            caption.caption_fields(columns, config.video) if config.annotations.simulated.captions else {}
+        )

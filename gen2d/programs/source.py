@@ -1,7 +1,7 @@
-"""Videos of a config, wherever they go: the one driver behind generating, streaming, rendering, previewing, checking.
+"""Videos of a config by split and number, for generation, streaming, rendering, previews and verification.
 
-A request names the videos of one batch; the source simulates it, checks that every scene was placed, and renders it in
-slices. Batches, slices, idle devices and the fields that the host makes are its own affair.
+A request names the videos of one batch. The source simulates it, checks that all objects were placed, and renders it in
+slices. Its users see neither batches nor slices, padding for idle devices or host-computed fields.
 """
 
 import contextlib
@@ -20,11 +20,11 @@ from gen2d.records.axes import Array
 
 
 class NoPlaceError(UserError):
-    """A scene in which the objects do not fit."""
+    """The objects of a scene do not fit."""
 
 
 class VideoRange(NamedTuple):
-    """Videos `first` to before `stop` of a split; `tag` is whatever the caller knows them by."""
+    """Videos `first` to `stop`, exclusive, of a split; `tag` is the caller's own identifier."""
 
     split: str
     first: int
@@ -33,9 +33,9 @@ class VideoRange(NamedTuple):
 
 
 class Part(NamedTuple):
-    """The videos of one range that one device renders together."""
+    """Videos of one range that one device renders together."""
 
-    order: int  # place among all parts, in the order of the ranges and of their videos
+    order: int  # index among all parts, in the order of the ranges and their videos
     range: VideoRange
     device: int
     first: int  # number of the video in row 0 of the device's batch
@@ -44,7 +44,7 @@ class Part(NamedTuple):
 
     @property
     def numbers(self) -> np.ndarray:
-        """The videos' numbers in their split, int64."""
+        """Numbers of the videos in their split, int64."""
         return np.arange(self.first + self.rows.start, self.first + self.rows.stop)
 
 
@@ -53,12 +53,12 @@ class Request(NamedTuple):
 
     split: str
     numbers: np.ndarray  # [devices * batch_size]
-    wanted: np.ndarray  # bool, the same shape: the others fill the batch up
+    wanted: np.ndarray  # bool, same shape; False for padding
     parts: Sequence[Part] = ()
 
 
 class VideoSlice(NamedTuple):
-    """Videos of one range that one device has rendered, or is rendering."""
+    """Videos of one range that one device renders."""
 
     part: Part
     columns: dict[str, np.ndarray]  # of the device's whole batch
@@ -69,7 +69,7 @@ class VideoSlice(NamedTuple):
         return self.part.rows.stop - self.part.rows.start
 
     def fields(self) -> dict[str, np.ndarray]:
-        """All fields [m, ...] as stored, by name; waits for the device."""
+        """All stored fields [m, ...] by name; waits for the device."""
         rows, start = self.part.rows, self.part.start
         fields = {name: column[rows] for name, column in self.columns.items()}
         for name, array in self.rendered.items():
@@ -79,20 +79,20 @@ class VideoSlice(NamedTuple):
 
 
 class VideoSource:
-    """The videos of one config on some devices; `schema` says which fields they have."""
+    """Videos of one config on some devices; `schema` lists their fields."""
 
     def __init__(self, config: Config, devices: Sequence[Any]) -> None:
         self.config, self.rollout = config, Rollout(config, devices)
         self.schema = self.rollout.schema
 
     def close(self) -> None:
-        """Frees the compiled programs."""
+        """Free the compiled programs."""
         self.rollout.close()
 
     def of_splits(self, splits: Iterable[str]) -> Iterator[tuple["VideoSource", set[str]]]:
-        """The sources of these splits, each with its splits.
+        """Sources of these splits, each with the splits that share it.
 
-        A split with a look or physics of its own has a source of its own, which is closed when the next one is taken.
+        A split with its own look or physics has its own source, which is closed when the next one is requested.
         """
         groups: dict[Config, set[str]] = {}
         for split in splits:
@@ -105,7 +105,10 @@ class VideoSource:
                     yield other, group
 
     def videos(self, split: str, numbers: Any, fields: Sequence[str] | None = None) -> dict[str, np.ndarray]:
-        """The fields [n, ...] of the videos of a split with these numbers [n], all or those named."""
+        """Fields [n, ...] by name of the videos of a split with these numbers [n]; by default all fields.
+
+        Raises NoPlaceError if the objects of a video do not fit.
+        """
         unique, inverse = np.unique(np.asarray(numbers), return_inverse=True)
         ranges = [VideoRange(split, int(number), int(number) + 1) for number in unique]
         parts: dict[int, dict[str, np.ndarray]] = {}
@@ -116,9 +119,9 @@ class VideoSource:
         return {name: np.concatenate([part[name] for part in found])[inverse] for name in found[0]}
 
     def slices(self, ranges: Sequence[VideoRange]) -> Iterator[VideoSlice]:
-        """The videos of these ranges, as they are rendered: `part.order` says which come first.
+        """Videos of these ranges in the order in which they are rendered; `part.order` gives the order of the ranges.
 
-        The next batch is started when the caller has taken the last slice of the one before.
+        The next batch is started when the caller has taken the last slice of the current one.
         """
         for request, batch in self.batches(self.requests(ranges)):
             columns = self.rollout.host_columns(batch)
@@ -130,10 +133,10 @@ class VideoSource:
                         yield VideoSlice(part, columns[at], rendered[at], self.schema.host_columns)
 
     def requests(self, ranges: Sequence[VideoRange]) -> Iterator[Request]:
-        """The batches that hold these ranges, as many at a time as there are devices.
+        """Requests that cover these ranges, one batch for each device.
 
-        Batch b holds the videos from b * batch_size on, whatever the ranges are, so that every video keeps its row. An
-        idle device gets a copy of the last batch.
+        Batch b holds the videos from b * batch_size on, whatever the ranges are, so that every video keeps its row.
+        Idle devices are padded with a copy of the last batch.
         """
         size, devices, order = self.rollout.batch_size, len(self.rollout.devices), itertools.count()
         batches: dict[tuple[str, int], list[VideoRange]] = {}
@@ -142,13 +145,15 @@ class VideoSource:
                 batches.setdefault((own.split, first), []).append(own)
         for split, group in itertools.groupby(batches, key=lambda batch: batch[0]):
             firsts = [first for _, first in group]
-            for place in range(0, len(firsts), devices):
-                own = firsts[place : place + devices]
+            for position in range(0, len(firsts), devices):
+                own = firsts[position : position + devices]
                 parts = [
-                    Part(next(order), of, device, first, start, slice(max(low, start), min(high, start + step)))
+                    Part(
+                        next(order), video_range, device, first, start, slice(max(low, start), min(high, start + step))
+                    )
                     for device, first in enumerate(own)
-                    for of in batches[split, first]
-                    for low, high in [(max(of.first - first, 0), min(of.stop - first, size))]
+                    for video_range in batches[split, first]
+                    for low, high in [(max(video_range.first - first, 0), min(video_range.stop - first, size))]
                     for step in [self.rollout.slice]
                     for start in range(low // step * step, high, step)
                 ]
@@ -160,9 +165,9 @@ class VideoSource:
                 yield Request(split, numbers, wanted.ravel(), parts)
 
     def batches(self, requests: Iterable[Request], ahead: int = 0) -> Iterator[tuple[Request, DeviceBatch]]:
-        """The simulated batches in order, each checked; as many others as `ahead` are started before one is waited for.
+        """Simulated batches in order; up to `ahead` more are in flight.
 
-        Raises NoPlaceError where the objects of a wanted video found no place.
+        Raises NoPlaceError if the objects of a wanted video do not fit.
         """
         started: deque[tuple[Request, DeviceBatch]] = deque()
         for request in requests:

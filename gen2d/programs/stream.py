@@ -1,9 +1,9 @@
-"""The batches that a dataset would give, without the dataset: simulated and drawn on the device as they are asked for.
+"""Batches of videos that are simulated and rendered on the device on demand, without a dataset.
 
     for batch in gen2d.stream("bouncing.yaml", seed=0, batch_size=32): ...
 
-Videos are simulated by the program that also makes datasets, as many at a time as there, and rendered in parts: a
-cell, which holds all videos of a batch, or some.
+Videos are simulated by the program that also generates datasets, in batches of the same size. They are rendered in
+cells (micro-batches), one or several per delivered batch.
 """
 
 import dataclasses
@@ -33,7 +33,8 @@ from gen2d.records.axes import Array
 from gen2d.records.keys import MAX_VIDEOS
 
 Arrays = dict[str, Any]
-SHARES = np.arange(256, dtype=np.float32) / np.float32(255)  # XLA would multiply, which rounds otherwise
+# A table, because XLA would multiply by 1 / 255, which rounds differently.
+SHARES = np.arange(256, dtype=np.float32) / np.float32(255)
 
 
 def stream(
@@ -59,13 +60,71 @@ def stream(
     to: str = "jax",
     device: str = "auto",
 ) -> "Stream":
-    """Batches as dictionaries of arrays on the device, made inside the training loop.
+    """Batches of videos that are simulated and rendered on the device, inside the training loop.
 
-    Those that `DataLoader(open(folder, split, fields, window, ...), batch_size, order_seed, shuffle, ...)` gives of the
-    dataset that `generate(config, n, folder, seed=seed, split=split)` makes, frame for frame, with the same
-    `state_dict`. Without `n` there is no end of new videos. `to` is "jax" or "torch" (the same memory, by DLPack); text
-    is NumPy's bytes in both.
-    Raises ConfigError and, where a scene does not fit, NoPlaceError (all UserError).
+    The batches equal, frame for frame, those of `DataLoader(open(folder, split, fields, window, ...), batch_size,
+    order_seed, shuffle, ...)` for the dataset that `generate(config, n, folder, seed=seed, split=split)` writes, and
+    have the same `state_dict`.
+
+    Parameters
+    ----------
+    config : Config, mapping, str or Path
+        A config, or the name or path of its file.
+    seed : int, optional
+        Seed of the videos; by default that of the config.
+    batch_size : int
+        Number of videos in a batch of this rank.
+    n : int, optional
+        Number of videos, from 1 to 2**32 - 1; by default new videos never end.
+    split : str
+        Name of the split.
+    overrides : sequence of str
+        Options of the config to change, such as 'physics.substeps=8'.
+    fields : sequence of str, optional
+        Names or patterns of fields; by default "frames" and "states/*".
+    window : int, optional
+        Number of frames of each video in a batch; by default all.
+    stride : int
+        Distance of the window's frames, in frames.
+    start : int or str
+        First frame of the window: a number, "first", or "random", which is sampled for each video and epoch.
+    layout : str
+        Order of the axes of images, such as "THWC" or "TCHW".
+    dtype : str
+        Type of the frames: "uint8", or "float32" from 0 to 1.
+    shuffle : bool or str
+        "global" (or True) to shuffle the videos in each epoch.
+    order_seed : int
+        Seed of the order and of random windows.
+    epochs : int, optional
+        Number of epochs of an iteration; by default without end.
+    rank, world_size : int, optional
+        Rank of this process and number of processes; by default those that torchrun sets, or a single process.
+    drop_last : bool
+        Whether to drop the last videos of an epoch that fill no batch of all ranks.
+    to : str
+        "jax", or "torch" for tensors that share the same memory by DLPack. Text is an array of bytes in NumPy.
+    device : str
+        "auto", "cpu" or "gpu".
+
+    Returns
+    -------
+    Stream
+        An iterable of dictionaries of arrays [batch_size, ...] by field, whose position can be saved and restored.
+
+    Raises
+    ------
+    ConfigError
+        If the config or an argument is invalid.
+    DeviceError
+        If there is no such device.
+    NoPlaceError
+        If the objects of a video do not fit; raised during iteration, as is NoVideoError.
+
+    Examples
+    --------
+    >>> for batch in gen2d.stream("bouncing.yaml", seed=0, batch_size=32, window=16):
+    ...     step(batch["frames"])
     """
     config = load_config(config, overrides)
     if seed is not None:
@@ -80,28 +139,28 @@ def stream(
     if n is not None and not 1 <= n <= MAX_VIDEOS:
         raise ConfigError(f"n is {n}, but must be from 1 to 2**32 - 1, or None")
     count = MAX_VIDEOS if n is None else n
-    walk = EpochSampler(count, batch_size, order_seed, shuffle, epochs, rank, world_size, drop_last)
-    return Stream(source, options, walk, batch_size, to, frames)
+    epoch_sampler = EpochSampler(count, batch_size, order_seed, shuffle, epochs, rank, world_size, drop_last)
+    return Stream(source, options, epoch_sampler, batch_size, to, frames)
 
 
 @functools.lru_cache(maxsize=4)
 def _source(config: Config, device: str) -> VideoSource:
-    """The videos of a config; its programs are compiled when they first run."""
+    """Video source of a config; its programs are compiled when they first run."""
     return VideoSource(config, devices.prepare(device)[:1])
 
 
 class _Cell(NamedTuple):
-    """Videos that are drawn together; if they are fewer than fit, the last is repeated."""
+    """A micro-batch: videos that are rendered together, padded with copies of the last."""
 
     step: GlobalBatch
-    videos: int
+    videos: int  # without padding
     numbers: np.ndarray  # uint32
-    starts: np.ndarray  # frame at which each video's window begins
-    ends: bool  # its batch
+    starts: np.ndarray  # first frame of each video's window
+    ends: bool  # whether it is the last of its batch
 
 
 class Stream:
-    """Batches without end, or of some epochs, from wherever the state says."""
+    """Resumable iterable of batches, which `stream` returns."""
 
     def __init__(
         self, source: VideoSource, options: ViewOptions, walk: EpochSampler, batch_size: int, to: str, frames: int
@@ -112,48 +171,48 @@ class Stream:
         self._view = jax.jit(self._viewed)
 
     def __len__(self) -> int:
-        """The number of batches in one epoch."""
+        """Number of batches in one epoch."""
         return len(self.walk)
 
     def __iter__(self) -> Iterator[Arrays]:
         return self._batches()
 
     def state_dict(self) -> dict[str, Any]:
-        """Where the iteration stands: what has been delivered."""
+        """State of the iteration, after the last batch that was delivered."""
         return self.walk.state_dict()
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Returns nothing; the next iteration goes on where `state` was taken, of a stream or of a DataLoader."""
+        """Continue the next iteration from this state of a stream or a DataLoader."""
         self.walk.load_state_dict(state)
 
     def _batches(self) -> Generator[Arrays, None, None]:
         parts: list[Arrays] = []
         cells: deque[_Cell] = deque()
-        for _, batch in self.source.batches(self._requests(cells), ahead=1):  # the next runs while this is rendered
-            for place in range(min(len(cells), self.source.rollout.batch_size // self.cell)):
+        for _, batch in self.source.batches(self._requests(cells), ahead=1):  # the next is simulated meanwhile
+            for index in range(min(len(cells), self.source.rollout.batch_size // self.cell)):
                 cell = cells.popleft()
-                parts.append(self._drawn(batch, place * self.cell, cell))
+                parts.append(self._drawn(batch, index * self.cell, cell))
                 if cell.ends:
-                    made = parts[0] if len(parts) == 1 else {k: _joined([p[k] for p in parts]) for k in parts[0]}
+                    fields = parts[0] if len(parts) == 1 else {k: _joined([p[k] for p in parts]) for k in parts[0]}
                     parts = []
                     self.walk.passed(cell.step)
-                    yield _DELIVER[self.to](made)
+                    yield _DELIVER[self.to](fields)
 
     def _cells(self) -> Iterator[_Cell]:
         for step in self.walk.steps():
             positions = self.walk.share(step)
             numbers = shuffled(self.walk.shuffled_by, step.epoch, positions, self.walk.videos)
-            first = self.options.starts(self.walk.bits(step, positions), self._frames)
-            first = np.full(len(numbers), self.options.first) if first is None else first
-            real = len(numbers)  # a rank's share may be empty
-            for begin in range(0, max(real, 1), self.cell):
-                end, held = min(begin + self.cell, real), np.arange(begin, begin + self.cell)
-                numbers, first = (a if real else np.zeros(1, np.int64) for a in (numbers, first))
-                held = np.minimum(held, len(numbers) - 1)
-                yield _Cell(step, end - begin, numbers[held].astype(np.uint32), first[held], end == real)
+            starts = self.options.starts(self.walk.bits(step, positions), self._frames)
+            starts = np.full(len(numbers), self.options.first) if starts is None else starts
+            count = len(numbers)  # a rank's share may be empty
+            for begin in range(0, max(count, 1), self.cell):
+                end, rows = min(begin + self.cell, count), np.arange(begin, begin + self.cell)
+                numbers, starts = (a if count else np.zeros(1, np.int64) for a in (numbers, starts))
+                rows = np.minimum(rows, len(numbers) - 1)
+                yield _Cell(step, end - begin, numbers[rows].astype(np.uint32), starts[rows], end == count)
 
     def _requests(self, requested: deque[_Cell]) -> Iterator[Request]:
-        """The cells in groups that are simulated together; those requested are appended to `requested`."""
+        """Requests for groups of cells that are simulated together; their cells are appended to `requested`."""
         cells, number = self._cells(), self.source.rollout.batch_size // self.cell
         while group := list(itertools.islice(cells, number)):
             requested.extend(group)
@@ -161,45 +220,47 @@ class Stream:
             yield Request(self.options.split, numbers, np.ones(len(numbers), bool))
 
     def _drawn(self, batch: DeviceBatch, lane: int, cell: _Cell) -> Arrays:
-        """A cell's videos as they are delivered."""
-        found = {name: batch.columns[name] for name in self.fields if name in batch.columns}
-        told = self.fields.keys() & self.source.schema.host_fields.keys()
-        if self.fields.keys() - batch.columns.keys() - told - {"index"}:
-            found |= self._pictures(batch, lane)
+        """Fields of a cell's videos, ready for delivery."""
+        columns = {name: batch.columns[name] for name in self.fields if name in batch.columns}
+        host_fields = self.fields.keys() & self.source.schema.host_fields.keys()
+        if self.fields.keys() - batch.columns.keys() - host_fields - {"index"}:
+            columns |= self._pictures(batch, lane)
         numbers, starts = jnp.asarray(cell.numbers.astype(np.int32)), jnp.asarray(cell.starts, jnp.int32)
-        made = self._view(found, numbers, starts, np.int32(lane))
-        made |= self._words(batch, lane, told) if told else {}
-        return made if cell.videos == self.cell else {name: array[: cell.videos] for name, array in made.items()}
+        fields = self._view(columns, numbers, starts, np.int32(lane))
+        fields |= self._words(batch, lane, host_fields) if host_fields else {}
+        return fields if cell.videos == self.cell else {name: array[: cell.videos] for name, array in fields.items()}
 
     def _words(self, batch: DeviceBatch, lane: int, wanted: Set[str]) -> Arrays:
-        """What is told of a cell, on the host; text stays there."""
+        """Host-computed fields of a cell; text stays on the host."""
         columns = self.source.rollout.host_columns(batch)[0]
-        own = {name: column[lane : lane + self.cell] for name, column in columns.items()}
-        told = self.source.schema.host_columns(own, self.options.split)
-        return {name: v if self.fields[name].is_text else jnp.asarray(v) for name, v in told.items() if name in wanted}
+        cell_columns = {name: column[lane : lane + self.cell] for name, column in columns.items()}
+        fields = self.source.schema.host_columns(cell_columns, self.options.split)
+        return {
+            name: v if self.fields[name].is_text else jnp.asarray(v) for name, v in fields.items() if name in wanted
+        }
 
     def _pictures(self, batch: DeviceBatch, lane: int) -> Arrays:
-        """What is drawn of a cell, in slices that fit the cache."""
+        """Rendered fields of a cell, computed in slices that fit the cache."""
         size = divisor(self.cell, self.source.rollout.slice)
         parts = [self.source.rollout.draw(batch, start, size)[0] for start in range(lane, lane + self.cell, size)]
         wanted = self.fields.keys() & parts[0].keys()
         return {name: jnp.concatenate([part[name] for part in parts]) for name in wanted}
 
     def _viewed(self, found: Arrays, numbers: Array, starts: Array, lane: Array) -> Arrays:
-        """The fields of a cell with windows, layout and type as asked for; columns are of the whole batch."""
-        made = {}
+        """Fields of a cell with the requested windows, layout and type; `found` may hold the whole batch."""
+        views = {}
         for name, field in self.fields.items():
             if name not in found and name != "index":
-                continue  # it is made on the host
+                continue  # computed on the host
             values = numbers if name == "index" else found[name]
             if len(values) != self.cell:
                 values = jax.lax.dynamic_slice_in_dim(values, lane, self.cell)
-            made[name] = _as_asked(name, field, values, starts, self.options)
-        return made
+            views[name] = _as_asked(name, field, values, starts, self.options)
+        return views
 
 
 def cell_size(batch_size: int, simulated: int) -> int:
-    """How many videos a cell holds: as many as possible, so that at most an eighth of what is made is left over."""
+    """Largest number of videos in a cell that divides the simulated batch and wastes at most an eighth of them."""
     sizes = [size for size in range(1, min(batch_size, simulated) * 2) if simulated % size == 0]
     return max(size for size in sizes if -(-batch_size // size) * size <= batch_size * 9 / 8)
 
@@ -209,7 +270,7 @@ def _joined(parts: list[Any]) -> Any:
 
 
 def _as_asked(name: str, field: Field, values: Array, starts: Array, options: ViewOptions) -> Array:
-    """Videos [m, ...] with windows, layout and type as asked for."""
+    """Values of videos [m, ...] with the requested windows, layout and type."""
     axes = field.axes.split()[1:]
     if options.window is not None and axes[:1] == ["T"]:
         frames = starts[:, None] + options.stride * jnp.arange(options.window)
@@ -227,5 +288,5 @@ def _to_torch(batch: Arrays) -> Arrays:
     return {name: torch.from_dlpack(values) for name, values in numbers.items()} | text
 
 
-# How batches are handed out, by the value of `to`.
+# Conversions of a batch, by the value of `to`.
 _DELIVER = {"jax": lambda batch: batch, "torch": _to_torch}

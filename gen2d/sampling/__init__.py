@@ -1,1 +1,1 @@
-"""Scenes sampled from distributions: slots, placement, rejection, matched sets."""
+"""Sampling of scenes from distributions: factors, slots, placement, rejection, matched sets."""

@@ -1,10 +1,11 @@
-"""Groups of bodies from which a scene is assembled: discs, capsules, segments, boxes and polygons, of one video.
+"""Groups of bodies from which the scene of one video is assembled: discs, capsules, segments, boxes and polygons.
 
     balls = builder.discs(positions, radius, present, velocity=velocity, **builder.material(factors))
     walls = builder.box_walls(options.width, options.height, **builder.material(factors, "wall"))
     scene, state = builder.assemble(layout(options), [balls, walls], factors["gravity"])
 
-A group fills a run of slots. Numbers are broadcast to its slots; empty slots are zero everywhere.
+A group fills consecutive slots. Arguments are broadcast to its K slots; absent bodies (`present` is false) are zero
+in every field.
 """
 
 import dataclasses
@@ -30,28 +31,28 @@ from gen2d.records.layout import Layout, SlotGroup
 from gen2d.records.scene import Joints, Objects, Scene, State
 
 GREY = (128.0, 128.0, 128.0)
-OPTIONAL = ("vertices", "vertex_count", "rolling_resistance", "force", "torque")  # fields that a scene may lack
+OPTIONAL = ("vertices", "vertex_count", "rolling_resistance", "force", "torque")  # fields that scenes may lack
 
 
 class SampledScene(NamedTuple):
-    """One video's scene and initial state, sampled by a family from its factors."""
+    """Scene and initial state of one video, which a family builds from sampled factors."""
 
     scene: Scene
     state: State
-    rejected: Any = 0  # positions that were drawn again because of overlap
-    fits: Any = True  # whether everything could be placed
-    derived: Mapping[str, Array] = MappingProxyType({})  # numbers that follow from the factors
+    rejected: Any = 0  # number of positions rejected because of overlap
+    fits: Any = True  # whether all objects could be placed
+    derived: Mapping[str, Array] = MappingProxyType({})  # values derived from the factors, stored beside them
 
 
 class BodyGroup(NamedTuple):
-    """Bodies in a run of slots: `objects` without their depth, and their initial state."""
+    """Bodies in consecutive slots: fields of `Objects` except the depth, and the initial state."""
 
     run: SlotGroup
     objects: dict[str, Array]
     state: State
 
 
-# Arguments of every group besides its shape; each is a number, or one for each slot [K].
+# Arguments of all groups besides the shape; each is a scalar or has a value per slot [K].
 MATERIAL = {
     "density": "kg/m^2; default 1",
     "mass": "kg; default: area times density",
@@ -70,16 +71,16 @@ MATERIAL = {
 
 
 def material(factors: Mapping[str, Array], of: str = "") -> dict[str, Any]:
-    """The density, elasticity, friction and color among a family's factors, as arguments of a group.
+    """Density, elasticity, friction and color among a family's factors, as arguments of a group.
 
-    Those `of` "wall" are the factors `wall_elasticity`, `wall_friction` and so on.
+    With `of="wall"`, they come from the factors `wall_density`, `wall_elasticity`, `wall_friction` and `wall_color`.
     """
     names = {name: f"{of}_{name}" if of else name for name in ("density", "elasticity", "friction", "color")}
     return {name: factors[factor] for name, factor in names.items() if factor in factors}
 
 
 def discs(position: Array, radius: Any, present: Any = True, *, angle: Any = 0.0, **material: Any) -> BodyGroup:
-    """Discs with these centres [K, 2] m and radii in m."""
+    """Discs at centres [K, 2] m, with radii in m."""
     radius = jnp.broadcast_to(radius, position.shape[:1]).astype(jnp.float32)
     mass = disc_mass(radius, material.get("density", 1.0))
     return _group("circle", position, angle, present, material, mass, disc_moment(radius, jnp.ones(())), radius=radius)
@@ -88,14 +89,14 @@ def discs(position: Array, radius: Any, present: Any = True, *, angle: Any = 0.0
 def capsules(
     position: Array, angle: Any, half_length: Any, radius: Any, present: Any = True, **material: Any
 ) -> BodyGroup:
-    """Capsules with these centres [K, 2] m; `half_length` m is half the distance between the centres of their ends."""
+    """Capsules at centres [K, 2] m; `half_length` m is half the distance between the centres of their ends."""
     half, radius = (jnp.broadcast_to(x, position.shape[:1]).astype(jnp.float32) for x in (half_length, radius))
     mass, moment = stadium_mass(half, radius, material.get("density", 1.0)), stadium_moment(half, radius, jnp.ones(()))
     return _group("capsule", position, angle, present, material, mass, moment, radius=radius, half_length=half)
 
 
 def capsules_between(a: Any, b: Any, radius: Any, present: Any = True, **material: Any) -> BodyGroup:
-    """Capsules whose ends have their centres at `a` and `b` [K, 2] m."""
+    """Capsules whose ends are centred at `a` and `b` [K, 2] m."""
     a, b = (jnp.asarray(x, jnp.float32) for x in (a, b))
     along = b - a
     angle, half = jnp.arctan2(along[:, 1], along[:, 0]), jnp.linalg.norm(along, axis=-1) / 2
@@ -103,7 +104,7 @@ def capsules_between(a: Any, b: Any, radius: Any, present: Any = True, **materia
 
 
 def segments(a: Any, b: Any, present: Any = True, **material: Any) -> BodyGroup:
-    """Segments from `a` to `b` [K, 2] m; static by default. Others have `mass`, 1 kg by default."""
+    """Segments from `a` to `b` [K, 2] m, static by default; dynamic ones have a mass of 1 kg by default."""
     a, b = (jnp.asarray(x, jnp.float32) for x in (a, b))
     along = b - a
     half = jnp.linalg.norm(along, axis=-1) / 2
@@ -115,7 +116,7 @@ def segments(a: Any, b: Any, present: Any = True, **material: Any) -> BodyGroup:
 
 
 def boxes(position: Array, angle: Any, width: Any, height: Any, present: Any = True, **material: Any) -> BodyGroup:
-    """Rectangles with these centres [K, 2] m and sides in m."""
+    """Rectangles at centres [K, 2] m, with sides in m."""
     count = position.shape[0]
     corners = box_vertices(*(jnp.broadcast_to(x, (count,)).astype(jnp.float32) for x in (width, height)))
     return polygons(position, angle, corners, present, **material)
@@ -130,13 +131,14 @@ def polygons(
     count: Any = None,
     **material: Any,
 ) -> BodyGroup:
-    """Convex polygons with these centres of mass [K, 2] m and, relative to them, `vertices` [K, V, 2] m.
+    """Convex polygons with centres of mass at `position` [K, 2] m.
 
-    They are counter-clockwise. A polygon has the first `count` [K] of them, all by default; the rest repeat its last.
+    `vertices` [K, V, 2] m are relative to these, counter-clockwise. Each polygon has the first `count` [K] of them, by
+    default all; the others must repeat the last one.
     """
     mass, moment = polygon_mass(vertices, material.get("density", 1.0)), polygon_moment(vertices, jnp.ones(()))
-    own = vertices.shape[1] if count is None else count
-    shape = {"vertices": vertices, "vertex_count": jnp.broadcast_to(own, position.shape[:1])}
+    corners = vertices.shape[1] if count is None else count
+    shape = {"vertices": vertices, "vertex_count": jnp.broadcast_to(corners, position.shape[:1])}
     return _group("polygon", position, angle, present, material, mass, moment, **shape)
 
 
@@ -147,7 +149,7 @@ def box_walls(width: float, height: float, **material: Any) -> BodyGroup:
 
 
 def floor(layout: Layout, widths: float = 4.0, **material: Any) -> BodyGroup:
-    """A floor at height 0; to both sides it extends `widths` times as far as the layout's bounds do to the right."""
+    """Floor at height 0 from -w to w, where w is `widths` times the right bound of the layout."""
     reach = widths * layout.bounds[2]
     return segments([(-reach, 0.0)], [(reach, 0.0)], **material)
 
@@ -162,7 +164,7 @@ def _group(
     moment: Array,
     **sizes: Array,
 ) -> BodyGroup:
-    """A group of one shape, where `mass` follows from the density and `moment` is that of one kilogram."""
+    """Group of one shape; `mass` follows from the density, `moment` is that of one kilogram."""
     assert material.keys() <= MATERIAL.keys(), f"{material.keys() - MATERIAL.keys()} are not of {list(MATERIAL)}"
     count, kind = position.shape[0], material.get("kind", DYNAMIC)
     present = jnp.broadcast_to(present, (count,))
@@ -199,9 +201,9 @@ def _group(
 def assemble(
     layout: Layout, groups: Sequence[BodyGroup], gravity: Array, joints: Joints | None = None
 ) -> tuple[Scene, State]:
-    """Scene and initial state of these groups; `gravity` [2] m/s^2.
+    """Scene and initial state of these groups, with `gravity` [2] m/s^2.
 
-    Raises AssertionError unless their runs are the layout's.
+    Raises AssertionError unless the layout has the same slot groups.
     """
     runs = tuple(group.run for group in groups)
     assert runs == layout.runs, f"the groups are {runs}, but the layout has {layout.runs}"
@@ -216,43 +218,43 @@ def assemble(
 
 
 def _values_of(group: BodyGroup, name: str, corners: int) -> Array:
-    """A group's values of one of the objects' fields; zero if it lacks the field."""
+    """Values of a field of the objects in a group; zeros if the group lacks the field."""
     count = group.run.count
-    empty = {
+    zeros = {
         "vertices": jnp.zeros((count, corners, 2)),
         "vertex_count": jnp.zeros(count, jnp.uint8),
         "rolling_resistance": jnp.zeros(count),
         "force": jnp.zeros((count, 2)),
         "torque": jnp.zeros(count),
     }
-    values = group.objects[name] if name in group.objects else empty[name]
-    if name == "vertices" and values.shape[1] < corners:  # repeats the last vertex
+    values = group.objects[name] if name in group.objects else zeros[name]
+    if name == "vertices" and values.shape[1] < corners:  # pad with copies of the last vertex
         values = jnp.concatenate([values, jnp.repeat(values[:, -1:], corners - values.shape[1], axis=1)], axis=1)
     return values
 
 
 def distance_joints(anchor_a: Any, anchor_b: Any, **numbers: Any) -> Joints:
-    """Joints in the order of the layout's, with anchors [J, 2] m in the frames of their objects.
+    """Joints in the layout's order, with anchors [J, 2] m in the frames of their objects.
 
-    `numbers` are other fields of `Joints`, each a number or one for each joint. By default, joints are rigid and have
-    neither limits nor motors.
+    `numbers` are other fields of `Joints`, scalars or arrays [J]. By default, joints are rigid and have neither limits
+    nor motors.
     """
     anchors = [jnp.asarray(x, jnp.float32) for x in (anchor_a, anchor_b)]
-    usual = {"rest": 0.0, "stiffness": jnp.inf, "damping": 0.0, "lower": -jnp.inf, "upper": jnp.inf}
-    usual |= {"motor_speed": 0.0, "motor_torque": 0.0}
-    known = [field.name for field in dataclasses.fields(Joints) if field.name in usual]
-    assert not numbers.keys() - set(known), f"{numbers.keys() - set(known)} are not of {known}"
+    defaults = {"rest": 0.0, "stiffness": jnp.inf, "damping": 0.0, "lower": -jnp.inf, "upper": jnp.inf}
+    defaults |= {"motor_speed": 0.0, "motor_torque": 0.0}
+    names = [field.name for field in dataclasses.fields(Joints) if field.name in defaults]
+    assert not numbers.keys() - set(names), f"{numbers.keys() - set(names)} are not of {names}"
     values = {
-        name: jnp.broadcast_to(jnp.asarray((usual | numbers)[name], jnp.float32), len(anchors[0])) for name in known
+        name: jnp.broadcast_to(jnp.asarray((defaults | numbers)[name], jnp.float32), len(anchors[0])) for name in names
     }
     return Joints(*anchors, **values)
 
 
 def hinge_chain(links: BodyGroup, tail: bool, **numbers: Any) -> Joints:
-    """Revolute joints of a row of bars.
+    """Revolute joints of a chain of bars.
 
-    The first bar hangs from the middle of an object, each other one from the end of the bar before it. With a `tail`,
-    another joint connects the middle of an object, its `a`, with the end of the last bar.
+    The first bar hangs from the centre of an object, each other bar from the end of the previous one. With `tail`,
+    another joint connects the centre of an object (the joint's `a`) with the end of the last bar.
     """
     half = links.objects["half_length"]
     ends, middle = jnp.stack([half, jnp.zeros_like(half)], -1), jnp.zeros((1, 2))

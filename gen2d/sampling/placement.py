@@ -1,6 +1,6 @@
-"""Start positions: at a given fraction of the room there is, or at random without overlap.
+"""Start positions: at a given fraction of the possible interval, or random without overlap.
 
-Where objects overlap, the position alone is drawn again; drawing sizes again would bias them.
+If objects overlap, only the position is sampled again, because sampling sizes again would bias them.
 """
 
 from typing import Any
@@ -11,15 +11,15 @@ import jax.numpy as jnp
 from gen2d.records.axes import Array
 
 TRIES = 100  # positions tried for one object before all objects are placed anew
-RESTARTS = 100  # of all objects, before the scene is given up
+RESTARTS = 100  # of all objects before the scene is abandoned
 CLEARANCE = 1e-3  # m between objects at the start
 
 
 def start_position(fraction: Array, low: Any, high: Any, displacement: Array, entry_distance: float) -> Array:
-    """Start on a line from which an object moves by `displacement` m and stays between `low` and `high` m.
+    """Start from which an object that moves by `displacement` m stays between `low` and `high` m.
 
-    It lies at `fraction`, in [0, 1], of the interval of possible starts. Where there are none, it lies within
-    `entry_distance` m of the end that the object comes from, at this fraction of that distance.
+    The start lies at `fraction`, in [0, 1], of the interval of possible starts. If there are none, it lies at this
+    fraction of `entry_distance` m from the end that the object comes from.
     """
     lowest, highest = low - jnp.minimum(displacement, 0), high - jnp.maximum(displacement, 0)
     near = fraction * jnp.minimum(entry_distance, high - low)
@@ -28,10 +28,11 @@ def start_position(fraction: Array, low: Any, high: Any, displacement: Array, en
 
 
 def place(key: Array, radius: Array, present: Array, low: Array, high: Array) -> tuple[Array, Array, Array]:
-    """Centres [K, 2] of discs that neither overlap nor leave a box, drawn uniformly one after the other.
+    """Centres [K, 2] m of discs in a box without overlap, sampled uniformly one after the other.
 
-    `radius` [K] m, `present` [K], the box from `low` [2] to `high` [2] m. Also returns the number of rejected draws,
-    and whether all discs were placed. Each iteration makes one draw, so a batch costs what its slowest scene does.
+    `radius` [K] is in m, and the box extends from `low` [2] to `high` [2] m. Also returns the number of rejected
+    positions, and whether all discs with `present` [K] could be placed. Each iteration samples one position, so a batch
+    takes as long as its slowest scene.
     """
     slots = jnp.arange(radius.shape[0])
 
@@ -47,11 +48,11 @@ def place(key: Array, radius: Array, present: Array, low: Array, high: Array) ->
         distance = jnp.linalg.norm(positions - centre, axis=-1)
         clear = jnp.all((distance >= radius + reach + CLEARANCE) | ~present | (slots >= slot))
         fits = clear | ~present[slot]
-        again = ~fits & (tries + 1 >= TRIES)
+        restart = ~fits & (tries + 1 >= TRIES)
         return (
-            jnp.where(again, 0, slot + fits),
-            jnp.where(fits | again, 0, tries + 1),
-            restarts + again,
+            jnp.where(restart, 0, slot + fits),
+            jnp.where(fits | restart, 0, tries + 1),
+            restarts + restart,
             rejected + ~fits,
             draws + 1,
             jnp.where((slots == slot)[:, None] & fits, centre, positions),

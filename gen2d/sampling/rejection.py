@@ -1,8 +1,8 @@
-"""Rejection sampling of videos whose quality measures lie in the ranges that a config asks for.
+"""Rejection sampling of videos whose quality measures lie in the ranges of a config.
 
-A video outside of them is sampled again until it fits: its factors and positions come from another attempt's key; its
-look, camera and combination on a grid stay. Attempts fill batches of the usual size, several for one video at once. The
-first that fits is taken, so a video does not depend on the others in its batch.
+A video outside of them is sampled again: factors and positions come from the key of another attempt, while look, camera
+and grid combination stay. Attempts fill batches of the usual size, several for one video at once. The first attempt
+that fits is accepted, so a video does not depend on the others in its batch.
 """
 
 from collections.abc import Callable, Mapping
@@ -22,11 +22,11 @@ FIELD = Field("int32", "n", "1", "attempts rejected, as they were outside the ra
 
 
 class NoVideoError(UserError):
-    """No attempt at a video lies in the ranges that were asked for."""
+    """No attempt at a video lies in the required ranges."""
 
 
 def attempt_keys(keys: Array, attempts: Array) -> Array:
-    """Keys from which videos are sampled in their attempts [n]; in attempt 0 each video's own key."""
+    """Keys of these attempts [n] at videos with these keys [n]; attempt 0 has the video's own key."""
 
     def key_of(key: Array, attempt: Array) -> Array:
         data = jax.random.key_data
@@ -39,33 +39,35 @@ def attempt_keys(keys: Array, attempts: Array) -> Array:
 def accepted_batch(
     make: Callable[[np.ndarray, np.ndarray], Any], numbers: np.ndarray, options: Any
 ) -> tuple[Any, np.ndarray]:
-    """A batch of videos that all lie in the ranges that were asked for, and the attempt of each.
+    """Batch of videos that all lie in the required ranges, and the accepted attempt of each [n].
 
-    `make(rows, attempts)` returns these attempts at the videos in these rows: a batch with `columns`, whose arrays have
-    the rows first. Raises NoVideoError where `options.attempts` are too few.
+    `make(rows, attempts)` returns a batch with these attempts at the videos in these rows; its `columns` have the rows
+    first. Raises NoVideoError if a video has no accepted attempt among `options.attempts`.
     """
-    wanted, rows = ranges(options), np.arange(len(numbers))
+    limits, rows = ranges(options), np.arange(len(numbers))
     chosen = np.zeros(len(numbers), np.int64)
     batch = make(rows, chosen)
-    pending, tried = rows[~_fits(batch, wanted)], 1
+    pending, tried = rows[~_fits(batch, limits)], 1
     while len(pending):
         if tried > options.attempts:
-            asked = ", ".join(f"{name} from {low:g} to {high:g}" for name, (low, high) in wanted.items())
+            required = ", ".join(f"{name} from {low:g} to {high:g}" for name, (low, high) in limits.items())
             raise NoVideoError(
-                f"quality: none of {options.attempts} attempts at video {numbers[pending[0]]} has {asked}; ask for "
+                f"quality: none of {options.attempts} attempts at video {numbers[pending[0]]} has {required}; ask for "
                 "less, or for more quality.attempts"
             )
-        each = min(len(rows) // len(pending), options.attempts)
-        of, attempts = np.repeat(pending, each), tried + np.tile(np.arange(each), len(pending))
-        fill = np.resize(np.arange(len(of)), len(rows))  # idle rows are padded with copies
-        attempted = make(of[fill], attempts[fill])
-        fits = (_fits(attempted, wanted)[: len(of)] & (attempts <= options.attempts)).reshape(len(pending), each)
+        per_video = min(len(rows) // len(pending), options.attempts)
+        videos, attempts = np.repeat(pending, per_video), tried + np.tile(np.arange(per_video), len(pending))
+        fill = np.resize(np.arange(len(videos)), len(rows))  # idle rows are padded with copies
+        attempted = make(videos[fill], attempts[fill])
+        fits = (_fits(attempted, limits)[: len(videos)] & (attempts <= options.attempts)).reshape(
+            len(pending), per_video
+        )
         accepted, first = fits.any(axis=1), fits.argmax(axis=1)
         chosen[pending[accepted]] = tried + first[accepted]
         source = np.full(len(rows), -1)
-        source[pending[accepted]] = (np.arange(len(pending)) * each + first)[accepted]
+        source[pending[accepted]] = (np.arange(len(pending)) * per_video + first)[accepted]
         batch = _replaced(batch, attempted, source)
-        pending, tried = pending[~accepted], tried + each
+        pending, tried = pending[~accepted], tried + per_video
     return batch, chosen
 
 
@@ -77,6 +79,6 @@ def _fits(batch: Any, wanted: Mapping[str, tuple[float, float]]) -> np.ndarray:
 
 @jax.jit
 def _replaced(old: Any, new: Any, source: Array) -> Any:
-    """The old batch, with a row of the new one wherever `source` [n] names one."""
+    """The old batch, with rows of the new one where `source` [n] is their index and not -1."""
     replaced, row = source >= 0, jnp.maximum(source, 0)
     return jax.tree.map(lambda a, b: jnp.where(replaced.reshape(-1, *[1] * (a.ndim - 1)), b[row], a), old, new)

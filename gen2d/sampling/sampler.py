@@ -1,11 +1,11 @@
-"""Sampling of a video's scene: the factors are drawn from its key, and the family builds the scene from them.
+"""Sampling of a video's scene: factors are sampled from its key, and the family builds the scene from them.
 
-A factor is an option that is drawn: one number a video, or one for each of the objects that its `each` names. That is
-either a drawn whole number such as `balls`, whose largest value is the length of the axis, or a size that the family
-fixes.
+A factor is an option with a distribution. It has one value per video, or one per object along the axis that its `each`
+names. The axis is either another factor, a count such as `balls` whose largest value is the axis's length, or a size
+that the family fixes.
 
-Each split has a joint distribution of its own (config/joint_distribution.py). One program samples from all of them and
-takes the split's row as an argument.
+Each split has its own joint distribution (config/joint_distribution.py). One program samples from all of them; the row
+of the split is an argument.
 """
 
 import functools
@@ -33,14 +33,14 @@ FactorChange = Callable[[SampledFactors, Callable[[Array], SampledFactors]], Sam
 
 
 def sizes(scene: Plugin) -> dict[str, int]:
-    """Lengths of the factors' axes: the largest counts that may be drawn, and the sizes that the family fixes."""
+    """Lengths of the factors' axes: the largest possible counts, and the sizes that the family fixes."""
     fixed = dict(scene.contract.sizes(scene.options))
     counted = {spec.each for spec in drawn_options(scene.contract).values() if spec.each} - fixed.keys()
     return fixed | {each: int(getattr(scene.options, each).support[1]) for each in sorted(counted)}
 
 
 def fields(config: Config) -> dict[str, Field]:
-    """Stored fields of the factors, of the numbers that the family derives from them, and of splits."""
+    """Stored fields of the factors, of the values that the family derives from them, and of splits."""
     stored, splits = {}, {}
     for name, spec in drawn_options(config.scene.contract).items():
         axes = " ".join(["n", *([spec.each] if spec.each else []), *([str(spec.parts)] if spec.parts else [])])
@@ -55,7 +55,7 @@ def fields(config: Config) -> dict[str, Field]:
 
 
 class Sampler:
-    """Draws of a config's scenes, in every split."""
+    """Sampler of a config's scenes, for all its splits."""
 
     def __init__(self, config: Config) -> None:
         self.scene, self.laws, self.options = config.scene, config.laws, drawn_options(config.scene.contract)
@@ -66,9 +66,9 @@ class Sampler:
         self.gridded = sorted({name for names, _ in self.combinations for name in names})
 
     def combination(self, row: int, words: np.ndarray, numbers: np.ndarray) -> np.ndarray:
-        """Values [n, G] float32 of the factors on a grid, a combination for each video number [n].
+        """Values [n, G] float32 of the factors on a grid: a combination for each video number [n].
 
-        Each combination comes once before any comes again, in an order that `words` (seed and split) decide.
+        Every combination occurs once before any is repeated, in an order that depends on `words` (seed and split).
         """
         names, every = self.combinations[row]
         values = np.zeros((len(numbers), len(self.gridded)), np.float32)
@@ -85,10 +85,10 @@ class Sampler:
     def sampled(
         self, key: Array, row: Any = 0, given: Any = (), change: FactorChange | None = None
     ) -> tuple[SampledFactors, SampledScene]:
-        """A video's factors, including derived ones, and its scene and initial state.
+        """Factors of a video, including derived values, and its scene and initial state.
 
-        `row` is that of the split, `given` [G] the video's `combination`. `change(factors, draw)` returns the factors
-        to use instead of these, where `draw(key)` draws all of them anew.
+        `row` is that of the split, `given` [G] the video's `combination`. `change(factors, draw)` returns replacements
+        of all factors, where `draw(key)` samples them from another key.
         """
         draw_key, place_key = jax.random.split(key)
         factors = self.drawn(draw_key, row, given, change)
@@ -97,18 +97,18 @@ class Sampler:
         return {**factors, **scene.derived}, scene._replace(rejected=rejected, fits=fits, derived={})
 
     def drawn(self, key: Array, row: Any = 0, given: Any = (), change: FactorChange | None = None) -> SampledFactors:
-        """A video's factors by name; zero for objects beyond the drawn count."""
+        """Factors of a video by name; zero for objects beyond the sampled count."""
         factors = self._sampled_factors(key, row, given)
         factors = change(factors, lambda other: self._sampled_factors(other, row, given)) if change else factors
         return {name: self._counted(name, values, factors) for name, values in factors.items()}
 
     def _sampled_factors(self, key: Array, row: Any, given: Any) -> SampledFactors:
-        """All factors by name. Each has a key of its own, so its draws do not depend on the other factors."""
+        """All factors by name; each has its own key, so its samples do not depend on the other factors."""
         components = self._components(key, row)
         factors = {}
-        for (name, spec), own in zip(self.options.items(), keys_for(key, [*self.options]), strict=True):
+        for (name, spec), factor_key in zip(self.options.items(), keys_for(key, [*self.options]), strict=True):
             shape = (self.lengths[spec.each],) if spec.each else ()
-            keys = jax.random.split(own, spec.parts) if spec.parts else [own]
+            keys = jax.random.split(factor_key, spec.parts) if spec.parts else [factor_key]
             which = components[spec.each]
             parts = [
                 self._coordinate(k, coordinate, shape, which, row, given)
@@ -121,25 +121,25 @@ class Sampler:
         return list(coordinates(name, getattr(self.scene.options, name)))
 
     def _coordinate(self, key: Array, name: str, shape: tuple[int, ...], which: Array, row: Any, given: Any) -> Array:
-        """One coordinate's draws, from its distribution in the chosen product."""
-        own = [product.parts[name] for product in self.products]
-        distinct = list(dict.fromkeys(own))
+        """Samples of one coordinate, from its distribution in the chosen product."""
+        distributions = [product.parts[name] for product in self.products]
+        distinct = list(dict.fromkeys(distributions))
         draws = [source.sample(key, shape) for source in distinct]
         if len(draws) > 1:
-            index = jnp.asarray([distinct.index(source) for source in own])[which]
+            index = jnp.asarray([distinct.index(source) for source in distributions])[which]
             values = jnp.select([index == i for i in range(len(draws))], draws)
         else:
             values = draws[0]
         if name not in self.gridded:
             return values
-        here = jnp.asarray([name in names for names, _ in self.combinations])[row]
-        return jnp.where(here, given[self.gridded.index(name)].astype(values.dtype), values)
+        on_grid = jnp.asarray([name in names for names, _ in self.combinations])[row]
+        return jnp.where(on_grid, given[self.gridded.index(name)].astype(values.dtype), values)
 
     def _components(self, key: Array, row: Any) -> dict[str, Array]:
-        """Index of the product to draw from, by axis ("" is the video), into the products of all splits.
+        """Index of the product to sample from, into the products of all splits, by axis ("" is the video).
 
-        Where a split's products differ only in factors of one axis, each of its objects draws a product of its own. So
-        {radius: small, color: red} or {radius: large, color: blue} for each ball gives videos with balls of both sorts.
+        If a split's products differ only in factors of one axis, a product is sampled for each of its objects. For
+        example, {radius: small, color: red} or {radius: large, color: blue} for balls gives videos with both sorts.
         """
         counts = [len(law.products) for law in self.laws]
         firsts = jnp.asarray(np.cumsum([0, *counts[:-1]]))[row]
@@ -148,16 +148,16 @@ class Sampler:
         ends = np.full((len(counts), max(counts)), 2.0, np.float32)
         for i, law in enumerate(self.laws):
             ends[i, : counts[i] - 1] = np.cumsum([product.share for product in law.products])[:-1]
-        own, axes = key_for(key, "product"), [self._axis(law) for law in self.laws]
+        product_key, axes = key_for(key, "product"), [self._axis(law) for law in self.laws]
 
         def pick(key: Array, shape: tuple[int, ...]) -> Array:
             return firsts + (jax.random.uniform(key, shape)[..., None] >= jnp.asarray(ends)[row]).sum(-1)
 
-        common = pick(own, ())
+        common = pick(product_key, ())
         components = {"": common}
         for axis, length in self.lengths.items():
             each = jnp.asarray([a == axis for a in axes])[row]
-            components[axis] = jnp.where(each, pick(key_for(own, axis), (length,)), common)
+            components[axis] = jnp.where(each, pick(key_for(product_key, axis), (length,)), common)
         return components
 
     def _axis(self, law: JointDistribution) -> str:
@@ -171,7 +171,10 @@ class Sampler:
     # ---- Distance from the training split
 
     def outside(self, factors: SampledFactors) -> dict[str, Array]:
-        """By stored name: distance of each factor from what training can draw, and whether it cannot draw them all."""
+        """Distance of each factor from the training split's support, and whether they are outside it, by stored name.
+
+        Empty without splits.
+        """
         if self.training is None:
             return {}
         distances = {f"ood_distance/{name}": self._distance(name, factors) for name in self.options}
@@ -186,7 +189,7 @@ class Sampler:
         return self._counted(name, distance, factors)
 
     def _inside(self, law: JointDistribution, factors: SampledFactors) -> Array:
-        """Whether a distribution can draw these factors: all from one product, or each object's from one of its own."""
+        """Whether these factors lie in the support: all in one product, or those of each object in its own product."""
         axis = self._axis(law)
         fits = []
         for product in law.products:
@@ -201,7 +204,7 @@ class Sampler:
         return jnp.all(functools.reduce(jnp.logical_or, fits))
 
     def _within(self, parts: Any, name: str, factors: SampledFactors) -> Array:
-        """Whether each of a factor's values lies in a product; a vector does if all its parts do."""
+        """Whether each value of a factor lies in a product; for vectors, whether all parts do."""
         values = factors[name]
         each = jnp.moveaxis(values, -1, 0) if self.options[name].parts else values[None]
         distances = [
@@ -214,12 +217,12 @@ class Sampler:
 
 
 def _present(each: str, values: Array, factors: SampledFactors) -> Array:
-    """Which of the counted objects [K, ...] are present, in the shape of `values`."""
+    """Whether each of the counted objects is present; broadcasts to `values` [K, ...]."""
     return (jnp.arange(values.shape[0]) < factors[each]).reshape(-1, *[1] * (values.ndim - 1))
 
 
 def _distance_from(values: Array, spans: tuple[Span, ...]) -> Array:
-    """Distance of each value from the nearest span; 0 within."""
+    """Distance of each value from the nearest span; 0 inside one."""
     x = values.astype(jnp.float32)
     low = np.array([span.low for span in spans], np.float32)
     last = np.array([span.last for span in spans], np.float32)

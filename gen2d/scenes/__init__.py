@@ -1,4 +1,4 @@
-"""Scene families: one file each, named like the family; a config asks for one by `scene: NAME`, or `scene: my/NAME.py`.
+"""Scene families, one file each, named like the family; a config selects one by `scene: NAME` or `scene: my/NAME.py`.
 
 A file ends with a `FAMILY`, whose members `gen2d.plugin.Family` describes. The smallest one:
 

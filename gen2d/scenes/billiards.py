@@ -1,6 +1,6 @@
 """Billiards, seen from above: a cue ball hits a triangle of balls, between four cushions.
 
-What the cloth takes away is `physics.damping`, a rate in 1/s; nothing in the scene does.
+The scene has no friction of the cloth; `physics.damping`, a rate in 1/s, slows the balls down.
 """
 
 import dataclasses
@@ -41,7 +41,7 @@ class Options:
 
 
 def check(options: Options) -> None:
-    """Raises ValueError where the rack or the cue ball may not fit the table."""
+    """Raise ValueError if the rack or the cue ball may not fit the table."""
     rows, radius = int(options.rows.support[1]), options.radius.support[1]
     side = (rows - 1) * (2 * radius + options.gap.support[1])
     if not (
@@ -59,7 +59,7 @@ def check(options: Options) -> None:
 
 
 def sizes(options: Options) -> dict[str, int]:
-    """The balls of the largest rack."""
+    """The number of balls in the largest rack."""
     rows = int(options.rows.support[1])
     return {"rack": rows * (rows + 1) // 2}
 
@@ -71,14 +71,14 @@ def layout(options: Options) -> Layout:
 
 
 def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledScene:
-    """One video's scene and initial state: the rack in place, and the cue ball on its way there."""
+    """One video's scene and initial state: the rack at rest, and the cue ball moving towards it."""
     radius, rows = factors["radius"], factors["rows"]
     nearest, farthest = jnp.stack([radius, radius]), jnp.stack([options.head_distance, options.height - radius])
     cue = nearest + factors["relative_position"] * (farthest - nearest)
     spot = jnp.asarray([options.spot_distance, options.height / 2])
     rack = spot + _triangle(int(options.rows.support[1])) * (2 * radius + factors["gap"])
-    way = jnp.arctan2(*(spot - cue)[::-1]) + factors["aim_angle"]
-    stroke = factors["speed"] * jnp.stack([jnp.cos(way), jnp.sin(way)])
+    direction = jnp.arctan2(*(spot - cue)[::-1]) + factors["aim_angle"]
+    stroke = factors["speed"] * jnp.stack([jnp.cos(direction), jnp.sin(direction)])
     balls = builder.discs(
         jnp.concatenate([cue[None], rack]),
         radius,

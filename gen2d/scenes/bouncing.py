@@ -43,7 +43,7 @@ class Options:
 
 
 def check(options: Options) -> None:
-    """Raises ValueError where the box cannot hold a ball."""
+    """Raise ValueError if the box cannot hold a ball."""
     largest = options.radius.support[1]
     if not 2 * largest < min(options.width, options.height):
         raise ValueError(
@@ -61,9 +61,9 @@ def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledSc
     """One video's scene and initial state: balls at random positions without overlap."""
     radius, box = factors["radius"], jnp.asarray([options.width, options.height])
     present = jnp.arange(len(radius)) < factors["balls"]
-    places, rejected, fits = place(jax.random.fold_in(key, 0), radius, present, jnp.zeros(2), box)
+    positions, rejected, fits = place(jax.random.fold_in(key, 0), radius, present, jnp.zeros(2), box)
     balls = builder.discs(
-        places, radius, present, velocity=factors["velocity"], spin=factors["spin"], **builder.material(factors)
+        positions, radius, present, velocity=factors["velocity"], spin=factors["spin"], **builder.material(factors)
     )
     walls = builder.box_walls(options.width, options.height, **builder.material(factors, "wall"))
     return SampledScene(*builder.assemble(layout(options), [balls, walls], factors["gravity"]), rejected, fits)

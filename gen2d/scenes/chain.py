@@ -1,6 +1,6 @@
-"""A chain that hangs between two pins, pulled tight by one of its joints and let go; or that swings from one pin.
+"""A chain that is pulled tight between two pins and released, or that swings from one pin.
 
-The links pass one another, and what they hang from, freely.
+Links collide neither with each other nor with the pins.
 """
 
 import dataclasses
@@ -49,7 +49,7 @@ def sizes(options: Options) -> dict[str, int]:
 
 
 def check(options: Options) -> None:
-    """Raises ValueError where no joint may exist by which the chain can be pulled tight."""
+    """Raise ValueError if the chain may have no joint that can pull it tight."""
     least = options.span.support[0]
     if options.ends == 2 and not 2 / options.links <= least <= options.span.support[1] < 1:
         raise ValueError(
@@ -59,7 +59,7 @@ def check(options: Options) -> None:
 
 
 def layout(options: Options) -> Layout:
-    """The pins, then the links, each hung from the one before."""
+    """The pins, then the links, each hung from the previous one."""
     n, pins, radius = options.links, options.ends, options.radius.support[1]
     ties = [JointSpec("revolute", pins + i - 1 if i else 0, pins + i) for i in range(n)]
     ties += [JointSpec("revolute", 1, pins + n - 1)] if pins == 2 else []
@@ -69,7 +69,7 @@ def layout(options: Options) -> Layout:
 
 
 def _bounds(options: Options, whole: float) -> tuple[float, float, float, float]:
-    """Bounds in m of what a chain of this length can reach, without the upper part, which it hardly ever does."""
+    """Bounds in m of the region that a chain of this length can reach, without its rarely reached upper part."""
     rim = 2 * options.radius.support[1]
     if options.ends == 1:
         turn = min(max(map(abs, options.angle.support)), math.pi)
@@ -82,7 +82,7 @@ def _bounds(options: Options, whole: float) -> tuple[float, float, float, float]
 
 
 def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledScene:
-    """One video's scene and initial state: the chain at rest, taut."""
+    """One video's scene and initial state: the taut chain at rest."""
     n, radius = options.links, factors["radius"]
     corners, kink = _straight(factors, n) if options.ends == 1 else _pulled(factors, n)
     pins = builder.discs(
@@ -96,26 +96,26 @@ def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledSc
 
 
 def _straight(factors: dict[str, Array], n: int) -> tuple[Array, Array]:
-    """The corners [n + 1, 2] in m of a straight chain from the pin at the origin, and its kink, at the pin."""
-    way = jnp.stack([jnp.sin(factors["angle"]), -jnp.cos(factors["angle"])])
-    return jnp.arange(n + 1.0)[:, None] * factors["length"] * way, jnp.zeros(())
+    """Joints [n + 1, 2] in m of a straight chain from the pin at the origin, and the number of its kink, 0."""
+    direction = jnp.stack([jnp.sin(factors["angle"]), -jnp.cos(factors["angle"])])
+    return jnp.arange(n + 1.0)[:, None] * factors["length"] * direction, jnp.zeros(())
 
 
 def _pulled(factors: dict[str, Array], n: int) -> tuple[Array, Array]:
-    """The corners [n + 1, 2] in m of a chain along two sides of a triangle, and the number of the joint between them.
+    """Joints [n + 1, 2] in m of a chain along two sides of a triangle, and the number of the joint between the sides.
 
-    The third side, from pin to pin, has its middle at the origin.
+    The midpoint of the third side, from pin to pin, is the origin.
     """
-    apart = factors["span"] * n  # all in lengths of a link
-    first, last = jnp.ceil((n - apart) / 2 + 1e-3), jnp.floor((n + apart) / 2 - 1e-3)
+    span = factors["span"] * n  # all in lengths of a link
+    first, last = jnp.ceil((n - span) / 2 + 1e-3), jnp.floor((n + span) / 2 - 1e-3)
     kink = first + jnp.minimum(jnp.floor(factors["pulled_joint"] * (last - first + 1)), last - first)
-    along = (kink**2 - (n - kink) ** 2 + apart**2) / (2 * apart)
+    along = (kink**2 - (n - kink) ** 2 + span**2) / (2 * span)
     aside = jnp.sqrt(jnp.maximum(kink**2 - along**2, 0.0)) * (2 * factors["pulled_above"] - 1)
     number, zero = jnp.arange(n + 1.0), jnp.zeros(())
-    one, tip, other = jnp.stack([zero, zero]), jnp.stack([along, aside]), jnp.stack([apart, zero])
+    left_pin, tip, right_pin = jnp.stack([zero, zero]), jnp.stack([along, aside]), jnp.stack([span, zero])
     up, down = (number / kink)[:, None], ((number - kink) / (n - kink))[:, None]
-    corners = jnp.where(number[:, None] <= kink, one + up * (tip - one), tip + down * (other - tip))
-    corners = corners - jnp.stack([apart / 2, zero])
+    corners = jnp.where(number[:, None] <= kink, left_pin + up * (tip - left_pin), tip + down * (right_pin - tip))
+    corners = corners - jnp.stack([span / 2, zero])
     cos, sin = jnp.cos(factors["slope"]), jnp.sin(factors["slope"])
     return factors["length"] * corners @ jnp.stack([jnp.stack([cos, sin]), jnp.stack([-sin, cos])]), kink
 

@@ -1,10 +1,10 @@
 """Two balls that meet head-on: the first comes from the left, the second from the right.
 
-With the numbers of configs/phyworld_collision.yaml it is a scene of the study 'How Far is Video Generation from World
+With the values of configs/phyworld_collision.yaml it is a scene of the study 'How Far is Video Generation from World
 Model' (Kang et al., arXiv 2411.02385).
 
-They are to touch within a window of frames. Where the view is too narrow for that, as both are large or fast, the
-window is what is feasible, less its first half. Two balls that stand still never touch.
+They touch within a window of frames. If the view is too narrow for that, because both are large or fast, the time of
+contact lies in the second half of the possible interval. Two balls at rest never touch.
 """
 
 import dataclasses
@@ -53,7 +53,7 @@ class Options:
 
 
 def check(options: Options) -> None:
-    """Raises ValueError where the view may not hold both balls, or the first contact frame is after the last."""
+    """Raise ValueError if the view may not hold both balls, or the first contact frame is after the last."""
     largest = options.radius_1.support[1], options.radius_2.support[1]
     if not 2 * sum(largest) + 2 * CLEARANCE < options.width:
         raise ValueError(
@@ -70,7 +70,7 @@ def check(options: Options) -> None:
 
 
 def sizes(options: Options) -> dict[str, int]:
-    """There are two balls."""
+    """The number of balls, two."""
     return {"balls": 2}
 
 
@@ -81,7 +81,7 @@ def layout(options: Options) -> Layout:
 
 
 def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledScene:
-    """One video's scene and initial state: balls on one line, whose gap follows from the time of contact."""
+    """One video's scene and initial state: balls on one line, with a gap that follows from the time of contact."""
     radius = jnp.stack([factors["radius_1"], factors["radius_2"]])
     speed = jnp.stack([factors["speed_1"], factors["speed_2"]])
     time, gap = _contact(factors["contact_fraction"], speed.sum(), options.width - 2 * radius.sum(), options)
@@ -101,7 +101,7 @@ def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledSc
 def _contact(share: Array, closing: Array, room: Array, options: Options) -> tuple[Array, Array]:
     """Time in s until two balls touch, at this fraction of the window, and the gap in m between them at the start.
 
-    `closing` is the speed at which they approach, `room` how far apart they may be.
+    `closing` is the speed in m/s at which they approach, `room` the largest possible gap in m.
     """
     first, last = (frame * options.frame_interval for frame in options.contact_frames)
     latest = jnp.minimum(last, room / closing)

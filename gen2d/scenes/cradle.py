@@ -1,4 +1,4 @@
-"""Balls in a row that hand on speed, as Newton's cradle does: some come from the left, as many leave to the right."""
+"""Newton's cradle: some balls hit a row from the left, and as many leave it to the right."""
 
 import dataclasses
 
@@ -9,14 +9,14 @@ from gen2d.plugin import Array, Distribution, Family, Field, Layout, SampledScen
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """The row of balls, seen from above, so that nothing falls."""
+    """The row of balls, seen from above, without gravity."""
 
     balls: Distribution = common.count("balls", [3, 6], "number of balls in the row", low=2)
     moving_balls: Distribution = common.count("balls", [1, 2], "number of balls that come from the left", high=63)
     width: float = common.size("width of the view", 18.0)
     height: float = common.size("height of the view", 4.5)
     radius: Distribution = common.radius("every ball", [0.5, 0.8])
-    # Bodies that touch are hit all at once, and how they share the speed is then not determined.
+    # Above 0, because a simultaneous impact of touching bodies does not determine their speeds.
     gap: Distribution = common.length("gap between neighbours", [0.03, 0.1], low=1e-3)
     approach_distance: Distribution = common.length("gap between moving and resting balls", [0.5, 2.0], low=1e-3)
     speed: Distribution = common.speed("the balls that move", [2.0, 5.0])
@@ -27,7 +27,7 @@ class Options:
 
 
 def check(options: Options) -> None:
-    """Raises ValueError where all balls could move, or the row may not fit the view."""
+    """Raise ValueError if all balls could move, or the row may not fit the view."""
     few, most = options.balls.support[0], options.moving_balls.support[1]
     if not most < few:
         raise ValueError(f"moving_balls may be {most:g}, but must be less than balls, which may be {few:g}")
@@ -57,10 +57,10 @@ def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledSc
     pitch, resting = 2 * radius + gap, factors["balls"] - moving
     x = options.width / 2 + (number - moving - (resting - 1) / 2) * pitch
     x = jnp.where(number < moving, x - factors["approach_distance"] + gap, x)
-    places = jnp.stack([x, jnp.full_like(x, options.height / 2)], axis=-1)
+    positions = jnp.stack([x, jnp.full_like(x, options.height / 2)], axis=-1)
     speed = jnp.where(number < moving, factors["speed"], 0.0)
     velocity = jnp.stack([speed, jnp.zeros_like(speed)], axis=-1)
-    balls = builder.discs(places, radius, number < factors["balls"], velocity=velocity, **builder.material(factors))
+    balls = builder.discs(positions, radius, number < factors["balls"], velocity=velocity, **builder.material(factors))
     derived = {"contact_time": factors["approach_distance"] / factors["speed"]}
     return SampledScene(*builder.assemble(layout(options), [balls], jnp.zeros(2)), derived=derived)
 

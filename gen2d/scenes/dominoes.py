@@ -30,7 +30,7 @@ class Options:
 
 
 def check(options: Options) -> None:
-    """Raises ValueError where the ball would begin in the floor."""
+    """Raise ValueError if the ball would begin in the floor."""
     lowest = options.ball_height.support[0] * options.height.support[0]
     if not options.radius.support[1] <= lowest:
         raise ValueError(
@@ -47,7 +47,7 @@ def layout(options: Options) -> Layout:
         for name in ("height", "thickness", "gap", "radius", "ball_distance", "ball_height")
     }
     row = most * ends["thickness"] + (most - 1) * ends["gap"]
-    width = 2 * ends["radius"] + ends["ball_distance"] + row + ends["height"]  # the last one's fall
+    width = 2 * ends["radius"] + ends["ball_distance"] + row + ends["height"]  # room for the last one to fall
     runs = SlotGroup("segment", 1, STATIC), SlotGroup("circle", 1), SlotGroup("polygon", most, vertices=4)
     top = max(1.2 * ends["height"], ends["ball_height"] * ends["height"] + ends["radius"])
     reach = max((ends["height"] ** 2 + ends["thickness"] ** 2) ** 0.5 / 2, ends["radius"])
@@ -55,7 +55,7 @@ def layout(options: Options) -> Layout:
 
 
 def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledScene:
-    """One video's scene and initial state: ball, row and the last one's fall are in the middle of the view."""
+    """One video's scene and initial state: the ball, the row and room for its fall, centred in the view."""
     layers = layout(options)
     count, most = factors["dominoes"], int(options.dominoes.support[1])
     height, thickness, gap, radius = (factors[name] for name in ("height", "thickness", "gap", "radius"))
@@ -63,12 +63,13 @@ def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledSc
     length = run_up + count * thickness + (count - 1) * gap + height
     first = (layers.bounds[2] - length) / 2 + run_up
     x = first + thickness / 2 + numbers * (thickness + gap)
-    places = jnp.stack([x, jnp.full(most, 1.0) * height / 2], -1)
-    tips = numbers == 0
-    turning = factors["spin"] * jnp.stack([-height, -thickness]) / 2  # its centre is up and left of its right foot
+    positions = jnp.stack([x, jnp.full(most, 1.0) * height / 2], -1)
+    is_first = numbers == 0
+    # The centre is above and left of the foot about which the first domino turns.
+    velocity = factors["spin"] * jnp.stack([-height, -thickness]) / 2
     row = builder.boxes(
-        places, 0.0, thickness, height, numbers < count, velocity=tips[:, None] * turning, spin=tips * factors["spin"],
-        **builder.material(factors),
+        positions, 0.0, thickness, height, numbers < count,
+        velocity=is_first[:, None] * velocity, spin=is_first * factors["spin"], **builder.material(factors),
     )  # fmt: skip
     ball = builder.discs(
         jnp.stack([first - factors["ball_distance"] - radius, factors["ball_height"] * height])[None], radius,

@@ -30,7 +30,7 @@ class Options:
 
 
 def check(options: Options) -> None:
-    """Raises ValueError where the slopes do not fit the box, or leave no room for a ball above them."""
+    """Raise ValueError if the slopes do not fit the box, or leave no room for a ball above them."""
     largest, (narrow, wide) = options.radius.support[1], options.gap.support
     if not wide < options.width:
         raise ValueError(f"gap may be {wide:g} m, but must be less than the width of the box, {options.width:g} m")
@@ -60,12 +60,12 @@ def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledSc
     rim = options.neck_height + jnp.tan(factors["angle"]) * (middle - factors["gap"] / 2)
     present = jnp.arange(len(radius)) < factors["balls"]
     low, high = jnp.stack([jnp.zeros_like(rim), rim]), jnp.asarray([options.width, options.height])
-    places, rejected, fits = place(jax.random.fold_in(key, 0), radius, present, low, high)
+    positions, rejected, fits = place(jax.random.fold_in(key, 0), radius, present, low, high)
     upper = jnp.stack([jnp.asarray([0.0, options.width]), jnp.stack([rim, rim])], axis=-1)
     sides = middle + jnp.asarray([-0.5, 0.5]) * factors["gap"]
     lower = jnp.stack([sides, jnp.full(2, options.neck_height)], axis=-1)
     parts = [
-        builder.discs(places, radius, present, **builder.material(factors)),
+        builder.discs(positions, radius, present, **builder.material(factors)),
         builder.box_walls(options.width, options.height, **builder.material(factors, "wall")),
         builder.segments(upper, lower, **builder.material(factors, "wall")),
     ]

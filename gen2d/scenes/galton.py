@@ -33,7 +33,7 @@ class Options:
 
 
 def check(options: Options) -> None:
-    """Raises ValueError where a ball does not fit between pegs, or two touch at the start."""
+    """Raise ValueError if a ball does not fit between pegs, or two touch at the start."""
     largest, room = options.radius.support[1], options.spacing - 2 * options.peg_radius
     if not 2 * largest < room:
         raise ValueError(f"radius may be {largest:g} m, but a ball must fit between pegs {room:g} m apart")
@@ -85,22 +85,22 @@ def layout(options: Options) -> Layout:
 
 
 def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledScene:
-    """One video's scene and initial state: balls at rest above the first peg, each a little aside."""
-    here, (_, _, right, top) = layout(options), layout(options).bounds
+    """One video's scene and initial state: balls at rest above the first peg, slightly off centre."""
+    scene_layout, (_, _, right, top) = layout(options), layout(options).bounds
     number = jnp.arange(len(factors["radius"]))
     heights = top_peg(options) + options.spacing + number * options.ball_spacing
-    places = jnp.stack([right / 2 + factors["jitter"], heights], axis=-1)
-    balls = builder.discs(places, factors["radius"], number < factors["balls"], **builder.material(factors))
+    positions = jnp.stack([right / 2 + factors["jitter"], heights], axis=-1)
+    balls = builder.discs(positions, factors["radius"], number < factors["balls"], **builder.material(factors))
 
     board = builder.material(factors, "board")
     lattice = builder.discs(
         jnp.asarray(pegs(options)), options.peg_radius, kind=STATIC, color=factors["peg_color"], **board
     )
-    at = jnp.arange(1, options.rows + 1) * options.spacing
-    feet = jnp.stack([at, jnp.zeros_like(at)], axis=-1)
+    x = jnp.arange(1, options.rows + 1) * options.spacing
+    feet = jnp.stack([x, jnp.zeros_like(x)], axis=-1)
     bins = builder.segments(feet, feet + jnp.asarray([0.0, options.bin_height]), **board)
     parts = [balls, lattice, bins, builder.box_walls(right, top, **board)]
-    return SampledScene(*builder.assemble(here, parts, factors["gravity"]))
+    return SampledScene(*builder.assemble(scene_layout, parts, factors["gravity"]))
 
 
 FAMILY = Family(options=Options, layout=layout, sample=sample, check=check)

@@ -1,4 +1,4 @@
-"""Pairs of balls that look the same and are not: what one weighs shows where it hits another."""
+"""Pairs of balls that look alike but differ in density, elasticity and friction, which only collisions reveal."""
 
 import dataclasses
 
@@ -21,9 +21,9 @@ from gen2d.plugin import (
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """The pairs of balls and their box, seen from above, so that nothing falls.
+    """The pairs of balls and their box, seen from above, without gravity.
 
-    A list of two is of the ball that comes from the left and of the one that comes from the right.
+    Lists of two hold values of the left and the right ball of each pair.
     """
 
     pairs: Distribution = common.count("pairs", [1, 2], "number of pairs, each in a lane of its own", high=32)
@@ -58,7 +58,7 @@ class Options:
 
 
 def check(options: Options) -> None:
-    """Raises ValueError where the pairs do not fit beside each other, or two balls not behind one another."""
+    """Raise ValueError if the pairs do not fit above each other, or two balls not beside each other."""
     largest, pairs = options.radius.support[1], options.pairs.support[1]
     lane = 2 * largest * (1 + max(map(abs, options.offset.support)))
     if not pairs * lane < options.height:
@@ -77,30 +77,31 @@ def layout(options: Options) -> Layout:
 
 
 def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledScene:
-    """One video's scene and initial state: every pair in its lane, one from the left and one from the right."""
+    """One video's scene and initial state: each pair in its lane, a ball from the left and one from the right."""
     radius, density, pairs = factors["radius"], factors["density"], factors["pairs"]
     number, sides = jnp.arange(len(density)), jnp.asarray([1.0, -1.0])
     present = number < pairs
-    inwards = radius + factors["relative_position"] * (
-        options.width / 2 - 2 * radius
-    )  # m, from the ball's side of the box
+    # Distance in m from the ball's side of the box.
+    inwards = radius + factors["relative_position"] * (options.width / 2 - 2 * radius)
     x = jnp.where(sides > 0, inwards, options.width - inwards)
     aside = factors["offset"] * 2 * radius
     y = ((number + 0.5) / pairs * options.height)[:, None] - sides * aside[:, None] / 2
     velocity = jnp.stack([factors["speed"] * sides, jnp.zeros_like(x)], axis=-1)
 
     def each(values: Array) -> Array:
-        """Of the balls, from what is of pairs."""
+        """Values of the balls [2 pairs, ...], from those of the pairs [pairs, 2, ...]."""
         return values.reshape(-1, *values.shape[2:])
 
-    own = {name: each(factors[name]) for name in ("density", "elasticity", "friction")} | {"color": factors["color"]}
+    material = {name: each(factors[name]) for name in ("density", "elasticity", "friction")} | {
+        "color": factors["color"]
+    }
     balls = builder.discs(
-        each(jnp.stack([x, y], axis=-1)), radius, jnp.repeat(present, 2), velocity=each(velocity), **own
+        each(jnp.stack([x, y], axis=-1)), radius, jnp.repeat(present, 2), velocity=each(velocity), **material
     )
     walls = builder.box_walls(options.width, options.height, **builder.material(factors, "wall"))
-    closing, way = factors["speed"].sum(-1), x[:, 1] - x[:, 0] - jnp.sqrt(4 * radius**2 - aside**2)
+    closing, gap = factors["speed"].sum(-1), x[:, 1] - x[:, 0] - jnp.sqrt(4 * radius**2 - aside**2)
     derived = {
-        "contact_time": jnp.where(present, way / jnp.where(present, closing, 1.0), 0.0),
+        "contact_time": jnp.where(present, gap / jnp.where(present, closing, 1.0), 0.0),
         "mass_ratio": jnp.where(present, density[:, 0] / jnp.where(present, density[:, 1], 1.0), 0.0),
     }
     return SampledScene(*builder.assemble(layout(options), [balls, walls], jnp.zeros(2)), derived=derived)

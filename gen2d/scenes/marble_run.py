@@ -7,7 +7,7 @@ import jax.numpy as jnp
 
 from gen2d.plugin import STATIC, Array, Distribution, Family, Layout, SampledScene, SlotGroup, builder, common, option
 
-CLEARANCE = 0.02  # m: how much more room than it needs the ball has between two ramps, at least
+CLEARANCE = 0.02  # m, smallest spare room for the ball between two ramps
 
 
 @dataclasses.dataclass(frozen=True)
@@ -36,7 +36,7 @@ class Options:
 
 
 def check(options: Options) -> None:
-    """Raises ValueError where the ball could miss a ramp, or not pass between two."""
+    """Raise ValueError if the ball could miss a ramp, or not pass between two."""
     largest, (short, long) = options.radius.support[1], options.length.support
     ramps, steep = options.ramps.support[1], options.slope.support[1]
     if not short > 0.5:
@@ -45,7 +45,7 @@ def check(options: Options) -> None:
         raise ValueError(
             f"length may be {long:g}, but must leave the ball, whose radius may be {largest:g} m, room to fall"
         )
-    # All but the first ramp begin as far above the end of the last one as they rise to the wall from there.
+    # Each ramp after the first passes `room` below the end of the previous one, and rises from there to its wall.
     down = (long + (ramps - 1) * (2 * long - 1)) * options.width * math.tan(steep)
     room = (options.height - headroom(options) - down) / ramps
     if not room * math.cos(steep) > 2 * largest + CLEARANCE:
@@ -72,7 +72,7 @@ def layout(options: Options) -> Layout:
 
 
 def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledScene:
-    """One video's scene and initial state: ramps as far apart as the height allows, and the ball over the first.
+    """One video's scene and initial state: ramps as far apart as the height allows, and the ball above the first.
 
     The first begins at the left wall, the next at the right one, and so on.
     """
@@ -80,7 +80,7 @@ def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledSc
     present = number < factors["ramps"]
     across, rise = factors["length"] * options.width, jnp.tan(factors["slope"])
     falls = across * rise
-    # The next ramp is under a ramp's lower end by `room`, and rises from there to the wall.
+    # The next ramp passes `room` below a ramp's lower end, and rises from there to the wall.
     rises = jnp.where(present, options.width - across, 0.0) * jnp.append(rise[1:], 0.0)
     top = options.height - headroom(options)
     room = (top - falls.sum() + rises.sum()) / factors["ramps"]

@@ -1,4 +1,4 @@
-"""Balls that pass behind a screen, which is drawn before them and which nothing touches."""
+"""Balls that pass behind a screen, which hides them and collides with nothing."""
 
 import dataclasses
 
@@ -53,7 +53,7 @@ class Options:
 
 
 def check(options: Options) -> None:
-    """Raises ValueError where a ball does not fit behind the screen or beside it, or the screen into the box."""
+    """Raise ValueError if a ball does not fit behind the screen or beside it, or the screen into the box."""
     largest, most = options.radius.support[1], options.balls.support[1]
     (narrow, wide), (low, high) = options.screen_width.support, options.screen_height.support
     if not 2 * largest < narrow:
@@ -82,7 +82,7 @@ def layout(options: Options) -> Layout:
 
 
 def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledScene:
-    """One video's scene and initial state: balls on their way to the screen, each at its own part of its height."""
+    """One video's scene and initial state: balls that move towards the screen, each to its own part of it."""
     radius, side, speed = factors["radius"], factors["side"], factors["speed"]
     number, largest = jnp.arange(len(radius)), options.radius.support[1]
     present = number < factors["balls"]
@@ -91,20 +91,22 @@ def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledSc
     corner = beside + factors["screen_position"] * (jnp.asarray([options.width, options.height]) - size - 2 * beside)
 
     left, right = corner[0], options.width - corner[0] - size[0]  # m, between the walls and the screen
-    across = radius + factors["relative_position"][:, 0] * (jnp.where(side < 0, left, right) - 2 * radius)
-    x = jnp.where(side < 0, across, options.width - across)
-    part = size[1] / factors["balls"]
-    y = corner[1] + number * part + radius + factors["relative_position"][:, 1] * (part - 2 * radius)
+    distance = radius + factors["relative_position"][:, 0] * (jnp.where(side < 0, left, right) - 2 * radius)
+    x = jnp.where(side < 0, distance, options.width - distance)
+    part_height = size[1] / factors["balls"]
+    y = corner[1] + number * part_height + radius + factors["relative_position"][:, 1] * (part_height - 2 * radius)
     velocity = jnp.stack([-side * speed, jnp.zeros_like(speed)], axis=-1)
     balls = builder.discs(jnp.stack([x, y], axis=-1), radius, present, velocity=velocity, **builder.material(factors))
     walls = (
         [builder.box_walls(options.width, options.height, **builder.material(factors, "wall"))] if options.walls else []
     )
-    unseen = {"kind": STATIC, "layer": 2, "collides": False}
-    screen = builder.boxes((corner + size / 2)[None], 0.0, *size, **unseen, **builder.material(factors, "screen"))
-    there = jnp.where(present, speed, 1.0)
-    hidden_from = (jnp.where(side < 0, left, right) - across + radius) / there
-    derived = {"hidden_from": hidden_from, "hidden_for": (size[0] - 2 * radius) / there}
+    collisionless = {"kind": STATIC, "layer": 2, "collides": False}
+    screen = builder.boxes(
+        (corner + size / 2)[None], 0.0, *size, **collisionless, **builder.material(factors, "screen")
+    )
+    divisor = jnp.where(present, speed, 1.0)
+    hidden_from = (jnp.where(side < 0, left, right) - distance + radius) / divisor
+    derived = {"hidden_from": hidden_from, "hidden_for": (size[0] - 2 * radius) / divisor}
     derived = {name: jnp.where(present, values, 0.0) for name, values in derived.items()}
     return SampledScene(
         *builder.assemble(layout(options), [balls, *walls, screen], factors["gravity"]), derived=derived

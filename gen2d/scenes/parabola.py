@@ -1,6 +1,6 @@
-"""A thrown ball: its way is a parabola, as nothing is in its way.
+"""A thrown ball, whose path is a parabola, as it hits nothing.
 
-With the numbers of configs/phyworld_parabola.yaml it is a scene of the study 'How Far is Video Generation from World
+With the values of configs/phyworld_parabola.yaml it is a scene of the study 'How Far is Video Generation from World
 Model' (Kang et al., arXiv 2411.02385).
 """
 
@@ -43,7 +43,7 @@ class Options:
 
 
 def check(options: Options) -> None:
-    """Raises ValueError where the ball may start outside of the view."""
+    """Raise ValueError if the ball may start outside of the view."""
     largest, drop = options.radius.support[1], options.top_distance.support[1]
     if not 2 * largest < options.width:
         raise ValueError(f"radius may be {largest:g} m, but a ball must fit a view {options.width:g} m wide")
@@ -63,7 +63,7 @@ def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledSc
     """One video's scene and initial state: the ball where it stays in view long enough, if such a position exists."""
     radius, angle = factors["radius"], factors["angle"]
     velocity = factors["speed"] * jnp.stack([jnp.cos(angle), jnp.sin(angle)])
-    # Its way to the side is that of a ball without gravity, which is exact where gravity points down.
+    # The horizontal motion is computed without gravity, which is exact if gravity points down.
     x = start_position(
         factors["relative_position"],
         radius,

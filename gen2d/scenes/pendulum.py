@@ -1,4 +1,4 @@
-"""A pendulum of one link or two: rods with a bob at the end of each, which pass one another freely."""
+"""A pendulum of one link or two: rods with a bob at the end of each, which do not collide."""
 
 import dataclasses
 import math
@@ -45,11 +45,11 @@ def sizes(options: Options) -> dict[str, int]:
 
 
 def layout(options: Options) -> Layout:
-    """The pin, the rods and the bobs; each bob hangs on its rod from what is above it."""
+    """The pin, the rods and the bobs; each bob hangs from the pin or the bob above it."""
     n, length, radius = options.links, options.length.support[1], options.radius.support[1]
     rods, bobs = SlotGroup("capsule", n, layer=1, collides=False), SlotGroup("circle", n, layer=2, collides=False)
     pin = SlotGroup("circle", 1, STATIC, layer=3, collides=False)
-    # A bob turns with its rod, about what is above it; the rod, which is light, is fixed to it at both ends.
+    # A bob turns about the pin or the bob above it; its light rod is fixed to it at both ends.
     ties = [
         (JointSpec("revolute", n + i if i else 0, 1 + n + i), *[JointSpec("revolute", 1 + i, 1 + n + i)] * 2)
         for i in range(n)
@@ -64,12 +64,12 @@ def layout(options: Options) -> Layout:
 def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledScene:
     """One video's scene and initial state: every link at its angle."""
     length, angle, n = factors["length"], factors["angle"], options.links
-    ways = length[:, None] * jnp.stack([jnp.sin(angle), -jnp.cos(angle)], -1)
-    speeds = factors["spin"][:, None] * jnp.stack([-ways[:, 1], ways[:, 0]], -1)
-    ends, end_speeds = jnp.cumsum(ways, 0), jnp.cumsum(speeds, 0)
+    links = length[:, None] * jnp.stack([jnp.sin(angle), -jnp.cos(angle)], -1)
+    speeds = factors["spin"][:, None] * jnp.stack([-links[:, 1], links[:, 0]], -1)
+    ends, end_speeds = jnp.cumsum(links, 0), jnp.cumsum(speeds, 0)
     pin = builder.discs(jnp.zeros((1, 2)), PIN, kind=STATIC, layer=3, collides=False)
     rods = builder.capsules_between(
-        ends - ways, ends, ROD, velocity=end_speeds - speeds / 2, spin=factors["spin"], layer=1, collides=False,
+        ends - links, ends, ROD, velocity=end_speeds - speeds / 2, spin=factors["spin"], layer=1, collides=False,
         **builder.material(factors, "rod"),
     )  # fmt: skip
     bobs = builder.discs(
@@ -77,9 +77,9 @@ def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledSc
         **builder.material(factors),
     )  # fmt: skip
     half, up = (jnp.stack(pair, -1) for pair in ((rods.objects["half_length"], jnp.zeros(n)), (jnp.zeros(n), length)))
-    nothing = jnp.zeros((n, 2))
-    # In the frame of a bob `up` is where it hangs; a rod goes from its left end to its right.
-    above, below = (jnp.stack(x, 1).reshape(-1, 2) for x in ((nothing, -half, half), (up, up, nothing)))
+    zeros = jnp.zeros((n, 2))
+    # `up` is the upper joint in the frame of a bob; a rod extends from its left end to its right end.
+    above, below = (jnp.stack(x, 1).reshape(-1, 2) for x in ((zeros, -half, half), (up, up, zeros)))
     scene, state = builder.assemble(
         layout(options), [pin, rods, bobs], factors["gravity"], builder.distance_joints(above, below)
     )

@@ -1,4 +1,4 @@
-"""Many objects, discs, boxes and capsules, that fall into a bin and come to rest."""
+"""Many discs, boxes and capsules that fall into a bin and come to rest."""
 
 import dataclasses
 import math
@@ -55,13 +55,13 @@ class Options:
 
 
 def reach(options: Options) -> float:
-    """The largest distance of a rim from its centre, m."""
+    """Largest distance of an object's boundary from its centre, m."""
     stadium = options.capsule_radius.support[1] + options.capsule_half_length.support[1]
     return max(options.disc_radius.support[1], math.hypot(*(side.support[1] for side in options.box_size)) / 2, stadium)
 
 
 def check(options: Options) -> None:
-    """Raises ValueError where the bin cannot hold an object."""
+    """Raise ValueError if the bin cannot hold an object."""
     if not 2 * reach(options) < min(options.width, options.height):
         raise ValueError(
             f"disc_radius, box_size and capsule_half_length allow an object {2 * reach(options):g} m across, but it "
@@ -82,21 +82,27 @@ def layout(options: Options) -> Layout:
 
 
 def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledScene:
-    """One video's scene and initial state: everything at rest in the air, so far apart that it may have any angle."""
+    """One video's scene and initial state: all objects at rest in the air, far enough apart for any angle."""
     radius, size, half = factors["disc_radius"], factors["box_size"], factors["capsule_half_length"]
     kinds = ("discs", "boxes", "capsules")
-    around = [radius, jnp.linalg.norm(size, axis=-1) / 2, half + factors["capsule_radius"]]
-    there = [jnp.arange(len(r)) < factors[kind] for r, kind in zip(around, kinds, strict=True)]
-    radii, present, room = jnp.concatenate(around), jnp.concatenate(there), jnp.asarray([options.width, options.height])
-    places, rejected, fits = place(jax.random.fold_in(key, 0), radii, present, jnp.zeros(2), room)
-    at = jnp.split(places, [len(there[0]), len(there[0]) + len(there[1])])
+    radii_of = [radius, jnp.linalg.norm(size, axis=-1) / 2, half + factors["capsule_radius"]]
+    present_of = [jnp.arange(len(r)) < factors[kind] for r, kind in zip(radii_of, kinds, strict=True)]
+    radii, present, room = (
+        jnp.concatenate(radii_of),
+        jnp.concatenate(present_of),
+        jnp.asarray([options.width, options.height]),
+    )
+    positions, rejected, fits = place(jax.random.fold_in(key, 0), radii, present, jnp.zeros(2), room)
+    positions_of = jnp.split(positions, [len(present_of[0]), len(present_of[0]) + len(present_of[1])])
     disc, box, capsule = (
         builder.material(factors) | builder.material(factors, of) for of in ("disc", "box", "capsule")
     )
     parts = [
-        builder.discs(at[0], radius, there[0], **disc),
-        builder.boxes(at[1], factors["box_angle"], size[:, 0], size[:, 1], there[1], **box),
-        builder.capsules(at[2], factors["capsule_angle"], half, factors["capsule_radius"], there[2], **capsule),
+        builder.discs(positions_of[0], radius, present_of[0], **disc),
+        builder.boxes(positions_of[1], factors["box_angle"], size[:, 0], size[:, 1], present_of[1], **box),
+        builder.capsules(
+            positions_of[2], factors["capsule_angle"], half, factors["capsule_radius"], present_of[2], **capsule
+        ),
         builder.box_walls(options.width, options.height, **builder.material(factors, "bin")),
     ]
     return SampledScene(*builder.assemble(layout(options), parts, factors["gravity"]), rejected, fits)

@@ -1,7 +1,8 @@
 """A ball that rolls or slides down a slope, or a capsule that slides down or stays, then a floor and a wall.
 
-The friction of a contact is the product of both (physics.mixing). A ball rolls where it is above tan(slope) / 3, at
-2/3 g sin(slope); below, it slides, at g (sin - friction cos). A capsule stays where it is above tan(slope).
+The friction of a contact is the product of both bodies' (physics.mixing). If it is above tan(slope) / 3, a ball rolls
+with acceleration 2/3 g sin(slope); otherwise it slides with g (sin(slope) - friction cos(slope)). A capsule stays at
+rest if the friction is above tan(slope).
 """
 
 import dataclasses
@@ -47,7 +48,7 @@ class Options:
 
 
 def check(options: Options) -> None:
-    """Raises ValueError where the slope may leave the view, or be too short."""
+    """Raise ValueError if the slope may leave the view, or be too short."""
     radius, steepest = options.radius.support[1], options.slope.support[1]
     most = 2 * (radius + (options.half_length.support[1] if options.shape == "capsule" else 0.0))
     if not options.foot_distance < options.width:
@@ -74,7 +75,7 @@ def layout(options: Options) -> Layout:
 
 
 def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledScene:
-    """One video's scene and initial state: a ball or capsule at rest that touches the slope."""
+    """One video's scene and initial state: a ball or capsule at rest on the slope."""
     slope, radius = factors["slope"], factors["radius"]
     half = factors["half_length"] if options.shape == "capsule" else jnp.zeros(())
     length, top = options.foot_distance / jnp.cos(slope), options.foot_distance * jnp.tan(slope)

@@ -41,7 +41,7 @@ class Options:
 
 
 def check(options: Options) -> None:
-    """Raises ValueError where a weight may be wider than its part of the plank, or the plank may touch the floor."""
+    """Raise ValueError if a weight may be wider than its part of the plank, or the plank may touch the floor."""
     part = options.length.support[0] / options.weights.support[1]
     if options.width.support[1] > part:
         raise ValueError(
@@ -66,7 +66,7 @@ def layout(options: Options) -> Layout:
         SlotGroup("polygon", most, vertices=4, layer=1),
     )
     top = options.pivot_height.support[1] + options.thickness.support[1] / 2 + options.drop_height.support[1] + height
-    half = length / 2 + max(width, height)  # what slides off lies beside it
+    half = length / 2 + max(width, height)  # room for weights that slide off
     reach = max(length**2 + options.thickness.support[1] ** 2, width**2 + height**2) ** 0.5 / 2
     return Layout(runs, (-half, 0.0, half, max(top, length / 2)), reach, (JointSpec("revolute", 1, 2),))
 
@@ -76,11 +76,13 @@ def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledSc
     layers, pivot, length, thickness = layout(options), factors["pivot_height"], factors["length"], factors["thickness"]
     surface = {name: factors[name] for name in ("elasticity", "friction")}
     ground = builder.floor(layers, friction=factors["friction"])
-    # Its upper corner is the pivot, its centre of mass at a third of the height.
+    # The upper corner is the pivot, and the centre of mass lies at a third of the height.
     corners = pivot * jnp.asarray([[-0.4, -1 / 3], [0.4, -1 / 3], [0.0, 2 / 3]])
     stand = builder.polygons(jnp.stack([jnp.zeros(()), pivot / 3])[None], 0.0, corners[None], kind=STATIC, **surface)
-    level = jnp.stack([jnp.zeros(()), pivot])[None]
-    plank = builder.boxes(level, 0.0, length, thickness, layer=1, **surface, **builder.material(factors, "plank"))
+    plank_position = jnp.stack([jnp.zeros(()), pivot])[None]
+    plank = builder.boxes(
+        plank_position, 0.0, length, thickness, layer=1, **surface, **builder.material(factors, "plank")
+    )
     numbers, part = jnp.arange(len(factors["width"])), length / factors["weights"]
     x = numbers * part + factors["width"] / 2 + factors["relative_position"] * (part - factors["width"]) - length / 2
     y = pivot + (thickness + factors["height"]) / 2 + factors["drop_height"]
@@ -88,8 +90,8 @@ def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledSc
         jnp.stack([x, y], -1), 0.0, factors["width"], factors["height"], numbers < factors["weights"],
         layer=1, **builder.material(factors),
     )  # fmt: skip
-    nowhere = jnp.zeros((1, 2))
-    joint = builder.distance_joints(jnp.asarray([[0.0, 2 / 3]]) * pivot, nowhere)
+    centre = jnp.zeros((1, 2))
+    joint = builder.distance_joints(jnp.asarray([[0.0, 2 / 3]]) * pivot, centre)
     scene, state = builder.assemble(layers, [ground, stand, plank, weights], factors["gravity"], joint)
     torque = factors["gravity"][1] * jnp.sum(weights.objects["mass"] * x)
     return SampledScene(scene, state, derived={"torque": torque})

@@ -1,7 +1,7 @@
-"""Balls that go to the right with a spin, each on a floor of its own; with enough back-spin they come back.
+"""Balls that move to the right with a spin, each on its own floor; with enough back-spin they come back.
 
-A ball slides until it rolls, and then has the speed (2 v - r w) / 3, whatever the friction: about a point of the floor
-its angular momentum stays the same.
+A ball slides until it rolls, and then has the speed (2 v - r w) / 3, regardless of friction, because its angular
+momentum about a point of the floor is conserved.
 """
 
 import dataclasses
@@ -31,7 +31,7 @@ class Options:
 
 
 def check(options: Options) -> None:
-    """Raises ValueError where a ball may not fit its storey."""
+    """Raise ValueError if a ball may not fit its storey."""
     largest = options.radius.support[1]
     if not 2 * largest < min(options.floor_spacing, options.width):
         raise ValueError(
@@ -41,7 +41,7 @@ def check(options: Options) -> None:
 
 
 def layout(options: Options) -> Layout:
-    """The balls, and as many floors, each from the lowest on."""
+    """The balls, then their floors, both from the lowest up."""
     most = int(options.balls.support[1])
     runs = SlotGroup("circle", most), SlotGroup("segment", most, STATIC)
     return Layout(runs, (0.0, 0.0, options.width, most * options.floor_spacing), options.radius.support[1])
@@ -57,7 +57,7 @@ def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledSc
         velocity=jnp.stack([factors["speed"], jnp.zeros(most)], 1),
         spin=factors["spin"], **builder.material(factors),
     )  # fmt: skip
-    # A ball that leaves the view is far away when it comes to the end of its floor.
+    # The floors are so long that balls are far out of view when they reach the ends.
     left, right = (jnp.stack([jnp.full(most, end * options.width), floor], 1) for end in (-9.0, 10.0))
     floors = builder.segments(left, right, present, **builder.material(factors, "floor"))
     return SampledScene(*builder.assemble(layout(options), [balls, floors], factors["gravity"]))

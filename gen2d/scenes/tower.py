@@ -1,4 +1,4 @@
-"""Blocks stacked one on another, each a little aside: some towers stand, some fall."""
+"""A tower of blocks, each offset from the one below: some towers stand, some fall."""
 
 import dataclasses
 
@@ -18,7 +18,7 @@ from gen2d.plugin import (
     option,
 )
 
-AROUND = 0.75  # of the tower's height: how much is seen on either side, for what falls
+AROUND = 0.75  # margin of the view on either side, over the tower's height, for falling blocks
 
 
 @dataclasses.dataclass(frozen=True)
@@ -68,8 +68,8 @@ def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledSc
 def _margin(x: Array, width: Array, mass: Array, present: Array) -> Array:
     """Smallest distance in m, over all joints, of the centre of mass above the joint from the edge of its support.
 
-    A stack in which each block lies on one other stands if, and only if, it is above 0 at every joint (the floor's
-    too), as long as gravity is upright.
+    The contact with the floor counts as a joint. Under vertical gravity, a stack in which each block lies on one other
+    stands if and only if the margin is positive.
     """
     above = jnp.cumsum(mass[::-1])[::-1]
     centre = jnp.cumsum((mass * x)[::-1])[::-1] / jnp.where(above > 0, above, 1.0)

@@ -1,6 +1,6 @@
-"""One ball that crosses the view at a constant velocity: nothing pulls at it, nothing is in its way.
+"""One ball that crosses the view at constant velocity, without gravity or obstacles.
 
-With the numbers of configs/phyworld_uniform_motion.yaml it is a scene of the study 'How Far is Video Generation from
+With the values of configs/phyworld_uniform_motion.yaml it is a scene of the study 'How Far is Video Generation from
 World Model' (Kang et al., arXiv 2411.02385).
 """
 
@@ -43,7 +43,7 @@ class Options:
 
 
 def check(options: Options) -> None:
-    """Raises ValueError where the ball may be larger than the view."""
+    """Raise ValueError if the ball may be larger than the view."""
     largest = options.radius.support[1]
     if not (2 * largest < options.width and 2 * (largest + options.margin) < options.height):
         raise ValueError(
@@ -61,10 +61,10 @@ def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledSc
     """One video's scene and initial state: the ball where it stays in view long enough, if such a position exists."""
     radius, direction = factors["radius"], factors["direction"]
     velocity = factors["speed"] * jnp.stack([jnp.cos(direction), jnp.sin(direction)])
-    room = jnp.asarray([options.width, options.height])
+    view = jnp.asarray([options.width, options.height])
     nearest = radius + jnp.asarray([0.0, options.margin])
     start = start_position(
-        factors["relative_position"], nearest, room - nearest, options.duration * velocity, options.entry_distance
+        factors["relative_position"], nearest, view - nearest, options.duration * velocity, options.entry_distance
     )
     ball = builder.discs(start[None], radius, velocity=velocity, elasticity=1.0, **builder.material(factors))
     return SampledScene(*builder.assemble(layout(options), [ball], jnp.zeros(2)))

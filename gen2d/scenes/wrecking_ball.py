@@ -19,7 +19,7 @@ from gen2d.plugin import (
 )
 
 PIN, LINK = 0.12, 0.06  # m: radii of the disc that the chain hangs from, and of a link
-DEBRIS = 0.8  # of the tower's height: how much is seen beyond the tower
+DEBRIS = 0.8  # margin of the view beyond the tower, over its height
 
 
 @dataclasses.dataclass(frozen=True)
@@ -45,7 +45,7 @@ class Options:
 
 
 def check(options: Options) -> None:
-    """Raises ValueError where the ball might swing through the floor."""
+    """Raise ValueError if the ball might swing through the floor."""
     lowest = options.ball_height.support[0] * options.blocks.support[0] * options.height.support[0]
     if options.radius.support[1] > lowest:
         raise ValueError(
@@ -76,22 +76,22 @@ def layout(options: Options) -> Layout:
 
 
 def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledScene:
-    """One video's scene and initial state: the tower's left side at 0, the ball at rest on its taut chain."""
+    """One video's scene and initial state: the tower's left side at x = 0, and the ball at rest on its taut chain."""
     layers, n, most = layout(options), options.links, int(options.blocks.support[1])
     width, height, radius, chain, angle = (factors[x] for x in ("width", "height", "radius", "chain_length", "angle"))
     ground = builder.floor(layers, friction=factors["friction"])
     lowest = factors["ball_height"] * factors["blocks"] * height
     top = jnp.stack([-radius - factors["gap"], lowest + chain])
     pin = builder.discs(top[None], PIN, kind=STATIC, layer=3, collides=False)
-    way = chain * jnp.stack([-jnp.sin(angle), -jnp.cos(angle)])
-    corners = top + (jnp.arange(n + 1.0) / n)[:, None] * way
+    chain_vector = chain * jnp.stack([-jnp.sin(angle), -jnp.cos(angle)])
+    corners = top + (jnp.arange(n + 1.0) / n)[:, None] * chain_vector
     links = builder.capsules_between(
         corners[:-1], corners[1:], LINK, density=factors["ball_density"], layer=2, collides=False
     )
     ball = builder.discs(corners[-1:], radius, layer=3, **builder.material(factors) | builder.material(factors, "ball"))
     numbers = jnp.arange(most)
-    places = jnp.stack([jnp.full(most, 0.5) * width, (numbers + 0.5) * height], -1)
-    blocks = builder.boxes(places, 0.0, width, height, numbers < factors["blocks"], **builder.material(factors))
+    positions = jnp.stack([jnp.full(most, 0.5) * width, (numbers + 0.5) * height], -1)
+    blocks = builder.boxes(positions, 0.0, width, height, numbers < factors["blocks"], **builder.material(factors))
     parts = [ground, pin, links, ball, blocks]
     return SampledScene(*builder.assemble(layers, parts, factors["gravity"], builder.hinge_chain(links, tail=True)))
 

@@ -1,1 +1,1 @@
-"""A scene by hand: bodies and joints in a few lines of Python, simulated at once."""
+"""Scenes built by hand: bodies and joints in a few lines of Python, simulated at once."""

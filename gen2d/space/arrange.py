@@ -1,4 +1,4 @@
-"""Bodies by hand as slots of a scene, and the compiled program of their layout."""
+"""Arrangement of a space's bodies in slots, and the compiled program of their layout."""
 
 import dataclasses
 import functools
@@ -28,18 +28,21 @@ def slots_of_span(span: tuple[SlotGroup, int]) -> range:
 
 
 def shape_family(body: Body) -> str:
-    """The shape of the run that holds a body: a segment is a capsule, whose radius may be 0."""
+    """Shape of the slot group that holds a body; a segment counts as a capsule, whose radius may be 0."""
     return "capsule" if body.shape == "segment" else body.shape
 
 
 def slot_order(body: Body) -> tuple:
-    """By what slots are sorted; bodies alike in it share a run, fixed polygons only if they have as many corners."""
+    """Sort key of slots: kind, shape and, unless the body is dynamic, number of corners.
+
+    Bodies with equal keys share a slot group.
+    """
     corners = 0 if body.kind == DYNAMIC else len(body.vertices)
     return body.kind, ("circle", "capsule", "polygon").index(shape_family(body)), corners
 
 
 def fill_vertices(vertices: np.ndarray, corners: int) -> np.ndarray:
-    """The corners, the last one repeated up to a number; zeros where there are none."""
+    """Corners [corners, 2], padded with copies of the last; zeros if there are none."""
     if not len(vertices):
         return np.zeros((corners, 2))
     return np.concatenate([vertices, np.repeat(vertices[-1:], corners - len(vertices), axis=0)])
@@ -58,9 +61,12 @@ def world_anchor(shape: str) -> Body:
 def touching_points(
     runs: tuple[SlotGroup, SlotGroup], objects: Objects, sides: Sequence[jax.Array], places: Sequence
 ) -> list[tuple]:
-    """Gap, place and normal of each point of some pairs: slots of two runs, and where they are."""
-    forms = (body_shape_of(objects, run, side) for run, side in zip(runs, sides, strict=True))
-    a, b = (to_world(form, *place) for form, place in zip(forms, places, strict=True))
+    """Gap, point and normal of the closest points of pairs of bodies.
+
+    `runs` are two slot groups, `sides` the slots of each pair in them, `places` the positions and angles of these.
+    """
+    shapes = (body_shape_of(objects, run, side) for run, side in zip(runs, sides, strict=True))
+    a, b = (to_world(form, *place) for form, place in zip(shapes, places, strict=True))
     return [(point.gap, a.centre + point.arm_a, point.normal) for point in touches(a, b)]
 
 
@@ -68,7 +74,7 @@ def touching_points(
 def compiled_program(
     layout: Layout, rules: SolverParams, frames: int, steps: int, keep: SaveAt, forces: Any
 ) -> Callable:
-    """The compiled program of a layout; scenes, states and trajectories have videos first."""
+    """Compiled simulation of a layout; scenes, states and trajectories have the videos first."""
     hook = None if forces is None else _by_slot(*forces)
     sparse = jax.default_backend() == "cpu"
 
@@ -80,33 +86,33 @@ def compiled_program(
 
 
 def _by_slot(forces: Callable, slots: tuple[int, ...]) -> Forces:
-    """The hook that the solver takes, from one over bodies by number."""
+    """Forces on slots, as the solver expects them, from a function of forces on bodies by number."""
     order = np.array(slots)
 
     def hook(state: State, time: jax.Array) -> tuple[jax.Array, jax.Array]:
-        own = jax.tree.map(lambda x: jnp.moveaxis(x[..., order, 0], 0, -1), state)
-        force, torque = forces(own, time)
-        nothing = jnp.zeros_like(state.position), jnp.zeros_like(state.angle)
-        return nothing[0].at[:, order, 0].set(jnp.asarray(force).T), nothing[1].at[order, 0].set(torque)
+        body_state = jax.tree.map(lambda x: jnp.moveaxis(x[..., order, 0], 0, -1), state)
+        force, torque = forces(body_state, time)
+        zeros = jnp.zeros_like(state.position), jnp.zeros_like(state.angle)
+        return zeros[0].at[:, order, 0].set(jnp.asarray(force).T), zeros[1].at[order, 0].set(torque)
 
     return hook
 
 
 def body_numbers(slots: np.ndarray, count: int) -> np.ndarray:
-    """The number of the body in each slot; -1 is the world."""
+    """Number of the body in each slot; -1 for the world's."""
     numbers = np.full(count, -1)
     numbers[slots] = np.arange(len(slots))
     return numbers
 
 
 def filled_contacts(contacts: Contacts, slots: np.ndarray, count: int) -> Contacts:
-    """The rows in use, with bodies by number."""
-    there, room = int(contacts.count), contacts.time.shape[0]
-    if there > room:
+    """Filled rows of contacts, with bodies by number; warns if rows are missing for lack of room."""
+    total, capacity = int(contacts.count), contacts.time.shape[0]
+    if total > capacity:
         warnings.warn(
-            f"simulate: there were {there} rows of contacts, but contacts={room} keeps only so many", stacklevel=3
+            f"simulate: there were {total} rows of contacts, but contacts={capacity} keeps only so many", stacklevel=3
         )
     names = [f.name for f in dataclasses.fields(contacts) if f.name != "count"]
-    rows = {name: getattr(contacts, name)[:there] for name in names}
+    rows = {name: getattr(contacts, name)[:total] for name in names}
     numbers = body_numbers(slots, count)
     return Contacts(**rows | {"a": numbers[rows["a"]], "b": numbers[rows["b"]], "count": contacts.count})

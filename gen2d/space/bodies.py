@@ -1,4 +1,4 @@
-"""Bodies, joints and poses of a scene by hand."""
+"""Bodies, joints and poses of a `Space`."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -10,30 +10,30 @@ from gen2d.core.enums import DYNAMIC, KINEMATIC, STATIC
 
 KINDS = {"dynamic": DYNAMIC, "static": STATIC, "kinematic": KINEMATIC}
 MOST_CORNERS = 8
-GREY = (110, 110, 110)  # what does not move of itself
+GREY = (110, 110, 110)  # of static and kinematic bodies
 Pair = Sequence[float] | np.ndarray
 
 
 class BodyOptions(TypedDict, total=False):
-    """What every `add_` of a body takes besides its shape."""
+    """Options of all methods of `Space` that add a body."""
 
-    kind: str  # "dynamic", "static" or "kinematic" (moves at its velocity, whatever it meets)
+    kind: str  # "dynamic", "static" or "kinematic" (moves at its velocity, whatever it touches)
     velocity: Pair  # m/s, of the centre of mass; default 0
     spin: float  # rad/s; default 0
     density: float  # kg/m^2; default 1
-    mass: float | None  # kg; default: area times density. Of a dynamic body only, as is the moment
-    moment: float | None  # kg m^2; default: of a solid body of this mass; infinite: it does not turn
-    elasticity: float  # coefficient of restitution, 0 to 1; default 0. Space(mixing=...) makes one of two
+    mass: float | None  # kg; default: area times density. Dynamic bodies only, as is the moment
+    moment: float | None  # kg m^2; default: that of a solid body of this mass; infinite: no rotation
+    elasticity: float  # coefficient of restitution, 0 to 1; default 0. Space(mixing=...) combines those of two bodies
     friction: float  # Coulomb coefficient; default 0.7
     rolling_resistance: float  # torque over normal force and radius; default 0
-    color: Sequence[int] | None  # red, green, blue, 0 to 255; default: by number, grey if it is not dynamic
+    color: Sequence[int] | None  # red, green, blue, 0 to 255; default: by number, grey if not dynamic
     force: Pair | None  # N, constant, at the centre of mass
     torque: float | None  # N m, constant
 
 
 @dataclasses.dataclass(frozen=True)
 class Body:
-    """A body as it is at the start."""
+    """A body in its initial state."""
 
     shape: str
     position: np.ndarray  # [2] m, of the centre of mass
@@ -56,7 +56,7 @@ class Body:
 
 @dataclasses.dataclass(frozen=True)
 class Joint:
-    """A joint between two bodies by number; -1 is the world. Anchors are in the bodies' frames."""
+    """A joint between two bodies by number, where -1 is the world; anchors are in the bodies' frames."""
 
     kind: str
     a: int
@@ -68,7 +68,7 @@ class Joint:
 
 
 class Overlaps(NamedTuple):
-    """Where bodies overlap, a row for each of R points, in order of frames."""
+    """Overlaps of bodies, a row for each of R points, ordered by frame."""
 
     frame: np.ndarray
     a: np.ndarray  # number of the body that the normal leaves
@@ -79,7 +79,7 @@ class Overlaps(NamedTuple):
 
 
 class Poses(NamedTuple):
-    """Bodies that are where they are told to be; a video as far as it can be drawn."""
+    """Bodies at given positions and angles, with their overlaps; can be plotted like a video."""
 
     bodies: tuple[Body, ...]
     joints: tuple[Joint, ...]
@@ -89,7 +89,7 @@ class Poses(NamedTuple):
 
 
 class Drawable(Protocol):
-    """What can be plotted: bodies and joints, and where they are at T instants."""
+    """Anything that can be plotted: bodies and joints with their poses at T instants."""
 
     @property
     def bodies(self) -> tuple[Body, ...]:
@@ -98,7 +98,7 @@ class Drawable(Protocol):
 
     @property
     def joints(self) -> tuple[Joint, ...]:
-        """The joints between them."""
+        """Joints between the bodies."""
         ...
 
     @property
@@ -118,7 +118,7 @@ class Drawable(Protocol):
 
 
 class Film(Drawable, Protocol):
-    """A drawable whose instants are frames."""
+    """A drawable with a frame rate."""
 
     @property
     def fps(self) -> float:

@@ -1,4 +1,4 @@
-"""Checks of arguments."""
+"""Checks of the arguments of `Space`; each raises ConfigError."""
 
 import colorsys
 import math
@@ -11,13 +11,11 @@ from gen2d.core.enums import DYNAMIC
 from gen2d.core.errors import ConfigError
 from gen2d.space.bodies import GREY, MOST_CORNERS
 
-# Checks -------------------------------------------------------------------------------------------------------------
-
 
 def checked_number(
     name: str, value: Any, low: float | None = None, above: float | None = None, infinite: bool = False
 ) -> float:
-    """The value as a number, or ConfigError; infinite ones are allowed only if it says so."""
+    """The value as a float in these bounds; finite unless `infinite` allows otherwise."""
     allowed = " and ".join(
         [
             "a number",
@@ -36,7 +34,7 @@ def checked_number(
 
 
 def _floats(value: Any) -> np.ndarray:
-    """The value as an array of numbers; an empty one if it is none."""
+    """The value as an array of floats; empty if that is impossible."""
     try:
         return np.asarray(value, float)
     except (TypeError, ValueError):
@@ -51,25 +49,25 @@ def checked_pair(name: str, value: Any) -> np.ndarray:
 
 
 def checked_corners(name: str, value: Any) -> np.ndarray:
-    """Counter-clockwise corners of a convex polygon."""
+    """Counter-clockwise corners [V, 2] of a convex polygon."""
     corners = _floats(value)
     if corners.ndim != 2 or corners.shape[-1] != 2 or not 3 <= len(corners) <= MOST_CORNERS:
         raise ConfigError(f"{name} has shape {list(corners.shape)}, but must be 3 to {MOST_CORNERS} corners (x, y)")
     if not np.isfinite(corners).all():
         raise ConfigError(f"{name} has a corner that is not a number, but all must be finite")
     edges = np.roll(corners, -1, axis=0) - corners
-    after = np.roll(edges, -1, axis=0)
-    turns = np.arctan2(edges[:, 0] * after[:, 1] - edges[:, 1] * after[:, 0], (edges * after).sum(1))
-    way = np.sign(turns.sum())
-    once = abs(abs(turns.sum()) - 2 * math.pi) < 1e-6  # a star turns twice
-    if not once or (way * turns < 1e-6).any() or (np.hypot(*edges.T) == 0).any():
+    next_edges = np.roll(edges, -1, axis=0)
+    turns = np.arctan2(edges[:, 0] * next_edges[:, 1] - edges[:, 1] * next_edges[:, 0], (edges * next_edges).sum(1))
+    orientation = np.sign(turns.sum())
+    simple = abs(abs(turns.sum()) - 2 * math.pi) < 1e-6  # a star turns twice
+    if not simple or (orientation * turns < 1e-6).any() or (np.hypot(*edges.T) == 0).any():
         raise ConfigError(f"{name} is {corners.tolist()}, but must be convex, its corners in order and none in line")
-    return corners if way > 0 else corners[::-1].copy()
+    return corners if orientation > 0 else corners[::-1].copy()
 
 
 def checked_color(name: str, value: Any, number: int, kind: int) -> tuple[int, int, int]:
     if value is None:
-        hue = 0.03 + 0.618034 * number  # the golden section: neighbours differ, and none comes twice
+        hue = 0.03 + 0.618034 * number  # golden ratio: consecutive hues differ, and none repeats
         red, green, blue = (round(255 * part) for part in colorsys.hls_to_rgb(hue % 1, 0.55, 0.6))
         return (red, green, blue) if kind == DYNAMIC else GREY
     parts = tuple(value) if isinstance(value, Sequence | np.ndarray) else ()

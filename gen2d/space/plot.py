@@ -1,7 +1,7 @@
-"""Pictures of a space for a person, with smooth edges: one instant, all frames over each other, a film.
+"""Anti-aliased plots of a space for people: one instant, all frames in one image, or a film.
 
-They show what the physics knows, not what a dataset's look makes of it: marks that turn with the bodies, joints as thin
-lines, contacts as red arrows along their normals.
+They show the physics rather than a dataset's look: bodies with marks that turn with them, joints as thin lines, and
+contacts as red arrows along their normals.
 """
 
 from pathlib import Path
@@ -18,13 +18,13 @@ from gen2d.space.bodies import Body, Drawable, Film
 
 RED, DARK, WHITE = (220, 30, 30), (60, 60, 60), (255, 255, 255)
 SHIFT = 6  # fractional bits of the coordinates that OpenCV takes
-MARGIN = 0.05  # of the view that is shown where none is asked for, on each side
+MARGIN = 0.05  # of the longer side of the default view, on each side
 FORMATS = (".png", ".webp", ".mp4")
 ViewBounds = tuple[float, float, float, float]
 
 
 class PlotCanvas:
-    """An image and the part of the world that it shows: left, bottom, right, top in metres."""
+    """An image of a part of the world, `view`, with `size` px on its longer side."""
 
     def __init__(self, view: ViewBounds, size: int) -> None:
         left, bottom, right, top = view
@@ -32,34 +32,34 @@ class PlotCanvas:
             raise ConfigError(f"view is {view}, but must be left, bottom, right, top, each side longer than 0 m")
         self.left, self.top, self.scale = left, top, size / max(right - left, top - bottom)
         height, width = (max(2, round(side * self.scale / 2) * 2) for side in (top - bottom, right - left))
-        self.image = np.full((height, width, 3), WHITE, np.uint8)  # even sizes, as films need them
+        self.image = np.full((height, width, 3), WHITE, np.uint8)  # even sizes, which video codecs need
         self.thickness = max(1, round(size / 300))
 
     def at(self, points: Any) -> np.ndarray:
-        """World points [..., 2] in OpenCV's fixed-point pixels; a pixel's centre is whole."""
+        """World points [..., 2] in OpenCV's fixed-point pixels; pixel centres are integers."""
         pixels = (np.asarray(points) - (self.left, self.top)) * (self.scale, -self.scale) - 0.5
         return np.clip(np.round(pixels * 2**SHIFT), -(2**30), 2**30).astype(np.int32)
 
     def disc(self, centre: Any, radius: float, color: tuple, filled: bool) -> None:
-        """A disc, or its outline."""
+        """Draw a disc or its outline."""
         thickness = -1 if filled else self.thickness
         pixels = round(radius * self.scale * 2**SHIFT)
         cv2.circle(self.image, self.at(centre).tolist(), pixels, color, thickness, cv2.LINE_AA, SHIFT)
 
     def outline(self, points: Any, color: tuple, filled: bool) -> None:
-        """A convex polygon, or its outline."""
+        """Draw a convex polygon or its outline."""
         if filled:
             cv2.fillConvexPoly(self.image, self.at(points), color, cv2.LINE_AA, SHIFT)
         else:
             cv2.polylines(self.image, [self.at(points)], True, color, self.thickness, cv2.LINE_AA, SHIFT)
 
     def line(self, a: Any, b: Any, color: tuple, thickness: int | None = None) -> None:
-        """A line between two points."""
+        """Draw a line between two points."""
         start, end = (self.at(point).tolist() for point in (a, b))
         cv2.line(self.image, start, end, color, thickness or self.thickness, cv2.LINE_AA, SHIFT)
 
     def arrow(self, start: Any, along: np.ndarray) -> None:
-        """A red arrow of a fixed length in pixels from a point along a unit vector."""
+        """Draw a red arrow of a fixed length in pixels from a point along a unit vector."""
         length = 0.07 * max(self.image.shape) / self.scale
         end, side = start + length * along, 0.15 * length * np.array([-along[1], along[0]])
         neck = start + 0.6 * length * along
@@ -70,9 +70,10 @@ class PlotCanvas:
 def picture(
     of: Drawable, frame: int = 0, *, view: ViewBounds | None = None, size: int = 400, contacts: bool = True
 ) -> np.ndarray:
-    """One instant as uint8 [H, W, 3], `size` pixels on its longer side.
+    """Image of one frame, uint8 [H, W, 3], `size` px on its longer side.
 
-    `view` is the part of the world that it shows: (left, bottom, right, top) in m; default: all that is ever visited.
+    `view` is the visible part of the world, (left, bottom, right, top) in m; by default everything that the bodies ever
+    cover, with a margin. Raises ConfigError if there is no such frame or the view is empty.
     """
     if not -len(of.position) <= frame < len(of.position):
         raise ConfigError(f"frame is {frame}, but must be from 0 to {len(of.position) - 1}")
@@ -89,7 +90,7 @@ def picture(
 
 
 def overlay(of: Drawable, *, view: ViewBounds | None = None, size: int = 400, contacts: bool = False) -> np.ndarray:
-    """All frames over each other as uint8 [H, W, 3], moving bodies as outlines; as `picture` else."""
+    """Image of all frames over each other, uint8 [H, W, 3], with moving bodies as outlines; options as in `picture`."""
     canvas = PlotCanvas(view or _seen(of), size)
     for i, body in enumerate(of.bodies):
         moves = bool(np.ptp(of.position[:, i], axis=0).any() or np.ptp(of.angle[:, i]))
@@ -101,9 +102,10 @@ def overlay(of: Drawable, *, view: ViewBounds | None = None, size: int = 400, co
 
 
 def save(of: Film, path: str | Path, **options: Any) -> Path:
-    """The path of a file made there: .png all frames over each other, .webp (loops) or .mp4 the film.
+    """Write an image of all frames over each other (.png) or a film (.webp, which loops, or .mp4); return the path.
 
-    Options are those of `overlay` and of `picture`. ConfigError for another ending, OSError where it cannot be written.
+    Options are those of `overlay` for images, and of `picture` for films. Raises ConfigError for another suffix, and
+    OSError if the file cannot be written.
     """
     path = Path(path)
     if path.suffix not in FORMATS:
@@ -126,7 +128,7 @@ def _write(path: Path, image: np.ndarray) -> None:
 
 
 def _placed(points: Any, position: np.ndarray, angle: float) -> np.ndarray:
-    """Points [V, 2] of a body in the world."""
+    """Points [V, 2] of a body's frame in world coordinates."""
     cos, sin = np.cos(angle), np.sin(angle)
     return np.asarray(points) @ np.array([[cos, sin], [-sin, cos]]) + position
 
@@ -170,17 +172,17 @@ def _joints(canvas: PlotCanvas, of: Drawable, frame: int) -> None:
 
 
 def _arrows(canvas: PlotCanvas, of: Drawable, frame: int) -> None:
-    found = of.contacts
-    if found is None:
+    contacts = of.contacts
+    if contacts is None:
         return
-    points, normals = np.asarray(found.point), np.asarray(found.normal)
-    here = (np.asarray(found.frame) == frame) & normals.any(axis=1)  # a touch that ended in an earlier frame has none
-    for point, normal in zip(points[here], normals[here], strict=True):
+    points, normals = np.asarray(contacts.point), np.asarray(contacts.normal)
+    current = (np.asarray(contacts.frame) == frame) & normals.any(axis=1)  # no normal: ended before the frame
+    for point, normal in zip(points[current], normals[current], strict=True):
         canvas.arrow(point, normal)
 
 
 def _seen(of: Drawable) -> ViewBounds:
-    """The rectangle around all that is ever visited, and some margin."""
+    """Rectangle around everything that the bodies and joints ever cover, with a margin."""
     low, high = [], []
     for i, body in enumerate(of.bodies):
         if body.shape == "polygon":
@@ -192,5 +194,5 @@ def _seen(of: Drawable) -> ViewBounds:
         high.append(turned.max((0, 1)) + body.radius)
     anchors = [anchor for j in of.joints for i, anchor in ((j.a, j.anchor_a), (j.b, j.anchor_b)) if i < 0]
     (left, bottom), (right, top) = np.min([*low, *anchors], axis=0), np.max([*high, *anchors], axis=0)
-    room = MARGIN * max(right - left, top - bottom)
-    return float(left - room), float(bottom - room), float(right + room), float(top + room)
+    margin = MARGIN * max(right - left, top - bottom)
+    return float(left - margin), float(bottom - margin), float(right + margin), float(top + margin)

@@ -1,4 +1,4 @@
-"""A scene in a few lines of Python, simulated at once:
+"""Scenes in a few lines of Python, simulated at once.
 
     space = gen2d.Space(gravity=(0, -9.8))
     floor = space.add_segment((-5, 0), (5, 0), elasticity=1)
@@ -7,8 +7,9 @@
     video.position[:, ball], video.contacts.time, video.energy.residual
     video.save("fall.webp")
 
-A body's number is the place in which it was added, and its place in every result. The solver's slots are in another
-order (a layout's runs hold one shape and kind each): `Space.slots` says which is whose.
+A body's number counts the bodies in the order in which they are added; it is also its index in every result. The
+solver's slots have another order, because each slot group of a layout holds one shape and kind: `Space.slots` maps
+numbers to slots.
 """
 
 import dataclasses
@@ -45,15 +46,33 @@ from gen2d.space.bodies import KINDS, Body, BodyOptions, Joint, Overlaps, Pair, 
 from gen2d.space.checks import checked_color, checked_corners, checked_number, checked_pair, rotate
 from gen2d.space.video import Video
 
-# The builder --------------------------------------------------------------------------------------------------------
-
 
 class Space:
-    """Bodies and joints, added one by one, and the rules by which they move. SI units, radians, y up.
+    """Scene of bodies and joints, which are added one by one, and the options of its physics.
 
-    `gravity` is in m/s^2. `physics` are the options of a config's section of that name, with its defaults: damping
-    (1/s), mixing ("product", "mean", "max", "geometric"), bounce_threshold (m/s), max_step (s), substeps,
-    contact_hertz, contact_damping_ratio, push_speed. ConfigError names what cannot be.
+    Units are SI units and radians; y points up.
+
+    Parameters
+    ----------
+    gravity : pair of float
+        Acceleration in m/s^2.
+    **physics
+        Options of a config's section `physics`, with the same defaults: damping (1/s), mixing ("product", "mean",
+        "max", "geometric"), bounce_threshold (m/s), max_step (s), substeps, contact_hertz (Hz), contact_damping_ratio,
+        push_speed (m/s).
+
+    Raises
+    ------
+    ConfigError
+        If an argument is invalid.
+
+    Examples
+    --------
+    >>> space = gen2d.Space(gravity=(0, -9.8))
+    >>> floor = space.add_segment((-5, 0), (5, 0), elasticity=1)
+    >>> ball = space.add_circle((0, 3), radius=0.5, elasticity=0.8)
+    >>> video = space.simulate(seconds=2)
+    >>> height = video.position[:, ball, 1]
     """
 
     def __init__(self, gravity: Pair = (0.0, -9.8), **physics: Any) -> None:
@@ -63,27 +82,108 @@ class Space:
         self.joints: list[Joint] = []
 
     def add_circle(self, position: Pair, radius: float, *, angle: float = 0.0, **options: Unpack[BodyOptions]) -> int:
-        """The number of a disc with its centre there (m)."""
+        """Add a disc.
+
+        Parameters
+        ----------
+        position : pair of float
+            Centre in m.
+        radius : float
+            Radius in m, above 0.
+        angle : float
+            Angle in rad.
+        **options
+            Options of the body; see `BodyOptions`.
+
+        Returns
+        -------
+        int
+            Number of the body.
+
+        Raises
+        ------
+        ConfigError
+            If an argument is invalid.
+        """
         name = "add_circle"
         radius = checked_number(f"{name}: radius", radius, above=0)
         return self._added(name, "circle", checked_pair(f"{name}: position", position), angle, radius=radius, **options)
 
     def add_segment(self, a: Pair, b: Pair, *, radius: float = 0.0, **options: Unpack[BodyOptions]) -> int:
-        """The number of a line from a to b (m), rounded if it has a radius; static unless `kind` says otherwise.
+        """Add a line segment, which is static by default.
 
-        A dynamic one without radius has no area, so it needs a mass.
+        Parameters
+        ----------
+        a, b : pair of float
+            Ends of the segment in m.
+        radius : float
+            Half the thickness in m, with round ends. A dynamic segment of radius 0 has no area, so it needs a mass.
+        **options
+            Options of the body; see `BodyOptions`.
+
+        Returns
+        -------
+        int
+            Number of the body.
+
+        Raises
+        ------
+        ConfigError
+            If an argument is invalid.
         """
         radius = checked_number("add_segment: radius", radius, low=0)
         return self._added_line("add_segment", a, b, radius, **{"kind": "static", **options})
 
     def add_capsule(self, a: Pair, b: Pair, radius: float, **options: Unpack[BodyOptions]) -> int:
-        """The number of all points within `radius` (m) of the line from a to b."""
+        """Add a capsule: all points within `radius` of the line segment from a to b.
+
+        Parameters
+        ----------
+        a, b : pair of float
+            Centres of the ends in m.
+        radius : float
+            Radius of the ends in m, above 0.
+        **options
+            Options of the body; see `BodyOptions`.
+
+        Returns
+        -------
+        int
+            Number of the body.
+
+        Raises
+        ------
+        ConfigError
+            If an argument is invalid.
+        """
         return self._added_line("add_capsule", a, b, checked_number("add_capsule: radius", radius, above=0), **options)
 
     def add_box(
         self, position: Pair, width: float, height: float, *, angle: float = 0.0, **options: Unpack[BodyOptions]
     ) -> int:
-        """The number of a rectangle with its centre there, its width along its own x axis (m)."""
+        """Add a rectangle.
+
+        Parameters
+        ----------
+        position : pair of float
+            Centre in m.
+        width, height : float
+            Sides in m along the body's x and y axes, above 0.
+        angle : float
+            Angle in rad.
+        **options
+            Options of the body; see `BodyOptions`.
+
+        Returns
+        -------
+        int
+            Number of the body.
+
+        Raises
+        ------
+        ConfigError
+            If an argument is invalid.
+        """
         name = "add_box"
         w, h = (checked_number(f"{name}: {n}", x, above=0) / 2 for n, x in (("width", width), ("height", height)))
         corners = np.array([(-w, -h), (w, -h), (w, h), (-w, h)])
@@ -92,9 +192,24 @@ class Space:
         )
 
     def add_polygon(self, vertices: Any, **options: Unpack[BodyOptions]) -> int:
-        """The number of a convex polygon with these 3 to 8 corners [V, 2] in the world (m), in order, either way round.
+        """Add a convex polygon. Its position is its centre of mass, its angle 0.
 
-        Its position is its centre of mass, its angle 0.
+        Parameters
+        ----------
+        vertices : array_like, [V, 2]
+            The 3 to 8 corners in world coordinates, in m, clockwise or counter-clockwise.
+        **options
+            Options of the body; see `BodyOptions`.
+
+        Returns
+        -------
+        int
+            Number of the body.
+
+        Raises
+        ------
+        ConfigError
+            If an argument is invalid.
         """
         corners = checked_corners("add_polygon: vertices", vertices)
         with jax.enable_x64(True):
@@ -107,12 +222,42 @@ class Space:
         limits: tuple[float, float] | None = None, motor_speed: float = 0.0, motor_torque: float = 0.0,
         collide: bool = False,
     ) -> int:  # fmt: skip
-        """The number of a joint between bodies a and b; without b it ties a to the world.
+        """Add a joint between two bodies, or between a body and the world.
 
-        Anchors are where they are in the world now, in m (default: the centres of mass). "distance" keeps them `length`
-        apart (default: as now): a rod, or with a `stiffness` (N/m) and `damping` (N s/m) a spring. "revolute" is a
-        hinge in anchor_a, with `limits` (rad: of b over a, or of a over the world, beyond now) and a motor that aims at
-        `motor_speed` (rad/s) with `motor_torque` (N m) at most. The two do not collide unless `collide` says so.
+        Parameters
+        ----------
+        kind : str
+            "distance" for a rod or a spring between the anchors, or "revolute" for a hinge in `anchor_a`.
+        a, b : int
+            Numbers of the bodies; without `b`, the joint ties a to the world.
+        anchor_a, anchor_b : pair of float, optional
+            Anchors in world coordinates, in m; by default the centres of mass. A revolute joint needs `anchor_a` and
+            has no `anchor_b`; a distance joint to the world needs `anchor_b`.
+        length : float, optional
+            Length of a distance joint in m; by default the current distance of the anchors.
+        stiffness : float
+            Stiffness of a distance joint in N/m; infinite for a rod.
+        damping : float
+            Damping of a distance joint in N s/m.
+        limits : pair of float, optional
+            Smallest and largest angle of a revolute joint in rad, from the current one: of b relative to a, or of a
+            relative to the world.
+        motor_speed : float
+            Target speed of a revolute joint's motor in rad/s.
+        motor_torque : float
+            Largest torque of the motor in N m; 0 for none.
+        collide : bool
+            Whether the two bodies collide with each other.
+
+        Returns
+        -------
+        int
+            Number of the joint.
+
+        Raises
+        ------
+        ConfigError
+            If an argument is invalid, or neither body is dynamic.
         """
         name = "add_joint"
         if kind not in ("distance", "revolute"):
@@ -184,25 +329,25 @@ class Space:
     ) -> int:  # fmt: skip
         if kind not in KINDS:
             raise ConfigError(f"{name}: kind is {kind!r}, but must be one of {', '.join(KINDS)}")
-        number, of = len(self.bodies), lambda option: f"{name}: {option}"
+        number, label = len(self.bodies), lambda option: f"{name}: {option}"
         body = Body(
             shape=shape,
             position=position,
-            angle=checked_number(of("angle"), angle),
+            angle=checked_number(label("angle"), angle),
             kind=KINDS[kind],
             radius=radius,
             half_length=half_length,
             vertices=np.zeros((0, 2)) if vertices is None else vertices,
-            velocity=checked_pair(of("velocity"), velocity),
-            spin=checked_number(of("spin"), spin),
+            velocity=checked_pair(label("velocity"), velocity),
+            spin=checked_number(label("spin"), spin),
             mass=math.inf,
             moment=math.inf,
-            elasticity=checked_number(of("elasticity"), elasticity, low=0),
-            friction=checked_number(of("friction"), friction, low=0),
-            rolling_resistance=checked_number(of("rolling_resistance"), rolling_resistance, low=0),
-            color=checked_color(of("color"), color, number, KINDS[kind]),
-            force=checked_pair(of("force"), (0.0, 0.0) if force is None else force),
-            torque=checked_number(of("torque"), 0.0 if torque is None else torque),
+            elasticity=checked_number(label("elasticity"), elasticity, low=0),
+            friction=checked_number(label("friction"), friction, low=0),
+            rolling_resistance=checked_number(label("rolling_resistance"), rolling_resistance, low=0),
+            color=checked_color(label("color"), color, number, KINDS[kind]),
+            force=checked_pair(label("force"), (0.0, 0.0) if force is None else force),
+            torque=checked_number(label("torque"), 0.0 if torque is None else torque),
         )
         if body.elasticity > 1:
             raise ConfigError(f"{name}: elasticity is {elasticity!r}, but must be a number from 0 to 1")
@@ -213,18 +358,32 @@ class Space:
         self.bodies.append(body)
         return number
 
-    # What the solver takes ------------------------------------------------------------------------------------------
+    # ---- Input of the solver
 
     @property
     def slots(self) -> np.ndarray:
-        """The slot of each body in `scene()`, [K]."""
+        """Slot of each body in `scene()`, [K]."""
         return self._arranged()[1]
 
     def scene(self) -> tuple[Scene, State, Layout]:
-        """Scene, initial state and layout of one video ("K 2"), as a sampler gives them; batch them with `jax.vmap`.
+        """Scene and initial state of one video, as a sampler returns them, and their layout.
 
-        Where a joint holds on to the world, one more slot stands for it: a dynamic one of infinite mass, which nothing
-        moves and nothing touches. ConfigError if nothing can move.
+        If a joint is tied to the world, an extra slot represents the world: a dynamic body of infinite mass that
+        collides with nothing.
+
+        Returns
+        -------
+        scene : Scene
+            Fields of objects have the axes [K, ...] with a row per slot; batch them with `jax.vmap`.
+        state : State
+            Initial positions [K, 2] m, angles [K] rad and velocities.
+        layout : Layout
+            Slot groups and joints.
+
+        Raises
+        ------
+        ConfigError
+            If no body is dynamic.
         """
         runs, slots, bodies = self._arranged()
         real = np.dtype(jnp.result_type(float))
@@ -235,12 +394,12 @@ class Space:
         corners = max((run.vertices for run in runs), default=0)
         vertices = np.array([fill_vertices(body.vertices, corners) for body in bodies])
         counts = np.array([len(body.vertices) for body in bodies], np.uint8)
-        places = {int(slot): number for number, slot in enumerate(slots)}  # in the order of numbers
-        depth = [places.get(slot, 0) for slot in range(len(bodies))]
+        number_of = {int(slot): number for number, slot in enumerate(slots)}  # ordered by number
+        depths = [number_of.get(slot, 0) for slot in range(len(bodies))]
         objects = Objects(
             present=jnp.ones(len(bodies), bool),
             shape=jnp.asarray([SHAPES.index(body.shape) for body in bodies], jnp.uint8),
-            depth=jnp.asarray(depth, jnp.int16),
+            depth=jnp.asarray(depths, jnp.int16),
             kind=column("kind", np.uint8),
             color=column("color", np.uint8),
             vertices=jnp.asarray(vertices.astype(real)) if corners else None,
@@ -252,7 +411,8 @@ class Space:
         )
         state = State(column("position"), column("angle"), column("velocity"), column("spin"))
         scene = Scene(objects, jnp.asarray(self.gravity, real), self._joints(real))
-        slot = [*places, *(set(range(len(bodies))) - places.keys())]  # the last, -1, is the world's, if there is one
+        # The last one, -1, is the world's if a joint needs it.
+        slot = [*number_of, *(set(range(len(bodies))) - number_of.keys())]
         ties = tuple(JointSpec(j.kind, slot[j.a], slot[j.b], j.collide) for j in self.joints)
         return scene, state, Layout(runs, joints=ties)
 
@@ -267,36 +427,66 @@ class Space:
         )
 
     def _arranged(self) -> tuple[tuple[SlotGroup, ...], np.ndarray, list[Body]]:
-        """The runs, the slot of each body, and the bodies by slot, with one for the world where a joint needs it."""
+        """Slot groups, the slot of each body, and the bodies by slot, including the world's if a joint needs it."""
         bodies = list(self.bodies)
         moving = [shape_family(body) for body in bodies if body.kind == DYNAMIC]
         if not moving:
             raise ConfigError(f"Space: none of its {len(bodies)} bodies is dynamic, but one or more must be")
         if any(joint.a < 0 for joint in self.joints):
-            # In a run of odd length, where its place is free: the solver takes an even number.
+            # It costs nothing in a group of odd size, as the solver pads groups to even sizes.
             shape = min(dict.fromkeys(moving), key=lambda s: moving.count(s) % 2 == 0)
             bodies.append(world_anchor(shape))
         order = sorted(range(len(bodies)), key=lambda i: slot_order(bodies[i]))
         runs = []
         for _, group in itertools.groupby((bodies[i] for i in order), key=slot_order):
-            some = list(group)
-            corners = max(len(body.vertices) for body in some)
-            runs.append(SlotGroup(shape_family(some[0]), len(some), some[0].kind, corners))
+            members = list(group)
+            corners = max(len(body.vertices) for body in members)
+            runs.append(SlotGroup(shape_family(members[0]), len(members), members[0].kind, corners))
         return tuple(runs), np.argsort(order)[: len(self.bodies)], [bodies[i] for i in order]
 
-    # What happens ---------------------------------------------------------------------------------------------------
+    # ---- Simulation
 
     def simulate(
         self, seconds: float, fps: float = 30.0, *, substeps: int | None = None, contacts: int | None = None,
         energy: bool = True, forces: Forces | None = None,
     ) -> Video:  # fmt: skip
-        """The video of round(seconds * fps) + 1 frames; frame 0 is the start.
+        """Simulate the space from its initial state.
 
-        `substeps` are steps a frame (default: of 1/240 s at most). `contacts` is how many rows there may be (default: 4
-        for each body and frame, which is more than can touch; 0: none). `forces(state, time)` gives force [K, 2] in N
-        and torque [K] in N m of all bodies from their state [K, 2], [K] and the time in s, in every step; jax traces
-        it, once for each new function. The first call compiles, for seconds; a space that has as many bodies of each
-        shape and the same joints does not again. ConfigError if nothing can move, or for arguments that cannot be.
+        The first call compiles a program, which takes seconds. Another space with as many bodies of each shape and the
+        same joints reuses it.
+
+        Parameters
+        ----------
+        seconds : float
+            Duration in s; the video has round(seconds * fps) + 1 frames, of which frame 0 is the initial state.
+        fps : float
+            Frame rate in frames/s.
+        substeps : int, optional
+            Steps per frame; by default as many as `max_step` (1/240 s) requires.
+        contacts : int, optional
+            Largest number of contact rows; by default 4 for each body and frame, which is more than can touch. 0 for
+            none.
+        energy : bool
+            Whether to record energy and momentum.
+        forces : callable, optional
+            `forces(state, time)` returns the force [K, 2] in N and the torque [K] in N m on each body at each step,
+            from the state (position [K, 2], angle [K] and so on) and the time in s. jax traces it, once for each new
+            function.
+
+        Returns
+        -------
+        Video
+            Trajectories of all bodies, contacts and energy.
+
+        Raises
+        ------
+        ConfigError
+            If an argument is invalid, or no body is dynamic.
+
+        Examples
+        --------
+        >>> drag = lambda state, time: (-0.1 * state.velocity, -0.1 * state.angular_velocity)
+        >>> video = space.simulate(seconds=2, fps=60, forces=drag)
         """
         seconds, fps = (checked_number(f"simulate: {n}", x, above=0) for n, x in (("seconds", seconds), ("fps", fps)))
         frames = round(seconds * fps) + 1
@@ -312,10 +502,10 @@ class Space:
         )
         rules, steps = self._rules(fps, substeps)
         slots = self.slots
-        own = None if forces is None else (forces, tuple(int(s) for s in slots))
-        program = compiled_program(layout, rules, frames, steps, SaveAt(rows, energy), own)
-        made = jax.tree.map(lambda x: np.asarray(x[0]), program(*jax.tree.map(lambda x: x[None], (scene, state))))
-        states = made.states
+        slot_forces = None if forces is None else (forces, tuple(int(s) for s in slots))
+        program = compiled_program(layout, rules, frames, steps, SaveAt(rows, energy), slot_forces)
+        trajectory = jax.tree.map(lambda x: np.asarray(x[0]), program(*jax.tree.map(lambda x: x[None], (scene, state))))
+        states = trajectory.states
         return Video(
             bodies=tuple(self.bodies),
             joints=tuple(self.joints),
@@ -324,9 +514,9 @@ class Space:
             angle=states.angle[:, slots],
             velocity=states.velocity[:, slots],
             angular_velocity=states.angular_velocity[:, slots],
-            contacts=None if made.contacts is None else filled_contacts(made.contacts, slots, layout.slots),
-            energy=made.energy,
-            quality=made.quality,
+            contacts=None if trajectory.contacts is None else filled_contacts(trajectory.contacts, slots, layout.slots),
+            energy=trajectory.energy,
+            quality=trajectory.quality,
         )
 
     def _rules(self, fps: float, asked: int | None) -> tuple[SolverParams, int]:
@@ -337,62 +527,85 @@ class Space:
         return solver_params(physics, fps, steps), steps
 
     def poses(self, position: np.ndarray | None = None, angle: np.ndarray | None = None) -> Poses:
-        """The bodies at position [T, K, 2] and angle [T, K] (default: as added), and what overlaps there.
+        """Bodies at given positions and angles, and their overlaps; nothing is simulated.
 
-        Only detection: nothing moves. Two bodies of which neither is dynamic, or that a joint keeps from colliding, do
-        not count.
+        Pairs without a dynamic body, and pairs that a joint keeps from colliding, are ignored.
+
+        Parameters
+        ----------
+        position : array_like, [T, K, 2], optional
+            Positions in m; by default those at which the bodies were added, with T = 1.
+        angle : array_like, [T, K], optional
+            Angles in rad; by default those at which the bodies were added.
+
+        Returns
+        -------
+        Poses
+            The poses, with their overlaps as `contacts`.
+
+        Raises
+        ------
+        ConfigError
+            If an array has another shape, or no body is dynamic.
         """
         count = len(self.bodies)
-        place = np.array([[body.position for body in self.bodies]]) if position is None else np.asarray(position, float)
-        if place.ndim != 3 or place.shape[1:] != (count, 2):
-            raise ConfigError(f"poses: position has shape {list(place.shape)}, but must have [T, {count}, 2]")
-        turn = np.array([body.angle for body in self.bodies]) if angle is None else np.asarray(angle, float)
-        if angle is not None and turn.shape != place.shape[:2]:
-            raise ConfigError(f"poses: angle has shape {list(turn.shape)}, but must have {list(place.shape[:2])}")
-        turn = np.broadcast_to(turn, place.shape[:2])
-        return Poses(tuple(self.bodies), tuple(self.joints), place, turn, self._overlaps(place, turn))
+        positions = (
+            np.array([[body.position for body in self.bodies]]) if position is None else np.asarray(position, float)
+        )
+        if positions.ndim != 3 or positions.shape[1:] != (count, 2):
+            raise ConfigError(f"poses: position has shape {list(positions.shape)}, but must have [T, {count}, 2]")
+        angles = np.array([body.angle for body in self.bodies]) if angle is None else np.asarray(angle, float)
+        if angle is not None and angles.shape != positions.shape[:2]:
+            raise ConfigError(f"poses: angle has shape {list(angles.shape)}, but must have {list(positions.shape[:2])}")
+        angles = np.broadcast_to(angles, positions.shape[:2])
+        return Poses(tuple(self.bodies), tuple(self.joints), positions, angles, self._overlaps(positions, angles))
 
     def overlaps(self) -> Overlaps:
-        """What overlaps at the start."""
+        """Overlaps in the initial state, as in `poses`."""
         return self.poses().contacts
 
     def _overlaps(self, position: np.ndarray, angle: np.ndarray) -> Overlaps:
         scene, _, layout = self.scene()
         objects = to_device(jax.tree.map(lambda x: x[None], scene.objects))
         number = body_numbers(self.slots, layout.slots)
-        apart = {frozenset((tie.a, tie.b)) for tie in layout.joints if not tie.collide}
-        places = jnp.asarray(position.transpose(2, 1, 0)), jnp.asarray(angle.T)
-        found = []
-        for one, two in itertools.combinations_with_replacement(layout.spans, 2):
+        exempt = {frozenset((tie.a, tie.b)) for tie in layout.joints if not tie.collide}
+        body_poses = jnp.asarray(position.transpose(2, 1, 0)), jnp.asarray(angle.T)
+        overlaps = []
+        for span_a, span_b in itertools.combinations_with_replacement(layout.spans, 2):
             pairs = [
-                (i, j) for i in slots_of_span(one) for j in slots_of_span(two) if i < j and number[i] >= 0 <= number[j]
+                (i, j)
+                for i in slots_of_span(span_a)
+                for j in slots_of_span(span_b)
+                if i < j and number[i] >= 0 <= number[j]
             ]
-            pairs = [pair for pair in pairs if frozenset(pair) not in apart]
-            if not pairs or (one[0].kind != DYNAMIC and two[0].kind != DYNAMIC):
+            pairs = [pair for pair in pairs if frozenset(pair) not in exempt]
+            if not pairs or (span_a[0].kind != DYNAMIC and span_b[0].kind != DYNAMIC):
                 continue
             sides = [np.array(side) for side in zip(*pairs, strict=True)]
             first, second = (number[side] for side in sides)
-            there = [[x[..., who, :] for x in places] for who in (first, second)]
-            for gap, point, normal in touching_points((one[0], two[0]), objects, sides, there):
+            poses = [[x[..., who, :] for x in body_poses] for who in (first, second)]
+            for gap, point, normal in touching_points((span_a[0], span_b[0]), objects, sides, poses):
                 pair, frame = np.nonzero(np.asarray(gap) < 0)
-                where, way = (np.asarray(x)[:, pair, frame].T for x in (point, normal))
-                found.append(Overlaps(frame, first[pair], second[pair], where, way, -np.asarray(gap)[pair, frame]))
-        if not found:
+                points, normals = (np.asarray(x)[:, pair, frame].T for x in (point, normal))
+                overlaps.append(
+                    Overlaps(frame, first[pair], second[pair], points, normals, -np.asarray(gap)[pair, frame])
+                )
+        if not overlaps:
             return Overlaps._make([*np.zeros((3, 0), int), *np.zeros((2, 0, 2)), np.zeros(0)])
-        rows = [np.concatenate(parts) for parts in zip(*found, strict=True)]
+        rows = [np.concatenate(parts) for parts in zip(*overlaps, strict=True)]
         order = np.argsort(rows[0], kind="stable")
         return Overlaps._make(row[order] for row in rows)
 
 
 def _inertia(name: str, body: Body, density: float, mass: float | None, moment: float | None) -> dict[str, float]:
-    """Mass and moment of a dynamic body."""
+    """Mass in kg and moment of inertia in kg m^2 of a dynamic body."""
     density = checked_number(f"{name}: density", density, above=0)
     mass = None if mass is None else checked_number(f"{name}: mass", mass, above=0)
     with jax.enable_x64(True):
         half, radius, corners, rho = (
             jnp.asarray(x, float) for x in (body.half_length, body.radius, body.vertices, density)
         )
-        solid, turning = {
+        mass_of, moment_of = {
             "circle": (lambda: inertia.disc_mass(radius, rho), lambda m: inertia.disc_moment(radius, m)),
             "capsule": (
                 lambda: inertia.stadium_mass(half, radius, rho),
@@ -400,8 +613,8 @@ def _inertia(name: str, body: Body, density: float, mass: float | None, moment: 
             ),
             "polygon": (lambda: inertia.polygon_mass(corners, rho), lambda m: inertia.polygon_moment(corners, m)),
         }[shape_family(body)]
-        mass = float(solid()) if mass is None else mass
+        mass = float(mass_of()) if mass is None else mass
         if mass == 0:
             raise ConfigError(f"{name}: mass is None, but a dynamic body of radius 0 needs one")
-        moment = float(turning(jnp.asarray(mass))) if moment is None else moment
+        moment = float(moment_of(jnp.asarray(mass))) if moment is None else moment
     return {"mass": mass, "moment": checked_number(f"{name}: moment", moment, above=0, infinite=True)}

@@ -1,4 +1,4 @@
-"""The result of a simulation by hand."""
+"""Result of the simulation of a `Space`."""
 
 import dataclasses
 from pathlib import Path
@@ -11,7 +11,7 @@ from gen2d.space.bodies import Body, Joint
 
 @dataclasses.dataclass(frozen=True)
 class Video:
-    """What a space did: NumPy arrays, T frames of K bodies in the order in which they were added."""
+    """Trajectories of K bodies, in the order in which they were added, as NumPy arrays over T frames."""
 
     bodies: tuple[Body, ...]
     joints: tuple[Joint, ...]
@@ -20,9 +20,9 @@ class Video:
     angle: np.ndarray  # [T, K] rad
     velocity: np.ndarray  # [T, K, 2] m/s
     angular_velocity: np.ndarray  # [T, K] rad/s
-    contacts: Any  # types.Contacts: only the rows there are, in order of time; a and b are numbers of bodies
-    energy: Any  # types.Energy: [T] J, and the momentum
-    quality: Any  # types.Quality
+    contacts: Any  # Contacts, or None: filled rows only, ordered by time; a and b are numbers of bodies
+    energy: Any  # Energy, or None: [T] J, and the momentum
+    quality: Any  # Quality: scalar measures of the simulation
 
     @property
     def fps(self) -> float:
@@ -31,23 +31,23 @@ class Video:
 
     @property
     def momentum(self) -> Any:
-        """Of all dynamic bodies [T, 2], kg m/s; needs energy=True."""
+        """Momentum of all dynamic bodies [T, 2] in kg m/s; None unless simulated with energy=True."""
         return None if self.energy is None else self.energy.linear
 
     def picture(self, frame: int = 0, **options: Any) -> np.ndarray:
-        """One instant as uint8 [H, W, 3]; options are those of `plot.picture`."""
+        """Image of one frame, uint8 [H, W, 3]; options are those of `plot.picture`."""
         from gen2d.space import plot
 
         return plot.picture(self, frame, **options)
 
     def overlay(self, **options: Any) -> np.ndarray:
-        """All frames over each other as uint8 [H, W, 3]; options are those of `plot.overlay`."""
+        """Image of all frames over each other, uint8 [H, W, 3]; options are those of `plot.overlay`."""
         from gen2d.space import plot
 
         return plot.overlay(self, **options)
 
     def save(self, path: str | Path, **options: Any) -> Path:
-        """The path of a file written there: .webp or .mp4 the video, .png all frames over each other."""
+        """Write a film (.webp, .mp4) or an image of all frames (.png); return the path. Options as in `plot.save`."""
         from gen2d.space import plot
 
         return plot.save(self, path, **options)

@@ -1,1 +1,1 @@
-"""What people do with a dataset: verify, preview, gallery."""
+"""Tools for datasets: verify, preview, gallery."""

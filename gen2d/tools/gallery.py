@@ -41,9 +41,10 @@ def gallery(
     timeout: float = 30.0,
     deadline: float = 300.0,
 ) -> Path:
-    """Path of NAME-gallery.png in the folder `out`: every look and annotation, each of the first `videos` in a row.
+    """Write NAME-gallery.png into the folder `out`: the first videos in every look and with every annotation.
 
-    The config's own look has its options, the others their defaults. Raises as `preview` does.
+    The config's own look keeps its options, the others have their defaults. Returns the path. Parameters and errors are
+    those of `preview`.
     """
     check_videos(videos)
     check_folder(out)
@@ -52,8 +53,8 @@ def gallery(
         looks = _looks(config_of(ds, overrides, trust).plain()["look"])
         picture, name = _sheet(ds, videos, looks, overrides, trust), ds.manifest.name
     else:
-        with _annotated_video(source, videos, seed, overrides) as (ds, plain, own):
-            picture, name = _sheet(ds, videos, _looks(plain["look"]), (), own), plain["name"]
+        with _annotated_video(source, videos, seed, overrides) as (ds, plain, own_files):
+            picture, name = _sheet(ds, videos, _looks(plain["look"]), (), own_files), plain["name"]
     path = out / f"{name}-gallery.png"
     with writing(out):
         write(path, picture)
@@ -63,14 +64,16 @@ def gallery(
 def families(
     out: Path, videos: int = 1, *, seed: int | None = None, overrides: Sequence[str] = (), **_: object
 ) -> list[Path]:
-    """Paths of families.png, with the first `videos` of every scene family in its config's look, and of the gallery of
-    each, FAMILY-gallery.png, in the folder `out`."""
+    """Write families.png and FAMILY-gallery.png of every scene family into the folder `out`; return their paths.
+
+    families.png shows the first videos of each family in the look of its config.
+    """
     check_videos(videos)
     check_folder(out)
     rows, paths = [], []
     for name in plugins.names("scene"):
-        own = f"{name}.yaml" in plugins.config_names()
-        with _annotated_video(name if own else {"name": name, "scene": name}, videos, seed, overrides) as (
+        has_config = f"{name}.yaml" in plugins.config_names()
+        with _annotated_video(name if has_config else {"name": name, "scene": name}, videos, seed, overrides) as (
             ds,
             plain,
             own_files,
@@ -94,8 +97,7 @@ def _fitted(sheet: np.ndarray) -> np.ndarray:
 def _annotated_video(
     source: str | Mapping[str, Any], videos: int, seed: int | None, overrides: Sequence[str]
 ) -> Iterator[tuple[Dataset, dict[str, Any], list[str]]]:
-    """Context of a temporary dataset with a config's first videos, without frames, the plain config, and the sha256 of
-    each user's own file."""
+    """Temporary dataset of a config's first videos without frames, the plain config, and the sha256 of user files."""
     config = load_config(source, overrides)
     plain, split = config.plain(), config.training.name if config.training else "train"
     bare = plain | {"look": "flat", "annotations": {}, "storage": plain["storage"] | {"frames": "none"}}
@@ -105,21 +107,21 @@ def _annotated_video(
 
 
 def _looks(own: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
-    """Every look by its name in the gallery; `own` keeps its options."""
+    """All looks by their names in the gallery; the config's own look keeps its options."""
     return {name: {"name": name} for name in plugins.names("look")} | {Path(own["name"]).stem: own}
 
 
 def _sheet(
     ds: Dataset, videos: int, looks: Mapping[str, Mapping[str, Any]], overrides: Sequence[str], trust: Sequence[str]
 ) -> np.ndarray:
-    """A picture [H, W, 3] of all rows."""
+    """Gallery [H, W, 3] of all looks and annotations."""
     numbers = range(min(videos, len(ds)))
     rows = [*_look_rows(ds, numbers, looks, overrides, trust), *_annotation_rows(ds, numbers, overrides, trust)]
     return np.concatenate([_labelled(name, contact_sheet(frames)) for name, frames in rows])
 
 
 def _labelled(name: str, picture: np.ndarray) -> np.ndarray:
-    """A picture with its name on a white strip at the left."""
+    """An image with its name on a white strip at the left."""
     strip = np.full((len(picture), LABEL, 3), 255, np.uint8)
     cv2.putText(strip, name, (2 * GAP, 20), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (0, 0, 0), 1, cv2.LINE_AA)
     return np.concatenate([strip, picture], axis=1)

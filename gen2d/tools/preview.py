@@ -25,11 +25,42 @@ def preview(
     timeout: float = 30.0,
     deadline: float = 300.0,
 ) -> list[Path]:
-    """Paths of a contact sheet, NAME-sheet.png, and an animation, NAME.webp, written into the folder `out`.
+    """Write a contact sheet, NAME-sheet.png, and an animation, NAME.webp, of a dataset or a config.
 
-    `source` is a dataset's folder or URL, or a config, which `seed` and `overrides` change. `trust` is that of
-    `render`, for a dataset without frames; `timeout` and `deadline`, in seconds, are those of `open`.
-    Raises UserError for an invalid source or option, DamagedError, UnreachableError.
+    Parameters
+    ----------
+    source : str or path
+        Folder or URL of a dataset, or the name or path of a config.
+    out : str or Path
+        Folder for the files.
+    videos : int
+        Number of videos, 1 or more, from the first on.
+    seed : int, optional
+        Seed of the videos of a config; by default that of the config.
+    overrides : sequence of str
+        Options of the config to change, such as 'video.height=128'.
+    trust : sequence of str
+        sha256 of code in the dataset that may run, as in `render`; only for datasets without frames.
+    timeout, deadline : float
+        Limits in s of a server's silence and of a whole request, as in `open`.
+
+    Returns
+    -------
+    list of Path
+        Paths of the contact sheet and the animation.
+
+    Raises
+    ------
+    UserError
+        If the source or an option is invalid.
+    DamagedError
+        If a stored field cannot be read.
+    UnreachableError
+        If a server does not answer.
+
+    Examples
+    --------
+    >>> sheet, animation = gen2d.preview("bouncing.yaml", "pictures", videos=4)
     """
     source, out = str(source) if isinstance(source, Path) else source, Path(out)
     check_videos(videos)
@@ -48,7 +79,7 @@ def preview(
 
 
 def is_dataset(source: str | Url) -> bool:
-    """Whether the source is a dataset, at a URL or in a folder, rather than a config."""
+    """Whether the source is a dataset (a URL or a folder) rather than a config."""
     path = place(source)
     return isinstance(path, Url) or path.is_dir()
 
@@ -60,7 +91,7 @@ def check_videos(videos: int) -> None:
 
 
 def _stored(ds: Dataset, numbers: Sequence[int], trust: Sequence[str]) -> np.ndarray:
-    """Frames of a dataset's videos, rendered if they are not stored."""
+    """Frames [n, T, H, W, 3] of a dataset's videos, rendered if they are not stored."""
     if "frames" in ds.manifest.fields:
         return ds.batch(numbers)["frames"]
     from gen2d.programs.redraw import render
@@ -69,7 +100,7 @@ def _stored(ds: Dataset, numbers: Sequence[int], trust: Sequence[str]) -> np.nda
 
 
 def _drawn(source: str, videos: int, seed: int | None, overrides: Sequence[str]) -> tuple[str, np.ndarray, float]:
-    """Name of a config, and the frames and frame rate of its first videos."""
+    """Name of a config, and frames [n, T, H, W, 3] and frame rate of its first videos."""
     import dataclasses
 
     from gen2d.config.config import checked_seed, load_config

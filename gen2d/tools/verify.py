@@ -1,6 +1,6 @@
 """Verification of a stored dataset, at three levels.
 
-`quick` checks names and sizes, `full` every byte and value, `regen` also makes some videos again from their recipe and
+`quick` checks names and sizes, `full` every byte and value. `regen` also regenerates some videos from their recipe and
 compares them to the bit.
 """
 
@@ -31,15 +31,15 @@ from gen2d.storage.paths import Network, Place, Url, download, place, reading
 from gen2d.storage.sealed import file_sha256, has_sha256, read_bytes, read_sealed, sha256
 
 LEVELS = ("quick", "full", "regen")
-VIDEOS = 8  # default number of videos to make again
+VIDEOS = 8  # default number of videos to regenerate
 
-# Fields that are infinite for static bodies; in all others a value that is not finite is an error.
+# Fields that may be infinite, for static bodies and rigid joints; in all others a value that is not finite is an error.
 INFINITE = ("objects/mass", "objects/moment", "joints/stiffness", "joints/lower", "joints/upper")
 
 
 @dataclasses.dataclass(frozen=True)
 class Problem:
-    """A sentence that names the file and what is wrong; `shard` is the one to make again, if any."""
+    """A problem of a dataset: a sentence that names the file, and the shard to regenerate, if any."""
 
     sentence: str
     shard: str = ""
@@ -50,11 +50,11 @@ class Problem:
 
 @dataclasses.dataclass(frozen=True)
 class Outcome:
-    """The problems that a check found, a sentence each, and what a repair did."""
+    """Problems that a check found, a sentence each, and the result of a repair."""
 
-    problems: list[str]  # those that remain after the repair, if there was one
-    repaired: list[str]  # those that the repair solved
-    remade: list[str]  # names of the shards that were made again
+    problems: list[str]  # remaining ones, after the repair if there was one
+    repaired: list[str]  # solved by the repair
+    remade: list[str]  # names of regenerated shards
 
 
 Repair = Callable[[list[str]], Sequence[str] | None]
@@ -71,13 +71,47 @@ def verify(
     timeout: float = 30.0,
     deadline: float = 300.0,
 ) -> list[str]:
-    """The problems of a dataset, a sentence each; none if it is whole.
+    """Problems of a dataset.
 
-    `level` is "quick", "full" or "regen". The last one makes `videos` videos, chosen from `seed`, again; it imports
-    jax, and raises FolderError if this machine would make other bits, and UntrustedError if that needs code of the
-    dataset whose sha256 is not in `trust`. If there are problems, `repair_with` is called with the names of the bad
-    shards, must make these again and finish the dataset, as `regenerate.repair` does, and the problems that remain are
-    returned. `timeout` and `deadline` are those of `open`.
+    Parameters
+    ----------
+    root : str or path
+        Folder or URL of the dataset.
+    level : str
+        "quick" checks names and sizes, "full" every byte and value; "regen" also regenerates some videos and compares
+        them to the bit, for which it imports jax.
+    repair_with : callable, optional
+        Called with the names of damaged shards if there are problems. It must regenerate these and complete the
+        dataset, as `regenerate.repair` does; the dataset is then checked again.
+    videos : int
+        Number of videos that "regen" regenerates, 1 or more.
+    seed : int
+        Seed of their random choice.
+    trust : sequence of str
+        sha256 of code in the dataset that may run, as in `render`; only for "regen".
+    timeout, deadline : float
+        Limits in s of a server's silence and of a whole request, as in `open`.
+
+    Returns
+    -------
+    list of str
+        A sentence for each problem, those that remain after a repair; empty if the dataset is intact.
+
+    Raises
+    ------
+    ConfigError
+        If an argument is invalid.
+    FolderError
+        If the folder cannot be read, or, with "regen", if this machine or these versions would generate other bits.
+    UntrustedError
+        If "regen" needs code of the dataset that is not trusted.
+    UnreachableError
+        If a server does not answer.
+
+    Examples
+    --------
+    >>> gen2d.verify("datasets/bouncing", "regen", videos=4)
+    []
     """
     root = place(root, Network(timeout, deadline))
     return verify_and_repair(root, level, repair_with, videos, seed, trust).problems
@@ -91,27 +125,27 @@ def verify_and_repair(
     seed: int = 0,
     trust: Sequence[str] = (),
 ) -> Outcome:
-    """The problems that `verify` returns, and what was repaired."""
+    """Result of `verify`, with the repaired problems and the regenerated shards."""
     before = find_problems(root, level, videos, seed, trust)
     if not before or repair_with is None:
         return Outcome([problem.sentence for problem in before], [], [])
     remade = repair_with(sorted({problem.shard for problem in before if problem.shard}))
-    left = [problem.sentence for problem in find_problems(root, level, videos, seed, trust)]
-    repaired = [problem.sentence for problem in before if problem.sentence not in left]
-    return Outcome(left, repaired, list(remade or ()))
+    remaining = [problem.sentence for problem in find_problems(root, level, videos, seed, trust)]
+    repaired = [problem.sentence for problem in before if problem.sentence not in remaining]
+    return Outcome(remaining, repaired, list(remade or ()))
 
 
 def damaged_shards(root: str | Place, level: str = "full") -> list[str]:
-    """The names of the shards that must be made again."""
+    """Names of the shards that must be regenerated."""
     return sorted({problem.shard for problem in find_problems(place(root), level) if problem.shard})
 
 
 def find_problems(
     root: Place, level: str = "full", videos: int = VIDEOS, seed: int = 0, trust: Sequence[str] = ()
 ) -> list[Problem]:
-    """All problems: those of the folder, of the shards in their order, and of the regenerated videos.
+    """All problems of the folder, then of the shards in their order, then of regenerated videos.
 
-    The check starts anew if it finds problems and the dataset has grown meanwhile.
+    The check starts again if it finds problems and the dataset has grown meanwhile.
     """
     if level not in LEVELS:
         raise ConfigError(f"level is {level!r}, but must be one of {', '.join(LEVELS)}")
@@ -133,7 +167,7 @@ def find_problems(
 
 
 def _has(root: Place, manifest: Manifest) -> bool:
-    """Whether the folder still has this manifest, or none that is intact."""
+    """Whether the folder still has this manifest, or no intact one."""
     try:
         return read_manifest(root).sha256 == manifest.sha256
     except Error:
@@ -160,7 +194,10 @@ def _problems_of(
 
 
 def _changed_videos(root: Place, manifest: Manifest, videos: int, seed: int, trust: Sequence[str]) -> Iterator[Problem]:
-    """The fields of regenerated videos that differ; raises FolderError, at once, if this machine makes other bits."""
+    """Differing fields of regenerated videos.
+
+    Raises FolderError, before anything is yielded, if this machine generates other bits.
+    """
     from gen2d.generation import regenerate  # imports jax
 
     source = regenerate.source_of(root, manifest.identity, trust)
@@ -173,14 +210,14 @@ def _changed_videos(root: Place, manifest: Manifest, videos: int, seed: int, tru
 
 
 def chosen_videos(splits: Mapping[str, int], videos: int, seed: int) -> list[tuple[str, int]]:
-    """The split and number of `videos` videos, or of all if there are fewer, chosen from `seed`."""
+    """Split and number of `videos` random videos, or of all if there are fewer."""
     total = sum(splits.values())
-    places = np.sort(order(seed, 0, np.arange(min(videos, total)), total))
+    positions = np.sort(order(seed, 0, np.arange(min(videos, total)), total))
     ends = np.cumsum(list(splits.values()))
-    owner = np.searchsorted(ends, places, side="right")
+    split_index = np.searchsorted(ends, positions, side="right")
     return [
-        (list(splits)[k], int(place - ends[k] + list(splits.values())[k]))
-        for k, place in zip(owner, places, strict=True)
+        (list(splits)[k], int(position - ends[k] + list(splits.values())[k]))
+        for k, position in zip(split_index, positions, strict=True)
     ]
 
 
@@ -188,8 +225,8 @@ def chosen_videos(splits: Mapping[str, int], videos: int, seed: int) -> list[tup
 
 
 def _check_files(root: Place, manifest: Manifest) -> Iterator[Problem]:
-    """The problems of config, plug-ins, sheet and cards; people may edit README.md."""
-    upcoming = next_manifest(root)  # of a run that was killed while it published this manifest
+    """Problems of config, plug-ins, contact sheet and cards; people may edit README.md."""
+    upcoming = next_manifest(root)  # left by a run that was killed while it published this manifest
     for name, expected in manifest.files.items():
         next_sha256 = upcoming.files.get(name) if upcoming else None
         yield from map(Problem, _check_hash(root / name, expected, next_sha256))
@@ -200,14 +237,14 @@ def _check_files(root: Place, manifest: Manifest) -> Iterator[Problem]:
 
 
 def _check_hash(path: Place, *expected: str | None) -> Iterator[str]:
-    """The problems of a file that must have one of these sha256."""
+    """Problems of a file that must have one of these sha256."""
     try:
         if not any(has_sha256(path, one, FILE_BYTES) for one in expected if one):
             yield f"{path} is not what was written"
     except FileNotFoundError:
         yield f"{path} is missing"
     except OSError as error:
-        if isinstance(path, Url):  # the file may be whole
+        if isinstance(path, Url):  # the file may be intact
             raise
         failure = reading_error(path, error)
         if isinstance(failure, UserError):
@@ -216,7 +253,7 @@ def _check_hash(path: Place, *expected: str | None) -> Iterator[str]:
 
 
 def _check_tables(root: Place, manifest: Manifest) -> tuple[list[Problem], dict[str, np.ndarray]]:
-    """The problems of the splits' tables, and the rows of the tables that are whole."""
+    """Problems of the splits' tables, and the rows of the intact tables by split."""
     problems, rows_of = [], {}
     dtype, per_shard = manifest.shard_type, manifest.videos_per_shard
     sizes = manifest.video_type.itemsize, manifest.row_bytes, manifest.raw_bytes
@@ -240,13 +277,15 @@ def _check_tables(root: Place, manifest: Manifest) -> tuple[list[Problem], dict[
         rows = np.frombuffer(content, dtype, offset=len(header))
         firsts = range(0, table.shards * per_shard, per_shard)
         damaged = np.flatnonzero(~intact(rows, begin, firsts)).tolist()
-        own = plan({split: manifest.splits[split]}, per_shard)
-        for shard, row in zip(own, rows, strict=True):
+        split_shards = plan({split: manifest.splits[split]}, per_shard)
+        for shard, row in zip(split_shards, rows, strict=True):
             try:
                 check_shard(row, shard.first, shard.count, *sizes)
             except DamagedError as error:
                 problems.append(Problem(f"{path} has an impossible row {shard.place}: {error}", shard.name))
-        problems += [Problem(f"{path} is not what was written, in row {row}", own[row].name) for row in damaged]
+        problems += [
+            Problem(f"{path} is not what was written, in row {row}", split_shards[row].name) for row in damaged
+        ]
         if int(rows["bytes"].sum()) != table.bytes or int(rows["bytes"].max()) != table.largest:
             problems.append(Problem(f"{path} has shards of other sizes than {MANIFEST} says"))
         rows_of[split] = rows
@@ -254,7 +293,7 @@ def _check_tables(root: Place, manifest: Manifest) -> tuple[list[Problem], dict[
 
 
 def _check_mark(root: Place, manifest: Manifest) -> Iterator[Problem]:
-    """The problems of the mark, which later runs need; a copy may have been made without it."""
+    """Problems of the mark, which later runs need; a copy of a dataset may lack it."""
     if isinstance(root, Url) and not mark_path(root).exists():
         return
     if (root / MARK).is_dir() or isinstance(root, Url):
@@ -265,7 +304,7 @@ def _check_mark(root: Place, manifest: Manifest) -> Iterator[Problem]:
 
 
 def _foreign_files(root: Place, manifest: Manifest) -> Iterator[Problem]:
-    """The files that no run writes; shards that the manifest does not name yet are allowed."""
+    """Files that no run writes; shards that the manifest does not name yet are allowed."""
     for folder in ("shards", "index"):
         for path in sorted((root / folder).glob("*"), key=str):
             if is_foreign(path.name):
@@ -280,7 +319,7 @@ def _foreign_files(root: Place, manifest: Manifest) -> Iterator[Problem]:
 
 
 def _check_sizes(root: Place, shards: Sequence[Shard], rows: Mapping[str, np.ndarray]) -> Iterator[Problem]:
-    """The shards whose files are missing or have another size than their rows say."""
+    """Shards whose files are missing or differ in size from their rows."""
 
     def size(path: Place) -> int | None:
         try:
@@ -306,7 +345,7 @@ def _check_sizes(root: Place, shards: Sequence[Shard], rows: Mapping[str, np.nda
 
 
 class _ShardChecker:
-    """Checks shards by their bytes, by every value, and by what HDF5 says; at a URL each is downloaded first."""
+    """Check shards by their bytes, by all values, and by HDF5's structure; at a URL each is downloaded first."""
 
     def __init__(self, root: Place, manifest: Manifest, rows: Mapping[str, np.ndarray]) -> None:
         self.root, self.manifest, self.rows = root, manifest, rows
@@ -315,7 +354,7 @@ class _ShardChecker:
         with contextlib.ExitStack() as stack:
             if isinstance(self.root, Path):
                 self.local = self.root
-            else:  # a folder on disk with the manifest and the tables, into which the shards are downloaded
+            else:  # a local folder with the manifest and the tables, for the downloaded shards
                 self.local = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="gen2d-")))
                 for name in ("shards", "index"):
                     (self.local / name).mkdir()
@@ -330,7 +369,7 @@ class _ShardChecker:
         self._stack.close()
 
     def check(self, shards: Iterable[Shard]) -> Iterator[list[Problem]]:
-        """The problems of each shard, in their order."""
+        """Problems of each shard, in order."""
         with ThreadPoolExecutor(min(os.cpu_count() or 1, 8)) as pool:
             yield from pool.map(self._check, shards)
 
@@ -359,17 +398,17 @@ class _ShardChecker:
             yield Problem(str(failure), shard.name)
             return
         if row is None:
-            return  # its table is damaged, which is reported already
-        whole = digest == row["sha256"].tobytes().hex()
-        if not whole:
+            return  # its table is damaged, which is already reported
+        same_bytes = digest == row["sha256"].tobytes().hex()
+        if not same_bytes:
             yield Problem(f"{path} is not what was written: its sha256 differs", shard.name)
         for sentence in self._check_values(shard):
             yield Problem(sentence if sentence.startswith(str(path)) else f"{path}: {sentence}", shard.name)
-        if whole:  # otherwise HDF5's errors add nothing
+        if same_bytes:  # otherwise HDF5's errors add nothing
             yield from (Problem(f"{path}: {fault}", shard.name) for fault in faults(path, shard, self.manifest))
 
     def _check_values(self, shard: Shard) -> Iterator[str]:
-        """The problems of the stored values, which are read, checked and decoded as for training."""
+        """Problems of the stored values, which are read, checked and decoded as for training."""
         dataset = self.datasets[shard.split]
         for number in range(shard.first, shard.first + shard.count):
             try:

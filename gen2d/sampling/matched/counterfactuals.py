@@ -15,7 +15,7 @@ from gen2d.sampling.matched.sets import SetMember, along_slots
 
 
 def changed_factors(member: SetMember, config: Any, factors: dict[str, Array], draw: Callable) -> dict[str, Array]:
-    """The factors, of which the one that the set changes is scaled or drawn anew; `draw(key)` draws all."""
+    """Factors, with the one that the set changes scaled or sampled again; `draw(key)` samples all factors."""
     specs, matched, redrawn, changed = (
         drawn_options(config.scene.contract),
         config.matched,
@@ -38,7 +38,7 @@ def changed_factors(member: SetMember, config: Any, factors: dict[str, Array], d
 
 
 def changed_slot(one: tuple[Objects, State], other: tuple[Objects, State]) -> Array:
-    """The only slot in which two scenes differ at their start; -1 where none or several do."""
+    """The only slot in which two initial states differ; -1 if none or several do."""
     differ = jnp.zeros(one[0].present.shape, bool)
     for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True):
         differ |= (a != b).reshape(len(differ), -1).any(axis=1)

@@ -24,12 +24,12 @@ class SetMember(NamedTuple):
 
 
 def keys_of(words: Array, numbers: Array, options: Any) -> Array:
-    """A key per video; members of a set share one."""
+    """Key of each video [n]; the members of a set share one."""
     return keys.video_keys(words, numbers // options.members if options.change else numbers)
 
 
 def member_of(key: Array, number: Array, options: Any, frames: int) -> SetMember:
-    """The membership of a video with this number in its set, whose key this is."""
+    """Membership of the video with this number in its set; `key` is that of the set."""
     set_key = key_for(key, "matched")
     kind = jax.random.randint(key_for(set_key, "change"), (), 0, len(options.change))
     share = options.onset.sample(key_for(set_key, "onset"), ())
@@ -38,7 +38,7 @@ def member_of(key: Array, number: Array, options: Any, frames: int) -> SetMember
 
 
 def along_slots(values: Array, like: Array) -> Array:
-    """Values [K] with axes added, so that they broadcast to `like` [K, ...]."""
+    """Values [K] with trailing axes, which broadcast to `like` [K, ...]."""
     return values.reshape(-1, *[1] * (like.ndim - 1))
 
 
@@ -48,7 +48,7 @@ UNITS = (
 
 
 def fields(options: Any) -> dict[str, Field]:
-    """Stored fields of sets."""
+    """Stored fields of matched sets."""
     if not options.change:
         return {}
     codes = ", ".join(f"{code} {name}" for name, code in zip(options.change, change_codes(options), strict=True))
@@ -64,12 +64,12 @@ def fields(options: Any) -> dict[str, Field]:
 
 
 def omitted_fields(options: Any) -> tuple[str, ...]:
-    """Stored fields that sets lack: of a video spliced from two, the quality of neither simulation holds."""
+    """Fields that are not stored for violations: the quality of neither simulation describes the spliced video."""
     parts = "quality/max_penetration", "quality/contacts"
     return parts if set(options.change or ()) & set(VIOLATIONS) else ()
 
 
 def change_codes(options: Any) -> list[int]:
-    """Code of each change in matched.change: interventions by their number, then factors."""
+    """Code of each change in matched.change: first all interventions, then factors."""
     names, factor_codes = list(INTERVENTIONS), iter(range(len(INTERVENTIONS), 256))
     return [names.index(name) if name in names else next(factor_codes) for name in options.change]

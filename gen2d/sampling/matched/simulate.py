@@ -21,7 +21,7 @@ from gen2d.sampling.matched.violations import INTERVENTION_FUNCTIONS, Interventi
 
 
 class MemberVideos(NamedTuple):
-    """Simulated videos and the records of their changes; arrays have the videos first."""
+    """Simulated videos and records of their changes; arrays have the videos first."""
 
     factors: dict[str, Array]
     sampled: SampledScene
@@ -32,11 +32,11 @@ class MemberVideos(NamedTuple):
 def simulate_members(
     keys: Array, numbers: Array, config: Any, layout: Layout, sample: Callable, run: Callable
 ) -> MemberVideos:
-    """The videos with these numbers, where `keys` are those of their sets.
+    """Videos with these numbers [n]; `keys` [n] are those of their sets.
 
     `sample(key, change)` returns a video's factors and its sampled scene (sampler.py), `run(scenes, states)` the
-    trajectories. The original and the member are two turns of one loop, hence of one compiled program: two programs
-    would round differently.
+    trajectories. The original and the member are two iterations of one loop, and thus of one compiled program, because
+    two programs would round differently.
     """
     options, run = config.matched, jax.jit(run)  # traced once
     numbered = functools.partial(member_of, options=options, frames=config.video.frames)
@@ -67,7 +67,7 @@ def simulate_members(
 
 
 def _blank(keys: Array, sample: Callable, run: Callable) -> MemberVideos:
-    """Videos of zeros, from which the loop starts."""
+    """Zero-filled videos, the initial value of the loop."""
 
     def videos(keys: Array) -> MemberVideos:
         factors, sampled = jax.vmap(sample)(keys)
@@ -82,18 +82,18 @@ def _blank(keys: Array, sample: Callable, run: Callable) -> MemberVideos:
 def _intervene(
     member: SetMember, scene: Scene, state: State, states: State, options: Any, layout: Layout
 ) -> tuple[Scene, Scene, State, Array, dict[str, Array]]:
-    """One video's scene as stored; the scene, state and frame to simulate from; the intervention's record."""
+    """Scene of a video as stored; scene, state and frame to simulate from; record of the intervention."""
     free = jnp.asarray(free_slots(layout)) & scene.objects.present
-    here = jax.tree.map(lambda values: values[member.frame], states)
-    later = SceneInstant(scene, here, free & inside_view(here.position, layout))
+    onset_state = jax.tree.map(lambda values: values[member.frame], states)
+    later = SceneInstant(scene, onset_state, free & inside_view(onset_state.position, layout))
     chosen, frame = Intervention(scene, state, jnp.zeros(()), jnp.int32(-1), jnp.int32(-1)), jnp.int32(0)
     for index, name in enumerate(options.change):
         if name in INTERVENTIONS:
-            act = INTERVENTION_FUNCTIONS[name](
+            intervention = INTERVENTION_FUNCTIONS[name](
                 member, later if name in VIOLATIONS else SceneInstant(scene, state, free), options, layout
             )
-            on = member.changed & (member.kind == index) & (act.size > 0)
-            chosen = jax.tree.map(lambda new, old, on=on: jnp.where(on, new, old), act, chosen)
+            on = member.changed & (member.kind == index) & (intervention.size > 0)
+            chosen = jax.tree.map(lambda new, old, on=on: jnp.where(on, new, old), intervention, chosen)
             frame = jnp.where(on, member.frame, frame) if name in VIOLATIONS else frame
     stored = dataclasses.replace(chosen.scene, gravity=scene.gravity)
     record = {"object": chosen.object, "partner": chosen.partner, "size": chosen.size}
@@ -101,7 +101,7 @@ def _intervene(
 
 
 def _spliced(frame: Array, before: State, after: State) -> State:
-    """Videos [n, T, ...] that continue, from their `frame` [n] on, with other videos from their first frame on."""
+    """Videos [n, T, ...] `before`, continued from their `frame` [n] on by those in `after` from frame 0 on."""
 
     def spliced(frame: Array, old: Array, new: Array) -> Array:
         number = jnp.arange(len(old))
@@ -112,21 +112,21 @@ def _spliced(frame: Array, before: State, after: State) -> State:
 
 
 def _record_change(member: SetMember, before: MemberVideos, after: MemberVideos, config: Any) -> dict[str, Array]:
-    """The record of one video's change, including a changed factor's, and the first frame that shows it."""
-    one, other = before.sampled, after.sampled
-    record, both = dict(after.record), one.scene.objects.present & other.scene.objects.present
+    """Record of a video's change, including that of a factor, and of the first frame that differs."""
+    original, changed = before.sampled, after.sampled
+    record, both = dict(after.record), original.scene.objects.present & changed.scene.objects.present
     for index, name in enumerate(config.matched.change):
         if name not in INTERVENTIONS:
-            on = member.changed & (member.kind == index)
-            slot = changed_slot((one.scene.objects, one.state), (other.scene.objects, other.state))
-            record["object"] = jnp.where(on, slot, record["object"])
+            applies = member.changed & (member.kind == index)
+            slot = changed_slot((original.scene.objects, original.state), (changed.scene.objects, changed.state))
+            record["object"] = jnp.where(applies, slot, record["object"])
             change = (after.factors[name] - before.factors[name]).astype(jnp.float32)
             size = (
                 jnp.linalg.norm(change, axis=-1)
                 if drawn_options(config.scene.contract)[name].parts
                 else jnp.abs(change)
             )
-            record["size"] = jnp.where(on, jnp.max(size), record["size"])
+            record["size"] = jnp.where(applies, jnp.max(size), record["size"])
     differ = jnp.zeros(len(after.trajectory.states.angle), bool)
     for a, b in zip(jax.tree.leaves(before.trajectory.states), jax.tree.leaves(after.trajectory.states), strict=True):
         differ |= ((a != b).reshape(*a.shape[:2], -1).any(axis=-1) & both).any(axis=-1)

@@ -15,7 +15,7 @@ from gen2d.sampling.matched.sets import SetMember, along_slots
 
 CLEARANCE = 1e-3  # m around an object that has jumped
 DIRECTIONS = 32  # tried for a jump
-MAX_INCIDENCE = math.pi / 3  # rad, of an object on the wall that is not there
+MAX_INCIDENCE = math.pi / 3  # rad, angle of incidence on an invisible wall
 MAX_SIZE_DIFFERENCE = 0.25  # of two objects that swap places, over the smaller size
 
 
@@ -28,7 +28,7 @@ class SceneInstant(NamedTuple):
 
 
 class Intervention(NamedTuple):
-    """Scene and state after a change; its size is 0 where none was possible."""
+    """Scene and state after a change; size 0 means that none was possible."""
 
     scene: Scene
     state: State
@@ -38,7 +38,7 @@ class Intervention(NamedTuple):
 
 
 def _removed(member: SetMember, now: SceneInstant, options: Any, layout: Layout) -> Intervention:
-    """One object is removed, a different one in each member. Size: its mass, kg."""
+    """Remove one object, a different one in each member. Size: its mass in kg."""
     scene, state = now.scene, now.state
     slot, possible = _random_slot(key_for(member.set_key, "object"), now.free, member.number - 1)
 
@@ -50,7 +50,7 @@ def _removed(member: SetMember, now: SceneInstant, options: Any, layout: Layout)
 
 
 def _teleported(member: SetMember, now: SceneInstant, options: Any, layout: Layout) -> Intervention:
-    """One object jumps to a free position. Size: the distance, m."""
+    """Move one object to a free position. Size: the distance in m."""
     state = now.state
     slot, possible = _random_slot(key_for(member.set_key, "object"), now.free)
     distance = options.distance.sample(key_for(member.own_key, "distance"), ())
@@ -66,7 +66,7 @@ def _teleported(member: SetMember, now: SceneInstant, options: Any, layout: Layo
 
 
 def _swapped(member: SetMember, now: SceneInstant, options: Any, layout: Layout) -> Intervention:
-    """The two objects of one shape most similar in size swap positions and motions. Size: their distance, m."""
+    """Swap positions and motions of two objects of the same shape and the most similar size. Size: distance in m."""
     free, objects, slots = now.free, now.scene.objects, jnp.arange(len(now.free))
     size = extent(objects)
     differ = jnp.abs(size[:, None] - size)
@@ -75,21 +75,21 @@ def _swapped(member: SetMember, now: SceneInstant, options: Any, layout: Layout)
     nearest = pair & (differ <= jnp.min(jnp.where(pair, differ, jnp.inf)) + 1e-6)  # m
     priority = jax.random.uniform(key_for(member.set_key, "object"), pair.shape)
     a, b = jnp.divmod(jnp.argmax(jnp.where(nearest, priority, -1)), len(free))
-    turned = slots.at[a].set(b).at[b].set(a)
+    permutation = slots.at[a].set(b).at[b].set(a)
     distance = jnp.linalg.norm(now.state.position[a] - now.state.position[b])
     return Intervention(
-        now.scene, jax.tree.map(lambda values: values[turned], now.state), nearest.any() * distance, a, b
+        now.scene, jax.tree.map(lambda values: values[permutation], now.state), nearest.any() * distance, a, b
     )
 
 
 def _flipped(member: SetMember, now: SceneInstant, options: Any, layout: Layout) -> Intervention:
-    """Gravity is reversed. Size: its change, m/s^2."""
+    """Reverse gravity. Size: its change in m/s^2."""
     flipped = dataclasses.replace(now.scene, gravity=-now.scene.gravity)
     return Intervention(flipped, now.state, 2 * jnp.linalg.norm(now.scene.gravity))
 
 
 def _bounced(member: SetMember, now: SceneInstant, options: Any, layout: Layout) -> Intervention:
-    """One object bounces off a wall that is not there. Size: the angle by which its velocity turns, rad."""
+    """Bounce one object off an invisible wall. Size: the angle in rad by which its velocity turns."""
     state = now.state
     slot, possible = _random_slot(key_for(member.set_key, "object"), _fast_objects(now))
     velocity = state.velocity[slot]
@@ -102,7 +102,7 @@ def _bounced(member: SetMember, now: SceneInstant, options: Any, layout: Layout)
 
 
 def _sped_up(member: SetMember, now: SceneInstant, options: Any, layout: Layout) -> Intervention:
-    """One object moves and spins faster. Size: the factor of its speed."""
+    """Speed up one object, in motion and spin. Size: the factor of its speed."""
     state = now.state
     slot, possible = _random_slot(key_for(member.set_key, "object"), _fast_objects(now))
     gain = options.gain.sample(key_for(member.own_key, "gain"), ())
@@ -124,13 +124,13 @@ INTERVENTION_FUNCTIONS = {
 
 
 def _random_slot(key: Array, eligible: Array, index: Any = 0) -> tuple[Array, Array]:
-    """The slot at an index, modulo their index, into a random order of the eligible, and whether any is."""
+    """Slot at `index`, modulo their number, in a random order of the eligible slots, and whether there are any."""
     order = jnp.argsort(jnp.where(eligible, jax.random.uniform(key, eligible.shape), 2))
     return order[index % jnp.maximum(eligible.sum(), 1)], eligible.any()
 
 
 def _fast_objects(now: SceneInstant) -> Array:
-    """Whether each object [K] is at least half as fast as the fastest; a change of slower ones would show little."""
+    """Whether each object [K] has at least half the largest speed; changes of slower ones would hardly be visible."""
     speed = jnp.where(now.free, jnp.linalg.norm(now.state.velocity, axis=-1), 0)
     return now.free & (speed > 0) & (speed >= jnp.max(speed) / 2)
 
@@ -142,13 +142,13 @@ def _rotated(vector: Array, angle: Array) -> Array:
 
 
 def extent(objects: Objects) -> Array:
-    """Largest distance [K] m of each object's rim from its centre."""
+    """Largest distance [K] m of each object's boundary from its centre."""
     corner = 0.0 if objects.vertices is None else jnp.linalg.norm(objects.vertices, axis=-1).max(axis=-1)
     return objects.radius + objects.half_length + corner
 
 
 def gaps(point: Array, objects: Objects, state: State) -> Array:
-    """Distance [K] m of each object's rim from a point [2]; a lower bound beside a polygon's corner."""
+    """Distance [K] m of a point [2] from each object's boundary, negative inside; a lower bound near corners."""
     local = _rotated(point - state.position, -state.angle)
     along = jnp.maximum(jnp.abs(local[:, 0]) - objects.half_length, 0)
     distance = jnp.hypot(along, local[:, 1])
