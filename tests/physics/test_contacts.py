@@ -119,7 +119,7 @@ def found(a: dict, b: dict, dtype: type = np.float64):
     """The points of contact, in NumPy, as normal [points, 2, n], gap [points, n] and world points [points, 2, n] by a
     and by b."""
     with jax.enable_x64(dtype == np.float64):
-        points = compiled(placed(a, dtype), placed(b, dtype), jnp.ones((), dtype))
+        points = compiled(placed(a, dtype), placed(b, dtype))
         assert all(x.dtype == dtype for point in points for x in point)
         normal, gap, arm_a, arm_b = (np.stack(x) for x in zip(*points, strict=True))
     return normal, gap, a["position"].T + arm_a, b["position"].T + arm_b
