@@ -9,14 +9,14 @@ import os
 from collections import deque
 from collections.abc import Callable, Generator, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
-from typing import TYPE_CHECKING, Any, Generic, Literal, Self, TypeVar, overload
+from typing import TYPE_CHECKING, Any, Generic, Literal, Self, TypeVar, cast, overload
 
 import numpy as np
 
 from gen2d.core.errors import ConfigError
 from gen2d.loading.epochs import EpochSampler, GlobalBatch, one_of
 from gen2d.loading.mixture import Mixture
-from gen2d.loading.protocols import Batch, LoaderState, VideoReader
+from gen2d.loading.protocols import Batch, LoaderState, Snapshot, VideoReader
 
 if TYPE_CHECKING:
     import jax
@@ -217,7 +217,7 @@ class DataLoader(Generic[A]):
         shares = self.dataset.shares if isinstance(self.dataset, Mixture) else None
         if known.get("shares", shares) != shares:
             raise ConfigError(f"the state has shares {known['shares']}, but the dataset {shares}: their orders differ")
-        dataset = self.dataset.at(snapshot) if isinstance(snapshot, str | list) else self.dataset
+        dataset = self.dataset if snapshot is None else self.dataset.at(cast(Snapshot, snapshot))
         sampler = self.walk.over(len(dataset))
         sampler.load_state_dict(state)
         self.dataset, self.walk = dataset, sampler
