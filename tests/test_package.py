@@ -2,9 +2,12 @@
 
 import ast
 import importlib
+import inspect
 import pkgutil
+import re
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -125,6 +128,33 @@ def test_public_names_are_declared_alike(facade: str) -> None:
     assert all(getattr(module, name) is not None for name in module.__all__)
     with pytest.raises(AttributeError, match=f"module '{facade}' has no attribute 'nothing'"):
         _ = module.nothing
+
+
+def public() -> dict[str, Callable]:
+    """Every public function, and the public methods of public classes."""
+    functions = {}
+    for name in gen2d.__all__:
+        value = getattr(gen2d, name)
+        members = vars(value) if inspect.isclass(value) else {"": value}
+        methods = {member: function for member, function in members.items() if inspect.isfunction(function)}
+        functions |= {f"{name}.{member}".strip("."): f for member, f in methods.items() if not member.startswith("_")}
+    return functions
+
+
+PUBLIC = public()
+JSON = {"Config.plain", "Config.recipe"}  # whose values are those of JSON
+
+
+@pytest.mark.parametrize("name", PUBLIC)
+def test_a_public_function_names_its_parameters_and_their_types(name: str) -> None:
+    signature = inspect.signature(PUBLIC[name])
+    doc = PUBLIC[name].__doc__ or ""
+    assert doc.strip()
+    ours = [p for p in signature.parameters if p not in ("self", "options")]
+    assert [p for p in ours if len(ours) > 1 and not re.search(rf"\b{p}\b", doc)] == []
+    annotations = inspect.get_annotations(PUBLIC[name])
+    assert annotations.keys() >= {*signature.parameters.keys() - {"self"}, "return"}
+    assert name in JSON or not any(re.search(r"\bAny\b", f"{annotation}") for annotation in annotations.values())
 
 
 def test_few_files_lie_beside_the_rooms() -> None:

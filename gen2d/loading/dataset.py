@@ -417,7 +417,10 @@ class Dataset:
         return shuffled(seed, epoch, positions, len(self))
 
     def starts(self, numbers: np.ndarray, bits: np.ndarray) -> np.ndarray | None:
-        """First frame of each video's window, int64 [n], sampled from random bits; None if windows are not random."""
+        """First frames of the windows of the videos `numbers` [n], int64 [n], sampled from random `bits`, uint64 [n].
+
+        None if windows are not random.
+        """
         return self.options.starts(bits, self._frames)
 
     def numbers(self, indices: Numbers) -> np.ndarray:

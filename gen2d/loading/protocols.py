@@ -12,7 +12,9 @@ Batch = dict[str, np.ndarray]
 Numbers = Sequence[int] | np.ndarray
 Key = SupportsIndex | slice | Numbers  # index of one video, or of several
 Snapshot: TypeAlias = "str | list[Snapshot]"  # of one dataset, or of each of several
-LoaderState: TypeAlias = "Mapping[str, int | bool | Snapshot | list[int] | None]"  # values that JSON can store
+LoaderState: TypeAlias = (
+    "Mapping[str, int | bool | str | list[Snapshot] | list[int] | None]"  # values that JSON can store
+)
 FieldStats = dict[str, dict[str, list[float] | None]]  # mean, std, min and max of each component, by field
 
 

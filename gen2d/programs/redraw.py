@@ -41,7 +41,7 @@ from gen2d.renderers.rasterizer import draw_soft
 from gen2d.sampling.matched import sets as sets_module
 from gen2d.xla import on_cpu
 
-FieldColumns = Mapping[str, Any]
+FieldColumns = Mapping[str, Array | np.ndarray]
 
 
 @overload
@@ -51,7 +51,7 @@ def render(
     *,
     height: int | None = None,
     width: int | None = None,
-    look: str | Mapping[str, Any] | None = None,
+    look: str | Mapping[str, object] | None = None,
     overrides: Sequence[str] = (),
     states: FieldColumns | None = None,
     fields: None = None,
@@ -66,7 +66,7 @@ def render(
     *,
     height: int | None = None,
     width: int | None = None,
-    look: str | Mapping[str, Any] | None = None,
+    look: str | Mapping[str, object] | None = None,
     overrides: Sequence[str] = (),
     states: FieldColumns | None = None,
     fields: Sequence[str],
@@ -80,7 +80,7 @@ def render(
     *,
     height: int | None = None,
     width: int | None = None,
-    look: str | Mapping[str, Any] | None = None,
+    look: str | Mapping[str, object] | None = None,
     overrides: Sequence[str] = (),
     states: FieldColumns | None = None,
     fields: Sequence[str] | None = None,
@@ -157,7 +157,7 @@ def render_soft(
     sigma: float = 0.0,
     height: int | None = None,
     width: int | None = None,
-    look: str | Mapping[str, Any] | None = None,
+    look: str | Mapping[str, object] | None = None,
     overrides: Sequence[str] = (),
     trust: Trust = (),
 ) -> Array:
@@ -275,7 +275,7 @@ def _recipes(
     indices: Numbers,
     height: int | None,
     width: int | None,
-    look: str | Mapping[str, Any] | None,
+    look: str | Mapping[str, object] | None,
     overrides: Sequence[str],
     fields: Sequence[str] | None,
     trust: Trust,

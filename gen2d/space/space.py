@@ -15,6 +15,7 @@ numbers to slots.
 import dataclasses
 import itertools
 import math
+from collections.abc import Sequence
 from typing import Any, Unpack
 
 import jax
@@ -75,7 +76,7 @@ class Space:
     >>> height = video.position[:, ball, 1]
     """
 
-    def __init__(self, gravity: Pair = (0.0, -9.8), **physics: Any) -> None:
+    def __init__(self, gravity: Pair = (0.0, -9.8), **physics: float | str) -> None:
         self.gravity = checked_pair("Space: gravity", gravity)
         self.physics: PhysicsOptions = build(PhysicsOptions, physics, "physics", "Space")
         self.bodies: list[Body] = []
@@ -191,7 +192,7 @@ class Space:
             name, "polygon", checked_pair(f"{name}: position", position), angle, vertices=corners, **options
         )
 
-    def add_polygon(self, vertices: Any, **options: Unpack[BodyOptions]) -> int:
+    def add_polygon(self, vertices: Sequence[Pair] | np.ndarray, **options: Unpack[BodyOptions]) -> int:
         """Add a convex polygon. Its position is its centre of mass, its angle 0.
 
         Parameters

@@ -27,7 +27,7 @@ class Options(PlainOptions):
 
     background_kind: str = option("noise", str, "", "what is behind everything", choices=("plain", "gradient", "noise"))
     background_to: tuple = option([64, 64, 84], int, "sRGB", "where it ends", parts=3, low=0, high=255)
-    contrast: float = option(
+    texture_contrast: float = option(
         0.8, float, "1", "contrast of the spots; 1: black or white, the farther from the background", low=0, high=1
     )
     cell_size: float = option(0.6, float, "1", "size of a spot, over the largest object's reach", above=0)
@@ -40,7 +40,7 @@ def paint(scene: Scene, layout: Layout, options: Options, key: Array) -> Paint:
     texture = Texture(
         seed=jax.random.bits(jax.random.fold_in(key, 2), (layout.slots,), jnp.uint32),
         cell=jnp.full(layout.slots, options.cell_size * layout.reach),
-        color=base.color + options.contrast * (extreme - base.color),
+        color=base.color + options.texture_contrast * (extreme - base.color),
     )
     return base._replace(texture=texture)
 
