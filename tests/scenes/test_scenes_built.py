@@ -133,7 +133,7 @@ def test_a_seesaw_tips_to_the_side_of_the_larger_torque():
     np.testing.assert_array_equal(np.sign(angle[clear]), np.sign(torque[clear]))
     assert np.abs(angle[clear]).min() > 0.05
     holds("seesaw: pivot, m", apart(made), 1e-5)
-    # The worst of these 32 gains 24 %; the worst of the 32 that were sampled under the factors' former names gained 6 %.
+    # The worst of these 32 gains 24 %, the worst of 32 sampled under the former names of the factors gained 6 %.
     holds("seesaw: energy gained", gained(made), 0.3, asked=1e-2)
 
 
