@@ -32,8 +32,8 @@ from gen2d.renderers.compositing import (
     static_layer,
 )
 from gen2d.renderers.plan import FramePlan, RenderScene
+from gen2d.renderers.postprocessing import add_noise, exposure_average
 from gen2d.renderers.primitives import Instants, PixelWindow
-from gen2d.renderers.sensor import add_noise, exposure_average
 from gen2d.renderers.shading import covered_color, fills_of
 from gen2d.renderers.tiles import draw_tiles
 from gen2d.xla import on_cpu

@@ -24,8 +24,8 @@ from gen2d.renderers.compositing import (
     to_levels,
 )
 from gen2d.renderers.plan import FramePlan, RenderScene, TileGroup, tile_windows
+from gen2d.renderers.postprocessing import add_noise, exposure_average
 from gen2d.renderers.primitives import Instants, PixelWindow
-from gen2d.renderers.sensor import add_noise, exposure_average
 from gen2d.renderers.shading import EdgeSamples, covered_color, fills_of
 
 

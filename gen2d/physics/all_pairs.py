@@ -22,10 +22,10 @@ from gen2d.physics.contact_log import (
     pair_event,
     record_event,
 )
-from gen2d.physics.contact_solver import ContactSolver
 from gen2d.physics.contact_state import BodySide, PassSetup, SolvedPair, WarmStart
 from gen2d.physics.params import SolverParams
 from gen2d.physics.schedule import Match, run_schedule
+from gen2d.physics.solver_protocol import ContactSolver
 from gen2d.records.axes import Array
 from gen2d.records.trajectory import Contacts
 

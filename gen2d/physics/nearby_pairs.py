@@ -43,11 +43,11 @@ from gen2d.physics.contact_log import (
     pair_event,
     record_event,
 )
-from gen2d.physics.contact_solver import ContactSolver
 from gen2d.physics.contact_state import BodySide, PassSetup, WarmStart
 from gen2d.physics.packing import SAFE, PackedTable, TableSpec, make_table, pack, repeat_rows, unpack
 from gen2d.physics.params import SolverParams
 from gen2d.physics.schedule import bipartite_rounds
+from gen2d.physics.solver_protocol import ContactSolver
 from gen2d.records.axes import Array
 from gen2d.records.trajectory import Contacts
 from gen2d.xla import materialize, max_bodies

@@ -23,7 +23,7 @@ from gen2d.physics.banded import factor, solve_factored
 from gen2d.physics.collision import dot, turned
 from gen2d.physics.constraint import Inertia, Motion
 from gen2d.physics.energy import Work
-from gen2d.physics.joint_forces import JointSide, anchors_of, direction_of, groups_of, table_of, take_rows
+from gen2d.physics.springs_limits_motors import JointSide, anchors_of, direction_of, groups_of, table_of, take_rows
 from gen2d.records.axes import Array
 from gen2d.records.layout import JointSpec
 from gen2d.xla import materialize

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 
 from gen2d.core.enums import DYNAMIC, STATIC
 from gen2d.core.errors import ConfigError
-from gen2d.physics import joint_forces, rigid_joints
+from gen2d.physics import rigid_joints, springs_limits_motors
 from gen2d.physics.constraint import Motion
 from gen2d.physics.energy import Ledger, Work, balance, close_balance
 from gen2d.physics.params import SolverParams
@@ -119,7 +119,7 @@ def _start(state: State, layout: Layout, model: Model, keep: SaveAt, params: Sol
         zero = Motion(jnp.zeros_like(own.position), jnp.zeros_like(own.angle))
         bodies.append(BodyState(own.position, own.angle, Motion(own.velocity, own.angular_velocity), zero))
     time, contacts = jnp.zeros((), state.angle.dtype), model.solver.start(keep.contacts)
-    joints = [joint_forces.zero_impulses(joint) for joint in model.joints]
+    joints = [springs_limits_motors.zero_impulses(joint) for joint in model.joints]
     system = None if model.joint_system is None else rigid_joints.zero_impulses(model.joint_system)
     if keep.energy:
         driven = model.forces is not None or any(f.motion is not None for f in model.statics)
@@ -137,7 +137,7 @@ def _balance(world: WorldState, model: Model) -> tuple | None:
     if world.ledger is None:
         return None
     statics = [body.at(world.time) for body in model.statics]
-    springs = joint_forces.springs_energy(model.joints, world.bodies, statics)
+    springs = springs_limits_motors.springs_energy(model.joints, world.bodies, statics)
     springs = springs + jnp.zeros_like(model.gravity[0])
     return balance(model.groups, world.bodies, model.gravity, springs), close_balance(world.ledger, springs)
 

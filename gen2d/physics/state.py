@@ -5,12 +5,12 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 
-from gen2d.physics import joint_forces, rigid_joints
+from gen2d.physics import rigid_joints, springs_limits_motors
 from gen2d.physics.collision import Shape, Stadium
 from gen2d.physics.constraint import Inertia, Motion
-from gen2d.physics.contact_solver import ContactSolver
 from gen2d.physics.energy import Ledger
 from gen2d.physics.shapes import BodyShape, to_world
+from gen2d.physics.solver_protocol import ContactSolver
 from gen2d.records.axes import Array
 
 
@@ -63,7 +63,7 @@ class Model(NamedTuple):
     segments: list[Stadium]  # static segments at rest; of negative length where absent
     gravity: Array  # [2, ...] m/s^2
     solver: ContactSolver
-    joints: list[joint_forces.JointBatch]
+    joints: list[springs_limits_motors.JointBatch]
     joint_system: rigid_joints.JointSystem | None
     forces: Callable | None  # (bodies, time) -> for each group force [2, N, ...] N and torque [N, ...] N m
     one: Array  # see `xla.runtime_one`

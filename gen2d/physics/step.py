@@ -9,8 +9,8 @@ A step of h seconds:
 5. Every pair and all joints are solved once more without the bias, so that pushing apart leaves no speed behind.
 
 Pairs are solved in rounds of disjoint pairs (schedule.py), all of them (all_pairs.py) or those that are near
-(nearby_pairs.py), and each round starts from the result of the last. Springs, limits and motors (joint_forces.py) come
-before the contacts, static bodies last of all pairs, and rigid joints (rigid_joints.py) after the contacts.
+(nearby_pairs.py), and each round starts from the result of the last. Springs, limits and motors come before the contacts
+(springs_limits_motors.py), static bodies last of all pairs, and rigid joints (rigid_joints.py) after the contacts.
 
 Restitution. A contact that closes within the step bounces: Newton's law is applied to the velocities that it finds, so
 impacts follow one another and never add energy. The impulse P acts at the time of impact tau, not at the start of the
@@ -28,7 +28,7 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 
-from gen2d.physics import joint_forces, rigid_joints
+from gen2d.physics import rigid_joints, springs_limits_motors
 from gen2d.physics.constraint import Motion
 from gen2d.physics.contact_state import BodySide
 from gen2d.physics.energy import Ledger, accumulate, record_energy
@@ -131,7 +131,7 @@ def step(world: WorldState, model: Model, params: SolverParams) -> WorldState:
     free, free_drifts = materialize([motion for motion, _ in flights]), [drift for _, drift in flights]
     fixed = [body.at(world.time) for body in model.statics]
 
-    joints, motions, work_warm = joint_forces.warm_start(model.joints, world.bodies, fixed, free, world.joints)
+    joints, motions, work_warm = springs_limits_motors.warm_start(model.joints, world.bodies, fixed, free, world.joints)
     rigid = _RigidJoints(model.joint_system, world, fixed, h)
     before = rigid.warm_start(motions)
     shapes = [to_world(g.body_shape, b.position, b.angle) for g, b in zip(groups, world.bodies, strict=True)]
@@ -148,7 +148,7 @@ def step(world: WorldState, model: Model, params: SolverParams) -> WorldState:
         pushes.append(x + y)
 
     drifts = [Motion(*(jnp.zeros_like(x) for x in m)) for m in motions]
-    joints, motions, drifts, work_solve = joint_forces.solve(
+    joints, motions, drifts, work_solve = springs_limits_motors.solve(
         joints, motions, drifts, accelerations, fixed, params, biased=True
     )
     of_groups = zip(sides, motions, drifts, pushes, strict=True)
@@ -163,7 +163,7 @@ def step(world: WorldState, model: Model, params: SolverParams) -> WorldState:
     displacements = clamp_displacement(displacements, solid, model.segments)
     bodies = [_displaced(*of) for of in zip(world.bodies, displacements, motions, strict=True)]
 
-    joints, motions, _, work_relax = joint_forces.solve(
+    joints, motions, _, work_relax = springs_limits_motors.solve(
         joints, motions, displacements, accelerations, fixed, params, biased=False
     )
     sides = [side._replace(motion=motion, drift=None) for side, motion in zip(sides, motions, strict=True)]

@@ -1,4 +1,4 @@
-"""Camera sensor: average over an exposure, and noise."""
+"""Postprocessing of whole frames: the average over an exposure (motion blur), and sensor noise."""
 
 import functools
 import math
