@@ -9,7 +9,7 @@ A step of h seconds:
 5. Every pair and all joints are solved once more without the bias, so that pushing apart leaves no speed behind.
 
 Pairs are solved in rounds of disjoint pairs (schedule.py), all of them (all_pairs.py) or those that are near
-(nearby_pairs.py), and each round starts from the result of the last. Springs, limits and motors come before the contacts
+(nearby_pairs.py), each round from the result of the last. Springs, limits and motors come before the contacts
 (springs_limits_motors.py), static bodies last of all pairs, and rigid joints (rigid_joints.py) after the contacts.
 
 Restitution. A contact that closes within the step bounces: Newton's law is applied to the velocities that it finds, so
