@@ -4,7 +4,6 @@ import argparse
 import dataclasses
 import json
 import secrets
-from pathlib import Path
 
 from gen2d.cli.parser import Parser, add_dataset, add_network, add_trust, limits, whole_number
 from gen2d.core.errors import UserError
@@ -35,13 +34,14 @@ def add_arguments(parser: Parser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
+    from gen2d.dataset.manifest import is_begun
+    from gen2d.dataset.spec import MANIFEST
     from gen2d.storage.paths import Network, place, reading
     from gen2d.tools.verify import verify_and_repair
 
     root = place(options.dataset, Network(**limits(options)))
     with reading(root):
-        begun = (root / ".gen2d" / "dataset.json").exists() or (isinstance(root, Path) and (root / ".gen2d").is_dir())
-        if not begun and not (root / "manifest.json").exists():
+        if not is_begun(root) and not (root / MANIFEST).exists():
             raise UserError(f"{root} is not a dataset that gen2d made")
 
     def repair(shards: list[str]) -> list[str]:

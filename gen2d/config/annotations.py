@@ -38,12 +38,11 @@ class Annotations:
 
 def _plain(plugin: Plugin) -> Any:
     """`value` or `{option: value, ...}`; always a mapping for a user file, which adds its sha256."""
-    single = not dataclasses.is_dataclass(plugin.contract.options)
-    if single:
-        value = plain_value(plugin.options)
-        return {"sha256": plugin.sha256, "value": value} if plugin.sha256 else value
     digest = {"sha256": plugin.sha256} if plugin.sha256 else {}
-    return digest | plain_of(plugin.options) if plugin.options else False
+    if dataclasses.is_dataclass(plugin.contract.options):
+        return digest | plain_of(plugin.options) if plugin.options else False
+    value = plain_value(plugin.options)
+    return digest | {"value": value} if digest else value
 
 
 def annotations_of(values: Any, source: str, copies: Copies) -> Annotations:
@@ -56,21 +55,17 @@ def annotations_of(values: Any, source: str, copies: Copies) -> Annotations:
         raise ConfigError(f"{source}: annotations is {values!r}, but must be a mapping of options")
     simulated = [field.name for field in dataclasses.fields(SimulationAnnotations)]
     built_in = plugins.names("annotation")
-    user_files = [name for name, value in values.items() if _is_own(name) and value is not False]
+    user_files = [name for name, value in values.items() if plugins.is_own(name) and value is not False]
     for name in values:
-        if name not in (*simulated, *built_in) and not _is_own(name):
+        if name not in (*simulated, *built_in) and not plugins.is_own(name):
             raise ConfigError(
                 f"{source}: annotations.{name} is not an option; {plugins.nearest(name, [*simulated, *built_in])}"
             )
-    filename, count = (
-        collections.Counter(pathlib.PurePath(name).name for name in user_files).most_common(1)[0]
-        if user_files
-        else ("", 0)
-    )
-    if count > 1:
-        raise ConfigError(
-            f"{source}: annotations has {count} files named {filename}: a dataset keeps a copy of one only"
-        )
+    for filename, count in collections.Counter(pathlib.PurePath(name).name for name in user_files).most_common(1):
+        if count > 1:
+            raise ConfigError(
+                f"{source}: annotations has {count} files named {filename}: a dataset keeps a copy of one only"
+            )
     simulation = build(
         SimulationAnnotations, {k: v for k, v in values.items() if k in simulated}, "annotations", source
     )
@@ -79,17 +74,14 @@ def annotations_of(values: Any, source: str, copies: Copies) -> Annotations:
     )
 
 
-def _is_own(name: Any) -> bool:
-    return isinstance(name, str) and plugins.is_own(name)
-
-
 def _annotation(name: str, values: Mapping[str, Any], source: str, copies: Copies) -> Plugin:
     where, value = f"annotations.{name}", values.get(name, False)
     given = dict(value) if isinstance(value, Mapping) else {}
     digest = given.pop("sha256", None)
     contract, digest, content = contract_of("annotation", name, digest, f"{source}: an annotation", copies)
     if isinstance(contract.options, dataclasses.Field):
-        spec, single_value = contract.options.metadata["option"], given["value"] if [*given] == ["value"] else value
+        spec = contract.options.metadata["option"]
+        single_value = given["value"] if [*given] == ["value"] else value
         try:
             options = value_of(spec, single_value) if name in values else contract.options.default
         except ValueError as error:

@@ -15,7 +15,7 @@ from gen2d.config import matched as matched_module
 from gen2d.config import plugins
 from gen2d.config import quality as quality_module
 from gen2d.config.annotations import Annotations, annotations_of
-from gen2d.config.joint_distribution import JointDistribution
+from gen2d.config.joint_distribution import JointDistribution, on_grid
 from gen2d.config.options import build, coordinates, plain_of
 from gen2d.config.plugin_options import NO_COPIES, Copies, Plugin, StoredCopies, named, plugin_of
 from gen2d.config.reading import YAML_BYTES, overridden, parse_yaml, yaml_text
@@ -213,7 +213,7 @@ def own_files(plain: Mapping[str, Any]) -> dict[str, str]:
     ]
     names = [(kind, _mapping(named(plugin)).get("name")) for kind, plugin in declared]
     names += [("annotation", name) for name in _mapping(plain.get("annotations"))]
-    own = [(kind, name) for kind, name in names if isinstance(name, str) and plugins.is_own(name)]
+    own = [(kind, name) for kind, name in names if plugins.is_own(name)]
     return {plugins.copy_name(kind, name): name for kind, name in own}
 
 
@@ -242,8 +242,7 @@ def _check_grids(config: Config, source: str) -> None:
         for field in dataclasses.fields(options):
             spec, value = field.metadata["option"], getattr(options, field.name)
             parts = coordinates(field.name, value).values() if spec.draw and value is not None else ()
-            on_grid = any(simple.kind == "grid" for part in parts for _, simple in part.weighted)
-            if on_grid and (section != "scene" or spec.each):
+            if any(map(on_grid, parts)) and (section != "scene" or spec.each):
                 raise ConfigError(
                     f"{source}: {section}.{field.name} is on a grid, but only a scene's numbers of a whole video can be"
                 )

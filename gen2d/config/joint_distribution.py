@@ -68,13 +68,13 @@ class JointDistribution:
 
     def combinations(self) -> tuple[list[str], np.ndarray]:
         """Names of the G coordinates on a grid, and their M distinct combinations, float32 [M, G]."""
-        names = [name for name, part in self.products[0].parts.items() if _on_grid(part)]
+        names = [name for name, part in self.products[0].parts.items() if on_grid(part)]
         grids = [itertools.product(*(_values(p.parts[name]) for name in names)) for p in self.products]
         distinct = dict.fromkeys(itertools.islice(itertools.chain(*grids), MOST_COMBINATIONS + 1))
         return names, np.array(list(distinct), np.float32).reshape(len(distinct), len(names))
 
 
-def _on_grid(part: Distribution) -> bool:
+def on_grid(part: Distribution) -> bool:
     return any(simple.kind == "grid" for _, simple in part.weighted)
 
 

@@ -66,10 +66,12 @@ def contract_of(kind: str, name: str, digest: Any, where: str, copies: Copies) -
     """
     content, actual_digest = b"", None
     if plugins.is_own(name):
-        content = copies.get(name, b"")
-        if name not in copies or sha256(content) != digest:
-            if isinstance(copies, StoredCopies):
-                raise ConfigError(f"{where} is {name!r}, of which the dataset holds no copy that is what was written")
+        copy = copies.get(name)
+        if copy is not None and sha256(copy) == digest:
+            content = copy
+        elif isinstance(copies, StoredCopies):
+            raise ConfigError(f"{where} is {name!r}, of which the dataset holds no copy that is what was written")
+        else:
             content = plugins.content_of(name, where)
         actual_digest = sha256(content)
     if digest not in (None, actual_digest):

@@ -7,7 +7,7 @@ import pathlib
 import pkgutil
 import sys
 from types import ModuleType
-from typing import Any
+from typing import Any, TypeGuard
 
 from gen2d.config.contracts import Annotation, Export, Family, Look
 from gen2d.core.errors import ConfigError
@@ -27,6 +27,7 @@ def nearest(name: str, names: list[str]) -> str:
     return f"did you mean {close[0]}?" if close else "there are: " + ", ".join(sorted(names))
 
 
+@functools.cache  # the folders do not change
 def names(kind: str) -> list[str]:
     """Sorted names of the built-in plug-ins of a kind."""
     return sorted(module.name for module in pkgutil.iter_modules(importlib.import_module(KINDS[kind][0]).__path__))
@@ -64,9 +65,9 @@ def _module(kind: str, name: str) -> ModuleType:
     return importlib.import_module(f"{KINDS[kind][0]}.{name}")
 
 
-def is_own(name: str) -> bool:
+def is_own(name: Any) -> TypeGuard[str]:
     """Whether a plug-in's name is the path of a user file."""
-    return name.endswith(".py")
+    return isinstance(name, str) and name.endswith(".py")
 
 
 def copy_name(kind: str, name: str) -> str:

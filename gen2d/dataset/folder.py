@@ -81,8 +81,8 @@ def open_folder(spec: DatasetSpec, overwrite: bool = False) -> list[Shard]:
             records, sizes = read_records(spec, root), Sizes(root)
             shards = whole_plan(spec, records)
             remaining = [shard for shard in shards if not is_done(shard, records, sizes)]
-            manifest = current_manifest(root) if remaining else None
-            if manifest and any(s.first + s.count > manifest.splits.get(s.split, 0) for s in shards):
+            manifest = records.manifest
+            if remaining and manifest and any(s.first + s.count > manifest.splits.get(s.split, 0) for s in shards):
                 remove_snapshots(root)  # the dataset grows
             return remaining
 
@@ -197,7 +197,7 @@ def _claim(spec: DatasetSpec) -> None:
         there = None
     if there is None and mark.exists():
         raise FolderError(f"{mark} is damaged: choose another --out, or --overwrite to make the dataset anew")
-    if there is not None:
+    if there is not None and there != spec.identity:
         sources = sources_of(root), spec.producer.get("sources", {})
         difference = describe_differences(there, spec.identity, *sources)
         if difference:

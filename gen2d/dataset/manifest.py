@@ -122,6 +122,11 @@ def read_manifest(root: Place, snapshot: str | None = None) -> Manifest:
     return earlier
 
 
+def is_begun(root: Place) -> bool:
+    """Whether the folder is marked as a dataset, finished or not."""
+    return mark_path(root).exists() if isinstance(root, Url) else (root / MARK).is_dir()
+
+
 def _read(root: Place, path: Place, optional: bool) -> Manifest | None:
     try:
         content = read_bytes(path, JSON_BYTES)
@@ -129,7 +134,7 @@ def _read(root: Place, path: Place, optional: bool) -> Manifest | None:
         if optional:
             return None
         with reading(root):
-            begun = mark_path(root).exists() if isinstance(root, Url) else (root / MARK).is_dir()
+            begun = is_begun(root)
         if not begun:
             raise IncompleteError(f"{root} is not a gen2d dataset: it has no {MANIFEST}") from None
         raise IncompleteError(

@@ -103,7 +103,8 @@ def _retire(root: Place, new: Manifest) -> None:
             for name in _growing_files(earlier) - _growing_files(new):
                 snapshots.setdefault(name, []).append(snapshot_path(root, earlier.sha256))
     for name, folders in snapshots.items():
-        for source, target in ((root / name, folder / name) for folder in folders):
+        source = root / name
+        for target in (folder / name for folder in folders):
             if target.exists():
                 continue
             target.parent.mkdir(parents=True, exist_ok=True)
@@ -112,7 +113,7 @@ def _retire(root: Place, new: Manifest) -> None:
                     source.copy(target)
                 elif isinstance(source, Path) and isinstance(target, Path):
                     link_or_copy(source, target)
-        (root / name).unlink(missing_ok=True)
+        source.unlink(missing_ok=True)
 
 
 def _growing_files(manifest: Manifest) -> set[str]:

@@ -114,12 +114,11 @@ def export(
 
 def _format(to: str) -> Export:
     """Format with this name, or from this Python file."""
-    if plugins.is_own(to):
-        return plugins.load("export", to, "--to", plugins.content_of(to, "--to"))
     known = plugins.names("export")
-    if to not in known:
+    if not plugins.is_own(to) and to not in known:
         raise ConfigError(f"--to is {to!r}, but must be one of {', '.join(known)}, or a Python file")
-    return plugins.load("export", to, "--to")
+    content = plugins.content_of(to, "--to") if plugins.is_own(to) else b""
+    return plugins.load("export", to, "--to", content)
 
 
 def _patterns(to: str, form: Export, fields: Sequence[str] | None) -> Sequence[str]:

@@ -2,7 +2,6 @@
 
 import time
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import jax
 import numpy as np
@@ -33,11 +32,14 @@ def warm_up(
     name = f"{len(rollout.devices)} {rollout.devices[0].platform} device{'s' if len(rollout.devices) > 1 else ''}"
     say(f"Compiling for {name} (seconds; up to a minute for dozens of objects; kept for the next run) ...")
     began = time.perf_counter()
-    request = next(source.requests(ranges))
-    batch = _fitted(lambda: jax.block_until_ready(rollout.start(request.split, request.numbers)))
+    request = next(source.requests(ranges[:1]))
+    try:
+        batch = jax.block_until_ready(rollout.start(request.split, request.numbers))
+    except jax.errors.JaxRuntimeError as error:
+        raise _explained(error) from None
     _fit_slice(rollout, batch)
     compiled = time.perf_counter() - began
-    block, seconds = _measured(source, encoder, batch, next(source.requests(ranges)))
+    block, seconds = _measured(source, encoder, batch, next(source.requests(ranges[:1])))
     size, duration = block.nbytes / len(block) * count, seconds * count
     say(f"Compiled in {compiled:.1f} s. {count:,} videos will take about {in_bytes(size)} and {in_time(duration)}.")
     _warn_of_ratio(encoder.dataset, block, say)
@@ -84,13 +86,6 @@ def _warn_of_ratio(dataset: DatasetSpec, block: Block, say: Callable[[str], None
     ratio = raw / sum(map(len, block.chunks["frames"]))
     if dataset.codec == "gzip" and ratio < 3:
         say(f"gzip makes these frames only {ratio:.1f} times smaller; --set storage.codec=zstd may do better.")
-
-
-def _fitted(call: Callable[[], Any]) -> Any:
-    try:
-        return call()
-    except jax.errors.JaxRuntimeError as error:
-        raise _explained(error) from None
 
 
 def _explained(error: Exception) -> Exception:

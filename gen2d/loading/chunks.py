@@ -19,6 +19,7 @@ from typing import NamedTuple
 import numpy as np
 
 from gen2d.core.errors import DamagedError, FolderError, UnreachableError, UserError
+from gen2d.dataset.block import row_names
 from gen2d.dataset.manifest import Manifest
 from gen2d.dataset.rows import check_shard, intact, npy_header, origin
 from gen2d.dataset.spec import Shard, shard_name, shard_of, snapshot_path
@@ -187,8 +188,7 @@ class SplitFiles:
     @functools.cached_property
     def _names(self) -> dict[str, int]:
         """Position of each uncompressed field in the sorted list of them."""
-        sorted_names = sorted(n for n, field in self.manifest.fields.items() if field.per_video and not field.is_image)
-        return {name: position for position, name in enumerate(sorted_names)}
+        return {name: position for position, name in enumerate(row_names(self.manifest.fields))}
 
     def _piece(self, column: Column, place: int, chunk: tuple[int, int, int]) -> Chunk:
         offset, size, crc = chunk

@@ -22,7 +22,7 @@ from gen2d.dataset.spec import shard_name
 from gen2d.loading.chunks import Chunk, Reader, SplitFiles
 from gen2d.loading.column import LAYOUTS, Column
 from gen2d.loading.concat import ConcatDataset
-from gen2d.loading.epochs import shuffled
+from gen2d.loading.epochs import one_of, shuffled
 from gen2d.loading.protocols import Batch, Key, Numbers, Snapshot, checked_numbers, filled, item, unbatch
 from gen2d.storage import codecs
 from gen2d.storage.cache import Cache
@@ -152,7 +152,7 @@ def open(
         if snapshot is not None:
             raise ConfigError("snapshot must be None for a list of datasets")
         return _joined([open(one, *view, timeout=timeout, deadline=deadline) for one in path])
-    root = path if isinstance(path, Url) else place(path, Network(timeout, deadline))  # a Url has its limits
+    root = place(path, Network(timeout, deadline))
     manifest = read_manifest(root, snapshot)
     split = _chosen_split(root, manifest, split)
     names = chosen_fields(f"{root}", manifest.fields, fields)
@@ -205,10 +205,9 @@ class ViewOptions:
         return dataclasses.replace(self, window=frames, stride=1, start="first")
 
     def _check(self, frames: int) -> None:
-        allowed = {"layout": tuple(LAYOUTS), "dtype": ("uint8", "float32"), "verify": ("checksum", "none")}
-        for name, values in allowed.items():
-            if getattr(self, name) not in values:
-                raise ConfigError(f"{name} is {getattr(self, name)!r}, but must be one of {', '.join(values)}")
+        one_of("layout", self.layout, tuple(LAYOUTS))
+        one_of("dtype", self.dtype, ("uint8", "float32"))
+        one_of("verify", self.verify, ("checksum", "none"))
         if isinstance(self.start, str) and self.start not in ("random", "first"):
             raise ConfigError(f"start is {self.start!r}, but must be 'random', 'first' or a frame's number")
         if isinstance(self.start, int) and self.window is None:

@@ -29,9 +29,10 @@ def amodal_overlay(frame: VideoFields) -> np.ndarray:
     """Frame with the outline of each object's amodal mask."""
     image = enlarged(frame["frames"])
     height, width = frame["frames"].shape[:2]
+    palette = colors(256)
     for slot, packed in enumerate(frame["masks/amodal"]):
         mask = enlarged(np.unpackbits(packed)[: height * width].reshape(height, width))
-        image[(mask > 0) & (cv2.erode(mask, np.ones((3, 3), np.uint8)) == 0)] = colors(256)[slot + 1]
+        image[(mask > 0) & (cv2.erode(mask, np.ones((3, 3), np.uint8)) == 0)] = palette[slot + 1]
     return image
 
 
@@ -57,9 +58,9 @@ def flow_overlay(frame: VideoFields) -> np.ndarray:
 def tracks_overlay(frame: VideoFields) -> np.ndarray:
     """Frame with the visible track points."""
     image = enlarged(frame["frames"])
-    factor = len(image) // len(frame["frames"])
+    factor, palette = len(image) // len(frame["frames"]), colors(256)
     for number, (point, visible) in enumerate(zip(frame["tracks/points"], frame["tracks/visible"], strict=True)):
         if visible:
             pixel = np.floor(point * factor).astype(int).tolist()
-            cv2.circle(image, pixel, 1, colors(256)[number % 254 + 1].tolist(), -1)
+            cv2.circle(image, pixel, 1, palette[number % 254 + 1].tolist(), -1)
     return image

@@ -13,6 +13,7 @@ from gen2d.physics.constraint import (
     ContactConstraint,
     ContactPoint,
     Impulse,
+    Motion,
     apply_angular_impulse,
     apply_impulse,
     biased_impulse,
@@ -25,7 +26,7 @@ from gen2d.physics.constraint import (
     softness,
 )
 from gen2d.physics.contact_points import bounce_threshold, contact_points, impact_of, two_point_impulses
-from gen2d.physics.contact_state import BodySide, Motion, PassSetup, SolvedPair, WarmStart
+from gen2d.physics.contact_state import BodySide, PassSetup, SolvedPair, WarmStart
 from gen2d.physics.energy import dissipated, dissipated_by_discs
 from gen2d.physics.params import SolverParams
 from gen2d.records.axes import Array
@@ -62,8 +63,8 @@ def _apply_pass(
             tangent = materialize(friction_impulse(constraint, contact, normal, slip, old))
             impulses.append(Impulse(normal, tangent))
             motions = apply_impulse(constraint, contact, (None, tangent - old.tangent), *motions)
-        if roll is not None and pair.roll is not None:
-            roll = materialize(rolling_impulse(constraint, sum(normals[1:], normals[0]), *motions, roll))
+        if pair.roll is not None:
+            roll = materialize(rolling_impulse(constraint, sum(normals[1:], normals[0]), *motions, pair.roll))
             motions = apply_angular_impulse(constraint, roll - pair.roll, *motions)
         changes = [impulse_change(new, old) for new, old in zip(impulses, pair.impulses, strict=True)]
         twist = None if roll is None or pair.roll is None else roll - pair.roll

@@ -92,10 +92,14 @@ class PairBatch:
         return [self.second] if self.first in (None, self.second) else [self.first, self.second]
 
     @property
+    def pairs_in_order(self) -> np.ndarray:
+        """The pair [R, P] that each bit of a round stands for, unless bits are in the order of a round robin."""
+        return np.broadcast_to(np.arange(self.a.shape[1]), self.a.shape)
+
+    @property
     def pair_of_bit(self) -> np.ndarray:
         """The pair [R, bits] that each bit of a round stands for."""
-        every = np.broadcast_to(np.arange(self.a.shape[1]), self.a.shape)
-        return every if self.round_robin is None else self.round_robin.pair
+        return self.pairs_in_order if self.round_robin is None else self.round_robin.pair
 
 
 class GatherIndices(NamedTuple):
@@ -408,10 +412,10 @@ class NearbyPairs(ContactSolver):
         self, carry: NearbyCarry, solved: SolvedChunk, sides: list[BodySide], statics: list[BodySide], time: Array
     ) -> tuple[list[BodySide], NearbyCarry]:
         listed = solved.listed
-        specs = [self._cached(batch, rows).spec for batch, rows in zip(self.batches, carry.cache, strict=True)]
+        caches = [self._cached(batch, rows) for batch, rows in zip(self.batches, carry.cache, strict=True)]
 
         def play(i: int, k: Array, indices: GatherIndices, a: BodySide, b: BodySide, carried: tuple) -> tuple:
-            cache, touch = PackedTable(carried[0], specs[i]), carried[1]
+            cache, touch = caches[i]._replace(rows=carried[0]), carried[1]
             constraint, _, _, setup = self._unpacked(listed, i, k)
             pair = unpack(list(solved.packed[i][k]), solved.specs[i])
             a, b, (last, warm) = contact_passes.relax(constraint, pair, a, b, setup)
@@ -476,11 +480,10 @@ class NearbyPairs(ContactSolver):
         slots = [jnp.asarray(x.reshape(-1), jnp.int32) for x in batch.slots]
         capacity, width = (len(log) - 1) // n, words.shape[1]
         frame = carry.step // jnp.maximum(carry.step - carry.first, 1)
-        every = np.broadcast_to(np.arange(batch.a.shape[1]), batch.a.shape)
 
         def chunk(k: Array, log: Array) -> Array:
             lookup = row_lookup(active, k, self.chunk)
-            indices = self._gather(batch, lookup, every)
+            indices = self._gather(batch, lookup, batch.pairs_in_order)
             cached = cache.at(indices.pair)
             event, last = self._event(carry, cached), cached.stamp == (carry.step - 1).astype(self._dtype)
             event = event._replace(flags=jnp.where(last, event.flags, event.flags & ~ON))

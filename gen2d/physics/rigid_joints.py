@@ -23,7 +23,15 @@ from gen2d.physics.banded import factor, solve_factored
 from gen2d.physics.collision import dot, turned
 from gen2d.physics.constraint import Inertia, Motion
 from gen2d.physics.energy import Work
-from gen2d.physics.springs_limits_motors import JointSide, anchors_of, direction_of, groups_of, table_of, take_rows
+from gen2d.physics.springs_limits_motors import (
+    JointSide,
+    anchors_of,
+    direction_of,
+    groups_of,
+    places_of,
+    table_of,
+    take_rows,
+)
 from gen2d.records.axes import Array
 from gen2d.records.layout import JointSpec
 from gen2d.xla import materialize
@@ -229,7 +237,7 @@ def warm_start(
     system: JointSystem, bodies: list[Any], statics: list[Any], motions: list[Motion], impulses: Array
 ) -> tuple[Anchors, list[Motion], Work]:
     """Anchors at the start of the step, motions with the impulses of the last step, and their work."""
-    places = table_of(*([(body.position, body.angle) for body in some] for some in (bodies, statics)))
+    places = places_of(bodies, statics)
     anchors = Anchors(*anchors_of(system.a, system.b, places))
     now = table_of(motions, [body.motion for body in statics])
     now, work = _apply(system, _rows(system, anchors), now, impulses)

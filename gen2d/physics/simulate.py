@@ -73,14 +73,18 @@ def simulate(
     model = build_model(scene, state, layout, params, hook, keep.contacts > 0, sparse)
     solver, seconds = model.solver, steps * params.step
 
+    def substep(world: WorldState, _: None) -> tuple[WorldState, list[BodyState]]:
+        world = step(world, model, params)
+        return world, _bodies(world)
+
     def frame(world: WorldState, number: Array) -> tuple[WorldState, tuple]:
         world = world._replace(time=number * seconds, contacts=solver.begin_frame(world.contacts))
         if keep.between:
-            world, every = jax.lax.scan(lambda now, _: _with_bodies(step(now, model, params)), world, length=steps)
+            world, every = jax.lax.scan(substep, world, length=steps)
         else:
             world, every = jax.lax.fori_loop(0, steps, lambda _, now: step(now, model, params), world), None
         carry, events = solver.end_frame(world.contacts)
-        return world._replace(contacts=carry), (_with_bodies(world)[1], every, _balance(world, model), events)
+        return world._replace(contacts=carry), (_bodies(world), every, _balance(world, model), events)
 
     with runtime_one(model.one):
         start = _start(state, layout, model, keep, params)
@@ -99,9 +103,9 @@ def simulate(
     return Trajectory(states, Quality(depth, begins, residual), contacts, energy, between)
 
 
-def _with_bodies(world: WorldState) -> tuple[WorldState, list[BodyState]]:
-    """World, and what is kept of its bodies."""
-    return world, [body._replace(remainder=None) for body in world.bodies]
+def _bodies(world: WorldState) -> list[BodyState]:
+    """Bodies as stored, without the remainders of their positions."""
+    return [body._replace(remainder=None) for body in world.bodies]
 
 
 def _substep_states(start: State, every: list[BodyState], layout: Layout, step: float) -> State:

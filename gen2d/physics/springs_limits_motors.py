@@ -91,6 +91,11 @@ def table_of(groups: Sequence[Any], statics: Sequence[Any]) -> Any:
     return jax.tree.map(lambda *x: jnp.concatenate(x, axis=-2), *groups, *statics)
 
 
+def places_of(bodies: Sequence[Any], statics: Sequence[Any]) -> Any:
+    """Positions and angles of all bodies in one table."""
+    return table_of(*([(body.position, body.angle) for body in some] for some in (bodies, statics)))
+
+
 def take_rows(table: Any, rows: np.ndarray) -> Any:
     """Values of some rows of a table."""
     return jax.tree.map(lambda x: x[..., rows, :], table)
@@ -151,7 +156,7 @@ def warm_start(
     """Joints of every round in this step, motions with the impulses of the last step, and their work."""
     if not batches:
         return [], motions, []
-    places = table_of(*([(body.position, body.angle) for body in some] for some in (bodies, statics)))
+    places = places_of(bodies, statics)
     now, joints, works = table_of(motions, [body.motion for body in statics]), [], []
     for batch, old in zip(batches, impulses, strict=True):
         angle_a, angle_b = (take_rows(places[1], side.rows) for side in (batch.a, batch.b))
@@ -301,7 +306,7 @@ def springs_energy(batches: list[JointBatch], bodies: list[Any], statics: list[A
     springs = [batch for batch in batches if batch.kind == "distance"]
     if not springs:
         return 0.0
-    places, energy = table_of(*([(body.position, body.angle) for body in some] for some in (bodies, statics))), 0.0
+    places, energy = places_of(bodies, statics), 0.0
     for batch in springs:
         length = direction_of(anchors_of(batch.a, batch.b, places)[2])[1]
         stiffness = jnp.where(batch.present & jnp.isfinite(batch.stiffness), batch.stiffness, 0.0)

@@ -147,7 +147,7 @@ def step(world: WorldState, model: Model, params: SolverParams) -> WorldState:
         x, y = jnp.abs(after.velocity - old.velocity)
         pushes.append(x + y)
 
-    drifts = [Motion(*(jnp.zeros_like(x) for x in m)) for m in motions]
+    drifts = jax.tree.map(jnp.zeros_like, motions)
     joints, motions, drifts, work_solve = springs_limits_motors.solve(
         joints, motions, drifts, accelerations, fixed, params, biased=True
     )

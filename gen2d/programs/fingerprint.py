@@ -6,6 +6,7 @@ does not.
 """
 
 import ast
+import functools
 import hashlib
 import inspect
 import os
@@ -134,13 +135,14 @@ def code_hash(*parts: Any) -> str:
     return digest.hexdigest()
 
 
+@functools.cache
 def sources() -> dict[str, str]:
     """First 12 digits of the sha256 of each source file of gen2d, by path.
 
     They only serve to name the edited files when a program differs.
     """
     package = pathlib.Path(gen2d.__file__).parent
-    renderers = package / "renderers" if (package / "renderers").is_dir() else package.parent / "renderers"
+    renderers = package / "renderers"
     files = {f"gen2d/{path.relative_to(package).as_posix()}": path for path in package.rglob("*.py")}
     files |= {f"renderers/{path.relative_to(renderers).as_posix()}": path for path in renderers.rglob("*.py")}
     return {

@@ -302,7 +302,7 @@ def _asked(fields: Sequence[str] | None, section: Annotations) -> dict[str, Any]
     return {plugin.name: plugin.contract.usual for plugin in off}
 
 
-def _check_frames(columns: FieldColumns, states: FieldColumns | None) -> None:
+def _check_frames(columns: FieldColumns) -> None:
     frames = {
         len(np.shape(columns[name])) and np.shape(columns[name])[1] for name in ("states/position", "camera/scale")
     }
@@ -350,16 +350,6 @@ class _Settings:
     base: Config
     config: Config
 
-    def __hash__(self) -> int:
-        return hash(self._key)
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Settings) and self._key == other._key
-
-    @property
-    def _key(self) -> tuple[str, str]:
-        return self.base.text(), self.config.text()
-
     @property
     def layout(self) -> Layout:
         return self.config.scene.contract.layout(self.config.scene.options)
@@ -377,7 +367,7 @@ class _Settings:
 def _stages(ds: Dataset, settings: "_Settings", numbers: np.ndarray, states: FieldColumns | None) -> RenderScene:
     """Render scenes of these videos; `states` replace the stored ones."""
     columns = dict(_stored(ds, numbers)) | dict(states or {})
-    _check_frames(columns, states)
+    _check_frames(columns)
     return _compiled(_staged, settings)(columns, _key_words(ds), jnp.asarray(numbers, jnp.uint32))
 
 

@@ -89,15 +89,11 @@ class Rollout:
         self.mesh = Mesh(np.array(self.devices), ("videos",))
         self._draws: dict[int, Any] = {}  # by number of videos
         self._drawn: set[int] = set()  # those numbers whose program is compiled
-        program = (
-            self._simulated_batch
-            if len(self.devices) == 1
-            else self._shared(self._simulated_batch, (*[PartitionSpec()] * 2, *[VIDEOS] * 3))
-        )
+        program = self._simulated_batch
+        if len(self.devices) > 1:
+            specs = PartitionSpec(), PartitionSpec(), VIDEOS, VIDEOS, VIDEOS
+            program = jax.shard_map(program, mesh=self.mesh, in_specs=specs, out_specs=VIDEOS, check_vma=False)
         self._simulate: Any = jax.jit(program)
-
-    def _shared(self, function: Any, specs: tuple) -> Any:
-        return jax.shard_map(function, mesh=self.mesh, in_specs=specs, out_specs=VIDEOS, check_vma=False)
 
     def start(self, split: str, numbers: np.ndarray) -> DeviceBatch:
         """Start to simulate the videos of a split with these numbers [devices * batch_size].

@@ -1,6 +1,7 @@
 """Stored fields of a config's videos, the sizes of their axes, and the fields computed on the host."""
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -37,7 +38,7 @@ class VideoSchema:
     save_at: SaveAt
     sampler: sampler.Sampler
 
-    @property
+    @functools.cached_property
     def sizes(self) -> dict[str, int]:
         """Sizes of the named axes of all fields (T, K, H, W and so on)."""
         video = self.config.video
@@ -48,7 +49,7 @@ class VideoSchema:
         sizes |= {"V": corners} if corners else {}
         return annotations.sizes(self.config.annotations, self.plan, sizes | self.sampler.lengths)
 
-    @property
+    @functools.cached_property
     def fields(self) -> dict[str, Field]:
         """All stored fields, by name."""
         config = self.config
@@ -80,7 +81,7 @@ class VideoSchema:
     def _scene(self, key: jax.Array) -> scene.Scene:
         return self.sampler.sampled(key, given=jnp.zeros(len(self.sampler.gridded)))[1].scene
 
-    @property
+    @functools.cached_property
     def constants(self) -> dict[str, np.ndarray]:
         """Values of the stored fields that are the same for all videos."""
         joints = self.layout.joints
@@ -90,12 +91,12 @@ class VideoSchema:
         kinds = np.array([JOINT_KINDS.index(joint.kind) for joint in joints], np.uint8)
         return {"time": self.time, "joints/kind": kinds, **slots}
 
-    @property
+    @functools.cached_property
     def time(self) -> np.ndarray:
         """Time of each frame [T] in s, exactly t / fps."""
         return np.arange(self.config.video.frames, dtype=np.float64) / self.config.video.fps
 
-    @property
+    @functools.cached_property
     def host_fields(self) -> dict[str, Field]:
         """Fields that the host computes from the others: split and captions."""
         longest = max((len(split.name) for split in self.config.splits), default=0)

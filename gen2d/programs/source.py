@@ -68,14 +68,17 @@ class VideoSlice(NamedTuple):
     def __len__(self) -> int:
         return self.part.rows.stop - self.part.rows.start
 
-    def fields(self) -> dict[str, np.ndarray]:
-        """All stored fields [m, ...] by name; waits for the device."""
+    def fields(self, names: Sequence[str] | None = None) -> dict[str, np.ndarray]:
+        """Stored fields [m, ...] by name, by default all; waits for the device."""
         rows, start = self.part.rows, self.part.start
         fields = {name: column[rows] for name, column in self.columns.items()}
         for name, array in self.rendered.items():
-            fields[name] = np.asarray(array)[rows.start - start : rows.stop - start]
+            if names is None or name in names:
+                fields[name] = np.asarray(array)[rows.start - start : rows.stop - start]
         fields["index"] = self.part.numbers
-        return fields | self.host_columns(fields, self.part.range.split)
+        if names is None or not fields.keys() >= set(names):
+            fields |= self.host_columns(fields, self.part.range.split)
+        return fields if names is None else {name: fields[name] for name in names}
 
 
 class VideoSource:
@@ -110,13 +113,11 @@ class VideoSource:
         Raises NoPlaceError if the objects of a video do not fit.
         """
         unique, inverse = np.unique(np.asarray(numbers), return_inverse=True)
-        ranges = [VideoRange(split, int(number), int(number) + 1) for number in unique]
-        parts: dict[int, dict[str, np.ndarray]] = {}
-        for piece in self.slices(ranges):
-            own = piece.fields()
-            parts[piece.part.order] = {name: own[name] for name in (own if fields is None else fields)}
-        found = [parts[order] for order in sorted(parts)]
-        return {name: np.concatenate([part[name] for part in found])[inverse] for name in found[0]}
+        runs = np.split(unique, np.flatnonzero(np.diff(unique) != 1) + 1)
+        ranges = [VideoRange(split, int(run[0]), int(run[-1]) + 1) for run in runs]
+        parts = {videos.part.order: videos.fields(fields) for videos in self.slices(ranges)}
+        ordered = [parts[order] for order in sorted(parts)]
+        return {name: np.concatenate([part[name] for part in ordered])[inverse] for name in ordered[0]}
 
     def slices(self, ranges: Sequence[VideoRange]) -> Iterator[VideoSlice]:
         """Videos of these ranges in the order in which they are rendered; `part.order` gives the order of the ranges.
@@ -140,25 +141,21 @@ class VideoSource:
         """
         size, devices, order = self.rollout.batch_size, len(self.rollout.devices), itertools.count()
         batches: dict[tuple[str, int], list[VideoRange]] = {}
-        for own in ranges:
-            for first in range(own.first // size * size, own.stop, size):
-                batches.setdefault((own.split, first), []).append(own)
+        for video_range in ranges:
+            for first in range(video_range.first // size * size, video_range.stop, size):
+                batches.setdefault((video_range.split, first), []).append(video_range)
         for split, group in itertools.groupby(batches, key=lambda batch: batch[0]):
             firsts = [first for _, first in group]
             for position in range(0, len(firsts), devices):
-                own = firsts[position : position + devices]
-                parts = [
-                    Part(
-                        next(order), video_range, device, first, start, slice(max(low, start), min(high, start + step))
-                    )
-                    for device, first in enumerate(own)
-                    for video_range in batches[split, first]
-                    for low, high in [(max(video_range.first - first, 0), min(video_range.stop - first, size))]
-                    for step in [self.rollout.slice]
-                    for start in range(low // step * step, high, step)
-                ]
-                batch_starts = own + own[-1:] * (devices - len(own))
-                numbers = np.concatenate([np.arange(first, first + size) for first in batch_starts])
+                starts, step, parts = firsts[position : position + devices], self.rollout.slice, []
+                for device, first in enumerate(starts):
+                    for video_range in batches[split, first]:
+                        low, high = max(video_range.first - first, 0), min(video_range.stop - first, size)
+                        for start in range(low // step * step, high, step):
+                            rows = slice(max(low, start), min(high, start + step))
+                            parts.append(Part(next(order), video_range, device, first, start, rows))
+                starts += starts[-1:] * (devices - len(starts))
+                numbers = np.concatenate([np.arange(first, first + size) for first in starts])
                 wanted = np.zeros((devices, size), bool)
                 for part in parts:
                     wanted[part.device, part.rows] = True

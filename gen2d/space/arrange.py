@@ -21,6 +21,7 @@ from gen2d.records.layout import Layout, SlotGroup
 from gen2d.records.scene import Objects, Scene, State
 from gen2d.records.trajectory import Contacts
 from gen2d.space.bodies import GREY, Body
+from gen2d.xla import on_cpu
 
 
 def slots_of_span(span: tuple[SlotGroup, int]) -> range:
@@ -76,11 +77,10 @@ def compiled_program(
 ) -> Callable:
     """Compiled simulation of a layout; scenes, states and trajectories have the videos first."""
     hook = None if forces is None else _by_slot(*forces)
-    sparse = jax.default_backend() == "cpu"
 
     def run(scene: Scene, state: State) -> Any:
         device = to_device(scene), to_device(state)
-        return to_stored(simulate(*device, layout, rules, frames, steps, keep, hook, sparse))
+        return to_stored(simulate(*device, layout, rules, frames, steps, keep, hook, on_cpu()))
 
     return jax.jit(run)
 

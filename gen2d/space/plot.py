@@ -13,7 +13,7 @@ import numpy as np
 from gen2d.core.enums import DYNAMIC
 from gen2d.core.errors import ConfigError
 from gen2d.media import films
-from gen2d.media.images import animate
+from gen2d.media.images import animate, write
 from gen2d.space.bodies import Body, Drawable, Film
 
 RED, DARK, WHITE = (220, 30, 30), (60, 60, 60), (255, 255, 255)
@@ -111,7 +111,7 @@ def save(of: Film, path: str | Path, **options: Any) -> Path:
     if path.suffix not in FORMATS:
         raise ConfigError(f"{path}: ends in {path.suffix or 'nothing'}, but must end in one of {', '.join(FORMATS)}")
     if path.suffix == ".png":
-        _write(path, overlay(of, **options))
+        write(path, overlay(of, **options))
         return path
     view = options.pop("view", None) or _seen(of)
     film = np.stack([picture(of, frame, view=view, **options) for frame in range(len(of.position))])
@@ -120,11 +120,6 @@ def save(of: Film, path: str | Path, **options: Any) -> Path:
     else:
         films.mp4v(path, film, of.fps)
     return path
-
-
-def _write(path: Path, image: np.ndarray) -> None:
-    if not cv2.imwrite(str(path), image[..., ::-1]):
-        raise OSError(f"{path}: OpenCV could not write a picture")
 
 
 def _placed(points: Any, position: np.ndarray, angle: float) -> np.ndarray:

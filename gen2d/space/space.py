@@ -395,12 +395,11 @@ class Space:
         corners = max((run.vertices for run in runs), default=0)
         vertices = np.array([fill_vertices(body.vertices, corners) for body in bodies])
         counts = np.array([len(body.vertices) for body in bodies], np.uint8)
-        number_of = {int(slot): number for number, slot in enumerate(slots)}  # ordered by number
-        depths = [number_of.get(slot, 0) for slot in range(len(bodies))]
+        numbers = body_numbers(slots, len(bodies))  # -1: the world's
         objects = Objects(
             present=jnp.ones(len(bodies), bool),
             shape=jnp.asarray([SHAPES.index(body.shape) for body in bodies], jnp.uint8),
-            depth=jnp.asarray(depths, jnp.int16),
+            depth=jnp.asarray(np.maximum(numbers, 0), jnp.int16),
             kind=column("kind", np.uint8),
             color=column("color", np.uint8),
             vertices=jnp.asarray(vertices.astype(real)) if corners else None,
@@ -413,7 +412,7 @@ class Space:
         state = State(column("position"), column("angle"), column("velocity"), column("spin"))
         scene = Scene(objects, jnp.asarray(self.gravity, real), self._joints(real))
         # The last one, -1, is the world's if a joint needs it.
-        slot = [*number_of, *(set(range(len(bodies))) - number_of.keys())]
+        slot = [*slots.tolist(), *np.flatnonzero(numbers < 0).tolist()]
         ties = tuple(JointSpec(j.kind, slot[j.a], slot[j.b], j.collide) for j in self.joints)
         return scene, state, Layout(runs, joints=ties)
 

@@ -72,12 +72,8 @@ class Url:
         return dataclasses.replace(self, text=self.text.rpartition("/")[0])
 
     @property
-    def is_listed(self) -> bool:
-        """Whether the server lists folders; plain web servers need not."""
-        return not self.is_web
-
-    @property
     def is_web(self) -> bool:
+        """Whether it is on a plain web server, which need not list folders."""
         return self.text.startswith(("http://", "https://"))
 
     def stat(self) -> os.stat_result:
@@ -105,14 +101,14 @@ class Url:
         """Do nothing: a folder exists when something is in it."""
 
     def iterdir(self) -> "Iterator[Url]":
-        names = attempt(self, lambda system, path: _names(system, path, system.ls)) if self.is_listed else []
+        names = attempt(self, lambda system, path: _names(system, path, system.ls)) if not self.is_web else []
         return (self / name for name in names)
 
     def glob(self, pattern: str) -> "Iterator[Url]":
         return (path for path in self.iterdir() if fnmatch.fnmatchcase(path.name, pattern))
 
     def rglob(self, pattern: str) -> "Iterator[Url]":
-        names = attempt(self, lambda system, path: _names(system, path, system.find)) if self.is_listed else []
+        names = attempt(self, lambda system, path: _names(system, path, system.find)) if not self.is_web else []
         return (self / name for name in names if fnmatch.fnmatchcase(PurePath(name).name, pattern))
 
     def read_bytes(self, limit: int) -> bytes:
@@ -137,10 +133,10 @@ Place = Path | Url
 def place(path: str | Place, network: Network | None = None) -> Place:
     """The Path of a folder on disk, or the Url of a text with another protocol than `file`.
 
-    `network` replaces the limits of a Url. Raises FolderError for a URL that cannot be used.
+    `network` holds the limits of a Url that is made. Raises FolderError for a URL that cannot be used.
     """
     if isinstance(path, Url):
-        return path if network is None else dataclasses.replace(path, network=network)
+        return path  # it has its own limits
     if not isinstance(path, str) or "://" not in path:
         return Path(path)
     protocol, _, rest = path.partition("://")

@@ -5,11 +5,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import yaml
 
 from gen2d.cli.report import plugins as plugins_text
 from gen2d.config import plugins
 from gen2d.config.config import load_config
+from gen2d.config.reading import parse_yaml
 from gen2d.core.errors import ConfigError
 from gen2d.core.schema import Field
 from gen2d.plugin import Annotation, Export, Family, Look, option
@@ -46,7 +46,7 @@ def test_a_plug_in_says_what_it_is_and_is_listed(kind: str, name: str) -> None:
 @pytest.mark.parametrize(("kind", "name"), IN_A_CONFIG)
 def test_a_config_that_asks_for_a_plug_in_means_the_same_when_it_is_read_again(kind: str, name: str) -> None:
     config = load_config(asking(kind, name))
-    again = load_config(yaml.safe_load(config.text()))
+    again = load_config(parse_yaml(config.text(), "its text"))
     assert again == config
     assert again.sha256() == config.sha256() != load_config({"scene": "billiards", "look": "phyworld"}).sha256()
     if kind == "annotation":

@@ -20,6 +20,7 @@ import numpy as np
 import synthetic
 
 from gen2d.core.schema import Field
+from gen2d.dataset.spec import SCHEMA
 
 HUGE = [0, -1, 1, 2**31, 2**32, 2**40, 2**53, 2**63, 2**64, -(2**63), 10**400, 1e308, 0.5]
 NAMES = [
@@ -184,8 +185,8 @@ def a_manifest_that_is_none(root: Path, chance: random.Random) -> str:
         "digits": b'{"a": ' + b"9" * 10**5 + b"}",
         "utf-16": "{}".encode("utf-16"),
         "null": b"null",
-        "half": b'{"schema": "gen2d.dataset/2"',
-        "nothing sealed": b'{"schema": "gen2d.dataset/2"}',
+        "half": f'{{"schema": "{SCHEMA}"'.encode(),
+        "nothing sealed": json.dumps({"schema": SCHEMA}).encode(),
         "zeros": bytes(1000),
     }
     which = chance.choice(sorted(texts))
@@ -483,7 +484,7 @@ def a_log_or_a_snapshot(root: Path, chance: random.Random) -> str:
     if "fifo" in name:
         os.mkfifo(path.with_name("train.0123456789abcdef.1"))
     else:
-        path.write_bytes(chance.choice([b"", b"{}", bytes(10**6), json.dumps({"schema": "gen2d.dataset/2"}).encode()]))
+        path.write_bytes(chance.choice([b"", b"{}", bytes(10**6), json.dumps({"schema": SCHEMA}).encode()]))
     return name
 
 

@@ -10,10 +10,11 @@ from typing import Any
 import numpy as np
 
 from gen2d.core.errors import DamagedError, FolderError
+from gen2d.dataset.block import row_names
 from gen2d.dataset.croissant import croissant
 from gen2d.dataset.manifest import Manifest, read_manifest
 from gen2d.dataset.rows import checks, npy_header, origin
-from gen2d.dataset.spec import plan
+from gen2d.dataset.spec import plan, shard_name
 from gen2d.storage import codecs
 
 
@@ -65,7 +66,7 @@ def change_shard(root: Path, split: str, place: int, change: Callable[[bytearray
     """
     manifest = read_manifest(root)
     shard = plan({split: manifest.splits[split]}, manifest.videos_per_shard)[place]
-    path = root / "shards" / f"{shard.name}.h5"
+    path = root / shard_name(shard.name)
 
     def update_row(rows: np.ndarray) -> None:
         content, row, index_type = bytearray(path.read_bytes()), rows[place], manifest.video_type
@@ -86,7 +87,7 @@ def change_shard(root: Path, split: str, place: int, change: Callable[[bytearray
 def flip_value(root: Path, split: str, place: int, field: str, video: int) -> None:
     """Flip a bit of an uncompressed field, in row `video` of the shard with number `place`."""
     manifest = read_manifest(root)
-    names = sorted(name for name, f in manifest.fields.items() if f.per_video and not f.is_image)
+    names = row_names(manifest.fields)
     size = manifest.row_bytes[names.index(field)]
 
     def change(content: bytearray, index: np.ndarray, row: np.void) -> None:

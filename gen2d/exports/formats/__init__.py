@@ -14,10 +14,3 @@ Each file ends with an `EXPORT`; `gen2d.plugin.Export` describes its members. Th
 
 `source.each(function)` calls `function(key, video)` for every video in several threads, and reports the progress.
 """
-
-import pkgutil
-
-
-def names() -> list[str]:
-    """Names of the formats, sorted."""
-    return sorted(module.name for module in pkgutil.iter_modules(__path__))
