@@ -14,6 +14,7 @@ import dataclasses
 import functools
 from collections.abc import Callable
 
+import chex
 import jax
 import jax.numpy as jnp
 
@@ -42,8 +43,9 @@ from gen2d.xla import on_cpu
 def draw(stages: RenderScene, plan: FramePlan) -> tuple[Array | None, Array | None]:
     """Frames [n, T, H, W, 3] uint8 and owners [n, T, H, W] uint8, None if `plan` does not want them.
 
-    Uses tiles on a CPU, and `draw_dense` elsewhere.
+    Uses tiles on a CPU, and `draw_dense` elsewhere. Raises AssertionError for scenes of another layout.
     """
+    chex.assert_shape(stages.instants.position, (None, None, plan.layout.slots, 2))
     return (draw_tiles if on_cpu() else draw_dense)(stages, plan)
 
 
@@ -82,8 +84,9 @@ def draw_soft(stage: RenderScene, plan: FramePlan, sigma: float = 0.0) -> Array:
     """Frames [T, H, W, 3] of one video as floats from 0 to 255, without rounding, noise or motion blur.
 
     They are differentiable in positions, angles, sizes, colours and the camera. `sigma` (px) blurs the coverage of each
-    object; with 0 the frames are those of `draw` up to rounding.
+    object; with 0 the frames are those of `draw` up to rounding. Raises AssertionError for a scene of another layout.
     """
+    chex.assert_shape(stage.instants.position, (None, plan.layout.slots, 2))
     at, paint = stage.instants, soft(plan.linear, sigma)
     image = background_image(stage, at, plan)
     image = jnp.broadcast_to(to_linear(image) if plan.linear else image, (len(at.angle), *image.shape[1:]))

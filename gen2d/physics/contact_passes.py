@@ -14,20 +14,18 @@ from gen2d.physics.constraint import (
     ContactPoint,
     Impulse,
     Motion,
-    apply_angular_impulse,
     apply_impulse,
     biased_impulse,
     bounces_again,
-    friction_impulse,
     impulse_change,
     relative_speed,
     relaxed_impulse,
-    rolling_impulse,
     softness,
 )
 from gen2d.physics.contact_points import bounce_threshold, contact_points, impact_of, two_point_impulses
 from gen2d.physics.contact_state import BodySide, PassSetup, SolvedPair, WarmStart
 from gen2d.physics.energy import dissipated, dissipated_by_discs
+from gen2d.physics.friction import apply_angular_impulse, friction_impulse, rolling_impulse
 from gen2d.physics.params import SolverParams
 from gen2d.records.axes import Array
 from gen2d.xla import materialize

@@ -20,8 +20,8 @@ from gen2d.physics.constraint import (
     Impulse,
     Motion,
     relative_speed,
-    relative_spin,
 )
+from gen2d.physics.friction import relative_spin
 from gen2d.records.axes import Array
 from gen2d.xla import sum_bodies
 

@@ -4,7 +4,6 @@ import dataclasses
 import math
 from collections.abc import Callable
 
-import chex
 import jax
 import jax.numpy as jnp
 
@@ -17,7 +16,7 @@ from gen2d.physics.params import SolverParams
 from gen2d.physics.setup import build_model, moving, pad_groups, slots_of, without_empty
 from gen2d.physics.state import BodyState, Model, WorldState
 from gen2d.physics.step import step
-from gen2d.records.axes import Array
+from gen2d.records.axes import Array, check_shapes
 from gen2d.records.layout import Layout
 from gen2d.records.scene import Scene, State
 from gen2d.records.trajectory import Energy, Quality, Trajectory
@@ -66,8 +65,8 @@ def simulate(
     `sparse` solves only near pairs (nearby_pairs.py): as exact, on a CPU much faster, but without a reverse-mode
     gradient. Raises AssertionError for records of another layout.
     """
-    chex.assert_shape(state.position, (2, layout.slots, ...))
-    chex.assert_equal_shape([state.angle, state.angular_velocity, scene.objects.present, scene.objects.mass])
+    for record in (scene, state):
+        check_shapes(record, absent="T", device=True, K=layout.slots, J=len(layout.joints))
     scene, state = without_empty(scene, state)
     hook = _group_forces(scene, state, layout, forces)
     model = build_model(scene, state, layout, params, hook, keep.contacts > 0, sparse)

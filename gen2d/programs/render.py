@@ -3,6 +3,7 @@
 Each of them has its own key, so changing the look or the camera changes nothing else.
 """
 
+import chex
 import jax
 import jax.numpy as jnp
 
@@ -10,7 +11,7 @@ from gen2d import annotations
 from gen2d.config.annotations import Annotations
 from gen2d.config.config import Config
 from gen2d.config.sections import ImageOptions
-from gen2d.records.axes import Array
+from gen2d.records.axes import Array, check_shapes
 from gen2d.records.keys import key_for
 from gen2d.records.layout import Layout
 from gen2d.records.scene import Scene, State
@@ -63,9 +64,13 @@ def render_scene(
     """Render scene of one video.
 
     `states` [T, K, ...] are those at the frames, `between` [T - 1, steps, K, ...] those after each step, which motion
-    blur needs. By default, the view comes from the key.
+    blur needs. By default, the view comes from the key. Raises AssertionError for states of another layout, and for
+    a look's colours of another number of slots.
     """
+    slots = plan.layout.slots
+    check_shapes(states, absent="n", K=slots)
     paint = paint_of(key, config, scene, plan.layout)
+    chex.assert_shape(paint.color, (slots, 3))
     view = view_of(key, config, plan.layout, states) if view is None else view
     objects, image = scene.objects, config.image
     bodies = BodyGeometry(objects.radius, objects.half_length, objects.vertices)

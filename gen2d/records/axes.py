@@ -6,8 +6,10 @@ threads run over the last axis. Only `to_device` and `to_stored` transpose.
 """
 
 import dataclasses
+from collections.abc import Collection
 from typing import Any, TypeVar, dataclass_transform
 
+import chex
 import jax
 import jax.numpy as jnp
 
@@ -51,6 +53,22 @@ def columns(value: Any) -> dict[str, Array]:
         if "field" not in field.metadata and getattr(value, field.name) is not None:
             arrays |= columns(getattr(value, field.name))
     return {name: array for name, array in arrays.items() if array is not None}
+
+
+def check_shapes(value: Any, absent: Collection[str] = (), device: bool = False, **sizes: int) -> None:
+    """Assert that the arrays of a record, and of its inner records, have their declared axes.
+
+    `sizes` are lengths of axes by letter, such as K=10; other axes may have any length. `absent` are the letters of
+    axes that the arrays lack: "n" within `jax.vmap`, "T" for a single instant. `device`: the arrays are in device
+    layout. Raises AssertionError, which names the field.
+    """
+    arrays = columns(value)
+    for name, field in fields_of(value).items():
+        tokens = [token for token in field.axes.split() if token not in absent]
+        shape = [int(token) if token.isdigit() else sizes.get(token) for token in tokens]
+        if device:
+            shape = [shape[i] for i in _device_order(" ".join(tokens), len(tokens))]
+        chex.assert_shape(arrays[name], tuple(shape), custom_message=f"{name} has axes [{' '.join(tokens)}]")
 
 
 def _device_order(stored: str, dimensions: int) -> list[int]:

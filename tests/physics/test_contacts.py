@@ -7,6 +7,7 @@ position, angle and radius here, with scenes first, from which `placed` makes th
 
 from functools import cache
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -363,8 +364,7 @@ def test_degenerate_scenes_have_unit_normals_and_finite_gradients(kind_a: type, 
     normal, gap, *_ = found(a, b, np.float32)
     assert_allclose(np.linalg.norm(normal, axis=1), 1, atol=1e-6)
     assert_allclose(gap.min(0), true_gap(a, b), atol=1e-5)
-    for leaf in jax.tree.leaves(gradient(a, b, some_weights(len(gap)))):
-        assert np.isfinite(leaf).all()
+    chex.assert_tree_all_finite(gradient(a, b, some_weights(len(gap))))
 
 
 def some_weights(points: int) -> tuple[Point, ...]:
@@ -376,8 +376,7 @@ def some_weights(points: int) -> tuple[Point, ...]:
 def test_empty_slots_give_numbers(a: dict, b: dict):
     a, b = batch([a]), batch([b])
     points = found(a, b, np.float32)
-    for leaf in jax.tree.leaves((points, gradient(a, b, some_weights(len(points[1]))))):
-        assert np.isfinite(leaf).all()
+    chex.assert_tree_all_finite((points, gradient(a, b, some_weights(len(points[1])))))
 
 
 @pytest.mark.parametrize(("kind_a", "kind_b"), PAIRS)

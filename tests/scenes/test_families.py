@@ -9,6 +9,7 @@ import functools
 import itertools
 from typing import Any, NamedTuple
 
+import chex
 import cv2
 import jax
 import jax.numpy as jnp
@@ -202,8 +203,7 @@ def check_factors(scene: Plugin, found: dict[str, np.ndarray], doubt: float = 1e
 def test_a_key_is_a_scene(family):
     found = made(family)
     again = program(family)[2](jax.random.split(jax.random.key(0), KEYS))
-    for one, other in zip(jax.tree.leaves(found), jax.tree.leaves(again), strict=True):
-        np.testing.assert_array_equal(one, other)
+    chex.assert_trees_all_equal(found, again)
     rows = [np.asarray(x, np.float32).reshape(KEYS, -1) for x in (found.state.position, *found.factors.values())]
     assert len(np.unique(np.concatenate(rows, axis=1), axis=0)) == KEYS
 

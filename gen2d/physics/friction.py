@@ -1,0 +1,44 @@
+"""Sliding friction and rolling resistance of a contact, bounded by its normal impulse.
+
+Coefficients of a pair are mixed in setup.py; contact_passes.py applies the impulses.
+"""
+
+import jax.numpy as jnp
+
+from gen2d.physics.constraint import ActiveContact, ContactConstraint, Impulse, Motion, reciprocal
+from gen2d.records.axes import Array
+
+
+def friction_impulse(
+    constraint: ContactConstraint, contact: ActiveContact, normal_impulse: Array, slip: Array, old: Impulse
+) -> Array:
+    """Accumulated tangential impulse that stops the slip, within Coulomb's bound."""
+    bound = constraint.friction * normal_impulse
+    tangent = jnp.clip(old.tangent - contact.frame.tangent_mass * slip, -bound, bound)
+    return jnp.where(bound > 0, tangent, 0.0)  # the gradient of a clip between two zeros is not zero
+
+
+def apply_angular_impulse(
+    constraint: ContactConstraint, roll: Array, a: Motion | None, b: Motion
+) -> tuple[Motion | None, Motion]:
+    """Both motions after an angular impulse on b and its reaction on a."""
+    b = b._replace(spin=b.spin + constraint.b.moment * roll)
+    if constraint.a is None or a is None:
+        return a, b
+    return a._replace(spin=a.spin - constraint.a.moment * roll), b
+
+
+def relative_spin(a: Motion | None, b: Motion) -> Array:
+    """Spin of b relative to a, rad/s."""
+    return b.spin if a is None else b.spin - a.spin
+
+
+def rolling_impulse(
+    constraint: ContactConstraint, normal_impulse: Array, a: Motion | None, b: Motion, old: Array
+) -> Array:
+    """Accumulated angular impulse that stops rolling, within its bound by the normal impulse."""
+    assert constraint.rolling is not None, "the constraint has no rolling resistance"
+    k = constraint.b.moment if constraint.a is None else constraint.a.moment + constraint.b.moment
+    mass = reciprocal(k, constraint.present & (k > 0))
+    bound = constraint.rolling * normal_impulse
+    return jnp.clip(old - mass * relative_spin(a, b), -bound, bound)
