@@ -113,13 +113,13 @@ def test_a_video_does_not_depend_on_the_number_of_devices(tiny: Path, tmp_path: 
 def test_a_run_leaves_none_of_its_compiled_programs_behind(tmp_path: Path):
     def kept() -> list[str]:
         names = [each.hlo_modules()[0].name for each in jax.devices()[0].client.live_executables()]
-        return sorted(name for name in names if name in ("jit__simulated_batch", "jit_drawn"))
+        return sorted(name for name in names if name in ("jit__simulate_batch", "jit_render_slice"))
 
     before = kept()
     for balls in (1, 2):
         made = []
         config = changed(scene={"balls": balls})
-        generate(config, 4, tmp_path / str(balls), say=lambda line, made=made: made.append(kept()))
+        generate(config, 4, tmp_path / str(balls), log=lambda line, made=made: made.append(kept()))
         assert len(max(made, key=len)) > len(before)  # while it ran
         assert kept() == before
 
