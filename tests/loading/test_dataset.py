@@ -160,7 +160,7 @@ def test_files_are_closed_when_many_are_open(tmp_path: Path) -> None:
     before = len(list(Path("/proc/self/fd").iterdir()))
     assert dataset[:]["index"].tolist() == list(range(140))
     assert len(list(Path("/proc/self/fd").iterdir())) <= before + 128
-    assert len(chunks._files) <= chunks.OPEN
+    assert len(chunks._files) <= chunks.OPEN_FILES
 
 
 def test_no_jax_is_imported() -> None:

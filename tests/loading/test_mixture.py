@@ -16,7 +16,7 @@ from numpy.testing import assert_array_equal
 import gen2d
 from gen2d.core.errors import ConfigError
 from gen2d.loading import dataset as loader
-from gen2d.loading.mixture import Mixture, turns
+from gen2d.loading.mixture import Mixture, tijdeman_schedule
 
 WEIGHTS = {"a": 0.5, "b": 0.3, "c": 0.2}
 
@@ -39,7 +39,7 @@ def videos(mixture: Mixture, batches: Any) -> list[tuple[str, int]]:
 @settings(max_examples=60, deadline=None)
 @given(st.lists(st.integers(1, 60), min_size=1, max_size=7))
 def test_every_source_has_its_share_within_one_at_every_position(shares: list[int]) -> None:
-    period, found = sum(shares), turns(shares, [10**6] * len(shares))
+    period, found = sum(shares), tijdeman_schedule(shares, [10**6] * len(shares))
     assert len(found) == period
     taken = np.cumsum(found[:, None] == np.arange(len(shares)), axis=0)
     due = np.arange(1, period + 1)[:, None] * np.array([float(Fraction(share, period)) for share in shares])
@@ -103,7 +103,7 @@ def test_a_mixture_resumes_at_the_very_batch_on_any_world_size(sources: dict) ->
 def test_a_state_of_other_weights_is_refused(sources: dict) -> None:
     one, other = (gen2d.DataLoader(gen2d.mix(sources, weights), 6) for weights in (WEIGHTS, [1, 2, 3]))
     state = one.state_dict()
-    other.walk.videos = one.walk.videos  # a mixture of the same length
+    other.epoch_sampler.videos = one.epoch_sampler.videos  # a mixture of the same length
     with pytest.raises(ConfigError, match=r"the state has shares \[5, 3, 2\], but the dataset \[1, 2, 3\]"):
         other.load_state_dict(state)
 
