@@ -39,27 +39,27 @@ def videos(mixture: Mixture, batches: Any) -> list[tuple[str, int]]:
 @settings(max_examples=60, deadline=None)
 @given(st.lists(st.integers(1, 60), min_size=1, max_size=7))
 def test_every_source_has_its_share_within_one_at_every_position(shares: list[int]) -> None:
-    period, found = sum(shares), tijdeman_schedule(shares, [10**6] * len(shares))
-    assert len(found) == period
-    taken = np.cumsum(found[:, None] == np.arange(len(shares)), axis=0)
+    period, schedule = sum(shares), tijdeman_schedule(shares, [10**6] * len(shares))
+    assert len(schedule) == period
+    counts = np.cumsum(schedule[:, None] == np.arange(len(shares)), axis=0)
     due = np.arange(1, period + 1)[:, None] * np.array([float(Fraction(share, period)) for share in shares])
-    assert abs(taken - due).max() < 1
-    assert taken[-1].tolist() == shares
+    assert abs(counts - due).max() < 1
+    assert counts[-1].tolist() == shares
 
 
 @pytest.mark.parametrize("weights", [WEIGHTS, [1, 1, 1], [3, 1, 1000], None, [0.001, 1, 2], [1 / 3, 1 / 3, 1 / 7]])
 def test_an_epoch_is_as_long_as_no_video_comes_twice(sources: dict, weights: Any) -> None:
     mixture = gen2d.mix(sources, weights)
-    found = videos(mixture, [mixture[:]])
-    assert len(set(found)) == len(mixture) == len(found)
+    actual = videos(mixture, [mixture[:]])
+    assert len(set(actual)) == len(mixture) == len(actual)
     given = [1, 1, 1] if weights is None else weights if isinstance(weights, list) else list(weights.values())
     due = np.arange(1, len(mixture) + 1)[:, None] * np.array(given) / sum(given)
-    names = np.array([name for name, _ in found])
+    names = np.array([name for name, _ in actual])
     assert abs(np.cumsum(names[:, None] == np.array(list(sources)), axis=0) - due).max() < 1.01
-    counts = Counter(name for name, _ in found)
+    counts = Counter(name for name, _ in actual)
     assert any(counts[name] == len(source) for name, source in sources.items())
     whole = {name: source[:]["states/angle"] for name, source in sources.items()}
-    assert_array_equal(mixture[:]["states/angle"], np.stack([whole[name][number] for name, number in found]))
+    assert_array_equal(mixture[:]["states/angle"], np.stack([whole[name][number] for name, number in actual]))
 
 
 def test_over_epochs_every_video_comes_equally_often(sources: dict) -> None:
@@ -124,7 +124,7 @@ def test_a_mixture_of_one_is_that_one(sources: dict) -> None:
 
 
 @pytest.mark.parametrize(
-    ("weights", "told"),
+    ("weights", "message"),
     [
         ({"a": 1, "b": 1, "d": 1}, "weights has the names a, b, d, but must have a, b, c"),
         ([1, 2], "weights has 2 numbers, but there are 3 datasets"),
@@ -133,8 +133,8 @@ def test_a_mixture_of_one_is_that_one(sources: dict) -> None:
         ([1, 1, "many"], "weights of c is 'many'"),
     ],
 )
-def test_wrong_weights_are_named(sources: dict, weights: Any, told: str) -> None:
-    with pytest.raises(ConfigError, match=told):
+def test_wrong_weights_are_named(sources: dict, weights: Any, message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
         gen2d.mix(sources, weights)
 
 
