@@ -39,7 +39,7 @@ def run(options: argparse.Namespace) -> int:
         split=options.split,
         fields=options.fields,
         overwrite=options.overwrite,
-        say=to_stderr,
+        log=to_stderr,
         trust=options.trust,
         **limits(options),
     )

@@ -74,7 +74,7 @@ def run(options: argparse.Namespace) -> int:
             device=options.device,
             worker=options.worker,
             overwrite=options.overwrite,
-            say=to_stderr,
+            log=to_stderr,
             **limits(options),
         )
     except KeyboardInterrupt:

@@ -19,8 +19,8 @@ def to_stderr(line: str) -> None:
 
 
 @contextmanager
-def progress(count: int, say: Callable[[str], None]) -> Iterator[Callable[[int], None]]:
-    """Progress bar on a terminal; elsewhere one line every ten seconds, passed to `say`.
+def progress(count: int, log: Callable[[str], None]) -> Iterator[Callable[[int], None]]:
+    """Progress bar on a terminal; elsewhere one line every ten seconds, passed to `log`.
 
     Yields a function that advances the progress by a number of videos.
     """
@@ -41,13 +41,13 @@ def progress(count: int, say: Callable[[str], None]) -> Iterator[Callable[[int],
         now = time.perf_counter()
         if now - printed >= 10 and done < count:
             printed, speed = now, done / (now - start)
-            say(f"{done:,} of {count:,} videos, {speed:,.0f} videos/s, {in_time((count - done) / speed)} left")
+            log(f"{done:,} of {count:,} videos, {speed:,.0f} videos/s, {in_time((count - done) / speed)} left")
 
     yield advance
 
 
 @contextmanager
-def stopping_on_sigterm(say: Callable[[str], None]) -> Iterator[None]:
+def stopping_on_sigterm(log: Callable[[str], None]) -> Iterator[None]:
     """Raise KeyboardInterrupt on SIGTERM or SIGINT inside the block; a second signal ends the process at once.
 
     Without effect outside the main thread.
@@ -59,7 +59,7 @@ def stopping_on_sigterm(say: Callable[[str], None]) -> Iterator[None]:
     def stop(number: int, _: Any) -> None:
         signal.signal(signal.SIGINT, signal.SIG_DFL)
         signal.signal(signal.SIGTERM, signal.SIG_DFL)
-        say("Stopping, once compilation has ended and open files are closed or removed; a second signal stops at once.")
+        log("Stopping, once compilation has ended and open files are closed or removed; a second signal stops at once.")
         raise KeyboardInterrupt(number)
 
     handlers = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}

@@ -40,7 +40,7 @@ def export(
     split: str | None = None,
     fields: Sequence[str] | None = None,
     overwrite: bool = False,
-    say: Callable[[str], None] | None = None,
+    log: Callable[[str], None] | None = None,
     trust: Sequence[str] = (),
     timeout: float = 30.0,
     deadline: float = 300.0,
@@ -67,7 +67,7 @@ def export(
     overwrite : bool
         Whether an existing file, or an export of another dataset, is replaced. A folder with an earlier export of the
         same dataset is replaced in any case, and a folder with other files never.
-    say : callable, optional
+    log : callable, optional
         Function that is called with each line of progress.
     trust : sequence of str
         sha256 of code that came with the dataset and may run to render frames, as in `render`.
@@ -106,8 +106,8 @@ def export(
     description = _about(source, name)
     format_.check(source)
     _check_out(out, format_, description, overwrite)
-    say = say or (lambda line: None)
-    with _explained(out), stopping_on_sigterm(say), progress(len(source), say) as advance:
+    log = log or (lambda line: None)
+    with _explained(out), stopping_on_sigterm(log), progress(len(source), log) as advance:
         size = _written(out, format_, dataclasses.replace(source, advance=advance), description)
     return Exported(out, len(source), size, time.perf_counter() - start, format_.loss)
 

@@ -58,9 +58,9 @@ def publication(spec: DatasetSpec, shards: list[Shard], records: Records, old: M
         tables[split] = ShardTable(name, sha256(content), len(of_split), sum(sizes), max(sizes))
     counts = {shard.split: shard.first + shard.count for shard in shards}
     if old and (old.identity_sha256, old.splits, old.tables) == (spec.identity_sha256, counts, tables):
-        present = _present_publication(spec, old)
-        if present is not None:
-            return present
+        current = _current_publication(spec, old)
+        if current is not None:
+            return current
     stats = {split: summary(of_split["moments"], spec.fields) for split, of_split in rows.items()}
     files = spec.recipe_files
     hashes = {name: sha256(content) for name, content in files.items()}
@@ -75,7 +75,7 @@ def _cards(spec: DatasetSpec, manifest: Manifest) -> dict[str, bytes]:
     return {"README.md": readme(manifest, spec.command).encode(), "croissant.json": croissant(manifest)}
 
 
-def _present_publication(spec: DatasetSpec, old: Manifest) -> Publication | None:
+def _current_publication(spec: DatasetSpec, old: Manifest) -> Publication | None:
     """The current manifest and the damaged files to rewrite; None if the content of one of them would differ."""
     recipe, files = spec.recipe_files, {}
     for name, digest in old.files.items():
@@ -98,4 +98,4 @@ def sheet(root: Place, manifest: Manifest) -> bytes:
     ds = Dataset(root, manifest, options)
     # One video in memory at a time: they may be long and large.
     videos = (ds[number]["frames"] for number in range(min(ROWS, len(ds))))
-    return images.png(contact_sheet.contact_sheet(np.stack([contact_sheet.reduced(video) for video in videos])))
+    return images.png(contact_sheet.contact_sheet(np.stack([contact_sheet.downsample(video) for video in videos])))

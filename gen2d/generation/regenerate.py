@@ -32,7 +32,7 @@ from gen2d.dataset.spec import (
     shard_path,
 )
 from gen2d.generation.complete import publication
-from gen2d.generation.run import dataset_of, make
+from gen2d.generation.run import dataset_of, generate_shards
 from gen2d.loading import dataset as loader
 from gen2d.programs import devices
 from gen2d.programs.fingerprint import fingerprint, machine, sources
@@ -70,8 +70,8 @@ def check_fingerprint(root: Place, source: VideoSource, identity: Identity) -> N
     _check_equal(root, {"programs": programs}, {"programs": fingerprint(source.rollout)["programs"]})
 
 
-def _check_equal(root: Place, there: Identity, here: Identity) -> None:
-    fingerprints = {"fingerprint": there}, {"fingerprint": here}
+def _check_equal(root: Place, expected: Identity, actual: Identity) -> None:
+    fingerprints = {"fingerprint": expected}, {"fingerprint": actual}
     difference = folder.describe_differences(*fingerprints, folder.sources_of(root), sources())
     if difference:
         raise FolderError(
@@ -80,7 +80,7 @@ def _check_equal(root: Place, there: Identity, here: Identity) -> None:
 
 
 def changed_videos(
-    source: VideoSource, root: Place, manifest: Manifest, chosen: Sequence[tuple[str, int]]
+    source: VideoSource, root: Place, manifest: Manifest, selection: Sequence[tuple[str, int]]
 ) -> Iterator[tuple[str, str]]:
     """Shard and a sentence for each stored field of these videos (split, number) that differs when regenerated.
 
@@ -90,10 +90,10 @@ def changed_videos(
         if name not in manifest.constants or not np.array_equal(values, manifest.constants[name]):
             raise FolderError(f"{root}: its constant {name} differs from the one that its recipe makes")
     stored = {split: loader.open(root, split, fields=("*",)) for split in manifest.splits}
-    for split_source, splits in source.of_splits(split for split, _ in chosen):
+    for split_source, splits in source.of_splits(split for split, _ in selection):
         ranges = [
             VideoRange(split, number, number + 1, _shard_name(manifest, split, number))
-            for split, number in sorted(chosen)
+            for split, number in sorted(selection)
             if split in splits
         ]
         for videos in split_source.slices(ranges):
@@ -125,7 +125,7 @@ def _changed_fields(stored: loader.Dataset, number: int, fields: Mapping[str, np
 def repair(
     root: str | Place,
     bad: Sequence[str] = (),
-    say: Callable[[str], None] | None = None,
+    log: Callable[[str], None] | None = None,
     *,
     trust: Trust = (),
     timeout: float = 30.0,
@@ -144,7 +144,7 @@ def repair(
         The dataset's folder or URL.
     bad : sequence of str
         Names of shards to regenerate, as `verify` passes them.
-    say : callable, optional
+    log : callable, optional
         Receives lines of progress for a person.
     trust : str or sequence of str
         sha256 of code in the dataset that may run.
@@ -177,7 +177,7 @@ def repair(
     with folder.explained(root), _staging(root) as stage:
         if todo:
             check_fingerprint(root, source, identity)
-            staged = _remake(source, spec, stage, todo, records, manifest, say or (lambda line: None))
+            staged = _regenerate_shards(source, spec, stage, todo, records, manifest, log or (lambda line: None))
         try:
             with folder.locked(root):
                 check_current(root, manifest)
@@ -265,20 +265,20 @@ def _staging(root: Place) -> Iterator[Path]:
         yield stage
 
 
-def _remake(
+def _regenerate_shards(
     source: VideoSource,
     spec: DatasetSpec,
     stage: Path,
     todo: Sequence[Shard],
     records: Records,
     manifest: Manifest | None,
-    say: Callable[[str], None],
+    log: Callable[[str], None],
 ) -> Records:
     """Generate these shards in the folder `stage`; return their rows, or raise FolderError if one is not right."""
     for name in ("shards", f"{RECORDS}"):
         (stage / name).mkdir(parents=True)
     staged_spec = dataclasses.replace(spec, root=stage)
-    make(source, staged_spec, list(todo), say)
+    generate_shards(source, staged_spec, list(todo), log)
     staged = read_records(staged_spec, stage)
     versions = devices.versions()
     same_codecs = manifest is None or all(manifest.producer.get(key) == versions[key] for key in CODECS)

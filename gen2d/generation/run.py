@@ -58,7 +58,7 @@ def generate(
     device: str = "auto",
     worker: tuple[int, int] = (0, 1),
     overwrite: bool = False,
-    say: Callable[[str], None] | None = None,
+    log: Callable[[str], None] | None = None,
     timeout: float = 30.0,
     deadline: float = 300.0,
 ) -> Summary:
@@ -88,7 +88,7 @@ def generate(
         (r, W) for worker r of W, from 0; each generates its share of the shards.
     overwrite : bool
         Whether to delete a dataset in the folder first; only with a single worker.
-    say : callable, optional
+    log : callable, optional
         Receives lines of progress for a person.
     timeout, deadline : float
         Limits in s of a server's silence and of a whole request, as in `open`.
@@ -117,7 +117,7 @@ def generate(
     >>> summary = gen2d.generate("bouncing.yaml", 10_000, "datasets/bouncing", overrides=["video.height=128"])
     >>> print(summary.videos_per_second, "videos/s")
     """
-    say = say or (lambda line: None)
+    log = log or (lambda line: None)
     config = load_config(config, overrides)
     if seed is not None:
         config = dataclasses.replace(config, seed=checked_seed(seed))
@@ -131,18 +131,12 @@ def generate(
         remaining = [shard for shard in shards.open_folder(dataset, overwrite) if shard.split in counts]
         todo = shards_of_worker(remaining, *worker)
         began, video_count = time.perf_counter(), sum(shard.count for shard in todo)
-        size = make(source, dataset, todo, say)
+        size = generate_shards(source, dataset, todo, log)
     is_complete = complete(dataset)
     seconds = time.perf_counter() - began
     if todo:
-        entry = {
-            "time": time.time(),
-            "host": os.uname().nodename,
-            "videos": video_count,
-            "seconds": seconds,
-            "bytes": size,
-        }
-        shards.log(out, entry | {"devices": len(on), "platform": on[0].platform})
+        entry = {"time": time.time(), "host": os.uname().nodename, "videos": video_count, "seconds": seconds}
+        shards.log(out, entry | {"bytes": size, "devices": len(on), "platform": on[0].platform})
     return Summary(out, video_count, sum(counts.values()), seconds, size, is_complete)
 
 
@@ -193,27 +187,29 @@ def dataset_of(
     )
 
 
-def make(source: VideoSource, dataset: DatasetSpec, todo: list[Shard], say: Callable[[str], None]) -> int:
+def generate_shards(source: VideoSource, dataset: DatasetSpec, todo: list[Shard], log: Callable[[str], None]) -> int:
     """Generate and write these shards; return the number of bytes written."""
-    sources = source.of_splits(shard.split for shard in todo)
-    return sum(_make(own, dataset, [shard for shard in todo if shard.split in splits], say) for own, splits in sources)
+    return sum(
+        _generate_from(split_source, dataset, [shard for shard in todo if shard.split in splits], log)
+        for split_source, splits in source.of_splits(shard.split for shard in todo)
+    )
 
 
-def _make(source: VideoSource, dataset: DatasetSpec, todo: list[Shard], say: Callable[[str], None]) -> int:
+def _generate_from(source: VideoSource, dataset: DatasetSpec, todo: list[Shard], log: Callable[[str], None]) -> int:
     encoder, writers = Encoder(source, dataset, threads_for(devices.cores())), ShardWriters(dataset)
     ranges, size = shard_ranges(todo), 0
-    with stopping_on_sigterm(say):  # also during clean-up, when a second signal ends the process
+    with stopping_on_sigterm(log):  # also during clean-up, when a second signal ends the process
         try:
             count = sum(shard.count for shard in todo)
-            warm_up(source, encoder, ranges, count, say)
-            with progress(count, say) as advance:
+            warm_up(source, encoder, ranges, count, log)
+            with progress(count, log) as advance:
                 for shard, block in encoder.blocks(ranges):
                     writers.put(shard, block)
                     size += block.nbytes
                     advance(len(block))
             writers.finish()
         except BaseException:
-            writers.drop()
+            writers.abort()
             raise
         finally:
             encoder.close()

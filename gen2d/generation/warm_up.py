@@ -22,7 +22,7 @@ class DeviceMemoryError(UserError):
 
 
 def warm_up(
-    source: VideoSource, encoder: Encoder, ranges: Sequence[VideoRange], count: int, say: Callable[[str], None]
+    source: VideoSource, encoder: Encoder, ranges: Sequence[VideoRange], count: int, log: Callable[[str], None]
 ) -> None:
     """Compile, and report the estimated size and duration of a run of `count` videos.
 
@@ -30,19 +30,19 @@ def warm_up(
     """
     rollout = source.rollout
     name = f"{len(rollout.devices)} {rollout.devices[0].platform} device{'s' if len(rollout.devices) > 1 else ''}"
-    say(f"Compiling for {name} (seconds; up to a minute for dozens of objects; kept for the next run) ...")
+    log(f"Compiling for {name} (seconds; up to a minute for dozens of objects; kept for the next run) ...")
     began = time.perf_counter()
     request = next(source.requests(ranges[:1]))
     try:
         batch = jax.block_until_ready(rollout.start(request.split, request.numbers))
     except jax.errors.JaxRuntimeError as error:
-        raise _explained(error) from None
+        raise _device_error(error) from None
     _fit_slice(rollout, batch)
     compiled = time.perf_counter() - began
-    block, seconds = _measured(source, encoder, batch, next(source.requests(ranges[:1])))
+    block, seconds = _measure(source, encoder, batch, next(source.requests(ranges[:1])))
     size, duration = block.nbytes / len(block) * count, seconds * count
-    say(f"Compiled in {compiled:.1f} s. {count:,} videos will take about {in_bytes(size)} and {in_time(duration)}.")
-    _warn_of_ratio(encoder.dataset, block, say)
+    log(f"Compiled in {compiled:.1f} s. {count:,} videos will take about {in_bytes(size)} and {in_time(duration)}.")
+    _warn_of_low_compression(encoder.dataset, block, log)
     free = shards.free_bytes(encoder.dataset.root)
     if size > free:
         raise FolderError(
@@ -59,11 +59,11 @@ def _fit_slice(rollout: Rollout, batch: DeviceBatch) -> None:
             return
         except jax.errors.JaxRuntimeError as error:
             if "RESOURCE_EXHAUSTED" not in str(error) or rollout.slice == 1:
-                raise _explained(error) from None
+                raise _device_error(error) from None
             rollout.slice = divisor(rollout.batch_size, rollout.slice // 2)
 
 
-def _measured(source: VideoSource, encoder: Encoder, batch: DeviceBatch, request: Request) -> tuple[Block, float]:
+def _measure(source: VideoSource, encoder: Encoder, batch: DeviceBatch, request: Request) -> tuple[Block, float]:
     """The first block, and the estimated time for a video in s."""
     rollout, part, marks = source.rollout, request.parts[0], [time.perf_counter()]
     jax.block_until_ready(rollout.start(request.split, request.numbers))
@@ -78,17 +78,17 @@ def _measured(source: VideoSource, encoder: Encoder, batch: DeviceBatch, request
     return block, sum((b - a) / n for a, b, n in zip(marks, marks[1:], videos, strict=False))
 
 
-def _warn_of_ratio(dataset: DatasetSpec, block: Block, say: Callable[[str], None]) -> None:
+def _warn_of_low_compression(dataset: DatasetSpec, block: Block, log: Callable[[str], None]) -> None:
     """Report if gzip compresses the frames badly."""
     if "frames" not in dataset.fields:
         return
     raw = len(block) * int(np.prod(dataset.fields["frames"].shape(dataset.sizes)))
     ratio = raw / sum(map(len, block.chunks["frames"]))
     if dataset.codec == "gzip" and ratio < 3:
-        say(f"gzip makes these frames only {ratio:.1f} times smaller; --set storage.codec=zstd may do better.")
+        log(f"gzip makes these frames only {ratio:.1f} times smaller; --set storage.codec=zstd may do better.")
 
 
-def _explained(error: Exception) -> Exception:
+def _device_error(error: Exception) -> Exception:
     if "RESOURCE_EXHAUSTED" in str(error):
         return DeviceMemoryError(
             "the device has too little memory for a batch: lower storage.batch_size, or use --device cpu"

@@ -32,9 +32,9 @@ from gen2d.storage.sealed import open_regular
 
 BLOCK = 256  # rows of a table that are read together
 INDEX_BLOCK = 1024  # rows of a remote index that are read together
-SHARDS = 65536  # shard rows that each split keeps in memory
-KEPT = 256  # blocks of tables and indices that each split keeps in memory
-OPEN = 128  # files that a process keeps open
+CACHED_SHARDS = 65536  # shard rows that each split keeps in memory
+CACHED_BLOCKS = 256  # blocks of tables and indices that each split keeps in memory
+OPEN_FILES = 128  # files that a process keeps open
 
 
 class Chunk(NamedTuple):
@@ -76,41 +76,38 @@ class SplitFiles:
 
     # ---- The table
 
-    def shard(self, place: int) -> ShardRow:
-        """Row of the shard at position `place` of the split. Raises DamagedError if the row is damaged."""
-        row = self._shards.get(place)
+    def shard(self, position: int) -> ShardRow:
+        """Row of the shard at this position of the split. Raises DamagedError if the row is damaged."""
+        row = self._shards.get(position)
         if row is None:
-            if len(self._shards) >= SHARDS:
+            if len(self._shards) >= CACHED_SHARDS:
                 self._shards = {}
-            row = self._shards[place] = self._checked_shard(place)
+            row = self._shards[position] = self._read_shard_row(position)
         return row
 
-    def _checked_shard(self, place: int) -> ShardRow:
+    def _read_shard_row(self, position: int) -> ShardRow:
         per_shard, count = self.manifest.videos_per_shard, self.manifest.splits[self.split]
-        first = place * per_shard
+        first = position * per_shard
         expected = shard_of(self.split, first, min(per_shard, count - first), per_shard)
-        row = self._table_block(place // BLOCK)[place % BLOCK]
+        row = self._table_block(position // BLOCK)[position % BLOCK]
         path = f"{self.root / self.manifest.tables[self.split].file}"
         if self.checks and not intact(row.reshape(1), self._origin, [first]).all():
-            raise DamagedError(f"{path} is not what was written, in row {place}")
+            raise DamagedError(f"{path} is not what was written, in row {position}")
         try:
             check_shard(row, first, expected.count, self._video_type.itemsize, self._row_bytes, self._raw_bytes)
         except DamagedError as error:
-            raise DamagedError(f"{path} cannot be right in row {place}: {error}") from None
+            raise DamagedError(f"{path} cannot be right in row {position}: {error}") from None
         return ShardRow(expected, int(row["bytes"]), row["sha256"].tobytes().hex(), int(row["index"]), row["offsets"])
 
     def _table_block(self, number: int) -> np.ndarray:
-        table, size = self.manifest.tables[self.split], self._shard_type.itemsize
-        first = number * BLOCK
-        count = min(BLOCK, table.shards - first)
-
         def read() -> np.ndarray:
-            begin = self._header + first * size
-            return np.frombuffer(self._read_table(begin, begin + count * size), self._shard_type)
+            first, stop = number * BLOCK, min((number + 1) * BLOCK, self.manifest.tables[self.split].shards)
+            begin, end = (self._header + row * self._shard_type.itemsize for row in (first, stop))
+            return np.frombuffer(self._read_table(begin, end), self._shard_type)
 
-        return self._kept((-1, number), read)
+        return self._cached_block((-1, number), read)
 
-    def _kept(self, key: tuple[int, int], read: Callable[[], np.ndarray]) -> np.ndarray:
+    def _cached_block(self, key: tuple[int, int], read: Callable[[], np.ndarray]) -> np.ndarray:
         """Block of rows from memory, or from `read`; the least recently used blocks are dropped."""
         with _lock:
             if key in self._blocks:
@@ -119,7 +116,7 @@ class SplitFiles:
         rows = read()
         with _lock:
             self._blocks[key] = rows
-            while len(self._blocks) > KEPT:
+            while len(self._blocks) > CACHED_BLOCKS:
                 self._blocks.popitem(last=False)
         return rows
 
@@ -130,9 +127,9 @@ class SplitFiles:
         shards, rows = np.divmod(numbers, self.manifest.videos_per_shard)
         entries = np.empty(len(numbers), self._video_type)
         if isinstance(self.root, Url) and self.cache is None:
-            wanted = list(zip(shards.tolist(), (rows // INDEX_BLOCK).tolist(), strict=True))
-            blocks = self._fetched_blocks(set(wanted))
-            for step, key in enumerate(wanted):
+            keys = list(zip(shards.tolist(), (rows // INDEX_BLOCK).tolist(), strict=True))
+            blocks = self._fetch_blocks(set(keys))
+            for step, key in enumerate(keys):
                 entries[step] = blocks[key][rows[step] % INDEX_BLOCK]
         else:
             for shard in np.unique(shards):
@@ -142,44 +139,47 @@ class SplitFiles:
             is_intact = intact(entries, self._origin, numbers.tolist())
             if not is_intact.all():
                 wrong = int(np.argmin(is_intact))
-                raise self._bad_index(int(shards[wrong]), int(numbers[wrong]))
+                raise self._index_error(int(shards[wrong]), int(numbers[wrong]))
         return entries
 
-    def _bad_index(self, place: int, number: int) -> DamagedError:
-        path = self.path(shard_name(self.shard(place).shard.name))
+    def _index_error(self, position: int, number: int) -> DamagedError:
+        path = self.path(shard_name(self.shard(position).shard.name))
         return DamagedError(f"{path}: the index of {self.split} video {number} is not what was written")
 
-    def _index_rows(self, place: int, rows: np.ndarray) -> np.ndarray:
-        shard_row, size = self.shard(place), self._video_type.itemsize
-        file = self._open(shard_row)
+    def _index_rows(self, position: int, rows: np.ndarray) -> np.ndarray:
+        shard_row, size = self.shard(position), self._video_type.itemsize
+        file = self._open_shard(shard_row)
         parts = [file.read(shard_row.rows + row * size, size) for row in rows.tolist()]
         return np.frombuffer(b"".join(parts), self._video_type)
 
-    def _fetched_blocks(self, wanted: set[tuple[int, int]]) -> dict[tuple[int, int], np.ndarray]:
+    def _fetch_blocks(self, keys: set[tuple[int, int]]) -> dict[tuple[int, int], np.ndarray]:
         """Index blocks of remote shards, by shard and block number; the missing ones are requested in parallel."""
         with _lock:
-            blocks = {key: self._blocks[key] for key in wanted & self._blocks.keys()}
-        missing, size, ranges = sorted(wanted - blocks.keys()), self._video_type.itemsize, []
+            blocks = {key: self._blocks[key] for key in keys & self._blocks.keys()}
+        missing, size, ranges = sorted(keys - blocks.keys()), self._video_type.itemsize, []
         for shard, block in missing:
             row = self.shard(shard)
             first, last = block * INDEX_BLOCK, min((block + 1) * INDEX_BLOCK, row.shard.count)
             ranges.append((shard_name(row.shard.name), row.rows + first * size, row.rows + last * size))
-        for key, (name, *_), content in zip(missing, ranges, self._fetched(ranges), strict=True):
+        for key, (name, *_), content in zip(missing, ranges, self._fetch(ranges), strict=True):
             if isinstance(content, Exception):
                 raise _reading_error(self.path(name), content)
-            blocks[key] = self._kept(key, functools.partial(np.frombuffer, content, self._video_type))
+            blocks[key] = self._cached_block(key, functools.partial(np.frombuffer, content, self._video_type))
         return blocks
 
     # ---- Chunks
 
-    def pieces(
+    def chunks_of(
         self, column: Column, numbers: np.ndarray, videos: np.ndarray, begins: Sequence[int]
     ) -> list[list[Chunk]]:
         """Chunks of `column` that each video needs. `videos` are index rows, `begins` the first frames of windows."""
         shards, rows = np.divmod(numbers, self.manifest.videos_per_shard)
         if column.is_image:
             entries = zip(shards.tolist(), videos[column.name].tolist(), begins, strict=True)
-            return [[self._piece(column, shard, chunks[i]) for i in column.needed(b)] for shard, chunks, b in entries]
+            return [
+                [self._checked_chunk(column, shard, video_chunks[i]) for i in column.chunk_range(begin)]
+                for shard, video_chunks, begin in entries
+            ]
         names = self._names
         offsets = {shard: int(self.shard(shard).offsets[names[column.name]]) for shard in np.unique(shards).tolist()}
         entries = zip(shards.tolist(), rows.tolist(), videos[column.name].tolist(), strict=True)
@@ -190,22 +190,21 @@ class SplitFiles:
         """Position of each uncompressed field in the sorted list of them."""
         return {name: position for position, name in enumerate(row_names(self.manifest.fields))}
 
-    def _piece(self, column: Column, place: int, chunk: tuple[int, int, int]) -> Chunk:
-        offset, size, crc = chunk
-        raw_size = column.size // column.pieces
-        if size > 2 * raw_size + 1024 or offset + size > self.shard(place).bytes:
+    def _checked_chunk(self, column: Column, shard: int, entry: tuple[int, int, int]) -> Chunk:
+        offset, size, crc = entry
+        if size > 2 * (column.size // column.chunk_count) + 1024 or offset + size > self.shard(shard).bytes:
             raise DamagedError(f"{column.name} lies outside the file, by its index")
-        return Chunk(place, offset, size, crc)
+        return Chunk(shard, offset, size, crc)
 
-    def reader(self, places: Iterable[Iterable[Iterable[Chunk]]]) -> Reader:
+    def reader(self, chunks_by_column: Iterable[Iterable[Iterable[Chunk]]]) -> Reader:
         """Function that returns the bytes of these chunks, from the disk, the cache or one parallel download."""
         if isinstance(self.root, Path) or self.cache:
-            file_of = functools.lru_cache(maxsize=16)(lambda place: self._open(self.shard(place)))
-            return lambda column, piece, target: _piece_of(file_of(piece.shard), column, piece, target)
-        chunks = list({piece for column_chunks in places for video in column_chunks for piece in video})
-        names = {place: shard_name(self.shard(place).shard.name) for place in {piece.shard for piece in chunks}}
-        data = self._fetched([(names[p.shard], p.offset, p.offset + p.size) for p in chunks])
-        return functools.partial(_received, dict(zip(chunks, data, strict=True)))
+            file_of = functools.lru_cache(maxsize=16)(lambda shard: self._open_shard(self.shard(shard)))
+            return lambda column, chunk, target: _read_chunk(file_of(chunk.shard), column, chunk, target)
+        chunks = list({chunk for column_chunks in chunks_by_column for video in column_chunks for chunk in video})
+        names = {shard: shard_name(self.shard(shard).shard.name) for shard in {chunk.shard for chunk in chunks}}
+        data = self._fetch([(names[c.shard], c.offset, c.offset + c.size) for c in chunks])
+        return functools.partial(_downloaded_chunk, dict(zip(chunks, data, strict=True)))
 
     # ---- Files
 
@@ -213,7 +212,7 @@ class SplitFiles:
         """Path of a file of the latest snapshot; growth may have moved the file since."""
         return self.root / name
 
-    def _places(self, name: str) -> tuple[Place, Place]:
+    def _candidate_paths(self, name: str) -> tuple[Place, Place]:
         """Both possible paths of a file: growth moves files that only an earlier manifest names."""
         return self.root / name, snapshot_path(self.root, self.manifest.sha256) / name
 
@@ -222,23 +221,24 @@ class SplitFiles:
         table = self.manifest.tables[self.split]
         name = table.file
         if isinstance(self.root, Path):
-            file = self._opened(name)
+            file = self._open_local(name)
         elif self.cache:
-            file = self._cached(name, table.sha256, self._header + table.shards * self._shard_type.itemsize)
+            file = self._open_cached(name, table.sha256, self._header + table.shards * self._shard_type.itemsize)
         else:
-            (content,) = self._fetched([(name, begin, end)])
+            (content,) = self._fetch([(name, begin, end)])
             if isinstance(content, Exception):
                 raise _reading_error(self.path(name), content)
             return content
         return file.read(begin, end - begin)
 
-    def _fetched(self, wanted: Sequence[tuple[str, int, int]]) -> list[bytes | Exception]:
+    def _fetch(self, requests: Sequence[tuple[str, int, int]]) -> list[bytes | Exception]:
         """Bytes of each range (name, begin, end) of the remote files, or the error of reading it."""
         contents: list[bytes | Exception] = []
         for attempt in (0, 1):
-            missing = [i for i in range(len(wanted)) if not attempt or isinstance(contents[i], FileNotFoundError)]
-            urls = [self._places(wanted[i][0])[attempt] for i in missing]
-            ranges = [Range(url, *wanted[i][1:]) for url, i in zip(urls, missing, strict=True) if isinstance(url, Url)]
+            missing = [i for i in range(len(requests)) if not attempt or isinstance(contents[i], FileNotFoundError)]
+            pending = [requests[i] for i in missing]
+            urls = [self._candidate_paths(name)[attempt] for name, _, _ in pending]
+            ranges = [Range(url, *r[1:]) for url, r in zip(urls, pending, strict=True) if isinstance(url, Url)]
             read = read_ranges(ranges) if ranges else []
             if not attempt:
                 contents = list(read)
@@ -246,21 +246,23 @@ class SplitFiles:
                 contents[i] = content if not isinstance(content, FileNotFoundError) or not attempt else contents[i]
         return contents
 
-    def _opened(self, name: str) -> "_File":
-        for path in self._places(name):
+    def _open_local(self, name: str) -> "_File":
+        for path in self._candidate_paths(name):
             assert isinstance(path, Path)
             with contextlib.suppress(FileNotFoundError):
                 return open_file(path)
         raise DamagedError(f"{self.path(name)} is missing")
 
-    def _open(self, about: ShardRow) -> "_File":
-        name = shard_name(about.shard.name)
-        return self._opened(name) if self.cache is None else self._cached(name, about.sha256, about.bytes)
+    def _open_shard(self, shard_row: ShardRow) -> "_File":
+        name = shard_name(shard_row.shard.name)
+        if self.cache is None:
+            return self._open_local(name)
+        return self._open_cached(name, shard_row.sha256, shard_row.bytes)
 
-    def _cached(self, name: str, sha256: str, size: int) -> "_File":
+    def _open_cached(self, name: str, sha256: str, size: int) -> "_File":
         """Remote file, opened in the cache."""
         assert self.cache
-        for url in self._places(name):
+        for url in self._candidate_paths(name):
             assert isinstance(url, Url)
             try:
                 while True:
@@ -285,7 +287,7 @@ class _File:
             raise
         except OSError as error:
             raise reading_error(path, error) from error
-        self.about = _about(os.fstat(self.descriptor))
+        self.identity = _file_identity(os.fstat(self.descriptor))
 
     def read(self, offset: int, size: int) -> bytes:
         """`size` bytes from `offset` on. Raises DamagedError if the file ends too early."""
@@ -322,7 +324,7 @@ class _File:
             os.close(self.descriptor)
 
 
-def _about(status: os.stat_result) -> tuple[int, ...]:
+def _file_identity(status: os.stat_result) -> tuple[int, ...]:
     """Identity of a file, which differs from that of a later file with the same name."""
     return status.st_dev, status.st_ino, status.st_size, status.st_mtime_ns
 
@@ -338,14 +340,14 @@ def open_file(path: Path) -> _File:
     Raises FileNotFoundError if there is no such file, and otherwise the errors of `reading_error`.
     """
     try:
-        identity = _about(path.stat())
+        identity = _file_identity(path.stat())
     except FileNotFoundError:
         raise
     except OSError as error:
         raise reading_error(path, error) from error
     with _lock:
         cached = _files.get(path)
-        if cached is not None and cached.about == identity and cached.process == os.getpid():
+        if cached is not None and cached.identity == identity and cached.process == os.getpid():
             _files.move_to_end(path)
             return cached
     try:
@@ -356,7 +358,7 @@ def open_file(path: Path) -> _File:
         file = _File(path)
     with _lock:
         _files[path] = file
-        while len(_files) > OPEN:
+        while len(_files) > OPEN_FILES:
             _files.popitem(last=False)
     return file
 
@@ -369,22 +371,22 @@ def _after_fork() -> None:
 os.register_at_fork(after_in_child=_after_fork)
 
 
-def _piece_of(file: _File, column: Column, piece: Chunk, target: np.ndarray) -> bytes | memoryview:
+def _read_chunk(file: _File, column: Column, chunk: Chunk, target: np.ndarray) -> bytes | memoryview:
     """Bytes of a chunk; an uncompressed chunk is read directly into `target`."""
     if column.codec != "none":
-        return file.read(piece.offset, piece.size)
+        return file.read(chunk.offset, chunk.size)
     data = target.data
-    if data.nbytes != piece.size:
-        raise DamagedError(f"it has {piece.size} bytes, but must have {data.nbytes}")
-    file.read_into(data, piece.offset)
+    if data.nbytes != chunk.size:
+        raise DamagedError(f"it has {chunk.size} bytes, but must have {data.nbytes}")
+    file.read_into(data, chunk.offset)
     return data
 
 
-def _received(
-    found: Mapping[Chunk, bytes | Exception], column: Column, piece: Chunk, target: np.ndarray
+def _downloaded_chunk(
+    downloads: Mapping[Chunk, bytes | Exception], column: Column, chunk: Chunk, target: np.ndarray
 ) -> bytes | memoryview:
     """Bytes of a chunk that has been downloaded; raises the error of its download."""
-    data = found[piece]
+    data = downloads[chunk]
     if isinstance(data, Exception):
         raise data
     return data

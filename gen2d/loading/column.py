@@ -15,36 +15,36 @@ class Column:
         field = manifest.fields[name]
         self.name, self.field, self.is_image = name, field, field.is_image
         self.codec = manifest.codec_of(name)
-        self.stored = field.shape(manifest.sizes)
+        self.stored_shape = field.shape(manifest.sizes)
         self.size = stored_bytes(field, manifest.sizes)
         self.frames = manifest.chunk_frames if field.is_image else None  # frames in a chunk
-        self.pieces = manifest.pieces if field.is_image else 1
+        self.chunk_count = manifest.pieces if field.is_image else 1
         axes = field.axes.split()[1:]
         self.order = LAYOUTS[layout] if self.is_image and len(axes) == 4 else tuple(range(len(axes)))
         self.window, self.stride = (window if axes[:1] == ["T"] else None), stride
         self.to_float = name == "frames" and dtype == "float32"
         self.dtype = np.dtype("float32" if self.to_float else field.dtype)
-        shape = self.stored if self.window is None else (self.window, *self.stored[1:])
+        shape = self.stored_shape if self.window is None else (self.window, *self.stored_shape[1:])
         self.shape = tuple(shape[axis] for axis in self.order)
         # The chunks of a direct column are read or decoded in the batch itself.
         self.is_direct = not self.to_float and self.window is None and self.order == tuple(range(len(axes)))
 
-    def needed(self, first: int) -> range:
+    def chunk_range(self, first: int) -> range:
         """Numbers of the chunks that hold the window beginning at frame `first`."""
         if self.window is None or self.frames is None:
-            return range(self.pieces)
+            return range(self.chunk_count)
         return range(first // self.frames, (first + (self.window - 1) * self.stride) // self.frames + 1)
 
-    def part(self, whole: np.ndarray, piece: int) -> np.ndarray:
-        """View of chunk number `piece` in the array `whole` [1, T, ...] of a complete video."""
-        return whole if self.frames is None else whole[:, piece * self.frames : (piece + 1) * self.frames]
+    def chunk_view(self, video: np.ndarray, number: int) -> np.ndarray:
+        """View of chunk number `number` in the array `video` [1, T, ...] of a complete video."""
+        return video if self.frames is None else video[:, number * self.frames : (number + 1) * self.frames]
 
-    def convert(self, whole: np.ndarray, first: int, target: np.ndarray) -> None:
-        """Copy the window beginning at frame `first` of `whole` [1, T, ...] to `target` [1, ...]."""
+    def convert(self, video: np.ndarray, first: int, target: np.ndarray) -> None:
+        """Copy the window beginning at frame `first` of `video` [1, T, ...] to `target` [1, ...]."""
         if self.window is not None:
-            whole = whole[:, first : first + (self.window - 1) * self.stride + 1 : self.stride]
-        whole = whole.transpose(0, *(1 + axis for axis in self.order))
+            video = video[:, first : first + (self.window - 1) * self.stride + 1 : self.stride]
+        video = video.transpose(0, *(1 + axis for axis in self.order))
         if self.to_float:
-            np.divide(whole, np.float32(255), out=target)
+            np.divide(video, np.float32(255), out=target)
         else:
-            target[...] = whole
+            target[...] = video

@@ -6,7 +6,7 @@ import numpy as np
 
 from gen2d.core.errors import ConfigError
 from gen2d.core.schema import Field
-from gen2d.loading.epochs import shuffled
+from gen2d.loading.epochs import epoch_indices
 from gen2d.loading.protocols import (
     Batch,
     FieldStats,
@@ -15,8 +15,8 @@ from gen2d.loading.protocols import (
     Snapshot,
     VideoReader,
     checked_numbers,
-    filled,
     item,
+    read_batch,
     unbatch,
 )
 
@@ -65,7 +65,7 @@ class ConcatDataset:
     def stats(self) -> FieldStats:
         """Pooled statistics of each field; datasets are weighted by their numbers of videos."""
         parts = [source.stats for source in self.datasets]
-        return {name: _together([part[name] for part in parts], self.sizes) for name in parts[0]}
+        return {name: _pool_stats([part[name] for part in parts], self.sizes) for name in parts[0]}
 
     @property
     def snapshot(self) -> Snapshot:
@@ -81,7 +81,7 @@ class ConcatDataset:
 
     def batch(self, indices: Numbers, starts: Numbers | None = None, out: Batch | None = None) -> Batch:
         """Batch of the videos with these indices. Parameters and errors are those of `Dataset.batch`."""
-        return filled(self, checked_numbers(indices, len(self), "the whole"), starts, out)
+        return read_batch(self, checked_numbers(indices, len(self), "the whole"), starts, out)
 
     def empty(self, count: int) -> Batch:
         """Uninitialised batch of `count` videos."""
@@ -90,25 +90,25 @@ class ConcatDataset:
     def fill(self, out: Batch, rows: Numbers, indices: Numbers, starts: Numbers | None = None) -> None:
         """Read the videos with these indices into these rows of `out`. Parameters are those of `Dataset.fill`."""
         numbers, targets = np.asarray(indices), np.asarray(rows)
-        for owner, members in self._shared(numbers):
-            begins = None if starts is None else np.asarray(starts)[members]
-            self.datasets[owner].fill(out, targets[members], numbers[members] - self.firsts[owner], begins)
+        for owner, members in self._group_by_dataset(numbers):
+            own_starts = None if starts is None else np.asarray(starts)[members]
+            self.datasets[owner].fill(out, targets[members], numbers[members] - self.firsts[owner], own_starts)
 
     def numbers_at(self, positions: np.ndarray, epoch: int = 0, seed: int | None = None) -> np.ndarray:
         """Indices of the videos at these positions of an epoch, shuffled over all datasets unless `seed` is None."""
-        return shuffled(seed, epoch, positions, len(self))
+        return epoch_indices(seed, epoch, positions, len(self))
 
     def starts(self, numbers: np.ndarray, bits: np.ndarray) -> np.ndarray | None:
         """First frame of each video's window, sampled from random bits; None if windows are not random."""
         starts = np.zeros(len(numbers), np.int64)
-        for owner, members in self._shared(numbers):
-            begins = self.datasets[owner].starts(numbers[members], bits[members])
-            if begins is None:
+        for owner, members in self._group_by_dataset(numbers):
+            own_starts = self.datasets[owner].starts(numbers[members], bits[members])
+            if own_starts is None:
                 return None
-            starts[members] = begins
+            starts[members] = own_starts
         return starts
 
-    def _shared(self, numbers: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
+    def _group_by_dataset(self, numbers: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
         """Position of each dataset that holds some of these videos, and their positions in `numbers`."""
         return groups_of(np.searchsorted(self.firsts, numbers, side="right") - 1)
 
@@ -126,7 +126,7 @@ def groups_of(owners: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
     return ((int(owner), np.flatnonzero(owners == owner)) for owner in np.unique(owners))
 
 
-def _together(parts: Sequence[Mapping[str, list[float] | None]], sizes: np.ndarray) -> dict[str, list[float] | None]:
+def _pool_stats(parts: Sequence[Mapping[str, list[float] | None]], sizes: np.ndarray) -> dict[str, list[float] | None]:
     """Pooled statistics of a field over datasets of these sizes; None if any dataset has none."""
     if any(values is None for part in parts for values in part.values()):
         return dict.fromkeys(parts[0])

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Generic, Literal, Self, TypeVar, cast, ov
 import numpy as np
 
 from gen2d.core.errors import ConfigError
-from gen2d.loading.epochs import EpochSampler, GlobalBatch, one_of
+from gen2d.loading.epochs import EpochSampler, GlobalBatch, check_one_of
 from gen2d.loading.mixture import Mixture
 from gen2d.loading.protocols import Batch, LoaderState, Snapshot, VideoReader
 
@@ -156,18 +156,18 @@ class DataLoader(Generic[A]):
         sharding: "jax.sharding.Sharding | None" = None,
     ) -> None:
         self.threads, self.prefetch = num_threads or min(os.cpu_count() or 1, 8), prefetch
-        one_of("to", to, tuple(_DELIVER))
-        _check_place(to, device, sharding)
+        check_one_of("to", to, tuple(_CONVERTERS))
+        _check_device(to, device, sharding)
         if min(self.prefetch, self.threads) < 1:
             raise ConfigError("prefetch and num_threads must be 1 or more")
-        self.walk = EpochSampler(len(dataset), batch_size, seed, shuffle, epochs, rank, world_size, drop_last)
+        self.epoch_sampler = EpochSampler(len(dataset), batch_size, seed, shuffle, epochs, rank, world_size, drop_last)
         self.dataset, self.transform, self.to = dataset, transform, to
         self.device, self.sharding = device, sharding
         self._running: Generator[Any, None, None] | None = None
 
     def __len__(self) -> int:
         """The number of batches in one epoch."""
-        return len(self.walk)
+        return len(self.epoch_sampler)
 
     def __iter__(self) -> Iterator[dict[str, A]]:
         self.close()
@@ -191,7 +191,7 @@ class DataLoader(Generic[A]):
         It holds the epoch, the position, the values that determine the order, and the snapshot of the dataset.
         """
         shares = {"shares": self.dataset.shares} if isinstance(self.dataset, Mixture) else {}
-        return self.walk.state_dict() | {"snapshot": self.dataset.snapshot} | shares
+        return self.epoch_sampler.state_dict() | {"snapshot": self.dataset.snapshot} | shares
 
     def load_state_dict(self, state: LoaderState) -> None:
         """Let the next iteration continue from `state`, which may come from another number of ranks.
@@ -212,36 +212,36 @@ class DataLoader(Generic[A]):
             If the folder does not have the snapshot, because it was removed or belongs to another dataset.
         """
         self.close()
-        known = state if isinstance(state, Mapping) else {}
-        snapshot = known.get("snapshot")  # None in a stream's state
+        values = state if isinstance(state, Mapping) else {}
+        snapshot = values.get("snapshot")  # None in a stream's state
         shares = self.dataset.shares if isinstance(self.dataset, Mixture) else None
-        if known.get("shares", shares) != shares:
-            raise ConfigError(f"the state has shares {known['shares']}, but the dataset {shares}: their orders differ")
+        if values.get("shares", shares) != shares:
+            raise ConfigError(f"the state has shares {values['shares']}, but the dataset {shares}: their orders differ")
         dataset = self.dataset if snapshot is None else self.dataset.at(cast(Snapshot, snapshot))
-        sampler = self.walk.over(len(dataset))
-        sampler.load_state_dict(state)
-        self.dataset, self.walk = dataset, sampler
+        epoch_sampler = self.epoch_sampler.with_videos(len(dataset))
+        epoch_sampler.load_state_dict(state)
+        self.dataset, self.epoch_sampler = dataset, epoch_sampler
 
     def _batches(self) -> Generator[Any, None, None]:
-        steps = self.walk.steps()
+        steps = self.epoch_sampler.steps()
         pool = ThreadPoolExecutor(self.threads, "gen2d")
         try:
             ahead = deque((step, self._submit(pool, step)) for step in itertools.islice(steps, self.prefetch))
             while ahead:
                 step, future = ahead.popleft()
-                batch = _DELIVER[self.to](future.result(), self.device, self.sharding)
+                batch = _CONVERTERS[self.to](future.result(), self.device, self.sharding)
                 # The next batch is requested before this one is delivered: threads read while the caller trains.
                 ahead.extend((next_step, self._submit(pool, next_step)) for next_step in itertools.islice(steps, 1))
-                self.walk.passed(step)
+                self.epoch_sampler.advance(step)
                 yield batch
         finally:
             pool.shutdown(cancel_futures=True)
 
     def _submit(self, pool: ThreadPoolExecutor, step: GlobalBatch) -> Future[Any]:
         """Future of this rank's slice of a global batch, which all threads fill together."""
-        positions = self.walk.share(step)
-        indices = self.dataset.numbers_at(positions, step.epoch, self.walk.shuffled_by)
-        starts = self.dataset.starts(indices, self.walk.bits(step, positions))
+        positions = self.epoch_sampler.rank_positions(step)
+        indices = self.dataset.numbers_at(positions, step.epoch, self.epoch_sampler.shuffled_by)
+        starts = self.dataset.starts(indices, self.epoch_sampler.window_bits(step, positions))
         # A new batch each time, because jax may keep the memory of the arrays that it receives.
         out = self.dataset.empty(len(indices))
         parts = [
@@ -250,9 +250,9 @@ class DataLoader(Generic[A]):
             if len(part)
         ]
         # No deadlock: this task is queued after its parts, so all of them have started when a thread waits for them.
-        return pool.submit(self._whole, out, parts)
+        return pool.submit(self._finish_batch, out, parts)
 
-    def _whole(self, out: Batch, parts: list[Future[None]]) -> Any:
+    def _finish_batch(self, out: Batch, parts: list[Future[None]]) -> Any:
         for part in parts:
             part.result()
         return out if self.transform is None else self.transform(out)
@@ -267,8 +267,8 @@ def _to_torch(batch: Batch, device: Any, sharding: Any) -> dict[str, Any]:
 
 def _to_jax(batch: Any, device: Any, sharding: Any) -> Any:
     numbers, text = without_text(batch) if isinstance(batch, dict) else (batch, {})
-    placed = importlib.import_module("jax").device_put(numbers, device if sharding is None else sharding)
-    return placed | text if text else placed
+    arrays = importlib.import_module("jax").device_put(numbers, device if sharding is None else sharding)
+    return arrays | text if text else arrays
 
 
 def without_text(batch: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -280,14 +280,14 @@ def without_text(batch: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, An
 
 
 # Conversion of a batch (batch, device, sharding), by the value of `to`.
-_DELIVER: dict[str, Callable[[Any, Any, Any], Any]] = {
+_CONVERTERS: dict[str, Callable[[Any, Any, Any], Any]] = {
     "numpy": lambda batch, device, sharding: batch,
     "torch": _to_torch,
     "jax": _to_jax,
 }
 
 
-def _check_place(to: str, device: Any, sharding: Any) -> None:
+def _check_device(to: str, device: Any, sharding: Any) -> None:
     """Raise ConfigError for a device or sharding that does not fit `to`."""
     if device is not None and to == "numpy":
         raise ConfigError(f"device is {device!r}, but must be None with to='numpy'")

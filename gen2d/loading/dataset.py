@@ -22,8 +22,8 @@ from gen2d.dataset.spec import shard_name
 from gen2d.loading.chunks import Chunk, Reader, SplitFiles
 from gen2d.loading.column import LAYOUTS, Column
 from gen2d.loading.concat import ConcatDataset
-from gen2d.loading.epochs import one_of, shuffled
-from gen2d.loading.protocols import Batch, Key, Numbers, Snapshot, checked_numbers, filled, item, unbatch
+from gen2d.loading.epochs import check_one_of, epoch_indices
+from gen2d.loading.protocols import Batch, Key, Numbers, Snapshot, checked_numbers, item, read_batch, unbatch
 from gen2d.storage import codecs
 from gen2d.storage.cache import Cache
 from gen2d.storage.explain import reason
@@ -151,11 +151,11 @@ def open(
         view = split, fields, window, stride, start, layout, dtype, verify, cache_dir, cache_bytes
         if snapshot is not None:
             raise ConfigError("snapshot must be None for a list of datasets")
-        return _joined([open(one, *view, timeout=timeout, deadline=deadline) for one in path])
+        return _concatenate([open(one, *view, timeout=timeout, deadline=deadline) for one in path])
     root = place(path, Network(timeout, deadline))
     manifest = read_manifest(root, snapshot)
-    split = _chosen_split(root, manifest, split)
-    names = chosen_fields(f"{root}", manifest.fields, fields)
+    split = _select_split(root, manifest, split)
+    names = select_fields(f"{root}", manifest.fields, fields)
     options = ViewOptions(split, names, window, stride, start, layout, dtype, verify, cache_dir, cache_bytes)
     options = options.within(manifest.frames[split], manifest.sizes.get("T", 0))
     _check_cache(options, max(table.largest for table in manifest.tables.values()))
@@ -193,21 +193,21 @@ class ViewOptions:
         """Number of frames from the first to the last of a window, both included; 0 without a window."""
         return 0 if self.window is None else (self.window - 1) * self.stride + 1
 
-    def within(self, frames: int, whole: int) -> "ViewOptions":
-        """Options for a split that has the first `frames` of the `whole` stored frames.
+    def within(self, frames: int, stored_frames: int) -> "ViewOptions":
+        """Options for a split that has the first `frames` of the stored frames.
 
         Without a window, a shorter split is read through a window of all its frames. Raises ConfigError for invalid
         options, and for windows that are longer than the videos.
         """
         self._check(frames)
-        if self.window is not None or frames == whole:
+        if self.window is not None or frames == stored_frames:
             return self
         return dataclasses.replace(self, window=frames, stride=1, start="first")
 
     def _check(self, frames: int) -> None:
-        one_of("layout", self.layout, tuple(LAYOUTS))
-        one_of("dtype", self.dtype, ("uint8", "float32"))
-        one_of("verify", self.verify, ("checksum", "none"))
+        check_one_of("layout", self.layout, tuple(LAYOUTS))
+        check_one_of("dtype", self.dtype, ("uint8", "float32"))
+        check_one_of("verify", self.verify, ("checksum", "none"))
         if isinstance(self.start, str) and self.start not in ("random", "first"):
             raise ConfigError(f"start is {self.start!r}, but must be 'random', 'first' or a frame's number")
         if isinstance(self.start, int) and self.window is None:
@@ -340,7 +340,7 @@ class Dataset:
         >>> batch = ds.batch([3, 1, 4])
         >>> ds.batch([5, 9, 2], out=batch)  # reuses the arrays
         """
-        return filled(self, self.numbers(indices), starts, out)
+        return read_batch(self, self.numbers(indices), starts, out)
 
     def empty(self, count: int) -> Batch:
         """Uninitialised batch of `count` videos. Raises UserError if it does not fit in memory."""
@@ -372,38 +372,38 @@ class Dataset:
         if first.shape != numbers.shape or ((first < 0) | (first > last)).any():
             raise ConfigError(f"starts must be a frame from 0 to {last} for each video, but are {first.tolist()}")
         begins, targets = first.tolist(), np.asarray(rows).tolist()
-        with self._named(numbers):
+        with self._lookup_errors(numbers):
             videos = self._files.videos(numbers)
-            chunks = [self._files.pieces(column, numbers, videos, begins) for column in self._columns]
+            chunks = [self._files.chunks_of(column, numbers, videos, begins) for column in self._columns]
             read = self._files.reader(chunks)
         for column, column_chunks in zip(self._columns, chunks, strict=True):
-            scratch = None if column.is_direct else np.empty((1, *column.stored), column.field.dtype)
+            scratch = None if column.is_direct else np.empty((1, *column.stored_shape), column.field.dtype)
             for step, video_chunks in enumerate(column_chunks):
                 target = out[column.name][targets[step] : targets[step] + 1]
                 buffer, begin = target if scratch is None else scratch, begins[step]
-                for number, chunk in zip(column.needed(begin), video_chunks, strict=True):
-                    self._read(read, column, chunk, int(numbers[step]), column.part(buffer, number))
+                for number, chunk in zip(column.chunk_range(begin), video_chunks, strict=True):
+                    self._read(read, column, chunk, int(numbers[step]), column.chunk_view(buffer, number))
                 if scratch is not None:
                     column.convert(scratch, begin, target)
 
     @contextlib.contextmanager
-    def _named(self, numbers: np.ndarray) -> Iterator[None]:
-        """Context of looking up videos, which adds their indices to the message of a DamagedError."""
+    def _lookup_errors(self, numbers: np.ndarray) -> Iterator[None]:
+        """Context that adds the indices of the videos that are looked up to the message of a DamagedError."""
         try:
             yield
         except DamagedError as error:
             which = f"video {numbers[0]}" if len(numbers) == 1 else f"videos {numbers.min()} to {numbers.max()}"
             raise DamagedError(f"{error} (looking up {self.options.split} {which}): {_HINT}") from None
 
-    def _read(self, read: Reader, column: Column, piece: Chunk, video: int, target: np.ndarray) -> None:
+    def _read(self, read: Reader, column: Column, chunk: Chunk, video: int, target: np.ndarray) -> None:
         try:
-            data = read(column, piece, target)
-            if self.options.verify == "checksum" and codecs.crc32(data) != piece.crc32:
+            data = read(column, chunk, target)
+            if self.options.verify == "checksum" and codecs.crc32(data) != chunk.crc32:
                 raise DamagedError("its checksum differs")
             if isinstance(data, bytes):
                 codecs.decode_into(column.codec, data, target)
         except (DamagedError, UserError, UnreachableError, OSError) as error:
-            path = self._files.path(shard_name(self._files.shard(piece.shard).shard.name))
+            path = self._files.path(shard_name(self._files.shard(chunk.shard).shard.name))
             where = f"{path}: {column.name} of {self.options.split} video {video} cannot be read ({reason(error)})"
             if isinstance(error, DamagedError):
                 raise DamagedError(f"{where}: {_HINT}") from error
@@ -413,7 +413,7 @@ class Dataset:
 
     def numbers_at(self, positions: np.ndarray, epoch: int = 0, seed: int | None = None) -> np.ndarray:
         """Indices of the videos at these positions of an epoch: shuffled by the seed, or in order if it is None."""
-        return shuffled(seed, epoch, positions, len(self))
+        return epoch_indices(seed, epoch, positions, len(self))
 
     def starts(self, numbers: np.ndarray, bits: np.ndarray) -> np.ndarray | None:
         """First frames of the windows of the videos `numbers` [n], int64 [n], sampled from random `bits`, uint64 [n].
@@ -430,14 +430,15 @@ class Dataset:
         return checked_numbers(indices, len(self), self.options.split)
 
 
-def _joined(datasets: Sequence[Dataset]) -> ConcatDataset:
-    """Concatenation of the datasets. Raises ConfigError if they do not agree in the values of `_facts`."""
+def _concatenate(datasets: Sequence[Dataset]) -> ConcatDataset:
+    """Concatenation of the datasets. Raises ConfigError if they do not agree in the values of `_required_equal`."""
     if not datasets:
         raise ConfigError("path is an empty list, but must name one dataset or more")
-    facts = [dict(_facts(ds)) for ds in datasets]
-    for ds, other in zip(datasets, facts, strict=True):
-        for name in sorted(facts[0].keys() | other.keys()):
-            value, first = other.get(name, "missing"), facts[0].get(name, "missing")
+    first_values = dict(_required_equal(datasets[0]))
+    for ds in datasets:
+        values = dict(_required_equal(ds))
+        for name in sorted(first_values.keys() | values.keys()):
+            value, first = values.get(name, "missing"), first_values.get(name, "missing")
             if value != first:
                 difference = f"{ds.root}: {name} is {value}, but in {datasets[0].root} {first}"
                 raise ConfigError(
@@ -446,7 +447,7 @@ def _joined(datasets: Sequence[Dataset]) -> ConcatDataset:
     return ConcatDataset(datasets)
 
 
-def _facts(ds: Dataset) -> Iterator[tuple[str, Any]]:
+def _required_equal(ds: Dataset) -> Iterator[tuple[str, Any]]:
     """Names and values in which concatenated datasets must agree."""
     yield "split", ds.options.split
     yield "fps", ds.manifest.fps
@@ -455,17 +456,18 @@ def _facts(ds: Dataset) -> Iterator[tuple[str, Any]]:
         yield f"field {name}", f"{field.dtype} {field.axes}, {field.unit or 'no unit'}"
 
 
-def _chosen_split(root: Place, manifest: Manifest, split: str | None) -> str:
+def _select_split(root: Place, manifest: Manifest, split: str | None) -> str:
     splits = manifest.splits
     if split is None and len(splits) != 1 and "train" not in splits:
         raise ConfigError(f"{root} has the splits {', '.join(splits)}: say which, as split=")
-    chosen = split if split is not None else "train" if "train" in splits else next(iter(splits))
-    if chosen not in splits:
-        raise ConfigError(f"{root} has no split {chosen!r}{_nearest(chosen, splits)}")
-    return chosen
+    if split is None:
+        return "train" if "train" in splits else next(iter(splits))
+    if split not in splits:
+        raise ConfigError(f"{root} has no split {split!r}{_suggestion(split, splits)}")
+    return split
 
 
-def chosen_fields(source: str, fields: Mapping[str, Field], patterns: Sequence[str] | str | None) -> tuple[str, ...]:
+def select_fields(source: str, fields: Mapping[str, Field], patterns: Sequence[str] | str | None) -> tuple[str, ...]:
     """Names of the per-video fields that match the patterns; frames and states if `patterns` is None.
 
     Raises ConfigError if a pattern matches no field.
@@ -473,16 +475,16 @@ def chosen_fields(source: str, fields: Mapping[str, Field], patterns: Sequence[s
     names = [name for name, field in fields.items() if field.per_video]
     if patterns is None:
         patterns = [*({"frames"} & fields.keys()), "states/*"]
-    chosen: dict[str, None] = {}
+    selected: dict[str, None] = {}
     for pattern in [patterns] if isinstance(patterns, str) else patterns:
         matches = fnmatch.filter(names, pattern)
         if not matches:
-            raise ConfigError(f"{source} has no field {pattern!r}{_nearest(pattern, names)}")
-        chosen |= dict.fromkeys(matches)
-    return tuple(chosen)
+            raise ConfigError(f"{source} has no field {pattern!r}{_suggestion(pattern, names)}")
+        selected |= dict.fromkeys(matches)
+    return tuple(selected)
 
 
-def _nearest(name: str, names: Sequence[str] | Mapping[str, Any]) -> str:
+def _suggestion(name: str, names: Sequence[str] | Mapping[str, Any]) -> str:
     near = difflib.get_close_matches(name, names, n=1, cutoff=0.4)
     return f": did you mean {near[0]!r}?" if near else f": it has {', '.join(names)}"
 

@@ -42,25 +42,25 @@ class EpochSampler:
         world_size: int | None,
         drop_last: bool,
     ) -> None:
-        rank, world_size = _ranks(rank, world_size)
-        one_of("shuffle", shuffle, ("global", True, False))
-        one_of("drop_last", drop_last, (True, False))
+        rank, world_size = _rank_and_world_size(rank, world_size)
+        check_one_of("shuffle", shuffle, ("global", True, False))
+        check_one_of("drop_last", drop_last, (True, False))
         if min(batch_size, world_size) < 1 or not 0 <= rank < world_size:
             raise ConfigError("batch_size and world_size must be 1 or more, and rank from 0 to world_size - 1")
         self.videos, self.seed, self.shuffle, self.epochs = videos, seed, bool(shuffle), epochs
         self.rank, self.world_size, self.global_size = rank, world_size, batch_size * world_size
-        self.least = self.global_size if drop_last else 1  # the fewest videos in a global batch
+        self.min_videos = self.global_size if drop_last else 1  # in a global batch
         self.epoch = self.position = 0
         self._check_size()
 
     def _check_size(self) -> None:
-        if self.videos < self.least:
+        if self.videos < self.min_videos:
             raise ConfigError(f"{self.global_size} videos make a global batch, but there are only {self.videos}")
 
     def __len__(self) -> int:
         """The number of global batches in one epoch."""
         full, remainder = divmod(self.videos, self.global_size)
-        return full + (remainder >= self.least)
+        return full + (remainder >= self.min_videos)
 
     def state_dict(self) -> dict[str, int | bool | None]:
         """Current epoch and position, and the values that determine the order."""
@@ -83,10 +83,10 @@ class EpochSampler:
         epoch, position = state["epoch"], state["position"]
         if not (isinstance(epoch, int) and isinstance(position, int) and min(epoch, position) >= 0):
             raise ConfigError(f"the state has epoch and position {(epoch, position)}, but must have whole numbers")
-        self.epoch, self.position = self._resolved(epoch, position)
+        self.epoch, self.position = self._wrap(epoch, position)
 
-    def over(self, videos: int) -> "EpochSampler":
-        """Sampler with the same options for another number of videos, at its beginning."""
+    def with_videos(self, videos: int) -> "EpochSampler":
+        """Sampler at its beginning with the same options for another number of videos."""
         other = copy.copy(self)
         other.videos, other.epoch, other.position = videos, 0, 0
         other._check_size()
@@ -99,17 +99,17 @@ class EpochSampler:
         while end is None or epoch < end:
             size = min(self.global_size, self.videos - position)
             yield GlobalBatch(epoch, position, size)
-            epoch, position = self._resolved(epoch, position + size)
+            epoch, position = self._wrap(epoch, position + size)
 
-    def passed(self, step: GlobalBatch) -> None:
+    def advance(self, step: GlobalBatch) -> None:
         """Move the current position to the end of a global batch."""
-        self.epoch, self.position = self._resolved(step.epoch, step.position + step.size)
+        self.epoch, self.position = self._wrap(step.epoch, step.position + step.size)
 
-    def _resolved(self, epoch: int, position: int) -> tuple[int, int]:
-        """Epoch and position of the next global batch, from a position that may be at the end of an epoch."""
-        return (epoch, position) if self.videos - position >= self.least else (epoch + 1, 0)
+    def _wrap(self, epoch: int, position: int) -> tuple[int, int]:
+        """Epoch and position of the next global batch; a position near the end of an epoch wraps to the next epoch."""
+        return (epoch, position) if self.videos - position >= self.min_videos else (epoch + 1, 0)
 
-    def share(self, step: GlobalBatch) -> np.ndarray:
+    def rank_positions(self, step: GlobalBatch) -> np.ndarray:
         """Positions of this rank's slice of a global batch, int64 [n]."""
         begin, end = (step.size * rank // self.world_size for rank in (self.rank, self.rank + 1))
         return step.position + np.arange(begin, end)
@@ -119,12 +119,12 @@ class EpochSampler:
         """Seed of the shuffling; None without shuffling."""
         return self.seed if self.shuffle else None
 
-    def bits(self, step: GlobalBatch, positions: np.ndarray) -> np.ndarray:
+    def window_bits(self, step: GlobalBatch, positions: np.ndarray) -> np.ndarray:
         """Random bits for the window at each position, uint64."""
         return hashed(WINDOWS, self.seed, step.epoch, positions)
 
 
-def _ranks(rank: int | None, world_size: int | None) -> tuple[int, int]:
+def _rank_and_world_size(rank: int | None, world_size: int | None) -> tuple[int, int]:
     """Rank and world size: the arguments, else RANK and WORLD_SIZE as torchrun sets them, else 0 and 1."""
     if rank is None and world_size is None and {"RANK", "WORLD_SIZE"} <= os.environ.keys():
         values = os.environ["RANK"], os.environ["WORLD_SIZE"]
@@ -134,7 +134,7 @@ def _ranks(rank: int | None, world_size: int | None) -> tuple[int, int]:
     return 0 if rank is None else rank, 1 if world_size is None else world_size
 
 
-def one_of(name: str, value: Any, allowed: tuple) -> None:
+def check_one_of(name: str, value: Any, allowed: tuple) -> None:
     """Raise ConfigError unless the value is one of the allowed ones."""
     if value not in allowed:
         raise ConfigError(f"{name} is {value!r}, but must be one of {', '.join(map(str, allowed))}")
@@ -144,7 +144,7 @@ def one_of(name: str, value: Any, allowed: tuple) -> None:
 ORDER, WINDOWS, SOURCES = 0, 1, 2
 
 
-def shuffled(seed: int | None, epoch: int, positions: np.ndarray, count: int) -> np.ndarray:
+def epoch_indices(seed: int | None, epoch: int, positions: np.ndarray, count: int) -> np.ndarray:
     """Indices of the videos at these positions of an epoch: shuffled by the seed, or in order if it is None."""
     return positions if seed is None else order(seed, epoch, positions, count)
 

@@ -58,7 +58,7 @@ def mix(datasets: Mapping[str, VideoReader], weights: Weights | None = None) -> 
     for name, other in datasets.items():
         if isinstance(other, Mixture):
             raise ConfigError(f"dataset {name} is a mixture, but must be a dataset: mix those that it consists of")
-        _compare(first, datasets[first], name, other)
+        _check_equal_fields(first, datasets[first], name, other)
     return Mixture(datasets, _shares(list(datasets), weights))
 
 
@@ -79,21 +79,20 @@ class Mixture:
     def __init__(self, datasets: Mapping[str, VideoReader], shares: Sequence[int]) -> None:
         self.datasets, self.shares = dict(datasets), list(shares)
         self.fields = next(iter(datasets.values())).fields
-        self._joined = ConcatDataset(list(datasets.values()))
-        sizes = self._joined.sizes
-        self._turns = turns(self.shares, sizes.tolist())
-        counts = np.cumsum(self._turns[:, None] == np.arange(len(shares)), axis=0)
-        self._taken = np.concatenate(
-            [np.zeros_like(counts[:1]), counts]
-        )  # videos of each dataset before each position of the period
-        is_full = len(self._turns) == sum(shares)
+        self._concatenation = ConcatDataset(list(datasets.values()))
+        sizes = self._concatenation.sizes
+        self._schedule = tijdeman_schedule(self.shares, sizes.tolist())
+        counts = np.cumsum(self._schedule[:, None] == np.arange(len(shares)), axis=0)
+        # Videos of each dataset before each position of the period, and in a whole epoch.
+        self._counts_before = np.concatenate([np.zeros_like(counts[:1]), counts])
+        is_full = len(self._schedule) == sum(shares)
         periods = min(size // share for size, share in zip(sizes.tolist(), shares, strict=True)) if is_full else 0
-        remainder = (self._taken <= sizes - periods * self._taken[-1]).all(axis=1).sum() - 1
-        self._count = periods * len(self._turns) + int(remainder)
-        self._each = periods * self._taken[-1] + self._taken[remainder]  # videos of each dataset in an epoch
+        remainder = (self._counts_before <= sizes - periods * self._counts_before[-1]).all(axis=1).sum() - 1
+        self._length = periods * len(self._schedule) + int(remainder)
+        self._epoch_counts = periods * self._counts_before[-1] + self._counts_before[remainder]
 
     def __len__(self) -> int:
-        return self._count
+        return self._length
 
     def __getitem__(self, key: Key) -> Batch:
         """One video for an integer, or a batch of videos for a slice or a sequence of integers."""
@@ -110,7 +109,7 @@ class Mixture:
     @property
     def snapshot(self) -> Snapshot:
         """Snapshots of the datasets, in their order."""
-        return self._joined.snapshot
+        return self._concatenation.snapshot
 
     def at(self, snapshot: Snapshot) -> "Mixture":
         """Mixture of the same datasets at earlier snapshots.
@@ -134,11 +133,11 @@ class Mixture:
 
     def empty(self, count: int) -> Batch:
         """Uninitialised batch of `count` videos."""
-        return self._joined.empty(count)
+        return self._concatenation.empty(count)
 
     def fill(self, out: Batch, rows: Numbers, indices: Numbers, starts: Numbers | None = None) -> None:
         """Read videos of the concatenated datasets into these rows of `out`. Parameters are those of `Dataset.fill`."""
-        self._joined.fill(out, rows, indices, starts)
+        self._concatenation.fill(out, rows, indices, starts)
 
     def numbers_at(self, positions: np.ndarray, epoch: int = 0, seed: int | None = None) -> np.ndarray:
         """Indices into the concatenated datasets, int64 [n], of the videos at these positions of an epoch.
@@ -146,42 +145,43 @@ class Mixture:
         Each dataset is shuffled by a seed of its own, or read in order if `seed` is None. An epoch continues in each
         dataset where the previous epoch stopped.
         """
-        periods, turn = np.divmod(positions, len(self._turns))
-        owners, numbers = self._turns[turn], np.empty(len(positions), np.int64)
+        periods, steps = np.divmod(positions, len(self._schedule))
+        owners, numbers = self._schedule[steps], np.empty(len(positions), np.int64)
         for owner, rows in groups_of(owners):
-            offset = epoch * self._each[owner] + periods[rows] * self._taken[-1, owner] + self._taken[turn[rows], owner]
-            source, cycles = self._joined.datasets[owner], offset // self._joined.sizes[owner]
+            counts = self._counts_before[:, owner]
+            offset = epoch * self._epoch_counts[owner] + periods[rows] * counts[-1] + counts[steps[rows]]
+            source, cycles = self._concatenation.datasets[owner], offset // self._concatenation.sizes[owner]
             source_seed = None if seed is None else int(hashed(SOURCES, seed, owner)[0])
             for cycle in np.unique(cycles):
                 selected = rows[cycles == cycle]
                 indices = source.numbers_at(offset[cycles == cycle] % len(source), int(cycle), source_seed)
-                numbers[selected] = self._joined.firsts[owner] + indices
+                numbers[selected] = self._concatenation.firsts[owner] + indices
         return numbers
 
     def starts(self, numbers: np.ndarray, bits: np.ndarray) -> np.ndarray | None:
         """First frame of each video's window, sampled from random bits; None if windows are not random."""
-        return self._joined.starts(numbers, bits)
+        return self._concatenation.starts(numbers, bits)
 
     def source_of(self, positions: Numbers) -> list[str]:
         """Name of the dataset at each of these positions, which is the same in every epoch."""
         names = list(self.datasets)
-        return [names[owner] for owner in self._turns[np.asarray(positions) % len(self._turns)]]
+        return [names[owner] for owner in self._schedule[np.asarray(positions) % len(self._schedule)]]
 
 
-def turns(shares: Sequence[int], sizes: Sequence[int]) -> np.ndarray:
+def tijdeman_schedule(shares: Sequence[int], sizes: Sequence[int]) -> np.ndarray:
     """Position of the dataset at each step of a period of sum(shares) steps, shorter if a dataset runs out of videos.
 
     Of the datasets that are due, the one with the earliest deadline comes next (Tijdeman 1980). This keeps the count of
     each of K datasets within 1 - 1 / (2K - 2) of its share. Integer arithmetic makes the result the same everywhere.
     """
     period, scale, unit = sum(shares), max(2 * len(shares) - 2, 1), math.lcm(*shares)
-    taken, schedule = [0] * len(shares), []
+    counts, schedule = [0] * len(shares), []
     for length in range(1, period + 1):
-        behind = [k for k, share in enumerate(shares) if scale * (share * length - period * taken[k]) >= period]
-        owner = min(behind, key=lambda k: (scale - 1 + scale * taken[k]) * (unit // shares[k]))
-        if taken[owner] == sizes[owner]:
+        due = [k for k, share in enumerate(shares) if scale * (share * length - period * counts[k]) >= period]
+        owner = min(due, key=lambda k: (scale - 1 + scale * counts[k]) * (unit // shares[k]))
+        if counts[owner] == sizes[owner]:
             break
-        taken[owner] += 1
+        counts[owner] += 1
         schedule.append(owner)
     return np.array(schedule)
 
@@ -211,7 +211,7 @@ def _fraction(name: str, weight: float) -> Fraction:
     return fraction
 
 
-def _compare(first: str, one: VideoReader, name: str, other: VideoReader) -> None:
+def _check_equal_fields(first: str, one: VideoReader, name: str, other: VideoReader) -> None:
     """Raise ConfigError if videos of two datasets do not fit in one batch."""
     one_batch, other_batch = one.empty(1), other.empty(1)
     for field in sorted(one_batch.keys() ^ other_batch.keys()):

@@ -12,9 +12,8 @@ Batch = dict[str, np.ndarray]
 Numbers = Sequence[int] | np.ndarray
 Key = SupportsIndex | slice | Numbers  # index of one video, or of several
 Snapshot: TypeAlias = "str | list[Snapshot]"  # of one dataset, or of each of several
-LoaderState: TypeAlias = (
-    "Mapping[str, int | bool | str | list[Snapshot] | list[int] | None]"  # values that JSON can store
-)
+# Values that JSON can store.
+LoaderState: TypeAlias = "Mapping[str, int | bool | str | list[Snapshot] | list[int] | None]"
 FieldStats = dict[str, dict[str, list[float] | None]]  # mean, std, min and max of each component, by field
 
 
@@ -82,7 +81,7 @@ def checked_numbers(indices: Numbers, count: int, whose: str) -> np.ndarray:
     return np.where(numbers < 0, numbers + count, numbers).astype(np.int64)
 
 
-def filled(source: VideoReader, numbers: np.ndarray, starts: Numbers | None, out: Batch | None) -> Batch:
+def read_batch(source: VideoReader, numbers: np.ndarray, starts: Numbers | None, out: Batch | None) -> Batch:
     """Batch of the source's videos with these indices, in `out` if given. Raises ConfigError if `out` does not fit."""
     if out is None:
         out = source.empty(len(numbers))
@@ -95,6 +94,6 @@ def filled(source: VideoReader, numbers: np.ndarray, starts: Numbers | None, out
 def _check_out(out: Batch, like: Batch, count: int) -> None:
     """Raise ConfigError unless `out` has the fields of the batch `like`, with room for `count` videos."""
     for name, values in like.items():
-        given, shape = out.get(name), (count, *values.shape[1:])
-        if given is None or given.shape != shape or given.dtype != values.dtype or not given.flags.c_contiguous:
+        array, shape = out.get(name), (count, *values.shape[1:])
+        if array is None or array.shape != shape or array.dtype != values.dtype or not array.flags.c_contiguous:
             raise ConfigError(f"out[{name!r}] must be a contiguous {values.dtype} array of shape {shape}")

@@ -9,20 +9,20 @@ GAP, GREY = 2, 170  # width of a frame's border in px, and its sRGB value
 SMALLEST = 96  # px; smaller frames are enlarged by integer factors, which keeps pixels sharp
 
 
-def shown(frames: int) -> np.ndarray:
+def sheet_frames(frames: int) -> np.ndarray:
     """Indices of the frames that a sheet shows, evenly spaced from the first to the last."""
     return np.unique(np.linspace(0, frames - 1, COLUMNS).round().astype(int))
 
 
 def contact_sheet(frames: np.ndarray) -> np.ndarray:
     """Contact sheet [H, W, 3] of videos [n, T, H, W, 3], uint8."""
-    rows = [np.concatenate([framed(video[t]) for t in shown(len(video))], axis=1) for video in frames]
+    rows = [np.concatenate([add_border(video[t]) for t in sheet_frames(len(video))], axis=1) for video in frames]
     return np.concatenate(rows)
 
 
-def reduced(video: np.ndarray) -> np.ndarray:
+def downsample(video: np.ndarray) -> np.ndarray:
     """Frames of a video [T, H, W, 3] for a sheet, averaged over blocks of pixels to at most LARGEST pixels a side."""
-    frames = video[shown(len(video))]
+    frames = video[sheet_frames(len(video))]
     factor = -(-max(frames.shape[1:3]) // LARGEST)
     if factor == 1:
         return frames
@@ -30,12 +30,12 @@ def reduced(video: np.ndarray) -> np.ndarray:
     return np.stack([cv2.resize(frame, size, interpolation=cv2.INTER_AREA) for frame in frames])
 
 
-def enlarged(image: np.ndarray) -> np.ndarray:
+def upscale(image: np.ndarray) -> np.ndarray:
     """Image [H, W] or [H, W, 3] with its pixels repeated by an integer factor, so that no side is below SMALLEST."""
     factor = -(-SMALLEST // min(image.shape[:2]))
     return np.repeat(np.repeat(image, factor, axis=0), factor, axis=1)
 
 
-def framed(frame: np.ndarray) -> np.ndarray:
-    """Enlarged frame with a grey border."""
-    return np.pad(enlarged(frame), [(GAP, GAP), (GAP, GAP), (0, 0)], constant_values=GREY)
+def add_border(frame: np.ndarray) -> np.ndarray:
+    """Upscaled frame with a grey border."""
+    return np.pad(upscale(frame), [(GAP, GAP), (GAP, GAP), (0, 0)], constant_values=GREY)

@@ -12,7 +12,7 @@ import numpy as np
 from PIL import Image
 
 from gen2d.core.errors import FolderError
-from gen2d.media.contact_sheet import framed
+from gen2d.media.contact_sheet import add_border
 from gen2d.storage.atomic import publish
 
 WEBP_SIDE = 16383  # px, the largest height and width of the format
@@ -38,7 +38,7 @@ def writing(out: Path) -> Iterator[None]:
 def animate(path: Path, frames: np.ndarray, fps: float) -> None:
     """Write videos [n, T, H, W, 3] side by side as a lossless animated WebP that loops; raises OSError."""
     columns = int(np.ceil(np.sqrt(len(frames))))
-    tiles = [np.stack([framed(frame) for frame in video]) for video in frames]
+    tiles = [np.stack([add_border(frame) for frame in video]) for video in frames]
     tiles += [np.zeros_like(tiles[0])] * (-len(tiles) % columns)
     rows = [np.concatenate(tiles[i : i + columns], axis=2) for i in range(0, len(tiles), columns)]
     film = np.concatenate(rows, axis=1)

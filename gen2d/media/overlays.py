@@ -5,9 +5,9 @@ from collections.abc import Mapping
 import cv2
 import numpy as np
 
-from gen2d.media.contact_sheet import enlarged
+from gen2d.media.contact_sheet import upscale
 
-SEEN, WHOLE = (255, 255, 255), (255, 140, 0)  # colours of visible and amodal boxes
+VISIBLE, AMODAL = (255, 255, 255), (255, 140, 0)  # colours of visible and amodal boxes
 VideoFields = Mapping[str, np.ndarray]
 
 
@@ -27,20 +27,20 @@ def masks_overlay(frame: VideoFields) -> np.ndarray:
 
 def amodal_overlay(frame: VideoFields) -> np.ndarray:
     """Frame with the outline of each object's amodal mask."""
-    image = enlarged(frame["frames"])
+    image = upscale(frame["frames"])
     height, width = frame["frames"].shape[:2]
     palette = colors(256)
     for slot, packed in enumerate(frame["masks/amodal"]):
-        mask = enlarged(np.unpackbits(packed)[: height * width].reshape(height, width))
+        mask = upscale(np.unpackbits(packed)[: height * width].reshape(height, width))
         image[(mask > 0) & (cv2.erode(mask, np.ones((3, 3), np.uint8)) == 0)] = palette[slot + 1]
     return image
 
 
 def boxes_overlay(frame: VideoFields) -> np.ndarray:
     """Frame with a white box around the visible part of each object and an orange one around all of it."""
-    image = enlarged(frame["frames"])
+    image = upscale(frame["frames"])
     factor = len(image) // len(frame["frames"])
-    for name, color in (("boxes/amodal", WHOLE), ("boxes/visible", SEEN)):
+    for name, color in (("boxes/amodal", AMODAL), ("boxes/visible", VISIBLE)):
         for left, top, right, bottom in np.round(frame[name] * factor).astype(int).tolist():
             if right > left:
                 cv2.rectangle(image, (left, top), (right - 1, bottom - 1), color)
@@ -57,7 +57,7 @@ def flow_overlay(frame: VideoFields) -> np.ndarray:
 
 def tracks_overlay(frame: VideoFields) -> np.ndarray:
     """Frame with the visible track points."""
-    image = enlarged(frame["frames"])
+    image = upscale(frame["frames"])
     factor, palette = len(image) // len(frame["frames"]), colors(256)
     for number, (point, visible) in enumerate(zip(frame["tracks/points"], frame["tracks/visible"], strict=True)):
         if visible:

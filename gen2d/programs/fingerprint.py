@@ -42,7 +42,7 @@ HARMLESS = (
 
 def fingerprint(rollout: Rollout) -> dict[str, Any]:
     """Fingerprint of the datasets of a config; it is the same for all its splits and any number of devices."""
-    return machine(rollout) | {"programs": _of_splits(rollout)}
+    return machine(rollout) | {"programs": _program_hashes(rollout)}
 
 
 def machine(rollout: Rollout) -> dict[str, Any]:
@@ -53,36 +53,28 @@ def machine(rollout: Rollout) -> dict[str, Any]:
     return {"jaxlib": version("jaxlib"), "device": kind, "batch_size": rollout.batch_size, "xla_flags": " ".join(flags)}
 
 
-def _of_splits(rollout: Rollout) -> dict[str, str]:
+def _program_hashes(rollout: Rollout) -> dict[str, str]:
     """Hashes of all programs, by name.
 
     If a split has its own look or physics, the names of its programs are prefixed with the split's name.
     """
-    config, hashes, hashed = rollout.config, {}, set()
+    config, names, hashes = rollout.config, {}, {}
     for name in [split.name for split in config.splits] or [""]:
-        split_config = config.of_split(name)
-        if split_config not in hashed:
-            hashed.add(split_config)
-            programs = _remembered(rollout if split_config == config else Rollout(split_config, rollout.devices[:1]))
-            hashes |= {
-                f"{name}.{kind}" if split_config != config else kind: digest for kind, digest in programs.items()
-            }
+        names.setdefault(config.of_split(name), name)
+    for split_config, name in names.items():
+        if split_config == config:
+            hashes |= _cached_hashes(rollout)
+        else:
+            programs = _cached_hashes(Rollout(split_config, rollout.devices[:1]))
+            hashes |= {f"{name}.{kind}": digest for kind, digest in programs.items()}
     return hashes
 
 
-def _remembered(rollout: Rollout) -> dict[str, str]:
+def _cached_hashes(rollout: Rollout) -> dict[str, str]:
     """Hashes of a config's programs, cached per version of the sources because tracing is slow."""
     folder = jax.config.values["jax_compilation_cache_dir"]
-    platform = rollout.devices[0].platform
-    key = [
-        rollout.config.recipe(),
-        sources(),
-        version("jax"),
-        version("jaxlib"),
-        platform,
-        rollout.batch_size,
-        rollout.slice,
-    ]
+    platform, versions = rollout.devices[0].platform, [version("jax"), version("jaxlib")]
+    key = [rollout.config.recipe(), sources(), *versions, platform, rollout.batch_size, rollout.slice]
     path = pathlib.Path(folder or "") / "fingerprints" / sha256(as_json(key))
     try:
         cached = parsed(read_bytes(path, 10**5)) if folder else None
@@ -90,7 +82,7 @@ def _remembered(rollout: Rollout) -> dict[str, str]:
         cached = None
     if cached is not None and all(isinstance(digest, str) for digest in cached.values()):
         return cached
-    hashes = _hashes(rollout)
+    hashes = _compute_hashes(rollout)
     if folder:
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -100,7 +92,7 @@ def _remembered(rollout: Rollout) -> dict[str, str]:
     return hashes
 
 
-def _hashes(rollout: Rollout) -> dict[str, str]:
+def _compute_hashes(rollout: Rollout) -> dict[str, str]:
     hashes = {name: sha256(canonical(text).encode()) for name, text in rollout.lowered().items()}
     if rollout.config.annotations.simulated.captions:
         hashes["captions"] = code_hash(caption)
@@ -115,7 +107,7 @@ def canonical(text: str) -> str:
     """Text of a lowered program with functions renamed to numbers and names of arguments and results removed."""
     names = re.findall(r"func\.func (?:public |private )?@([\w.$-]+)\(", text)
     numbers = {name: f"@f{number}" for number, name in enumerate(dict.fromkeys(names))}
-    text = re.sub(r"@([\w.$-]+)", lambda found: numbers.get(found[1], found[0]), text)
+    text = re.sub(r"@([\w.$-]+)", lambda match: numbers.get(match[1], match[0]), text)
     text = re.sub(r'jax\.(?:result_info|arg_info) = "[^"]*"', "", text)
     return re.sub(r"^module @\S+", "module", text, count=1, flags=re.M)
 

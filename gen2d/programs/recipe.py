@@ -34,8 +34,8 @@ def config_from(root: Place, identity: Mapping[str, Any], trust: Trust = ()) -> 
     A family or look from a user's file is loaded from the copy in the dataset, never from another file of that name.
     Raises ConfigError if the config cannot be used here, and UntrustedError if it needs code that is not trusted.
     """
-    config = identity["config"]
-    copies = {path: copy for path, copy in _copies(root, config).items() if sha256(copy[1]) in _hashes(config)}
+    config, hashes = identity["config"], _config_hashes(identity["config"])
+    copies = {path: copy for path, copy in _stored_copies(root, config).items() if sha256(copy[1]) in hashes}
     check_trusted({path: content for path, (_, content) in copies.items()}, trust, root)
     try:
         return load_config(config | {"seed": identity["seed"]}, copies=StoredCopies(copies.values()))
@@ -43,15 +43,15 @@ def config_from(root: Place, identity: Mapping[str, Any], trust: Trust = ()) -> 
         raise ConfigError(f"{root}: its config cannot be used ({error})") from None
 
 
-def _hashes(value: Any) -> set[str]:
+def _config_hashes(value: Any) -> set[str]:
     """All sha256 in a config."""
     if not isinstance(value, Mapping):
         return set()
     own = {value["sha256"]} if isinstance(value.get("sha256"), str) else set()
-    return own.union(*(_hashes(part) for part in value.values()))
+    return own.union(*(_config_hashes(part) for part in value.values()))
 
 
-def _copies(root: Place, config: Mapping[str, Any]) -> dict[str, tuple[str, bytes]]:
+def _stored_copies(root: Place, config: Mapping[str, Any]) -> dict[str, tuple[str, bytes]]:
     """Copies of user files in the dataset: the name in the config and the content, by path."""
     copies = {}
     for path, name in own_files(config).items():

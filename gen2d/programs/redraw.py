@@ -133,14 +133,14 @@ def render(
     >>> frames = gen2d.render(ds, [0, 1], height=256, width=256, look="shaded")
     >>> masks = gen2d.render(ds, range(8), fields=["masks/instance"])["masks/instance"]
     """
-    base, config, numbers = _recipes(ds, indices, height, width, look, overrides, fields, trust)
+    base, config, numbers = _configs_and_numbers(ds, indices, height, width, look, overrides, fields, trust)
     if config.image.exposure and states is not None:
         raise ConfigError("states have no motion between frames: image.exposure must be 0 where they are given")
     if config.image.exposure:
-        rendered = _again(ds, config, numbers)
+        rendered = _regenerate(ds, config, numbers)
     else:
         settings = _Settings(base, config)
-        rendered = _compiled(_pictures, settings)(_stages(ds, settings, numbers, states))
+        rendered = _compile(_render_frames, settings)(_render_scenes(ds, settings, numbers, states))
     if fields is None:
         return rendered["frames"]
     missing = [name for name in fields if name not in rendered]
@@ -198,9 +198,9 @@ def render_soft(
     if not 0 <= sigma <= 1000:
         raise ConfigError(f"sigma is {sigma!r}, but must be a number of pixels from 0 to 1000")
     plain = [*overrides, "image.exposure=0", "image.noise=0"]
-    base, config, numbers = _recipes(ds, indices, height, width, look, plain, None, trust)
+    base, config, numbers = _configs_and_numbers(ds, indices, height, width, look, plain, None, trust)
     settings = _Settings(base, config)
-    return _compiled(_soft, settings, float(sigma))(_stages(ds, settings, numbers, states))
+    return _compile(_render_soft_frames, settings, float(sigma))(_render_scenes(ds, settings, numbers, states))
 
 
 def simulate_again(
@@ -262,15 +262,15 @@ def simulate_again(
     config = load_config(base, changes)
     if not set(matched.VIOLATIONS).isdisjoint(config.matched.change or ()):
         raise ConfigError(f"{ds.root}: matched.change has violations, which cannot be simulated again from a scene")
-    simulated = _compiled(_simulated, _Settings(base, config))
-    columns = simulated(_stored(ds, numbers), _key_words(ds), jnp.asarray(numbers, jnp.uint32))
+    simulated = _compile(_simulate_columns, _Settings(base, config))
+    columns = simulated(_with_all_fields(ds).batch(numbers), _seed_words(ds), jnp.asarray(numbers, jnp.uint32))
     return columns | {"time": jnp.arange(config.video.frames) / config.video.fps}
 
 
 # ---- Configs
 
 
-def _recipes(
+def _configs_and_numbers(
     ds: Dataset,
     indices: Numbers,
     height: int | None,
@@ -282,39 +282,28 @@ def _recipes(
 ) -> tuple[Config, Config, np.ndarray]:
     """The dataset's config, the config of the requested frames, and the numbers of the videos."""
     base, numbers = config_of(ds, (), trust), ds.numbers(np.atleast_1d(indices))
-    config = load_config(base, [*overrides, *_changed(height, width), "storage.frames=video"])
-    changed: dict[str, Any] = {} if look is None else {"look": named(look)}
-    if switched_on := _asked(fields, config.annotations):
-        changed["annotations"] = config.annotations.plain() | switched_on
-    if changed:
-        config = load_config(config.plain() | changed, copies=config.copies)
+    size = [f"video.{name}={value}" for name, value in (("height", height), ("width", width)) if value is not None]
+    config = load_config(base, [*overrides, *size, "storage.frames=video"])
+    changes: dict[str, Any] = {} if look is None else {"look": named(look)}
+    if annotation_changes := _annotation_changes(fields, config.annotations):
+        changes["annotations"] = config.annotations.plain() | annotation_changes
+    if changes:
+        config = load_config(config.plain() | changes, copies=config.copies)
     return base, config, numbers
 
 
-def _changed(height: int | None, width: int | None) -> list[str]:
-    return [f"video.{name}={value}" for name, value in (("height", height), ("width", width)) if value is not None]
-
-
-def _asked(fields: Sequence[str] | None, section: Annotations) -> dict[str, Any]:
+def _annotation_changes(fields: Sequence[str] | None, section: Annotations) -> dict[str, Any]:
     """Options that switch on the annotations of these fields."""
     requested = set(fields or ())
     off = [plugin for plugin in section.pixels if not plugin.options and requested & plugin.contract.fields.keys()]
     return {plugin.name: plugin.contract.usual for plugin in off}
 
 
-def _check_frames(columns: FieldColumns) -> None:
-    frames = {
-        len(np.shape(columns[name])) and np.shape(columns[name])[1] for name in ("states/position", "camera/scale")
-    }
-    if len(frames) > 1:
-        raise ConfigError("states and camera have other numbers of frames: give all that simulate_again returned")
-
-
 # ---- From fields to records
 
 
 @functools.lru_cache(maxsize=16)
-def _whole(ds: Dataset) -> Dataset:
+def _with_all_fields(ds: Dataset) -> Dataset:
     """The same dataset with every field but images and text."""
     fields = ds.manifest.fields
     names = tuple(name for name, f in fields.items() if f.per_video and not f.is_image and not f.is_text)
@@ -323,14 +312,10 @@ def _whole(ds: Dataset) -> Dataset:
     return Dataset(ds.root, ds.manifest, options.within(frames, ds.manifest.sizes["T"]))
 
 
-def _stored(ds: Dataset, numbers: np.ndarray) -> dict[str, np.ndarray]:
-    return _whole(ds).batch(numbers)
-
-
 def from_columns(cls: type, columns: FieldColumns) -> Any:
     """A record of class `cls` from arrays by stored name."""
-    known = axes.described(cls).items()
-    return cls(**{attribute: jnp.asarray(columns[name]) for name, (attribute, _) in known if name in columns})
+    fields = axes.described(cls).items()
+    return cls(**{attribute: jnp.asarray(columns[name]) for name, (attribute, _) in fields if name in columns})
 
 
 def scene_of(columns: FieldColumns) -> Scene:
@@ -339,7 +324,7 @@ def scene_of(columns: FieldColumns) -> Scene:
     return Scene(from_columns(Objects, columns), jnp.asarray(columns["world/gravity"]), joints)
 
 
-def _key_words(ds: Dataset) -> np.ndarray:
+def _seed_words(ds: Dataset) -> np.ndarray:
     return keys_module.seed_words(ds.manifest.seed, zlib.crc32(ds.options.split.encode()))
 
 
@@ -358,60 +343,62 @@ class _Settings:
     def plan(self) -> FramePlan:
         return render_module.plan_of(self.config, self.layout)
 
-    def resized(self, view: CameraView) -> CameraView:
+    def rescale(self, view: CameraView) -> CameraView:
         """A stored view, scaled to frames of another size so that everything stays in view."""
         old, new = self.base.video, self.config.video
         return view._replace(scale=view.scale * min(new.height / old.height, new.width / old.width))
 
 
-def _stages(ds: Dataset, settings: "_Settings", numbers: np.ndarray, states: FieldColumns | None) -> RenderScene:
+def _render_scenes(ds: Dataset, settings: _Settings, numbers: np.ndarray, states: FieldColumns | None) -> RenderScene:
     """Render scenes of these videos; `states` replace the stored ones."""
-    columns = dict(_stored(ds, numbers)) | dict(states or {})
-    _check_frames(columns)
-    return _compiled(_staged, settings)(columns, _key_words(ds), jnp.asarray(numbers, jnp.uint32))
+    columns: FieldColumns = {**_with_all_fields(ds).batch(numbers), **(states or {})}
+    shapes = [np.shape(columns[name]) for name in ("states/position", "camera/scale")]
+    if len({len(shape) and shape[1] for shape in shapes}) > 1:
+        raise ConfigError("states and camera have other numbers of frames: give all that simulate_again returned")
+    return _compile(_build_render_scenes, settings)(columns, _seed_words(ds), jnp.asarray(numbers, jnp.uint32))
 
 
-def _staged(columns: FieldColumns, words: Array, numbers: Array, settings: _Settings) -> RenderScene:
+def _build_render_scenes(columns: FieldColumns, words: Array, numbers: Array, settings: _Settings) -> RenderScene:
     config, plan = settings.config, settings.plan
     scene, states = scene_of(columns), from_columns(State, columns)
-    view = settings.resized(CameraView(*(jnp.asarray(columns[f"camera/{name}"]) for name in CameraView._fields)))
+    view = settings.rescale(CameraView(*(jnp.asarray(columns[f"camera/{name}"]) for name in CameraView._fields)))
 
-    def staged(key: Array, scene: Scene, states: State, view: CameraView) -> RenderScene:
+    def build(key: Array, scene: Scene, states: State, view: CameraView) -> RenderScene:
         return render_module.render_scene(key, config, plan, scene, states, view)
 
-    return jax.vmap(staged)(sets_module.keys_of(words, numbers, settings.base.matched), scene, states, view)
+    return jax.vmap(build)(sets_module.keys_of(words, numbers, settings.base.matched), scene, states, view)
 
 
-def _pictures(stages: RenderScene, settings: _Settings) -> dict[str, Array]:
+def _render_frames(render_scenes: RenderScene, settings: _Settings) -> dict[str, Array]:
     """Frames and annotations, from a separate program as in a run, so that they round alike."""
-    return render_module.render_frames(stages, settings.plan, settings.config.annotations)
+    return render_module.render_frames(render_scenes, settings.plan, settings.config.annotations)
 
 
-def _soft(stages: RenderScene, settings: _Settings, sigma: float) -> Array:
-    return jax.vmap(lambda stage: draw_soft(stage, settings.plan, sigma))(stages)
+def _render_soft_frames(render_scenes: RenderScene, settings: _Settings, sigma: float) -> Array:
+    return jax.vmap(lambda render_scene: draw_soft(render_scene, settings.plan, sigma))(render_scenes)
 
 
-def _simulated(columns: FieldColumns, words: Array, numbers: Array, settings: _Settings) -> dict[str, Array]:
+def _simulate_columns(columns: FieldColumns, words: Array, numbers: Array, settings: _Settings) -> dict[str, Array]:
     config, layout = settings.config, settings.layout
     scene = scene_of(columns)
     first = jax.tree.map(lambda a: a[:, 0], from_columns(State, columns))
     steps = substeps(config.video.fps, config.physics.substeps, config.physics.max_step)
     rules = solver_params(config.physics, config.video.fps, steps)
-    kept = dataclasses.replace(save_at(config, layout), between=False)
+    saved = dataclasses.replace(save_at(config, layout), between=False)
     start = axes.to_device(scene), axes.to_device(first)
-    trajectory = axes.to_stored(simulate(*start, layout, rules, config.video.frames, steps, kept, sparse=on_cpu()))
+    trajectory = axes.to_stored(simulate(*start, layout, rules, config.video.frames, steps, saved, sparse=on_cpu()))
     keys = sets_module.keys_of(words, numbers, settings.base.matched)
     view = jax.vmap(lambda key, states: render_module.view_of(key, config, layout, states))(keys, trajectory.states)
     return axes.columns(trajectory) | render_module.camera_columns(view)
 
 
 @functools.lru_cache(maxsize=16)  # a program takes up to thousands of memory maps, of which a process has some 60,000
-def _compiled(program: Callable, settings: _Settings, *more: float) -> Callable:
+def _compile(program: Callable, settings: _Settings, *more: float) -> Callable:
     """One of the functions above, compiled for these settings."""
     return jax.jit(lambda *arrays: program(*arrays, settings, *more))
 
 
-def _again(ds: Dataset, config: Config, numbers: np.ndarray) -> dict[str, Array]:
+def _regenerate(ds: Dataset, config: Config, numbers: np.ndarray) -> dict[str, Array]:
     """Frames and annotations of videos that are sampled and simulated again, as motion blur needs unsaved states."""
     config = load_config(config, [f"storage.batch_size={ds.manifest.fingerprint['batch_size']}"])
     with contextlib.closing(VideoSource(config, jax.devices()[:1])) as source:

@@ -77,16 +77,16 @@ def render_scene(
     exposed = None
     if image.exposure:
         assert between is not None, "motion blur needs the states between frames"
-        exposed = _exposed(image, config.video.fps, states, between, view)
+        exposed = _exposure_instants(image, config.video.fps, states, between, view)
     seed = jax.random.bits(key_for(key, "pixels"), (), jnp.uint32)
     deviation = image.noise.sample(key_for(key, "noise"), ()) if image.noise.support != (0.0, 0.0) else None
-    occluders = _occluders(key_for(key, "occluders"), config, plan) if image.occluders else None
+    occluders = _sample_occluders(key_for(key, "occluders"), config, plan) if image.occluders else None
     return RenderScene(
         bodies, Instants(states.position, states.angle, view), exposed, paint, occluders, deviation, seed
     )
 
 
-def _exposed(image: ImageOptions, fps: float, states: State, between: State, view: CameraView) -> Instants:
+def _exposure_instants(image: ImageOptions, fps: float, states: State, between: State, view: CameraView) -> Instants:
     """Positions, angles and views at the samples of each exposure [T, samples, ...].
 
     An exposure ends at the frame's instant; its samples are the midpoints of equal parts. Motion is linear between
@@ -95,29 +95,29 @@ def _exposed(image: ImageOptions, fps: float, states: State, between: State, vie
     steps, samples = between.angle.shape[1], image.exposure_samples
     before = image.exposure * (1 - (jnp.arange(samples) + 0.5) / samples)  # frames
 
-    def at(now: Array, rate: Array, ends: Array) -> Array:
-        """Values [T, samples, ...], interpolated between frames [T, ...] and steps [T - 1, steps, ...]."""
-        previous = now[0] - rate[0] / fps  # one frame before the first
-        weight = (jnp.arange(steps + 1) / steps).reshape(-1, *[1] * (now.ndim - 1))
-        path = jnp.concatenate([now[:-1, None], ends], axis=1)
-        path = jnp.concatenate([(previous + weight * (now[0] - previous))[None], path])
+    def interpolate(values: Array, rates: Array, step_values: Array) -> Array:
+        """Values [T, samples, ...], interpolated between those of frames [T, ...] and of steps [T - 1, steps, ...]."""
+        previous = values[0] - rates[0] / fps  # one frame before the first
+        weight = (jnp.arange(steps + 1) / steps).reshape(-1, *[1] * (values.ndim - 1))
+        path = jnp.concatenate([values[:-1, None], step_values], axis=1)
+        path = jnp.concatenate([(previous + weight * (values[0] - previous))[None], path])
         time = (1 - before) * steps
         low = jnp.clip(jnp.floor(time).astype(jnp.int32), 0, steps - 1)
-        weight = (time - low).reshape(-1, *[1] * (now.ndim - 1))
+        weight = (time - low).reshape(-1, *[1] * (values.ndim - 1))
         return path[:, low] * (1 - weight) + path[:, low + 1] * weight
 
-    def even(values: Array) -> Array:
+    def interpolate_camera(values: Array) -> Array:
         """A camera parameter [T, samples, ...], interpolated linearly between frames."""
         last = jnp.concatenate([2 * values[:1] - values[1:2] if len(values) > 1 else values[:1], values[:-1]])
         weight = before.reshape(-1, *[1] * (values.ndim - 1))
         return values[:, None] * (1 - weight) + last[:, None] * weight
 
-    position = at(states.position, states.velocity, between.position)
-    angle = at(states.angle, states.angular_velocity, between.angle)
-    return Instants(position, angle, CameraView(*map(even, view)))
+    position = interpolate(states.position, states.velocity, between.position)
+    angle = interpolate(states.angle, states.angular_velocity, between.angle)
+    return Instants(position, angle, CameraView(*map(interpolate_camera, view)))
 
 
-def _occluders(key: Array, config: Config, plan: FramePlan) -> Occluders:
+def _sample_occluders(key: Array, config: Config, plan: FramePlan) -> Occluders:
     image, video = config.image, config.video
     count = image.occluders
     keys = dict(zip(("place", "width", "height", "front", "color"), jax.random.split(key, 5), strict=True))
@@ -138,11 +138,11 @@ def _occluders(key: Array, config: Config, plan: FramePlan) -> Occluders:
     return Occluders(jnp.concatenate([center - size / 2, center + size / 2], -1), jnp.stack(channels, -1), rank)
 
 
-def render_frames(stages: RenderScene, plan: FramePlan, options: Annotations) -> dict[str, Array]:
+def render_frames(render_scenes: RenderScene, plan: FramePlan, options: Annotations) -> dict[str, Array]:
     """Frames and annotations [n, ...] of these videos, by stored name."""
-    frames, owners = draw(stages, plan)
+    frames, owners = draw(render_scenes, plan)
     rendered = {} if frames is None else {"frames": frames}
-    return rendered | annotations.annotated(stages, owners, plan, options)
+    return rendered | annotations.annotated(render_scenes, owners, plan, options)
 
 
 def painted_colors(paint: Paint, scene: Scene) -> Array:

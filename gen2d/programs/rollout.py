@@ -52,7 +52,7 @@ class DeviceBatch(NamedTuple):
     """`batch_size` simulated videos on each device, ready to be rendered."""
 
     columns: dict[str, Array]  # stored fields [n, ...] except rendered ones
-    stages: RenderScene
+    render_scenes: RenderScene
     placed: Array  # [n] whether all objects could be placed
 
 
@@ -72,7 +72,7 @@ class Rollout:
         self.config, self.devices = config, list(devices)
         video = config.video
         self.layout = config.scene.contract.layout(config.scene.options)
-        self.sampler, self.wanted = Sampler(config), quality.ranges(config.quality)
+        self.sampler, self.quality_ranges = Sampler(config), quality.ranges(config.quality)
         self.plan = render.plan_of(config, self.layout)
         self.steps = substeps(video.fps, config.physics.substeps, config.physics.max_step)
         self.save_at = save_at(config, self.layout)
@@ -87,9 +87,9 @@ class Rollout:
         self.batch_size = config.storage.batch_size or min(default_batch, default_shard)
         self.slice = divisor(self.batch_size, max(1, SLICE_BYTES // frame_bytes))
         self.mesh = Mesh(np.array(self.devices), ("videos",))
-        self._draws: dict[int, Any] = {}  # by number of videos
-        self._drawn: set[int] = set()  # those numbers whose program is compiled
-        program = self._simulated_batch
+        self._draw_programs: dict[int, Any] = {}  # by number of videos
+        self._compiled_draws: set[int] = set()  # keys of `_draw_programs` whose program is compiled
+        program = self._simulate_batch
         if len(self.devices) > 1:
             specs = PartitionSpec(), PartitionSpec(), VIDEOS, VIDEOS, VIDEOS
             program = jax.shard_map(program, mesh=self.mesh, in_specs=specs, out_specs=VIDEOS, check_vma=False)
@@ -102,33 +102,30 @@ class Rollout:
         """
         root, row = keys_module.seed_words(self.config.seed, zlib.crc32(split.encode())), self.config.row(split)
         numbers = numbers.astype(np.uint32)
-        given = self.sampler.combination(row, root, numbers)
+        grid = self.sampler.combination(row, root, numbers)
 
-        def make(rows: np.ndarray, attempts: np.ndarray) -> DeviceBatch:
-            of_videos = given[rows], numbers[rows], attempts.astype(np.uint32)
-            return self._simulate(root, np.int32(row), *self._shares(of_videos))
+        def simulate_rows(rows: np.ndarray, attempts: np.ndarray) -> DeviceBatch:
+            sharded = self._shard_over_devices((grid[rows], numbers[rows], attempts.astype(np.uint32)))
+            batch = self._simulate(root, np.int32(row), *sharded)
+            return self._with_visibility(batch) if quality.VISIBILITY in self.quality_ranges else batch
 
-        if not self.wanted:
-            return make(np.arange(len(numbers)), np.zeros(len(numbers)))
-        if quality.VISIBILITY not in self.wanted:
-            batch, attempts = rejection.accepted_batch(make, numbers, self.config.quality)
-        else:
-            batch, attempts = rejection.accepted_batch(lambda *of: self._seen(make(*of)), numbers, self.config.quality)
-            del batch.columns[quality.VISIBILITY]  # `draw` returns it
-        return batch._replace(
-            columns=batch.columns | {"quality/rejected_videos": self._shares(attempts.astype(np.int32))}
-        )
+        if not self.quality_ranges:
+            return simulate_rows(np.arange(len(numbers)), np.zeros(len(numbers)))
+        batch, attempts = rejection.accepted_batch(simulate_rows, numbers, self.config.quality)
+        batch.columns.pop(quality.VISIBILITY, None)  # `draw` returns it
+        rejected = self._shard_over_devices(attempts.astype(np.int32))
+        return batch._replace(columns=batch.columns | {"quality/rejected_videos": rejected})
 
-    def _shares(self, arrays: Any) -> Any:
+    def _shard_over_devices(self, arrays: Any) -> Any:
         """Arrays [n, ...], sharded over the devices."""
         return jax.device_put(arrays, NamedSharding(self.mesh, VIDEOS))
 
-    def _seen(self, batch: DeviceBatch) -> DeviceBatch:
-        """The batch with its visibility, which is only known once it is rendered."""
+    def _with_visibility(self, batch: DeviceBatch) -> DeviceBatch:
+        """The batch with its visibility, which only rendering gives."""
         slices = [self.draw(batch, start, self.slice) for start in range(0, self.batch_size, self.slice)]
-        of_devices = zip(*slices, strict=True)
-        visibility = np.concatenate([np.asarray(part[quality.VISIBILITY]) for parts in of_devices for part in parts])
-        return batch._replace(columns=batch.columns | {quality.VISIBILITY: self._shares(visibility)})
+        visibility = [np.asarray(part[quality.VISIBILITY]) for parts in zip(*slices, strict=True) for part in parts]
+        sharded = self._shard_over_devices(np.concatenate(visibility))  # devices first, then their slices
+        return batch._replace(columns=batch.columns | {quality.VISIBILITY: sharded})
 
     def draw(self, batch: DeviceBatch, start: int, count: int) -> list[dict[str, Array]]:
         """Start to render `count` videos of each device, from row `start` on.
@@ -136,41 +133,42 @@ class Rollout:
         Returns each device's frames [count, T, H, W, 3] and annotations by stored name. Each device runs a separate
         program, because a program for several devices would round differently.
         """
-        stages_of = [
-            jax.tree.map(lambda array, d=d: _pieces(array)[d].data, batch.stages) for d in range(len(self.devices))
+        scenes_by_device = [
+            jax.tree.map(lambda array, d=d: _device_shards(array)[d].data, batch.render_scenes)
+            for d in range(len(self.devices))
         ]
-        draw = functools.partial(self._draw(count), start=np.int32(start))
-        if count in self._drawn:
-            return [draw(stages) for stages in stages_of]
-        self._drawn.add(count)
-        with ThreadPoolExecutor(len(stages_of)) as pool:  # compiles for all devices in parallel
-            return list(pool.map(draw, stages_of))
+        draw = functools.partial(self._draw_program(count), start=np.int32(start))
+        if count in self._compiled_draws:
+            return [draw(scenes) for scenes in scenes_by_device]
+        self._compiled_draws.add(count)
+        with ThreadPoolExecutor(len(scenes_by_device)) as pool:  # compiles for all devices in parallel
+            return list(pool.map(draw, scenes_by_device))
 
     def close(self) -> None:
         """Free the compiled programs, which jax would keep; each takes up to thousands of memory maps."""
-        for program in (self._simulate, *self._draws.values()):
+        for program in (self._simulate, *self._draw_programs.values()):
             program.clear_cache()
 
     def lowered(self) -> dict[str, str]:
         """Text of each program, lowered for one device."""
         numbers, scalar = jax.ShapeDtypeStruct((self.batch_size,), np.uint32), jax.ShapeDtypeStruct((), np.int32)
-        given = jax.ShapeDtypeStruct((self.batch_size, len(self.sampler.gridded)), np.float32)
-        simulate = self._simulate if len(self.devices) == 1 else jax.jit(self._simulated_batch)
+        grid = jax.ShapeDtypeStruct((self.batch_size, len(self.sampler.gridded)), np.float32)
+        simulate = self._simulate if len(self.devices) == 1 else jax.jit(self._simulate_batch)
         with jax.default_device(self.devices[0]):
-            simulated = simulate.lower(jax.ShapeDtypeStruct((3,), np.uint32), scalar, given, numbers, numbers)
-            drawn = self._draw(self.slice).lower(simulated.out_info.stages, start=scalar)
-        return {"simulate": simulated.as_text(), "draw": drawn.as_text()}
+            simulation = simulate.lower(jax.ShapeDtypeStruct((3,), np.uint32), scalar, grid, numbers, numbers)
+            rendering = self._draw_program(self.slice).lower(simulation.out_info.render_scenes, start=scalar)
+        return {"simulate": simulation.as_text(), "draw": rendering.as_text()}
 
-    def _draw(self, count: int) -> Any:
-        def render_slice(stages: RenderScene, start: Array) -> dict[str, Array]:
-            part = jax.tree.map(lambda x: jax.lax.dynamic_slice_in_dim(x, start, count), stages)
+    def _draw_program(self, count: int) -> Any:
+        def render_slice(render_scenes: RenderScene, start: Array) -> dict[str, Array]:
+            part = jax.tree.map(lambda x: jax.lax.dynamic_slice_in_dim(x, start, count), render_scenes)
             return render.render_frames(part, self.plan, self.config.annotations)
 
-        if count not in self._draws:
-            self._draws[count] = jax.jit(render_slice)
-        return self._draws[count]
+        if count not in self._draw_programs:
+            self._draw_programs[count] = jax.jit(render_slice)
+        return self._draw_programs[count]
 
-    def _simulated_batch(self, root: Array, row: Array, given: Array, numbers: Array, attempts: Array) -> DeviceBatch:
+    def _simulate_batch(self, root: Array, row: Array, grid: Array, numbers: Array, attempts: Array) -> DeviceBatch:
         """One device's part of a batch: everything but the frames, from video numbers."""
         config = self.config
         keys, matched_columns = sets.keys_of(root, numbers, config.matched), {}
@@ -180,69 +178,65 @@ class Rollout:
                 return self.sampler.sampled(key, row, change=change)
 
             factors, sampled, trajectory, matched_columns = simulate_module.simulate_members(
-                keys, numbers, config, self.layout, member, self._run
+                keys, numbers, config, self.layout, member, self._trajectory
             )
         else:
-            own_keys = rejection.attempt_keys(keys, attempts) if self.wanted else keys
-            factors, sampled = jax.vmap(self.sampler.sampled, (0, None, 0))(own_keys, row, given)
-            trajectory = self._run(sampled.scene, sampled.state)
+            own_keys = rejection.attempt_keys(keys, attempts) if self.quality_ranges else keys
+            factors, sampled = jax.vmap(self.sampler.sampled, (0, None, 0))(own_keys, row, grid)
+            trajectory = self._trajectory(sampled.scene, sampled.state)
         scene, between, trajectory = sampled.scene, trajectory.between, dataclasses.replace(trajectory, between=None)
 
-        def staged(key: Array, scene: Scene, states: State, between: State | None) -> tuple[RenderScene, Array]:
-            stage = render.render_scene(key, config, self.plan, scene, states, between=between)
-            return stage, render.painted_colors(stage.paint, scene)
+        def build(key: Array, scene: Scene, states: State, between: State | None) -> tuple[RenderScene, Array]:
+            render_scene = render.render_scene(key, config, self.plan, scene, states, between=between)
+            return render_scene, render.painted_colors(render_scene.paint, scene)
 
-        stages, colors = jax.vmap(staged)(keys, scene, trajectory.states, between)
+        render_scenes, colors = jax.vmap(build)(keys, scene, trajectory.states, between)
         columns = axes_module.columns(scene) | axes_module.columns(trajectory)
         columns["objects/color"] = colors
-        columns |= render.camera_columns(stages.instants.view)
+        columns |= render.camera_columns(render_scenes.instants.view)
         columns |= {f"factors/{name}": values.astype(jnp.float32) for name, values in factors.items()}
         columns |= jax.vmap(self.sampler.outside)(factors)
         columns["quality/rejected_draws"] = sampled.rejected
         if config.annotations.simulated.lyapunov:
-            columns["quality/lyapunov"] = self._growth(keys, sampled)
+            columns["quality/lyapunov"] = self._lyapunov(keys, sampled)
         columns = {name: values for name, values in columns.items() if name not in sets.omitted_fields(config.matched)}
-        return DeviceBatch(columns | matched_columns, stages, sampled.fits)
+        return DeviceBatch(columns | matched_columns, render_scenes, sampled.fits)
 
-    def _simulated(self, scene: Scene, state: State, keep: SaveAt) -> Trajectory:
+    def _device_trajectory(self, scene: Scene, state: State, keep: SaveAt) -> Trajectory:
         """Trajectories from these initial states, in the device's layout."""
         config, sparse = self.config, self.devices[0].platform == "cpu"
         rules = solver_params(config.physics, config.video.fps, self.steps)
         return simulate(scene, state, self.layout, rules, config.video.frames, self.steps, keep, sparse=sparse)
 
-    def _run(self, scene: Scene, state: State) -> Trajectory:
+    def _trajectory(self, scene: Scene, state: State) -> Trajectory:
         """Trajectories from these initial states, with the videos first."""
-        trajectory = self._simulated(axes_module.to_device(scene), axes_module.to_device(state), self.save_at)
-        between = None if trajectory.between is None else _videos_first(trajectory.between)
-        return dataclasses.replace(
-            axes_module.to_stored(dataclasses.replace(trajectory, between=None)), between=between
-        )
+        trajectory = self._device_trajectory(axes_module.to_device(scene), axes_module.to_device(state), self.save_at)
+        between = trajectory.between
+        if between is not None:  # from [T - 1, steps, (2,) K, n] to [n, T - 1, steps, K(, 2)]
+            between = jax.tree.map(lambda x: jnp.moveaxis(jnp.moveaxis(x, -1, 0), -1, 3), between)
+        stored = axes_module.to_stored(dataclasses.replace(trajectory, between=None))
+        return dataclasses.replace(stored, between=between)
 
-    def _growth(self, keys: Array, own: SampledScene) -> Array:
-        rerun = functools.partial(self._simulated, keep=SaveAt())
-        start = axes_module.to_device(own.scene), axes_module.to_device(own.state)
+    def _lyapunov(self, keys: Array, sampled: SampledScene) -> Array:
+        rerun = functools.partial(self._device_trajectory, keep=SaveAt())
+        start = axes_module.to_device(sampled.scene), axes_module.to_device(sampled.state)
         return lyapunov.lyapunov_exponent(keys, *start, rerun, float(self.schema.time[-1]))
 
     def host_columns(self, batch: DeviceBatch) -> list[dict[str, np.ndarray]]:
         """Each device's columns as NumPy arrays; waits for the devices."""
-        pieces = {name: per_device(array) for name, array in batch.columns.items()}
-        if "contacts/time" in pieces:  # a device may have no float64
-            pieces["contacts/time"] = [array.astype(np.float64) for array in pieces["contacts/time"]]
-        return [{name: arrays[d] for name, arrays in pieces.items()} for d in range(len(self.devices))]
+        columns = {name: per_device(array) for name, array in batch.columns.items()}
+        if "contacts/time" in columns:  # a device may have no float64
+            columns["contacts/time"] = [array.astype(np.float64) for array in columns["contacts/time"]]
+        return [{name: arrays[d] for name, arrays in columns.items()} for d in range(len(self.devices))]
 
 
-def _videos_first(between: State) -> State:
-    """States [T - 1, steps, (2,) K, n] as [n, T - 1, steps, K(, 2)]."""
-    return jax.tree.map(lambda x: jnp.moveaxis(jnp.moveaxis(x, -1, 0), -1, 3), between)
-
-
-def _pieces(array: Array) -> list[Any]:
-    return sorted(array.addressable_shards, key=lambda piece: piece.index[0].start or 0)
+def _device_shards(array: Array) -> list[Any]:
+    return sorted(array.addressable_shards, key=lambda shard: shard.index[0].start or 0)
 
 
 def per_device(array: Array) -> list[np.ndarray]:
     """Each device's part of an array, as NumPy arrays."""
-    return [np.asarray(piece.data) for piece in _pieces(array)]
+    return [np.asarray(shard.data) for shard in _device_shards(array)]
 
 
 def save_at(config: Config, layout: layout_module.Layout) -> SaveAt:

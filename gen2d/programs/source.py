@@ -13,7 +13,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gen2d.config.config import Config
-from gen2d.config.plugin_options import Plugin
 from gen2d.core.errors import UserError
 from gen2d.programs.rollout import DeviceBatch, Rollout, per_device
 from gen2d.records.axes import Array
@@ -170,21 +169,17 @@ class VideoSource:
         for request in requests:
             started.append((request, self.rollout.start(request.split, request.numbers)))
             if len(started) > ahead:
-                yield self._checked(*started.popleft())
+                yield self._check_placed(*started.popleft())
         while started:
-            yield self._checked(*started.popleft())
+            yield self._check_placed(*started.popleft())
 
-    def _checked(self, request: Request, batch: DeviceBatch) -> tuple[Request, DeviceBatch]:
+    def _check_placed(self, request: Request, batch: DeviceBatch) -> tuple[Request, DeviceBatch]:
         misplaced = request.wanted & ~np.concatenate(per_device(batch.placed))
         if misplaced.any():
-            raise NoPlaceError(_misplaced(self.config.scene, int(request.numbers[np.argmax(misplaced)])))
+            options = [f"scene.{name}" for name in self.config.scene.contract.crowded_by]
+            cause = f": it depends on {', '.join(options)}" if options else ""
+            raise NoPlaceError(
+                f"scene: video {request.numbers[np.argmax(misplaced)]} could not be placed without overlap in 100 "
+                f"attempts{cause}; ask for fewer or smaller objects, or for more room"
+            )
         return request, batch
-
-
-def _misplaced(scene: Plugin, number: int) -> str:
-    options = [f"scene.{name}" for name in scene.contract.crowded_by]
-    cause = f": it depends on {', '.join(options)}" if options else ""
-    return (
-        f"scene: video {number} could not be placed without overlap in 100 attempts{cause}; ask for fewer or smaller "
-        "objects, or for more room"
-    )

@@ -24,8 +24,8 @@ from gen2d.core.errors import ConfigError
 from gen2d.core.schema import Field
 from gen2d.loading.column import LAYOUTS
 from gen2d.loading.dataloader import without_text
-from gen2d.loading.dataset import ViewOptions, chosen_fields
-from gen2d.loading.epochs import EpochSampler, GlobalBatch, one_of, shuffled
+from gen2d.loading.dataset import ViewOptions, select_fields
+from gen2d.loading.epochs import EpochSampler, GlobalBatch, check_one_of, epoch_indices
 from gen2d.programs import devices
 from gen2d.programs.rollout import DeviceBatch, divisor
 from gen2d.programs.source import Request, VideoSource
@@ -34,7 +34,7 @@ from gen2d.records.keys import MAX_VIDEOS
 
 Arrays = dict[str, Any]
 # A table, because XLA would multiply by 1 / 255, which rounds differently.
-SHARES = np.arange(256, dtype=np.float32) / np.float32(255)
+UINT8_TO_FLOAT = np.arange(256, dtype=np.float32) / np.float32(255)
 
 
 def stream(
@@ -129,9 +129,9 @@ def stream(
     config = load_config(config, overrides)
     if seed is not None:
         config = dataclasses.replace(config, seed=checked_seed(seed))
-    one_of("to", to, tuple(_DELIVER))
+    check_one_of("to", to, tuple(_CONVERTERS))
     source = _source(config.of_split(split), device)
-    names = chosen_fields(config.name, source.schema.fields, fields)
+    names = select_fields(config.name, source.schema.fields, fields)
     frames = config.frames_of(split)
     options = ViewOptions(split, names, window, stride, start, layout, dtype, "none").within(
         frames, config.video.frames
@@ -156,34 +156,41 @@ class _Cell(NamedTuple):
     videos: int  # without padding
     numbers: np.ndarray  # uint32
     starts: np.ndarray  # first frame of each video's window
-    ends: bool  # whether it is the last of its batch
+    is_last: bool  # whether it is the last of its batch
 
 
 class Stream:
     """Resumable iterable of batches, which `stream` returns."""
 
     def __init__(
-        self, source: VideoSource, options: ViewOptions, walk: EpochSampler, batch_size: int, to: str, frames: int
+        self,
+        source: VideoSource,
+        options: ViewOptions,
+        epoch_sampler: EpochSampler,
+        batch_size: int,
+        to: str,
+        frames: int,
     ) -> None:
-        self.source, self.options, self.walk, self.to, self._frames = source, options, walk, to, frames
+        self.source, self.options, self.epoch_sampler = source, options, epoch_sampler
+        self.to, self._frames = to, frames
         self.fields = {name: source.schema.fields[name] for name in options.fields}
         self.cell = cell_size(batch_size, source.rollout.batch_size)
-        self._view = jax.jit(self._viewed)
+        self._jitted_cell_views = jax.jit(self._cell_views)
 
     def __len__(self) -> int:
         """Number of batches in one epoch."""
-        return len(self.walk)
+        return len(self.epoch_sampler)
 
     def __iter__(self) -> Iterator[Arrays]:
         return self._batches()
 
     def state_dict(self) -> dict[str, Any]:
         """State of the iteration, after the last batch that was delivered."""
-        return self.walk.state_dict()
+        return self.epoch_sampler.state_dict()
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Continue the next iteration from this state of a stream or a DataLoader."""
-        self.walk.load_state_dict(state)
+        self.epoch_sampler.load_state_dict(state)
 
     def _batches(self) -> Generator[Arrays, None, None]:
         parts: list[Arrays] = []
@@ -191,18 +198,18 @@ class Stream:
         for _, batch in self.source.batches(self._requests(cells), ahead=1):  # the next is simulated meanwhile
             for index in range(min(len(cells), self.source.rollout.batch_size // self.cell)):
                 cell = cells.popleft()
-                parts.append(self._drawn(batch, index * self.cell, cell))
-                if cell.ends:
-                    fields = parts[0] if len(parts) == 1 else {k: _joined([p[k] for p in parts]) for k in parts[0]}
+                parts.append(self._cell_fields(batch, index * self.cell, cell))
+                if cell.is_last:
+                    fields = parts[0] if len(parts) == 1 else {k: _concatenate([p[k] for p in parts]) for k in parts[0]}
                     parts = []
-                    self.walk.passed(cell.step)
-                    yield _DELIVER[self.to](fields)
+                    self.epoch_sampler.advance(cell.step)
+                    yield _CONVERTERS[self.to](fields)
 
     def _cells(self) -> Iterator[_Cell]:
-        for step in self.walk.steps():
-            positions = self.walk.share(step)
-            numbers = shuffled(self.walk.shuffled_by, step.epoch, positions, self.walk.videos)
-            starts = self.options.starts(self.walk.bits(step, positions), self._frames)
+        for step in self.epoch_sampler.steps():
+            positions = self.epoch_sampler.rank_positions(step)
+            numbers = epoch_indices(self.epoch_sampler.shuffled_by, step.epoch, positions, self.epoch_sampler.videos)
+            starts = self.options.starts(self.epoch_sampler.window_bits(step, positions), self._frames)
             starts = np.full(len(numbers), self.options.first) if starts is None else starts
             count = len(numbers)  # a rank's share may be empty
             for begin in range(0, max(count, 1), self.cell):
@@ -219,43 +226,41 @@ class Stream:
             numbers = np.concatenate([group[min(i, len(group) - 1)].numbers for i in range(number)])
             yield Request(self.options.split, numbers, np.ones(len(numbers), bool))
 
-    def _drawn(self, batch: DeviceBatch, lane: int, cell: _Cell) -> Arrays:
+    def _cell_fields(self, batch: DeviceBatch, row: int, cell: _Cell) -> Arrays:
         """Fields of a cell's videos, ready for delivery."""
         columns = {name: batch.columns[name] for name in self.fields if name in batch.columns}
         host_fields = self.fields.keys() & self.source.schema.host_fields.keys()
         if self.fields.keys() - batch.columns.keys() - host_fields - {"index"}:
-            columns |= self._pictures(batch, lane)
+            columns |= self._render_cell(batch, row)
         numbers, starts = jnp.asarray(cell.numbers.astype(np.int32)), jnp.asarray(cell.starts, jnp.int32)
-        fields = self._view(columns, numbers, starts, np.int32(lane))
-        fields |= self._words(batch, lane, host_fields) if host_fields else {}
+        fields = self._jitted_cell_views(columns, numbers, starts, np.int32(row))
+        fields |= self._host_fields(batch, row, host_fields) if host_fields else {}
         return fields if cell.videos == self.cell else {name: array[: cell.videos] for name, array in fields.items()}
 
-    def _words(self, batch: DeviceBatch, lane: int, wanted: Set[str]) -> Arrays:
+    def _host_fields(self, batch: DeviceBatch, row: int, names: Set[str]) -> Arrays:
         """Host-computed fields of a cell; text stays on the host."""
         columns = self.source.rollout.host_columns(batch)[0]
-        cell_columns = {name: column[lane : lane + self.cell] for name, column in columns.items()}
+        cell_columns = {name: column[row : row + self.cell] for name, column in columns.items()}
         fields = self.source.schema.host_columns(cell_columns, self.options.split)
-        return {
-            name: v if self.fields[name].is_text else jnp.asarray(v) for name, v in fields.items() if name in wanted
-        }
+        return {name: v if self.fields[name].is_text else jnp.asarray(v) for name, v in fields.items() if name in names}
 
-    def _pictures(self, batch: DeviceBatch, lane: int) -> Arrays:
+    def _render_cell(self, batch: DeviceBatch, row: int) -> Arrays:
         """Rendered fields of a cell, computed in slices that fit the cache."""
         size = divisor(self.cell, self.source.rollout.slice)
-        parts = [self.source.rollout.draw(batch, start, size)[0] for start in range(lane, lane + self.cell, size)]
-        wanted = self.fields.keys() & parts[0].keys()
-        return {name: jnp.concatenate([part[name] for part in parts]) for name in wanted}
+        parts = [self.source.rollout.draw(batch, start, size)[0] for start in range(row, row + self.cell, size)]
+        names = self.fields.keys() & parts[0].keys()
+        return {name: jnp.concatenate([part[name] for part in parts]) for name in names}
 
-    def _viewed(self, found: Arrays, numbers: Array, starts: Array, lane: Array) -> Arrays:
-        """Fields of a cell with the requested windows, layout and type; `found` may hold the whole batch."""
+    def _cell_views(self, columns: Arrays, numbers: Array, starts: Array, row: Array) -> Arrays:
+        """Fields of a cell with the requested windows, layout and type; `columns` may hold the whole batch."""
         views = {}
         for name, field in self.fields.items():
-            if name not in found and name != "index":
+            if name not in columns and name != "index":
                 continue  # computed on the host
-            values = numbers if name == "index" else found[name]
+            values = numbers if name == "index" else columns[name]
             if len(values) != self.cell:
-                values = jax.lax.dynamic_slice_in_dim(values, lane, self.cell)
-            views[name] = _as_asked(name, field, values, starts, self.options)
+                values = jax.lax.dynamic_slice_in_dim(values, row, self.cell)
+            views[name] = _apply_view(name, field, values, starts, self.options)
         return views
 
 
@@ -265,11 +270,11 @@ def cell_size(batch_size: int, simulated: int) -> int:
     return max(size for size in sizes if -(-batch_size // size) * size <= batch_size * 9 / 8)
 
 
-def _joined(parts: list[Any]) -> Any:
+def _concatenate(parts: list[Any]) -> Any:
     return np.concatenate(parts) if isinstance(parts[0], np.ndarray) else jnp.concatenate(parts)
 
 
-def _as_asked(name: str, field: Field, values: Array, starts: Array, options: ViewOptions) -> Array:
+def _apply_view(name: str, field: Field, values: Array, starts: Array, options: ViewOptions) -> Array:
     """Values of videos [m, ...] with the requested windows, layout and type."""
     axes = field.axes.split()[1:]
     if options.window is not None and axes[:1] == ["T"]:
@@ -278,7 +283,7 @@ def _as_asked(name: str, field: Field, values: Array, starts: Array, options: Vi
     if field.is_image and len(axes) == 4:
         values = values.transpose(0, *(1 + axis for axis in LAYOUTS[options.layout]))
     if name == "frames" and options.dtype == "float32":
-        values = jnp.asarray(SHARES)[values.astype(jnp.int32)]
+        values = jnp.asarray(UINT8_TO_FLOAT)[values.astype(jnp.int32)]
     return values
 
 
@@ -289,4 +294,4 @@ def _to_torch(batch: Arrays) -> Arrays:
 
 
 # Conversions of a batch, by the value of `to`.
-_DELIVER = {"jax": lambda batch: batch, "torch": _to_torch}
+_CONVERTERS = {"jax": lambda batch: batch, "torch": _to_torch}

@@ -17,7 +17,7 @@ from gen2d.config.config import load_config
 from gen2d.generation.run import generate
 from gen2d.loading.dataset import Dataset
 from gen2d.loading.dataset import open as open_dataset
-from gen2d.media.contact_sheet import GAP, contact_sheet, shown
+from gen2d.media.contact_sheet import GAP, contact_sheet, sheet_frames
 from gen2d.media.images import check_folder, write, writing
 from gen2d.media.overlays import amodal_overlay, boxes_overlay, flow_overlay, masks_overlay, tracks_overlay
 from gen2d.programs.recipe import config_of
@@ -148,7 +148,7 @@ def _annotation_rows(ds: Dataset, numbers: Sequence[int], overrides: Sequence[st
     fields = ["masks/instance", "masks/amodal", "boxes/visible", "boxes/amodal", "flow/forward", "tracks/points"]
     fields += ["tracks/visible", "frames"]
     batch = render(ds, numbers, look="flat", overrides=overrides, fields=fields, trust=trust)
-    times = shown(batch["frames"].shape[1])
+    times = sheet_frames(batch["frames"].shape[1])
     columns = {name: np.asarray(array[:, times]) for name, array in batch.items()}
     fastest = np.abs(columns["flow/forward"].astype(np.float32)).max()
     columns["flow/forward"] = columns["flow/forward"] / max(fastest, 1e-3)

@@ -55,9 +55,9 @@ def test_without_frames_there_is_no_sheet(tmp_path: Path) -> None:
 
 def test_a_large_frame_is_made_smaller_on_the_sheet() -> None:
     video = np.random.default_rng(0).integers(0, 256, (30, 300, 400, 3), np.uint8)
-    found = contact_sheet.reduced(video)
+    found = contact_sheet.downsample(video)
     assert found.shape == (10, 100, 133, 3)
-    assert abs(found.mean() - video[contact_sheet.shown(30)].mean()) < 1
+    assert abs(found.mean() - video[contact_sheet.sheet_frames(30)].mean()) < 1
 
 
 def test_the_readme_tells_the_statistics(tmp_path: Path) -> None:

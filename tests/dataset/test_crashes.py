@@ -115,7 +115,7 @@ DAMAGES = {
 def repaired(monkeypatch: pytest.MonkeyPatch) -> None:
     """Has repair make the synthetic videos again instead of simulating."""
 
-    def make(rollout: object, spec: DatasetSpec, todo: list[Shard], say: object) -> None:
+    def make(rollout: object, spec: DatasetSpec, todo: list[Shard], log: object) -> None:
         with ShardWriter(spec) as writer:
             for shard in todo:
                 writer.write(shard, synthetic.blocks(spec, shard))
@@ -127,7 +127,7 @@ def repaired(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(regenerate, "check_fingerprint", lambda *_: None)
     monkeypatch.setattr(regenerate.devices, "versions", lambda: dict.fromkeys(regenerate.CODECS))
     monkeypatch.setattr(regenerate, "dataset_of", made)
-    monkeypatch.setattr(regenerate, "make", make)
+    monkeypatch.setattr(regenerate, "generate_shards", make)
 
 
 @pytest.mark.parametrize("damage", DAMAGES)
@@ -187,13 +187,13 @@ def test_a_repair_that_makes_other_bytes_changes_nothing(
     (root / "shards" / "train-00000.h5").write_bytes(b"")
     before = contents(root)
 
-    def wrong(rollout: object, spec: DatasetSpec, todo: list[Shard], say: object) -> None:
+    def wrong(rollout: object, spec: DatasetSpec, todo: list[Shard], log: object) -> None:
         other = small(spec.root, spec.splits, seed=8)
         with ShardWriter(spec) as writer:
             for shard in todo:
                 writer.write(shard, synthetic.blocks(other, shard))
 
-    monkeypatch.setattr(regenerate, "make", wrong)
+    monkeypatch.setattr(regenerate, "generate_shards", wrong)
     with pytest.raises(FolderError, match="train-00000, made again, is not right, so nothing was changed"):
         regenerate.repair(root)
     assert contents(root) == before

@@ -111,17 +111,17 @@ def test_a_video_does_not_depend_on_the_number_of_devices(tiny: Path, tmp_path: 
 
 
 def test_a_run_leaves_none_of_its_compiled_programs_behind(tmp_path: Path):
-    def kept() -> list[str]:
+    def live_programs() -> list[str]:
         names = [each.hlo_modules()[0].name for each in jax.devices()[0].client.live_executables()]
-        return sorted(name for name in names if name in ("jit__simulated_batch", "jit_drawn"))
+        return sorted(name for name in names if name in ("jit__simulate_batch", "jit_render_slice"))
 
-    before = kept()
+    before = live_programs()
     for balls in (1, 2):
-        made = []
+        programs = []
         config = changed(scene={"balls": balls})
-        generate(config, 4, tmp_path / str(balls), say=lambda line, made=made: made.append(kept()))
-        assert len(max(made, key=len)) > len(before)  # while it ran
-        assert kept() == before
+        generate(config, 4, tmp_path / str(balls), log=lambda line, programs=programs: programs.append(live_programs()))
+        assert len(max(programs, key=len)) > len(before)  # while it ran
+        assert live_programs() == before
 
 
 def test_workers_together_make_what_one_makes(tiny: Path, tmp_path: Path):
@@ -176,8 +176,8 @@ def test_killed_at_random_moments_it_completes_to_the_same_bits(tiny: Path, tmp_
     for attempt in range(7):
         process = subprocess.Popen(words, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
         shards = out / "shards"
-        wanted = chance.randint(1, 8) + 5 * attempt
-        while process.poll() is None and len(list(shards.glob("*.h5"))) < wanted:
+        shard_count = chance.randint(1, 8) + 5 * attempt
+        while process.poll() is None and len(list(shards.glob("*.h5"))) < shard_count:
             time.sleep(0.001)
         time.sleep(chance.random() * 0.02)
         if process.poll() is None:

@@ -43,12 +43,12 @@ def pristine(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def places(root: Path) -> list[tuple[str, int]]:
     """A bit in each kilobyte of each file, but for the card that people may write in."""
-    chance, found = random.Random(3), []
+    chance, positions = random.Random(3), []
     for name, content in sorted(contents(root).items()):
         if name != "README.md":
             for begin in range(0, len(content), 1000):
-                found.append((name, 8 * begin + chance.randrange(8 * min(1000, len(content) - begin))))
-    return found
+                positions.append((name, 8 * begin + chance.randrange(8 * min(1000, len(content) - begin))))
+    return positions
 
 
 def flip(root: Path, name: str, bit: int) -> None:
@@ -100,9 +100,9 @@ class Reader(threading.Thread):
         while self.going:
             try:
                 for ds in (self.ds, gen2d.open(self.root, fields="*", snapshot=self.ds.snapshot)):
-                    found = ds[:]
+                    actual = ds[:]
                     for name, values in self.expected.items():
-                        assert (found[name] == values).all() or values.dtype.kind == "f", name
+                        assert (actual[name] == values).all() or values.dtype.kind == "f", name
                 self.rounds += 1
             except Exception as error:
                 self.errors.append(repr(error))
@@ -124,7 +124,7 @@ def test_two_hundred_kills_while_a_dataset_grows(tmp_path: Path) -> None:
             made.append(subprocess.Popen(words, env=environment, **pipes))
         return made
 
-    def ended(processes: list[subprocess.Popen]) -> int:
+    def count_killed(processes: list[subprocess.Popen]) -> int:
         codes = []
         for process in processes:
             told = process.communicate()[1]
@@ -132,7 +132,7 @@ def test_two_hundred_kills_while_a_dataset_grows(tmp_path: Path) -> None:
             codes.append(process.returncode)
         return sum(code != 0 for code in codes)
 
-    assert ended(workers(count)) == 0
+    assert count_killed(workers(count)) == 0
     while killed < 200:
         reader = Reader(out)
         reader.start()
@@ -142,9 +142,9 @@ def test_two_hundred_kills_while_a_dataset_grows(tmp_path: Path) -> None:
             time.sleep(chance.random() * 12)
             for process in processes if chance.random() < 0.5 else [chance.choice(processes)]:
                 process.send_signal(signal.SIGKILL)
-            killed += ended(processes)
+            killed += count_killed(processes)
             assert verify(out, "quick") == []
-        assert ended(workers(count)) == 0
+        assert count_killed(workers(count)) == 0
         reader.going = False
         reader.join()
         assert reader.errors == []
@@ -227,8 +227,8 @@ def test_thirty_kills_of_an_upload(server: buckets.Server, tmp_path: Path) -> No
             server.fault = killing(process, number + 1, "" if number % 2 else "fail")
             process.wait()
         server.reset()
-        found = gen2d.open(url, fields="*", snapshot=old.snapshot)[:]
-        assert all((found[name] == values).all() for name, values in videos.items())
+        actual = gen2d.open(url, fields="*", snapshot=old.snapshot)[:]
+        assert all((actual[name] == values).all() for name, values in videos.items())
         assert len(gen2d.open(url)) in (12, 30)
         synthetic.make(synthetic.dataset(gen2d.storage.paths.place(url), train=30))
         assert buckets.tree(url) == expected

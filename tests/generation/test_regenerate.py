@@ -123,13 +123,13 @@ def test_other_versions_are_told_and_nothing_is_changed(root: Path, monkeypatch:
 
 
 def test_the_command_line_repairs(pristine: Path, root: Path) -> None:
-    told = ran("verify", root, "--level", "regen", "--videos", 3, "--seed", 5)
-    assert (told.returncode, "3 videos chosen by --seed 5" in told.stdout) == (0, True), told.stderr
+    done = ran("verify", root, "--level", "regen", "--videos", 3, "--seed", 5)
+    assert (done.returncode, "3 videos chosen by --seed 5" in done.stdout) == (0, True), done.stderr
     flip(root / "shards" / "train-00001.h5", 80000)
     flip(root / "manifest.json", 3000)
-    found = ran("verify", root, "--json")
-    assert found.returncode == 1
-    assert json.loads(found.stdout)["level"] == "full"
+    done = ran("verify", root, "--json")
+    assert done.returncode == 1
+    assert json.loads(done.stdout)["level"] == "full"
     done = ran("verify", root, "--repair", "--json")
     assert done.returncode == 0, done.stderr
     about = json.loads(done.stdout)

@@ -43,16 +43,16 @@ def test_the_order_is_a_permutation(count: int) -> None:
 
 def test_orders_differ_and_look_random() -> None:
     orders = [order(seed, epoch, np.arange(1000), 1000) for seed in range(5) for epoch in range(20)]
-    assert len({found.tobytes() for found in orders}) == 100
+    assert len({values.tobytes() for values in orders}) == 100
     # The mean of 100 places is normal around 499.5 with deviation 289 / sqrt(100).
     assert abs(np.mean(orders, 0) - 499.5).max() < 5 * 28.9
     assert abs(np.corrcoef(orders)[np.triu_indices(100, 1)]).max() < 0.2
 
 
 def test_a_huge_dataset_needs_no_memory() -> None:
-    found = order(0, 0, np.arange(10**12 - 5, 10**12), 10**12)
-    assert len(set(found.tolist())) == 5
-    assert ((found >= 0) & (found < 10**12)).all()
+    actual = order(0, 0, np.arange(10**12 - 5, 10**12), 10**12)
+    assert len(set(actual.tolist())) == 5
+    assert ((actual >= 0) & (actual < 10**12)).all()
 
 
 # ---- Batches
@@ -112,11 +112,11 @@ def test_random_windows_follow_from_seed_epoch_and_position(toy: Path) -> None:
     dataset, whole = loader.open(toy, fields=("index", "states/angle"), window=2), synthetic.stored(toy)["states/angle"]
 
     def starts(**options: Any) -> list[int]:
-        found = []
+        frames = []
         for batch in DataLoader(dataset, 4, epochs=3, **options):
             for index, angle in zip(batch["index"], batch["states/angle"], strict=True):
-                found += [start for start in range(4) if np.array_equal(whole[index, start : start + 2], angle)]
-        return found
+                frames += [start for start in range(4) if np.array_equal(whole[index, start : start + 2], angle)]
+        return frames
 
     assert starts() == starts(num_threads=1, prefetch=1)
     assert starts() != starts(seed=1)
@@ -149,9 +149,9 @@ def test_break_and_go_on(toy: Path) -> None:
     dataset = loader.open(toy, fields="index")
     expected = numbers(list(DataLoader(dataset, 4, epochs=1)))
     with DataLoader(dataset, 4, epochs=1) as batches:
-        found = [next(iter(batches))["index"].tolist()]
-        found += numbers(list(batches))
-    assert found == expected
+        actual = [next(iter(batches))["index"].tolist()]
+        actual += numbers(list(batches))
+    assert actual == expected
 
 
 def test_an_error_in_a_thread_reaches_the_caller(toy: Path) -> None:
@@ -179,7 +179,7 @@ def test_a_wrong_loader_option_is_refused(toy: Path, options: dict[str, Any]) ->
 
 
 @pytest.fixture
-def aligned(monkeypatch: pytest.MonkeyPatch) -> None:
+def aligned_arrays(monkeypatch: pytest.MonkeyPatch) -> None:
     """Batches begin at multiples of 64 bytes, where jax on a CPU takes over the memory itself."""
 
     def aligned_like(values: np.ndarray) -> np.ndarray:
@@ -193,21 +193,21 @@ def aligned(monkeypatch: pytest.MonkeyPatch) -> None:
     )
 
 
-@pytest.mark.usefixtures("aligned")
+@pytest.mark.usefixtures("aligned_arrays")
 @pytest.mark.parametrize("kind", ["jax", "torch"])
 def test_batches_stay_as_they_were_while_others_follow(toy: Path, kind: Any) -> None:
     library = pytest.importorskip(kind)
     dataset = loader.open(toy, fields="*", window=2)
     expected = list(DataLoader(dataset, 4, epochs=3))
-    kept = list(DataLoader(dataset, 4, epochs=3, prefetch=1, to=kind))
-    for found, batch in zip(kept, expected, strict=True):
-        assert found.keys() == batch.keys()
+    batches = list(DataLoader(dataset, 4, epochs=3, prefetch=1, to=kind))
+    for actual, batch in zip(batches, expected, strict=True):
+        assert actual.keys() == batch.keys()
         for name, values in batch.items():
-            assert isinstance(found[name], library.Array if kind == "jax" else library.Tensor)
-            assert_array_equal(np.asarray(found[name]), values)
+            assert isinstance(actual[name], library.Array if kind == "jax" else library.Tensor)
+            assert_array_equal(np.asarray(actual[name]), values)
 
 
-def lie_where_they_are_asked_to(root: str) -> None:
+def check_device_placement(root: str) -> None:
     """Fails unless batches for jax lie on the device, or over the devices, that they are asked to."""
     import jax
 
@@ -230,7 +230,7 @@ def lie_where_they_are_asked_to(root: str) -> None:
 
 def test_jax_batches_lie_where_they_are_asked_to(toy: Path) -> None:
     code = f"import sys; sys.path.insert(0, {str(Path(__file__).parent)!r});"
-    code += f"import test_dataloader; test_dataloader.lie_where_they_are_asked_to({str(toy)!r})"
+    code += f"import test_dataloader; test_dataloader.check_device_placement({str(toy)!r})"
     run_on(2, "assert len(jax.devices()) == 2;" + code, JAX_PLATFORMS="cpu")
 
 
@@ -263,12 +263,12 @@ def read_in_process(dataset: loader.Dataset, send: Callable[[Any], None]) -> Non
 @pytest.mark.parametrize("method", ["fork", "spawn"])
 def test_processes_read_the_same(toy: Path, method: str) -> None:
     dataset = loader.open(toy, fields=("index", "frames"))
-    found: list[Any] = []
-    read_in_process(dataset, found.append)
+    actual: list[Any] = []
+    read_in_process(dataset, actual.append)
     context: Any = multiprocessing.get_context(method)
     receiver, sender = context.Pipe(duplex=False)
     process = context.Process(target=read_in_process, args=(dataset, sender.send))
     process.start()
     assert receiver.poll(60)
-    assert receiver.recv() == found[0]
+    assert receiver.recv() == actual[0]
     process.join()

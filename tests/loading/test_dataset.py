@@ -31,15 +31,15 @@ def root(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactor
 
 @pytest.fixture(scope="module", params=[None, 1])
 def toy(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    made = synthetic.dataset(tmp_path_factory.mktemp("data") / "toy", chunk_frames=request.param)
-    return synthetic.folder(synthetic.make(made))
+    spec = synthetic.dataset(tmp_path_factory.mktemp("data") / "toy", chunk_frames=request.param)
+    return synthetic.folder(synthetic.make(spec))
 
 
-def same(found: dict[str, np.ndarray], expected: dict[str, np.ndarray]) -> None:
-    assert found.keys() == expected.keys()
+def assert_same(actual: dict[str, np.ndarray], expected: dict[str, np.ndarray]) -> None:
+    assert actual.keys() == expected.keys()
     for name, values in expected.items():
-        assert found[name].dtype == values.dtype
-        assert_array_equal(found[name], values)
+        assert actual[name].dtype == values.dtype
+        assert_array_equal(actual[name], values)
 
 
 # ---- Videos by number
@@ -49,12 +49,12 @@ def test_the_loader_gives_what_is_stored(root: Path) -> None:
     for split, count in (("train", TRAIN), ("test", 3)):
         dataset, expected = loader.open(root, split, fields="*"), synthetic.stored(root, split)
         assert len(dataset) == count
-        same(dataset[:], expected)
-        same(dataset[1], {name: values[1] for name, values in expected.items()})
-        same(dataset[[2, 0, -1]], {name: values[[2, 0, -1]] for name, values in expected.items()})
-        same(dataset[-1:0:-2], {name: values[-1:0:-2] for name, values in expected.items()})
+        assert_same(dataset[:], expected)
+        assert_same(dataset[1], {name: values[1] for name, values in expected.items()})
+        assert_same(dataset[[2, 0, -1]], {name: values[[2, 0, -1]] for name, values in expected.items()})
+        assert_same(dataset[-1:0:-2], {name: values[-1:0:-2] for name, values in expected.items()})
         for row, video in zip((1, 1, -2), dataset.__getitems__([1, 1, -2]), strict=True):
-            same(video, {name: values[row] for name, values in expected.items()})
+            assert_same(video, {name: values[row] for name, values in expected.items()})
 
 
 @settings(max_examples=25, deadline=None)
@@ -67,32 +67,32 @@ def test_windows_and_layouts_are_views_of_what_is_stored(toy: Path, data: st.Dat
     first = st.integers(0, 5 - (window - 1) * stride - 1)
     starts = data.draw(st.lists(first, min_size=len(indices), max_size=len(indices)))
     dataset = loader.open(toy, "train", "*", window=window, stride=stride, layout=layout, dtype=dtype)
-    found, expected = dataset.batch(indices, starts), synthetic.stored(toy)
+    actual, expected = dataset.batch(indices, starts), synthetic.stored(toy)
     for name, field in dataset.fields.items():
         videos = [expected[name][index] for index in indices]
         if "T" in field.axes.split():
             videos = [
                 video[s : s + (window - 1) * stride + 1 : stride] for video, s in zip(videos, starts, strict=True)
             ]
-        values = np.array(videos) if videos else np.empty((0, *found[name].shape[1:]), expected[name].dtype)
+        values = np.array(videos) if videos else np.empty((0, *actual[name].shape[1:]), expected[name].dtype)
         if videos and field.is_image and values.ndim == 5:
             values = values.transpose(AXES[layout])
         if name == "frames" and dtype == "float32":
             values = (values / 255).astype(np.float32)
-        assert_array_equal(found[name], values)
-        assert found[name].dtype == values.dtype
+        assert_array_equal(actual[name], values)
+        assert actual[name].dtype == values.dtype
 
 
 def test_an_integer_start_begins_there(toy: Path) -> None:
-    found = loader.open(toy, window=2, start=3)[4]["states/angle"]
-    assert_array_equal(found, synthetic.stored(toy)["states/angle"][4, 3:5])
+    actual = loader.open(toy, window=2, start=3)[4]["states/angle"]
+    assert_array_equal(actual, synthetic.stored(toy)["states/angle"][4, 3:5])
 
 
 def test_a_batch_can_be_filled_in_place(root: Path) -> None:
     dataset = loader.open(root)
     out = dataset.empty(2)
     assert dataset.batch([3, 4], out=out) is out
-    same(out, dataset[3:5])
+    assert_same(out, dataset[3:5])
     with pytest.raises(ConfigError, match="must be a contiguous"):
         dataset.batch([3, 4, 5], out=out)
 
@@ -107,7 +107,7 @@ def test_what_a_dataset_tells_about_itself(toy: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("options", "told"),
+    ("options", "message"),
     [
         ({"fields": "state/position"}, "has no field 'state/position': did you mean 'states/position'?"),
         ({"fields": "time"}, "has no field 'time'"),
@@ -122,10 +122,10 @@ def test_what_a_dataset_tells_about_itself(toy: Path) -> None:
         ({"verify": "maybe"}, "verify is 'maybe'"),
     ],
 )
-def test_a_wrong_option_is_named(toy: Path, options: dict[str, Any], told: str) -> None:
+def test_a_wrong_option_is_named(toy: Path, options: dict[str, Any], message: str) -> None:
     with pytest.raises(ConfigError) as caught:
         loader.open(toy, **options)
-    assert told in str(caught.value)
+    assert message in str(caught.value)
 
 
 @pytest.mark.parametrize("index", [TRAIN, -TRAIN - 1, [0, TRAIN]])
@@ -151,7 +151,7 @@ def test_a_pickled_dataset_is_the_same(toy: Path) -> None:
     dataset = loader.open(toy, "test", ("frames",), 2, 2, "first", "TCHW", "float32", "none")
     again = pickle.loads(pickle.dumps(dataset))
     assert again.options == dataset.options
-    same(again[1], dataset[1])
+    assert_same(again[1], dataset[1])
 
 
 def test_files_are_closed_when_many_are_open(tmp_path: Path) -> None:
@@ -160,7 +160,7 @@ def test_files_are_closed_when_many_are_open(tmp_path: Path) -> None:
     before = len(list(Path("/proc/self/fd").iterdir()))
     assert dataset[:]["index"].tolist() == list(range(140))
     assert len(list(Path("/proc/self/fd").iterdir())) <= before + 128
-    assert len(chunks._files) <= chunks.OPEN
+    assert len(chunks._files) <= chunks.OPEN_FILES
 
 
 def test_no_jax_is_imported() -> None:

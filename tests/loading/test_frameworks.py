@@ -26,9 +26,9 @@ def source(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFact
 def check(batches: Sequence[dict[str, Any]], source: Any, order: Sequence[int]) -> None:
     """Fails unless the batches hold the videos at these positions, to the bit."""
     for name, values in source[np.asarray(order)].items():
-        found = np.concatenate([np.asarray(batch[name]) for batch in batches])
-        assert found.dtype == values.dtype
-        assert_array_equal(found, values)
+        actual = np.concatenate([np.asarray(batch[name]) for batch in batches])
+        assert actual.dtype == values.dtype
+        assert_array_equal(actual, values)
 
 
 # ---- torch
@@ -47,15 +47,15 @@ def test_torch_reads_the_same_in_any_number_of_processes(source: Any, method: st
 
 def test_torch_asks_for_whole_batches(source: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     torch = pytest.importorskip("torch")
-    asked: list[list[int]] = []
+    requests: list[list[int]] = []
     whole = type(source).__getitems__
     monkeypatch.setattr(
-        type(source), "__getitems__", lambda self, indices: asked.append(list(indices)) or whole(self, indices)
+        type(source), "__getitems__", lambda self, indices: requests.append(list(indices)) or whole(self, indices)
     )
     generator = torch.Generator().manual_seed(0)
     batches = list(torch.utils.data.DataLoader(source, batch_size=5, shuffle=True, generator=generator))
-    order = [number for batch in asked for number in batch]
-    assert [len(batch) for batch in asked] == [5] * (len(source) // 5)
+    order = [number for batch in requests for number in batch]
+    assert [len(batch) for batch in requests] == [5] * (len(source) // 5)
     assert sorted(order) == list(range(len(source)))
     check(batches, source, order)
 

@@ -16,7 +16,7 @@ from numpy.testing import assert_array_equal
 import gen2d
 from gen2d.core.errors import ConfigError
 from gen2d.loading import dataset as loader
-from gen2d.loading.mixture import Mixture, turns
+from gen2d.loading.mixture import Mixture, tijdeman_schedule
 
 WEIGHTS = {"a": 0.5, "b": 0.3, "c": 0.2}
 
@@ -39,27 +39,27 @@ def videos(mixture: Mixture, batches: Any) -> list[tuple[str, int]]:
 @settings(max_examples=60, deadline=None)
 @given(st.lists(st.integers(1, 60), min_size=1, max_size=7))
 def test_every_source_has_its_share_within_one_at_every_position(shares: list[int]) -> None:
-    period, found = sum(shares), turns(shares, [10**6] * len(shares))
-    assert len(found) == period
-    taken = np.cumsum(found[:, None] == np.arange(len(shares)), axis=0)
+    period, schedule = sum(shares), tijdeman_schedule(shares, [10**6] * len(shares))
+    assert len(schedule) == period
+    counts = np.cumsum(schedule[:, None] == np.arange(len(shares)), axis=0)
     due = np.arange(1, period + 1)[:, None] * np.array([float(Fraction(share, period)) for share in shares])
-    assert abs(taken - due).max() < 1
-    assert taken[-1].tolist() == shares
+    assert abs(counts - due).max() < 1
+    assert counts[-1].tolist() == shares
 
 
 @pytest.mark.parametrize("weights", [WEIGHTS, [1, 1, 1], [3, 1, 1000], None, [0.001, 1, 2], [1 / 3, 1 / 3, 1 / 7]])
 def test_an_epoch_is_as_long_as_no_video_comes_twice(sources: dict, weights: Any) -> None:
     mixture = gen2d.mix(sources, weights)
-    found = videos(mixture, [mixture[:]])
-    assert len(set(found)) == len(mixture) == len(found)
+    actual = videos(mixture, [mixture[:]])
+    assert len(set(actual)) == len(mixture) == len(actual)
     given = [1, 1, 1] if weights is None else weights if isinstance(weights, list) else list(weights.values())
     due = np.arange(1, len(mixture) + 1)[:, None] * np.array(given) / sum(given)
-    names = np.array([name for name, _ in found])
+    names = np.array([name for name, _ in actual])
     assert abs(np.cumsum(names[:, None] == np.array(list(sources)), axis=0) - due).max() < 1.01
-    counts = Counter(name for name, _ in found)
+    counts = Counter(name for name, _ in actual)
     assert any(counts[name] == len(source) for name, source in sources.items())
     whole = {name: source[:]["states/angle"] for name, source in sources.items()}
-    assert_array_equal(mixture[:]["states/angle"], np.stack([whole[name][number] for name, number in found]))
+    assert_array_equal(mixture[:]["states/angle"], np.stack([whole[name][number] for name, number in actual]))
 
 
 def test_over_epochs_every_video_comes_equally_often(sources: dict) -> None:
@@ -103,7 +103,7 @@ def test_a_mixture_resumes_at_the_very_batch_on_any_world_size(sources: dict) ->
 def test_a_state_of_other_weights_is_refused(sources: dict) -> None:
     one, other = (gen2d.DataLoader(gen2d.mix(sources, weights), 6) for weights in (WEIGHTS, [1, 2, 3]))
     state = one.state_dict()
-    other.walk.videos = one.walk.videos  # a mixture of the same length
+    other.epoch_sampler.videos = one.epoch_sampler.videos  # a mixture of the same length
     with pytest.raises(ConfigError, match=r"the state has shares \[5, 3, 2\], but the dataset \[1, 2, 3\]"):
         other.load_state_dict(state)
 
@@ -124,7 +124,7 @@ def test_a_mixture_of_one_is_that_one(sources: dict) -> None:
 
 
 @pytest.mark.parametrize(
-    ("weights", "told"),
+    ("weights", "message"),
     [
         ({"a": 1, "b": 1, "d": 1}, "weights has the names a, b, d, but must have a, b, c"),
         ([1, 2], "weights has 2 numbers, but there are 3 datasets"),
@@ -133,8 +133,8 @@ def test_a_mixture_of_one_is_that_one(sources: dict) -> None:
         ([1, 1, "many"], "weights of c is 'many'"),
     ],
 )
-def test_wrong_weights_are_named(sources: dict, weights: Any, told: str) -> None:
-    with pytest.raises(ConfigError, match=told):
+def test_wrong_weights_are_named(sources: dict, weights: Any, message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
         gen2d.mix(sources, weights)
 
 

@@ -7,7 +7,7 @@ import pytest
 from PIL import Image, ImageSequence
 
 from gen2d.core.errors import FolderError
-from gen2d.media.contact_sheet import framed
+from gen2d.media.contact_sheet import add_border
 from gen2d.media.images import WEBP_SIDE, animate, writing
 
 
@@ -20,7 +20,7 @@ def test_an_animation_holds_every_pixel_of_every_video(tmp_path: Path, fps: floa
         assert file.info["loop"] == 0
     assert [shown for _, shown in frames] == [duration] * 4
     for t, (image, _) in enumerate(frames):
-        first, second, third = (framed(video[t]) for video in videos)
+        first, second, third = (add_border(video[t]) for video in videos)
         expected = [[first, second], [third, np.zeros_like(third)]]
         np.testing.assert_array_equal(image, np.concatenate([np.concatenate(row, axis=1) for row in expected]))
 

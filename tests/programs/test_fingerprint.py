@@ -58,7 +58,7 @@ EDITS = {
 
 
 @pytest.fixture
-def edited(package: Path) -> Iterator[Edit]:
+def edit_source(package: Path) -> Iterator[Edit]:
     """What replaces a text in a file of the copy, until the test ends."""
     before: dict[Path, bytes] = {}
 
@@ -76,10 +76,10 @@ def edited(package: Path) -> Iterator[Edit]:
 
 @pytest.mark.parametrize("what", EDITS)
 def test_an_edited_program_is_refused_by_name(
-    package: Path, edited: Callable[[str, str, str], None], what: str
+    package: Path, edit_source: Callable[[str, str, str], None], what: str
 ) -> None:
     file, old, new, does = EDITS[what]
-    edited(file, old, new)
+    edit_source(file, old, new)
     before = synthetic.tree(package / "data")
     regen = [("verify", "data", "--level", "regen")] if what == "solver" else []  # each takes seconds
     for arguments in (("--config", "tiny.yaml", "--n", 9, "--out", "data"), *regen):
@@ -90,10 +90,10 @@ def test_an_edited_program_is_refused_by_name(
     assert synthetic.tree(package / "data") == before
 
 
-def test_other_names_and_comments_are_not_refused(package: Path, edited: Edit) -> None:
+def test_other_names_and_comments_are_not_refused(package: Path, edit_source: Edit) -> None:
     for name in ("time_of_impact", "contact_points"):
-        edited(f"gen2d/physics/{name}.py", "plane_approach_speed", "speed_at_a_plane")
-    edited("gen2d/captions/caption.py", "\nNOUNS =", "\n# What they are called\nNOUNS =")
+        edit_source(f"gen2d/physics/{name}.py", "plane_approach_speed", "speed_at_a_plane")
+    edit_source("gen2d/captions/caption.py", "\nNOUNS =", "\n# What they are called\nNOUNS =")
     flags = "--xla_force_host_platform_device_count=2"
     done = run(package, "--config", "tiny.yaml", "--n", 3, "--out", "data", XLA_FLAGS=flags)
     assert "nothing to do" in done.stdout, done.stderr

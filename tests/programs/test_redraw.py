@@ -83,9 +83,9 @@ def test_a_blur_that_cannot_be_is_refused(plain, sigma):
 
 
 def test_another_look_and_other_annotations(plain):
-    made = gen2d.render(plain, [1], look={"name": "marked"}, fields=("frames", "boxes/visible", "flow/forward"))
-    assert (np.asarray(made["frames"]) != plain[[1]]["frames"]).any()
-    assert made["flow/forward"].shape == (1, 8, 32, 48, 2)
+    fields = gen2d.render(plain, [1], look={"name": "marked"}, fields=("frames", "boxes/visible", "flow/forward"))
+    assert (np.asarray(fields["frames"]) != plain[[1]]["frames"]).any()
+    assert fields["flow/forward"].shape == (1, 8, 32, 48, 2)
 
 
 def test_states_alone_are_drawn_when_loaded(tmp_path, plain):
