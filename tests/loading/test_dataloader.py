@@ -1,8 +1,10 @@
 """The order is a permutation that can be resumed anywhere, and batches are the same wherever they are made."""
 
+import gc
 import itertools
 import multiprocessing
 import pickle
+import threading
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
