@@ -209,6 +209,26 @@ def test_batches_stay_as_they_were_while_others_follow(toy: Path, kind: Any) -> 
             assert_array_equal(np.asarray(actual[name]), values)
 
 
+def test_an_abandoned_iterator_does_not_wait_for_its_threads(toy: Path) -> None:
+    """The garbage collector may end it while a thread starts; joining a thread would then wait for ever."""
+    gate, delivered = threading.Event(), itertools.count()
+
+    def transform(batch: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+        if next(delivered):  # only the first batch passes at once
+            gate.wait(60)
+        return batch
+
+    batches = iter(DataLoader(loader.open(toy), 4, num_threads=1, transform=transform))
+    next(batches)
+    late = threading.Timer(20, gate.set)
+    late.start()
+    del batches
+    gc.collect()
+    assert not gate.is_set()
+    late.cancel()
+    gate.set()
+
+
 def check_device_placement(root: str) -> None:
     """Fails unless batches for jax lie on the device, or over the devices, that they are asked to."""
     import jax
