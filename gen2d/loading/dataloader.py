@@ -164,6 +164,7 @@ class DataLoader(Generic[A]):
         self.dataset, self.transform, self.to = dataset, transform, to
         self.device, self.sharding = device, sharding
         self._running: Generator[Any, None, None] | None = None
+        self._pool: ThreadPoolExecutor | None = None
 
     def __len__(self) -> int:
         """The number of batches in one epoch."""
@@ -184,6 +185,8 @@ class DataLoader(Generic[A]):
         """Stop the iteration in progress and wait for its threads."""
         if self._running is not None:
             self._running.close()
+        if self._pool is not None:
+            self._pool.shutdown()
 
     def state_dict(self) -> LoaderState:
         """State after the last batch delivered, as values that JSON can store; batches read ahead do not count.
@@ -224,7 +227,7 @@ class DataLoader(Generic[A]):
 
     def _batches(self) -> Generator[Any, None, None]:
         steps = self.epoch_sampler.steps()
-        pool = ThreadPoolExecutor(self.threads, "gen2d")
+        self._pool = pool = ThreadPoolExecutor(self.threads, "gen2d")
         try:
             ahead = deque((step, self._submit(pool, step)) for step in itertools.islice(steps, self.prefetch))
             while ahead:
@@ -235,7 +238,9 @@ class DataLoader(Generic[A]):
                 self.epoch_sampler.advance(step)
                 yield batch
         finally:
-            pool.shutdown(cancel_futures=True)
+            # An abandoned iterator ends in the garbage collector, which may run while a thread starts and holds the
+            # lock that joining a thread needs. `close` waits.
+            pool.shutdown(wait=False, cancel_futures=True)
 
     def _submit(self, pool: ThreadPoolExecutor, step: GlobalBatch) -> Future[Any]:
         """Future of this rank's slice of a global batch, which all threads fill together."""

@@ -1,8 +1,12 @@
 """The order is a permutation that can be resumed anywhere, and batches are the same wherever they are made."""
 
+import gc
 import itertools
 import multiprocessing
 import pickle
+import threading
+import time
+import weakref
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -205,6 +209,23 @@ def test_batches_stay_as_they_were_while_others_follow(toy: Path, kind: Any) -> 
         for name, values in batch.items():
             assert isinstance(actual[name], library.Array if kind == "jax" else library.Tensor)
             assert_array_equal(np.asarray(actual[name]), values)
+
+
+def test_an_abandoned_iterator_joins_no_thread(toy: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The garbage collector may end it while another thread starts and holds the lock that joining needs."""
+    joined = []
+    monkeypatch.setattr(threading.Thread, "join", lambda thread, timeout=None: joined.append(thread.name))
+    data_loader = DataLoader(loader.open(toy), 4, num_threads=1)
+    next(iter(data_loader))
+    alive = weakref.ref(data_loader)
+    del data_loader
+    for _ in range(100):  # until its thread has done what was requested ahead
+        gc.collect()
+        if alive() is None:
+            break
+        time.sleep(0.1)
+    assert alive() is None
+    assert not joined
 
 
 def check_device_placement(root: str) -> None:
