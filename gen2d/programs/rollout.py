@@ -48,14 +48,6 @@ BATCH_SIZE, PAIRS = 512, 2**20
 VIDEOS = PartitionSpec("videos")
 
 
-class DeviceBatch(NamedTuple):
-    """`batch_size` simulated videos on each device, ready to be rendered."""
-
-    columns: dict[str, Array]  # stored fields [n, ...] except rendered ones
-    render_scenes: RenderScene
-    placed: Array  # [n] whether all objects could be placed
-
-
 def _power_of_two(limit: int) -> int:
     return 1 << max(0, limit.bit_length() - 1)
 
@@ -168,60 +160,6 @@ class Rollout:
             self._draw_programs[count] = jax.jit(render_slice)
         return self._draw_programs[count]
 
-    def _simulate_batch(self, root: Array, row: Array, grid: Array, numbers: Array, attempts: Array) -> DeviceBatch:
-        """One device's part of a batch: everything but the frames, from video numbers."""
-        config = self.config
-        keys, matched_columns = sets.keys_of(root, numbers, config.matched), {}
-        if config.matched.change:
-
-            def member(key: Array, change: FactorChange | None = None) -> tuple[dict[str, Array], SampledScene]:
-                return self.sampler.sampled(key, row, change=change)
-
-            factors, sampled, trajectory, matched_columns = simulate_module.simulate_members(
-                keys, numbers, config, self.layout, member, self._trajectory
-            )
-        else:
-            own_keys = rejection.attempt_keys(keys, attempts) if self.quality_ranges else keys
-            factors, sampled = jax.vmap(self.sampler.sampled, (0, None, 0))(own_keys, row, grid)
-            trajectory = self._trajectory(sampled.scene, sampled.state)
-        scene, between, trajectory = sampled.scene, trajectory.between, dataclasses.replace(trajectory, between=None)
-
-        def build(key: Array, scene: Scene, states: State, between: State | None) -> tuple[RenderScene, Array]:
-            render_scene = render.render_scene(key, config, self.plan, scene, states, between=between)
-            return render_scene, render.painted_colors(render_scene.paint, scene)
-
-        render_scenes, colors = jax.vmap(build)(keys, scene, trajectory.states, between)
-        columns = axes_module.columns(scene) | axes_module.columns(trajectory)
-        columns["objects/color"] = colors
-        columns |= render.camera_columns(render_scenes.instants.view)
-        columns |= {f"factors/{name}": values.astype(jnp.float32) for name, values in factors.items()}
-        columns |= jax.vmap(self.sampler.outside)(factors)
-        columns["quality/rejected_draws"] = sampled.rejected
-        if config.annotations.simulated.lyapunov:
-            columns["quality/lyapunov"] = self._lyapunov(keys, sampled)
-        columns = {name: values for name, values in columns.items() if name not in sets.omitted_fields(config.matched)}
-        return DeviceBatch(columns | matched_columns, render_scenes, sampled.fits)
-
-    def _device_trajectory(self, scene: Scene, state: State, keep: SaveAt) -> Trajectory:
-        """Trajectories from these initial states, in the device's layout."""
-        config, sparse = self.config, self.devices[0].platform == "cpu"
-        rules = solver_params(config.physics, config.video.fps, self.steps)
-        return simulate(scene, state, self.layout, rules, config.video.frames, self.steps, keep, sparse=sparse)
-
-    def _trajectory(self, scene: Scene, state: State) -> Trajectory:
-        """Trajectories from these initial states, with the videos first."""
-        trajectory = self._device_trajectory(axes_module.to_device(scene), axes_module.to_device(state), self.save_at)
-        between = trajectory.between
-        if between is not None:  # from [T - 1, steps, (2,) K, n] to [n, T - 1, steps, K(, 2)]
-            between = jax.tree.map(lambda x: jnp.moveaxis(jnp.moveaxis(x, -1, 0), -1, 3), between)
-        stored = axes_module.to_stored(dataclasses.replace(trajectory, between=None))
-        return dataclasses.replace(stored, between=between)
-
-    def _lyapunov(self, keys: Array, sampled: SampledScene) -> Array:
-        rerun = functools.partial(self._device_trajectory, keep=SaveAt())
-        start = axes_module.to_device(sampled.scene), axes_module.to_device(sampled.state)
-        return lyapunov.lyapunov_exponent(keys, *start, rerun, float(self.schema.time[-1]))
-
     def host_columns(self, batch: DeviceBatch) -> list[dict[str, np.ndarray]]:
         """Each device's columns as NumPy arrays; waits for the devices."""
         columns = {name: per_device(array) for name, array in batch.columns.items()}
@@ -237,9 +175,3 @@ def _device_shards(array: Array) -> list[Any]:
 def per_device(array: Array) -> list[np.ndarray]:
     """Each device's part of an array, as NumPy arrays."""
     return [np.asarray(shard.data) for shard in _device_shards(array)]
-
-
-def save_at(config: Config, layout: layout_module.Layout) -> SaveAt:
-    """What to record of a simulation besides its states."""
-    rows = config.annotations.simulated.contacts * math.ceil(config.video.frames / 16) * layout.slots
-    return SaveAt(rows, config.annotations.simulated.energy, between=config.image.exposure > 0)

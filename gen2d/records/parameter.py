@@ -9,10 +9,9 @@ NumPy's functions take parameters (`np.sqrt`, `np.hypot`); those of `math` need 
 """
 
 import contextlib
-import dataclasses
 import math
 import operator
-from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterator, Sequence
 from typing import Any
 
 import jax
@@ -41,6 +40,16 @@ class Tape:
             self._nodes.append((operation, operands))
             self._parameters[known] = Parameter(self, len(self._nodes) - 1, value)
         return self._parameters[known]
+
+    def leaf(self, index: int, value: Any) -> "Parameter":
+        """Number `index` of the config."""
+        self._nodes.append((_leaf, (index,)))
+        return Parameter(self, len(self._nodes) - 1, value)
+
+    @property
+    def size(self) -> int:
+        """Number of arguments that the programs traced so far take."""
+        return self._used
 
     def guard(self, parameter: "Parameter") -> Any:
         """Value of a parameter, on which the programs then depend."""
@@ -199,17 +208,3 @@ def apply(operation: Callable, *operands: Any) -> Any:
     """Result of a host function of numbers; recorded if one of them is a parameter."""
     tape = next((x.tape for x in operands if isinstance(x, Parameter)), None)
     return operation(*operands) if tape is None else tape.apply(operation, *operands)
-
-
-def parametrized(tape: Tape, value: Any, leaves: list[Any]) -> Any:
-    """The value, a tree of dataclasses, mappings and tuples, with a parameter in place of each number.
-
-    The numbers are appended to `leaves`. A whole number that stands alone, such as a count, remains; those in tuples,
-    such as a colour's or a distribution's, do not.
-    """
-
-    def number(x: Any) -> Any:
-        leaves.append(x)
-        return tape.apply(_leaf, len(leaves) - 1) if tape is not None else x
-
-    raise NotImplementedError(number)

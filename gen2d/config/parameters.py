@@ -1,0 +1,63 @@
+"""Configs whose numbers are parameters, and the structure that remains of a config without its numbers."""
+
+import dataclasses
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from gen2d.config.config import Config
+from gen2d.config.plugin_options import Plugin
+from gen2d.config.sections import StorageOptions
+from gen2d.records.parameter import Tape
+
+Number = Callable[[Any], Any]
+
+
+def split_numbers(config: Config) -> tuple[str, list[Any]]:
+    """Structure of a config as text, equal for configs that differ in numbers only, and these numbers."""
+    numbers: list[Any] = []
+
+    def take(number: Any) -> str:
+        numbers.append(number)
+        return "number"
+
+    return repr(_replaced(config, take)), numbers
+
+
+def parametrized(config: Config, tape: Tape) -> Config:
+    """The config with a parameter of the tape in place of each number; leaf i is number i of `split_numbers`.
+
+    It holds only what programs depend on.
+    """
+    count = iter(range(2**31))
+    return _replaced(config, lambda number: tape.leaf(next(count), number))
+
+
+def _replaced(config: Config, convert: Number) -> Config:
+    """The config with its numbers converted, and without its name, seed and storage."""
+    splits = tuple(
+        dataclasses.replace(split, videos=None, written="{}", law=_converted(split.law, convert), own={})
+        for split in config.splits
+    )
+    storage = StorageOptions(frames=config.storage.frames)
+    static = {"name": "", "seed": 0, "storage": storage, "splits": splits, "annotations": config.annotations}
+    names = [f.name for f in dataclasses.fields(config) if f.name not in static]
+    return dataclasses.replace(config, **static, **{n: _converted(getattr(config, n), convert) for n in names})
+
+
+def _converted(value: Any, convert: Number, listed: bool = False) -> Any:
+    """A tree of dataclasses, mappings and tuples with its numbers converted.
+
+    A whole number by itself, such as a count, stays; those in tuples, such as a colour's, are converted.
+    """
+    if isinstance(value, float) or (listed and isinstance(value, int) and not isinstance(value, bool)):
+        return convert(value)
+    if isinstance(value, tuple):
+        return tuple(_converted(part, convert, listed=True) for part in value)
+    if isinstance(value, Mapping):
+        return {key: _converted(part, convert) for key, part in value.items()}
+    if isinstance(value, Plugin):
+        return dataclasses.replace(value, options=_converted(value.options, convert), own=None)
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        parts = {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
+        return dataclasses.replace(value, **{name: _converted(part, convert) for name, part in parts.items()})
+    return value

@@ -1,0 +1,88 @@
+"""Programs that are traced and compiled once for all configs of one structure.
+
+The numbers of a config are arguments of its programs (records/parameter.py), so another gravity, radius or colour needs
+no other program.
+"""
+
+import collections
+import threading
+from collections.abc import Callable, Hashable
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from gen2d.config.config import Config
+from gen2d.config.parameters import parametrized, split_numbers
+from gen2d.records.parameter import SIZE, Tape
+
+MAX_PROGRAMS = 12  # kept in memory; each takes up to thousands of the 65,530 memory maps that a process may have
+
+Build = Callable[[Config], Callable[..., Any]]
+Wrap = Callable[[Callable[..., Any]], Callable[..., Any]]
+
+
+class Program(NamedTuple):
+    """A traced program and the tape of its parameters."""
+
+    jitted: Any  # called with the arguments of the tape, uint32 [SIZE], and others
+    tape: Tape
+
+
+class BoundProgram(NamedTuple):
+    """A program with the numbers of one config."""
+
+    program: Program
+    numbers: np.ndarray  # uint32 [SIZE]
+
+
+_programs: collections.OrderedDict[Hashable, list[Program]] = collections.OrderedDict()
+_lock = threading.Lock()
+
+
+def program_for(config: Config, key: Hashable, build: Build, args: tuple, wrap: Wrap = lambda run: run) -> BoundProgram:
+    """The program of a config: one that is already there if it serves the config, else a new one, traced for `args`.
+
+    Parameters
+    ----------
+    config : Config
+        The config; sections that the program does not depend on should have their defaults.
+    key : hashable
+        Everything else that determines the program, such as its name, devices and sizes.
+    build : callable
+        `build(config)` returns the function to be traced, for a config whose numbers are parameters.
+    args : tuple
+        Arguments of the function, or their shapes.
+    wrap : callable
+        Transformation of the function `run(numbers, *args)` before it is jitted.
+    """
+    structure, leaves = split_numbers(config)
+    with _lock:
+        programs = _programs.setdefault((key, structure), [])
+        _programs.move_to_end((key, structure))
+        for program in programs:
+            numbers = program.tape.arguments(leaves)
+            if numbers is not None:
+                return BoundProgram(program, numbers)
+        program = _traced(config, build, args, wrap)
+        programs.append(program)
+        numbers = program.tape.arguments(leaves)
+        assert numbers is not None, "a program serves the config that it is traced for"
+        while sum(map(len, _programs.values())) > MAX_PROGRAMS:
+            for old in _programs.popitem(last=False)[1]:
+                old.jitted.clear_cache()
+        return BoundProgram(program, numbers)
+
+
+def _traced(config: Config, build: Build, args: tuple, wrap: Wrap) -> Program:
+    tape = Tape()
+    function = build(parametrized(config, tape))
+
+    def run(numbers: jax.Array, *args: Any) -> Any:
+        with tape.tracing(numbers):
+            return function(*args)
+
+    run.__name__ = build.__name__
+    jitted = jax.jit(wrap(run))
+    jitted.trace(jax.ShapeDtypeStruct((SIZE,), np.uint32), *args)
+    return Program(jitted, tape)
