@@ -61,7 +61,7 @@ def _worker(text: str) -> tuple[int, int]:
 def run(options: argparse.Namespace) -> int:
     from gen2d.core.progress import to_stderr
     from gen2d.generation.run import generate  # imports jax
-    from gen2d.storage.paths import shown
+    from gen2d.storage.filesystems import shown
 
     try:
         summary = generate(

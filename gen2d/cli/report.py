@@ -8,7 +8,8 @@ from gen2d.core.errors import ConfigError
 from gen2d.core.humanize import in_bytes, in_time
 from gen2d.dataset.manifest import Manifest, read_manifest, statistics
 from gen2d.storage.atomic import size_of
-from gen2d.storage.paths import Network, Place, place
+from gen2d.storage.paths import Place, place
+from gen2d.storage.retries import Network
 
 
 def _table(rows: list[tuple[str, ...]]) -> list[str]:

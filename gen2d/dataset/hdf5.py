@@ -1,8 +1,10 @@
 """HDF5 shards: images in compressed chunks, by default one per video, everything else contiguous.
 
-Any HDF5 program reads them. The bytes depend on the compressed chunks and values alone: not on times, hosts or users,
-nor on how the videos were grouped into blocks. h5py serves one thread at a time, so compression happens elsewhere and
-chunks pass through h5py unchanged. Every file holds its own index (`rows.py`), by which gen2d reads without h5py.
+Any HDF5 program reads them. Four files decide the bytes of a shard: `block.py` divides images into chunks,
+`storage/codecs.py` compresses each chunk, this file lays out chunks, values and attributes, and `rows.py` defines the
+index, by which gen2d reads without h5py. The bytes do not depend on times, hosts or users, nor on how the videos were
+grouped into blocks. h5py serves one thread at a time, so compression happens in
+other threads and chunks pass through h5py unchanged.
 """
 
 import contextlib

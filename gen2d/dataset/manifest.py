@@ -4,6 +4,7 @@ It is the only entrance for what strangers write: `parse` turns bytes into a che
 """
 
 import dataclasses
+import functools
 import json
 from collections.abc import Iterator, Mapping
 from typing import Any, TypeGuard
@@ -59,7 +60,7 @@ class Manifest:
         """The values that another run must share to add to this dataset."""
         return {key: self.plain[key] for key in IDENTITY}
 
-    @property
+    @functools.cached_property
     def identity_sha256(self) -> str:
         """The sha256 of the identity."""
         return sha256(as_json(self.identity))

@@ -14,7 +14,8 @@ from gen2d.core.progress import progress, stopping_on_sigterm
 from gen2d.exports.source import Source, source_of
 from gen2d.storage.atomic import publishing, publishing_folder, sweep_beside
 from gen2d.storage.explain import writing_error
-from gen2d.storage.paths import Network, Place, Url, place
+from gen2d.storage.paths import Place, Url, place
+from gen2d.storage.retries import Network
 from gen2d.storage.sealed import JSON_BYTES, as_json, parsed, read_bytes
 
 SCHEMA = "gen2d.export/1"

@@ -40,7 +40,8 @@ from gen2d.programs.recipe import Trust, config_from
 from gen2d.programs.source import VideoRange, VideoSource
 from gen2d.storage.atomic import publish_changed, remove_tree, sync
 from gen2d.storage.leases import LOCK, leased, temporary_name
-from gen2d.storage.paths import Network, Place, Url, place, upload
+from gen2d.storage.paths import Place, Url, place, upload
+from gen2d.storage.retries import Network
 from gen2d.storage.sealed import file_sha256
 
 Identity = Mapping[str, Any]  # of a dataset; its manifest has the same keys

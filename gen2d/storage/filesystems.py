@@ -63,6 +63,6 @@ def _limits(start: str, timeout: float) -> dict[str, Any]:
         limits = aiohttp.ClientTimeout(total=None, sock_connect=timeout, sock_read=timeout)
         return {"client_kwargs": {"timeout": limits}}
     if start.startswith(("s3://", "s3a://")):
-        retries = {"max_attempts": 1}  # `attempt` tries again
+        retries = {"max_attempts": 1}  # `retries.attempt` tries again
         return {"config_kwargs": {"connect_timeout": timeout, "read_timeout": timeout, "retries": retries}}
     return {}

@@ -27,7 +27,8 @@ from gen2d.loading import dataset as loader
 from gen2d.loading.epochs import order
 from gen2d.storage.atomic import size_of
 from gen2d.storage.explain import reading_error, reason
-from gen2d.storage.paths import Network, Place, Url, download, place, reading
+from gen2d.storage.paths import Place, Url, download, place, reading
+from gen2d.storage.retries import Network
 from gen2d.storage.sealed import file_sha256, has_sha256, read_bytes, read_sealed, sha256
 
 LEVELS = ("quick", "full", "regen")

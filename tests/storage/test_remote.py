@@ -34,10 +34,9 @@ from gen2d.dataset.spec import DatasetSpec, shards_of_worker
 from gen2d.generation.complete import complete
 from gen2d.loading import dataset as loader
 from gen2d.loading.dataloader import DataLoader
-from gen2d.storage import filesystems, ranges
-from gen2d.storage import paths as remote
+from gen2d.storage import filesystems, ranges, retries
 from gen2d.storage.atomic import publish, sweep
-from gen2d.storage.paths import Url, place
+from gen2d.storage.paths import Url, place, upload
 from gen2d.storage.ranges import Range
 from gen2d.storage.sealed import read_bytes
 
@@ -57,7 +56,7 @@ def running() -> Iterator[Server]:
 
 @pytest.fixture(autouse=True)
 def server(running: Server, monkeypatch: pytest.MonkeyPatch) -> Server:
-    monkeypatch.setattr(remote, "PAUSE", 0.01)
+    monkeypatch.setattr(retries, "PAUSE", 0.01)
     monkeypatch.setattr(s3fs.S3FileSystem, "retries", 1)  # trying again is for gen2d
     running.reset()
     return running
@@ -109,7 +108,7 @@ def test_what_is_read_is_what_is_in_the_folder(
     if kind == "memory":
         for name, content in synthetic.tree(toy).items():
             (tmp_path / "one").write_bytes(content)
-            remote.upload(tmp_path / "one", Url(f"{urls[kind]}/{name}"))
+            upload(tmp_path / "one", Url(f"{urls[kind]}/{name}"))
     cache = tmp_path / "cache" if cached else None
     cases: list[dict[str, Any]] = [{"fields": "*"}, {"window": 2, "stride": 2, "layout": "TCHW", "dtype": "float32"}]
     for options in cases:
@@ -521,7 +520,7 @@ def test_another_dataset_is_refused_or_replaced(tmp_path: Path) -> None:
 
 def test_what_is_no_dataset_is_left_alone(tmp_path: Path) -> None:
     (tmp_path / "thesis.tex").write_text("years of work")
-    remote.upload(tmp_path / "thesis.tex", Url("s3://bucket/thesis/thesis.tex"))
+    upload(tmp_path / "thesis.tex", Url("s3://bucket/thesis/thesis.tex"))
     for overwrite in (False, True):
         with pytest.raises(FolderError, match="holds something other"):
             open_folder(at("s3://bucket/thesis"), overwrite)

@@ -15,8 +15,9 @@ from tiny import ran_here
 
 import gen2d
 from gen2d.core.errors import ConfigError, DamagedError, Error, FolderError, UnreachableError
-from gen2d.storage import paths
-from gen2d.storage.paths import Network, Url, place
+from gen2d.storage import retries
+from gen2d.storage.paths import Url, place
+from gen2d.storage.retries import Network
 
 TIMEOUT, DEADLINE = 0.3, 1.0
 
@@ -103,7 +104,7 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
 
 @pytest.fixture(autouse=True)
 def _quick(server: Server, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(paths, "PAUSE", 0.01)
+    monkeypatch.setattr(retries, "PAUSE", 0.01)
     server.fault, server.asked = "", []
 
 
