@@ -20,7 +20,7 @@ from pathlib import Path, PurePath
 from typing import Any
 
 from gen2d.core.errors import DamagedError, FolderError
-from gen2d.storage.filesystems import file_system, shown
+from gen2d.storage.filesystems import file_system, redact_url
 from gen2d.storage.retries import Address, Network, attempt, http_status
 
 PIECE = 2**20  # bytes of a file that are received at once
@@ -112,7 +112,7 @@ def place(path: str | Place, network: Network | None = None) -> Place:
     if protocol in ("file", "local"):
         return Path(rest)
     if not rest.strip("/") or "::" in path or not re.fullmatch(r"[A-Za-z0-9+.-]+", protocol):
-        raise FolderError(f"{shown(path)} must be PROTOCOL://FOLDER, such as s3://bucket/dataset")
+        raise FolderError(f"{redact_url(path)} must be PROTOCOL://FOLDER, such as s3://bucket/dataset")
     text, mark, query = path.partition("?") if protocol in ("http", "https", "az", "abfs", "abfss") else (path, "", "")
     url = Url(text.rstrip("/"), mark + query, network or Network())
     file_system(url.text, url.network.timeout)

@@ -14,7 +14,7 @@ from collections.abc import Callable
 from typing import Any, TypeVar
 
 from gen2d.core.errors import ConfigError, DamagedError, UnreachableError
-from gen2d.storage.filesystems import file_system, shown, without_secrets
+from gen2d.storage.filesystems import file_system, redact, redact_url
 
 PAUSE = 0.25  # s, before the second attempt; doubled before each later one
 ATTEMPTS = 4
@@ -45,7 +45,7 @@ class Address:
     network: Network = dataclasses.field(default=Network(), compare=False, repr=False)
 
     def __str__(self) -> str:
-        return shown(self.text + self.query)
+        return redact_url(self.text + self.query)
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}({str(self)!r})"
@@ -117,7 +117,7 @@ def request_error(error: BaseException, url: Address) -> Exception:
     number = getattr(error, "errno", None)
     text = getattr(error, "strerror", None) or str(error)
     text = text or ("no answer in time" if isinstance(error, TimeoutError) else type(error).__name__)
-    text = " ".join(without_secrets(text, url.text, url.query).split()).rstrip(".")
+    text = " ".join(redact(text, url.text, url.query).split()).rstrip(".")
     final = number in _FINAL_NUMBERS or isinstance(error, TypeError | ValueError | NotImplementedError | AttributeError)
     if final or (status is not None and 400 <= status < 500 and status not in (408, 425, 429)):
         return OSError(number or errno.EIO, text, str(url))

@@ -160,14 +160,14 @@ def find_problems(
         try:
             problems = list(_problems_of(root, manifest, level, videos, seed, trust))
         except Error:
-            if _has(root, manifest):
+            if _has_manifest(root, manifest):
                 raise
             continue
-        if not problems or _has(root, manifest):
+        if not problems or _has_manifest(root, manifest):
             return problems
 
 
-def _has(root: Place, manifest: Manifest) -> bool:
+def _has_manifest(root: Place, manifest: Manifest) -> bool:
     """Whether the folder still has this manifest, or no intact one."""
     try:
         return read_manifest(root).sha256 == manifest.sha256

@@ -19,7 +19,7 @@ from timing import timed
 from gen2d.core.schema import Field
 from gen2d.dataset.block import encode
 from gen2d.dataset.folder import open_folder
-from gen2d.dataset.rows import origin, sealed_rows
+from gen2d.dataset.rows import origin, seal_rows
 from gen2d.dataset.shard_writer import ShardWriter
 from gen2d.dataset.spec import RECORDS, DatasetSpec, plan
 from gen2d.generation.complete import complete
@@ -137,7 +137,7 @@ def of_many_shards(root: Path, count: int) -> dict[str, float]:
         row = [writer.write(shard, synthetic.blocks(spec, shard)) for shard in remaining[:8]][-1]
     rows = np.repeat(row, count - 16)
     rows["first"] = np.arange(8, count - 8)
-    sealed_rows(rows, origin(spec.identity_sha256, "train"), rows["first"].tolist())
+    seal_rows(rows, origin(spec.identity_sha256, "train"), rows["first"].tolist())
     (root / RECORDS / "train.0123456789abcdef.1").write_bytes(rows.tobytes())
     for shard in remaining[8:-8]:
         with (root / "shards" / f"{shard.name}.h5").open("wb") as file:

@@ -383,7 +383,7 @@ def test_every_format_keeps_the_contract(name: str, balls: Path, tmp_path: Path)
     assert done.loss == form.loss
     assert done.out.is_file() == bool(form.suffix)
     assert done.bytes > 0
-    assert form.suffix or (done.out / export.ABOUT).is_file()
+    assert form.suffix or (done.out / export.DESCRIPTION).is_file()
 
 
 @pytest.mark.parametrize(

@@ -22,7 +22,7 @@ from gen2d.core.errors import DamagedError, Error, FolderError, UnreachableError
 from gen2d.dataset.folder import open_folder
 from gen2d.loading import chunks
 from gen2d.storage import explain, leases
-from gen2d.storage.leases import leased, temporary_name
+from gen2d.storage.leases import lease, temporary_name
 from gen2d.tools.verify import verify
 
 TESTS = Path(synthetic.__file__).parent
@@ -276,16 +276,16 @@ def test_only_locks_that_all_respect_count(
 
 def test_a_lease_is_the_owner_s_alone(tmp_path: Path) -> None:
     path = tmp_path / temporary_name("x")
-    with leased(path) as descriptor:
+    with lease(path) as descriptor:
         os.write(descriptor, b"mine")
         assert leases.remove_abandoned([path]) == []
         assert path.read_bytes() == b"mine"
     assert leases.remove_abandoned([path]) == [path]
     folder = tmp_path / temporary_name("y")
     folder.mkdir()
-    with leased(folder.with_name(folder.name + ".lock")):
-        assert leases.remove_abandoned(list(leases.temporaries(tmp_path))) == []
-    assert leases.remove_abandoned(list(leases.temporaries(tmp_path))) == [folder]
+    with lease(folder.with_name(folder.name + ".lock")):
+        assert leases.remove_abandoned(list(leases.temporary_files(tmp_path))) == []
+    assert leases.remove_abandoned(list(leases.temporary_files(tmp_path))) == [folder]
     assert list(tmp_path.iterdir()) == []
 
 

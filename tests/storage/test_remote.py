@@ -29,7 +29,7 @@ from gen2d.dataset import hdf5
 from gen2d.dataset.folder import log, open_folder
 from gen2d.dataset.manifest import read_manifest
 from gen2d.dataset.records import read_tables
-from gen2d.dataset.rows import origin, sealed_rows
+from gen2d.dataset.rows import origin, seal_rows
 from gen2d.dataset.spec import DatasetSpec, shards_of_worker
 from gen2d.generation.complete import complete
 from gen2d.loading import dataset as loader
@@ -401,7 +401,7 @@ def test_many_shards_take_a_handful_of_requests(server: Server) -> None:
         row = writer.write(todo[0], synthetic.blocks(made, todo[0]))
     rows = np.repeat(row, 2999)
     rows["first"] = np.arange(1, 3000)
-    sealed_rows(rows, origin(made.identity_sha256, "train"), rows["first"].tolist())
+    seal_rows(rows, origin(made.identity_sha256, "train"), rows["first"].tolist())
     for part in range(3):
         publish(place(f"{url}/.gen2d/records/train.{part:016x}.1"), rows[part::3].tobytes())
     server.reset()
