@@ -67,7 +67,7 @@ def toy(running: Server, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A dataset in a folder, and at TOY, and on a web server."""
     root = tmp_path_factory.mktemp("data") / "toy"
     synthetic.make(synthetic.dataset(root))
-    buckets.copied(root, TOY)
+    buckets.copy_dataset(root, TOY)
     running.folder = root.parent
     return root
 
@@ -121,7 +121,7 @@ def test_what_is_read_is_what_is_in_the_folder(
 @pytest.mark.parametrize("codec", ["zstd", "none"])
 def test_every_codec_is_read(tmp_path: Path, codec: str) -> None:
     root = synthetic.folder(synthetic.make(synthetic.dataset(tmp_path / "toy", train=3, codec=codec)))
-    buckets.copied(root, f"s3://bucket/{codec}")
+    buckets.copy_dataset(root, f"s3://bucket/{codec}")
     same(gen2d.open(f"s3://bucket/{codec}", "train", "*")[:], synthetic.stored(root))
 
 
@@ -134,14 +134,14 @@ def test_a_video_takes_one_request_a_field_and_near_ones_share(
         monkeypatch.setattr(ranges, "NEAR", near)
         server.reset()
         dataset[3]
-        assert len(server.asked) == len(server.of("GET", "/shards/train-00000.h5")) == one
-        assert all(request.range for request in server.asked)
+        assert len(server.requests) == len(server.of("GET", "/shards/train-00000.h5")) == one
+        assert all(request.range for request in server.requests)
         server.reset()
         dataset[[4, 3, 3]]
-        assert len(server.asked) <= neighbours + (near == 0)  # between the chunks of frames lie those of masks
+        assert len(server.requests) <= neighbours + (near == 0)  # between the chunks of frames lie those of masks
     server.reset()
     dataset[:]
-    assert len(server.asked) == 3  # one for each shard
+    assert len(server.requests) == 3  # one for each shard
 
 
 def test_what_is_asked_covers_each_range_and_wastes_little() -> None:
@@ -203,18 +203,18 @@ def test_what_keeps_failing_is_told(server: Server, toy: Path, tmp_path: Path, k
 
 def test_a_server_without_parts_is_told_and_a_cache_helps(server: Server, toy: Path, tmp_path: Path) -> None:
     url = f"{server.address}/files/toy"
-    server.gives_parts = False
+    server.has_ranges = False
     try:
         with pytest.raises(FolderError, match="does not give parts of files: say cache_dir="):
             gen2d.open(url)[0]
         same(gen2d.open(url, cache_dir=tmp_path)[0], gen2d.open(toy)[0])
     finally:
-        server.gives_parts = True
+        server.has_ranges = True
 
 
 def damaged(toy: Path, url: str, name: str, change: Callable[[bytearray], Any]) -> None:
     """Puts a copy of the dataset at the URL, with one file changed."""
-    buckets.copied(toy, url)
+    buckets.copy_dataset(toy, url)
     content = bytearray((toy / name).read_bytes())
     change(content)
     s3fs.S3FileSystem().pipe(f"{url}/{name}", bytes(content))
@@ -280,7 +280,7 @@ def test_a_cache_keeps_to_its_limit_and_drops_what_was_used_longest_ago(
     assert {hashes[0], hashes[2]} <= sizes(tmp_path).keys()
     server.reset()
     dataset[[2, 18]]
-    assert not server.asked
+    assert not server.requests
     random = np.random.default_rng(0)
     for number in random.integers(0, 20, 30):
         same(dataset[int(number)], expected[int(number)])
@@ -406,16 +406,16 @@ def test_many_shards_take_a_handful_of_requests(server: Server) -> None:
         publish(place(f"{url}/.gen2d/records/train.{part:016x}.1"), rows[part::3].tobytes())
     server.reset()
     assert open_folder(made) == []
-    assert len(server.asked) < 20
+    assert len(server.requests) < 20
     server.reset()
     assert complete(made)
-    assert len(server.asked) < 60
+    assert len(server.requests) < 60
     server.reset()
     assert open_folder(made) == []
-    assert len(server.asked) < 12
+    assert len(server.requests) < 12
     server.reset()
     assert gen2d.open(url, fields="*")[0]["index"] == 0
-    assert len(server.asked) < 6
+    assert len(server.requests) < 6
 
 
 def test_memory_takes_a_dataset_too(toy: Path) -> None:

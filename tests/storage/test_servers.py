@@ -28,7 +28,7 @@ class Server:
     def __init__(self, folder: Path) -> None:
         self.folder, self.fault, self.part = folder, "", ""
         self.listener = socket.create_server(("127.0.0.1", 0))
-        self.asked: list[str] = []
+        self.requests: list[str] = []
         threading.Thread(target=self._accept, daemon=True).start()
 
     @property
@@ -52,7 +52,7 @@ class Server:
                 data += part
             head = data.decode()
             method, path = head.split()[:2]
-            self.asked.append(path)
+            self.requests.append(path)
             found = re.search(r"[Rr]ange: bytes=(\d+)-(\d+)", head)
             self._answer(connection, method, path.partition("?")[0], tuple(map(int, found.groups())) if found else None)
 
@@ -105,7 +105,7 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
 @pytest.fixture(autouse=True)
 def _quick(server: Server, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(retries, "PAUSE", 0.01)
-    server.fault, server.asked = "", []
+    server.fault, server.requests = "", []
 
 
 FAULTS: dict[str, type[Error]] = {
@@ -125,7 +125,7 @@ def test_each_fault_ends_in_time_as_what_it_is(server: Server, fault: str, part:
         gen2d.open(f"http://{server.address}/toy", fields="*", timeout=TIMEOUT, deadline=DEADLINE)[0]
     assert time.monotonic() - began < DEADLINE + 1
     assert server.address in str(caught.value)
-    asked = [path for path in server.asked if part in path]
+    asked = [path for path in server.requests if part in path]
     is_tried_again = len(asked) > len(set(asked))
     assert is_tried_again == (fault in ("reset", "cut", "500", "503", "429", "408", "hang", "stuck")), asked
 
@@ -163,7 +163,7 @@ def test_what_is_secret_is_never_shown(server: Server, what: str) -> None:
     url = start + (f"?sig={secret}" if what == "query" else "")
     ds = gen2d.open(url, fields="*")
     assert len(ds[:]["frames"]) == 3
-    assert all(secret in path for path in server.asked) == (what == "query")
+    assert all(secret in path for path in server.requests) == (what == "query")
     shown = [repr(ds), str(ds.root), repr(ds.root), f"{place(url)!r}"]
     for fault in ("503", "404", "wrong", "garbage", "reset"):
         server.fault, server.part = fault, "/"
