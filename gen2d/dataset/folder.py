@@ -81,8 +81,8 @@ def open_folder(spec: DatasetSpec, overwrite: bool = False) -> list[Shard]:
             records, sizes = read_records(spec, root), Sizes(root)
             shards = whole_plan(spec, records)
             remaining = [shard for shard in shards if not is_done(shard, records, sizes)]
-            manifest = records.manifest
-            if remaining and manifest and any(s.first + s.count > manifest.splits.get(s.split, 0) for s in shards):
+            manifest = current_manifest(root) if remaining else None  # without locks, a newer one than the records'
+            if manifest and any(s.first + s.count > manifest.splits.get(s.split, 0) for s in shards):
                 remove_snapshots(root)  # the dataset grows
             return remaining
 

@@ -46,9 +46,8 @@ class Records:
         folder's manifest when the rows were read.
         """
         self.size, self.rows, self.videos, self.manifest = videos_per_shard, {}, dict(videos or {}), manifest
-        self.indices: dict[
-            str, dict[tuple[int, int], int]
-        ] = {}  # index of the row of each (first video, count), by split
+        # Index of the row of each (first video, count), by split.
+        self.indices: dict[str, dict[tuple[int, int], int]] = {}
         for split, own in rows.items():
             possible = (own["first"] % self.size == 0) & (own["count"] >= 1) & (own["count"] <= self.size)
             self.rows[split] = own[possible]

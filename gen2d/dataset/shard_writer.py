@@ -77,7 +77,7 @@ class ShardWriter:
         spec = self.spec
         raw = sum(stored_bytes(field, spec.sizes) for field in spec.fields.values())
         need = shard.count * (totals.bytes / totals.videos if totals.videos else raw)
-        return writing_error(work_folder(spec.root), error, AGAIN, f"{shard.name} needs attributes {need / 1e6:.1f} MB")
+        return writing_error(work_folder(spec.root), error, AGAIN, f"{shard.name} needs about {need / 1e6:.1f} MB")
 
 
 @dataclasses.dataclass

@@ -194,8 +194,8 @@ def test_a_folder_that_is_moved_in_the_middle_loses_nothing(tmp_path: Path) -> N
 HOLDING = """
 import os, sys
 from pathlib import Path
-from gen2d.storage.leases import leased
-with leased(Path(sys.argv[1])):
+from gen2d.storage.leases import lease
+with lease(Path(sys.argv[1])):
     print("held", flush=True)
     sys.stdin.read()
     os._exit(9)  # without a word, as one that is killed
