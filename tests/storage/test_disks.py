@@ -245,7 +245,7 @@ def test_without_locks_only_clean_removes_what_is_left(toy: Path, monkeypatch: p
     monkeypatch.setattr(leases.fcntl, "flock", no_locks)
     synthetic.make(synthetic.dataset(toy, train=11))
     assert left.exists()
-    done = tiny.ran_here("clean", toy)
+    done = tiny.run_main("clean", toy)
     assert f"removed: shards/{left.name}" in done.stdout
     assert not left.exists()
 
@@ -331,7 +331,7 @@ def test_the_command_goes_on_after_what_happens_to_machines(tmp_path: Path, what
         assert "Traceback" not in errors
         shutil.rmtree(out, ignore_errors=True)
         (tmp_path / "moved").rename(out)
-        assert tiny.ran("--config", config, "--n", 10_000, "--out", out).returncode == 0
+        assert tiny.run_command("--config", config, "--n", 10_000, "--out", out).returncode == 0
     else:
         assert process.returncode == 0, errors
         assert "10,000 videos in" in told

@@ -569,7 +569,7 @@ def test_a_wrong_url_is_one_sentence(url: str, told: str) -> None:
     with pytest.raises((UserError, UnreachableError), match=told):
         gen2d.open(url)
     for verb in ("verify", "info"):
-        done = tiny.ran_here(verb, url)
+        done = tiny.run_main(verb, url)
         assert done.returncode == (3 if "reached" in told else 2)
         assert re.fullmatch(rf"gen2d: .*{told}.*\n", done.stderr), done.stderr
 
@@ -589,17 +589,17 @@ def test_a_run_leaves_at_a_url_what_it_leaves_in_a_folder(server: Server, tmp_pa
     config = tmp_path / "tiny.yaml"
     config.write_text(json.dumps(tiny.CONFIG))
     for out in (tmp_path / "tiny", "s3://bucket/tiny"):
-        done = tiny.ran("--config", config, "--n", 12, "--out", out, "--device", "cpu")
+        done = tiny.run_command("--config", config, "--n", 12, "--out", out, "--device", "cpu")
         assert done.returncode == 0, done.stderr
         assert f"in {out}" in done.stdout
     assert buckets.tree("s3://bucket/tiny") == synthetic.tree(tmp_path / "tiny")
     for verb in ("verify", "info"):
-        done = tiny.ran_here(verb, "s3://bucket/tiny")
+        done = tiny.run_main(verb, "s3://bucket/tiny")
         assert done.returncode == 0, done.stderr
         assert "s3://bucket/tiny" in done.stdout
-    done = tiny.ran_here("preview", "s3://bucket/tiny", "--out", tmp_path, "--videos", 2)
+    done = tiny.run_main("preview", "s3://bucket/tiny", "--out", tmp_path, "--videos", 2)
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "tiny-sheet.png").is_file()
-    done = tiny.ran("--config", config, "--n", 12, "--out", "s3://bucket/tiny", "--seed", 3, "--device", "cpu")
+    done = tiny.run_command("--config", config, "--n", 12, "--out", "s3://bucket/tiny", "--seed", 3, "--device", "cpu")
     assert done.returncode == 2
     assert "seed is 0 there and 3 here" in done.stderr

@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 import synthetic
-from tiny import ran_here
+from tiny import run_main
 
 import gen2d
 from gen2d.core.errors import ConfigError, DamagedError, Error, FolderError, UnreachableError
@@ -142,7 +142,7 @@ def test_the_command_line_has_a_code_for_each(server: Server, fault: str, code: 
     server.fault, server.part = fault, "manifest.json"
     for verb in (("info",), ("verify", "--level", "quick"), ("preview",)):
         limits = ("--timeout", TIMEOUT, "--deadline", DEADLINE)
-        done = ran_here(verb[0], f"http://{server.address}/toy", *verb[1:], *limits)
+        done = run_main(verb[0], f"http://{server.address}/toy", *verb[1:], *limits)
         assert done.returncode == (1 if (verb[0], fault) == ("verify", "404") else code), (verb, done)  # incomplete
         assert (done.stderr + done.stdout).count("\n") <= 2
 
@@ -151,7 +151,7 @@ def test_a_plain_server_without_listings_is_enough(server: Server, tmp_path: Pat
     url = f"http://{server.address}/toy"
     assert len(gen2d.open(url, fields="*")[:]["frames"]) == 3
     for words in (("info", url), ("verify", url), ("preview", url, "--out", tmp_path)):
-        done = ran_here(*words)
+        done = run_main(*words)
         assert done.returncode == 0, done
     assert gen2d.verify(url) == []
 
@@ -172,7 +172,7 @@ def test_what_is_secret_is_never_shown(server: Server, what: str) -> None:
         shown.append(str(caught.value))
         assert caught.value.__cause__ is None or secret not in str(caught.value.__cause__)
         for verb in ("info", "verify", "preview", "clean"):
-            done = ran_here(verb, url, "--timeout", TIMEOUT, "--deadline", DEADLINE)
+            done = run_main(verb, url, "--timeout", TIMEOUT, "--deadline", DEADLINE)
             shown += [done.stdout, done.stderr]
     with pytest.raises(Error) as caught:
         place(f"nope://me:{secret}@x/y")

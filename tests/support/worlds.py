@@ -156,7 +156,7 @@ def box(side: float, elasticity: float = 1.0, friction: float = 0.0, centre: Seq
     ]
 
 
-def turned(vector: Sequence[float], degrees: float) -> tuple[float, float]:
+def rotate(vector: Sequence[float], degrees: float) -> tuple[float, float]:
     """The vector rotated counter-clockwise."""
     c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
     return float(c * vector[0] - s * vector[1]), float(s * vector[0] + c * vector[1])
@@ -194,7 +194,7 @@ def momenta(worlds: Sequence[tuple[Scene, State, Layout]], trajectory: Trajector
 # ---- Render inputs without a solver
 
 
-def flown(config: Config | Mapping, count: int) -> tuple[RenderScene, FramePlan, Scene, State]:
+def straight_motion(config: Config | Mapping, count: int) -> tuple[RenderScene, FramePlan, Scene, State]:
     """Render scenes, frame plan, scenes and states [n, T, ...] of the first `count` videos of a config.
 
     From the sampled initial state, all bodies move in straight lines at constant velocity and spin, through walls, too.
@@ -204,16 +204,16 @@ def flown(config: Config | Mapping, count: int) -> tuple[RenderScene, FramePlan,
     keys = keys_module.video_keys(
         jnp.asarray(keys_module.seed_words(config.seed, 0)), jnp.arange(count, dtype=jnp.uint32)
     )
-    render_scenes, scenes, states = _all_flown(config, layout, keys)
+    render_scenes, scenes, states = _straight_motions(config, layout, keys)
     return render_scenes, render.plan_of(config, layout), scenes, states
 
 
 @functools.partial(jax.jit, static_argnums=(0, 1))
-def _all_flown(config: Config, layout: Layout, keys: jax.Array) -> tuple[RenderScene, Scene, State]:
-    return jax.vmap(functools.partial(_flown, config, layout))(keys)
+def _straight_motions(config: Config, layout: Layout, keys: jax.Array) -> tuple[RenderScene, Scene, State]:
+    return jax.vmap(functools.partial(_straight_motion, config, layout))(keys)
 
 
-def _flown(config: Config, layout: Layout, key: jax.Array) -> tuple[RenderScene, Scene, State]:
+def _straight_motion(config: Config, layout: Layout, key: jax.Array) -> tuple[RenderScene, Scene, State]:
     video, steps = config.video, 4
     scene, initial, *_ = sampler.Sampler(config).sampled(key)[1]
 
