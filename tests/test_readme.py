@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from tiny import ran
+from tiny import run_command
 
 from gen2d.config.config import load_config
 
@@ -69,7 +69,7 @@ def _run(line: str, folder: Path) -> None:
     if words[:3] != ["python", "-m", "gen2d"]:
         return
     arguments = ["40" if before == "--n" else word for before, word in zip(["", *words[3:]], words[3:], strict=False)]
-    done = ran(*arguments, cwd=folder)
+    done = run_command(*arguments, cwd=folder)
     assert done.returncode == 0, line + done.stderr
 
 

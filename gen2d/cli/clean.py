@@ -13,7 +13,8 @@ def add_arguments(parser: Parser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     from gen2d.dataset import folder
-    from gen2d.storage.paths import Network, place
+    from gen2d.storage.paths import place
+    from gen2d.storage.retries import Network
 
     root = place(options.dataset, Network(**limits(options)))
     for name in folder.clean(root):

@@ -61,7 +61,7 @@ def _worker(text: str) -> tuple[int, int]:
 def run(options: argparse.Namespace) -> int:
     from gen2d.core.progress import to_stderr
     from gen2d.generation.run import generate  # imports jax
-    from gen2d.storage.paths import shown
+    from gen2d.storage.filesystems import redact_url
 
     try:
         summary = generate(
@@ -78,7 +78,7 @@ def run(options: argparse.Namespace) -> int:
             **limits(options),
         )
     except KeyboardInterrupt:
-        again = [shlex.quote(shown(word)) for word in options.arguments if word != "--overwrite"]
+        again = [shlex.quote(redact_url(word)) for word in options.arguments if word != "--overwrite"]
         to_stderr(f"gen2d: stopped; complete shards are kept. To go on: {' '.join([PROG, *again])}")
         os._exit(130)  # all files are closed; jax may still compute in the background, and would crash a normal exit
     print(_report(summary))

@@ -64,24 +64,24 @@ def parse(arguments: Sequence[str], verbs: Mapping[str, ModuleType]) -> argparse
     parsers = top.add_subparsers(
         title="verbs", metavar="VERB", prog=PROG, parser_class=Parser, help=f"see {PROG} VERB --help for its options"
     )
-    parser_of: dict[str, Parser] = {}
-    for verb, module in verbs.items():
-        parser_of[verb] = parsers.add_parser(verb, help=module.__doc__, description=module.__doc__)
-        parser_of[verb].set_defaults(run=module.run)
-        module.add_arguments(parser_of[verb])
+    parser_of = {
+        verb: parsers.add_parser(verb, help=module.__doc__, description=module.__doc__)
+        for verb, module in verbs.items()
+    }
     words = list(arguments) or ["--help"]
     if words[0] in ("--help", "-h", "--version"):
         top.parse_args(words)  # exits
-    if words[0].startswith("-"):
-        words = ["generate", *words]
-    if words[0] not in verbs:
-        is_config = words[0].endswith((".yaml", ".yml"))
-        hint = f"did you mean --config {words[0]}?" if is_config else nearest(words[0], [*verbs])
-        raise UserError(f"{words[0]!r} is not a verb; {hint}")
-    parser_of[words[0]].check_names(words[1:])
-    options, extra = top.parse_known_args(words, argparse.Namespace(arguments=arguments))
+    verb, *words = ["generate", *words] if words[0].startswith("-") else words
+    if verb not in verbs:
+        is_config = verb.endswith((".yaml", ".yml"))
+        hint = f"did you mean --config {verb}?" if is_config else nearest(verb, [*verbs])
+        raise UserError(f"{verb!r} is not a verb; {hint}")
+    parser = parser_of[verb]
+    verbs[verb].add_arguments(parser)
+    parser.check_names(words)
+    options, extra = parser.parse_known_args(words, argparse.Namespace(arguments=arguments, run=verbs[verb].run))
     if extra:
-        parser_of[words[0]].error(f"{extra[0]!r} is one argument too many")
+        parser.error(f"{extra[0]!r} is one argument too many")
     return options
 
 

@@ -8,7 +8,8 @@ from gen2d.core.errors import ConfigError
 from gen2d.core.humanize import in_bytes, in_time
 from gen2d.dataset.manifest import Manifest, read_manifest, statistics
 from gen2d.storage.atomic import size_of
-from gen2d.storage.paths import Network, Place, place
+from gen2d.storage.paths import Place, place
+from gen2d.storage.retries import Network
 
 
 def _table(rows: list[tuple[str, ...]]) -> list[str]:
@@ -101,7 +102,7 @@ def plugins(name: str | None = None) -> str:
         known = [n for n in plugins.names(kind) if name in (None, n)]
         lines += [f"{title}:"] if known else []
         for plugin in known:
-            rows = _options(_declared(kind, plugin, plugins.load(kind, plugin)))
+            rows = _option_table(_plugin_options(kind, plugin, plugins.load(kind, plugin)))
             lines += [f" {plugin}: {plugins.summary(kind, plugin)}", *rows, *([""] if rows else [])]
         lines += [""] if known and lines[-1] else []
     configs = [c for c in plugins.config_names() if name in (None, c, c.removesuffix(".yaml"))]
@@ -110,35 +111,35 @@ def plugins(name: str | None = None) -> str:
     if name is None:
         lines.append("Sections of every config:")
         for section, options in {**config.SECTIONS, "annotations": SimulationAnnotations}.items():
-            about = (options.__doc__ or "").strip().partition("\n")[0]
-            lines += [f" {section}: {about}", *_options(_named(section, options)), ""]
+            summary = (options.__doc__ or "").strip().partition("\n")[0]
+            lines += [f" {section}: {summary}", *_option_table(_options_of(section, options)), ""]
     if not lines:
         names = [*(known for kind in TITLES for known in plugins.names(kind)), *plugins.config_names()]
         raise ConfigError(f"{name!r} is not known; {plugins.nearest(name or '', names)}")
     return "\n".join(lines).rstrip()
 
 
-def _declared(kind: str, name: str, contract: Any) -> dict[str, dataclasses.Field]:
+def _plugin_options(kind: str, name: str, contract: Any) -> dict[str, dataclasses.Field]:
     """The options of a plug-in, by where they stand in a config."""
     if kind == "export":
         return {}
     if kind != "annotation":
-        return _named(kind, contract.options)
+        return _options_of(kind, contract.options)
     where, options = f"annotations.{name}", contract.options
-    return {where: options} if isinstance(options, dataclasses.Field) else _named(where, options)
+    return {where: options} if isinstance(options, dataclasses.Field) else _options_of(where, options)
 
 
-def _named(where: str, options: type) -> dict[str, dataclasses.Field]:
+def _options_of(where: str, options: type) -> dict[str, dataclasses.Field]:
     return {f"{where}.{field.name}": field for field in dataclasses.fields(options)}
 
 
-def _options(fields: Mapping[str, dataclasses.Field]) -> list[str]:
+def _option_table(fields: Mapping[str, dataclasses.Field]) -> list[str]:
     rows = []
     for name, field in fields.items():
         spec = field.metadata["option"]
         unit = f" {spec.unit}" if spec.unit not in ("", "1") else ""
-        about = f"{spec.meaning}; {spec.allowed}" + (", or a distribution" if spec.draw else "")
-        rows.append((name, f"{_default(field.default)}{unit}", about))
+        meaning = f"{spec.meaning}; {spec.allowed}" + (", or a distribution" if spec.draw else "")
+        rows.append((name, f"{_default(field.default)}{unit}", meaning))
     return _table(rows) if rows else []
 
 

@@ -36,7 +36,8 @@ def add_arguments(parser: Parser) -> None:
 def run(options: argparse.Namespace) -> int:
     from gen2d.dataset.manifest import is_begun
     from gen2d.dataset.spec import MANIFEST
-    from gen2d.storage.paths import Network, place, reading
+    from gen2d.storage.paths import place, reading
+    from gen2d.storage.retries import Network
     from gen2d.tools.verify import verify_and_repair
 
     root = place(options.dataset, Network(**limits(options)))

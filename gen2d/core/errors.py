@@ -5,11 +5,11 @@ LONGEST = 800  # characters of a message; longer messages lose their middle
 
 def one_line(text: str) -> str:
     """The text on one line of about `LONGEST` characters at most, with unprintable characters escaped."""
-    text = "".join(c if c.isprintable() else _escaped(c) for c in text)
+    text = "".join(c if c.isprintable() else _escape(c) for c in text)
     return text if len(text) <= LONGEST else f"{text[: LONGEST // 2]} ... {text[-LONGEST // 2 :]}"
 
 
-def _escaped(character: str) -> str:
+def _escape(character: str) -> str:
     return " " if character in "\n\r\t" else character.encode("unicode_escape").decode()
 
 

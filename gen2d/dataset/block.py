@@ -1,7 +1,7 @@
 """Consecutive videos, ready to store.
 
 Host threads encode a Block while the device computes the next one: they compress images, and compute the checksum of
-every chunk and the moments for the statistics.
+every chunk and the moments for the statistics. `hdf5.py` lists the files that decide the bytes of a shard.
 """
 
 import dataclasses

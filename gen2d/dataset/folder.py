@@ -44,9 +44,9 @@ from gen2d.dataset.spec import (
 )
 from gen2d.storage.atomic import is_temporary, list_folder, publish, publish_changed, remove_tree, size_of, sweep
 from gen2d.storage.explain import writing_error
-from gen2d.storage.leases import exclusive
+from gen2d.storage.leases import exclusive_lock
 from gen2d.storage.paths import Place, Url
-from gen2d.storage.sealed import JSON_BYTES, as_json, read_sealed, sealed
+from gen2d.storage.sealed import JSON_BYTES, as_json, read_sealed, seal
 
 # What each program of a fingerprint does.
 PROGRAMS = {"simulate": "samples and simulates", "draw": "draws", "captions": "writes captions"}
@@ -69,11 +69,11 @@ def open_folder(spec: DatasetSpec, overwrite: bool = False) -> list[Shard]:
             f"storage.videos_per_shard is {spec.videos_per_shard}, which gives {count:,} shards, but must be large "
             f"enough for at most {SHARDS:,}"
         )
-    with explained(root):
+    with translate_errors(root):
         check_links(root)
         if root.is_dir() and not _is_dataset(root) and any(root.iterdir()):
             raise FolderError(f"{root} holds something other than a gen2d dataset: choose another --out")
-        with locked(root):
+        with folder_lock(root):
             if overwrite and _is_dataset(root):
                 _clear(root)
             _claim(spec)
@@ -88,7 +88,7 @@ def open_folder(spec: DatasetSpec, overwrite: bool = False) -> list[Shard]:
 
 
 @contextlib.contextmanager
-def locked(root: Place) -> Iterator[None]:
+def folder_lock(root: Place) -> Iterator[None]:
     """A block that holds the folder's lock; at a URL there is none.
 
     Raises FolderError if another process does not release the lock in time.
@@ -99,7 +99,7 @@ def locked(root: Place) -> Iterator[None]:
     (root / MARK).mkdir(parents=True, exist_ok=True)
     with contextlib.ExitStack() as stack:
         try:
-            stack.enter_context(exclusive(root / LOCK, LOCK_SECONDS))
+            stack.enter_context(exclusive_lock(root / LOCK, LOCK_SECONDS))
         except TimeoutError:
             raise FolderError(f"{root} is being changed by another process: try again when that has ended") from None
         yield
@@ -145,7 +145,7 @@ def free_bytes(root: Place) -> float:
 def log(root: Place, entry: Mapping[str, Any]) -> None:
     """Append a line to the folder's run log, the only file that contains times and hosts."""
     path, line = root / MARK / "run.jsonl", json.dumps(dict(entry), sort_keys=True) + "\n"
-    with explained(root):
+    with translate_errors(root):
         if isinstance(path, Path):
             with path.open("a") as file:
                 file.write(line)
@@ -209,7 +209,7 @@ def _claim(spec: DatasetSpec) -> None:
 
 def mark_content(spec: DatasetSpec) -> bytes:
     """The content of the mark, the file that holds the dataset's identity."""
-    return as_json(sealed({**spec.identity, "sources": spec.producer.get("sources", {})}, MARK_SEAL))
+    return as_json(seal({**spec.identity, "sources": spec.producer.get("sources", {})}, MARK_SEAL))
 
 
 def sources_of(root: Place) -> Mapping[str, str]:
@@ -254,7 +254,7 @@ def differences(there: Any, here: Any, name: str = "") -> Iterator[tuple[str, An
 
 
 @contextlib.contextmanager
-def explained(root: Place) -> Iterator[None]:
+def translate_errors(root: Place) -> Iterator[None]:
     """A block that writes into a dataset's folder; its OSError becomes one of ours, with one sentence."""
     try:
         yield
@@ -276,10 +276,10 @@ def clean(root: Place) -> list[str]:
     Where the file system has no locks, gen2d cannot know whether a temporary file is still being written: clean only
     while nothing else writes into the folder.
     """
-    with explained(root):
+    with translate_errors(root):
         check_links(root)
         read_manifest(root)  # raises IncompleteError before anything is written
-        with locked(root):
+        with folder_lock(root):
             manifest = read_manifest(root)
             records = read_records(manifest, root)
             removed = remove_replaced(root, manifest, records)

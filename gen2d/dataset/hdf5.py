@@ -1,8 +1,10 @@
 """HDF5 shards: images in compressed chunks, by default one per video, everything else contiguous.
 
-Any HDF5 program reads them. The bytes depend on the compressed chunks and values alone: not on times, hosts or users,
-nor on how the videos were grouped into blocks. h5py serves one thread at a time, so compression happens elsewhere and
-chunks pass through h5py unchanged. Every file holds its own index (`rows.py`), by which gen2d reads without h5py.
+Any HDF5 program reads them. Four files decide the bytes of a shard: `block.py` divides images into chunks,
+`storage/codecs.py` compresses each chunk, this file lays out chunks, values and attributes, and `rows.py` defines the
+index, by which gen2d reads without h5py. The bytes do not depend on times, hosts or users, nor on how the videos were
+grouped into blocks. h5py serves one thread at a time, so compression happens in
+other threads and chunks pass through h5py unchanged.
 """
 
 import contextlib
@@ -18,7 +20,7 @@ import numpy as np
 
 from gen2d.core.schema import Field
 from gen2d.dataset.block import Block, image_names, row_names
-from gen2d.dataset.rows import sealed_rows, video_type
+from gen2d.dataset.rows import seal_rows, video_type
 from gen2d.storage import codecs
 
 INDEX = "chunk_index"  # the HDF5 dataset of the videos' rows
@@ -52,13 +54,15 @@ def write(
     the index's checksums. Raises OSError, and ValueError for blocks that do not hold exactly these videos.
     """
     images, rows, count = image_names(fields), row_names(fields), len(videos)
-    with _new(path) as file:
+    with _create(path) as file:
         file.attrs.update(attributes)
         shapes = {name: (count, *fields[name].shape(sizes)) for name in images + rows}
-        chunked = {name: _chunked(file, name, fields[name].dtype, shapes[name], codec, chunk_frames) for name in images}
+        chunked = {
+            name: _create_chunked(file, name, fields[name], shapes[name], codec, chunk_frames) for name in images
+        }
         table = {name: np.zeros(shapes[name], _stored_type(fields[name])) for name in rows}
         index = np.zeros(count, video_type(fields, sizes["T"] // chunk_frames if chunk_frames else 1))
-        for first, block in _numbered(blocks, count, path):
+        for first, block in _number_blocks(blocks, count, path):
             _write_chunks(chunked, block, first, chunk_frames)
             own = index[first : first + len(block)]
             for name in rows:
@@ -72,7 +76,7 @@ def write(
             file.create_dataset(name, data=np.asarray(values, _stored_type(fields[name])))
         for name, field in sorted(fields.items()):
             file[name].attrs.update(axes=field.axes, unit=field.unit, meaning=field.meaning)
-        stored = file.create_dataset(INDEX, data=sealed_rows(index, origin, videos))
+        stored = file.create_dataset(INDEX, data=seal_rows(index, origin, videos))
         stored.attrs.update(
             axes="n", unit="", meaning="where each video's chunks lie, and CRC-32 of all that is stored"
         )
@@ -93,7 +97,7 @@ def read(path: Path) -> dict[str, np.ndarray]:
 
 
 @contextlib.contextmanager
-def _new(path: Path) -> Iterator[h5py.File]:
+def _create(path: Path) -> Iterator[h5py.File]:
     """A new file, closed at the end; an error while writing is raised before the error that closing then causes."""
     # HDF5's own lock would conflict with that of the temporary file.
     file = h5py.File(path, "w", libver=("v110", "v110"), locking=False)
@@ -116,8 +120,8 @@ def _as_oserror(error: RuntimeError) -> OSError:
     return OSError(int(number[1]) if number else errno.EIO, str(error))
 
 
-def _chunked(
-    file: h5py.File, name: str, dtype: str, shape: tuple[int, ...], codec: str, chunk_frames: int | None
+def _create_chunked(
+    file: h5py.File, name: str, field: Field, shape: tuple[int, ...], codec: str, chunk_frames: int | None
 ) -> h5py.Dataset:
     """A new HDF5 dataset with a chunk per video, or per `chunk_frames` frames.
 
@@ -131,10 +135,10 @@ def _chunked(
         number, options = codecs.HDF5_FILTERS[codec]
         settings.set_filter(number, h5py.h5z.FLAG_OPTIONAL, options)
     space = h5py.h5s.create_simple(shape)
-    kind = h5py.h5t.py_create(np.dtype(dtype), logical=True)
+    dtype = h5py.h5t.py_create(np.dtype(field.dtype), logical=True)
     links = h5py.h5p.create(h5py.h5p.LINK_CREATE)
     links.set_create_intermediate_group(True)
-    return h5py.Dataset(h5py.h5d.create(file.id, name.encode(), kind, space, settings, links))
+    return h5py.Dataset(h5py.h5d.create(file.id, name.encode(), dtype, space, settings, links))
 
 
 def _stored_type(field: Field) -> np.dtype:
@@ -143,7 +147,7 @@ def _stored_type(field: Field) -> np.dtype:
     return h5py.string_dtype("utf-8", dtype.itemsize) if field.is_text else dtype
 
 
-def _numbered(blocks: Iterable[Block], count: int, path: Path) -> Iterator[tuple[int, Block]]:
+def _number_blocks(blocks: Iterable[Block], count: int, path: Path) -> Iterator[tuple[int, Block]]:
     """Each block with the row of its first video; raises ValueError unless there are `count` videos in all."""
     first = 0
     for block in blocks:
@@ -185,8 +189,8 @@ def _fill_offsets(dataset: h5py.Dataset, rows: np.ndarray) -> None:
 
     def fill(chunk: h5py.h5d.StoreInfo) -> None:
         video, frame = chunk.chunk_offset[:2]
-        place = rows[video, frame // frames]
-        place["offset"], place["size"] = chunk.byte_offset, chunk.size
+        row = rows[video, frame // frames]
+        row["offset"], row["size"] = chunk.byte_offset, chunk.size
 
     dataset.id.chunk_iter(fill)
 

@@ -41,17 +41,18 @@ def faults(path: Path, shard: Shard, manifest: Manifest) -> list[str]:
     }
     request = {"path": str(path.absolute()), "split": shard.split, "first": shard.first, "fields": fields}
     with _lock:
-        return _ask(json.dumps(request).encode() + b"\n")
+        return _query(json.dumps(request).encode() + b"\n")
 
 
 # ---- The calling process
 
 _lock = threading.Lock()
 _process: subprocess.Popen[bytes] | None = None
+_owner = 0  # the id of the process that started it; a fork starts its own
 
 
-def _ask(request: bytes) -> list[str]:
-    process = _running()
+def _query(request: bytes) -> list[str]:
+    process = _checker_process()
     assert process.stdin
     assert process.stdout
     answer = b""
@@ -72,27 +73,18 @@ def _ask(request: bytes) -> list[str]:
     return json.loads(answer)
 
 
-def _running() -> subprocess.Popen[bytes]:
-    global _process
+def _checker_process() -> subprocess.Popen[bytes]:
+    global _process, _owner
     if _process is None or _process.poll() is not None or _owner != os.getpid():
         _stop()
-        _start()
-    assert _process is not None
+        command = [sys.executable, "-W", "ignore", "-m", "gen2d.dataset.hdf5_check"]
+        home = str(Path(__file__).parent.parent.parent)
+        paths = os.pathsep.join([home, *filter(None, [os.environ.get("PYTHONPATH")])])
+        environment = os.environ | {"PYTHONPATH": paths}
+        pipe = subprocess.PIPE
+        _process = subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=subprocess.DEVNULL, env=environment)
+        _owner = os.getpid()
     return _process
-
-
-_owner = 0
-
-
-def _start() -> None:
-    global _process, _owner
-    command = [sys.executable, "-W", "ignore", "-m", "gen2d.dataset.hdf5_check"]
-    home = str(Path(__file__).parent.parent.parent)
-    paths = os.pathsep.join([home, *filter(None, [os.environ.get("PYTHONPATH")])])
-    environment = os.environ | {"PYTHONPATH": paths}
-    pipe = subprocess.PIPE
-    _process = subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=subprocess.DEVNULL, env=environment)
-    _owner = os.getpid()
 
 
 @atexit.register
@@ -140,30 +132,30 @@ def _faults(request: Mapping[str, Any]) -> list[str]:
             request["first"],
         ):
             problems.append(f"its attributes say that it begins with {start[0]!s:.60} video {start[1]!s:.60}")
-        for name, about in request["fields"].items():
+        for name, expected in request["fields"].items():
             dataset = file.get(name)
             if not isinstance(dataset, h5py.Dataset):
                 problems.append(f"{name} is missing")
             else:
-                problems += [f"{name} {problem}" for problem in _dataset_faults(dataset, about)]
+                problems += [f"{name} {problem}" for problem in _dataset_faults(dataset, expected)]
     return problems
 
 
-def _dataset_faults(dataset: Any, about: Mapping[str, Any]) -> list[str]:
+def _dataset_faults(dataset: Any, expected: Mapping[str, Any]) -> list[str]:
     import numpy as np
 
-    if list(dataset.shape or ()) != about["shape"] or dataset.dtype != np.dtype(about["dtype"]):
-        return [f"is {dataset.dtype} {list(dataset.shape or ())}, but must be {about['dtype']} {about['shape']}"]
-    if bool(dataset.compression or dataset._filters) and not about["compressed"]:
+    if list(dataset.shape or ()) != expected["shape"] or dataset.dtype != np.dtype(expected["dtype"]):
+        return [f"is {dataset.dtype} {list(dataset.shape or ())}, but must be {expected['dtype']} {expected['shape']}"]
+    if bool(dataset.compression or dataset._filters) and not expected["compressed"]:
         return ["is compressed, but must not be"]
     if dataset.external or dataset.is_virtual:
         return ["lies in another file"]
     problems = []
     for key in ("axes", "unit", "meaning"):
         value = dataset.attrs.get(key)
-        if not isinstance(value, str) or value != about[key]:
-            problems.append(f"has {key} {value!r:.80}, but must have {about[key]!r}")
-    if about["constant"] is not None and not np.array_equal(dataset[()], np.array(about["constant"])):
+        if not isinstance(value, str) or value != expected[key]:
+            problems.append(f"has {key} {value!r:.80}, but must have {expected[key]!r}")
+    if expected["constant"] is not None and not np.array_equal(dataset[()], np.array(expected["constant"])):
         problems.append("differs from the manifest")
     return problems
 

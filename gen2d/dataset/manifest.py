@@ -4,6 +4,7 @@ It is the only entrance for what strangers write: `parse` turns bytes into a che
 """
 
 import dataclasses
+import functools
 import json
 from collections.abc import Iterator, Mapping
 from typing import Any, TypeGuard
@@ -19,7 +20,7 @@ from gen2d.dataset.spec import IDENTITY, MANIFEST, MARK, SCHEMA, DatasetSpec, ma
 from gen2d.dataset.statistics import SAMPLED, Stats
 from gen2d.storage.explain import reading_error
 from gen2d.storage.paths import Place, Url, reading
-from gen2d.storage.sealed import JSON_BYTES, as_json, parsed, read_bytes, read_sealed, sealed, sha256, unsealed
+from gen2d.storage.sealed import JSON_BYTES, as_json, parse_json, read_bytes, read_sealed, seal, sha256, unseal
 
 # The key in each file of the hash of everything else in it.
 SEAL, MARK_SEAL = "manifest_sha256", "identity_sha256"
@@ -59,7 +60,7 @@ class Manifest:
         """The values that another run must share to add to this dataset."""
         return {key: self.plain[key] for key in IDENTITY}
 
-    @property
+    @functools.cached_property
     def identity_sha256(self) -> str:
         """The sha256 of the identity."""
         return sha256(as_json(self.identity))
@@ -152,7 +153,7 @@ def parse(content: bytes, source: str) -> Manifest:
 
     Raises DamagedError for bytes that the generator cannot have written, FolderError for another schema.
     """
-    plain = unsealed(content, SEAL)
+    plain = unseal(content, SEAL)
     if plain is None:
         raise DamagedError(f"{source} is not what was written")
     schema = plain.get("schema")
@@ -169,8 +170,8 @@ def parse(content: bytes, source: str) -> Manifest:
 
 def identity_of(root: Place) -> dict[str, Any] | None:
     """The identity of the dataset in the folder, from its manifest or its mark; None if neither is intact."""
-    for path, seal in ((root / MANIFEST, SEAL), (mark_path(root), MARK_SEAL)):
-        values = read_sealed(path, seal)
+    for path, key in ((root / MANIFEST, SEAL), (mark_path(root), MARK_SEAL)):
+        values = read_sealed(path, key)
         if values is not None:
             identity = {key: values.get(key) for key in IDENTITY}
             try:
@@ -184,7 +185,7 @@ def identity_of(root: Place) -> dict[str, Any] | None:
 def schema_of(root: Place) -> str | None:
     """The schema that the folder's manifest names, whichever it is; None if there is none."""
     try:
-        schema = (parsed(read_bytes(root / MANIFEST, JSON_BYTES)) or {}).get("schema")
+        schema = (parse_json(read_bytes(root / MANIFEST, JSON_BYTES)) or {}).get("schema")
     except OSError:
         return None
     return schema if _is_schema(schema) else None
@@ -231,12 +232,12 @@ def describe(
         "producer": {key: value for key, value in spec.producer.items() if key != "fingerprint"},
     }
     # As it will be read: JSON makes every key a string and every tuple a list.
-    return parse(as_json(sealed(json.loads(as_json(plain)), SEAL)), "the manifest")
+    return parse(as_json(seal(json.loads(as_json(plain)), SEAL)), "the manifest")
 
 
 def statistics(manifest: Manifest) -> Iterator[tuple[str, ...]]:
     """Rows of a table of the statistics: split, field, mean, standard deviation, minimum and maximum."""
     for split, fields in sorted(manifest.stats.items()):
-        for name, about in fields.items():
-            parts = (about[key] for key in ("mean", "std", "min", "max"))
+        for name, moments in fields.items():
+            parts = (moments[key] for key in ("mean", "std", "min", "max"))
             yield split, name, *(", ".join(f"{x:.4g}" for x in part) if part else "-" for part in parts)

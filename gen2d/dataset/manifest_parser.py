@@ -16,7 +16,7 @@ from gen2d.core.schema import Field
 from gen2d.dataset.block import image_names, stored_bytes
 from gen2d.dataset.rows import CHUNK
 from gen2d.dataset.spec import CONFIG, NAME, PLUGIN, SHEET, SPLIT, shard_count, table_name
-from gen2d.dataset.statistics import MOMENTS, Stats, measured
+from gen2d.dataset.statistics import MOMENTS, Stats, component_counts
 from gen2d.storage.codecs import CODECS
 
 FILE_BYTES = 2**26  # maximum size of a file other than shards and tables
@@ -218,7 +218,7 @@ class ManifestParser:
                 _refuse(f"fields.{name}", own and f"{own.dtype} {own.axes}", " ".join(required))
         chunks = sizes["T"] // (self.part("chunk_frames") or sizes["T"] or 1)
         video = chunks * len(image_names(fields)) * CHUNK.itemsize
-        shard = 8 * MOMENTS * sum(measured(fields).values())
+        shard = 8 * MOMENTS * sum(component_counts(fields).values())
         if max(video, shard) > ROW_BYTES:
             _refuse("the size of a row", max(video, shard), f"at most {ROW_BYTES} bytes")
         return fields
@@ -274,7 +274,7 @@ class ManifestParser:
         _refuse(f"constants.{name}", value, f"{dtype} {list(shape)}")
 
     def stats(self, split: str, fields: Mapping[str, Field]) -> Stats:
-        where, known = f"stats.{split}", measured(fields)
+        where, known = f"stats.{split}", component_counts(fields)
         own = _mapping(self.part("stats")[split], where, FIELDS)
         if own.keys() != known.keys():
             _refuse(f"the fields of {where}", sorted(own), f"{_quote(sorted(known))}")

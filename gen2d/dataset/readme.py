@@ -4,14 +4,14 @@ from gen2d.dataset.manifest import Manifest, statistics
 from gen2d.dataset.spec import SHEET, shard_name, shard_of
 
 
-def shown_split(manifest: Manifest) -> str:
+def card_split(manifest: Manifest) -> str:
     """The split that the cards show and load."""
     return "train" if "train" in manifest.splits else min(manifest.splits)
 
 
 def readme(manifest: Manifest, command: str) -> str:
     """The dataset card as Markdown; `command` is the command that made the dataset."""
-    fields, first = manifest.fields, shown_split(manifest)
+    fields, first = manifest.fields, card_split(manifest)
     lines = (f"| {name} | {f.dtype} | {f.axes} | {f.unit} | {f.meaning} |" for name, f in fields.items())
     shard = shard_of(first, 0, min(manifest.splits[first], manifest.videos_per_shard), manifest.videos_per_shard)
     return _README.format(

@@ -21,7 +21,7 @@ from gen2d.dataset.manifest import Manifest, read_manifest
 from gen2d.dataset.rows import intact, intact_rows, npy_size, origin, shard_type
 from gen2d.dataset.spec import RECORDS, TABLE_NAME, DatasetSpec, Shard, shard_count, shard_of
 from gen2d.storage.atomic import list_folder, publish, sync
-from gen2d.storage.leases import has_locks, is_at, leased, try_lock
+from gen2d.storage.leases import has_locks, is_at, lease, try_lock
 from gen2d.storage.paths import Place, Url
 from gen2d.storage.sealed import open_regular, read_bytes
 
@@ -46,20 +46,21 @@ class Records:
         folder's manifest when the rows were read.
         """
         self.size, self.rows, self.videos, self.manifest = videos_per_shard, {}, dict(videos or {}), manifest
-        self.places: dict[str, dict[tuple[int, int], int]] = {}  # row of each (first video, count), by split
+        # Index of the row of each (first video, count), by split.
+        self.indices: dict[str, dict[tuple[int, int], int]] = {}
         for split, own in rows.items():
             possible = (own["first"] % self.size == 0) & (own["count"] >= 1) & (own["count"] <= self.size)
             self.rows[split] = own[possible]
-            self.places[split] = {key: place for place, key in enumerate(_keys(self.rows[split]))}
+            self.indices[split] = {key: index for index, key in enumerate(_keys(self.rows[split]))}
 
     def row_of(self, shard: Shard) -> np.void | None:
         """The row of a shard; None if it is not done."""
-        place = self.places.get(shard.split, {}).get((shard.first, shard.count))
-        return None if place is None else self.rows[shard.split][place]
+        index = self.indices.get(shard.split, {}).get((shard.first, shard.count))
+        return None if index is None else self.rows[shard.split][index]
 
     def table(self, split: str, shards: Iterable[Shard]) -> np.ndarray:
         """The rows of these shards of a split, all of which must be done."""
-        own = self.places[split]
+        own = self.indices[split]
         return self.rows[split][[own[shard.first, shard.count] for shard in shards]]
 
     def counts(self) -> dict[str, int]:
@@ -69,7 +70,7 @@ class Records:
 
     def shards(self) -> Iterator[Shard]:
         """Every shard that is done, including those that larger ones have replaced."""
-        for split, own in self.places.items():
+        for split, own in self.indices.items():
             yield from (shard_of(split, first, count, self.size) for first, count in own)
 
 
@@ -166,7 +167,7 @@ def remove_logs(spec: DatasetSpec, known: Records) -> None:
         with contextlib.suppress(FileNotFoundError), _unused(path) as unused:
             if match and unused:
                 rows = _intact_log_rows(read_bytes(path, LOG_BYTES), dtype, origin(identity, match["split"]))
-                if known.places.get(match["split"], {}).keys() >= set(_keys(rows)):
+                if known.indices.get(match["split"], {}).keys() >= set(_keys(rows)):
                     path.unlink(missing_ok=True)
 
 
@@ -234,7 +235,7 @@ class _LocalLog:
     def _begin(self) -> None:
         self.number += 1
         self._open = contextlib.ExitStack()
-        self._descriptor = self._open.enter_context(leased(self._name()))
+        self._descriptor = self._open.enter_context(lease(self._name()))
         sync(self.path.parent)
 
     def _append(self, rows: bytes) -> None:

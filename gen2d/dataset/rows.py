@@ -20,7 +20,7 @@ import numpy as np
 from gen2d.core.errors import DamagedError
 from gen2d.core.schema import Field
 from gen2d.dataset.block import image_names, row_names
-from gen2d.dataset.statistics import MOMENTS, measured
+from gen2d.dataset.statistics import MOMENTS, component_counts
 
 CHECK = "check"
 OVERHEAD = 2**26  # maximum bytes of a shard beside its values
@@ -38,7 +38,7 @@ def shard_type(fields: Mapping[str, Field]) -> np.dtype:
             ("sha256", "u1", (32,)),
             ("index", "<u8"),  # offset of the shard's index
             ("offsets", "<u8", (len(row_names(fields)),)),  # of each uncompressed field, in the order of the names
-            ("moments", "<f8", (MOMENTS * sum(measured(fields).values()),)),
+            ("moments", "<f8", (MOMENTS * sum(component_counts(fields).values()),)),
             (CHECK, "<u4"),
         ]
     )
@@ -55,7 +55,7 @@ def origin(identity_sha256: str, split: str) -> int:
     return zlib.crc32(f"{identity_sha256}/{split}".encode())
 
 
-def checks(rows: np.ndarray, begin: int, numbers: Sequence[int] | range) -> np.ndarray:
+def row_checksums(rows: np.ndarray, begin: int, numbers: Sequence[int] | range) -> np.ndarray:
     """The CRC-32 of each row without its last field, uint32 [rows].
 
     `begin` is the start value from `origin`; `numbers` are the videos of the rows, or the first videos of the shards.
@@ -72,15 +72,15 @@ def checks(rows: np.ndarray, begin: int, numbers: Sequence[int] | range) -> np.n
     )
 
 
-def sealed_rows(rows: np.ndarray, begin: int, numbers: Sequence[int] | range) -> np.ndarray:
+def seal_rows(rows: np.ndarray, begin: int, numbers: Sequence[int] | range) -> np.ndarray:
     """The rows, with their checksums filled in."""
-    rows[CHECK] = checks(rows, begin, numbers)
+    rows[CHECK] = row_checksums(rows, begin, numbers)
     return rows
 
 
 def intact(rows: np.ndarray, begin: int, numbers: Sequence[int] | range) -> np.ndarray:
     """Whether each row has the right checksum, bool [rows]."""
-    return rows[CHECK] == checks(rows, begin, numbers)
+    return rows[CHECK] == row_checksums(rows, begin, numbers)
 
 
 def npy_header(dtype: np.dtype, count: int) -> bytes:

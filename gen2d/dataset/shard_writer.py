@@ -9,9 +9,9 @@ from gen2d.core.errors import FolderError, UnreachableError, UserError
 from gen2d.dataset import hdf5
 from gen2d.dataset.block import Block, stored_bytes
 from gen2d.dataset.records import RecordLog
-from gen2d.dataset.rows import origin, sealed_rows, shard_type
+from gen2d.dataset.rows import origin, seal_rows, shard_type
 from gen2d.dataset.spec import SCHEMA, DatasetSpec, Shard, shard_path
-from gen2d.dataset.statistics import merged, packed
+from gen2d.dataset.statistics import merge_moments, pack_moments
 from gen2d.storage.atomic import publishing, work_folder
 from gen2d.storage.explain import FULL, writing_error
 from gen2d.storage.paths import Url
@@ -34,19 +34,21 @@ class ShardWriter:
         """
         spec, totals = self.spec, _Totals()
         begin = origin(spec.identity_sha256, shard.split)
-        about = {"schema": SCHEMA, "name": spec.name, "split": shard.split, "first": shard.first}
-        about |= {"fps": spec.fps, "seed": spec.seed, "conventions": spec.conventions}
+        attributes = {"schema": SCHEMA, "name": spec.name, "split": shard.split, "first": shard.first}
+        attributes |= {"fps": spec.fps, "seed": spec.seed, "conventions": spec.conventions}
         videos = range(shard.first, shard.first + shard.count)
         try:
             with publishing(shard_path(spec.root, shard.name)) as temporary:
                 stored = spec.fields, spec.sizes, videos, totals.count(blocks), spec.codec, spec.chunk_frames
-                offsets = hdf5.write(temporary, *stored, about, spec.constants, begin)
+                offsets = hdf5.write(temporary, *stored, attributes, spec.constants, begin)
                 row = np.zeros(1, shard_type(spec.fields))
                 row["first"], row["count"], row["data_bytes"] = shard.first, shard.count, totals.bytes
                 row["bytes"], row["index"], row["offsets"] = temporary.stat().st_size, offsets.index, offsets.rows
                 row["sha256"] = np.frombuffer(bytes.fromhex(file_sha256(temporary)), np.uint8)
-                row["moments"] = packed({name: merged(np.concatenate(own)) for name, own in totals.moments.items()})
-            row = sealed_rows(row, begin, [shard.first])
+                row["moments"] = pack_moments(
+                    {name: merge_moments(np.concatenate(own)) for name, own in totals.moments.items()}
+                )
+            row = seal_rows(row, begin, [shard.first])
             self.log.add(shard.split, row)
         except UnreachableError as error:
             raise UnreachableError(f"{error}: once it can, {AGAIN}") from None

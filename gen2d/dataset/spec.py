@@ -1,6 +1,7 @@
 """What a dataset folder holds, the shards that it is divided into, and the names of its files."""
 
 import dataclasses
+import functools
 import json
 import re
 from collections.abc import Iterable, Mapping
@@ -63,7 +64,7 @@ class DatasetSpec:
         values = vars(self) | {"fingerprint": self.producer["fingerprint"]}
         return json.loads(as_json({key: values[key] for key in IDENTITY}))
 
-    @property
+    @functools.cached_property
     def identity_sha256(self) -> str:
         """The sha256 of the identity."""
         return sha256(as_json(self.identity))

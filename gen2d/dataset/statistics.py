@@ -16,7 +16,7 @@ MOMENTS = 5
 Stats = dict[str, dict[str, list[float] | None]]  # of each field: mean, std, min and max of each component
 
 
-def measured(fields: Mapping[str, Field]) -> dict[str, int]:
+def component_counts(fields: Mapping[str, Field]) -> dict[str, int]:
     """The number of channels or components of each field that has statistics, sorted by name."""
     names = sorted(name for name, field in fields.items() if field.per_video and _is_measured(name))
     return {name: _components(fields[name]) for name in names}
@@ -41,7 +41,7 @@ def moments_of(columns: Mapping[str, np.ndarray], fields: Mapping[str, Field]) -
         name: _image_moments(columns[name], components)
         if fields[name].is_image
         else _moments(columns[name], fields[name], components, present)
-        for name, components in measured(fields).items()
+        for name, components in component_counts(fields).items()
     }
 
 
@@ -51,7 +51,7 @@ def _moments(column: np.ndarray, field: Field, components: int, present: np.ndar
     values = column.reshape(len(column), -1, components).transpose(0, 2, 1).astype(np.float64, order="C")
     count, low, high = np.full(values.shape[:2], values.shape[2], np.float64), values, values
     if "K" in axes and present is not None:
-        exists = _spread(present, axes, column.shape)
+        exists = _broadcast_presence(present, axes, column.shape)
         count = np.broadcast_to(exists, values.shape).sum(-1, dtype=np.float64)
         low, high = np.where(exists, values, np.inf), np.where(exists, values, -np.inf)
         values = np.where(exists, values, 0.0)
@@ -68,34 +68,34 @@ def _image_moments(images: np.ndarray, components: int) -> np.ndarray:
     return np.stack([count, wide.sum(-1), (wide * wide).sum(-1), values.min(-1), values.max(-1)], axis=1)
 
 
-def _spread(present: np.ndarray, axes: list[str], shape: tuple[int, ...]) -> np.ndarray:
+def _broadcast_presence(present: np.ndarray, axes: list[str], shape: tuple[int, ...]) -> np.ndarray:
     """Whether the object of each value is present, bool [m, 1, values]; `present` is [m, K]."""
     steps = [size if axis in "nK" else 1 for axis, size in zip(axes, shape, strict=True) if not axis.isdigit()]
     return np.broadcast_to(present.reshape(steps), shape[: len(steps)]).reshape(shape[0], 1, -1)
 
 
-def merged(moments: np.ndarray) -> np.ndarray:
+def merge_moments(moments: np.ndarray) -> np.ndarray:
     """The moments of all m parts together, [5, components], from [m, 5, components]."""
     return np.concatenate([moments[:, :3].sum(0), moments[:, 3:4].min(0), moments[:, 4:].max(0)])
 
 
-def packed(moments: Mapping[str, np.ndarray]) -> np.ndarray:
+def pack_moments(moments: Mapping[str, np.ndarray]) -> np.ndarray:
     """The moments [5, components] of all fields as one float64 vector, in the order of their names."""
     parts = [moments[name].reshape(-1) for name in sorted(moments)]
     return np.concatenate(parts) if parts else np.zeros(0)
 
 
-def summary(rows: np.ndarray, fields: Mapping[str, Field]) -> Stats:
-    """Mean, standard deviation, minimum and maximum of each field, from m vectors that `packed` returned."""
+def summarize(rows: np.ndarray, fields: Mapping[str, Field]) -> Stats:
+    """Mean, standard deviation, minimum and maximum of each field, from m vectors that `pack_moments` returned."""
     stats, begin = {}, 0
-    for name, components in measured(fields).items():
+    for name, components in component_counts(fields).items():
         end = begin + MOMENTS * components
-        count, total, squares, low, high = merged(rows[:, begin:end].reshape(-1, MOMENTS, components))
+        count, total, squares, low, high = merge_moments(rows[:, begin:end].reshape(-1, MOMENTS, components))
         with np.errstate(all="ignore"):
             mean = total / count
-            spread = np.sqrt(np.maximum(squares / count - mean**2, 0))
+            std = np.sqrt(np.maximum(squares / count - mean**2, 0))
         # JSON has no NaN or infinity: None.
-        values = {"mean": mean, "std": spread, "min": low, "max": high}
+        values = {"mean": mean, "std": std, "min": low, "max": high}
         stats[name] = {key: value.tolist() if np.isfinite(value).all() else None for key, value in values.items()}
         begin = end
     return stats

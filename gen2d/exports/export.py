@@ -14,11 +14,12 @@ from gen2d.core.progress import progress, stopping_on_sigterm
 from gen2d.exports.source import Source, source_of
 from gen2d.storage.atomic import publishing, publishing_folder, sweep_beside
 from gen2d.storage.explain import writing_error
-from gen2d.storage.paths import Network, Place, Url, place
-from gen2d.storage.sealed import JSON_BYTES, as_json, parsed, read_bytes
+from gen2d.storage.paths import Place, Url, place
+from gen2d.storage.retries import Network
+from gen2d.storage.sealed import JSON_BYTES, as_json, parse_json, read_bytes
 
 SCHEMA = "gen2d.export/1"
-ABOUT = "export.json"  # in every exported folder: its origin, and the files that belong to it
+DESCRIPTION = "export.json"  # in every exported folder: its origin, and the files that belong to it
 
 
 @dataclasses.dataclass(frozen=True)
@@ -102,13 +103,13 @@ def export(
     start, format_, name = time.perf_counter(), _format(to), Path(to).name
     folder = place(root, Network(timeout, deadline))
     source = source_of(folder, split, _patterns(to, format_, fields), trust)
-    out = Path(out) if out is not None else _beside(folder, f"{name.removesuffix('.py')}{format_.suffix}")
-    description = _about(source, name)
+    out = Path(out) if out is not None else _default_out(folder, f"{name.removesuffix('.py')}{format_.suffix}")
+    description = _export_description(source, name)
     format_.check(source)
     _check_out(out, format_, description, overwrite)
     log = log or (lambda line: None)
-    with _explained(out), stopping_on_sigterm(log), progress(len(source), log) as advance:
-        size = _written(out, format_, dataclasses.replace(source, advance=advance), description)
+    with _translate_errors(out), stopping_on_sigterm(log), progress(len(source), log) as advance:
+        size = _write_output(out, format_, dataclasses.replace(source, advance=advance), description)
     return Exported(out, len(source), size, time.perf_counter() - start, format_.loss)
 
 
@@ -121,11 +122,11 @@ def _format(to: str) -> Export:
     return plugins.load("export", to, "--to", content)
 
 
-def _patterns(to: str, form: Export, fields: Sequence[str] | None) -> Sequence[str]:
+def _patterns(to: str, format_: Export, fields: Sequence[str] | None) -> Sequence[str]:
     fields = [fields] if isinstance(fields, str) else fields
-    if fields is None or list(fields) == list(form.fields):
-        return form.fields
-    if form.fixed:
+    if fields is None or list(fields) == list(format_.fields):
+        return format_.fields
+    if format_.fixed:
         free = [name for name in plugins.names("export") if not plugins.load("export", name).fixed]
         raise ConfigError(f"--fields is {' '.join(fields)}, but {to} has its own: choose {' or '.join(free)}")
     if not fields:
@@ -133,82 +134,79 @@ def _patterns(to: str, form: Export, fields: Sequence[str] | None) -> Sequence[s
     return fields
 
 
-def _beside(root: Place, ending: str) -> Path:
+def _default_out(root: Place, ending: str) -> Path:
     if isinstance(root, Url):
         return Path(f"{root.name}-{ending}")
     root = root.resolve() if not root.name else root
     return root.with_name(f"{root.name}-{ending}")
 
 
-def _about(source: Source, to: str) -> dict[str, Any]:
+def _export_description(source: Source, to: str) -> dict[str, Any]:
     """Contents of a folder's export.json, without the list of files."""
     manifest = source.ds.manifest
     keys = ("name", "seed", "fps", "sizes", "conventions", "licence", "manifest_sha256", "config_sha256")
-    about = {key: manifest.plain[key] for key in keys} | {
-        "schema": SCHEMA,
-        "format": to,
-        "split": source.ds.options.split,
-    }
+    origin = {key: manifest.plain[key] for key in keys} | {"split": source.ds.options.split}
     fields = {name: dataclasses.asdict(field) for name, field in source.fields.items()}
-    return about | {"fields": fields, "videos": len(source)}
+    return origin | {"schema": SCHEMA, "format": to, "fields": fields, "videos": len(source)}
 
 
 # ---- Output
 
 
-def _check_out(out: Path, form: Export, about: Mapping[str, Any], overwrite: bool) -> None:
+def _check_out(out: Path, format_: Export, description: Mapping[str, Any], overwrite: bool) -> None:
     """Raise FolderError if `out` holds something that must not be replaced."""
-    with _explained(out):
+    with _translate_errors(out):
         if not out.exists():
             return
-        if out.is_dir() == bool(form.suffix):
+        if out.is_dir() == bool(format_.suffix):
             kinds = ("folder", "file") if out.is_dir() else ("file", "folder")
-            raise FolderError(f"{out} is a {kinds[0]}, but {about['format']} makes a {kinds[1]}: choose another --out")
+            name = description["format"]
+            raise FolderError(f"{out} is a {kinds[0]}, but {name} makes a {kinds[1]}: choose another --out")
         if out.is_dir():
-            _check_folder(out, about, overwrite)
+            _check_folder(out, description, overwrite)
         elif not overwrite:
             raise FolderError(f"{out} is there already: choose another --out, or --overwrite to replace it")
 
 
-def _check_folder(out: Path, about: Mapping[str, Any], overwrite: bool) -> None:
-    previous = _described(out)
-    known = {ABOUT, *previous["files"]} if previous else set()
+def _check_folder(out: Path, description: Mapping[str, Any], overwrite: bool) -> None:
+    previous = _read_description(out)
+    known = {DESCRIPTION, *previous["files"]} if previous else set()
     foreign = {path.name for path in out.iterdir()} - known
     if foreign:
         raise FolderError(f"{out} holds {min(foreign)}, which no export made: choose another --out")
     if not known:
         return  # an empty folder
-    same = all(previous.get(key) == about[key] for key in ("format", "split", "name", "seed", "config_sha256"))
+    same = all(previous.get(key) == description[key] for key in ("format", "split", "name", "seed", "config_sha256"))
     if not same and not overwrite:
         raise FolderError(f"{out} holds another export: choose another --out, or --overwrite to replace it")
 
 
-def _described(out: Path) -> dict[str, Any]:
+def _read_description(out: Path) -> dict[str, Any]:
     """Contents of the folder's export.json; empty if there is no valid one."""
     try:
-        description = parsed(read_bytes(out / ABOUT, JSON_BYTES)) or {}
+        description = parse_json(read_bytes(out / DESCRIPTION, JSON_BYTES)) or {}
     except FileNotFoundError:
         return {}
     return description if description.get("schema") == SCHEMA and isinstance(description.get("files"), dict) else {}
 
 
-def _written(out: Path, form: Export, source: Source, about: Mapping[str, Any]) -> int:
+def _write_output(out: Path, format_: Export, source: Source, description: Mapping[str, Any]) -> int:
     """Write `out` completely and return its size in bytes; also remove temporary files of killed exports."""
     out.parent.mkdir(parents=True, exist_ok=True)
     sweep_beside(out)
-    if form.suffix:
+    if format_.suffix:
         with publishing(out) as temporary:
-            form.write(temporary, source)
+            format_.write(temporary, source)
         return out.stat().st_size
     with publishing_folder(out) as temporary:
-        form.write(temporary, source)
+        format_.write(temporary, source)
         files = {path.name: path.stat().st_size for path in sorted(temporary.iterdir())}
-        (temporary / ABOUT).write_bytes(as_json({**about, "files": files}))
+        (temporary / DESCRIPTION).write_bytes(as_json({**description, "files": files}))
     return sum(files.values())
 
 
 @contextlib.contextmanager
-def _explained(out: Path) -> Iterator[None]:
+def _translate_errors(out: Path) -> Iterator[None]:
     """Context that turns an OSError into a UserError with one sentence."""
     try:
         yield

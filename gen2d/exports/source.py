@@ -17,7 +17,7 @@ from gen2d.loading.protocols import Batch
 from gen2d.storage.paths import Place
 
 FRAMES = Field("uint8", "n T H W 3", "sRGB", "the video")  # equal to the field of stored frames
-DRAWN_BYTES = 2**26  # size of a batch of rendered frames
+RENDERED_BYTES = 2**26  # size of a batch of rendered frames
 
 
 @dataclasses.dataclass(frozen=True)
@@ -25,7 +25,7 @@ class Source:
     """Videos of one split to export, in their order."""
 
     ds: Dataset
-    draws: bool  # whether frames are rendered, because they are not stored
+    renders: bool  # whether frames are rendered, because they are not stored
     trust: Sequence[str]  # sha256 of code that came with the dataset and may run to render
     advance: Callable[[int], None]  # to be called with the number of videos just written
 
@@ -35,7 +35,7 @@ class Source:
     @property
     def fields(self) -> dict[str, Field]:
         """The fields of each video, by name."""
-        return ({"frames": FRAMES} if self.draws else {}) | self.ds.fields
+        return ({"frames": FRAMES} if self.renders else {}) | self.ds.fields
 
     @property
     def fps(self) -> float:
@@ -58,10 +58,9 @@ class Source:
 
     def videos(self) -> Iterator[Batch]:
         """Videos one at a time, as dictionaries of arrays by field name."""
-        frames = self._drawn() if self.draws else iter(())
+        frames = self._rendered_frames() if self.renders else iter(())
         for number in range(len(self)):
-            rendered = {"frames": next(frames)} if self.draws else {}
-            yield rendered | self.ds[number]
+            yield ({"frames": next(frames)} if self.renders else {}) | self.ds[number]
 
     def each(self, write: Callable[[str, Batch], None]) -> None:
         """Call `write(key, video)` for every video in several threads, and report the progress to `advance`."""
@@ -77,11 +76,11 @@ class Source:
                 future.result()
                 self.advance(1)
 
-    def _drawn(self) -> Iterator[np.ndarray]:
+    def _rendered_frames(self) -> Iterator[np.ndarray]:
         """Rendered frames [T, H, W, 3] of each video; batches have equal sizes, so one program is compiled."""
         from gen2d.programs.redraw import render  # imports jax
 
-        count = max(1, min(128, len(self), DRAWN_BYTES // stored_bytes(FRAMES, self.ds.manifest.sizes)))
+        count = max(1, min(128, len(self), RENDERED_BYTES // stored_bytes(FRAMES, self.ds.manifest.sizes)))
         for first in range(0, len(self), count):
             numbers = np.minimum(np.arange(first, first + count), len(self) - 1)
             yield from np.asarray(render(self.ds, numbers, trust=self.trust))[: len(self) - first]
@@ -93,6 +92,6 @@ def source_of(root: str | Place, split: str | None, patterns: Sequence[str], tru
     Raises the errors of `open`.
     """
     ds = loader.open(root, split, fields=())
-    draws = "frames" not in ds.manifest.fields and any(fnmatch.fnmatch("frames", p) for p in patterns)
-    stored = [pattern for pattern in patterns if pattern != "frames"] if draws else patterns
-    return Source(loader.open(root, ds.options.split, stored), draws, trust, lambda videos: None)
+    renders = "frames" not in ds.manifest.fields and any(fnmatch.fnmatch("frames", p) for p in patterns)
+    stored = [pattern for pattern in patterns if pattern != "frames"] if renders else patterns
+    return Source(loader.open(root, ds.options.split, stored), renders, trust, lambda videos: None)

@@ -4,15 +4,15 @@ import numpy as np
 
 from gen2d.core.errors import UnreachableError, UserError
 from gen2d.dataset.croissant import croissant
-from gen2d.dataset.folder import Sizes, explained, is_done, locked, whole_plan
+from gen2d.dataset.folder import Sizes, folder_lock, is_done, translate_errors, whole_plan
 from gen2d.dataset.manifest import Manifest, describe
 from gen2d.dataset.manifest_parser import FILE_BYTES, ShardTable
-from gen2d.dataset.readme import readme, shown_split
+from gen2d.dataset.readme import card_split, readme
 from gen2d.dataset.records import Records, read_records
 from gen2d.dataset.rows import npy
 from gen2d.dataset.snapshots import Publication, SupersededError, publish_snapshot
 from gen2d.dataset.spec import SHEET, DatasetSpec, Shard, table_name
-from gen2d.dataset.statistics import summary
+from gen2d.dataset.statistics import summarize
 from gen2d.loading.dataset import Dataset, ViewOptions
 from gen2d.media import contact_sheet, images
 from gen2d.storage.atomic import publish_changed
@@ -29,7 +29,7 @@ def complete(spec: DatasetSpec) -> bool:
     False means that other workers are still generating shards. Raises UnreachableError if a server does not answer.
     """
     root = spec.root
-    with explained(root), locked(root):
+    with translate_errors(root), folder_lock(root):
         while True:
             records, sizes = read_records(spec, root), Sizes(root)
             old = records.manifest
@@ -61,7 +61,7 @@ def publication(spec: DatasetSpec, shards: list[Shard], records: Records, old: M
         current = _current_publication(spec, old)
         if current is not None:
             return current
-    stats = {split: summary(of_split["moments"], spec.fields) for split, of_split in rows.items()}
+    stats = {split: summarize(of_split["moments"], spec.fields) for split, of_split in rows.items()}
     files = spec.recipe_files
     hashes = {name: sha256(content) for name, content in files.items()}
     manifest = describe(spec, counts, tables, stats, hashes)
@@ -94,7 +94,7 @@ def _current_publication(spec: DatasetSpec, old: Manifest) -> Publication | None
 
 def sheet(root: Place, manifest: Manifest) -> bytes:
     """Contact sheet of the first videos, as PNG; the manifest need not be in the folder yet."""
-    options = ViewOptions(shown_split(manifest), ("frames",), None, 1, "first", "THWC", "uint8", "checksum")
+    options = ViewOptions(card_split(manifest), ("frames",), None, 1, "first", "THWC", "uint8", "checksum")
     ds = Dataset(root, manifest, options)
     # One video in memory at a time: they may be long and large.
     videos = (ds[number]["frames"] for number in range(min(ROWS, len(ds))))

@@ -39,8 +39,9 @@ from gen2d.programs.fingerprint import fingerprint, machine, sources
 from gen2d.programs.recipe import Trust, config_from
 from gen2d.programs.source import VideoRange, VideoSource
 from gen2d.storage.atomic import publish_changed, remove_tree, sync
-from gen2d.storage.leases import LOCK, leased, temporary_name
-from gen2d.storage.paths import Network, Place, Url, place, upload
+from gen2d.storage.leases import LOCK, lease, temporary_name
+from gen2d.storage.paths import Place, Url, place, upload
+from gen2d.storage.retries import Network
 from gen2d.storage.sealed import file_sha256
 
 Identity = Mapping[str, Any]  # of a dataset; its manifest has the same keys
@@ -174,12 +175,12 @@ def repair(
     shards = plan(counts, spec.videos_per_shard)
     todo = _damaged_shards(root, shards, records, bad, every_byte=manifest is None)
     staged = Records(spec.videos_per_shard, {})
-    with folder.explained(root), _staging(root) as stage:
+    with folder.translate_errors(root), _staging(root) as stage:
         if todo:
             check_fingerprint(root, source, identity)
             staged = _regenerate_shards(source, spec, stage, todo, records, manifest, log or (lambda line: None))
         try:
-            with folder.locked(root):
+            with folder.folder_lock(root):
                 check_current(root, manifest)
                 for shard in todo:
                     _replace(stage / shard_name(shard.name), shard_path(root, shard.name))
@@ -258,7 +259,7 @@ def _staging(root: Place) -> Iterator[Path]:
     (root / MARK).mkdir(exist_ok=True)
     stage = root / MARK / temporary_name(STAGED.name)
     lock = stage.with_name(stage.name + LOCK)
-    with leased(lock), contextlib.ExitStack() as stack:
+    with lease(lock), contextlib.ExitStack() as stack:
         stack.callback(lock.unlink, missing_ok=True)
         stage.mkdir()
         stack.callback(remove_tree, stage)

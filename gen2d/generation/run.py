@@ -23,7 +23,8 @@ from gen2d.programs import devices
 from gen2d.programs.fingerprint import fingerprint, sources
 from gen2d.programs.source import VideoSource
 from gen2d.records.keys import MAX_VIDEOS
-from gen2d.storage.paths import Network, Place, place
+from gen2d.storage.paths import Place, place
+from gen2d.storage.retries import Network
 
 CONVENTIONS = (
     "World: metres, y up, radians counter-clockwise, seconds. Pixels: (row, column) from the top left, pixel centres "

@@ -27,7 +27,8 @@ from gen2d.loading.protocols import Batch, Key, Numbers, Snapshot, checked_numbe
 from gen2d.storage import codecs
 from gen2d.storage.cache import Cache
 from gen2d.storage.explain import reason
-from gen2d.storage.paths import Network, Place, Url, place
+from gen2d.storage.paths import Place, Url, place
+from gen2d.storage.retries import Network
 
 Root = TypeVar("Root", bound=str | Place)
 

@@ -26,7 +26,7 @@ from gen2d.programs.devices import instruction_set
 from gen2d.programs.rollout import Rollout
 from gen2d.sampling.sampler import Sampler
 from gen2d.storage.atomic import publish
-from gen2d.storage.sealed import as_json, parsed, read_bytes, sha256
+from gen2d.storage.sealed import as_json, parse_json, read_bytes, sha256
 
 # Prefixes of XLA flags that leave all results unchanged to the bit; any other flag is assumed to change some.
 HARMLESS = (
@@ -77,7 +77,7 @@ def _cached_hashes(rollout: Rollout) -> dict[str, str]:
     key = [rollout.config.recipe(), sources(), *versions, platform, rollout.batch_size, rollout.slice]
     path = pathlib.Path(folder or "") / "fingerprints" / sha256(as_json(key))
     try:
-        cached = parsed(read_bytes(path, 10**5)) if folder else None
+        cached = parse_json(read_bytes(path, 10**5)) if folder else None
     except OSError:
         cached = None
     if cached is not None and all(isinstance(digest, str) for digest in cached.values()):

@@ -1,1 +1,1 @@
-"""Files and folders, local or at a URL: atomic publication, hashes, a cache, compression."""
+"""Files and folders, local or at a URL: atomic publication, retries, hashes, a cache, compression."""

@@ -12,7 +12,7 @@ import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
-from gen2d.storage.leases import LOCK, TEMPORARY, abandoned, leased, remove_abandoned, temporaries, temporary_name
+from gen2d.storage.leases import LOCK, TEMPORARY, abandoned, lease, remove_abandoned, temporary_files, temporary_name
 from gen2d.storage.paths import Place, Url, upload
 from gen2d.storage.sealed import read_bytes
 
@@ -25,7 +25,7 @@ def publishing(path: Place) -> Iterator[Path]:
     folder = Path(tempfile.gettempdir()) if isinstance(path, Url) else path.parent
     prefix = "gen2d-" if isinstance(path, Url) else ""
     temporary = folder / temporary_name(prefix + path.name)
-    with leased(temporary):
+    with lease(temporary):
         try:
             yield temporary
             if isinstance(path, Url):
@@ -42,7 +42,7 @@ def publishing(path: Place) -> Iterator[Path]:
 def publishing_folder(path: Path) -> Iterator[Path]:
     """Context with a temporary folder, which replaces `path` when the block ends without an error."""
     temporary, replaced = (path.with_name(temporary_name(path.name + old)) for old in ("", _OLD))
-    with _leased_folder(temporary), _leased_folder(replaced):
+    with _lease_folder(temporary), _lease_folder(replaced):
         try:
             temporary.mkdir()
             yield temporary
@@ -60,10 +60,10 @@ def publishing_folder(path: Path) -> Iterator[Path]:
 
 
 @contextlib.contextmanager
-def _leased_folder(folder: Path) -> Iterator[None]:
+def _lease_folder(folder: Path) -> Iterator[None]:
     """Context in which this process owns the temporary folder, by a locked file beside it."""
     lock = folder.with_name(folder.name + LOCK)
-    with leased(lock):
+    with lease(lock):
         try:
             yield
         finally:
@@ -107,19 +107,19 @@ def work_folder(root: Place) -> Path:
 def sweep(root: Place, folders: tuple[str, ...], force: bool = False) -> list[Path]:
     """Remove the abandoned temporary files in these folders of `root` and return their paths."""
     if isinstance(root, Url):
-        return remove_abandoned(temporaries(work_folder(root), "gen2d-"), force)
-    return [path for name in folders for path in remove_abandoned(temporaries(root / name), force)]
+        return remove_abandoned(temporary_files(work_folder(root), "gen2d-"), force)
+    return [path for name in folders for path in remove_abandoned(temporary_files(root / name), force)]
 
 
 def sweep_beside(path: Path) -> None:
     """Remove abandoned temporary files of `path`; restore a folder whose replacement was interrupted."""
-    for folder in temporaries(path.parent, f"{path.name}{_OLD}."):
+    for folder in temporary_files(path.parent, f"{path.name}{_OLD}."):
         if not folder.is_dir():
             continue
         with abandoned(folder) as is_abandoned:
             if is_abandoned and not path.exists():
                 folder.rename(path)
-    remove_abandoned(temporaries(path.parent, f"{path.name}."))
+    remove_abandoned(temporary_files(path.parent, f"{path.name}."))
 
 
 def is_temporary(name: str) -> bool:

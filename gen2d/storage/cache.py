@@ -17,7 +17,7 @@ from gen2d.storage.leases import is_at
 from gen2d.storage.paths import Url, download
 from gen2d.storage.sealed import file_sha256
 
-_OURS = re.compile(r"[0-9a-f]{64}")
+_SHA256 = re.compile(r"[0-9a-f]{64}")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -78,7 +78,7 @@ class Cache:
             return
         files = []
         for path in self.folder.iterdir():
-            if _OURS.fullmatch(path.name):
+            if _SHA256.fullmatch(path.name):
                 with contextlib.suppress(FileNotFoundError):
                     status = path.stat()
                     files.append((status.st_mtime_ns, status.st_size, path))

@@ -50,9 +50,9 @@ def decode_into(codec: str, data: bytes | memoryview, out: np.ndarray) -> None:
     """
     try:
         if codec == "zstd":
-            _unzstd(data, out)
+            _decompress_zstd(data, out)
             return
-        plain = _inflated(data, out.nbytes) if codec == "gzip" else memoryview(data).cast("B")
+        plain = _inflate(data, out.nbytes) if codec == "gzip" else memoryview(data).cast("B")
     except _ERRORS as error:
         raise DamagedError(f"compressed data is damaged ({error})") from error
     if len(plain) != out.nbytes:
@@ -61,7 +61,7 @@ def decode_into(codec: str, data: bytes | memoryview, out: np.ndarray) -> None:
         out.reshape(-1)[...] = np.frombuffer(plain, out.dtype)
 
 
-def _inflated(data: bytes | memoryview, size: int) -> bytes:
+def _inflate(data: bytes | memoryview, size: int) -> bytes:
     stream = isal_zlib.decompressobj()
     # One byte more than expected reveals a longer stream, and the buffer need not grow to reach the end.
     plain = stream.decompress(data, size + 1)
@@ -70,7 +70,7 @@ def _inflated(data: bytes | memoryview, size: int) -> bytes:
     return plain
 
 
-def _unzstd(data: bytes | memoryview, out: np.ndarray) -> None:
+def _decompress_zstd(data: bytes | memoryview, out: np.ndarray) -> None:
     # Checked before decompressing, so that a damaged size cannot exhaust the memory.
     if zstandard.frame_content_size(data) != out.nbytes:
         raise DamagedError(f"compressed data does not hold {out.nbytes} bytes, as it must")

@@ -1,9 +1,7 @@
 """Errors with one sentence for the user, made from OSErrors of reading and writing."""
 
-import contextlib
 import errno
 import os
-from collections.abc import Iterator
 from pathlib import Path
 
 from gen2d.core.errors import DamagedError, FolderError, UnreachableError, UserError
@@ -45,15 +43,6 @@ def reading_error(path: object, error: OSError) -> Exception:
     if error.errno in _NO_FILE:
         return DamagedError(f"{path} is not a regular file")
     return UnreachableError(f"{path} cannot be read ({reason(error)})")
-
-
-@contextlib.contextmanager
-def explained_reading(path: object) -> Iterator[None]:
-    """Context that turns an OSError into the error of `reading_error`."""
-    try:
-        yield
-    except OSError as error:
-        raise reading_error(path, error) from error
 
 
 def writing_error(where: Path, error: OSError, again: str = "run the same command again", need: str = "") -> UserError:

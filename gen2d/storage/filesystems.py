@@ -9,7 +9,7 @@ from gen2d.core.errors import FolderError
 _COMMON = ("s3", "gs", "az", "http", "https", "sftp", "memory", "file")
 
 
-def shown(text: str) -> str:
+def redact_url(text: str) -> str:
     """A URL without its secrets: user name, password and query."""
     start, separator, remainder = text.partition("://")
     if not separator:
@@ -20,7 +20,7 @@ def shown(text: str) -> str:
     return f"{start}://{'***@' if at_sign else ''}{host_only}{slash}{path}{'?***' if question else ''}"
 
 
-def without_secrets(sentence: str, url: str, query: str = "") -> str:
+def redact(sentence: str, url: str, query: str = "") -> str:
     """A library's message about a URL, without the URL's secrets."""
     host = url.partition("://")[2].partition("/")[0]
     user = host.rpartition("@")[0]
@@ -38,7 +38,7 @@ def file_system(url: str, timeout: float) -> Any:
 
 @functools.lru_cache(maxsize=32)
 def _connect(start: str, timeout: float, process: int) -> Any:
-    name = shown(start)
+    name = redact_url(start)
     try:
         import fsspec
     except ImportError:
@@ -51,7 +51,7 @@ def _connect(start: str, timeout: float, process: int) -> Any:
         raise FolderError(f"{name} needs another package ({error}){hint}") from None
     except Exception as error:
         known = ", ".join(sorted(name for name in fsspec.available_protocols() if name in _COMMON))
-        reason = without_secrets(" ".join(str(error).split()), start)
+        reason = redact(" ".join(str(error).split()), start)
         raise FolderError(f"{name} cannot be used ({reason}); common protocols are {known}") from None
 
 
@@ -63,6 +63,6 @@ def _limits(start: str, timeout: float) -> dict[str, Any]:
         limits = aiohttp.ClientTimeout(total=None, sock_connect=timeout, sock_read=timeout)
         return {"client_kwargs": {"timeout": limits}}
     if start.startswith(("s3://", "s3a://")):
-        retries = {"max_attempts": 1}  # `attempt` tries again
+        retries = {"max_attempts": 1}  # `retries.attempt` tries again
         return {"config_kwargs": {"connect_timeout": timeout, "read_timeout": timeout, "retries": retries}}
     return {}

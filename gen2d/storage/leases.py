@@ -34,7 +34,7 @@ def temporary_name(name: str) -> str:
 
 
 @contextlib.contextmanager
-def leased(path: Path) -> Iterator[int]:
+def lease(path: Path) -> Iterator[int]:
     """Descriptor of a new, empty file with this name, locked until the block ends.
 
     On a file system without locks, the file is created but not locked. Raises OSError.
@@ -51,7 +51,7 @@ def leased(path: Path) -> Iterator[int]:
 
 
 @contextlib.contextmanager
-def exclusive(path: Path, seconds: float) -> Iterator[None]:
+def exclusive_lock(path: Path, seconds: float) -> Iterator[None]:
     """Context that one process at a time enters, by a lock on the file `path`, which is not removed.
 
     On a file system without locks, any number of processes enter. Raises TimeoutError if another process holds the lock
@@ -113,22 +113,22 @@ def abandoned(path: Path, force: bool = False) -> Iterator[bool]:
         yield False
         return
     is_folder = path.is_dir() and not path.is_symlink()
-    lease = path.with_name(path.name + LOCK) if is_folder else path
-    if is_folder and not lease.exists():
+    lock = path.with_name(path.name + LOCK) if is_folder else path
+    if is_folder and not lock.exists():
         yield True
         return
-    descriptor = os.open(lease, os.O_RDWR | os.O_NONBLOCK | os.O_NOFOLLOW | os.O_CLOEXEC)
+    descriptor = os.open(lock, os.O_RDWR | os.O_NONBLOCK | os.O_NOFOLLOW | os.O_CLOEXEC)
     try:
         locked = try_lock(descriptor)
-        free = bool(locked or (force and locked is None)) and is_at(descriptor, lease)
+        free = bool(locked or (force and locked is None)) and is_at(descriptor, lock)
         yield free
         if free and is_folder:
-            lease.unlink(missing_ok=True)
+            lock.unlink(missing_ok=True)
     finally:
         os.close(descriptor)
 
 
-def temporaries(folder: Path, prefix: str = "") -> Iterator[Path]:
+def temporary_files(folder: Path, prefix: str = "") -> Iterator[Path]:
     """The temporary files and folders directly in a folder whose names begin with `prefix`."""
     with contextlib.suppress(FileNotFoundError, NotADirectoryError), os.scandir(folder) as entries:
         for entry in entries:

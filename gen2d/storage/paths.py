@@ -4,9 +4,8 @@
 the protocols; it is imported when the first URL is met. An object appears whole or not at all, so nothing is renamed;
 folders are only prefixes of names.
 
-Every request has a timeout and a deadline. Failures that may be temporary are tried again until the deadline and then
-raise UnreachableError; FileNotFoundError and PermissionError are raised where the server says so. No message, repr or
-log shows the user name, password or query of a URL.
+Every request, uploads and downloads included, is made by `retries.attempt`, which limits its time, retries it and
+explains its errors. No message, repr or log shows the user name, password or query of a URL.
 """
 
 import contextlib
@@ -16,52 +15,22 @@ import fnmatch
 import os
 import re
 import stat
-import threading
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path, PurePath
-from typing import Any, TypeVar
+from typing import Any
 
-from gen2d.core.errors import ConfigError, DamagedError, FolderError, UnreachableError
-from gen2d.storage.filesystems import file_system, shown, without_secrets
+from gen2d.core.errors import DamagedError, FolderError
+from gen2d.storage.filesystems import file_system, redact_url
+from gen2d.storage.retries import Address, Network, attempt, http_status
 
-PAUSE = 0.25  # s, before the second attempt; doubled before each that follows
-ATTEMPTS = 4
 PIECE = 2**20  # bytes of a file that are received at once
-SLOWEST = 2**20  # bytes/s, by which the deadline of a large file is extended
-
-T = TypeVar("T")
 
 
-@dataclasses.dataclass(frozen=True)
-class Network:
-    """Limits on the time that a server may take."""
-
-    timeout: float = 30.0  # s, to connect and between two parts of an answer
-    deadline: float = 300.0  # s, for a request including all further attempts
-
-    def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            if isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value < 1e9:
-                raise ConfigError(f"{name} is {value!r}, but must be a number of seconds above 0")
-
-
-@dataclasses.dataclass(frozen=True, order=True)
-class Url:
+class Url(Address):
     """A file or folder at a URL; its methods behave like those of pathlib.Path and raise the same OSErrors."""
-
-    text: str = dataclasses.field(repr=False)  # without the query
-    query: str = dataclasses.field(default="", repr=False)  # including its question mark
-    network: Network = dataclasses.field(default=Network(), compare=False, repr=False)
 
     def __truediv__(self, name: str | PurePath) -> "Url":
         return dataclasses.replace(self, text=f"{self.text}/{PurePath(name).as_posix()}")
-
-    def __str__(self) -> str:
-        return shown(self.text + self.query)
-
-    def __repr__(self) -> str:
-        return f"Url({str(self)!r})"
 
     @property
     def name(self) -> str:
@@ -143,7 +112,7 @@ def place(path: str | Place, network: Network | None = None) -> Place:
     if protocol in ("file", "local"):
         return Path(rest)
     if not rest.strip("/") or "::" in path or not re.fullmatch(r"[A-Za-z0-9+.-]+", protocol):
-        raise FolderError(f"{shown(path)} must be PROTOCOL://FOLDER, such as s3://bucket/dataset")
+        raise FolderError(f"{redact_url(path)} must be PROTOCOL://FOLDER, such as s3://bucket/dataset")
     text, mark, query = path.partition("?") if protocol in ("http", "https", "az", "abfs", "abfss") else (path, "", "")
     url = Url(text.rstrip("/"), mark + query, network or Network())
     file_system(url.text, url.network.timeout)
@@ -214,7 +183,7 @@ def _read(url: Url, system: Any, path: str, limit: int) -> bytes:
         try:
             content = system.cat_file(path, start=0, end=limit + 1)
         except Exception as error:
-            if _status(error) != 416:
+            if http_status(error) != 416:
                 raise
             content = b""  # an empty file has no range
     if len(content) > limit:
@@ -266,92 +235,3 @@ def _names(system: Any, path: str, call: Callable[..., list[str]]) -> list[str]:
     prefix = system._strip_protocol(path).rstrip("/") + "/"
     names = (system._strip_protocol(name) for name in paths)
     return sorted(name.removeprefix(prefix) for name in names if name.startswith(prefix) and name != prefix)
-
-
-# ---- Attempts
-
-
-def attempt(url: Url, call: Callable[[Any, str], T], size: int = 0) -> T:
-    """The result of `call` for the URL's file system and the path in it, after as many attempts as it takes.
-
-    `size` is the number of bytes to transfer, which extends the deadline. Raises OSError for failures that another
-    attempt would not solve, DamagedError, and UnreachableError.
-    """
-    system = file_system(url.text, url.network.timeout)
-    path = system._strip_protocol(url.text) + url.query
-    end = time.monotonic() + url.network.deadline + size / SLOWEST
-    for number in range(ATTEMPTS):
-        try:
-            return _within(end - time.monotonic(), lambda: call(system, path))
-        except Exception as error:
-            failure = explained(error, url)
-        left = end - time.monotonic() - PAUSE * 2**number
-        if not isinstance(failure, UnreachableError) or number == ATTEMPTS - 1 or left <= 0:
-            raise failure from None
-        time.sleep(PAUSE * 2**number)
-    raise AssertionError("unreachable")
-
-
-def _within(seconds: float, call: Callable[[], T]) -> T:
-    """The result of the call; raises TimeoutError if it takes longer, and leaves it to its thread."""
-    returned: list[T] = []
-    raised: list[BaseException] = []
-
-    def run() -> None:
-        try:
-            returned.append(call())
-        except BaseException as error:
-            raised.append(error)
-
-    thread = threading.Thread(target=run, daemon=True, name="gen2d-request")
-    thread.start()
-    thread.join(max(0.0, seconds))
-    if raised:
-        raise raised[0]
-    if not returned:
-        raise TimeoutError("no answer within the deadline")
-    return returned[0]
-
-
-# Errors that another attempt would not solve.
-_FINAL = (FileNotFoundError, PermissionError, IsADirectoryError, NotADirectoryError)
-_FINAL_NUMBERS = (errno.EFBIG, errno.EOPNOTSUPP, errno.ENOSPC, errno.EMFILE, errno.ENFILE)
-
-
-def explained(error: BaseException, url: Url) -> Exception:
-    """The error to raise for a library's error: OSError if another attempt would not solve it, DamagedError for a file
-    of another length, otherwise UnreachableError."""
-    status = _status(error)
-    if status in (401, 403) or "Credentials" in type(error).__name__:
-        error = PermissionError()
-    elif status in (404, 410):
-        error = FileNotFoundError()
-    elif status == 416:  # range not satisfiable
-        return DamagedError(f"{url} ends too early")
-    if isinstance(error, DamagedError):
-        return error
-    for kind in _FINAL:
-        if isinstance(error, kind):
-            number = errno.EACCES if kind is PermissionError else errno.ENOENT
-            return kind(number, os.strerror(number), str(url))
-    number = getattr(error, "errno", None)
-    text = getattr(error, "strerror", None) or str(error)
-    text = text or ("no answer in time" if isinstance(error, TimeoutError) else type(error).__name__)
-    text = " ".join(without_secrets(text, url.text, url.query).split()).rstrip(".")
-    final = number in _FINAL_NUMBERS or isinstance(error, TypeError | ValueError | NotImplementedError | AttributeError)
-    if final or (status is not None and 400 <= status < 500 and status not in (408, 425, 429)):
-        return OSError(number or errno.EIO, text, str(url))
-    return UnreachableError(f"{url} cannot be reached ({text})")
-
-
-def _status(error: BaseException | None) -> int | None:
-    """The HTTP status that a web server or S3 answered with."""
-    while error is not None:
-        status = getattr(error, "status", None)
-        response = getattr(error, "response", None)
-        if status is None and isinstance(response, dict):
-            status = response.get("ResponseMetadata", {}).get("HTTPStatusCode")
-        if isinstance(status, int):
-            return status
-        error = error.__cause__
-    return None

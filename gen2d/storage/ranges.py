@@ -6,7 +6,8 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
 from gen2d.core.errors import DamagedError, UnreachableError
-from gen2d.storage.paths import Url, attempt, read_range
+from gen2d.storage.paths import Url, read_range
+from gen2d.storage.retries import attempt
 
 NEAR = 2**18  # bytes; reading a gap of this size takes less time than a second request
 LONGEST = 2**23  # bytes of a request; a longer one takes more time than several in parallel

@@ -19,7 +19,7 @@ def as_json(value: Any) -> bytes:
     return json.dumps(value, sort_keys=True, indent=1, ensure_ascii=False, allow_nan=False).encode()
 
 
-def parsed(content: bytes) -> dict[str, Any] | None:
+def parse_json(content: bytes) -> dict[str, Any] | None:
     """The JSON object in these bytes; None if they hold none."""
     try:
         value = json.loads(content, parse_constant=_refuse)
@@ -32,17 +32,17 @@ def _refuse(name: str) -> NoReturn:
     raise ValueError(f"{name} is not a number")
 
 
-def sealed(values: Mapping[str, Any], key: str) -> dict[str, Any]:
+def seal(values: Mapping[str, Any], key: str) -> dict[str, Any]:
     """The values, with the sha256 of all others under `key`."""
     others = {name: value for name, value in values.items() if name != key}
     return others | {key: sha256(as_json(others))}
 
 
-def unsealed(content: bytes, key: str) -> dict[str, Any] | None:
-    """The object that `sealed` returned, from its bytes; None if any of them changed."""
-    values = parsed(content)
+def unseal(content: bytes, key: str) -> dict[str, Any] | None:
+    """The object that `seal` returned, from its bytes; None if any of them changed."""
+    values = parse_json(content)
     try:
-        return values if values is not None and content == as_json(sealed(values, key)) else None
+        return values if values is not None and content == as_json(seal(values, key)) else None
     except (ValueError, RecursionError):  # half a surrogate pair, or nested too deep
         return None
 
@@ -60,7 +60,7 @@ def read_sealed(path: Place, key: str) -> dict[str, Any] | None:
         if isinstance(path, Url):
             raise
         return None
-    return unsealed(content, key)
+    return unseal(content, key)
 
 
 def sha256(content: bytes) -> str:

@@ -51,13 +51,13 @@ def gallery(
     if is_dataset(source):
         ds = open_dataset(source, timeout=timeout, deadline=deadline)
         looks = _looks(config_of(ds, overrides, trust).plain()["look"])
-        picture, name = _sheet(ds, videos, looks, overrides, trust), ds.manifest.name
+        image, name = _sheet(ds, videos, looks, overrides, trust), ds.manifest.name
     else:
-        with _annotated_video(source, videos, seed, overrides) as (ds, plain, own_files):
-            picture, name = _sheet(ds, videos, _looks(plain["look"]), (), own_files), plain["name"]
+        with _temporary_dataset(source, videos, seed, overrides) as (ds, plain, own_files):
+            image, name = _sheet(ds, videos, _looks(plain["look"]), (), own_files), plain["name"]
     path = out / f"{name}-gallery.png"
     with writing(out):
-        write(path, picture)
+        write(path, image)
     return path
 
 
@@ -73,13 +73,13 @@ def families(
     rows, paths = [], []
     for name in plugins.names("scene"):
         has_config = f"{name}.yaml" in plugins.config_names()
-        with _annotated_video(name if has_config else {"name": name, "scene": name}, videos, seed, overrides) as (
+        with _temporary_dataset(name if has_config else {"name": name, "scene": name}, videos, seed, overrides) as (
             ds,
             plain,
             own_files,
         ):
             frames = np.asarray(render(ds, range(videos), look=plain["look"], trust=own_files))
-            rows.append(_labelled(name, _fitted(contact_sheet(frames))))
+            rows.append(_add_label(name, _resize_to_page(contact_sheet(frames))))
             paths.append(out / f"{name}-gallery.png")
             with writing(out):
                 write(paths[-1], _sheet(ds, videos, _looks(plain["look"]), (), own_files))
@@ -88,13 +88,13 @@ def families(
     return [out / "families.png", *paths]
 
 
-def _fitted(sheet: np.ndarray) -> np.ndarray:
+def _resize_to_page(sheet: np.ndarray) -> np.ndarray:
     """A sheet resized to the width of the page."""
     return cv2.resize(sheet, (PAGE, round(PAGE * sheet.shape[0] / sheet.shape[1])), interpolation=cv2.INTER_AREA)
 
 
 @contextlib.contextmanager
-def _annotated_video(
+def _temporary_dataset(
     source: str | Mapping[str, Any], videos: int, seed: int | None, overrides: Sequence[str]
 ) -> Iterator[tuple[Dataset, dict[str, Any], list[str]]]:
     """Temporary dataset of a config's first videos without frames, the plain config, and the sha256 of user files."""
@@ -117,14 +117,14 @@ def _sheet(
     """Gallery [H, W, 3] of all looks and annotations."""
     numbers = range(min(videos, len(ds)))
     rows = [*_look_rows(ds, numbers, looks, overrides, trust), *_annotation_rows(ds, numbers, overrides, trust)]
-    return np.concatenate([_labelled(name, contact_sheet(frames)) for name, frames in rows])
+    return np.concatenate([_add_label(name, contact_sheet(frames)) for name, frames in rows])
 
 
-def _labelled(name: str, picture: np.ndarray) -> np.ndarray:
+def _add_label(name: str, image: np.ndarray) -> np.ndarray:
     """An image with its name on a white strip at the left."""
-    strip = np.full((len(picture), LABEL, 3), 255, np.uint8)
+    strip = np.full((len(image), LABEL, 3), 255, np.uint8)
     cv2.putText(strip, name, (2 * GAP, 20), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (0, 0, 0), 1, cv2.LINE_AA)
-    return np.concatenate([strip, picture], axis=1)
+    return np.concatenate([strip, image], axis=1)
 
 
 Rows = Iterator[tuple[str, np.ndarray]]

@@ -68,9 +68,9 @@ def preview(
     if is_dataset(source):
         ds = open_dataset(source, timeout=timeout, deadline=deadline)
         numbers = range(min(videos, len(ds)))
-        name, frames, fps = ds.manifest.name, _stored(ds, numbers, trust), ds.manifest.fps
+        name, frames, fps = ds.manifest.name, _dataset_frames(ds, numbers, trust), ds.manifest.fps
     else:
-        name, frames, fps = _drawn(str(source), videos, seed, overrides)
+        name, frames, fps = _config_frames(str(source), videos, seed, overrides)
     sheet, animation = out / f"{name}-sheet.png", out / f"{name}.webp"
     with writing(out):
         write(sheet, contact_sheet(frames))
@@ -90,7 +90,7 @@ def check_videos(videos: int) -> None:
         raise UserError(f"--videos is {videos}, but must be 1 or more")
 
 
-def _stored(ds: Dataset, numbers: Sequence[int], trust: Sequence[str]) -> np.ndarray:
+def _dataset_frames(ds: Dataset, numbers: Sequence[int], trust: Sequence[str]) -> np.ndarray:
     """Frames [n, T, H, W, 3] of a dataset's videos, rendered if they are not stored."""
     if "frames" in ds.manifest.fields:
         return ds.batch(numbers)["frames"]
@@ -99,7 +99,9 @@ def _stored(ds: Dataset, numbers: Sequence[int], trust: Sequence[str]) -> np.nda
     return np.asarray(render(ds, numbers, trust=trust))
 
 
-def _drawn(source: str, videos: int, seed: int | None, overrides: Sequence[str]) -> tuple[str, np.ndarray, float]:
+def _config_frames(
+    source: str, videos: int, seed: int | None, overrides: Sequence[str]
+) -> tuple[str, np.ndarray, float]:
     """Name of a config, and frames [n, T, H, W, 3] and frame rate of its first videos."""
     import dataclasses
 

@@ -27,7 +27,8 @@ from gen2d.loading import dataset as loader
 from gen2d.loading.epochs import order
 from gen2d.storage.atomic import size_of
 from gen2d.storage.explain import reading_error, reason
-from gen2d.storage.paths import Network, Place, Url, download, place, reading
+from gen2d.storage.paths import Place, Url, download, place, reading
+from gen2d.storage.retries import Network
 from gen2d.storage.sealed import file_sha256, has_sha256, read_bytes, read_sealed, sha256
 
 LEVELS = ("quick", "full", "regen")
@@ -159,14 +160,14 @@ def find_problems(
         try:
             problems = list(_problems_of(root, manifest, level, videos, seed, trust))
         except Error:
-            if _has(root, manifest):
+            if _has_manifest(root, manifest):
                 raise
             continue
-        if not problems or _has(root, manifest):
+        if not problems or _has_manifest(root, manifest):
             return problems
 
 
-def _has(root: Place, manifest: Manifest) -> bool:
+def _has_manifest(root: Place, manifest: Manifest) -> bool:
     """Whether the folder still has this manifest, or no intact one."""
     try:
         return read_manifest(root).sha256 == manifest.sha256

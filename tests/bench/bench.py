@@ -39,7 +39,7 @@ import numpy as np
 from bench_physics import CASES, Cost
 from bench_render import Annotated, Drawing
 from bench_storage import Stored
-from timing import timed
+from timing import first_batch, medians, timed
 
 from gen2d.dataset.folder import open_folder
 from gen2d.dataset.shard_writer import ShardWriter
@@ -66,15 +66,14 @@ def stages(folder: Path, turns: int = 5, peer_videos: int = 32, overrides: Seque
     import peer
 
     cv2.setNumThreads(1)
-    works = {name: timed(work, videos, time.perf_counter) for name, (work, videos) in _parts(folder, overrides).items()}
-    works |= {
+    works = _stages(folder, overrides) | {
         f"peer {read}": lambda read=read: peer.seconds_to_step(peer_videos, read) / peer_videos for read in peer.READERS
     }
     return in_turns(works | {"peer draw": lambda: peer.seconds_to_draw(peer_videos) / peer_videos}, turns)
 
 
-def _parts(folder: Path, overrides: Sequence[str], config: str = CONFIG) -> dict[str, tuple[Callable[[], Any], int]]:
-    """For each stage of gen2d, a function that runs it on a batch, and its number of videos."""
+def _stages(folder: Path, overrides: Sequence[str], config: str = CONFIG) -> dict[str, Callable[[], float]]:
+    """For each stage of gen2d, a function that runs it on a batch and returns the seconds per video."""
     import jax
 
     from gen2d.generation import encoder as encoder_module
@@ -85,7 +84,7 @@ def _parts(folder: Path, overrides: Sequence[str], config: str = CONFIG) -> dict
     source = source_of(overrides, config)
     rollout = source.rollout
     sample, simulate, numbers = _physics(rollout)
-    start, batch = sample(numbers), rollout.start("train", np.tile(np.arange(rollout.batch_size), len(rollout.devices)))
+    start, batch = sample(numbers), first_batch(rollout)
     shard_videos = rollout.videos_per_shard // rollout.batch_size * rollout.batch_size
     dataset = dataset_of(source, folder / "data", {"train": shard_videos}, {})
     shard, *_ = open_folder(dataset)
@@ -107,14 +106,16 @@ def _parts(folder: Path, overrides: Sequence[str], config: str = CONFIG) -> dict
             *(np.asarray(array) for videos in slices for array in videos.rendered.values()),
         ]
 
-    return {
-        "sampler": (lambda: jax.block_until_ready(sample(numbers)), rollout.batch_size),
-        "simulate": (lambda: jax.block_until_ready(simulate(*start)), rollout.batch_size),
-        "render": (draw, rollout.batch_size),
-        "transfer": (transfer, rollout.batch_size),
-        "compress": (encode, rollout.batch_size),
-        "write": (lambda: ShardWriter(dataset).write(shard, blocks), shard_videos),
+    works: dict[str, Callable[[], Any]] = {
+        "sampler": lambda: jax.block_until_ready(sample(numbers)),
+        "simulate": lambda: jax.block_until_ready(simulate(*start)),
+        "render": draw,
+        "transfer": transfer,
+        "compress": encode,
     }
+    clock = time.perf_counter
+    timed_works = {name: timed(work, rollout.batch_size, clock) for name, work in works.items()}
+    return timed_works | {"write": timed(lambda: ShardWriter(dataset).write(shard, blocks), shard_videos, clock)}
 
 
 def source_of(overrides: Sequence[str] = (), config: str = CONFIG) -> Any:
@@ -226,17 +227,13 @@ def annotated(folder: Path, turns: int) -> Turns:
     """CPU seconds per frame of rendering with each annotation, and the bytes per frame of the annotation."""
     options = {name: [f"annotations.{part}" for part in parts] for name, parts in bench_render.ANNOTATIONS.items()}
     rollouts = {name: source_of((*bench_render.ANNOTATED.overrides, *parts)).rollout for name, parts in options.items()}
-    works, sizes = bench_render.annotating(rollouts)
+    works, sizes = bench_render.annotation_works(rollouts)
     return in_turns(works, turns) | {f"bytes {name}": [size] for name, size in sizes.items()}
 
 
 def family(folder: Path, name: str, turns: int) -> Turns:
     """Seconds per video of each stage, with the config of a scene family."""
-    works = {
-        part: timed(work, videos, time.perf_counter)
-        for part, (work, videos) in _parts(folder, (), f"{name}.yaml").items()
-    }
-    return in_turns(works, turns)
+    return in_turns(_stages(folder, (), f"{name}.yaml"), turns)
 
 
 def storage(folder: Path, case: str, turns: int) -> Turns:
@@ -276,7 +273,7 @@ def run(command: Sequence[object], cores: Sequence[int] = CORES, env: Mapping[st
     return Ran(time.perf_counter() - began, usage.ru_maxrss * 1024, text)
 
 
-def measured(work: Callable, folder: Path, cores: Sequence[int] = CORES, **options: Any) -> Any:
+def measure(work: Callable, folder: Path, cores: Sequence[int] = CORES, **options: Any) -> Any:
     """Result of one of MEASUREMENTS, run in a separate process."""
     ran = run([sys.executable, HERE, "--measure", work.__name__, folder, json.dumps(options)], cores)
     return json.loads(next(line for line in ran.text.splitlines() if line.startswith("{")))
@@ -325,12 +322,12 @@ class Promise(NamedTuple):
         """The target and whether it is met; empty without a target."""
         if self.target is None:
             return ""
-        kept = self.value <= self.target if self.most else self.value >= self.target
-        return f"{'at most' if self.most else 'at least'} {self.target:g}: {'kept' if kept else 'NOT KEPT'}"
+        is_met = self.value <= self.target if self.most else self.value >= self.target
+        return f"{'at most' if self.most else 'at least'} {self.target:g}: {'kept' if is_met else 'NOT KEPT'}"
 
 
-Told = Row | Promise | Cost | Drawing | Annotated | Stored
-Found = Iterator[Told]
+Result = Row | Promise | Cost | Drawing | Annotated | Stored
+Results = Iterator[Result]
 BETA = "an interface that pymunk calls highly experimental"
 ALONE = f"against the frames alone, {bench_render.ANNOTATED.name}"
 
@@ -339,10 +336,10 @@ def _ratio(of: Sequence[float], to: Sequence[float]) -> float:
     return statistics.median(a / b for a, b in zip(of, to, strict=True))
 
 
-def parts_section(folder: Path, quick: bool) -> Found:
+def parts_section(folder: Path, quick: bool) -> Results:
     """Every stage on one core; physics and rendering beside the peer's."""
-    turns = measured(stages, folder, CORES[:1], turns=4 if quick else 9)
-    middle = {name: statistics.median(values) for name, values in turns.items()}
+    turns = measure(stages, folder, CORES[:1], turns=4 if quick else 9)
+    middle = medians(turns)
     peers = {"simulate": middle["peer body"], "render": middle["peer draw"]}
     ours = {name: seconds for name, seconds in middle.items() if not name.startswith("peer")}
     total = sum(ours.values())
@@ -354,18 +351,18 @@ def parts_section(folder: Path, quick: bool) -> Found:
     yield Promise("4 render, one core, against OpenCV", _ratio(turns["peer draw"], turns["render"]), target=5)
 
 
-def steady_section(folder: Path, quick: bool) -> Found:
+def steady_section(folder: Path, quick: bool) -> Results:
     """End-to-end generation with compiled programs."""
     count, repeats = (2048, 2) if quick else (4096, 5)
-    turns = measured(steady, folder, videos=count, turns=repeats, peer_videos=256 if quick else 512)
-    middle = {name: statistics.median(values) for name, values in turns.items()}
+    turns = measure(steady, folder, videos=count, turns=repeats, peer_videos=256 if quick else 512)
+    middle = medians(turns)
     note = f"of the cores gen2d uses {middle['used']:.0%}, {middle['idle']:.0%} are idle"
     yield Row(f"end to end, {len(CORES)} cores", middle["gen2d"], middle["peer body"], note=note)
     yield Promise("1 end to end, against the peer", _ratio(turns["gen2d"], turns["peer body"]), target=5)
     yield Promise("  the same, it with pymunk.batch", _ratio(turns["gen2d"], turns["peer batch"]), note=BETA)
 
 
-def command_section(folder: Path, quick: bool) -> Found:
+def command_section(folder: Path, quick: bool) -> Results:
     """The whole command, with programs cached by an earlier run."""
     count, peer_count, ours, theirs = 8192, 512, [], []
     for turn in range(4):
@@ -379,28 +376,28 @@ def command_section(folder: Path, quick: bool) -> Found:
     yield Promise(f"2 whole command, {count} videos", ratio, target=3, note=note)
 
 
-def memory_section(folder: Path, quick: bool) -> Found:
+def memory_section(folder: Path, quick: bool) -> Results:
     """Peak memory of a small and a large dataset, and broken videos of the large one."""
     small, large = command(2000, folder / "small"), command(20000, folder / "large")
     yield Promise("5 peak memory, 20,000 videos", large.peak / 2**30, "GiB", 3, most=True)
     yield Promise("  the same, against 2,000 videos", large.peak / small.peak, target=1.1, most=True)
-    checks = measured(bounds, folder / "large")
+    checks = measure(bounds, folder / "large")
     note = f"deepest: {checks['walls']:.3f} m into a wall, {checks['overlap']:.3f} m at any step between any two"
     yield Promise(f"8 broken of {checks['videos']:,} videos", checks["bad"], "videos", 0, most=True, note=note)
 
 
-def scaling_section(folder: Path, quick: bool) -> Found:
+def scaling_section(folder: Path, quick: bool) -> Results:
     """End-to-end speed on two cores against one."""
     if len(CORES) < 2:
         return
-    runs = [measured(steady, folder, CORES[:k], videos=2048, turns=2) for _ in range(3) for k in (1, 2)]
+    runs = [measure(steady, folder, CORES[:k], videos=2048, turns=2) for _ in range(3) for k in (1, 2)]
     one, two = ([max(run["gen2d"]) for run in runs[k::2]] for k in (0, 1))
     used = statistics.median(max(run["used"]) for run in runs[1::2])
     note = f"{statistics.median(one):.0f} and {statistics.median(two):.0f} videos/s; of two cores gen2d got {used:.0%}"
     yield Promise("6 two cores against one", _ratio(two, one), target=1.7, note=note)
 
 
-def start_section(folder: Path, quick: bool) -> Found:
+def start_section(folder: Path, quick: bool) -> Results:
     """Time from process start to the first complete shard, with a cold and a warm compilation cache."""
     seconds = []
     for turn in range(4):
@@ -411,13 +408,13 @@ def start_section(folder: Path, quick: bool) -> Found:
     yield Promise("  first shard, cold cache", seconds[0], "s", 40, most=True)
 
 
-def physics_section(folder: Path, quick: bool) -> Found:
+def physics_section(folder: Path, quick: bool) -> Results:
     """Physics of 4 to 64 discs and of 8 boxes on one core, beside pymunk and phyjax2d."""
     if not bench_physics.has_phyjax2d():
         print(bench_physics.INSTALL)
     for case in CASES.values():
-        turns = measured(physics, folder, CORES[:1], scene=case.name, turns=1 if quick else case.turns)
-        cost = bench_physics.cost_of(case, {name: statistics.median(values) for name, values in turns.items()})
+        turns = measure(physics, folder, CORES[:1], scene=case.name, turns=1 if quick else case.turns)
+        cost = bench_physics.cost_of(case, medians(turns))
         floor, note = (5 if case.objects <= 32 and case.shape == "discs" else 1), "contacts and energy written"
         yield cost
         for other, target in {"pymunk": floor, "phyjax2d": floor if floor > 1 else None}.items():
@@ -427,20 +424,20 @@ def physics_section(folder: Path, quick: bool) -> Found:
         yield Promise("  compiled", cost.compile["all"], "s", 30, most=True)
 
 
-def render_section(folder: Path, quick: bool) -> Found:
+def render_section(folder: Path, quick: bool) -> Results:
     """Rendering of 2 to 32 discs at 64 to 256 px on one core, beside OpenCV and a copy; cost of annotations."""
     repeats = 5 if quick else 15
     for case in bench_render.CASES.values():
-        turns = measured(render, folder, CORES[:1], case=case.name, turns=repeats)
-        yield bench_render.drawing_of(case, {name: statistics.median(values) for name, values in turns.items()})
+        turns = measure(render, folder, CORES[:1], case=case.name, turns=repeats)
+        yield bench_render.drawing_of(case, medians(turns))
         target, name = 5 if case.pixels == 64 else None, f"render {case.name} against"
         yield Promise(f"{name} OpenCV", _ratio(turns["opencv"], turns["gen2d"]), target=target)
         if case.name == bench_render.COPIED:
             yield Promise(f"{name} a copy", _ratio(turns["gen2d"], turns["copy"]), target=4, most=True)
-    yield from annotations_told(measured(annotated, folder, CORES[:1], turns=repeats))
+    yield from annotation_results(measure(annotated, folder, CORES[:1], turns=repeats))
 
 
-def annotations_told(turns: Turns) -> Found:
+def annotation_results(turns: Turns) -> Results:
     """Cost of rendering with annotations, relative to frames alone."""
     frames, limits = turns["frames"], {"masks, boxes, visibility": 1.5}
     for name in bench_render.ANNOTATIONS:
@@ -456,13 +453,13 @@ def annotations_told(turns: Turns) -> Found:
             yield Promise("  a byte of it, against one of frames", each, target=2, most=True)
 
 
-def storage_section(folder: Path, quick: bool) -> Found:
+def storage_section(folder: Path, quick: bool) -> Results:
     """Videos of three sizes on one core: loader against an h5py loop and a copy, writing against its codec."""
     for number, case in enumerate(bench_storage.CASES.values()):
         case_folder = folder / str(number)
         case_folder.mkdir()
-        turns = measured(storage, case_folder, CORES[:1], case=case.name, turns=3 if quick else 9)
-        yield bench_storage.stored_of(case, {name: statistics.median(values) for name, values in turns.items()})
+        turns = measure(storage, case_folder, CORES[:1], case=case.name, turns=3 if quick else 9)
+        yield bench_storage.stored_of(case, medians(turns))
         for codec in ("zstd", "gzip"):
             targets = case.against_gzip4, case.against_same, case.against_copy
             loader_seconds = turns[f"loader {codec}"]
@@ -485,21 +482,21 @@ def storage_section(folder: Path, quick: bool) -> Found:
         )
 
 
-def shards_section(folder: Path, quick: bool) -> Found:
+def shards_section(folder: Path, quick: bool) -> Results:
     """CPU seconds of a worker's start and end in a folder of many shards."""
     count = 10_000 if quick else 100_000
-    for name, seconds in bench_storage.of_many_shards(folder / "many", count).items():
+    for name, seconds in bench_storage.many_shards(folder / "many", count).items():
         yield Promise(f"{count:,} shards: {name}", seconds, "CPU s", target=5, most=True)
 
 
-def families_section(folder: Path, quick: bool) -> Found:
+def families_section(folder: Path, quick: bool) -> Results:
     """Cost of sampling, relative to all other stages, for every scene family."""
     from gen2d.config import plugins
 
     for name in plugins.names("scene"):
         family_folder = folder / name
         family_folder.mkdir()
-        turns = measured(family, family_folder, CORES[:1], name=name, turns=2 if quick else 5)
+        turns = measure(family, family_folder, CORES[:1], name=name, turns=2 if quick else 5)
         shares = [
             turns["sampler"][i] / sum(of[i] for part, of in turns.items() if part != "sampler")
             for i in range(len(turns["sampler"]))
@@ -528,14 +525,8 @@ def machine() -> dict[str, Any]:
 
 
 # Keys of the results in JSON; kinds of results with a table of their own; sections with a chart.
-KINDS = {
-    "rows": Row,
-    "promises": Promise,
-    "costs": Cost,
-    "drawings": Drawing,
-    "annotations": Annotated,
-    "stored": Stored,
-}
+KINDS = {"rows": Row, "promises": Promise, "costs": Cost, "drawings": Drawing}
+KINDS |= {"annotations": Annotated, "stored": Stored}
 TABLES: Mapping[type, Callable[[Any], list[str]]] = {
     Cost: bench_physics.table,
     Drawing: bench_render.table,
@@ -548,10 +539,10 @@ CHARTS: Mapping[str, tuple[type, Callable[[Any, Path], None]]] = {
 }
 
 
-def text_of(facts: Mapping[str, Any], found: Sequence[Told]) -> str:
+def text_of(facts: Mapping[str, Any], results: Sequence[Result]) -> str:
     """Tables of the results, as text."""
     lines = [", ".join(f"{key} {value}" for key, value in facts.items())]
-    rows, promises = [f for f in found if isinstance(f, Row)], [f for f in found if isinstance(f, Promise)]
+    rows, promises = [f for f in results if isinstance(f, Row)], [f for f in results if isinstance(f, Promise)]
     if rows:
         lines += ["", f"{'':21} {'videos/s':>9} {'MB/s':>8} {'share':>6} {'peer':>7} {'ratio':>6}"]
     for row in rows:
@@ -560,8 +551,8 @@ def text_of(facts: Mapping[str, Any], found: Sequence[Told]) -> str:
         speed = f"{row.rate:9,.0f} {row.rate * FRAMES_BYTES / 1e6:8,.0f}"
         lines += [f"{row.name:21} {speed} {share:>6} {peer:>7} {ratio:>6}  {row.note}".rstrip()]
     for kind, table in TABLES.items():
-        results = [f for f in found if isinstance(f, kind)]
-        lines += ["", *table(results)] if results else []
+        own = [result for result in results if isinstance(result, kind)]
+        lines += ["", *table(own)] if own else []
     lines += [""]
     for p in promises:
         lines += [f"{p.name:38} {p.value:7.2f} {p.unit:7} {p.verdict:22} {p.note}".rstrip()]

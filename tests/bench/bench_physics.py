@@ -23,6 +23,7 @@ import numpy as np
 import peer
 import pymunk
 from charts import FAINT, cost_chart, save
+from timing import timed
 
 FRAMES, STEPS, STEP = 64, 4, 1 / 240  # s
 GRAVITY, ELASTICITY, FRICTION = -9.81, 0.9, 0.2  # m/s^2; of each body: gen2d and Chipmunk multiply those of two
@@ -37,7 +38,7 @@ class Case(NamedTuple):
 
     shape: str  # "discs" or "boxes"
     objects: int
-    lanes: int  # batch size of gen2d
+    batch_size: int  # of gen2d
     peers: tuple[int, int]  # videos that pymunk and phyjax2d simulate in a turn
     turns: int
 
@@ -69,7 +70,7 @@ class Start(NamedTuple):
     """Initial state of a video; discs have a radius, boxes two sides."""
 
     box: float  # m, its side
-    places: np.ndarray  # [N, 2] m
+    positions: np.ndarray  # [N, 2] m
     angles: np.ndarray  # [N] rad
     velocities: np.ndarray  # [N, 2] m/s
     sizes: np.ndarray  # [N] or [N, 2] m
@@ -86,18 +87,15 @@ class Start(NamedTuple):
         return list(itertools.pairwise(corners))
 
 
-def sampled(case: Case, number: int) -> Start:
+def sample(case: Case, number: int) -> Start:
     """Initial state of video `number`: objects on a square grid, so that none overlap."""
-    rng, box, columns = (
-        np.random.default_rng([1, number]),
-        math.sqrt(AREA * case.objects),
-        math.isqrt(case.objects - 1) + 1,
-    )
+    rng, box = np.random.default_rng([1, number]), math.sqrt(AREA * case.objects)
+    columns = math.isqrt(case.objects - 1) + 1
     cells = [((i + 0.5) * box / columns, (j + 0.5) * box / columns) for j in range(columns) for i in range(columns)]
     discs = case.shape == "discs"
     return Start(
         box=box,
-        places=np.array(cells[: case.objects]),
+        positions=np.array(cells[: case.objects]),
         angles=np.zeros(case.objects) if discs else rng.uniform(0, np.pi, case.objects),
         velocities=rng.normal(0, SPEED, (case.objects, 2)),
         sizes=rng.uniform(*RADIUS, case.objects) if discs else rng.uniform(*SIDES, (case.objects, 2)),
@@ -112,11 +110,11 @@ def works(case: Case) -> tuple[dict[str, Callable[[], float]], dict[str, float]]
     ours, seconds = {}, {}
     for name, everything in (("states", False), ("all", True)):
         program, inputs, seconds[f"compile {name}"] = gen2d_program(case, everything)
-        ours[name] = _ready(program, inputs, case.lanes)
+        ours[name] = _timed_program(program, inputs, case.batch_size)
     by_engine = ours | {"pymunk": lambda: chipmunk_seconds(case)}
     if case.peers[1] and has_phyjax2d():
         program, inputs = phyjax2d_program(case)
-        by_engine["phyjax2d"] = _ready(program, inputs, case.peers[1])
+        by_engine["phyjax2d"] = _timed_program(program, inputs, case.peers[1])
     return by_engine, seconds
 
 
@@ -125,15 +123,10 @@ def has_phyjax2d() -> bool:
     return importlib.util.find_spec("phyjax2d") is not None
 
 
-def _ready(program: Callable, inputs: Any, videos: int) -> Callable[[], float]:
+def _timed_program(program: Callable, inputs: Sequence[Any], videos: int) -> Callable[[], float]:
     import jax
 
-    def seconds() -> float:
-        began = time.process_time()
-        jax.block_until_ready(program(*inputs))
-        return (time.process_time() - began) / videos
-
-    return seconds
+    return timed(lambda: jax.block_until_ready(program(*inputs)), videos)
 
 
 def gen2d_program(case: Case, everything: bool) -> tuple[Callable, Any, float]:
@@ -151,7 +144,7 @@ def gen2d_program(case: Case, everything: bool) -> tuple[Callable, Any, float]:
 
     devices.keep_freed_memory()  # as in a run
     jax.config.update("jax_enable_compilation_cache", False)
-    scenes = [gen2d_scene(sampled(case, number)) for number in range(case.lanes)]
+    scenes = [gen2d_scene(sample(case, number)) for number in range(case.batch_size)]
     layout = scenes[0][2]
     inputs = jax.tree.map(lambda *x: np.stack(x), *(scene[:2] for scene in scenes))
     save_at = SaveAt(4 * layout.slots * math.ceil(FRAMES / 16), energy=True) if everything else SaveAt()
@@ -170,11 +163,11 @@ def gen2d_scene(start: Start) -> Any:
     from gen2d.space.space import Space
 
     space = Space((0, GRAVITY))
-    for place, angle, velocity, size in zip(*start[1:], strict=True):
+    for position, angle, velocity, size in zip(*start[1:], strict=True):
         if start.sizes.ndim == 1:
-            space.add_circle(place, size, velocity=velocity, elasticity=ELASTICITY, friction=FRICTION)
+            space.add_circle(position, size, velocity=velocity, elasticity=ELASTICITY, friction=FRICTION)
         else:
-            space.add_box(place, *size, angle=angle, velocity=velocity, elasticity=ELASTICITY, friction=FRICTION)
+            space.add_box(position, *size, angle=angle, velocity=velocity, elasticity=ELASTICITY, friction=FRICTION)
     for a, b in start.walls:
         space.add_segment(a, b, elasticity=ELASTICITY, friction=FRICTION)
     return space.scene()
@@ -182,10 +175,10 @@ def gen2d_scene(start: Start) -> Any:
 
 def chipmunk_seconds(case: Case) -> float:
     """CPU seconds per video, without building the scenes."""
-    spaces = [chipmunk_space(sampled(case, number)) for number in range(case.peers[0])]
+    spaces = [chipmunk_space(sample(case, number)) for number in range(case.peers[0])]
     began = time.process_time()
     for space in spaces:
-        stepped(space)
+        peer.simulate(space, step=STEP)
     return (time.process_time() - began) / len(spaces)
 
 
@@ -194,12 +187,12 @@ def chipmunk_space(start: Start) -> pymunk.Space:
     space = pymunk.Space()
     space.gravity = 0, GRAVITY
     shapes: list[pymunk.Shape] = [pymunk.Segment(space.static_body, a, b, 0) for a, b in start.walls]
-    rows = zip(start.places, start.angles, start.velocities, start.sizes, start.masses, strict=True)
-    for place, angle, velocity, size, mass in rows:
+    rows = zip(start.positions, start.angles, start.velocities, start.sizes, start.masses, strict=True)
+    for position, angle, velocity, size, mass in rows:
         disc = start.sizes.ndim == 1
         moment = pymunk.moment_for_circle(mass, 0, size) if disc else pymunk.moment_for_box(mass, tuple(size))
         body = pymunk.Body(mass, moment)
-        body.position, body.angle, body.velocity = tuple(place.tolist()), float(angle), tuple(velocity.tolist())
+        body.position, body.angle, body.velocity = tuple(position.tolist()), float(angle), tuple(velocity.tolist())
         shapes.append(pymunk.Circle(body, size) if disc else pymunk.Poly.create_box(body, tuple(size)))
         space.add(body)
     for shape in shapes:
@@ -208,21 +201,11 @@ def chipmunk_space(start: Start) -> pymunk.Space:
     return space
 
 
-def stepped(space: pymunk.Space) -> np.ndarray:
-    """States [T, N, 6], float32: position, angle, velocity and angular velocity."""
-    states, take = [], peer.READERS["body"](space)
-    for t in range(FRAMES):
-        for _ in range(STEPS if t else 0):
-            space.step(STEP)
-        states.append(take())
-    return np.array(states, np.float32)
-
-
 def phyjax2d_program(case: Case) -> tuple[Callable, Any]:
     """Compiled program for discs, with phyjax2d's default of 6 and 2 iterations, and its inputs."""
     import jax
 
-    starts = [sampled(case, number) for number in range(case.peers[1])]
+    starts = [sample(case, number) for number in range(case.peers[1])]
     spaces = [phyjax2d_space(start) for start in starts]
     step, first = importlib.import_module("phyjax2d").step, spaces[0]
     parts = [(space.shaped, space._ci, space._ci_total) for space in spaces]
@@ -231,10 +214,10 @@ def phyjax2d_program(case: Case) -> tuple[Callable, Any]:
     # Arrays that differ between scenes: radii and masses.
     own = {i: array for i, array in arrays.items() if (array != array[:1]).any()}
 
-    def video(own: Any, place: Any, velocity: Any) -> Any:
+    def video(own: Any, position: Any, velocity: Any) -> Any:
         space = copy.copy(first)  # a Space cannot be built under jit, so all were built before
         space.shaped, space._ci, space._ci_total = tree.unflatten([own.get(i, all_[0]) for i, all_ in arrays.items()])
-        state = first.zeros_state().nested_replace("circle.p.xy", place).nested_replace("circle.v.xy", velocity)
+        state = first.zeros_state().nested_replace("circle.p.xy", position).nested_replace("circle.v.xy", velocity)
 
         def frame(world: Any, _: None) -> Any:
             world = jax.lax.fori_loop(0, STEPS, lambda _, now: step(space, *now)[:2], world)
@@ -253,10 +236,8 @@ def phyjax2d_space(start: Start) -> Any:
     builder = physics.SpaceBuilder(
         gravity=(0, GRAVITY), dt=STEP, linear_damping=0.0, angular_damping=0.0, bounce_threshold=0.01
     )
-    material = {
-        "elasticity": ELASTICITY**2,
-        "friction": FRICTION**2,
-    }  # phyjax2d takes the mean of two bodies, the others the product
+    # phyjax2d takes the mean of two bodies, the others the product.
+    material = {"elasticity": ELASTICITY**2, "friction": FRICTION**2}
     for radius in start.sizes:
         builder.add_circle(radius=float(radius), **material)
     for a, b in start.walls:

@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 import peer
 from charts import FAINT, cost_chart, save
-from timing import timed
+from timing import first_batch, timed
 
 FRAMES = 64  # of a video
 SIZES = {64: 128, 128: 32, 256: 8}  # px: number of videos that are 100 MB
@@ -71,39 +71,35 @@ ANNOTATIONS = {
 def works(case: Case, rollout: Any) -> dict[str, Callable[[], float]]:
     """Functions by name that render, or copy, all frames of a case and return the CPU seconds per frame."""
     cv2.setNumThreads(1)
-    batch = rollout.start("train", np.tile(np.arange(rollout.batch_size), len(rollout.devices)))
+    batch = first_batch(rollout)
     columns = rollout.host_columns(batch)[0]
     buffer = np.zeros((rollout.slice, FRAMES, case.pixels, case.pixels, 3), np.uint8)
     source, target = (np.full(case.videos * FRAMES * case.frame_bytes, i, np.uint8) for i in range(2))
 
     def opencv() -> None:
         for video in range(case.videos):
-            drawn(columns, video, buffer[video % len(buffer)])
+            draw_discs(columns, video, buffer[video % len(buffer)])
 
-    by_name = {"gen2d": _drawing(rollout, batch), "opencv": opencv, "copy": lambda: np.copyto(target, source)}
+    by_name = {"gen2d": _render_all(rollout, batch), "opencv": opencv, "copy": lambda: np.copyto(target, source)}
     return {name: timed(work, case.videos * FRAMES) for name, work in by_name.items()}
 
 
-def annotating(rollouts: Mapping[str, Any]) -> tuple[dict[str, Callable[[], float]], dict[str, int]]:
+def annotation_works(rollouts: Mapping[str, Any]) -> tuple[dict[str, Callable[[], float]], dict[str, int]]:
     """By annotation, functions that render with it and return the CPU seconds per frame; its bytes per frame."""
     first = next(iter(rollouts.values()))
-    # Annotations do not affect the simulation.
-    batch = first.start("train", np.tile(np.arange(first.batch_size), len(first.devices)))
-    frames = first.config.video.frames
+    batch, frames = first_batch(first), first.config.video.frames  # annotations do not affect the simulation
     works_by_name = {
-        name: timed(_drawing(rollout, batch), first.batch_size * frames) for name, rollout in rollouts.items()
+        name: timed(_render_all(rollout, batch), first.batch_size * frames) for name, rollout in rollouts.items()
     }
     rendered = {name: rollout.draw(batch, 0, rollout.slice)[0] for name, rollout in rollouts.items()}
-    annotations = {
-        name: {field: array for field, array in arrays.items() if field != "frames"}
+    sizes = {
+        name: sum(array.nbytes for field, array in arrays.items() if field != "frames") // (first.slice * frames)
         for name, arrays in rendered.items()
     }
-    return works_by_name, {
-        name: sum(a.nbytes for a in arrays.values()) // (first.slice * frames) for name, arrays in annotations.items()
-    }
+    return works_by_name, sizes
 
 
-def _drawing(rollout: Any, batch: Any) -> Callable[[], None]:
+def _render_all(rollout: Any, batch: Any) -> Callable[[], None]:
     import jax
 
     def draw() -> None:
@@ -113,18 +109,11 @@ def _drawing(rollout: Any, batch: Any) -> Callable[[], None]:
     return draw
 
 
-def drawn(columns: Mapping[str, np.ndarray], video: int, frames: np.ndarray) -> None:
-    """Render the discs of a video into frames [T, H, W, 3] uint8 by OpenCV, as peer.drawn does."""
-    height, discs = frames.shape[1], columns["objects/radius"][video] > 0  # walls have none
-    scale, places = height / peer.SIDE, columns["states/position"][video][:, discs]
-    pixels = np.stack([places[..., 0] * scale - 0.5, (peer.SIDE - places[..., 1]) * scale - 0.5], axis=-1)
-    centers = np.rint(pixels * 2**peer.BITS).astype(int).tolist()
-    radii = np.rint(columns["objects/radius"][video][discs] * scale * 2**peer.BITS).astype(int).tolist()
-    colors = columns["objects/color"][video][discs].tolist()
-    frames[:] = peer.BACKGROUND
-    for frame, row in zip(frames, centers, strict=True):
-        for center, radius, color in zip(row, radii, colors, strict=True):
-            cv2.circle(frame, center, radius, color, -1, cv2.LINE_AA, peer.BITS)
+def draw_discs(columns: Mapping[str, np.ndarray], video: int, frames: np.ndarray) -> None:
+    """Render the discs of a video into frames [T, H, W, 3] uint8 by OpenCV."""
+    radius, color, position = (columns[name][video] for name in ("objects/radius", "objects/color", "states/position"))
+    discs = radius > 0  # walls have none
+    peer.draw(position[:, discs], radius[discs], color[discs].tolist(), frames)
 
 
 # ---- Results
@@ -168,19 +157,16 @@ def table(drawings: Sequence[Drawing]) -> list[str]:
     return lines
 
 
-def table_of_annotations(found: Sequence[Annotated]) -> list[str]:
+def table_of_annotations(rows: Sequence[Annotated]) -> list[str]:
     """Lines of the table."""
     lines = [f"one core, {ANNOTATED.name}, microseconds of CPU time a frame with an annotation, and its bytes"]
     lines += [f"{'':26} {'micros':>8} {'added':>8} {'bytes':>8}"]
-    return lines + [f"{a.name:26} {a.micros:8.2f} {a.added:8.2f} {a.bytes:8,}" for a in found]
+    return lines + [f"{a.name:26} {a.micros:8.2f} {a.added:8.2f} {a.bytes:8,}" for a in rows]
 
 
 COLORS = {"gen2d": "#114499", "opencv": "#dd6622"}
 # The label of a line: index of its point, and alignment.
-ENDS = {
-    "gen2d": (0, "right"),
-    "opencv": (-1, "left"),
-}
+ENDS = {"gen2d": (0, "right"), "opencv": (-1, "left")}
 
 
 def chart(drawings: Sequence[Drawing], path: Path) -> None:

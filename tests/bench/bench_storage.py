@@ -6,7 +6,6 @@ The videos are those of synthetic.discs, about 50 MB of frames, with states. The
 the system's page cache, into preallocated arrays. Times are CPU times of this process.
 """
 
-import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -19,7 +18,7 @@ from timing import timed
 from gen2d.core.schema import Field
 from gen2d.dataset.block import encode
 from gen2d.dataset.folder import open_folder
-from gen2d.dataset.rows import origin, sealed_rows
+from gen2d.dataset.rows import origin, seal_rows
 from gen2d.dataset.shard_writer import ShardWriter
 from gen2d.dataset.spec import RECORDS, DatasetSpec, plan
 from gen2d.generation.complete import complete
@@ -85,7 +84,7 @@ def works(case: Case, folder: Path) -> dict[str, Callable[[], float]]:
             file.create_dataset(name, data=values, chunks=(1, *values.shape[1:]), compression="gzip")
     measurements: dict[str, Callable[[], Any]] = {
         "copy": lambda: np.copyto(out["frames"], frames),
-        "h5py gzip-4": lambda: _looped(folder / "gzip-4.h5", out),
+        "h5py gzip-4": lambda: _read_by_h5py(folder / "gzip-4.h5", out),
     }
     for codec in codecs.CODECS:
         spec = _dataset(case, folder / codec, codec)
@@ -94,7 +93,7 @@ def works(case: Case, folder: Path) -> dict[str, Callable[[], float]]:
         ds = loader.open(spec.root, fields=tuple(columns))
         shard = folder / codec / "shards" / "train-00000.h5"
         measurements[f"loader {codec}"] = lambda ds=ds: ds.batch(range(case.videos), out=out)
-        measurements[f"h5py {codec}"] = lambda shard=shard: _looped(shard, out)
+        measurements[f"h5py {codec}"] = lambda shard=shard: _read_by_h5py(shard, out)
         if codec != "none":
             large = _dataset(case, folder / f"{codec} again", codec, ROUNDS)
             measurements[f"codec {codec}"] = lambda codec=codec: [codecs.encode(codec, video) for video in frames]
@@ -110,23 +109,23 @@ def _dataset(case: Case, root: Path, codec: str, rounds: int = 1) -> DatasetSpec
     return spec
 
 
-def _write(made: DatasetSpec, columns: Mapping[str, np.ndarray]) -> None:
+def _write(spec: DatasetSpec, columns: Mapping[str, np.ndarray]) -> None:
     """Write the only shard of the dataset, which holds the videos once or more often."""
-    (shard,) = plan(made.splits, made.videos_per_shard)
+    (shard,) = plan(spec.splits, spec.videos_per_shard)
     starts = [*range(0, len(columns["frames"]), 4)] * (shard.count // len(columns["frames"]))
     numbers = np.arange(shard.count)
     blocks = (
         encode(
             {name: values[i : i + 4] for name, values in columns.items()} | {"index": numbers[4 * k : 4 * k + 4]},
-            made.fields,
-            made.codec,
+            spec.fields,
+            spec.codec,
         )
         for k, i in enumerate(starts)
     )
-    ShardWriter(made).write(shard, blocks)
+    ShardWriter(spec).write(shard, blocks)
 
 
-def of_many_shards(root: Path, count: int) -> dict[str, float]:
+def many_shards(root: Path, count: int) -> dict[str, float]:
     """CPU seconds to find the remaining shards in a folder of `count` shards, and to complete the dataset.
 
     Most files are empty files of a shard's size; the last shards are still missing.
@@ -137,28 +136,22 @@ def of_many_shards(root: Path, count: int) -> dict[str, float]:
         row = [writer.write(shard, synthetic.blocks(spec, shard)) for shard in remaining[:8]][-1]
     rows = np.repeat(row, count - 16)
     rows["first"] = np.arange(8, count - 8)
-    sealed_rows(rows, origin(spec.identity_sha256, "train"), rows["first"].tolist())
+    seal_rows(rows, origin(spec.identity_sha256, "train"), rows["first"].tolist())
     (root / RECORDS / "train.0123456789abcdef.1").write_bytes(rows.tobytes())
     for shard in remaining[8:-8]:
         with (root / "shards" / f"{shard.name}.h5").open("wb") as file:
             file.truncate(int(row["bytes"][0]))
-    seconds = {"resuming": _cpu_seconds(lambda: open_folder(spec))}
+    seconds = {"resuming": timed(lambda: open_folder(spec), 1)()}
     with ShardWriter(spec) as writer:
         for shard in open_folder(spec):
             writer.write(shard, synthetic.blocks(spec, shard))
-    seconds["finishing"] = _cpu_seconds(lambda: complete(spec))
-    seconds["resuming when all is done"] = _cpu_seconds(lambda: open_folder(spec))
-    seconds["opening and reading a video"] = _cpu_seconds(lambda: loader.open(root)[0])
+    seconds["finishing"] = timed(lambda: complete(spec), 1)()
+    seconds["resuming when all is done"] = timed(lambda: open_folder(spec), 1)()
+    seconds["opening and reading a video"] = timed(lambda: loader.open(root)[0], 1)()
     return seconds | {"all of it": sum(seconds.values())}
 
 
-def _cpu_seconds(work: Callable[[], Any]) -> float:
-    began = time.process_time()
-    work()
-    return time.process_time() - began
-
-
-def _looped(path: Path, out: Mapping[str, np.ndarray]) -> None:
+def _read_by_h5py(path: Path, out: Mapping[str, np.ndarray]) -> None:
     """Read every video of a file in a plain loop."""
     with h5py.File(path) as file:
         for name, target in out.items():

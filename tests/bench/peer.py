@@ -9,7 +9,7 @@ import math
 import multiprocessing
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -35,32 +35,32 @@ class Start(NamedTuple):
     """Initial state of a video."""
 
     radii: list[float]  # m
-    places: list[tuple[float, float]]  # m
+    positions: list[tuple[float, float]]  # m
     velocities: list[list[float]]  # m/s
     colors: list[list[int]]
 
 
-def sampled(number: int) -> Start:
+def sample(number: int) -> Start:
     """Initial state of video `number`: balls at random positions, by rejection of those that overlap."""
     rng = np.random.default_rng([0, number])
     radii = rng.uniform(*RADIUS, BALLS).tolist()
-    while (places := _places(rng, radii)) is None:
+    while (positions := _sample_positions(rng, radii)) is None:
         pass
     velocities, colors = rng.normal(0, SPEED, (BALLS, 2)), rng.integers(*COLORS, (BALLS, 3))
-    return Start(radii, places, velocities.tolist(), colors.tolist())
+    return Start(radii, positions, velocities.tolist(), colors.tolist())
 
 
-def _places(rng: np.random.Generator, radii: list[float]) -> list[tuple[float, float]] | None:
-    places: list[tuple[float, float]] = []
+def _sample_positions(rng: np.random.Generator, radii: list[float]) -> list[tuple[float, float]] | None:
+    positions: list[tuple[float, float]] = []
     for radius in radii:
         for unit in rng.random((100, 2)).tolist():
             x, y = (radius + u * (SIDE - 2 * radius) for u in unit)
-            if all(math.hypot(x - a, y - b) > radius + r for (a, b), r in zip(places, radii, strict=False)):
-                places.append((x, y))
+            if all(math.hypot(x - a, y - b) > radius + r for (a, b), r in zip(positions, radii, strict=False)):
+                positions.append((x, y))
                 break
         else:
             return None
-    return places
+    return positions
 
 
 def space_of(start: Start) -> pymunk.Space:
@@ -69,10 +69,10 @@ def space_of(start: Start) -> pymunk.Space:
     space.gravity = 0, GRAVITY
     corners = [(0, 0), (SIDE, 0), (SIDE, SIDE), (0, SIDE), (0, 0)]
     shapes: list[pymunk.Shape] = [pymunk.Segment(space.static_body, a, b, 0) for a, b in itertools.pairwise(corners)]
-    for radius, place, velocity in zip(start.radii, start.places, start.velocities, strict=True):
+    for radius, position, velocity in zip(start.radii, start.positions, start.velocities, strict=True):
         mass = math.pi * radius**2
         body = pymunk.Body(mass, pymunk.moment_for_circle(mass, 0, radius))
-        body.position, body.velocity = place, (velocity[0], velocity[1])
+        body.position, body.velocity = position, (velocity[0], velocity[1])
         shapes.append(pymunk.Circle(body, radius))
         space.add(body)
     for shape in shapes:
@@ -81,13 +81,13 @@ def space_of(start: Start) -> pymunk.Space:
     return space
 
 
-def stepped(space: pymunk.Space, read: str = "body") -> np.ndarray:
-    """States [T, N, 6], float32: position, angle, velocity and angular velocity."""
-    dt, states, take = 1 / FPS / SUBSTEPS, [], READERS[read](space)
+def simulate(space: pymunk.Space, read: str = "body", step: float = 1 / FPS / SUBSTEPS) -> np.ndarray:
+    """States [T, N, 6], float32: position, angle, velocity and angular velocity; `step` is in s."""
+    states, read_states = [], READERS[read](space)
     for t in range(FRAMES):
         for _ in range(SUBSTEPS if t else 0):
-            space.step(dt)
-        states.append(take())
+            space.step(step)
+        states.append(read_states())
     return np.array(states, np.float32)
 
 
@@ -99,12 +99,12 @@ def _by_body(space: pymunk.Space) -> Callable[[], Any]:
 def _by_batch(space: pymunk.Space) -> Callable[[], Any]:
     buffer = batch.Buffer()
 
-    def take() -> np.ndarray:
+    def read_states() -> np.ndarray:
         buffer.clear()
         batch.get_space_bodies(space, STATE, buffer)
         return np.frombuffer(buffer.float_buf()).reshape(-1, 6)[:BALLS].copy()  # the last body holds the walls
 
-    return take
+    return read_states
 
 
 # How states are read from Chipmunk: by the attributes of each body, as in pymunk's manual, or by one call of
@@ -112,15 +112,18 @@ def _by_batch(space: pymunk.Space) -> Callable[[], Any]:
 READERS = {"body": _by_body, "batch": _by_batch}
 
 
-def drawn(start: Start, states: np.ndarray, frames: np.ndarray) -> None:
-    """Render antialiased discs on a dark background into frames [T, H, W, 3] uint8."""
-    scale = SIZE / SIDE
+def draw(states: np.ndarray, radii: np.ndarray, colors: Sequence[Sequence[int]], frames: np.ndarray) -> None:
+    """Render antialiased discs on a dark background into frames [T, H, W, 3] uint8.
+
+    The states [T, N, ...] begin with x and y in m; `radii` [N] are in m.
+    """
+    scale = frames.shape[1] / SIDE
     pixels = np.stack([states[..., 0] * scale - 0.5, (SIDE - states[..., 1]) * scale - 0.5], axis=-1)
     centers = np.rint(pixels * 2**BITS).astype(int).tolist()
-    radii = [round(radius * scale * 2**BITS) for radius in start.radii]
+    pixel_radii = np.rint(radii * scale * 2**BITS).astype(int).tolist()
     frames[:] = BACKGROUND
-    for frame, places in zip(frames, centers, strict=True):
-        for center, radius, color in zip(places, radii, start.colors, strict=True):
+    for frame, frame_centers in zip(frames, centers, strict=True):
+        for center, radius, color in zip(frame_centers, pixel_radii, colors, strict=True):
             cv2.circle(frame, center, radius, color, -1, cv2.LINE_AA, BITS)
 
 
@@ -129,9 +132,9 @@ def write_shard(path: Path, numbers: range, compression: str = "gzip", read: str
     frames = np.empty((len(numbers), FRAMES, SIZE, SIZE, 3), np.uint8)
     states = np.empty((len(numbers), FRAMES, BALLS, 6), np.float32)
     for row, number in enumerate(numbers):
-        start = sampled(number)
-        states[row] = stepped(space_of(start), read)
-        drawn(start, states[row], frames[row])
+        start = sample(number)
+        states[row] = simulate(space_of(start), read)
+        draw(states[row], np.array(start.radii), start.colors, frames[row])
     filters = {"compression": "gzip", "compression_opts": 1} if compression == "gzip" else {}
     with h5py.File(path, "w") as file:
         file.create_dataset("frames", data=frames, chunks=(1, *frames.shape[1:]), **filters)
@@ -151,21 +154,21 @@ def make(count: int, workers: int, compression: str, read: str, out: Path) -> fl
 
 def seconds_to_step(count: int, read: str = "body") -> float:
     """Seconds to step `count` videos, without sampling and building the scenes."""
-    spaces = [space_of(sampled(number)) for number in range(count)]
+    spaces = [space_of(sample(number)) for number in range(count)]
     began = time.perf_counter()
     for space in spaces:
-        stepped(space, read)
+        simulate(space, read)
     return time.perf_counter() - began
 
 
 def seconds_to_draw(count: int) -> float:
     """Seconds to render `count` videos from given states."""
-    starts = [sampled(number) for number in range(count)]
-    states = [stepped(space_of(start)) for start in starts]
+    starts = [sample(number) for number in range(count)]
+    states = [simulate(space_of(start)) for start in starts]
     frames = np.zeros((FRAMES, SIZE, SIZE, 3), np.uint8)
     began = time.perf_counter()
     for start, trajectory in zip(starts, states, strict=True):
-        drawn(start, trajectory, frames)
+        draw(trajectory, np.array(start.radii), start.colors, frames)
     return time.perf_counter() - began
 
 

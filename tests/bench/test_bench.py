@@ -16,6 +16,7 @@ import h5py
 import numpy as np
 import peer
 import pytest
+from timing import first_batch
 
 from gen2d.config.config import load_config
 
@@ -85,14 +86,14 @@ def test_the_peer_makes_a_readable_shard(tmp_path: Path) -> None:
 
 
 def test_both_ways_of_reading_pymunk_agree() -> None:
-    start = peer.sampled(0)
-    by_body, by_batch = (peer.stepped(peer.space_of(start), read) for read in peer.READERS)
+    start = peer.sample(0)
+    by_body, by_batch = (peer.simulate(peer.space_of(start), read) for read in peer.READERS)
     assert (by_body == by_batch).all()
 
 
 @pytest.mark.parametrize("shape", ["discs", "boxes"])
 def test_the_engines_of_the_physics_section_start_from_the_same_scene(shape: str) -> None:
-    start = bench_physics.sampled(bench_physics.Case(shape, 5, 1, (1, 0), 1), 0)
+    start = bench_physics.sample(bench_physics.Case(shape, 5, 1, (1, 0), 1), 0)
     (scene, state, layout), space = bench_physics.gen2d_scene(start), bench_physics.chipmunk_space(start)
     assert [run.count for run in layout.runs] == [5, 4]
     chipmunk = np.array([(*b.position, b.angle, *b.velocity, b.mass, b.moment) for b in space.bodies])
@@ -132,10 +133,10 @@ SMALL = bench_render.Case(32, 2, 4)
 
 def test_opencv_draws_the_pictures_of_gen2d() -> None:
     rollout = bench.source_of(SMALL.overrides).rollout
-    batch = rollout.start("train", np.tile(np.arange(rollout.batch_size), len(rollout.devices)))
+    batch = first_batch(rollout)
     ours, columns = np.asarray(rollout.draw(batch, 0, 4)[0]["frames"])[0], rollout.host_columns(batch)[0]
     theirs = np.empty_like(ours)
-    bench_render.drawn(columns, 0, theirs)
+    bench_render.draw_discs(columns, 0, theirs)
     scale, middle = SMALL.pixels / peer.SIDE, np.arange(SMALL.pixels) + 0.5
     position, radius = columns["states/position"][0, :, :2] * scale, columns["objects/radius"][0, :2] * scale
     x, y = (position[..., i, None, None] for i in (0, 1))
@@ -161,7 +162,7 @@ def test_what_annotations_add_is_timed_and_weighed(monkeypatch: pytest.MonkeyPat
     turns = bench.annotated(tmp_path, turns=1)
     assert all(seconds > 0 for name in ("frames", "flow") for seconds in turns[name])
     assert (turns["bytes frames"], turns["bytes flow"]) == ([0], [32 * 32 * 2 * (2 * 2 + 1)])
-    assert "flow" in bench.text_of({}, list(bench.annotations_told(turns)))
+    assert "flow" in bench.text_of({}, list(bench.annotation_results(turns)))
 
 
 def test_the_chart_of_the_render_section_draws_what_was_measured(tmp_path: Path) -> None:

@@ -325,7 +325,7 @@ def test_shapes_have_their_nouns() -> None:
 
 
 ASKED = {"captions": True, "contacts": 8, "visibility": True, "lyapunov": True}
-WORDY = tiny.changed(annotations=ASKED, video={"frames": 16})
+WORDY = tiny.tiny_config(annotations=ASKED, video={"frames": 16})
 
 
 @pytest.fixture(scope="module")
@@ -376,4 +376,4 @@ def test_frames_are_drawn_again_beside_words(made: Path) -> None:
 
 def test_words_need_contacts() -> None:
     with pytest.raises(ConfigError, match=r"annotations\.contacts is 0, but annotations\.captions needs them"):
-        load_config(tiny.changed(annotations={"captions": True}))
+        load_config(tiny.tiny_config(annotations={"captions": True}))

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import jax
 import pytest
-from tiny import CONFIG, ran, ran_here
+from tiny import CONFIG, run_command, run_main
 
 from gen2d.cli.main import VERBS
 from gen2d.cli.parser import Parser, parse
@@ -25,10 +25,10 @@ OPTIONS = [(verb, name) for verb in VERBS for name in parser_of(verb)._option_st
 @pytest.mark.parametrize("width", [80, 120])
 def test_help_fits_the_terminal(width: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("COLUMNS", str(width))
-    top = ran_here("--help")
-    assert ran_here().stdout == top.stdout
+    top = run_main("--help")
+    assert run_main().stdout == top.stdout
     for words in ((), *((verb,) for verb in VERBS)):
-        done = ran_here(*words, "--help")
+        done = run_main(*words, "--help")
         assert (done.returncode, done.stderr) == (0, "")
         assert max(map(len, done.stdout.splitlines())) <= width
     for verb, module in VERBS.items():
@@ -51,14 +51,14 @@ def test_generate_is_the_verb_of_a_line_without_one() -> None:
 
 @pytest.mark.parametrize(("verb", "name"), OPTIONS)
 def test_an_option_cut_short_is_an_error_that_names_it(verb: str, name: str) -> None:
-    done = ran_here(verb, f"{name[:-1]}=1")
+    done = run_main(verb, f"{name[:-1]}=1")
     assert (done.returncode, done.stdout) == (2, "")
     assert done.stderr == f"gen2d: {name[:-1]} is not an option; did you mean {name}?\n"
 
 
 @pytest.mark.parametrize("verb", VERBS)
 def test_a_misspelt_verb_is_an_error_that_names_it(verb: str) -> None:
-    done = ran_here(verb[:2] + verb[3:], "data")
+    done = run_main(verb[:2] + verb[3:], "data")
     assert (done.returncode, done.stderr) == (
         2,
         f"gen2d: {verb[:2] + verb[3:]!r} is not a verb; did you mean {verb}?\n",
@@ -77,13 +77,13 @@ def test_a_misspelt_verb_is_an_error_that_names_it(verb: str) -> None:
     ],
 )
 def test_an_error_says_what_to_write(words: tuple[str, ...], sentence: str) -> None:
-    done = ran_here(*words)
+    done = run_main(*words)
     assert (done.returncode, done.stdout, done.stderr.count("\n")) == (2, "", 1)
     assert done.stderr.startswith(f"gen2d: {sentence}")
 
 
 def test_words_after_two_dashes_are_no_options(tmp_path: Path) -> None:
-    done = ran_here("info", "--", "--nothing", cwd=tmp_path)
+    done = run_main("info", "--", "--nothing", cwd=tmp_path)
     assert (done.returncode, done.stderr) == (
         2,
         "gen2d: --nothing is not a gen2d dataset: it has no manifest.json\n",
@@ -104,25 +104,25 @@ def test_help_imports_no_numpy() -> None:
 
 def test_the_command_line_tells_what_it_did(tmp_path: Path):
     (tmp_path / "tiny.yaml").write_text(yaml_text(CONFIG))
-    done = ran("--config", "tiny.yaml", "--n", 9, cwd=tmp_path)
+    done = run_command("--config", "tiny.yaml", "--n", 9, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert "9 videos in" in done.stdout
     assert "datasets/tiny" in done.stdout
     assert "will take about" in done.stderr
-    again = ran_here("--config", "tiny.yaml", "--n", 9, cwd=tmp_path)
+    again = run_main("--config", "tiny.yaml", "--n", 9, cwd=tmp_path)
     assert (again.returncode, "nothing to do" in again.stdout) == (0, True)
-    sheet = ran_here("info", "datasets/tiny", cwd=tmp_path)
+    sheet = run_main("info", "datasets/tiny", cwd=tmp_path)
     assert "train: 9 videos" in sheet.stdout
     assert "m/s^2" in sheet.stdout
-    assert ran_here("verify", "datasets/tiny", cwd=tmp_path).returncode == 0
+    assert run_main("verify", "datasets/tiny", cwd=tmp_path).returncode == 0
     path = tmp_path / "datasets/tiny/shards/train-00001-n1.h5"
     content = bytearray(path.read_bytes())
     content[len(content) // 2] ^= 4
     path.write_bytes(content)
-    broken = ran("verify", "datasets/tiny", cwd=tmp_path)
+    broken = run_command("verify", "datasets/tiny", cwd=tmp_path)
     assert broken.returncode == 1
     assert "train-00001" in broken.stdout
-    pictures = ran_here("preview", "tiny.yaml", "--videos", 2, "--out", "pictures", cwd=tmp_path)
+    pictures = run_main("preview", "tiny.yaml", "--videos", 2, "--out", "pictures", cwd=tmp_path)
     assert pictures.returncode == 0, pictures.stderr
     for name in pictures.stdout.split():
         assert (tmp_path / name).stat().st_size > 500
@@ -181,7 +181,7 @@ def test_the_command_line_tells_what_it_did(tmp_path: Path):
 def test_bad_commands_end_with_one_sentence_and_code_two(tmp_path: Path, arguments: list[str]):
     if "gpu" in arguments and any(d.platform == "gpu" for d in jax.devices()):
         return
-    done = (ran if "many" in arguments else ran_here)(*arguments, cwd=tmp_path)
+    done = (run_command if "many" in arguments else run_main)(*arguments, cwd=tmp_path)
     assert done.returncode == 2, done.stdout + done.stderr
     sentences = [line for line in done.stderr.splitlines() if line.startswith("gen2d: ")]
     assert len(sentences) == 1

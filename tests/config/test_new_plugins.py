@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tiny import ran
+from tiny import run_command
 
 import gen2d
 from gen2d.config import plugins
@@ -210,17 +210,17 @@ def copy_with(kind: str, copy: Path) -> Path:
 def test_one_file_in_its_folder_adds_a_plug_in(kind: str, plain: Path, tmp_path: Path) -> None:
     copy = copy_with(kind, tmp_path / "copy")
     here = {"cwd": copy, "PYTHONPATH": str(copy)}
-    listed = ran("list", "brandnew", **here)
+    listed = run_command("list", "brandnew", **here)
     assert listed.returncode == 0, listed.stderr
     assert OPTION[kind] in listed.stdout
     if kind == "export":
-        done = ran("export", plain, "--to", "brandnew", "--out", tmp_path / "levels.json", **here)
+        done = run_command("export", plain, "--to", "brandnew", "--out", tmp_path / "levels.json", **here)
         assert done.returncode == 0, done.stderr
         assert "brandnew is levels alone" in done.stdout
         check_export(tmp_path / "levels.json", plain)
     else:
         (tmp_path / "new.yaml").write_text(yaml_text(config_with(kind, "brandnew")))
-        done = ran("--config", tmp_path / "new.yaml", "--n", 4, "--out", tmp_path / "data", **here)
+        done = run_command("--config", tmp_path / "new.yaml", "--n", 4, "--out", tmp_path / "data", **here)
         assert done.returncode == 0, done.stderr
         check_dataset(kind, tmp_path / "data")
     check_tests(copy, "tests/config/test_contracts.py")
@@ -249,7 +249,7 @@ def test_one_file_anywhere_is_a_plug_in(kind: str, plain: Path, tmp_path: Path) 
         made = gen2d.export(plain, str(path), tmp_path / "levels.json")
         assert (made.videos, made.loss) == (4, "levels alone")
         check_export(made.out, plain)
-        done = ran("export", plain, "--to", path, cwd=tmp_path)
+        done = run_command("export", plain, "--to", path, cwd=tmp_path)
         assert done.returncode == 0, done.stderr
         check_export(plain.with_name("data-own.json"), plain)
         with pytest.raises(ConfigError, match="has its own: choose npz or webdataset"):

@@ -11,7 +11,7 @@ import pytest
 import synthetic
 from numpy.testing import assert_array_equal
 from synthetic import contents, flip
-from tiny import changed, ran_here
+from tiny import run_main, tiny_config
 
 import gen2d
 from gen2d.annotations import tracks
@@ -49,7 +49,7 @@ def config(home: Path) -> dict:
         "look": {"name": f"{home}/looks/mine.py"},
         "annotations": {f"{home}/annotations/mine.py": 2},
     }
-    return changed(video={"frames": 3}, physics={"substeps": 1}, storage={"videos_per_shard": 4}, **names)
+    return tiny_config(video={"frames": 3}, physics={"substeps": 1}, storage={"videos_per_shard": 4}, **names)
 
 
 GONE = {
@@ -127,7 +127,7 @@ def foreign(request: pytest.FixtureRequest, home: Path, tmp_path: Path, monkeypa
     (tmp_path / "mine.py").write_bytes((home / f"{request.param}s" / "mine.py").read_bytes() + trace.encode())
     path = str(tmp_path / "mine.py")
     own = {"look": path} if request.param == "look" else {"annotations": {path: 1}}
-    states = changed(video={"frames": 3}, physics={"substeps": 1}, storage={"frames": "none"})
+    states = tiny_config(video={"frames": 3}, physics={"substeps": 1}, storage={"frames": "none"})
     monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "of whoever made it"))
     generate(states | own, 3, tmp_path / "data")
     assert sha256((tmp_path / "mine.py").read_bytes()) in list_path().read_text()
@@ -147,7 +147,7 @@ def test_what_came_with_a_dataset_runs_only_if_it_is_trusted(foreign: Path, tmp_
         ("verify", foreign),
         ("export", foreign, "--to", "npz", "--out", tmp_path / "npz"),
     ):
-        ran_here(*words)
+        run_main(*words)
     assert not (tmp_path / SEEN).exists()
     commands = [("preview", foreign, "--out", tmp_path), ("preview", foreign, "--gallery", "--out", tmp_path)]
     commands += [
@@ -157,7 +157,7 @@ def test_what_came_with_a_dataset_runs_only_if_it_is_trusted(foreign: Path, tmp_
     flip(foreign / "shards" / "train-00000-n3.h5", 80000)
     commands += [("verify", foreign, "--repair")]
     for words in commands:
-        done = ran_here(*words)
+        done = run_main(*words)
         assert done.returncode == 2
         assert done.stderr.count("\n") == 1
         assert f"{copy}" in done.stderr

@@ -24,7 +24,7 @@ import synthetic
 import gen2d
 from gen2d.cli.main import main
 from gen2d.core.errors import Error
-from gen2d.storage import paths
+from gen2d.storage import retries
 
 SECONDS = 10.0  # for one action
 
@@ -147,7 +147,7 @@ def pristine(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_crafted_dataset_does_no_harm(
     pristine: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, count: int
 ) -> None:
-    monkeypatch.setattr(paths, "PAUSE", 0.01)
+    monkeypatch.setattr(retries, "PAUSE", 0.01)
     import gen2d.generation.regenerate  # noqa: F401  warms up what a child would import
 
     known = {path.name for path in pristine.rglob("*")}

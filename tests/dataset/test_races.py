@@ -154,7 +154,7 @@ def test_one_process_at_a_time_publishes(tmp_path: Path, monkeypatch: pytest.Mon
     made = small(root, {"train": 12})
     work(made)
     monkeypatch.setattr(folder, "LOCK_SECONDS", 0.1)
-    with folder.locked(root):
+    with folder.folder_lock(root):
         for action in (lambda: completion.complete(made), lambda: open_folder(made)):
             with pytest.raises(FolderError, match="is being changed by another process: try again"):
                 action()

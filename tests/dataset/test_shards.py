@@ -28,7 +28,7 @@ from gen2d.dataset.manifest import read_manifest
 from gen2d.dataset.spec import plan, shards_of_worker
 from gen2d.generation.complete import complete
 from gen2d.storage import codecs
-from gen2d.storage.leases import leased
+from gen2d.storage.leases import lease
 
 CODECS = pytest.mark.parametrize("codec", codecs.CODECS)
 
@@ -279,7 +279,7 @@ def test_leftovers_of_the_dead_go_and_others_stay(tmp_path: Path) -> None:
     names = ["a.h5.tmp.0123456789abcdef", "b.h5.tmp.0123456789abcdef", "c.h5.tmp.host.17"]
     (tmp_path / "shards" / names[0]).touch()
     (tmp_path / "shards" / names[2]).touch()
-    with leased(tmp_path / "shards" / names[1]):
+    with lease(tmp_path / "shards" / names[1]):
         open_folder(synthetic.dataset(tmp_path, train=3))
         assert [(tmp_path / "shards" / name).exists() for name in names] == [False, True, True]
     open_folder(synthetic.dataset(tmp_path, train=3))

@@ -176,7 +176,7 @@ def centre(frame: np.ndarray) -> np.ndarray:
 def balls(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """One ball with its frames stored, or two whose frames are yet to be drawn."""
     colors = {1: [230, 20, 20], 2: [[20, 230], 20, 20]}[request.param]
-    config = tiny.changed(
+    config = tiny.tiny_config(
         video={"width": 96, "height": 64, "frames": 4},
         scene={"balls": request.param, "radius": [0.7, 0.8], "color": colors},
         look={"background": [255, 255, 255], "wall_width": 0},
@@ -284,7 +284,7 @@ def test_frames_that_are_not_stored_are_drawn(balls: Path, tmp_path: Path, monke
     if "frames" in ds.manifest.fields:
         return  # the case of one ball
     monkeypatch.setattr(
-        "gen2d.exports.source.DRAWN_BYTES", 4 * 4 * 64 * 96 * 3
+        "gen2d.exports.source.RENDERED_BYTES", 4 * 4 * 64 * 96 * 3
     )  # four videos at a time: the last are two
     out, expected = gen2d.export(balls, "npz", tmp_path / "npz").out, np.asarray(gen2d.render(ds, range(6)))
     for number in range(6):
@@ -383,7 +383,7 @@ def test_every_format_keeps_the_contract(name: str, balls: Path, tmp_path: Path)
     assert done.loss == form.loss
     assert done.out.is_file() == bool(form.suffix)
     assert done.bytes > 0
-    assert form.suffix or (done.out / export.ABOUT).is_file()
+    assert form.suffix or (done.out / export.DESCRIPTION).is_file()
 
 
 @pytest.mark.parametrize(
@@ -403,7 +403,7 @@ def test_every_format_keeps_the_contract(name: str, balls: Path, tmp_path: Path)
 )
 def test_bad_input_gets_one_line_and_code_2(toy: Path, tmp_path: Path, words: list[str], told: str) -> None:
     (tmp_path / "file").write_text("")
-    done = tiny.ran_here("export", toy, *words, cwd=tmp_path)
+    done = tiny.run_main("export", toy, *words, cwd=tmp_path)
     assert done.returncode == 2, done
     assert told in done.stderr
     assert len(done.stderr.splitlines()) == 1
@@ -411,18 +411,18 @@ def test_bad_input_gets_one_line_and_code_2(toy: Path, tmp_path: Path, words: li
 
 
 def test_a_folder_that_is_no_dataset_is_told(tmp_path: Path) -> None:
-    done = tiny.ran("export", tmp_path, "--to", "npz")
+    done = tiny.run_command("export", tmp_path, "--to", "npz")
     assert (done.returncode, len(done.stderr.splitlines())) == (2, 1)
     assert "is not a gen2d dataset" in done.stderr
 
 
 def test_the_command_says_what_it_made_and_what_was_lost(toy: Path, tmp_path: Path) -> None:
-    done = tiny.ran("export", toy, "--to", "mp4", "--out", tmp_path / "films")
+    done = tiny.run_command("export", toy, "--to", "mp4", "--out", tmp_path / "films")
     assert done.returncode == 0, done.stderr
     assert f"{TRAIN} videos in" in done.stdout
     assert "mp4 is lossy" in done.stdout
     words = "--to", "npz", "--split", "test", "--fields", "index", "states/*"
-    exact = tiny.ran_here("export", toy, *words, cwd=tmp_path)
+    exact = tiny.run_main("export", toy, *words, cwd=tmp_path)
     assert "lossy" not in exact.stdout
     assert (toy.parent / "toy-npz" / "test-000000002.npz").is_file()  # beside the dataset
 

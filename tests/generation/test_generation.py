@@ -13,7 +13,7 @@ import jax
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
-from tiny import CONFIG, CROWDED, changed, command, everything, ran, run_on, same
+from tiny import CONFIG, CROWDED, command, everything, run_command, run_on, same, tiny_config
 
 import gen2d
 from gen2d.config.reading import yaml_text
@@ -97,7 +97,7 @@ def test_h5py_alone_reads_every_field_with_its_unit(tiny: Path):
 def test_a_video_does_not_depend_on_how_many_are_made_or_how_they_lie(
     tiny: Path, tmp_path: Path, n: int, options: dict
 ):
-    generate(changed(storage=options), n, tmp_path / "other")
+    generate(tiny_config(storage=options), n, tmp_path / "other")
     same(everything(tiny), everything(tmp_path / "other"), min(n, N))
 
 
@@ -118,7 +118,7 @@ def test_a_run_leaves_none_of_its_compiled_programs_behind(tmp_path: Path):
     before = live_programs()
     for balls in (1, 2):
         programs = []
-        config = changed(scene={"balls": balls})
+        config = tiny_config(scene={"balls": balls})
         generate(config, 4, tmp_path / str(balls), log=lambda line, programs=programs: programs.append(live_programs()))
         assert len(max(programs, key=len)) > len(before)  # while it ran
         assert live_programs() == before
@@ -160,7 +160,7 @@ def test_another_config_or_seed_is_refused_unless_overwritten(tmp_path: Path):
     with pytest.raises(FolderError, match="seed"):
         generate(CONFIG, 4, out, seed=1)
     with pytest.raises(FolderError, match="elasticity"):
-        generate(changed(scene={"elasticity": 0.5}), 4, out)
+        generate(tiny_config(scene={"elasticity": 0.5}), 4, out)
     same(before, everything(out))
     generate(CONFIG, 4, out, seed=1, overwrite=True)
     assert not np.array_equal(before["frames"], everything(out)["frames"])
@@ -168,7 +168,7 @@ def test_another_config_or_seed_is_refused_unless_overwritten(tmp_path: Path):
 
 def test_killed_at_random_moments_it_completes_to_the_same_bits(tiny: Path, tmp_path: Path):
     config, out = tmp_path / "tiny.yaml", tmp_path / "data"
-    config.write_text(yaml_text(changed(storage={"videos_per_shard": 4})))
+    config.write_text(yaml_text(tiny_config(storage={"videos_per_shard": 4})))
     clean = tmp_path / "clean"
     generate(str(config), 160, clean)
     words, environment = command("--config", config, "--n", 160, "--out", out)
@@ -189,7 +189,7 @@ def test_killed_at_random_moments_it_completes_to_the_same_bits(tiny: Path, tmp_
                 frames: Any = file["frames"]
                 assert len(frames) == 4
     assert killed >= 3
-    assert ran("--config", config, "--n", 160, "--out", out).returncode == 0
+    assert run_command("--config", config, "--n", 160, "--out", out).returncode == 0
     same(everything(clean), everything(out))
     same(everything(tiny), everything(out), N)
     assert not list((out / "shards").glob("*.tmp*"))
@@ -199,7 +199,7 @@ def test_killed_at_random_moments_it_completes_to_the_same_bits(tiny: Path, tmp_
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_stops_it_and_says_how_to_go_on(tmp_path: Path, number: int):
     config, out = tmp_path / "tiny.yaml", tmp_path / "data"
-    config.write_text(yaml_text(changed(storage={"videos_per_shard": 4})))
+    config.write_text(yaml_text(tiny_config(storage={"videos_per_shard": 4})))
     arguments = ["--config", config, "--n", 40_000, "--out", out]  # enough for a process that is seldom looked at
     words, environment = command(*arguments)
     process = subprocess.Popen(words, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
@@ -215,7 +215,7 @@ def test_a_signal_stops_it_and_says_how_to_go_on(tmp_path: Path, number: int):
 
 def test_scenes_that_cannot_be_placed_are_an_error_with_the_options_to_change(tmp_path: Path):
     with pytest.raises(UserError, match="video 0 could not be placed"):
-        generate(changed(scene=CROWDED), 4, tmp_path / "data")
+        generate(tiny_config(scene=CROWDED), 4, tmp_path / "data")
 
 
 def test_states_that_are_no_numbers_are_an_error_not_data(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -260,8 +260,12 @@ def test_impossible_runs_are_refused(tmp_path: Path, n: int, worker: tuple[int, 
 
 def test_the_frame_rate_does_not_change_the_motion(tmp_path: Path):
     """Frame t is the state at t / fps: two rates agree where their frames fall together, at steps of one length."""
-    slow = changed(video={"fps": 10, "frames": 4}, physics={"substeps": 24}, scene={"elasticity": 1.0, "friction": 0})
-    fast = changed(video={"fps": 30, "frames": 10}, physics={"substeps": 8}, scene={"elasticity": 1.0, "friction": 0})
+    slow = tiny_config(
+        video={"fps": 10, "frames": 4}, physics={"substeps": 24}, scene={"elasticity": 1.0, "friction": 0}
+    )
+    fast = tiny_config(
+        video={"fps": 30, "frames": 10}, physics={"substeps": 8}, scene={"elasticity": 1.0, "friction": 0}
+    )
     generate(slow, 8, tmp_path / "slow")
     generate(fast, 8, tmp_path / "fast")
     one, other = everything(tmp_path / "slow")["states/position"], everything(tmp_path / "fast")["states/position"]

@@ -26,7 +26,7 @@ from gen2d.generation.regenerate import repair
 from gen2d.generation.run import generate
 from gen2d.tools.verify import verify, verify_and_repair
 
-CONFIG = tiny.changed(video={"frames": 12, "height": 32, "width": 32}, annotations={"masks": True})
+CONFIG = tiny.tiny_config(video={"frames": 12, "height": 32, "width": 32}, annotations={"masks": True})
 slow = pytest.mark.slow
 
 
@@ -77,7 +77,7 @@ def test_the_command_repairs_a_flipped_bit_to_the_byte(pristine: Path, tmp_path:
     shutil.copytree(pristine, root)
     for name, bit in random.Random(5).sample(places(pristine), 20):
         flip(root, name, bit)
-        done = tiny.ran("verify", root, "--repair", "--json")
+        done = tiny.run_command("verify", root, "--repair", "--json")
         assert done.returncode == 0, done
         assert json.loads(done.stdout)["problems"] == []
         assert contents(root) == before, (name, bit)

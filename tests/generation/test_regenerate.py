@@ -7,7 +7,7 @@ from pathlib import Path
 import forged
 import pytest
 from synthetic import contents, flip
-from tiny import changed, ran
+from tiny import run_command, tiny_config
 
 from gen2d.core.errors import FolderError
 from gen2d.generation.regenerate import repair
@@ -18,7 +18,7 @@ from gen2d.tools.verify import chosen_videos, verify, verify_and_repair
 @pytest.fixture(scope="module")
 def pristine(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("tiny") / "data"
-    config = changed(storage={"codec": "zstd"})
+    config = tiny_config(storage={"codec": "zstd"})
     generate(config, 21, out)
     generate(config, 3, out, split="test")
     return out
@@ -123,19 +123,19 @@ def test_other_versions_are_told_and_nothing_is_changed(root: Path, monkeypatch:
 
 
 def test_the_command_line_repairs(pristine: Path, root: Path) -> None:
-    done = ran("verify", root, "--level", "regen", "--videos", 3, "--seed", 5)
+    done = run_command("verify", root, "--level", "regen", "--videos", 3, "--seed", 5)
     assert (done.returncode, "3 videos chosen by --seed 5" in done.stdout) == (0, True), done.stderr
     flip(root / "shards" / "train-00001.h5", 80000)
     flip(root / "manifest.json", 3000)
-    done = ran("verify", root, "--json")
+    done = run_command("verify", root, "--json")
     assert done.returncode == 1
     assert json.loads(done.stdout)["level"] == "full"
-    done = ran("verify", root, "--repair", "--json")
+    done = run_command("verify", root, "--repair", "--json")
     assert done.returncode == 0, done.stderr
     about = json.loads(done.stdout)
     assert (about["problems"], about["remade"]) == ([], ["train-00001"])
     assert "manifest.json" in about["repaired"][0]
     assert contents(root) == contents(pristine)
-    other = ran("verify", root, "--level", "regen", XLA_FLAGS="--xla_cpu_enable_fast_math=false")
+    other = run_command("verify", root, "--level", "regen", XLA_FLAGS="--xla_cpu_enable_fast_math=false")
     assert (other.returncode, other.stdout) == (2, "")
     assert other.stderr.count("\n") == 1

@@ -8,7 +8,7 @@ import functools
 import numpy as np
 import pytest
 from laws import DOWN, FLOOR, GRAVITY, Case, Motion, holds, times, watch
-from worlds import STEP, box, rules, turned
+from worlds import STEP, box, rotate, rules
 
 RADIUS = 0.5  # m
 MASS = np.pi * RADIUS**2  # kg
@@ -18,13 +18,13 @@ SIN, COS = np.sin(np.radians(SLOPE)), np.cos(np.radians(SLOPE))
 
 def on_slope(degrees: float = SLOPE, **disc) -> Case:
     """A disc at rest on a plane that falls towards +x."""
-    ends = {"a": turned((-50, 0), -degrees), "b": turned((50, 0), -degrees)}
-    return Case([{"x": turned((0, RADIUS), -degrees), "elasticity": 0, **disc}], [{**FLOOR, **ends}], DOWN)
+    ends = {"a": rotate((-50, 0), -degrees), "b": rotate((50, 0), -degrees)}
+    return Case([{"x": rotate((0, RADIUS), -degrees), "elasticity": 0, **disc}], [{**FLOOR, **ends}], DOWN)
 
 
 def downhill(vectors: np.ndarray, degrees: float = SLOPE) -> np.ndarray:
     """The part of vectors [..., 2] along such a plane."""
-    return vectors @ np.array(turned((1, 0), -degrees))
+    return vectors @ np.array(rotate((1, 0), -degrees))
 
 
 # Free motion --------------------------------------------------------------------------------------------------------

@@ -2,7 +2,7 @@
 
 import jax
 import numpy as np
-from laws import DOWN, GRAVITY, doubled, holds
+from laws import DOWN, GRAVITY, holds, to_double
 from test_invariants import gas
 from worlds import STEP, energies, momenta, run, world
 
@@ -56,7 +56,7 @@ def test_books_and_rows_agree_with_the_states():
 def test_falling_disc_tells_its_bounces():
     """Where, when, how fast and how hard are closed forms; in double precision the books close to rounding."""
     with jax.enable_x64(True):
-        drop = doubled([world([{"x": (0.25, 2.5), "elasticity": 0.5}], [{"a": (-5, 0), "b": (5, 0)}], DOWN)])
+        drop = to_double([world([{"x": (0.25, 2.5), "elasticity": 0.5}], [{"a": (-5, 0), "b": (5, 0)}], DOWN)])
         found = run(drop, 181, 2, keep=EVERYTHING)
     rows, mass = found.contacts, np.pi / 4
     first = np.sqrt(2 * 2 / GRAVITY)

@@ -13,9 +13,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from laws import DOWN, FAR, FLOOR, GRAVITY, doubled, holds
+from laws import DOWN, FAR, FLOOR, GRAVITY, holds, to_double
 from numpy.testing import assert_array_equal
-from worlds import STEP, rules, turned, world
+from worlds import STEP, rotate, rules, world
 
 from gen2d.physics.simulate import simulate
 from gen2d.records import axes
@@ -115,7 +115,7 @@ def nudged(values: jax.Array, slot: int, axis: int, by: float) -> jax.Array:
 def measured() -> tuple[dict, dict]:
     """For each event and number the derivative by jax.grad, and by differences of 1e-5 and of .05."""
     with jax.enable_x64(True):
-        worlds = doubled([
+        worlds = to_double([
             world(e.discs, [*e.segments, FAR_WALL, FAR_WALL][:2], e.gravity, slots=2) for e in EVENTS.values()
         ])  # fmt: skip
         numbers, scene, state, layout = batch(worlds)
@@ -180,7 +180,7 @@ def some(seed: int, discs: int = 4) -> tuple:
     """Discs that fly at each other between two walls that meet below them."""
     rng = np.random.default_rng(seed)
     rows = [
-        {"x": turned((1.1, 0), 90 * k + rng.uniform(0, 20)), "v": rng.normal(0, 4, 2), "radius": rng.uniform(0.3, 0.6)}
+        {"x": rotate((1.1, 0), 90 * k + rng.uniform(0, 20)), "v": rng.normal(0, 4, 2), "radius": rng.uniform(0.3, 0.6)}
         | {"spin": rng.normal(0, 5), "elasticity": rng.uniform(), "friction": rng.uniform()}
         for k in range(discs)
     ]

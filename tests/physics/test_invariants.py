@@ -16,9 +16,9 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from laws import DOWN, FLOOR, GRAVITY, QUARTERS, Case, doubled, holds, posed, watch
+from laws import DOWN, FLOOR, GRAVITY, QUARTERS, Case, holds, pose_world, to_double, watch
 from numpy.testing import assert_array_equal
-from worlds import STEP, box, energies, momenta, rules, run, turned, world
+from worlds import STEP, box, energies, momenta, rotate, rules, run, world
 
 from gen2d.physics.simulate import substeps
 
@@ -47,8 +47,8 @@ def cluster(seed: int, elasticity: float, friction: float) -> tuple:
     rng = np.random.default_rng(seed)
     rows = [
         {
-            "x": turned((3, 0), 45 * k),
-            "v": turned((-2 + rng.normal(0, 0.3), rng.normal(0, 0.3)), 45 * k),
+            "x": rotate((3, 0), 45 * k),
+            "v": rotate((-2 + rng.normal(0, 0.3), rng.normal(0, 0.3)), 45 * k),
             "radius": rng.uniform(0.3, 0.7),
             "spin": rng.normal(0, 4),
             "elasticity": elasticity,
@@ -63,7 +63,7 @@ def wedge(seed: int, elasticity: float, friction: float) -> tuple:
     """Eight discs that fall into a narrow valley."""
     rng = np.random.default_rng(seed)
     half = rng.uniform(15, 60)  # degrees between a wall and the vertical
-    walls = [{"a": (0, 0), "b": turned((0, 30), side * half), "friction": friction} for side in (-1, 1)]
+    walls = [{"a": (0, 0), "b": rotate((0, 30), side * half), "friction": friction} for side in (-1, 1)]
     walls += [{"a": (-1, -1000 - k), "b": (1, -1000 - k)} for k in range(2)]
     rows = [
         {"x": (rng.uniform(-0.2, 0.2), 4 + 1.5 * k), "v": rng.normal(0, 2, 2), "radius": rng.uniform(0.3, 0.7)}
@@ -159,8 +159,8 @@ def test_i3_elastic_gas_keeps_its_energy_for_a_minute():
 
 def test_elastic_gas_in_double_precision_conserves_to_the_ninth_digit():
     with jax.enable_x64(True):
-        free = doubled([cluster(seed, 1.0, mu) for seed in range(8) for mu in (0.0, 0.5)])
-        boxed = doubled([gas(seed, 1.0, 0.0) for seed in range(8)])
+        free = to_double([cluster(seed, 1.0, mu) for seed in range(8) for mu in (0.0, 0.5)])
+        boxed = to_double([gas(seed, 1.0, 0.0) for seed in range(8)])
         flying, bouncing = run(free, 481, 1), run(boxed, 481, 1)
     assert np.asarray(flying.states.position).dtype == np.float64
     linear, angular = momenta(free, flying)
@@ -288,7 +288,7 @@ def few_events(shift: Any = (0, 0), boost: Any = (0, 0), order: Any = (0, 1, 2),
 
 
 def test_a_quarter_turn_turns_the_motion():
-    worlds = [posed(few_events(), turn, 8, 4) for turn in QUARTERS] * 2
+    worlds = [pose_world(few_events(), turn, 8, 4) for turn in QUARTERS] * 2
     made = run(worlds, 241, 1)
     for k, turn in enumerate(QUARTERS):
         holds(
@@ -318,14 +318,14 @@ def test_twice_the_unit_of_length_gives_the_same_bits():
 
 def test_translation_translates():
     far = np.array([64.0, -32.0])
-    made = run([posed(few_events(shift), QUARTERS[0], 8, 4) for shift in ((0, 0), far)] * 4, 241, 1)
+    made = run([pose_world(few_events(shift), QUARTERS[0], 8, 4) for shift in ((0, 0), far)] * 4, 241, 1)
     x = np.asarray(made.states.position, float)[:, :, :3]
     holds("Translated by (64, -32), 1 s, m", x[1] - far - x[0], 1e-4)
 
 
 def test_boost_without_fixed_objects_boosts():
     boost = np.array([2.0, -1.0])
-    made = run([posed(few_events(boost=u, walls=False), QUARTERS[0], 8, 4) for u in ((0, 0), boost)] * 4, 241, 1)
+    made = run([pose_world(few_events(boost=u, walls=False), QUARTERS[0], 8, 4) for u in ((0, 0), boost)] * 4, 241, 1)
     x = np.asarray(made.states.position, float)[:, :, :3]
     way = boost * (np.arange(241) * STEP)[:, None, None]
     holds("Boosted by (2, -1), 1 s, m", x[1] - way - x[0], 1e-4)
@@ -334,7 +334,7 @@ def test_boost_without_fixed_objects_boosts():
 def test_the_order_of_the_discs_does_not_matter():
     orders = [(0, 1, 2), (1, 2, 0), (2, 0, 1), (1, 0, 2), (2, 1, 0), (0, 2, 1)]
     cases = [few_events(order=order) for order in orders]
-    made = run([posed(case, QUARTERS[0], 8, 4) for case in [*cases, *cases[:2]]], 241, 1)
+    made = run([pose_world(case, QUARTERS[0], 8, 4) for case in [*cases, *cases[:2]]], 241, 1)
     x = np.asarray(made.states.position, float)
     for k, order in enumerate(orders):
         holds("Other order of the discs, 1 s, 3 events, m", x[k, :, :3] - x[0][:, list(order)], 3e-5)
@@ -416,7 +416,7 @@ def test_order_of_convergence_in_double_precision():
         Case([{"x": (0, 0.5), "v": (u, 0), "elasticity": 0, "friction": mu, "moment": np.inf}], [FLOOR], DOWN),
     ]
     with jax.enable_x64(True):
-        worlds = doubled([posed(case, QUARTERS[0], 2, 2) for case in cases])
+        worlds = to_double([pose_world(case, QUARTERS[0], 2, 2) for case in cases])
         made = [np.asarray(run(worlds, 121, n, rules(1 / 60 / n)).states.position) for n in PER_SIXTIETH]
     fall = [x[0, 30, 0, 1] - (20 + 4 * 0.5 - GRAVITY * 0.5**2 / 2) for x in made]
     hit = np.sqrt(2 * height / GRAVITY)

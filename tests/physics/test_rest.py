@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from laws import DOWN, FAR, FLOOR, GRAVITY, POSES, QUARTERS, Case, holds, overlaps, posed, watch
-from worlds import STEP, run, turned
+from laws import DOWN, FAR, FLOOR, GRAVITY, POSES, QUARTERS, Case, holds, overlaps, pose_world, watch
+from worlds import STEP, rotate, run
 
 RADIUS = 0.5  # m
 SLOP = 0.005  # m
@@ -24,7 +24,7 @@ def wall(x: float, height: float = 60.0) -> dict:
 def rested(case: Case, slots: int, settle: int, walls: int = 4) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Overlap in m, way in m and speed in m/s over the 10 s after `settle` s, at most, by pose; the bodies upright and
     mirrored, at 60 frames per s."""
-    worlds = [posed(case, pose, slots, walls) for pose in (QUARTERS[0], POSES[4])]
+    worlds = [pose_world(case, pose, slots, walls) for pose in (QUARTERS[0], POSES[4])]
     made = run(worlds, 60 * (settle + 10) + 1, 4)
     position, velocity = (np.asarray(a, float)[:, 60 * settle :] for a in (made.states.position, made.states.velocity))
     count = len(case.discs)
@@ -129,7 +129,7 @@ def test_heavy_disc_rests_on_a_light_one(ratio, bound):
 
 
 def test_c17_disc_rests_in_a_v_groove_without_swinging():
-    groove = [{"a": (0, 0), "b": turned((50, 0), d), "elasticity": 1, "friction": 1} for d in (45, 135)]
+    groove = [{"a": (0, 0), "b": rotate((50, 0), d), "elasticity": 1, "friction": 1} for d in (45, 135)]
     disc = {"x": (0, RADIUS * np.sqrt(2))}
     cases = [Case([{**disc, "elasticity": e, "friction": mu}], groove, DOWN) for e in (0, 0.5, 1) for mu in (0, 0.5)]
     made = watch(cases)
@@ -198,7 +198,7 @@ def beyond(shots: list[Case]) -> np.ndarray:
     """Places of the discs, [shot, turn, frame, slot, 2], in the frame of the shots; every step of 0.5 s, 4 turns."""
     found = []
     for k in range(0, len(shots), len(SHOTS)):  # one size of batch, one program
-        worlds = [posed(case, turn, 2, 2) for turn in QUARTERS for case in shots[k : k + len(SHOTS)]]
+        worlds = [pose_world(case, turn, 2, 2) for turn in QUARTERS for case in shots[k : k + len(SHOTS)]]
         made = np.asarray(run(worlds, 121, 1).states.position, float)[:, :, :2].reshape(4, len(SHOTS), 121, 2, 2)
         found.append(np.stack([x @ turn for x, turn in zip(made, QUARTERS, strict=True)], axis=1))
     return np.concatenate(found)
@@ -239,7 +239,7 @@ def test_no_disc_passes_an_end_cap():
 @pytest.mark.parametrize("half", [15, 45, 80])
 def test_no_disc_leaves_a_wedge_through_its_corner(half):
     """Two segments that meet at 0 and open towards -x, at `half` degrees each to the axis."""
-    walls = [{"a": (0, 0), "b": turned((-400, 0), side * half)} for side in (-1, 1)]
+    walls = [{"a": (0, 0), "b": rotate((-400, 0), side * half)} for side in (-1, 1)]
     away = 1.5 / np.sin(np.radians(half))
     shots = [
         Case([{"x": (-away * r - v * late, y * r), "v": (v, 0), "radius": r, "elasticity": e}], walls)

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import pytest
 import synthetic
-from tiny import changed, command
+from tiny import command, tiny_config
 
 import gen2d
 from gen2d.config.reading import yaml_text
@@ -35,7 +35,7 @@ def package(tmp_path_factory: pytest.TempPathFactory) -> Path:
     home = tmp_path_factory.mktemp("package")
     for name in ("gen2d", "renderers", "configs"):
         shutil.copytree(ROOT / name, home / name, symlinks=True, ignore=shutil.ignore_patterns("__pycache__"))
-    config = changed(video={"frames": 3}, annotations={"contacts": 4, "captions": True})
+    config = tiny_config(video={"frames": 3}, annotations={"contacts": 4, "captions": True})
     (home / "tiny.yaml").write_text(yaml_text(config))
     done = run(home, "--config", "tiny.yaml", "--n", 3, "--out", "data")
     assert done.returncode == 0, done.stderr

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_array_equal
-from tiny import CONFIG, CROWDED, changed
+from tiny import CONFIG, CROWDED, tiny_config
 
 import gen2d
 from gen2d.core.errors import ConfigError
@@ -124,4 +124,4 @@ def test_a_wrong_option_is_told(options: dict, message: str):
 
 def test_a_scene_that_does_not_fit_is_told():
     with pytest.raises(NoPlaceError, match="could not be placed"):
-        next(iter(gen2d.stream(changed(scene=CROWDED), batch_size=4)))
+        next(iter(gen2d.stream(tiny_config(scene=CROWDED), batch_size=4)))

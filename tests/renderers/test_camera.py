@@ -8,7 +8,7 @@ import jax
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
-from worlds import flown
+from worlds import straight_motion
 
 from gen2d.config.config import load_config
 from gen2d.records.layout import Layout, SlotGroup
@@ -138,7 +138,7 @@ def test_no_frame_has_more_pixels_per_metre_than_is_said(zoom):
 def shown(drawn=None, **camera):
     """Three videos with a camera at 7 px/m, their plan, and their frames [n, T, H, W] in grey levels; all slots are
     drawn, or those that are named."""
-    stages, plan, *_ = flown({**BALLS, "camera": {"scale": 7, **camera}}, 3)
+    stages, plan, *_ = straight_motion({**BALLS, "camera": {"scale": 7, **camera}}, 3)
     if drawn is not None:
         stages = stages._replace(paint=stages.paint._replace(drawn=np.tile(drawn, (3, 1))))
     return stages, plan, np.asarray(draw(stages, plan)[0])[..., 0].astype(float)

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from tiny import CONFIG
-from worlds import flown, outline, polygon_areas
+from worlds import outline, polygon_areas, straight_motion
 
 from gen2d.config.config import load_config
 from gen2d.core.enums import STATIC
@@ -421,7 +421,7 @@ def centroids(frames):
 
 
 def test_a_moving_ball_is_blurred_along_its_path():
-    blurred, plan, _, _ = flown({**BALL, "image": {"exposure": 1, "exposure_samples": 8}}, 16)
+    blurred, plan, _, _ = straight_motion({**BALL, "image": {"exposure": 1, "exposure_samples": 8}}, 16)
     frames = np.asarray(PATCHES(blurred, plan)[0])
     at = jax.tree.map(np.asarray, blurred.instants)
     inside = (np.abs(at.position[:, :, 0] - 5) < 5 - 0.8).all((1, 2))  # all of it in all frames, and before
@@ -447,7 +447,7 @@ def test_a_parser_of_colours_measures_the_speed_of_a_ball():
     """As in PhyWorld (Kang et al., arXiv 2411.02385); frames aligned by their corners would be off by 1/255 of it."""
     scene = {**BALL["scene"], "radius": [0.7, 1.4], "velocity": [[-3, 3], [-3, 3]], "color": [255, 0, 0]}
     config = {**BALL, "scene": scene, "video": {"frames": 32, "fps": 30, "height": 256, "width": 256}}
-    some, plan, _, states = flown(config, 24)
+    some, plan, _, states = straight_motion(config, 24)
     room = 5 - np.asarray(some.bodies.radius)[:, :1, None]
     inside = np.flatnonzero((np.abs(np.asarray(states.position)[:, :, 0] - 5) < room).all((1, 2)))[:8]
     assert len(inside) == 8
@@ -472,7 +472,7 @@ def test_batches_share_one_program():
     config = load_config(CONFIG)
     rollout = Rollout(config, jax.devices()[:1])
     count = config.storage.batch_size
-    every, *_ = flown(config, 3 * count)
+    every, *_ = straight_motion(config, 3 * count)
     for first in range(0, 3 * count, count):
         batch = DeviceBatch(
             {}, jax.tree.map(lambda a, first=first: a[first : first + count], every), jnp.ones(count, bool)

@@ -8,7 +8,7 @@ import jax
 import numpy as np
 import pytest
 from laws import holds
-from tiny import ran
+from tiny import run_command
 
 from gen2d.config.config import load_config
 from gen2d.core.errors import ConfigError
@@ -219,9 +219,9 @@ def test_a_wrecking_ball_hits_a_tower_that_stands():
 def test_joints_and_polygons_are_stored_whole(tmp_path):
     options = ["video.frames=3", "video.height=16", "video.width=24", "storage.batch_size=2", "scene.weights=2"]
     overrides = [word for option in options for word in ("--set", option)]
-    made = ran("--config", "seesaw.yaml", "--n", 2, "--out", tmp_path / "made", *overrides)
+    made = run_command("--config", "seesaw.yaml", "--n", 2, "--out", tmp_path / "made", *overrides)
     assert made.returncode == 0, made.stderr
-    checked = ran("verify", tmp_path / "made")
+    checked = run_command("verify", tmp_path / "made")
     assert checked.returncode == 0, checked.stdout
 
 

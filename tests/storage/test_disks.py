@@ -22,7 +22,7 @@ from gen2d.core.errors import DamagedError, Error, FolderError, UnreachableError
 from gen2d.dataset.folder import open_folder
 from gen2d.loading import chunks
 from gen2d.storage import explain, leases
-from gen2d.storage.leases import leased, temporary_name
+from gen2d.storage.leases import lease, temporary_name
 from gen2d.tools.verify import verify
 
 TESTS = Path(synthetic.__file__).parent
@@ -194,8 +194,8 @@ def test_a_folder_that_is_moved_in_the_middle_loses_nothing(tmp_path: Path) -> N
 HOLDING = """
 import os, sys
 from pathlib import Path
-from gen2d.storage.leases import leased
-with leased(Path(sys.argv[1])):
+from gen2d.storage.leases import lease
+with lease(Path(sys.argv[1])):
     print("held", flush=True)
     sys.stdin.read()
     os._exit(9)  # without a word, as one that is killed
@@ -245,7 +245,7 @@ def test_without_locks_only_clean_removes_what_is_left(toy: Path, monkeypatch: p
     monkeypatch.setattr(leases.fcntl, "flock", no_locks)
     synthetic.make(synthetic.dataset(toy, train=11))
     assert left.exists()
-    done = tiny.ran_here("clean", toy)
+    done = tiny.run_main("clean", toy)
     assert f"removed: shards/{left.name}" in done.stdout
     assert not left.exists()
 
@@ -276,16 +276,16 @@ def test_only_locks_that_all_respect_count(
 
 def test_a_lease_is_the_owner_s_alone(tmp_path: Path) -> None:
     path = tmp_path / temporary_name("x")
-    with leased(path) as descriptor:
+    with lease(path) as descriptor:
         os.write(descriptor, b"mine")
         assert leases.remove_abandoned([path]) == []
         assert path.read_bytes() == b"mine"
     assert leases.remove_abandoned([path]) == [path]
     folder = tmp_path / temporary_name("y")
     folder.mkdir()
-    with leased(folder.with_name(folder.name + ".lock")):
-        assert leases.remove_abandoned(list(leases.temporaries(tmp_path))) == []
-    assert leases.remove_abandoned(list(leases.temporaries(tmp_path))) == [folder]
+    with lease(folder.with_name(folder.name + ".lock")):
+        assert leases.remove_abandoned(list(leases.temporary_files(tmp_path))) == []
+    assert leases.remove_abandoned(list(leases.temporary_files(tmp_path))) == [folder]
     assert list(tmp_path.iterdir()) == []
 
 
@@ -331,7 +331,7 @@ def test_the_command_goes_on_after_what_happens_to_machines(tmp_path: Path, what
         assert "Traceback" not in errors
         shutil.rmtree(out, ignore_errors=True)
         (tmp_path / "moved").rename(out)
-        assert tiny.ran("--config", config, "--n", 10_000, "--out", out).returncode == 0
+        assert tiny.run_command("--config", config, "--n", 10_000, "--out", out).returncode == 0
     else:
         assert process.returncode == 0, errors
         assert "10,000 videos in" in told

@@ -29,15 +29,14 @@ from gen2d.dataset import hdf5
 from gen2d.dataset.folder import log, open_folder
 from gen2d.dataset.manifest import read_manifest
 from gen2d.dataset.records import read_tables
-from gen2d.dataset.rows import origin, sealed_rows
+from gen2d.dataset.rows import origin, seal_rows
 from gen2d.dataset.spec import DatasetSpec, shards_of_worker
 from gen2d.generation.complete import complete
 from gen2d.loading import dataset as loader
 from gen2d.loading.dataloader import DataLoader
-from gen2d.storage import filesystems, ranges
-from gen2d.storage import paths as remote
+from gen2d.storage import filesystems, ranges, retries
 from gen2d.storage.atomic import publish, sweep
-from gen2d.storage.paths import Url, place
+from gen2d.storage.paths import Url, place, upload
 from gen2d.storage.ranges import Range
 from gen2d.storage.sealed import read_bytes
 
@@ -57,7 +56,7 @@ def running() -> Iterator[Server]:
 
 @pytest.fixture(autouse=True)
 def server(running: Server, monkeypatch: pytest.MonkeyPatch) -> Server:
-    monkeypatch.setattr(remote, "PAUSE", 0.01)
+    monkeypatch.setattr(retries, "PAUSE", 0.01)
     monkeypatch.setattr(s3fs.S3FileSystem, "retries", 1)  # trying again is for gen2d
     running.reset()
     return running
@@ -68,7 +67,7 @@ def toy(running: Server, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A dataset in a folder, and at TOY, and on a web server."""
     root = tmp_path_factory.mktemp("data") / "toy"
     synthetic.make(synthetic.dataset(root))
-    buckets.copied(root, TOY)
+    buckets.copy_dataset(root, TOY)
     running.folder = root.parent
     return root
 
@@ -109,7 +108,7 @@ def test_what_is_read_is_what_is_in_the_folder(
     if kind == "memory":
         for name, content in synthetic.tree(toy).items():
             (tmp_path / "one").write_bytes(content)
-            remote.upload(tmp_path / "one", Url(f"{urls[kind]}/{name}"))
+            upload(tmp_path / "one", Url(f"{urls[kind]}/{name}"))
     cache = tmp_path / "cache" if cached else None
     cases: list[dict[str, Any]] = [{"fields": "*"}, {"window": 2, "stride": 2, "layout": "TCHW", "dtype": "float32"}]
     for options in cases:
@@ -122,7 +121,7 @@ def test_what_is_read_is_what_is_in_the_folder(
 @pytest.mark.parametrize("codec", ["zstd", "none"])
 def test_every_codec_is_read(tmp_path: Path, codec: str) -> None:
     root = synthetic.folder(synthetic.make(synthetic.dataset(tmp_path / "toy", train=3, codec=codec)))
-    buckets.copied(root, f"s3://bucket/{codec}")
+    buckets.copy_dataset(root, f"s3://bucket/{codec}")
     same(gen2d.open(f"s3://bucket/{codec}", "train", "*")[:], synthetic.stored(root))
 
 
@@ -135,14 +134,14 @@ def test_a_video_takes_one_request_a_field_and_near_ones_share(
         monkeypatch.setattr(ranges, "NEAR", near)
         server.reset()
         dataset[3]
-        assert len(server.asked) == len(server.of("GET", "/shards/train-00000.h5")) == one
-        assert all(request.range for request in server.asked)
+        assert len(server.requests) == len(server.of("GET", "/shards/train-00000.h5")) == one
+        assert all(request.range for request in server.requests)
         server.reset()
         dataset[[4, 3, 3]]
-        assert len(server.asked) <= neighbours + (near == 0)  # between the chunks of frames lie those of masks
+        assert len(server.requests) <= neighbours + (near == 0)  # between the chunks of frames lie those of masks
     server.reset()
     dataset[:]
-    assert len(server.asked) == 3  # one for each shard
+    assert len(server.requests) == 3  # one for each shard
 
 
 def test_what_is_asked_covers_each_range_and_wastes_little() -> None:
@@ -204,18 +203,18 @@ def test_what_keeps_failing_is_told(server: Server, toy: Path, tmp_path: Path, k
 
 def test_a_server_without_parts_is_told_and_a_cache_helps(server: Server, toy: Path, tmp_path: Path) -> None:
     url = f"{server.address}/files/toy"
-    server.gives_parts = False
+    server.has_ranges = False
     try:
         with pytest.raises(FolderError, match="does not give parts of files: say cache_dir="):
             gen2d.open(url)[0]
         same(gen2d.open(url, cache_dir=tmp_path)[0], gen2d.open(toy)[0])
     finally:
-        server.gives_parts = True
+        server.has_ranges = True
 
 
 def damaged(toy: Path, url: str, name: str, change: Callable[[bytearray], Any]) -> None:
     """Puts a copy of the dataset at the URL, with one file changed."""
-    buckets.copied(toy, url)
+    buckets.copy_dataset(toy, url)
     content = bytearray((toy / name).read_bytes())
     change(content)
     s3fs.S3FileSystem().pipe(f"{url}/{name}", bytes(content))
@@ -281,7 +280,7 @@ def test_a_cache_keeps_to_its_limit_and_drops_what_was_used_longest_ago(
     assert {hashes[0], hashes[2]} <= sizes(tmp_path).keys()
     server.reset()
     dataset[[2, 18]]
-    assert not server.asked
+    assert not server.requests
     random = np.random.default_rng(0)
     for number in random.integers(0, 20, 30):
         same(dataset[int(number)], expected[int(number)])
@@ -402,21 +401,21 @@ def test_many_shards_take_a_handful_of_requests(server: Server) -> None:
         row = writer.write(todo[0], synthetic.blocks(made, todo[0]))
     rows = np.repeat(row, 2999)
     rows["first"] = np.arange(1, 3000)
-    sealed_rows(rows, origin(made.identity_sha256, "train"), rows["first"].tolist())
+    seal_rows(rows, origin(made.identity_sha256, "train"), rows["first"].tolist())
     for part in range(3):
         publish(place(f"{url}/.gen2d/records/train.{part:016x}.1"), rows[part::3].tobytes())
     server.reset()
     assert open_folder(made) == []
-    assert len(server.asked) < 20
+    assert len(server.requests) < 20
     server.reset()
     assert complete(made)
-    assert len(server.asked) < 60
+    assert len(server.requests) < 60
     server.reset()
     assert open_folder(made) == []
-    assert len(server.asked) < 12
+    assert len(server.requests) < 12
     server.reset()
     assert gen2d.open(url, fields="*")[0]["index"] == 0
-    assert len(server.asked) < 6
+    assert len(server.requests) < 6
 
 
 def test_memory_takes_a_dataset_too(toy: Path) -> None:
@@ -521,7 +520,7 @@ def test_another_dataset_is_refused_or_replaced(tmp_path: Path) -> None:
 
 def test_what_is_no_dataset_is_left_alone(tmp_path: Path) -> None:
     (tmp_path / "thesis.tex").write_text("years of work")
-    remote.upload(tmp_path / "thesis.tex", Url("s3://bucket/thesis/thesis.tex"))
+    upload(tmp_path / "thesis.tex", Url("s3://bucket/thesis/thesis.tex"))
     for overwrite in (False, True):
         with pytest.raises(FolderError, match="holds something other"):
             open_folder(at("s3://bucket/thesis"), overwrite)
@@ -570,7 +569,7 @@ def test_a_wrong_url_is_one_sentence(url: str, told: str) -> None:
     with pytest.raises((UserError, UnreachableError), match=told):
         gen2d.open(url)
     for verb in ("verify", "info"):
-        done = tiny.ran_here(verb, url)
+        done = tiny.run_main(verb, url)
         assert done.returncode == (3 if "reached" in told else 2)
         assert re.fullmatch(rf"gen2d: .*{told}.*\n", done.stderr), done.stderr
 
@@ -590,17 +589,17 @@ def test_a_run_leaves_at_a_url_what_it_leaves_in_a_folder(server: Server, tmp_pa
     config = tmp_path / "tiny.yaml"
     config.write_text(json.dumps(tiny.CONFIG))
     for out in (tmp_path / "tiny", "s3://bucket/tiny"):
-        done = tiny.ran("--config", config, "--n", 12, "--out", out, "--device", "cpu")
+        done = tiny.run_command("--config", config, "--n", 12, "--out", out, "--device", "cpu")
         assert done.returncode == 0, done.stderr
         assert f"in {out}" in done.stdout
     assert buckets.tree("s3://bucket/tiny") == synthetic.tree(tmp_path / "tiny")
     for verb in ("verify", "info"):
-        done = tiny.ran_here(verb, "s3://bucket/tiny")
+        done = tiny.run_main(verb, "s3://bucket/tiny")
         assert done.returncode == 0, done.stderr
         assert "s3://bucket/tiny" in done.stdout
-    done = tiny.ran_here("preview", "s3://bucket/tiny", "--out", tmp_path, "--videos", 2)
+    done = tiny.run_main("preview", "s3://bucket/tiny", "--out", tmp_path, "--videos", 2)
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "tiny-sheet.png").is_file()
-    done = tiny.ran("--config", config, "--n", 12, "--out", "s3://bucket/tiny", "--seed", 3, "--device", "cpu")
+    done = tiny.run_command("--config", config, "--n", 12, "--out", "s3://bucket/tiny", "--seed", 3, "--device", "cpu")
     assert done.returncode == 2
     assert "seed is 0 there and 3 here" in done.stderr

@@ -11,12 +11,13 @@ from typing import Any
 
 import pytest
 import synthetic
-from tiny import ran_here
+from tiny import run_main
 
 import gen2d
 from gen2d.core.errors import ConfigError, DamagedError, Error, FolderError, UnreachableError
-from gen2d.storage import paths
-from gen2d.storage.paths import Network, Url, place
+from gen2d.storage import retries
+from gen2d.storage.paths import Url, place
+from gen2d.storage.retries import Network
 
 TIMEOUT, DEADLINE = 0.3, 1.0
 
@@ -27,7 +28,7 @@ class Server:
     def __init__(self, folder: Path) -> None:
         self.folder, self.fault, self.part = folder, "", ""
         self.listener = socket.create_server(("127.0.0.1", 0))
-        self.asked: list[str] = []
+        self.requests: list[str] = []
         threading.Thread(target=self._accept, daemon=True).start()
 
     @property
@@ -51,7 +52,7 @@ class Server:
                 data += part
             head = data.decode()
             method, path = head.split()[:2]
-            self.asked.append(path)
+            self.requests.append(path)
             found = re.search(r"[Rr]ange: bytes=(\d+)-(\d+)", head)
             self._answer(connection, method, path.partition("?")[0], tuple(map(int, found.groups())) if found else None)
 
@@ -103,8 +104,8 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
 
 @pytest.fixture(autouse=True)
 def _quick(server: Server, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(paths, "PAUSE", 0.01)
-    server.fault, server.asked = "", []
+    monkeypatch.setattr(retries, "PAUSE", 0.01)
+    server.fault, server.requests = "", []
 
 
 FAULTS: dict[str, type[Error]] = {
@@ -124,7 +125,7 @@ def test_each_fault_ends_in_time_as_what_it_is(server: Server, fault: str, part:
         gen2d.open(f"http://{server.address}/toy", fields="*", timeout=TIMEOUT, deadline=DEADLINE)[0]
     assert time.monotonic() - began < DEADLINE + 1
     assert server.address in str(caught.value)
-    asked = [path for path in server.asked if part in path]
+    asked = [path for path in server.requests if part in path]
     is_tried_again = len(asked) > len(set(asked))
     assert is_tried_again == (fault in ("reset", "cut", "500", "503", "429", "408", "hang", "stuck")), asked
 
@@ -141,7 +142,7 @@ def test_the_command_line_has_a_code_for_each(server: Server, fault: str, code: 
     server.fault, server.part = fault, "manifest.json"
     for verb in (("info",), ("verify", "--level", "quick"), ("preview",)):
         limits = ("--timeout", TIMEOUT, "--deadline", DEADLINE)
-        done = ran_here(verb[0], f"http://{server.address}/toy", *verb[1:], *limits)
+        done = run_main(verb[0], f"http://{server.address}/toy", *verb[1:], *limits)
         assert done.returncode == (1 if (verb[0], fault) == ("verify", "404") else code), (verb, done)  # incomplete
         assert (done.stderr + done.stdout).count("\n") <= 2
 
@@ -150,7 +151,7 @@ def test_a_plain_server_without_listings_is_enough(server: Server, tmp_path: Pat
     url = f"http://{server.address}/toy"
     assert len(gen2d.open(url, fields="*")[:]["frames"]) == 3
     for words in (("info", url), ("verify", url), ("preview", url, "--out", tmp_path)):
-        done = ran_here(*words)
+        done = run_main(*words)
         assert done.returncode == 0, done
     assert gen2d.verify(url) == []
 
@@ -162,7 +163,7 @@ def test_what_is_secret_is_never_shown(server: Server, what: str) -> None:
     url = start + (f"?sig={secret}" if what == "query" else "")
     ds = gen2d.open(url, fields="*")
     assert len(ds[:]["frames"]) == 3
-    assert all(secret in path for path in server.asked) == (what == "query")
+    assert all(secret in path for path in server.requests) == (what == "query")
     shown = [repr(ds), str(ds.root), repr(ds.root), f"{place(url)!r}"]
     for fault in ("503", "404", "wrong", "garbage", "reset"):
         server.fault, server.part = fault, "/"
@@ -171,7 +172,7 @@ def test_what_is_secret_is_never_shown(server: Server, what: str) -> None:
         shown.append(str(caught.value))
         assert caught.value.__cause__ is None or secret not in str(caught.value.__cause__)
         for verb in ("info", "verify", "preview", "clean"):
-            done = ran_here(verb, url, "--timeout", TIMEOUT, "--deadline", DEADLINE)
+            done = run_main(verb, url, "--timeout", TIMEOUT, "--deadline", DEADLINE)
             shown += [done.stdout, done.stderr]
     with pytest.raises(Error) as caught:
         place(f"nope://me:{secret}@x/y")

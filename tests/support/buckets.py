@@ -40,10 +40,10 @@ class Server(ThreadingHTTPServer):
     def __init__(self, behind: int) -> None:
         super().__init__(("127.0.0.1", 0), _Handler)
         self.behind = behind
-        self.asked: list[Request] = []
+        self.requests: list[Request] = []
         self.fault: Fault = lambda request: ""
         self.folder = Path()  # served as /files/
-        self.gives_parts = True
+        self.has_ranges = True
 
     @property
     def address(self) -> str:
@@ -51,11 +51,11 @@ class Server(ThreadingHTTPServer):
 
     def reset(self) -> None:
         """Forget all requests and inject no more faults."""
-        self.asked, self.fault = [], lambda request: ""
+        self.requests, self.fault = [], lambda request: ""
 
     def of(self, method: str, part: str = "") -> list[Request]:
         """Recorded requests with this method and this part in their path."""
-        return [request for request in self.asked if request.method == method and part in request.path]
+        return [request for request in self.requests if request.method == method and part in request.path]
 
     def handle_error(self, request: object, client_address: object) -> None:
         """Ignore errors: clients may disconnect."""
@@ -69,14 +69,14 @@ class _Handler(BaseHTTPRequestHandler):
         proxy = self.server
         assert isinstance(proxy, Server)
         request = Request(self.command, self.path, self.headers.get("Range", ""))
-        proxy.asked.append(request)
+        proxy.requests.append(request)
         content = self._content()
         fault = proxy.fault(request)
         if fault in ("fail", "deny"):
             return self._send(503 if fault == "fail" else 403, [], b"", cut=False)
         if request.path.startswith("/files/"):
             path = proxy.folder / request.path.removeprefix("/files/")
-            return self._send_file(path, request.range if proxy.gives_parts else "")
+            return self._send_file(path, request.range if proxy.has_ranges else "")
         upstream = http.client.HTTPConnection("127.0.0.1", proxy.behind, timeout=30)
         headers = {key: value for key, value in self.headers.items() if key.lower() != "transfer-encoding"}
         upstream.request(self.command, self.path, content, headers)
@@ -229,6 +229,6 @@ def tree(url: str) -> dict[str, bytes]:
     return {name: data for name, data in content.items() if isinstance(data, bytes)}
 
 
-def copied(root: Path, url: str) -> None:
+def copy_dataset(root: Path, url: str) -> None:
     """Copy the dataset in the folder to the URL."""
     s3fs.S3FileSystem().put(str(root), url, recursive=True)

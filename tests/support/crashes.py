@@ -10,7 +10,7 @@ from typing import Any
 CHANGES = ("replace", "rename", "unlink", "mkdir", "rmdir", "fsync", "ftruncate", "write", "link", "symlink")
 
 
-def _dying(call: Callable[..., Any], left: list[int], after: bool) -> Callable[..., Any]:
+def _kill_at_call(call: Callable[..., Any], left: list[int], after: bool) -> Callable[..., Any]:
     def counted(*arguments: Any, **named: Any) -> Any:
         left[0] -= 1
         if left[0] == 0 and not after:
@@ -30,7 +30,7 @@ def died_at(change: int, work: Callable[[], Any], after: bool = False) -> bool:
     if not pid:
         remaining = [change]
         for name in CHANGES:
-            setattr(os, name, _dying(getattr(os, name), remaining, after))
+            setattr(os, name, _kill_at_call(getattr(os, name), remaining, after))
         try:
             work()
         except BaseException:

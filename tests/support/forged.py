@@ -13,7 +13,7 @@ from gen2d.core.errors import DamagedError, FolderError
 from gen2d.dataset.block import row_names
 from gen2d.dataset.croissant import croissant
 from gen2d.dataset.manifest import Manifest, read_manifest
-from gen2d.dataset.rows import checks, npy_header, origin
+from gen2d.dataset.rows import npy_header, origin, row_checksums
 from gen2d.dataset.spec import plan, shard_name
 from gen2d.storage import codecs
 
@@ -48,7 +48,7 @@ def change_rows(root: Path, split: str, change: Callable[[np.ndarray], Any]) -> 
     rows = np.frombuffer((root / table.file).read_bytes(), row_type, offset=len(header)).copy()
     change(rows)
     firsts = range(0, len(rows) * manifest.videos_per_shard, manifest.videos_per_shard)
-    rows["check"] = checks(rows, origin(manifest.identity_sha256, split), firsts)
+    rows["check"] = row_checksums(rows, origin(manifest.identity_sha256, split), firsts)
     put_table(root, manifest, split, header + rows.tobytes())
 
 
@@ -73,7 +73,7 @@ def change_shard(root: Path, split: str, place: int, change: Callable[[bytearray
         offset, size = int(row["index"]), shard.count * index_type.itemsize
         index = np.frombuffer(bytes(content[offset : offset + size]), index_type).copy()
         change(content, index, row)
-        index["check"] = checks(
+        index["check"] = row_checksums(
             index, origin(manifest.identity_sha256, split), range(shard.first, shard.first + len(index))
         )
         content[offset : offset + size] = index.tobytes()

@@ -18,7 +18,7 @@ GRAVITY = 9.81  # m/s^2
 DOWN = (0.0, -GRAVITY)
 FLOOR = {"a": (-50.0, 0.0), "b": (50.0, 0.0), "elasticity": 1.0, "friction": 1.0}
 FAR = 1000.0  # m: out of reach of all bodies
-LANES = (64, 512)  # sizes that batches are padded to
+BATCH_SIZES = (64, 512)  # sizes that batches are padded to
 QUARTERS = [np.array([[c, -s], [s, c]]) for c, s in ((1, 0), (0, 1), (-1, 0), (0, -1))]
 MIRROR = np.diag([-1, 1])
 POSES = [*QUARTERS, *(turn @ MIRROR for turn in QUARTERS)]
@@ -41,7 +41,7 @@ class Motion(NamedTuple):
     spin: np.ndarray  # rad/s
 
 
-def posed(case: Case, pose: np.ndarray, slots: int, walls: int) -> tuple:
+def pose_world(case: Case, pose: np.ndarray, slots: int, walls: int) -> tuple:
     """World of a case, rotated or mirrored by `pose`, with `slots` disc slots and `walls` segments."""
     handedness = round(float(np.linalg.det(pose)))
 
@@ -55,9 +55,9 @@ def posed(case: Case, pose: np.ndarray, slots: int, walls: int) -> tuple:
     return world(discs, segments, tuple(pose @ np.array(case.gravity, float)), slots)
 
 
-def filled(worlds: Sequence[tuple]) -> list[tuple]:
-    """The worlds, padded with copies of the last one to a batch size in `LANES`."""
-    size = next(n for n in LANES if n >= len(worlds))
+def pad_batch(worlds: Sequence[tuple]) -> list[tuple]:
+    """The worlds, padded with copies of the last one to a batch size in `BATCH_SIZES`."""
+    size = next(n for n in BATCH_SIZES if n >= len(worlds))
     return [*worlds, *[worlds[-1]] * (size - len(worlds))]
 
 
@@ -65,8 +65,8 @@ def watch(
     cases: Sequence[Case], frames: int = 721, steps: int = 1, slots: int = 2, walls: int = 2, **options: Any
 ) -> Motion:
     """Motion of every case in every pose; `options` are those of `worlds.run`."""
-    worlds = [posed(case, pose, slots, walls) for case in cases for pose in POSES]
-    states = run(filled(worlds), frames, steps, **options).states
+    worlds = [pose_world(case, pose, slots, walls) for case in cases for pose in POSES]
+    states = run(pad_batch(worlds), frames, steps, **options).states
 
     def to_case_frame(values: np.ndarray, hand: bool) -> np.ndarray:
         in_world = np.asarray(values, float)[: len(worlds), :, :slots]
@@ -99,7 +99,7 @@ def holds(law: str, measured: Any, bound: float, asked: float | None = None) -> 
     assert worst <= bound, f"{law}: {worst:.4g}, but at most {bound:g}"
 
 
-def doubled(worlds: Sequence[tuple]) -> list[tuple]:
+def to_double(worlds: Sequence[tuple]) -> list[tuple]:
     """The worlds in double precision."""
 
     def wide(x: jax.Array) -> jax.Array:

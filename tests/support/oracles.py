@@ -202,18 +202,18 @@ def chipmunk_path(setting: Setting, seconds: float, steps: int = 4, fps: int = 6
 
 
 def _path(
-    step: Callable[[float], Any], state: Callable[[], list], heard: Callable, seconds: float, steps: int, fps: int,
-    most: int | None,
+    step: Callable[[float], Any], state: Callable[[], list], listen: Callable, seconds: float, steps: int, fps: int,
+    max_events: int | None,
 ) -> Path:  # fmt: skip
     h, states, events, now = 1 / (fps * steps), [state()], [], 0
-    if most is not None:
-        heard(lambda a, b: events.append(Event(now * h, pair_of(a, b))))
+    if max_events is not None:
+        listen(lambda a, b: events.append(Event(now * h, pair_of(a, b))))
     for _ in range(round(seconds * fps)):
         for _ in range(steps):
             step(h)
             now += 1
         states.append(state())
-        if most is not None and len(events) >= most:
+        if max_events is not None and len(events) >= max_events:
             break
     trajectory = np.array(states)
     return Path(trajectory[..., :3], trajectory[..., 3:], events)
@@ -267,7 +267,7 @@ def deepest(setting: Setting, poses: np.ndarray, skin: float = 0.0) -> float:
     things = [(_core(t, poses[:, k]), t.radius if t.size is None else skin) for k, t in enumerate(setting.things)]
     walls = [(np.broadcast_to(np.array(ends, float), (len(poses), 2, 2)), skin) for ends in setting.walls]
     pairs = [(a, b) for k, a in enumerate(things) for b in [*things[k + 1 :], *walls]]
-    return max(0.0, max(float((r + s - _apart(a, b)).max()) for (a, r), (b, s) in pairs))
+    return max(0.0, max(float((r + s - _separation(a, b)).max()) for (a, r), (b, s) in pairs))
 
 
 def _core(thing: Thing, poses: np.ndarray) -> np.ndarray:
@@ -279,7 +279,7 @@ def _core(thing: Thing, poses: np.ndarray) -> np.ndarray:
     return poses[:, None, :2] + np.einsum("vi,tij->tvj", thing.corners, axes)
 
 
-def _apart(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+def _separation(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Largest separation of two convex cores [T, V, 2] along any face normal; for a disc's centre, its distance."""
     if a.shape[1] == 1:
         start, edge = b[:, 0], b[:, -1] - b[:, 0]

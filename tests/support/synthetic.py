@@ -65,13 +65,13 @@ def small(root: Place, splits: Mapping[str, int], **changes: Any) -> DatasetSpec
     return dataset(root, fields=fields, splits=splits, **changes)
 
 
-def video(made: DatasetSpec, split: str, number: int) -> dict[str, np.ndarray]:
+def video(spec: DatasetSpec, split: str, number: int) -> dict[str, np.ndarray]:
     """All fields of one video, a function of (seed, split, number) only."""
-    rng = np.random.default_rng([made.seed, len(split), number])
-    frames, height, width, slots = (made.sizes[axis] for axis in "THWK")
+    rng = np.random.default_rng([spec.seed, len(split), number])
+    frames, height, width, slots = (spec.sizes[axis] for axis in "THWK")
     values: dict[str, np.ndarray] = {}
-    for name, field in made.fields.items():
-        shape = field.shape(made.sizes)
+    for name, field in spec.fields.items():
+        shape = field.shape(spec.sizes)
         values[name] = (rng.random(shape) * 100).astype(field.dtype)
     position = rng.random((slots, 2)) * (height, width) + np.arange(frames)[:, None, None] * rng.random((slots, 2))
     rows, columns = np.mgrid[:height, :width] + 0.5
@@ -82,7 +82,7 @@ def video(made: DatasetSpec, split: str, number: int) -> dict[str, np.ndarray]:
     colors = rng.integers(0, 256, (slots + 1, 3), np.uint8)
     present = np.arange(slots) <= number % slots
     values |= {
-        "index": np.full(made.fields["index"].shape(made.sizes), number),
+        "index": np.full(spec.fields["index"].shape(spec.sizes), number),
         "objects/present": present,
         "masks/instance": mask,
         "frames": colors[mask],
@@ -91,41 +91,41 @@ def video(made: DatasetSpec, split: str, number: int) -> dict[str, np.ndarray]:
     return values
 
 
-def columns(made: DatasetSpec, shard: Shard, rows: range | None = None) -> dict[str, np.ndarray]:
+def columns(spec: DatasetSpec, shard: Shard, rows: range | None = None) -> dict[str, np.ndarray]:
     """Stacked fields of the shard's videos, or of some `rows`."""
     rows = range(shard.count) if rows is None else rows
-    videos = [video(made, shard.split, shard.first + row) for row in rows]
-    names = [name for name, field in made.fields.items() if field.per_video]
-    return {name: np.stack([values[name] for values in videos]).astype(made.fields[name].dtype) for name in names}
+    videos = [video(spec, shard.split, shard.first + row) for row in rows]
+    names = [name for name, field in spec.fields.items() if field.per_video]
+    return {name: np.stack([values[name] for values in videos]).astype(spec.fields[name].dtype) for name in names}
 
 
-def blocks(made: DatasetSpec, shard: Shard, size: int = 3) -> Iterator[Block]:
+def blocks(spec: DatasetSpec, shard: Shard, size: int = 3) -> Iterator[Block]:
     """The shard in encoded blocks of `size` videos, one at a time."""
     for first in range(0, shard.count, size):
         rows = range(first, min(first + size, shard.count))
-        yield encode(columns(made, shard, rows), made.fields, made.codec, made.chunk_frames)
+        yield encode(columns(spec, shard, rows), spec.fields, spec.codec, spec.chunk_frames)
 
 
-def make(made: DatasetSpec, size: int = 3, **options: bool) -> DatasetSpec:
+def make(spec: DatasetSpec, size: int = 3, **options: bool) -> DatasetSpec:
     """Write the complete dataset and return its spec."""
-    todo = open_folder(made, **options)
-    with ShardWriter(made) as writer:
-        for shard in todo:
-            writer.write(shard, blocks(made, shard, size))
-    assert complete(made)
-    return made
+    remaining = open_folder(spec, **options)
+    with ShardWriter(spec) as writer:
+        for shard in remaining:
+            writer.write(shard, blocks(spec, shard, size))
+    assert complete(spec)
+    return spec
 
 
-def write(made: DatasetSpec, shard: Shard, blocks: Iterable[Block]) -> None:
+def write(spec: DatasetSpec, shard: Shard, blocks: Iterable[Block]) -> None:
     """Write the shard from these blocks."""
-    with ShardWriter(made) as writer:
+    with ShardWriter(spec) as writer:
         writer.write(shard, blocks)
 
 
-def folder(made: DatasetSpec) -> Path:
+def folder(spec: DatasetSpec) -> Path:
     """Local folder of the dataset."""
-    assert isinstance(made.root, Path)
-    return made.root
+    assert isinstance(spec.root, Path)
+    return spec.root
 
 
 def stored(root: Path, split: str = "train") -> dict[str, np.ndarray]:

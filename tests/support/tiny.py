@@ -23,7 +23,7 @@ CONFIG = {
 CROWDED = {"balls": 6, "radius": 1.6, "width": 8, "height": 8}  # a scene in which the balls do not fit
 
 
-def changed(**sections: dict) -> dict:
+def tiny_config(**sections: dict) -> dict:
     """The tiny config with changed options, by section."""
     return {**CONFIG, **{name: {**CONFIG.get(name, {}), **options} for name, options in sections.items()}}
 
@@ -47,7 +47,7 @@ def command(*arguments: object, **changes: str) -> list:
     return [[sys.executable, "-m", "gen2d", *map(str, arguments)], {**os.environ, **changes}]
 
 
-def ran(*arguments: object, cwd: Path | None = None, **changes: str) -> subprocess.CompletedProcess[str]:
+def run_command(*arguments: object, cwd: Path | None = None, **changes: str) -> subprocess.CompletedProcess[str]:
     """Output and exit code of `python -m gen2d ...`."""
     argv, environment = command(*arguments, **changes)
     return subprocess.run(argv, env=environment, cwd=cwd, capture_output=True, text=True, timeout=300, check=False)
@@ -62,8 +62,8 @@ def run_on(devices: int, code: str, **changes: str) -> None:
     assert done.returncode == 0, done.stderr
 
 
-def ran_here(*arguments: object, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
-    """As `ran`, but in this process: starting another takes seconds."""
+def run_main(*arguments: object, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
+    """As `run_command`, but in this process: starting another takes seconds."""
     argv, stdout, stderr = [*map(str, arguments)], io.StringIO(), io.StringIO()
     with contextlib.chdir(cwd or Path.cwd()), contextlib.redirect_stdout(stdout), contextlib.redirect_stderr(stderr):
         try:

@@ -156,35 +156,35 @@ def box(side: float, elasticity: float = 1.0, friction: float = 0.0, centre: Seq
     ]
 
 
-def turned(vector: Sequence[float], degrees: float) -> tuple[float, float]:
+def rotate(vector: Sequence[float], degrees: float) -> tuple[float, float]:
     """The vector rotated counter-clockwise."""
     c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
     return float(c * vector[0] - s * vector[1]), float(s * vector[0] + c * vector[1])
 
 
-def _of_discs(scene: Scene, made: Trajectory, i: int, count: int) -> tuple[np.ndarray, ...]:
+def _disc_states(scene: Scene, trajectory: Trajectory, i: int, count: int) -> tuple[np.ndarray, ...]:
     """Mass and moment [K], position and velocity [T, K, 2] and spin [T, K] of the discs of video i."""
     mass, moment = (np.asarray(x, float)[:count] for x in (scene.objects.mass, scene.objects.moment))
-    states = made.states.position, made.states.velocity, made.states.angular_velocity
+    states = trajectory.states.position, trajectory.states.velocity, trajectory.states.angular_velocity
     x, v, w = (np.asarray(a[i], float)[:, :count] for a in states)
     return mass, moment, x, v, w
 
 
-def energies(worlds: Sequence[tuple[Scene, State, Layout]], made: Trajectory) -> np.ndarray:
+def energies(worlds: Sequence[tuple[Scene, State, Layout]], trajectory: Trajectory) -> np.ndarray:
     """Kinetic and potential energy of each video and frame, J [n, T]."""
     total = []
     for i, (scene, _, layout) in enumerate(worlds):
-        mass, moment, x, v, w = _of_discs(scene, made, i, layout.runs[0].count)
+        mass, moment, x, v, w = _disc_states(scene, trajectory, i, layout.runs[0].count)
         fall = -np.einsum("tkd,d->tk", x, np.asarray(scene.gravity, float)) * mass
         total.append((0.5 * mass * (v**2).sum(-1) + 0.5 * moment * w**2 + fall).sum(-1))
     return np.array(total)
 
 
-def momenta(worlds: Sequence[tuple[Scene, State, Layout]], made: Trajectory) -> tuple[np.ndarray, np.ndarray]:
+def momenta(worlds: Sequence[tuple[Scene, State, Layout]], trajectory: Trajectory) -> tuple[np.ndarray, np.ndarray]:
     """Linear [n, T, 2] and angular [n, T] momentum about the origin."""
     linear, angular = [], []
     for i, (scene, _, layout) in enumerate(worlds):
-        mass, moment, x, v, w = _of_discs(scene, made, i, layout.runs[0].count)
+        mass, moment, x, v, w = _disc_states(scene, trajectory, i, layout.runs[0].count)
         linear.append((mass[:, None] * v).sum(1))
         cross = x[..., 0] * v[..., 1] - x[..., 1] * v[..., 0]
         angular.append((mass * cross + moment * w).sum(-1))
@@ -194,7 +194,7 @@ def momenta(worlds: Sequence[tuple[Scene, State, Layout]], made: Trajectory) -> 
 # ---- Render inputs without a solver
 
 
-def flown(config: Config | Mapping, count: int) -> tuple[RenderScene, FramePlan, Scene, State]:
+def straight_motion(config: Config | Mapping, count: int) -> tuple[RenderScene, FramePlan, Scene, State]:
     """Render scenes, frame plan, scenes and states [n, T, ...] of the first `count` videos of a config.
 
     From the sampled initial state, all bodies move in straight lines at constant velocity and spin, through walls, too.
@@ -204,16 +204,16 @@ def flown(config: Config | Mapping, count: int) -> tuple[RenderScene, FramePlan,
     keys = keys_module.video_keys(
         jnp.asarray(keys_module.seed_words(config.seed, 0)), jnp.arange(count, dtype=jnp.uint32)
     )
-    render_scenes, scenes, states = _all_flown(config, layout, keys)
+    render_scenes, scenes, states = _straight_motions(config, layout, keys)
     return render_scenes, render.plan_of(config, layout), scenes, states
 
 
 @functools.partial(jax.jit, static_argnums=(0, 1))
-def _all_flown(config: Config, layout: Layout, keys: jax.Array) -> tuple[RenderScene, Scene, State]:
-    return jax.vmap(functools.partial(_flown, config, layout))(keys)
+def _straight_motions(config: Config, layout: Layout, keys: jax.Array) -> tuple[RenderScene, Scene, State]:
+    return jax.vmap(functools.partial(_straight_motion, config, layout))(keys)
 
 
-def _flown(config: Config, layout: Layout, key: jax.Array) -> tuple[RenderScene, Scene, State]:
+def _straight_motion(config: Config, layout: Layout, key: jax.Array) -> tuple[RenderScene, Scene, State]:
     video, steps = config.video, 4
     scene, initial, *_ = sampler.Sampler(config).sampled(key)[1]
 
@@ -269,7 +269,7 @@ def polygon_areas(corners: np.ndarray, rows: int, columns: int) -> np.ndarray:
     Each piece of its boundary contributes to its own pixel and to those on its right, as in the anti-aliasing
     rasterizers of AGG and FreeType.
     """
-    starts = _finely(np.asarray(corners, float))
+    starts = _subdivide(np.asarray(corners, float))
     side = np.roll(starts, -1, axis=0) - starts
     cross = np.ones_like(side)  # where a piece crosses the edge of a column and of a row; it is shorter than a pixel
     np.divide(np.ceil(np.minimum(starts, starts + side)) - starts, side, where=np.abs(side) > 1e-12, out=cross)
@@ -287,7 +287,7 @@ def polygon_areas(corners: np.ndarray, rows: int, columns: int) -> np.ndarray:
     return np.abs(area + np.cumsum(right, axis=1)[:, :-1])
 
 
-def _finely(corners: np.ndarray) -> np.ndarray:
+def _subdivide(corners: np.ndarray) -> np.ndarray:
     """The polygon with its sides split into pieces shorter than a pixel."""
     side = np.roll(corners, -1, axis=0) - corners
     pieces = np.ceil(1.001 * np.hypot(*side.T)).astype(int) + 1

@@ -31,9 +31,9 @@ def check(source: Source) -> None:
     films.check_size("phyworld", source.frame_size)
     films.check_rate("phyworld", source.fps, films.FASTEST)
     ds = loader.open(source.ds.root, source.ds.options.split, (*OBJECTS, *CAMERA))
-    usual = len(_balls(ds[0]))
+    count = len(_balls(ds[0]))
     for number in range(len(ds)):
-        problem = _wrong(ds[number], usual)
+        problem = _problem_of(ds[number], count)
         if problem:
             raise ConfigError(f"phyworld cannot hold {ds.options.split} video {number} of {ds.root}: {problem}")
 
@@ -61,13 +61,13 @@ def _balls(video: Batch) -> np.ndarray:
     return np.flatnonzero(video["objects/present"] & (video["objects/kind"] != STATIC))
 
 
-def _wrong(video: Batch, usual: int) -> str:
-    """Reason why the format cannot represent a video, or ""; `usual` is the number of balls in the first video."""
+def _problem_of(video: Batch, count: int) -> str:
+    """Reason why the format cannot represent a video, or ""; `count` is the number of balls in the first video."""
     balls = _balls(video)
     if (video["objects/shape"][balls] != CIRCLE).any():
         return "something else than a ball moves in it"
-    if len(balls) not in (1, 2) or len(balls) != usual:
-        allowed = usual if usual in (1, 2) else "1 or 2"
+    if len(balls) not in (1, 2) or len(balls) != count:
+        allowed = count if count in (1, 2) else "1 or 2"
         return f"the number of balls that move in it is {len(balls)}, but must be {allowed}"
     if video["camera/angle"].any() or any(np.ptp(video[name], axis=0).any() for name in CAMERA):
         return "its camera moves or is turned, but must stand still and upright"

@@ -31,7 +31,7 @@ def write(target: Path, source: Source) -> None:
 
 def _add_video(tar: tarfile.TarFile, source: Source, number: int, video: Batch) -> None:
     key = source.key(number)
-    _add(tar, f"{key}.json", as_json(_about(source, number)))
+    _add(tar, f"{key}.json", as_json(_video_description(source, number)))
     for name, values in video.items():
         field, path = source.fields[name], f"{key}.{name.replace('/', '.')}"
         if field.is_text:
@@ -42,11 +42,11 @@ def _add_video(tar: tarfile.TarFile, source: Source, number: int, video: Batch) 
             _add(tar, f"{path}.npy", file.getvalue())
 
 
-def _about(source: Source, number: int) -> dict[str, Any]:
+def _video_description(source: Source, number: int) -> dict[str, Any]:
     """Contents of a video's JSON: its origin, and the dtype, axes, unit and meaning of each field."""
-    about = {key: source.ds.manifest.plain[key] for key in ("name", "seed", "fps")}
+    origin = {key: source.ds.manifest.plain[key] for key in ("name", "seed", "fps")}
     fields = {name: dataclasses.asdict(field) for name, field in source.fields.items()}
-    return about | {"split": source.ds.options.split, "number": number, "fields": fields}
+    return origin | {"split": source.ds.options.split, "number": number, "fields": fields}
 
 
 def _add(tar: tarfile.TarFile, name: str, content: bytes) -> None:
