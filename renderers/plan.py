@@ -13,7 +13,7 @@ from gen2d.renderers.camera import to_pixels
 from gen2d.renderers.paint import Paint
 from gen2d.renderers.primitives import BodyGeometry, Instants, PixelWindow
 
-LANES = 8  # px; tile widths are rounded up to multiples of this, whole SIMD vectors
+LANES = 8  # px; the sides of tiles are multiples of this: whole SIMD vectors, and few programs
 
 
 class Occluders(NamedTuple):
@@ -98,10 +98,10 @@ class TileGroup(NamedTuple):
 
     def size(self, height: int, width: int) -> tuple[int, int]:
         """Rows and columns of a tile."""
-        if math.isinf(self.reach):
+        if self.reach == math.inf:
             return height, width
-        side = math.floor(2 * self.reach) + 2
-        return min(side, height), min(-(-side // LANES) * LANES, width)
+        side = int(-(-(math.floor(2 * self.reach) + 2) // LANES)) * LANES
+        return min(side, height), min(side, width)
 
 
 def tile_windows(plan: FramePlan, group: TileGroup, at: Instants, run: SlotGroup, first: int) -> PixelWindow:

@@ -14,16 +14,51 @@ import jax.numpy as jnp
 import numpy as np
 
 from gen2d.records.axes import Array
+from gen2d.records.parameter import apply
+
+
+def _single(value: float) -> float:
+    return float(np.float32(value))
+
+
+def _after(value: float) -> float:
+    return float(np.nextafter(np.float32(value), np.float32(np.inf)))
 
 
 def single(value: float) -> float:
     """The nearest float32."""
-    return float(np.float32(value))
+    return apply(_single, value)
 
 
 def after(value: float) -> float:
     """The next float32 above a number."""
-    return float(np.nextafter(np.float32(value), np.float32(np.inf)))
+    return apply(_after, value)
+
+
+def _lowest(*numbers: float) -> float:
+    return min(numbers)
+
+
+def _highest(*numbers: float) -> float:
+    return max(numbers)
+
+
+def _before(low: float, high: float) -> float:
+    return float(np.nextafter(np.float32(high), np.float32(-np.inf)))
+
+
+def _last_whole(low: float, high: float) -> float:
+    return max(math.ceil(high) - 1, math.ceil(low))
+
+
+def _last(low: float, high: float) -> float:
+    """Largest sample of a continuous range, as float32."""
+    return _single(low) if low == high else _before(low, _single(high))
+
+
+def _thresholds(*weights: float) -> np.ndarray:
+    """Cumulative probabilities of components, without the last."""
+    return np.cumsum(weights)[:-1] / sum(weights)
 
 
 class Span(NamedTuple):
@@ -36,8 +71,7 @@ class Span(NamedTuple):
     @property
     def last(self) -> float:
         """Largest number of the span, as float32."""
-        below = float(np.nextafter(np.float32(self.high), np.float32(-np.inf)))
-        return max(math.ceil(self.high) - 1, math.ceil(self.low)) if self.whole else below
+        return apply(_last_whole if self.whole else _before, self.low, self.high)
 
     def contains(self, values: Any) -> np.ndarray:
         """Whether each value, rounded to float32, lies in the span."""
@@ -75,10 +109,10 @@ class Distribution:
         """Closed interval (low, high) that contains all values."""
         if self.kind == "mixture":
             ends = [part.support for part in self.parts]
-            return min(low for low, _ in ends), max(high for _, high in ends)
+            return apply(_lowest, *(low for low, _ in ends)), apply(_highest, *(high for _, high in ends))
         if self.kind == "normal":
             return (self.numbers[2], self.numbers[3]) if len(self.numbers) == 4 else (-math.inf, math.inf)
-        return min(self.numbers), max(self.numbers)
+        return apply(_lowest, *self.numbers), apply(_highest, *self.numbers)
 
     @property
     def spans(self) -> tuple[Span, ...]:
@@ -111,7 +145,7 @@ class Distribution:
         if self.kind == "constant":
             return jnp.full(shape, n[0], jnp.float32)
         if self.kind == "integer":
-            return jax.random.randint(key, shape, int(n[0]), int(n[1]) + 1)
+            return jax.random.randint(key, shape, apply(int, n[0]), apply(int, n[1]) + 1)
         if self.kind in ("choice", "grid"):
             return jnp.asarray(n, jnp.float32)[jax.random.randint(key, shape, 0, len(n))]
         if self.kind == "normal" and len(n) == 2:
@@ -119,11 +153,13 @@ class Distribution:
         if self.kind == "uniform":
             samples = jax.random.uniform(key, shape, minval=n[0], maxval=n[1])
         elif self.kind == "log_uniform":
-            samples = jnp.exp(jax.random.uniform(key, shape, minval=math.log(n[0]), maxval=math.log(n[1])))
+            low, high = (apply(math.log, x) for x in n)
+            samples = jnp.exp(jax.random.uniform(key, shape, minval=low, maxval=high))
         else:
             low, high = ((end - n[0]) / n[1] for end in n[2:])
             samples = n[0] + n[1] * jax.random.truncated_normal(key, low, high, shape)
-        return jnp.clip(samples, self.spans[0].low, self.spans[0].last)  # rounding may leave the support
+        low, high = self.support
+        return jnp.clip(samples, apply(single, low), apply(_last, low, high))  # rounding may leave the support
 
     @property
     def weighted(self) -> list[tuple[float, "Distribution"]]:
@@ -134,7 +170,7 @@ class Distribution:
 
     def _mixed(self, key: Array, shape: tuple[int, ...]) -> Array:
         component_key, value_key = jax.random.split(key)
-        thresholds = np.cumsum(self.numbers)[:-1] / sum(self.numbers)
-        chosen = (jax.random.uniform(component_key, shape)[..., None] >= jnp.asarray(thresholds, jnp.float32)).sum(-1)
+        thresholds = jnp.asarray(apply(_thresholds, *self.numbers), jnp.float32)
+        chosen = (jax.random.uniform(component_key, shape)[..., None] >= thresholds).sum(-1)
         samples = [part.sample(value_key, shape) for part in self.parts]
         return jnp.select([chosen == i for i in range(len(samples))], samples)

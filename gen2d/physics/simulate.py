@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import operator
 from collections.abc import Callable
 
 import jax
@@ -31,7 +32,7 @@ def substeps(fps: float, asked: int | None, max_step: float) -> int:
 
     Raises ConfigError if there are more than MOST_STEPS.
     """
-    steps = asked or max(1, math.ceil(1 / (fps * max_step) - 1e-9))
+    steps = asked or max(1, operator.index(math.ceil(1 / (fps * max_step) - 1e-9)))
     if steps > MOST_STEPS:
         raise ConfigError(f"video.fps is {fps:g}, which takes {steps:,} steps a frame, but {MOST_STEPS:,} is the most")
     return steps

@@ -37,6 +37,7 @@ from gen2d.physics.shapes import to_world
 from gen2d.physics.state import BodyState, Model, WorldState
 from gen2d.physics.tunnelling import clamp_displacement
 from gen2d.records.axes import Array
+from gen2d.records.parameter import apply
 from gen2d.xla import materialize
 
 
@@ -60,8 +61,8 @@ def _free_motion(
     q = (h - p) / c, v becomes s v + p a and the displacement is p v + q a.
     """
     h, c = params.step, params.damping
-    s = math.exp(-c * h)
-    p = -math.expm1(-c * h) / c if c else h
+    s = apply(math.exp, -c * h) if c else 1.0
+    p = -apply(math.expm1, -c * h) / c if c else h
     q = (h - p) / c if c * h > 1e-4 else 0.5 * h**2 * (1 - c * h / 3)
     old = body.motion
     motion = Motion(s * old.velocity + p * acceleration, s * old.spin + p * angular)

@@ -8,37 +8,27 @@ program, so its bits do not depend on how many videos are generated, or where.
 
 import dataclasses
 import functools
-import math
 import zlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from gen2d.config import quality
 from gen2d.config.config import Config
+from gen2d.config.sections import MatchedOptions, PhysicsOptions, QualityOptions
 from gen2d.core import enums
-from gen2d.physics import lyapunov
-from gen2d.physics.params import solver_params
-from gen2d.physics.simulate import SaveAt, simulate, substeps
 from gen2d.programs import render
 from gen2d.programs.schema import VideoSchema
-from gen2d.records import axes as axes_module
+from gen2d.programs.shared import BoundProgram, program_for
+from gen2d.programs.simulation import BatchSimulation, DeviceBatch
 from gen2d.records import keys as keys_module
-from gen2d.records import layout as layout_module
 from gen2d.records.axes import Array
-from gen2d.records.scene import Scene, State
-from gen2d.records.trajectory import Trajectory
 from gen2d.renderers.plan import RenderScene
 from gen2d.sampling import rejection
-from gen2d.sampling.builder import SampledScene
-from gen2d.sampling.matched import sets
-from gen2d.sampling.matched import simulate as simulate_module
-from gen2d.sampling.sampler import FactorChange, Sampler
 
 SLICE_BYTES = 16 * 2**20  # of raw frames rendered at once; larger buffers cost page faults
 SHARD_BYTES = 2**30  # of raw frames in a shard
@@ -62,13 +52,11 @@ class Rollout:
 
     def __init__(self, config: Config, devices: Sequence[Any]) -> None:
         self.config, self.devices = config, list(devices)
-        video = config.video
-        self.layout = config.scene.contract.layout(config.scene.options)
-        self.sampler, self.quality_ranges = Sampler(config), quality.ranges(config.quality)
-        self.plan = render.plan_of(config, self.layout)
-        self.steps = substeps(video.fps, config.physics.substeps, config.physics.max_step)
-        self.save_at = save_at(config, self.layout)
-        self.schema = VideoSchema(config, self.layout, self.plan, self.save_at, self.sampler)
+        video, self.sparse = config.video, self.devices[0].platform == "cpu"
+        self.simulation = BatchSimulation(config, self.sparse)
+        self.layout, self.plan, self.sampler = self.simulation.layout, self.simulation.plan, self.simulation.sampler
+        self.steps, self.quality_ranges = self.simulation.steps, self.simulation.quality_ranges
+        self.schema = VideoSchema(config, self.layout, self.plan, self.simulation.save_at, self.sampler)
         frame_bytes = video.frames * video.height * video.width * 3
         default_shard = min(SHARD_VIDEOS, _power_of_two(SHARD_BYTES // frame_bytes))
         self.videos_per_shard = config.storage.videos_per_shard or default_shard
@@ -79,13 +67,9 @@ class Rollout:
         self.batch_size = config.storage.batch_size or min(default_batch, default_shard)
         self.slice = divisor(self.batch_size, max(1, SLICE_BYTES // frame_bytes))
         self.mesh = Mesh(np.array(self.devices), ("videos",))
-        self._draw_programs: dict[int, Any] = {}  # by number of videos
-        self._compiled_draws: set[int] = set()  # keys of `_draw_programs` whose program is compiled
-        program = self._simulate_batch
-        if len(self.devices) > 1:
-            specs = PartitionSpec(), PartitionSpec(), VIDEOS, VIDEOS, VIDEOS
-            program = jax.shard_map(program, mesh=self.mesh, in_specs=specs, out_specs=VIDEOS, check_vma=False)
-        self._simulate: Any = jax.jit(program)
+        self._simulate: BoundProgram | None = None
+        self._draws: dict[int, BoundProgram] = {}  # by number of videos
+        self._compiled: set[int] = set()  # keys of `_draws` that are compiled
 
     def start(self, split: str, numbers: np.ndarray) -> DeviceBatch:
         """Start to simulate the videos of a split with these numbers [devices * batch_size].
@@ -98,7 +82,10 @@ class Rollout:
 
         def simulate_rows(rows: np.ndarray, attempts: np.ndarray) -> DeviceBatch:
             sharded = self._shard_over_devices((grid[rows], numbers[rows], attempts.astype(np.uint32)))
-            batch = self._simulate(root, np.int32(row), *sharded)
+            args = root, np.int32(row), *sharded
+            if self._simulate is None:
+                self._simulate = self._simulation_program(self.devices, args)
+            batch = self._simulate(*args)
             return self._with_visibility(batch) if quality.VISIBILITY in self.quality_ranges else batch
 
         if not self.quality_ranges:
@@ -129,36 +116,57 @@ class Rollout:
             jax.tree.map(lambda array, d=d: _device_shards(array)[d].data, batch.render_scenes)
             for d in range(len(self.devices))
         ]
-        draw = functools.partial(self._draw_program(count), start=np.int32(start))
-        if count in self._compiled_draws:
+        if count not in self._draws:
+            self._draws[count] = self._draw_program(count, (scenes_by_device[0], np.int32(start)))
+        draw = functools.partial(self._draws[count], start=np.int32(start))
+        if count in self._compiled:
             return [draw(scenes) for scenes in scenes_by_device]
-        self._compiled_draws.add(count)
+        self._compiled.add(count)
         with ThreadPoolExecutor(len(scenes_by_device)) as pool:  # compiles for all devices in parallel
             return list(pool.map(draw, scenes_by_device))
-
-    def close(self) -> None:
-        """Free the compiled programs, which jax would keep; each takes up to thousands of memory maps."""
-        for program in (self._simulate, *self._draw_programs.values()):
-            program.clear_cache()
 
     def lowered(self) -> dict[str, str]:
         """Text of each program, lowered for one device."""
         numbers, scalar = jax.ShapeDtypeStruct((self.batch_size,), np.uint32), jax.ShapeDtypeStruct((), np.int32)
         grid = jax.ShapeDtypeStruct((self.batch_size, len(self.sampler.gridded)), np.float32)
-        simulate = self._simulate if len(self.devices) == 1 else jax.jit(self._simulate_batch)
         with jax.default_device(self.devices[0]):
-            simulation = simulate.lower(jax.ShapeDtypeStruct((3,), np.uint32), scalar, grid, numbers, numbers)
-            rendering = self._draw_program(self.slice).lower(simulation.out_info.render_scenes, start=scalar)
+            args = jax.ShapeDtypeStruct((3,), np.uint32), scalar, grid, numbers, numbers
+            simulation = self._simulation_program(self.devices[:1], args).lower(*args)
+            args = simulation.out_info.render_scenes, scalar
+            rendering = self._draw_program(self.slice, args).lower(*args)
         return {"simulate": simulation.as_text(), "draw": rendering.as_text()}
 
-    def _draw_program(self, count: int) -> Any:
-        def render_slice(render_scenes: RenderScene, start: Array) -> dict[str, Array]:
-            part = jax.tree.map(lambda x: jax.lax.dynamic_slice_in_dim(x, start, count), render_scenes)
-            return render.render_frames(part, self.plan, self.config.annotations)
+    def _simulation_program(self, devices: Sequence[Any], args: tuple) -> BoundProgram:
+        """Program that samples and simulates `batch_size` videos on each device."""
+        annotations = dataclasses.replace(self.config.annotations, pixels=())
+        config, mesh = dataclasses.replace(self.config, annotations=annotations), Mesh(np.array(devices), ("videos",))
 
-        if count not in self._draw_programs:
-            self._draw_programs[count] = jax.jit(render_slice)
-        return self._draw_programs[count]
+        def simulate_batch(config: Config) -> BatchSimulation:
+            return BatchSimulation(config, self.sparse)
+
+        def over_devices(run: Any) -> Any:
+            specs = PartitionSpec(), PartitionSpec(), PartitionSpec(), VIDEOS, VIDEOS, VIDEOS
+            return jax.shard_map(run, mesh=mesh, in_specs=specs, out_specs=VIDEOS, check_vma=False)
+
+        wrap = over_devices if len(devices) > 1 else None
+        return program_for(config, (tuple(devices), self.batch_size), simulate_batch, args, wrap)
+
+    def _draw_program(self, count: int, args: tuple) -> BoundProgram:
+        """Program that renders `count` videos."""
+        config = dataclasses.replace(
+            self.config, physics=PhysicsOptions(), matched=MatchedOptions(), quality=QualityOptions(), splits=()
+        )
+
+        def render_slice(config: Config) -> Callable[[RenderScene, Array], dict[str, Array]]:
+            plan = render.plan_of(config, config.scene.contract.layout(config.scene.options))
+
+            def run(render_scenes: RenderScene, start: Array) -> dict[str, Array]:
+                part = jax.tree.map(lambda x: jax.lax.dynamic_slice_in_dim(x, start, count), render_scenes)
+                return render.render_frames(part, plan, config.annotations)
+
+            return run
+
+        return program_for(config, (count, self.batch_size), render_slice, args)
 
     def host_columns(self, batch: DeviceBatch) -> list[dict[str, np.ndarray]]:
         """Each device's columns as NumPy arrays; waits for the devices."""

@@ -35,12 +35,20 @@ class BoundProgram(NamedTuple):
     program: Program
     numbers: np.ndarray  # uint32 [SIZE]
 
+    def __call__(self, *args: Any, **named: Any) -> Any:
+        """Result of the program, which is compiled on its first call for a device."""
+        return self.program.jitted(self.numbers, *args, **named)
+
+    def lower(self, *args: Any) -> Any:
+        """The program, lowered for these arguments."""
+        return self.program.jitted.lower(self.numbers, *args)
+
 
 _programs: collections.OrderedDict[Hashable, list[Program]] = collections.OrderedDict()
 _lock = threading.Lock()
 
 
-def program_for(config: Config, key: Hashable, build: Build, args: tuple, wrap: Wrap = lambda run: run) -> BoundProgram:
+def program_for(config: Config, key: Hashable, build: Build, args: tuple, wrap: Wrap | None = None) -> BoundProgram:
     """The program of a config: one that is already there if it serves the config, else a new one, traced for `args`.
 
     Parameters
@@ -48,7 +56,7 @@ def program_for(config: Config, key: Hashable, build: Build, args: tuple, wrap: 
     config : Config
         The config; sections that the program does not depend on should have their defaults.
     key : hashable
-        Everything else that determines the program, such as its name, devices and sizes.
+        Everything else that determines the program, such as its devices and sizes.
     build : callable
         `build(config)` returns the function to be traced, for a config whose numbers are parameters.
     args : tuple
@@ -58,8 +66,9 @@ def program_for(config: Config, key: Hashable, build: Build, args: tuple, wrap: 
     """
     structure, leaves = split_numbers(config)
     with _lock:
-        programs = _programs.setdefault((key, structure), [])
-        _programs.move_to_end((key, structure))
+        key = build.__name__, key, structure
+        programs = _programs.setdefault(key, [])
+        _programs.move_to_end(key)
         for program in programs:
             numbers = program.tape.arguments(leaves)
             if numbers is not None:
@@ -74,15 +83,15 @@ def program_for(config: Config, key: Hashable, build: Build, args: tuple, wrap: 
         return BoundProgram(program, numbers)
 
 
-def _traced(config: Config, build: Build, args: tuple, wrap: Wrap) -> Program:
+def _traced(config: Config, build: Build, args: tuple, wrap: Wrap | None) -> Program:
     tape = Tape()
     function = build(parametrized(config, tape))
 
-    def run(numbers: jax.Array, *args: Any) -> Any:
+    def run(numbers: jax.Array, *args: Any, **named: Any) -> Any:
         with tape.tracing(numbers):
-            return function(*args)
+            return function(*args, **named)
 
     run.__name__ = build.__name__
-    jitted = jax.jit(wrap(run))
+    jitted = jax.jit(run if wrap is None else wrap(run))
     jitted.trace(jax.ShapeDtypeStruct((SIZE,), np.uint32), *args)
     return Program(jitted, tape)

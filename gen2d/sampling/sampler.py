@@ -26,6 +26,7 @@ from gen2d.core.schema import Field
 from gen2d.loading.epochs import order
 from gen2d.records.axes import Array
 from gen2d.records.keys import key_for, keys_for
+from gen2d.records.parameter import apply
 from gen2d.sampling.builder import SampledScene
 
 SampledFactors = dict[str, Array]
@@ -145,13 +146,12 @@ class Sampler:
         firsts = jnp.asarray(np.cumsum([0, *counts[:-1]]))[row]
         if max(counts) == 1:
             return {"": firsts} | {axis: jnp.full(length, firsts) for axis, length in self.lengths.items()}
-        ends = np.full((len(counts), max(counts)), 2.0, np.float32)
-        for i, law in enumerate(self.laws):
-            ends[i, : counts[i] - 1] = np.cumsum([product.share for product in law.products])[:-1]
+        shares = [[product.share for product in law.products] for law in self.laws]
+        ends = jnp.asarray([apply(_thresholds, max(counts), *own) for own in shares], jnp.float32)
         product_key, axes = key_for(key, "product"), [self._axis(law) for law in self.laws]
 
         def pick(key: Array, shape: tuple[int, ...]) -> Array:
-            return firsts + (jax.random.uniform(key, shape)[..., None] >= jnp.asarray(ends)[row]).sum(-1)
+            return firsts + (jax.random.uniform(key, shape)[..., None] >= ends[row]).sum(-1)
 
         common = pick(product_key, ())
         components = {"": common}
@@ -216,6 +216,13 @@ class Sampler:
         return _present(spec.each, inside, factors) if spec.each in factors else jnp.ones_like(inside)
 
 
+def _thresholds(length: int, *shares: float) -> np.ndarray:
+    """Cumulative probabilities [length] of products, without the last; 2 where there is none."""
+    thresholds = np.full(length, 2.0)
+    thresholds[: len(shares) - 1] = np.cumsum(shares)[:-1]
+    return thresholds
+
+
 def _present(each: str, values: Array, factors: SampledFactors) -> Array:
     """Whether each of the counted objects is present; broadcasts to `values` [K, ...]."""
     return (jnp.arange(values.shape[0]) < factors[each]).reshape(-1, *[1] * (values.ndim - 1))
@@ -224,6 +231,5 @@ def _present(each: str, values: Array, factors: SampledFactors) -> Array:
 def _distance_from(values: Array, spans: tuple[Span, ...]) -> Array:
     """Distance of each value from the nearest span; 0 inside one."""
     x = values.astype(jnp.float32)
-    low = np.array([span.low for span in spans], np.float32)
-    last = np.array([span.last for span in spans], np.float32)
+    low, last = (jnp.asarray(ends, jnp.float32) for ends in ([s.low for s in spans], [s.last for s in spans]))
     return jnp.maximum(jnp.maximum(low - x[..., None], x[..., None] - last), 0).min(-1)
