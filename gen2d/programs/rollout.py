@@ -100,9 +100,9 @@ class Rollout:
 
         Raises NoVideoError if no attempt at some video lies in the ranges that the config requires.
         """
-        root, row = keys_module.seed_words(self.config.seed, zlib.crc32(split.encode())), self.config.row(split)
+        root, row = keys_module.seed_words(self.config.seed, zlib.crc32(split.encode())), self.config.split_index(split)
         numbers = numbers.astype(np.uint32)
-        given = self.sampler.combination(row, root, numbers)
+        given = self.sampler.grid_values(row, root, numbers)
 
         def make(rows: np.ndarray, attempts: np.ndarray) -> DeviceBatch:
             of_videos = given[rows], numbers[rows], attempts.astype(np.uint32)
@@ -177,14 +177,14 @@ class Rollout:
         if config.matched.change:
 
             def member(key: Array, change: FactorChange | None = None) -> tuple[dict[str, Array], SampledScene]:
-                return self.sampler.sampled(key, row, change=change)
+                return self.sampler.sample(key, row, change=change)
 
             factors, sampled, trajectory, matched_columns = simulate_module.simulate_members(
                 keys, numbers, config, self.layout, member, self._run
             )
         else:
             own_keys = rejection.attempt_keys(keys, attempts) if self.wanted else keys
-            factors, sampled = jax.vmap(self.sampler.sampled, (0, None, 0))(own_keys, row, given)
+            factors, sampled = jax.vmap(self.sampler.sample, (0, None, 0))(own_keys, row, given)
             trajectory = self._run(sampled.scene, sampled.state)
         scene, between, trajectory = sampled.scene, trajectory.between, dataclasses.replace(trajectory, between=None)
 
@@ -197,7 +197,7 @@ class Rollout:
         columns["objects/color"] = colors
         columns |= render.camera_columns(stages.instants.view)
         columns |= {f"factors/{name}": values.astype(jnp.float32) for name, values in factors.items()}
-        columns |= jax.vmap(self.sampler.outside)(factors)
+        columns |= jax.vmap(self.sampler.ood_distances)(factors)
         columns["quality/rejected_draws"] = sampled.rejected
         if config.annotations.simulated.lyapunov:
             columns["quality/lyapunov"] = self._growth(keys, sampled)

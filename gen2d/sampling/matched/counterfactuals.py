@@ -7,17 +7,17 @@ import jax
 import jax.numpy as jnp
 
 from gen2d.config.matched import INTERVENTIONS
-from gen2d.config.options import drawn_options
+from gen2d.config.options import factor_options
 from gen2d.records.axes import Array
 from gen2d.records.keys import key_for
 from gen2d.records.scene import Objects, State
 from gen2d.sampling.matched.sets import SetMember, along_slots
 
 
-def changed_factors(member: SetMember, config: Any, factors: dict[str, Array], draw: Callable) -> dict[str, Array]:
+def change_factors(member: SetMember, config: Any, factors: dict[str, Array], draw: Callable) -> dict[str, Array]:
     """Factors, with the one that the set changes scaled or sampled again; `draw(key)` samples all factors."""
     specs, matched, redrawn, changed = (
-        drawn_options(config.scene.contract),
+        factor_options(config.scene.contract),
         config.matched,
         draw(member.own_key),
         dict(factors),
