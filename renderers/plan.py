@@ -63,7 +63,9 @@ class FramePlan:
         """Remaining runs, in consecutive groups that share a tile size."""
         groups: list[TileGroup] = []
         for run, first in self.layout.painted[len(self.static_runs) :]:
-            reach = self._reach(run)
+            reach = self.largest(run)
+            if 2 * reach + 2 >= max(self.height, self.width):  # a tile would be as large as the frame
+                reach = math.inf
             if groups and groups[-1].reach == reach:
                 groups[-1] = TileGroup((*groups[-1].runs, (run, first)), reach)
             else:
@@ -74,11 +76,6 @@ class FramePlan:
     def moving(self) -> int:
         """Number of slots in `groups`."""
         return sum(len(group.slots) for group in self.groups)
-
-    def _reach(self, run: SlotGroup) -> float:
-        """`largest`, but infinite if a tile would be as large as the frame."""
-        reach = self.largest(run)
-        return reach if 2 * reach + 2 < max(self.height, self.width) else math.inf
 
     def largest(self, run: SlotGroup) -> float:
         """Upper bound of the distance from centre to rim (px) of a run's objects; infinite for static runs."""

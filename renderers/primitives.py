@@ -74,9 +74,8 @@ def object_parts(
     if paint.rim is not None:
         rim = paint.rim[slots, None]
         visible = drawn & (radius > rim) if run.shape != "polygon" else drawn
-        inner = _primitive(
-            run, pose, _inset_corners(run, corners, rim, radius), jnp.maximum(radius - rim, 0.0), visible
-        )
+        inset = _inset_corners(run, corners, rim, radius)
+        inner = _primitive(run, pose, inset, jnp.maximum(radius - rim, 0.0), visible)
     if paint.mark is not None:
         # The round end of the bar lies beyond the rim, where nothing is painted.
         end = jnp.where(drawn, ahead, 0.0)

@@ -106,7 +106,11 @@ class _VideoRenderer:
     def paint_separately(self, canvas: LayerCanvas) -> LayerCanvas:
         """Frames painted on a separate image: for motion blur, a moving camera, or noise."""
         scene, plan = self.scene, self.plan
-        instants = scene.instants if scene.exposed is None else jax.tree.map(_merge_leading_axes, scene.exposed)
+        instants = (
+            scene.instants
+            if scene.exposed is None
+            else jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:]), scene.exposed)
+        )
         samples, edges = max(plan.exposed, 1), self._tile_edges(instants)
 
         def render_instant(i: Array) -> Array:
@@ -220,10 +224,6 @@ class _VideoRenderer:
                 cover, color, corner = quantize_cover(cover), quantize_color(color), (frame, jnp.int32(0), jnp.int32(0))
                 canvas = self._paint_layer(canvas, cover, color, OCCLUDER, corner)
         return jax.lax.fori_loop(done, count, paint_slot, canvas)
-
-
-def _merge_leading_axes(a: Array) -> Array:
-    return a.reshape(-1, *a.shape[2:])
 
 
 def _concatenate(arrays: list[Array]) -> Array:

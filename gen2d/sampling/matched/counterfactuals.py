@@ -16,16 +16,12 @@ from gen2d.sampling.matched.sets import SetMember, along_slots
 
 def change_factors(member: SetMember, config: Any, factors: dict[str, Array], draw: Callable) -> dict[str, Array]:
     """Factors, with the one that the set changes scaled or sampled again; `draw(key)` samples all factors."""
-    specs, matched, redrawn, changed = (
-        factor_options(config.scene.contract),
-        config.matched,
-        draw(member.own_key),
-        dict(factors),
-    )
+    specs, matched = factor_options(config.scene.contract), config.matched
+    samples, changed = draw(member.own_key), dict(factors)
     for index, name in enumerate(matched.change):
         if name in INTERVENTIONS:
             continue
-        spec, new = specs[name], redrawn[name]
+        spec, new = specs[name], samples[name]
         if matched.scale is not None:
             scale = matched.scale.sample(key_for(member.own_key, "scale"), ())
             new = jnp.clip(factors[name] * scale, spec.low, spec.high)
