@@ -20,7 +20,7 @@ from gen2d.renderers.color import LINEAR, to_linear, to_srgb
 from gen2d.renderers.noise import textured
 from gen2d.renderers.plan import FramePlan, RenderScene
 from gen2d.renderers.primitives import Instants, PixelWindow, object_parts
-from gen2d.renderers.shading import EdgeSamples, covered_color, edge_samples, fills_of
+from gen2d.renderers.shading import EdgeTerms, covered_color, edge_terms, fills_of
 
 FULL_COVER = 2**15 - 1  # a quantised coverage of 1
 NO_OWNER = FULL_COVER << 8  # owner of a pixel that shows only background
@@ -146,10 +146,8 @@ def background_layer(scene: RenderScene, at: Instants, plan: FramePlan) -> Layer
 def static_layer(scene: RenderScene, plan: FramePlan) -> LayerCanvas:
     """Canvas [1, ...] of the background and of static slots behind all moving ones, without occluders."""
     first = jax.tree.map(lambda a: a[:1], scene.instants)
-    alone = scene._replace(occluders=None)
-    return paint_runs(
-        background_layer(scene, first, plan), alone, plan, first, plan.static_runs, quantized_painter(plan.linear)
-    )
+    canvas, alone = background_layer(scene, first, plan), scene._replace(occluders=None)
+    return paint_runs(canvas, alone, plan, first, plan.static_runs, quantized_painter(plan.linear))
 
 
 def paint_runs(
@@ -174,7 +172,7 @@ def paint_runs(
                 return paint(canvas, *covered_color(edges, fills, window, plan.largest(run)), slot + 1), None
 
             offsets = jnp.arange(run.count)
-            entries = run_edges(scene, plan, at, run, first, window), fills_of(scene.paint, slots)
+            entries = run_edge_terms(scene, plan, at, run, first, window), fills_of(scene.paint, slots)
             return jax.lax.scan(paint_slot, canvas, (*entries, first + offsets, rank + offsets))[0]
 
         needed = scene.occluders is not None or scene.paint.drawn[slots].any()
@@ -214,10 +212,10 @@ def occluder_layer(scene: RenderScene, plan: FramePlan, i: int, here: Array) -> 
     return jnp.where(here, cover, 0.0)[None], scene.occluders.color[i]
 
 
-def run_edges(
+def run_edge_terms(
     scene: RenderScene, plan: FramePlan, at: Instants, run: SlotGroup, first: int, window: PixelWindow
-) -> EdgeSamples:
-    """Edge samples of a run's slots in their windows at the instants `at`; arrays [k, I, ...].
+) -> EdgeTerms:
+    """Edge terms of a run's slots in their windows at the instants `at`; arrays [k, I, ...].
 
     The loop over slots keeps the compiler from computing the parts again for each row and column.
     """
@@ -225,8 +223,8 @@ def run_edges(
     varied = scene.paint.shade is not None or scene.paint.texture is not None
     corners = [jnp.broadcast_to(jnp.asarray(edge), parts.pose.column.shape) for edge in (window.top, window.left)]
 
-    def sample(entry: tuple) -> EdgeSamples:
+    def sample(entry: tuple) -> EdgeTerms:
         part, top, left = entry
-        return edge_samples(part, PixelWindow(top, left, window.rows, window.columns), run.shape == "circle", varied)
+        return edge_terms(part, PixelWindow(top, left, window.rows, window.columns), run.shape == "circle", varied)
 
     return jax.lax.map(sample, (parts, *corners))

@@ -28,7 +28,7 @@ from gen2d.renderers.compositing import (
     paint_moving,
     paint_runs,
     quantized_painter,
-    run_edges,
+    run_edge_terms,
     static_layer,
 )
 from gen2d.renderers.plan import FramePlan, RenderScene
@@ -98,7 +98,7 @@ def alone(scene: RenderScene, plan: FramePlan, measure: Callable[[Array], Array]
     for run, first in plan.layout.spans:
         stands = plan.still and run.kind == STATIC
         at = jax.tree.map(lambda a, stands=stands: a[:1] if stands else a, scene.instants)
-        edges = run_edges(scene, plan, at, run, first, window)
+        edges = run_edge_terms(scene, plan, at, run, first, window)
         fills = fills_of(scene.paint, slice(first, first + run.count))
         largest = plan.largest(run)
         values = jax.lax.map(

@@ -30,7 +30,7 @@ def fills_of(paint: Paint, slots: slice) -> Fills:
     return jax.tree.map(lambda a: a[slots], fills)
 
 
-class EdgeSamples(NamedTuple):
+class EdgeTerms(NamedTuple):
     """Terms of the coverage of some slots that depend on a row or a column of their windows alone."""
 
     whole: Any  # disc.PixelDisc or polygon.RoundedPolygon
@@ -39,16 +39,16 @@ class EdgeSamples(NamedTuple):
     pose: ImagePose | None  # relative to the window, if the colour varies within it
 
 
-def edge_samples(parts: ObjectParts, window: PixelWindow, disc: bool, varied: bool) -> EdgeSamples:
-    """Edge samples of parts in a window; `disc` for discs, `varied` if shade or texture varies the colour."""
+def edge_terms(parts: ObjectParts, window: PixelWindow, disc: bool, varied: bool) -> EdgeTerms:
+    """Edge terms of parts in a window; `disc` for discs, `varied` if shade or texture varies the colour."""
     pose = parts.pose
     pose = pose._replace(column=pose.column - window.left, row=pose.row - window.top) if varied else None
-    inner = None if parts.inner is None else _edge_terms(parts.inner, window, disc)
-    mark = None if parts.mark is None else _edge_terms(parts.mark, window, disc=False)
-    return EdgeSamples(_edge_terms(parts.whole, window, disc), inner, mark, pose)
+    inner = None if parts.inner is None else _primitive_terms(parts.inner, window, disc)
+    mark = None if parts.mark is None else _primitive_terms(parts.mark, window, disc=False)
+    return EdgeTerms(_primitive_terms(parts.whole, window, disc), inner, mark, pose)
 
 
-def _edge_terms(primitive: Primitive, window: PixelWindow, disc: bool) -> Any:
+def _primitive_terms(primitive: Primitive, window: PixelWindow, disc: bool) -> Any:
     x, y = jnp.arange(window.columns, dtype=jnp.float32), jnp.arange(window.rows, dtype=jnp.float32)
     left, top = (jnp.asarray(edge, jnp.float32) for edge in (window.left, window.top))
     if disc:
@@ -65,7 +65,7 @@ def _coverage(terms: Any, largest: float) -> Array:
     return jnp.clip(polygon.polygon_coverage(terms), 0.0, 1.0)
 
 
-def covered_color(edges: EdgeSamples, fills: Fills, window: PixelWindow, largest: float) -> tuple[Array, Array]:
+def covered_color(edges: EdgeTerms, fills: Fills, window: PixelWindow, largest: float) -> tuple[Array, Array]:
     """Coverage [..., rows, columns] and mean colour [..., rows, columns, 3] of the covered area.
 
     The colour is [..., 1, 1, 3] if it does not vary. `largest` (px) bounds the radius of discs.

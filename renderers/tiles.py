@@ -20,13 +20,13 @@ from gen2d.renderers.compositing import (
     ownership,
     quantize_color,
     quantize_cover,
-    run_edges,
+    run_edge_terms,
     static_layer,
 )
 from gen2d.renderers.plan import FramePlan, RenderScene, TileGroup, tile_windows
 from gen2d.renderers.postprocessing import add_noise, exposure_average
 from gen2d.renderers.primitives import Instants, PixelWindow
-from gen2d.renderers.shading import EdgeSamples, covered_color, fills_of
+from gen2d.renderers.shading import EdgeTerms, covered_color, fills_of
 
 
 def draw_tiles(scenes: RenderScene, plan: FramePlan) -> tuple[Array | None, Array | None]:
@@ -53,11 +53,11 @@ def draw_tiles(scenes: RenderScene, plan: FramePlan) -> tuple[Array | None, Arra
 
 
 class TileEdges(NamedTuple):
-    """Edge samples of a group's slots in their tiles at all instants; arrays [k, I, ...]."""
+    """Edge terms of a group's slots in their tiles at all instants; arrays [k, I, ...]."""
 
     group: TileGroup
     window: PixelWindow
-    of_runs: list[EdgeSamples]
+    of_runs: list[EdgeTerms]
 
 
 class TileCoverage(NamedTuple):
@@ -106,11 +106,9 @@ class _VideoRenderer:
     def paint_separately(self, canvas: LayerCanvas) -> LayerCanvas:
         """Frames painted on a separate image: for motion blur, a moving camera, or noise."""
         scene, plan = self.scene, self.plan
-        instants = (
-            scene.instants
-            if scene.exposed is None
-            else jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:]), scene.exposed)
-        )
+        instants = scene.instants
+        if scene.exposed is not None:
+            instants = jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:]), scene.exposed)
         samples, edges = max(plan.exposed, 1), self._tile_edges(instants)
 
         def render_instant(i: Array) -> Array:
@@ -146,12 +144,12 @@ class _VideoRenderer:
         )
 
     def _tile_edges(self, at: Instants) -> list[TileEdges]:
-        """Edge samples of each group at all instants."""
+        """Edge terms of each group at all instants."""
         edges = []
         for group in self.plan.groups:
             windows = [tile_windows(self.plan, group, at, run, first) for run, first in group.runs]
             pairs = zip(group.runs, windows, strict=True)
-            samples = [run_edges(self.scene, self.plan, at, run, first, window) for (run, first), window in pairs]
+            samples = [run_edge_terms(self.scene, self.plan, at, run, first, window) for (run, first), window in pairs]
             top, left = (_concatenate([getattr(w, edge) for w in windows]) for edge in ("top", "left"))
             edges.append(TileEdges(group, PixelWindow(top, left, windows[0].rows, windows[0].columns), samples))
         return edges

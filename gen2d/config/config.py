@@ -197,9 +197,8 @@ def _with_splits(config: Config, written: Any, source: str, copies: Copies) -> C
         changes, split_sections = split.plain(), {}
         try:
             for name in (name for name in CHANGES if name in changes):
-                split_sections[name] = _parse_section(
-                    name, _merge_section(plain[name], changes[name]), "config", copies
-                )
+                values = _merge_section(plain[name], changes[name])
+                split_sections[name] = _parse_section(name, values, "config", copies)
         except ConfigError as error:
             raise ConfigError(f"{source}: splits.{split.name}: {str(error).removeprefix('config: ')}") from None
         if "look" in split_sections and split_sections["look"].sha256:
