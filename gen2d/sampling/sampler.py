@@ -101,11 +101,11 @@ class Sampler:
         self, key: Array, row: Any = 0, given: Any = (), change: FactorChange | None = None
     ) -> SampledFactors:
         """Factors of a video by name, without derived values; zero for objects beyond the sampled count."""
-        factors = self._sample_all(key, row, given)
-        factors = change(factors, lambda other: self._sample_all(other, row, given)) if change else factors
+        factors = self._unmasked_factors(key, row, given)
+        factors = change(factors, lambda other: self._unmasked_factors(other, row, given)) if change else factors
         return {name: self._zero_absent(name, values, factors) for name, values in factors.items()}
 
-    def _sample_all(self, key: Array, row: Any, given: Any) -> SampledFactors:
+    def _unmasked_factors(self, key: Array, row: Any, given: Any) -> SampledFactors:
         """All factors by name; each has its own key, so its samples do not depend on the other factors."""
         components = self._components(key, row)
         factors = {}
