@@ -40,7 +40,9 @@ def check(options: Any, default: Any, scene: Any, video: Any, annotations: Any, 
     annotated = [name for name in ("contacts", "energy", "lyapunov") if getattr(annotations, name)]
     violations = [name for name in options.change if name in VIOLATIONS]
     if annotated and violations:
-        raise ValueError(f"change is {violations[0]}, which breaks the laws of motion: annotations.{annotated[0]} must be off")
+        raise ValueError(
+            f"change is {violations[0]}, which breaks the laws of motion: annotations.{annotated[0]} must be off"
+        )
 
 
 def _check_intervention(name: str, scene: Any, layout: Layout, video: Any, camera: Any) -> None:
