@@ -16,12 +16,12 @@ import numpy as np
 from gen2d.records.axes import Array
 
 
-def single(value: float) -> float:
+def to_float32(value: float) -> float:
     """The nearest float32."""
     return float(np.float32(value))
 
 
-def after(value: float) -> float:
+def next_float32(value: float) -> float:
     """The next float32 above a number."""
     return float(np.nextafter(np.float32(value), np.float32(np.inf)))
 
@@ -44,7 +44,7 @@ class Span(NamedTuple):
         x = np.asarray(values, np.float32).astype(np.float64)
         return (x >= self.low) & (x < self.high) & (~np.asarray(self.whole) | (x == np.floor(x)))
 
-    def meet(self, other: "Span") -> "Span | None":
+    def intersect(self, other: "Span") -> "Span | None":
         """Intersection of two spans; None if it is empty."""
         overlap = Span(max(self.low, other.low), min(self.high, other.high), self.whole or other.whole)
         first = math.ceil(overlap.low) if overlap.whole and math.isfinite(overlap.low) else overlap.low
@@ -53,10 +53,7 @@ class Span(NamedTuple):
 
 def point(value: float) -> Span:
     """Span of a single float32."""
-    return Span(single(value), after(value))
-
-
-EVERYTHING = Span(-math.inf, math.inf)
+    return Span(to_float32(value), next_float32(value))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -90,7 +87,7 @@ class Distribution:
         low, high = self.support
         if self.kind == "integer":
             return (Span(low, high + 1, whole=True),)
-        return (point(low),) if low == high else (Span(single(low), single(high)),)
+        return (point(low),) if low == high else (Span(to_float32(low), to_float32(high)),)
 
     def contains(self, values: Any) -> np.ndarray:
         """Whether each value lies in the support."""
@@ -107,7 +104,7 @@ class Distribution:
         """Independent samples of this shape, float32 (int32 for `integer`)."""
         n = self.numbers
         if self.kind == "mixture":
-            return self._mixed(key, shape)
+            return self._sample_mixture(key, shape)
         if self.kind == "constant":
             return jnp.full(shape, n[0], jnp.float32)
         if self.kind == "integer":
@@ -132,7 +129,7 @@ class Distribution:
             return [(1.0, self)]
         return [(weight / sum(self.numbers), part) for weight, part in zip(self.numbers, self.parts, strict=True)]
 
-    def _mixed(self, key: Array, shape: tuple[int, ...]) -> Array:
+    def _sample_mixture(self, key: Array, shape: tuple[int, ...]) -> Array:
         component_key, value_key = jax.random.split(key)
         thresholds = np.cumsum(self.numbers)[:-1] / sum(self.numbers)
         chosen = (jax.random.uniform(component_key, shape)[..., None] >= jnp.asarray(thresholds, jnp.float32)).sum(-1)

@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from gen2d.config.config import Config, checked_seed, load_config, own_files
+from gen2d.config.config import Config, checked_seed, load_config, user_plugin_files
 from gen2d.config.trust import remember
 from gen2d.core.errors import ConfigError
 from gen2d.core.progress import progress, stopping_on_sigterm
@@ -144,7 +144,7 @@ def generate(
 def _counts(config: Config, n: int, split: str | None) -> dict[str, int]:
     """Requested number of videos, by split."""
     if split is not None:
-        config.row(split)  # raises ConfigError if there is no such split
+        config.split_index(split)  # raises ConfigError if there is no such split
         return {split: n}
     return {each.name: each.videos or n for each in config.splits} or {"train": n}
 
@@ -184,7 +184,7 @@ def dataset_of(
         constants=schema.constants,
         conventions=CONVENTIONS,
         command="python -m gen2d --config config.yaml",
-        copies={path: config.copies[name] for path, name in own_files(config.plain()).items()},
+        copies={path: config.copies[name] for path, name in user_plugin_files(config.plain()).items()},
     )
 
 

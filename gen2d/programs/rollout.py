@@ -100,9 +100,9 @@ class Rollout:
 
         Raises NoVideoError if no attempt at some video lies in the ranges that the config requires.
         """
-        root, row = keys_module.seed_words(self.config.seed, zlib.crc32(split.encode())), self.config.row(split)
+        root, row = keys_module.seed_words(self.config.seed, zlib.crc32(split.encode())), self.config.split_index(split)
         numbers = numbers.astype(np.uint32)
-        grid = self.sampler.combination(row, root, numbers)
+        grid = self.sampler.grid_values(row, root, numbers)
 
         def simulate_rows(rows: np.ndarray, attempts: np.ndarray) -> DeviceBatch:
             sharded = self._shard_over_devices((grid[rows], numbers[rows], attempts.astype(np.uint32)))
@@ -175,14 +175,14 @@ class Rollout:
         if config.matched.change:
 
             def member(key: Array, change: FactorChange | None = None) -> tuple[dict[str, Array], SampledScene]:
-                return self.sampler.sampled(key, row, change=change)
+                return self.sampler.sample(key, row, change=change)
 
             factors, sampled, trajectory, matched_columns = simulate_module.simulate_members(
                 keys, numbers, config, self.layout, member, self._trajectory
             )
         else:
             own_keys = rejection.attempt_keys(keys, attempts) if self.quality_ranges else keys
-            factors, sampled = jax.vmap(self.sampler.sampled, (0, None, 0))(own_keys, row, grid)
+            factors, sampled = jax.vmap(self.sampler.sample, (0, None, 0))(own_keys, row, grid)
             trajectory = self._trajectory(sampled.scene, sampled.state)
         scene, between, trajectory = sampled.scene, trajectory.between, dataclasses.replace(trajectory, between=None)
 
@@ -195,7 +195,7 @@ class Rollout:
         columns["objects/color"] = colors
         columns |= render.camera_columns(render_scenes.instants.view)
         columns |= {f"factors/{name}": values.astype(jnp.float32) for name, values in factors.items()}
-        columns |= jax.vmap(self.sampler.outside)(factors)
+        columns |= jax.vmap(self.sampler.ood_distances)(factors)
         columns["quality/rejected_draws"] = sampled.rejected
         if config.annotations.simulated.lyapunov:
             columns["quality/lyapunov"] = self._lyapunov(keys, sampled)
