@@ -39,10 +39,7 @@ def to_world(view: CameraView, columns: Array, rows: Array, height: int, width: 
     """World coordinates x and y [..., T, P] in m of columns and rows [..., T, P] in px."""
     cos, sin = jnp.cos(view.angle)[..., None], jnp.sin(view.angle)[..., None]
     right, up = (columns - width / 2) / view.scale[..., None], (height / 2 - rows) / view.scale[..., None]
-    return (
-        view.center[..., None, 0] + right * cos - up * sin,
-        view.center[..., None, 1] + right * sin + up * cos,
-    )
+    return (view.center[..., None, 0] + right * cos - up * sin, view.center[..., None, 1] + right * sin + up * cos)
 
 
 def pixel_at(column: Array, row: Array, height: int, width: int) -> tuple[Array, Array]:
@@ -55,23 +52,23 @@ def pixel_at(column: Array, row: Array, height: int, width: int) -> tuple[Array,
     return jnp.clip(i, 0, height - 1) * width + jnp.clip(j, 0, width - 1), inside
 
 
-def fitted(bounds: tuple[float, ...], height: int, width: int, margin: float) -> tuple[tuple[float, float], float]:
+def fit_bounds(bounds: tuple[float, ...], height: int, width: int, margin: float) -> tuple[tuple[float, float], float]:
     """Centre (m) and scale (px/m) that fit `bounds` (left, bottom, right, top) and `margin` in m into a frame."""
     left, bottom, right, top = bounds
     scale = apply(min, width / (right - left + 2 * margin), height / (top - bottom + 2 * margin))
     return ((left + right) / 2, (bottom + top) / 2), scale
 
 
-def moves(options: Any) -> bool:
+def may_move(options: Any) -> bool:
     """Whether the view may change during a video."""
     still = (0.0, 0.0)
     motions = (*options.pan, options.zoom, options.turn, options.shake)
     return options.follow is not None or any(motion.support != still for motion in motions)
 
 
-def base(options: Any, layout: Layout, height: int, width: int) -> tuple[tuple[float, float], float]:
+def initial_view(options: Any, layout: Layout, height: int, width: int) -> tuple[tuple[float, float], float]:
     """Centre (m) and scale (px/m) of the camera at the start of a video."""
-    center, scale = fitted(layout.bounds, height, width, options.margin)
+    center, scale = fit_bounds(layout.bounds, height, width, options.margin)
     if options.center is not None:
         center = options.center[0], options.center[1]
     return center, options.scale or scale
@@ -80,10 +77,12 @@ def base(options: Any, layout: Layout, height: int, width: int) -> tuple[tuple[f
 def largest_scale(options: Any, layout: Layout, height: int, width: int, seconds: float) -> float:
     """Upper bound of the scale (px/m) over a video of `seconds`; infinite if zoom may reach a factor of exp(50)."""
     rate = apply(max, options.zoom.support[1], 0.0) * seconds
-    return base(options, layout, height, width)[1] * apply(math.exp, rate) if rate < 50 else math.inf
+    return initial_view(options, layout, height, width)[1] * apply(math.exp, rate) if rate < 50 else math.inf
 
 
-def filmed(key: Array, options: Any, layout: Layout, states: State, fps: float, height: int, width: int) -> CameraView:
+def sample_view(
+    key: Array, options: Any, layout: Layout, states: State, fps: float, height: int, width: int
+) -> CameraView:
     """View of one video: motion sampled from the options, relative to the followed object if there is one."""
     frames = states.position.shape[0]
     time = jnp.arange(frames, dtype=jnp.float32) / fps
@@ -91,7 +90,7 @@ def filmed(key: Array, options: Any, layout: Layout, states: State, fps: float, 
     def sample(name: str, source: Any) -> Array:
         return source.sample(key_for(key, name), ())
 
-    start, scale = base(options, layout, height, width)
+    start, scale = initial_view(options, layout, height, width)
     pan = jnp.stack([sample(f"pan {axis}", speed) for axis, speed in zip("xy", options.pan, strict=True)])
     center = jnp.asarray(start, jnp.float32) + time[:, None] * pan
     if options.follow is not None:

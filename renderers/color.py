@@ -15,7 +15,7 @@ def palette(key: Array, count: int, distance: float, backgrounds: Array) -> Arra
     Each colour is the first of `TRIES` candidates at that distance, or the farthest candidate if there is none. The
     distance is `contrast`, from 0 to 765.
     """
-    candidates, offset = _vivid(key, count * TRIES).reshape(count, TRIES, 3), len(backgrounds)
+    candidates, offset = _vivid_colors(key, count * TRIES).reshape(count, TRIES, 3), len(backgrounds)
 
     def add(chosen: Array, entry: tuple[Array, Array]) -> tuple[Array, Array]:
         index, colors = entry
@@ -34,7 +34,7 @@ def contrast(a: Array, b: Array) -> Array:
     return jnp.sqrt((2 + mean / 256) * red**2 + 4 * green**2 + (2 + (255 - mean) / 256) * blue**2)
 
 
-def _vivid(key: Array, count: int) -> Array:
+def _vivid_colors(key: Array, count: int) -> Array:
     """Random saturated sRGB colours [count, 3] of any hue, rounded to integers."""
     hue, saturation, value = jax.random.uniform(
         key, (3, count), minval=jnp.asarray([[0.0], [0.45], [0.55]]), maxval=jnp.asarray([[6.0], [1.0], [1.0]])

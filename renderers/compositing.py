@@ -1,8 +1,8 @@
 """Compositing: layers painted over full-size images, back to front.
 
-A `Painter` is a function `paint(canvas, cover, color, name)` that paints one layer: its coverage [I, H, W] from 0 to 1,
-its sRGB colour, and its id. The canvas is a `LayerCanvas` of frames and owners, or a float image. The owner of a pixel
-is the object that the pixel shows most of.
+A `Painter` is a function `paint(canvas, cover, color, object_id)` that paints one layer: its coverage [I, H, W] from 0
+to 1, its sRGB colour, and its id. The canvas is a `LayerCanvas` of frames and owners, or a float image. The owner of
+a pixel is the object that the pixel shows most of.
 """
 
 import math
@@ -20,10 +20,10 @@ from gen2d.renderers.color import LINEAR, to_linear, to_srgb
 from gen2d.renderers.noise import textured
 from gen2d.renderers.plan import FramePlan, RenderScene
 from gen2d.renderers.primitives import Instants, PixelWindow, object_parts
-from gen2d.renderers.shading import EdgeSamples, covered_color, edge_samples, fills_of
+from gen2d.renderers.shading import EdgeTerms, covered_color, edge_terms, fills_of
 
-FULL = 2**15 - 1  # a quantised coverage of 1
-NOBODY = FULL << 8  # owner of a pixel that shows only background
+FULL_COVER = 2**15 - 1  # a quantised coverage of 1
+NO_OWNER = FULL_COVER << 8  # owner of a pixel that shows only background
 OCCLUDER = 255  # id of all occluders
 
 Painter = Callable[[Any, Array, Array, Any], Any]
@@ -39,22 +39,22 @@ class LayerCanvas(NamedTuple):
 # ---- One layer
 
 
-def to_levels(cover: Array) -> Array:
-    """Coverage from 0 to 1 as int16 from 0 to FULL."""
-    return (cover * FULL + 0.5).astype(jnp.int32).astype(jnp.int16)
+def quantize_cover(cover: Array) -> Array:
+    """Coverage from 0 to 1 as int16 from 0 to FULL_COVER."""
+    return (cover * FULL_COVER + 0.5).astype(jnp.int32).astype(jnp.int16)
 
 
-def to_ink(color: Array) -> Array:
+def quantize_color(color: Array) -> Array:
     """Colour rounded to int16."""
     return (color + 0.5).astype(jnp.int32).astype(jnp.int16)
 
 
 def over(under: Array, cover: Array, color: Array, linear: bool) -> Array:
-    """Composite of a layer over a uint8 image [..., 3]; `to_levels` gives the coverage [...], `to_ink` the colour."""
+    """Composite of a layer over a uint8 image [..., 3], from its quantised coverage [...] and colour."""
     cover = cover[..., None]
     if linear:
         light = jnp.asarray(LINEAR)[under.astype(jnp.int32)]
-        alpha = cover.astype(jnp.float32) * (1 / FULL)
+        alpha = cover.astype(jnp.float32) * (1 / FULL_COVER)
         mixed = light + alpha * (to_linear(color.astype(jnp.float32)) - light)
         return (to_srgb(mixed) + 0.5).astype(jnp.uint8)
     # Fixed point, so that tiles and dense rendering round alike: 5 fractional bits, in 16-bit integers, of which a
@@ -65,41 +65,42 @@ def over(under: Array, cover: Array, color: Array, linear: bool) -> Array:
     return (under + ((product + 16) >> 5)).astype(jnp.uint8)
 
 
-def ownership(owner: Array, cover: Array, name: Array | int) -> Array:
-    """Owner of each pixel after a layer of coverage by `to_levels` and id `name` is painted over the current owners.
+def ownership(owner: Array, cover: Array, object_id: Array | int) -> Array:
+    """Owner of each pixel after a layer of coverage by `quantize_cover` is painted over the current owners.
 
-    An owner packs the id of an object into its low 8 bits, and the visible share of the pixel, up to FULL, above them.
-    A layer scales the visible shares of everything below it by the same factor, so only the largest share is kept.
+    An owner packs the id of an object into its low 8 bits, and the visible share of the pixel, up to FULL_COVER,
+    above them. A layer scales the visible shares of everything below it by the same factor, so only the largest share
+    is kept.
     """
     cover = cover.astype(jnp.int32)
-    best = ((owner >> 8) * (FULL - cover) + FULL // 2) // FULL
-    return jnp.where(cover > best, (cover << 8) | name, (best << 8) | (owner & 255))
+    best = ((owner >> 8) * (FULL_COVER - cover) + FULL_COVER // 2) // FULL_COVER
+    return jnp.where(cover > best, (cover << 8) | object_id, (best << 8) | (owner & 255))
 
 
-def hard(linear: bool) -> Painter:
+def quantized_painter(linear: bool) -> Painter:
     """Painter of a `LayerCanvas`, which rounds each layer to integers."""
 
-    def paint(canvas: LayerCanvas, cover: Array, color: Array, name: Any) -> LayerCanvas:
+    def paint(canvas: LayerCanvas, cover: Array, color: Array, object_id: Any) -> LayerCanvas:
         image, owner = canvas
         return LayerCanvas(
-            None if image is None else over(image, to_levels(cover), to_ink(color), linear),
-            None if owner is None else ownership(owner, to_levels(cover), name),
+            None if image is None else over(image, quantize_cover(cover), quantize_color(color), linear),
+            None if owner is None else ownership(owner, quantize_cover(cover), object_id),
         )
 
     return paint
 
 
-def soft(linear: bool, sigma: float = 0.0) -> Painter:
+def float_painter(linear: bool, sigma: float = 0.0) -> Painter:
     """Painter of a float image in sRGB or linear light, without rounding; `sigma` (px) blurs each layer's coverage."""
 
-    def paint(image: Array, cover: Array, color: Array, name: Any) -> Array:
-        cover = blurred(cover, sigma) if sigma else cover
+    def paint(image: Array, cover: Array, color: Array, object_id: Any) -> Array:
+        cover = gaussian_blur(cover, sigma) if sigma else cover
         return image + cover[..., None] * ((to_linear(color) if linear else color) - image)
 
     return paint
 
 
-def blurred(cover: Array, sigma: float) -> Array:
+def gaussian_blur(cover: Array, sigma: float) -> Array:
     """Coverage [I, H, W] blurred by a Gaussian of standard deviation `sigma` (px), cut off at 4 sigma; edges repeat."""
     reach = math.ceil(4 * sigma)
     kernel = np.exp(-0.5 * (np.arange(-reach, reach + 1) / sigma) ** 2)
@@ -113,9 +114,9 @@ def blurred(cover: Array, sigma: float) -> Array:
 # ---- Full-size layers
 
 
-def background_image(stage: RenderScene, at: Instants, plan: FramePlan) -> Array:
+def background_image(scene: RenderScene, at: Instants, plan: FramePlan) -> Array:
     """Background [I, H, W, 3] in floats at the instants `at`; [1, H, W, 3] if it is a plain colour."""
-    background, first = stage.paint.background, stage.instants.view
+    background, first = scene.paint.background, scene.instants.view
     color, height, width = background.color, plan.height, plan.width
     if background.to_color is None and background.texture is None:
         return jnp.broadcast_to(color, (1, height, width, 3))
@@ -134,23 +135,23 @@ def background_image(stage: RenderScene, at: Instants, plan: FramePlan) -> Array
     return jnp.broadcast_to(color, (*x.shape, 3))
 
 
-def background_layer(stage: RenderScene, at: Instants, plan: FramePlan) -> LayerCanvas:
+def background_layer(scene: RenderScene, at: Instants, plan: FramePlan) -> LayerCanvas:
     """Canvas of the background alone at the instants `at`; its arrays are [1, ...] if they do not change."""
     return LayerCanvas(
-        (background_image(stage, at, plan) + 0.5).astype(jnp.uint8) if plan.frames else None,
-        jnp.full((1, plan.height, plan.width), NOBODY, jnp.int32) if plan.owners else None,
+        (background_image(scene, at, plan) + 0.5).astype(jnp.uint8) if plan.frames else None,
+        jnp.full((1, plan.height, plan.width), NO_OWNER, jnp.int32) if plan.owners else None,
     )
 
 
-def static_layer(stage: RenderScene, plan: FramePlan) -> LayerCanvas:
+def static_layer(scene: RenderScene, plan: FramePlan) -> LayerCanvas:
     """Canvas [1, ...] of the background and of static slots behind all moving ones, without occluders."""
-    first = jax.tree.map(lambda a: a[:1], stage.instants)
-    alone = stage._replace(occluders=None)
-    return all_over(background_layer(stage, first, plan), alone, plan, first, plan.behind, hard(plan.linear))
+    first = jax.tree.map(lambda a: a[:1], scene.instants)
+    canvas, alone = background_layer(scene, first, plan), scene._replace(occluders=None)
+    return paint_runs(canvas, alone, plan, first, plan.static_runs, quantized_painter(plan.linear))
 
 
-def all_over(
-    canvas: Any, stage: RenderScene, plan: FramePlan, at: Instants, runs: list[tuple[SlotGroup, int]], paint: Painter
+def paint_runs(
+    canvas: Any, scene: RenderScene, plan: FramePlan, at: Instants, runs: list[tuple[SlotGroup, int]], paint: Painter
 ) -> Any:
     """Canvas with the slots of `runs`, and the occluders between them, painted over its full size.
 
@@ -167,63 +168,63 @@ def all_over(
         ) -> Any:
             def paint_slot(canvas: Any, entry: tuple) -> tuple[Any, None]:
                 edges, fills, slot, rank = entry
-                canvas = static_objects(canvas, stage, plan, lambda of: of == rank, paint)
+                canvas = paint_occluders(canvas, scene, plan, lambda of: of == rank, paint)
                 return paint(canvas, *covered_color(edges, fills, window, plan.largest(run)), slot + 1), None
 
             offsets = jnp.arange(run.count)
-            entries = cut_of(stage, plan, at, run, first, window), fills_of(stage.paint, slots)
+            entries = run_edge_terms(scene, plan, at, run, first, window), fills_of(scene.paint, slots)
             return jax.lax.scan(paint_slot, canvas, (*entries, first + offsets, rank + offsets))[0]
 
-        needed = stage.occluders is not None or stage.paint.drawn[slots].any()
+        needed = scene.occluders is not None or scene.paint.drawn[slots].any()
         canvas = jax.lax.cond(needed, paint_run, lambda same: same, canvas)
         rank += run.count
     return canvas
 
 
-def moving_objects(canvas: Any, stage: RenderScene, plan: FramePlan, at: Instants, paint: Painter) -> Any:
+def paint_moving(canvas: Any, scene: RenderScene, plan: FramePlan, at: Instants, paint: Painter) -> Any:
     """Canvas with all moving slots and all occluders painted over its full size."""
-    canvas = all_over(canvas, stage, plan, at, [span for group in plan.groups for span in group.runs], paint)
-    return static_objects(canvas, stage, plan, lambda rank: rank >= plan.moving, paint)
+    canvas = paint_runs(canvas, scene, plan, at, [span for group in plan.groups for span in group.runs], paint)
+    return paint_occluders(canvas, scene, plan, lambda rank: rank >= plan.moving, paint)
 
 
-def static_objects(
-    canvas: Any, stage: RenderScene, plan: FramePlan, here: Callable[[Array], Array], paint: Painter
+def paint_occluders(
+    canvas: Any, scene: RenderScene, plan: FramePlan, here: Callable[[Array], Array], paint: Painter
 ) -> Any:
     """Canvas with the occluders painted whose rank satisfies `here`."""
-    if stage.occluders is None:
+    if scene.occluders is None:
         return canvas
-    for i, rank in enumerate(stage.occluders.rank):
-        cover, color = occluder(stage, plan, i, here(rank))
+    for i, rank in enumerate(scene.occluders.rank):
+        cover, color = occluder_layer(scene, plan, i, here(rank))
         canvas = paint(canvas, cover, color, OCCLUDER)
     return canvas
 
 
-def occluder(stage: RenderScene, plan: FramePlan, i: int, here: Array) -> tuple[Array, Array]:
+def occluder_layer(scene: RenderScene, plan: FramePlan, i: int, here: Array) -> tuple[Array, Array]:
     """Coverage [1, H, W] and colour [3] of occluder `i`; the coverage is 0 unless `here` is true."""
-    assert stage.occluders is not None
-    left, top, right, bottom = stage.occluders.box[i]
+    assert scene.occluders is not None
+    left, top, right, bottom = scene.occluders.box[i]
 
     def part(count: int, low: Array, high: Array) -> Array:
         edge = jnp.arange(count, dtype=jnp.float32)
         return jnp.clip(jnp.minimum(high, edge + 1) - jnp.maximum(low, edge), 0.0, 1.0)
 
     cover = part(plan.height, top, bottom)[:, None] * part(plan.width, left, right)
-    return jnp.where(here, cover, 0.0)[None], stage.occluders.color[i]
+    return jnp.where(here, cover, 0.0)[None], scene.occluders.color[i]
 
 
-def cut_of(
-    stage: RenderScene, plan: FramePlan, at: Instants, run: SlotGroup, first: int, window: PixelWindow
-) -> EdgeSamples:
-    """Edge samples of a run's slots in their windows at the instants `at`; arrays [k, I, ...].
+def run_edge_terms(
+    scene: RenderScene, plan: FramePlan, at: Instants, run: SlotGroup, first: int, window: PixelWindow
+) -> EdgeTerms:
+    """Edge terms of a run's slots in their windows at the instants `at`; arrays [k, I, ...].
 
     The loop over slots keeps the compiler from computing the parts again for each row and column.
     """
-    parts = object_parts(run, first, stage.bodies, at, stage.paint, plan.height, plan.width)
-    toned = stage.paint.shade is not None or stage.paint.texture is not None
-    corners = [jnp.broadcast_to(jnp.asarray(edge), parts.turn.column.shape) for edge in (window.top, window.left)]
+    parts = object_parts(run, first, scene.bodies, at, scene.paint, plan.height, plan.width)
+    varied = scene.paint.shade is not None or scene.paint.texture is not None
+    corners = [jnp.broadcast_to(jnp.asarray(edge), parts.pose.column.shape) for edge in (window.top, window.left)]
 
-    def sample(entry: tuple) -> EdgeSamples:
+    def sample(entry: tuple) -> EdgeTerms:
         part, top, left = entry
-        return edge_samples(part, PixelWindow(top, left, window.rows, window.columns), run.shape == "circle", toned)
+        return edge_terms(part, PixelWindow(top, left, window.rows, window.columns), run.shape == "circle", varied)
 
     return jax.lax.map(sample, (parts, *corners))

@@ -9,37 +9,37 @@ from gen2d.renderers.plan import FramePlan, RenderScene
 from gen2d.renderers.primitives import Primitive, object_parts
 
 
-def bounding_boxes(stage: RenderScene, plan: FramePlan) -> Array:
+def bounding_boxes(scene: RenderScene, plan: FramePlan) -> Array:
     """Bounding boxes [T, K, 4] px (x0 y0 x1 y1) of whole objects as rendered; 0 for slots that are not rendered."""
 
-    def box(figure: Primitive, disc: bool) -> Array:
-        corners = figure.corners[..., None, :] if disc else figure.corners
-        radius = 0.0 if figure.radius is None else figure.radius[..., None]
+    def box(primitive: Primitive, disc: bool) -> Array:
+        corners = primitive.corners[..., None, :] if disc else primitive.corners
+        radius = 0.0 if primitive.radius is None else primitive.radius[..., None]
         bounds = jnp.concatenate([corners.min(-2) - radius, corners.max(-2) + radius], -1)
-        return jnp.where(area_of(figure, disc)[..., None] > 0, bounds, 0.0)
+        return jnp.where(area_of(primitive, disc)[..., None] > 0, bounds, 0.0)
 
-    return _of_slots(stage, plan, box)
+    return _measure_slots(scene, plan, box)
 
 
-def areas(stage: RenderScene, plan: FramePlan) -> Array:
+def areas(scene: RenderScene, plan: FramePlan) -> Array:
     """Areas [T, K] px^2 of whole objects as rendered."""
-    return _of_slots(stage, plan, area_of)
+    return _measure_slots(scene, plan, area_of)
 
 
-def area_of(figure: Primitive, disc: bool) -> Array:
+def area_of(primitive: Primitive, disc: bool) -> Array:
     """Areas [...] px^2 of primitives: core, perimeter times radius, and a disc (Steiner's formula)."""
-    radius = jnp.zeros(()) if figure.radius is None else figure.radius
+    radius = jnp.zeros(()) if primitive.radius is None else primitive.radius
     round_part = jnp.pi * radius**2
     if disc:
         return round_part
-    corners, following = figure.corners, jnp.roll(figure.corners, -1, axis=-2)
+    corners, following = primitive.corners, jnp.roll(primitive.corners, -1, axis=-2)
     core = (corners[..., 0] * following[..., 1] - corners[..., 1] * following[..., 0]).sum(-1) / 2
     return core + radius * jnp.sqrt(((following - corners) ** 2).sum(-1)).sum(-1) + round_part
 
 
-def _of_slots(stage: RenderScene, plan: FramePlan, measure: Callable[[Primitive, bool], Array]) -> Array:
+def _measure_slots(scene: RenderScene, plan: FramePlan, measure: Callable[[Primitive, bool], Array]) -> Array:
     measures = []
     for run, first in plan.layout.spans:
-        parts = object_parts(run, first, stage.bodies, stage.instants, stage.paint, plan.height, plan.width)
+        parts = object_parts(run, first, scene.bodies, scene.instants, scene.paint, plan.height, plan.width)
         measures.append(measure(parts.whole, run.shape == "circle"))
     return jnp.moveaxis(jnp.concatenate(measures), 0, 1)

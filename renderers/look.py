@@ -19,24 +19,24 @@ from gen2d.renderers.paint import Background, Paint, Texture
 class LineOptions:
     """Options of segments, which are rendered as lines."""
 
-    wall_width: float = option(1.5, float, "px", "of a segment's line, beyond its own radius; 0: not drawn", low=0)
+    wall_width: float = option(1.5, float, "px", "line width of segments beyond their radius; 0: not drawn", low=0)
 
 
 @dataclasses.dataclass(frozen=True)
 class PlainOptions(LineOptions):
     """Options of the background, colours and lines of plain shapes."""
 
-    background_kind: str = option("plain", str, "", "what is behind everything", choices=("plain", "gradient", "noise"))
-    background: tuple = option(
-        [20, 20, 20], int, "sRGB", "behind everything; where a gradient or noise begins", parts=3, low=0, high=255
+    background_kind: str = option("plain", str, "", "kind of the background", choices=("plain", "gradient", "noise"))
+    background: tuple = option([20, 20, 20], int, "sRGB", "first color of the background", parts=3, low=0, high=255)
+    background_to: tuple = option(
+        [80, 80, 110], int, "sRGB", "second color of the background", parts=3, low=0, high=255
     )
-    background_to: tuple = option([80, 80, 110], int, "sRGB", "where it ends", parts=3, low=0, high=255)
     background_cell: float = option(
-        0.2, float, "1", "size of the noise's spots, over the scene's shorter side", above=0
+        0.2, float, "1", "cell size of the noise, over the shorter side of the scene", above=0
     )
-    palette: str = option("scene", str, "", "whose colours objects have", choices=("scene", "random"))
+    palette: str = option("scene", str, "", "source of the objects' colors", choices=("scene", "random"))
     contrast: float = option(
-        120.0, float, "1", "least difference of random colours and of the background, 0 to 765", low=0, high=765
+        120.0, float, "1", "smallest contrast of random colors and the background, 0 to 765", low=0, high=765
     )
 
 
@@ -47,12 +47,12 @@ def line_margin(options: LineOptions) -> float:
 
 def plain(scene: Scene, layout: Layout, options: PlainOptions, key: Array) -> Paint:
     """Paint with one colour per slot. The same key gives the same colours in all looks."""
-    background = background_of(options, layout, jax.random.fold_in(key, 1))
-    colors = colors_of(scene, layout, options, key, background)
+    background = sample_background(options, layout, jax.random.fold_in(key, 1))
+    colors = slot_colors(scene, layout, options, key, background)
     return Paint(background, colors, *line_fields(scene, options))
 
 
-def background_of(options: PlainOptions, layout: Layout, key: Array) -> Background:
+def sample_background(options: PlainOptions, layout: Layout, key: Array) -> Background:
     """Background by `background_kind`: plain, a gradient in a random direction, or noise."""
     color, to_color = (jnp.asarray(c, jnp.float32) for c in (options.background, options.background_to))
     if options.background_kind == "plain":
@@ -64,7 +64,7 @@ def background_of(options: PlainOptions, layout: Layout, key: Array) -> Backgrou
     return Background(color, texture=Texture(jax.random.bits(key, (), jnp.uint32), cell, to_color))
 
 
-def shades(background: Background) -> Array:
+def background_colors(background: Background) -> Array:
     """Colours [B, 3] that represent a background: its only colour, or its two end colours and their mean."""
     color, end = background.color, background.to_color if background.texture is None else background.texture.color
     return color[None] if end is None else jnp.stack([color, (color + end) / 2, end])
@@ -72,16 +72,16 @@ def shades(background: Background) -> Array:
 
 def mean_color(background: Background) -> Array:
     """Mean colour [3] of a background."""
-    return shades(background).mean(0)
+    return background_colors(background).mean(0)
 
 
-def colors_of(scene: Scene, layout: Layout, options: PlainOptions, key: Array, background: Background) -> Array:
+def slot_colors(scene: Scene, layout: Layout, options: PlainOptions, key: Array, background: Background) -> Array:
     """Colours [K, 3] of the slots: those of the scene, or for moving slots a random palette that contrasts with itself
     and with the background."""
     colors, moving = scene.objects.color.astype(jnp.float32), np.flatnonzero(are_moving(layout))
     if options.palette == "scene" or not len(moving):
         return colors
-    return colors.at[moving].set(palette(key, len(moving), options.contrast, shades(background)))
+    return colors.at[moving].set(palette(key, len(moving), options.contrast, background_colors(background)))
 
 
 def line_fields(scene: Scene, options: LineOptions) -> tuple[Array, Array]:

@@ -8,7 +8,7 @@ from gen2d.records.axes import Array
 from gen2d.renderers.paint import Texture
 
 
-def _hashed(x: Array) -> Array:
+def _hash_word(x: Array) -> Array:
     """Well-mixed 32-bit hash of a 32-bit word (the finalizer 'lowbias32' of C. Wellons, 2018)."""
     x = (x ^ (x >> 16)) * jnp.uint32(0x7FEB352D)
     x = (x ^ (x >> 15)) * jnp.uint32(0x846CA68B)
@@ -19,7 +19,7 @@ def hashed(*words: Any) -> Array:
     """Random 32-bit words, uint32, of combinations of integers; the arguments are broadcast."""
     state = jnp.uint32(0x9E3779B9)
     for word in words:
-        state = _hashed(state ^ jnp.asarray(word).astype(jnp.uint32))
+        state = _hash_word(state ^ jnp.asarray(word).astype(jnp.uint32))
     return state
 
 
@@ -40,7 +40,7 @@ def _octave(x: Array, y: Array, seed: Array) -> Array:
     i, j = left.astype(jnp.int32), top.astype(jnp.int32)
 
     def at(di: int, dj: int) -> Array:
-        return fraction(_hashed(_hashed((i + di).astype(jnp.uint32) ^ seed) ^ (j + dj).astype(jnp.uint32)))
+        return fraction(_hash_word(_hash_word((i + di).astype(jnp.uint32) ^ seed) ^ (j + dj).astype(jnp.uint32)))
 
     upper, lower = at(0, 0) * (1 - u) + at(1, 0) * u, at(0, 1) * (1 - u) + at(1, 1) * u
     return upper * (1 - v) + lower * v

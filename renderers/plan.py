@@ -21,7 +21,7 @@ class Occluders(NamedTuple):
 
     box: Array  # [O, 4] px: left, top, right, bottom
     color: Array  # [O, 3] sRGB
-    rank: Array  # [O] number of slots of `FramePlan.groups` behind them, in drawing order
+    rank: Array  # [O] number of slots of `FramePlan.groups` static_runs them, in drawing order
 
 
 class RenderScene(NamedTuple):
@@ -52,7 +52,7 @@ class FramePlan:
     exposed: int = 0  # instants per exposure; 0: no motion blur
 
     @property
-    def behind(self) -> list[tuple[SlotGroup, int]]:
+    def static_runs(self) -> list[tuple[SlotGroup, int]]:
         """Runs of the static layer, each with its first slot, back to front; empty if the camera moves."""
         spans = self.layout.painted
         first = next((i for i, (run, _) in enumerate(spans) if not self.still or run.kind != STATIC), len(spans))
@@ -62,8 +62,10 @@ class FramePlan:
     def groups(self) -> "list[TileGroup]":
         """Remaining runs, in consecutive groups that share a tile size."""
         groups: list[TileGroup] = []
-        for run, first in self.layout.painted[len(self.behind) :]:
-            reach = self._reach(run)
+        for run, first in self.layout.painted[len(self.static_runs) :]:
+            reach = self.largest(run)
+            if 2 * reach + 2 >= max(self.height, self.width):  # a tile would be as large as the frame
+                reach = math.inf
             if groups and groups[-1].reach == reach:
                 groups[-1] = TileGroup((*groups[-1].runs, (run, first)), reach)
             else:
@@ -74,11 +76,6 @@ class FramePlan:
     def moving(self) -> int:
         """Number of slots in `groups`."""
         return sum(len(group.slots) for group in self.groups)
-
-    def _reach(self, run: SlotGroup) -> float:
-        """`largest`, but infinite if a tile would be as large as the frame."""
-        reach = self.largest(run)
-        return reach if 2 * reach + 2 < max(self.height, self.width) else math.inf
 
     def largest(self, run: SlotGroup) -> float:
         """Upper bound of the distance from centre to rim (px) of a run's objects; infinite for static runs."""

@@ -42,11 +42,11 @@ class ObjectParts(NamedTuple):
     whole: Primitive
     inner: Primitive | None
     mark: Primitive | None
-    turn: "BodyTransform"
+    pose: "ImagePose"
 
 
-class BodyTransform(NamedTuple):
-    """Transform from pixels to the body frame."""
+class ImagePose(NamedTuple):
+    """Poses of bodies in the image."""
 
     column: Array  # [...] px, of the centre
     row: Array
@@ -65,27 +65,28 @@ def object_parts(
     center = jnp.moveaxis(to_pixels(at.view, at.position[:, slots], height, width), 1, 0)
     angle = at.view.angle - at.angle[:, slots].T  # clockwise in the image, as y is down
     radius = bodies.radius[slots, None] * scale + (0.0 if paint.grow is None else paint.grow[slots, None])
-    corners, reach, ahead = _own(run, slots, bodies, scale, radius)
-    turn = BodyTransform(
+    corners, reach, ahead = _body_shape(run, slots, bodies, scale, radius)
+    pose = ImagePose(
         center[..., 0], center[..., 1], jnp.cos(angle), jnp.sin(angle), scale + jnp.zeros_like(angle), reach
     )
-    whole = _primitive(run, turn, corners, radius, drawn)
+    whole = _primitive(run, pose, corners, radius, drawn)
     inner = mark = None
     if paint.rim is not None:
         rim = paint.rim[slots, None]
         visible = drawn & (radius > rim) if run.shape != "polygon" else drawn
-        inner = _primitive(run, turn, _inset(run, corners, rim, radius), jnp.maximum(radius - rim, 0.0), visible)
+        inset = _inset_corners(run, corners, rim, radius)
+        inner = _primitive(run, pose, inset, jnp.maximum(radius - rim, 0.0), visible)
     if paint.mark is not None:
         # The round end of the bar lies beyond the rim, where nothing is painted.
         end = jnp.where(drawn, ahead, 0.0)
         zero = jnp.zeros_like(end)
         bar = jnp.stack([jnp.stack([zero, zero], -1), jnp.stack([end, zero], -1)], -2)
-        half = paint.mark[slots, None] * _nearest(run, corners, radius)
-        mark = Primitive(_placed(bar, turn), jnp.where(drawn, half, 0.0))
-    return ObjectParts(whole, inner, mark, turn)
+        half = paint.mark[slots, None] * _inradius(run, corners, radius)
+        mark = Primitive(_to_image(bar, pose), jnp.where(drawn, half, 0.0))
+    return ObjectParts(whole, inner, mark, pose)
 
 
-def _own(
+def _body_shape(
     run: SlotGroup, slots: slice, bodies: BodyGeometry, scale: Array, radius: Array
 ) -> tuple[Array | None, Array, Array]:
     """Corners [k, I, V, 2] of the core in the body frame with y down (None for a disc), distance of the farthest point
@@ -98,7 +99,7 @@ def _own(
         corners = bodies.vertices[slots, None, ::-1] * jnp.asarray([1.0, -1.0]) * scale[:, None, None]
         square = (corners**2).sum(-1).max(-1)
         reach = jnp.sqrt(jnp.maximum(square, 1e-12)) + radius  # finite derivative in empty slots
-        return corners, reach, _ahead(corners) + radius
+        return corners, reach, _rim_along_x(corners) + radius
     half = bodies.half_length[slots, None] * scale
     zero = jnp.zeros_like(half)
     corners = jnp.stack([jnp.stack([-half, zero], -1), jnp.stack([half, zero], -1)], -2)
@@ -114,19 +115,19 @@ def _sides(corners: Array) -> tuple[Array, Array]:
     return normal, jnp.where(square > 1e-12, (normal * corners).sum(-1), jnp.inf)
 
 
-def _ahead(corners: Array) -> Array:
+def _rim_along_x(corners: Array) -> Array:
     """Distance of a polygon's rim from its centre along its own x axis."""
     normal, distance = _sides(corners)
     facing = normal[..., 0] > 1e-6
     return jnp.where(facing, distance / jnp.where(facing, normal[..., 0], 1.0), jnp.inf).min(-1)
 
 
-def _nearest(run: SlotGroup, corners: Array | None, radius: Array) -> Array:
+def _inradius(run: SlotGroup, corners: Array | None, radius: Array) -> Array:
     """Distance of the nearest point of the rim from the centre."""
     return radius if run.shape != "polygon" or corners is None else _sides(corners)[1].min(-1) + radius
 
 
-def _inset(run: SlotGroup, corners: Array | None, rim: Array, radius: Array) -> Array | None:
+def _inset_corners(run: SlotGroup, corners: Array | None, rim: Array, radius: Array) -> Array | None:
     """Corners of a polygon inset by the part of the rim line that exceeds the radius, at most to the centre."""
     if run.shape != "polygon" or corners is None:
         return corners
@@ -144,18 +145,18 @@ def _inset(run: SlotGroup, corners: Array | None, rim: Array, radius: Array) -> 
     return corners - inset * (outgoing + incoming) / jnp.maximum(denominator, 1e-3)
 
 
-def _placed(corners: Array, turn: BodyTransform) -> Array:
-    cos, sin = turn.cos[..., None], turn.sin[..., None]
+def _to_image(corners: Array, pose: ImagePose) -> Array:
+    cos, sin = pose.cos[..., None], pose.sin[..., None]
     x, y = corners[..., 0], corners[..., 1]
-    return jnp.stack([turn.column[..., None] + x * cos - y * sin, turn.row[..., None] + x * sin + y * cos], -1)
+    return jnp.stack([pose.column[..., None] + x * cos - y * sin, pose.row[..., None] + x * sin + y * cos], -1)
 
 
-def _primitive(run: SlotGroup, turn: BodyTransform, corners: Array | None, radius: Array, drawn: Array) -> Primitive:
+def _primitive(run: SlotGroup, pose: ImagePose, corners: Array | None, radius: Array, drawn: Array) -> Primitive:
     """Primitive of some slots, with an area of 0 where `drawn` is false."""
     radius = jnp.where(drawn, radius, 0.0)
     if corners is None:
-        return Primitive(jnp.stack([turn.column, turn.row], -1), radius)
-    placed = _placed(jnp.where(drawn[..., None, None], corners, 0.0), turn)
+        return Primitive(jnp.stack([pose.column, pose.row], -1), radius)
+    placed = _to_image(jnp.where(drawn[..., None, None], corners, 0.0), pose)
     return Primitive(placed, None if run.shape == "polygon" and not run.rounded else radius)
 
 

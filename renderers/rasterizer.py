@@ -23,13 +23,13 @@ from gen2d.records.axes import Array
 from gen2d.renderers.color import to_linear, to_srgb
 from gen2d.renderers.compositing import (
     LayerCanvas,
-    all_over,
     background_image,
     background_layer,
-    cut_of,
-    hard,
-    moving_objects,
-    soft,
+    float_painter,
+    paint_moving,
+    paint_runs,
+    quantized_painter,
+    run_edge_terms,
     static_layer,
 )
 from gen2d.renderers.plan import FramePlan, RenderScene
@@ -40,72 +40,72 @@ from gen2d.renderers.tiles import draw_tiles
 from gen2d.xla import on_cpu
 
 
-def draw(stages: RenderScene, plan: FramePlan) -> tuple[Array | None, Array | None]:
+def draw(scenes: RenderScene, plan: FramePlan) -> tuple[Array | None, Array | None]:
     """Frames [n, T, H, W, 3] uint8 and owners [n, T, H, W] uint8, None if `plan` does not want them.
 
     Uses tiles on a CPU, and `draw_dense` elsewhere. Raises AssertionError for scenes of another layout.
     """
-    chex.assert_shape(stages.instants.position, (None, None, plan.layout.slots, 2))
-    return (draw_tiles if on_cpu() else draw_dense)(stages, plan)
+    chex.assert_shape(scenes.instants.position, (None, None, plan.layout.slots, 2))
+    return (draw_tiles if on_cpu() else draw_dense)(scenes, plan)
 
 
-def draw_dense(stages: RenderScene, plan: FramePlan) -> tuple[Array | None, Array | None]:
+def draw_dense(scenes: RenderScene, plan: FramePlan) -> tuple[Array | None, Array | None]:
     """Frames and owners as from `draw`, with each object evaluated at every pixel. The form for GPUs."""
-    return jax.vmap(functools.partial(_dense, plan=plan))(stages)
+    return jax.vmap(functools.partial(_draw_video, plan=plan))(scenes)
 
 
-def _dense(stage: RenderScene, plan: FramePlan) -> tuple[Array | None, Array | None]:
+def _draw_video(scene: RenderScene, plan: FramePlan) -> tuple[Array | None, Array | None]:
     now = dataclasses.replace(plan, frames=plan.frames and not plan.exposed)
-    frames, owners = _painted(stage, now, stage.instants)
-    if plan.frames and stage.exposed is not None:
+    frames, owners = _paint_instants(scene, now, scene.instants)
+    if plan.frames and scene.exposed is not None:
         alone = dataclasses.replace(plan, owners=False)
 
         def add(total: Array, at: Instants) -> tuple[Array, None]:
-            image = _painted(stage, alone, at).image
+            image = _paint_instants(scene, alone, at).image
             assert image is not None
             return total + image.astype(jnp.uint16), None
 
-        exposed = jax.tree.map(lambda a: jnp.moveaxis(a, 1, 0), stage.exposed)
-        zero = jnp.zeros((stage.instants.angle.shape[0], plan.height, plan.width, 3), jnp.uint16)
+        exposed = jax.tree.map(lambda a: jnp.moveaxis(a, 1, 0), scene.exposed)
+        zero = jnp.zeros((scene.instants.angle.shape[0], plan.height, plan.width, 3), jnp.uint16)
         frames = exposure_average(jax.lax.scan(add, zero, exposed)[0], plan.exposed)
-    if frames is not None and stage.noise is not None:
-        frames = add_noise(frames, stage.noise, stage.seed, jnp.arange(frames.shape[0]))
+    if frames is not None and scene.noise is not None:
+        frames = add_noise(frames, scene.noise, scene.seed, jnp.arange(frames.shape[0]))
     return frames, None if owners is None else (owners & 255).astype(jnp.uint8)
 
 
-def _painted(stage: RenderScene, plan: FramePlan, at: Instants) -> LayerCanvas:
+def _paint_instants(scene: RenderScene, plan: FramePlan, at: Instants) -> LayerCanvas:
     """Canvas of all layers at the instants `at`."""
-    start = static_layer(stage, plan) if plan.still else background_layer(stage, at, plan)
+    start = static_layer(scene, plan) if plan.still else background_layer(scene, at, plan)
     canvas = jax.tree.map(lambda a: jnp.broadcast_to(a, (len(at.angle), *a.shape[1:])), start)
-    return moving_objects(canvas, stage, plan, at, hard(plan.linear))
+    return paint_moving(canvas, scene, plan, at, quantized_painter(plan.linear))
 
 
-def draw_soft(stage: RenderScene, plan: FramePlan, sigma: float = 0.0) -> Array:
+def draw_soft(scene: RenderScene, plan: FramePlan, sigma: float = 0.0) -> Array:
     """Frames [T, H, W, 3] of one video as floats from 0 to 255, without rounding, noise or motion blur.
 
     They are differentiable in positions, angles, sizes, colours and the camera. `sigma` (px) blurs the coverage of each
     object; with 0 the frames are those of `draw` up to rounding. Raises AssertionError for a scene of another layout.
     """
-    chex.assert_shape(stage.instants.position, (None, plan.layout.slots, 2))
-    at, paint = stage.instants, soft(plan.linear, sigma)
-    image = background_image(stage, at, plan)
+    chex.assert_shape(scene.instants.position, (None, plan.layout.slots, 2))
+    at, paint = scene.instants, float_painter(plan.linear, sigma)
+    image = background_image(scene, at, plan)
     image = jnp.broadcast_to(to_linear(image) if plan.linear else image, (len(at.angle), *image.shape[1:]))
-    image = all_over(image, stage._replace(occluders=None), plan, at, plan.behind, paint)
-    image = moving_objects(image, stage, plan, at, paint)
+    image = paint_runs(image, scene._replace(occluders=None), plan, at, plan.static_runs, paint)
+    image = paint_moving(image, scene, plan, at, paint)
     return to_srgb(image) if plan.linear else image
 
 
-def alone(stage: RenderScene, plan: FramePlan, measure: Callable[[Array], Array]) -> Array:
+def alone(scene: RenderScene, plan: FramePlan, measure: Callable[[Array], Array]) -> Array:
     """Results [T, K, ...] of `measure` on the coverage [T, H, W] of each slot, rendered without any other slot."""
     window, results = PixelWindow(0, 0, plan.height, plan.width), []
     for run, first in plan.layout.spans:
         stands = plan.still and run.kind == STATIC
-        at = jax.tree.map(lambda a, stands=stands: a[:1] if stands else a, stage.instants)
-        edges = cut_of(stage, plan, at, run, first, window)
-        fills = fills_of(stage.paint, slice(first, first + run.count))
+        at = jax.tree.map(lambda a, stands=stands: a[:1] if stands else a, scene.instants)
+        edges = run_edge_terms(scene, plan, at, run, first, window)
+        fills = fills_of(scene.paint, slice(first, first + run.count))
         largest = plan.largest(run)
         values = jax.lax.map(
             lambda one, most=largest: measure(covered_color(one[0], one[1], window, most)[0]), (edges, fills)
         )
-        results.append(jnp.broadcast_to(values, (run.count, len(stage.instants.angle), *values.shape[2:])))
+        results.append(jnp.broadcast_to(values, (run.count, len(scene.instants.angle), *values.shape[2:])))
     return jnp.moveaxis(jnp.concatenate(results), 0, 1)

@@ -8,9 +8,9 @@ A file ends with an `ANNOTATION`, whose members `gen2d.plugin.Annotation` descri
         return {"motion/turn": abs(scenes.instants.angle)}
 
     ANNOTATION = Annotation(
-        options=option(False, bool, "", "how far each object has turned"),
-        fields={"motion/turn": Field("float32", "n T K", "rad", "from its start, either way")},
-        annotate=annotate,
+        options=option(False, bool, "", "rotation of each object"),
+        fields={"motion/turn": Field("float32", "n T K", "rad", "absolute rotation since the first frame")},
+        annotate=annotate
     )
 
 A config selects turn.py in this folder by `annotations: {turn: true}`, and a file elsewhere by its path, as in
@@ -34,18 +34,19 @@ def need_owners(annotations: Annotations) -> bool:
 
 def fields(annotations: Annotations, others: Mapping[str, Field]) -> dict[str, Field]:
     """Stored fields by name: `others` and those of the annotations. Raises ConfigError if a name is declared twice."""
-    return _joined(others, {plugin.name: plugin.contract.fields for plugin in annotations.wanted}, "field")
+    return _merged_unique(others, {plugin.name: plugin.contract.fields for plugin in annotations.wanted}, "field")
 
 
 def sizes(annotations: Annotations, plan: FramePlan, others: Mapping[str, int]) -> dict[str, int]:
     """Lengths of axes by letter: `others` and those of the annotations. Raises ConfigError for a repeated letter."""
     sizes_of = {plugin.name: plugin.contract.sizes(plan, plugin.options) for plugin in annotations.wanted}
-    return _joined(others, sizes_of, "axis")
+    return _merged_unique(others, sizes_of, "axis")
 
 
-def _joined(others: Mapping[str, Any], own: Mapping[str, Mapping[str, Any]], what: str) -> dict[str, Any]:
+def _merged_unique(others: Mapping[str, Any], added: Mapping[str, Mapping[str, Any]], what: str) -> dict[str, Any]:
+    """`others` with the members that each annotation adds."""
     merged = dict(others)
-    for name, members in own.items():
+    for name, members in added.items():
         duplicates = members.keys() & merged.keys()
         if duplicates:
             raise ConfigError(
@@ -55,7 +56,7 @@ def _joined(others: Mapping[str, Any], own: Mapping[str, Mapping[str, Any]], wha
     return merged
 
 
-def annotated(scenes: RenderScene, owners: Array | None, plan: FramePlan, annotations: Annotations) -> dict[str, Array]:
+def annotate(scenes: RenderScene, owners: Array | None, plan: FramePlan, annotations: Annotations) -> dict[str, Array]:
     """Annotations of n videos by their stored names; owners [n, T, H, W] uint8 are from `rasterizer.draw`.
 
     Raises ConfigError if an annotation returns other names, shapes or types than it declares.

@@ -10,7 +10,7 @@ def sizes(plan: FramePlan, on: bool) -> dict[str, int]:
     return {"B": -(-plan.height * plan.width // 8)}
 
 
-def annotate(stages: RenderScene, owners: Array | None, plan: FramePlan, on: bool) -> dict[str, Array]:
+def annotate(scenes: RenderScene, owners: Array | None, plan: FramePlan, on: bool) -> dict[str, Array]:
     """Packed masks of every slot."""
     pixels = plan.height * plan.width
     weights = jnp.asarray([128, 64, 32, 16, 8, 4, 2, 1], jnp.uint8)
@@ -20,14 +20,17 @@ def annotate(stages: RenderScene, owners: Array | None, plan: FramePlan, on: boo
         bits = jnp.pad(bits, [(0, 0), (0, -pixels % 8)]).reshape(len(bits), -1, 8)
         return jnp.where(bits, weights, 0).astype(jnp.uint8).sum(-1, dtype=jnp.uint8)
 
-    return {"masks/amodal": each_video(lambda stage: alone(stage, plan, packed), stages)}
+    return {"masks/amodal": each_video(lambda scene: alone(scene, plan, packed), scenes)}
 
 
 ANNOTATION = Annotation(
-    options=option(False, bool, "", "where each object is, seen or not, a bit a pixel"),
+    options=option(False, bool, "", "masks of whole objects, hidden parts included, one bit per pixel"),
     fields={
         "masks/amodal": Field(
-            "uint8", "n T K B", "1", "pixels half covered or more, seen or not; bits in rows, first pixel highest"
+            "uint8",
+            "n T K B",
+            "1",
+            "mask of pixels at least half covered, hidden parts included; row-major bits, first pixel highest",
         )
     },
     annotate=annotate,

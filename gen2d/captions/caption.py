@@ -20,10 +20,10 @@ from gen2d.captions.events import (
     MAX_EVENTS,
     EventColumns,
     VideoEvent,
-    as_json,
-    events_of,
+    core_points,
+    events_json,
     moving_slots,
-    view_corners,
+    video_events,
 )
 from gen2d.core.enums import SEGMENT, STATIC
 from gen2d.core.schema import Field
@@ -53,27 +53,30 @@ def fields(slots: int, frames: int) -> dict[str, Field]:
     """Stored text fields; the numbers of slots and frames alone determine their widths."""
     width = 2 + EVENT_BYTES * slots * math.ceil(frames / 16)
     return {
-        "text/caption": Field(f"S{CAPTION_BYTES}", "n", "UTF-8", "what is there and what happens first"),
+        "text/caption": Field(f"S{CAPTION_BYTES}", "n", "UTF-8", "description of the objects and of the first events"),
         "text/events": Field(
-            f"S{width}", "n", "JSON", "hits, what leaves and enters the view, and rest, in time's order, as many as fit"
+            f"S{width}",
+            "n",
+            "JSON",
+            "list of events by time (hits, objects leaving and entering the view, rest), as many as fit",
         ),
         "text/event_count": Field(
-            "int32", "n", "1", "events there were; those that did not fit are not in text/events"
+            "int32", "n", "1", "number of events, including those that did not fit into text/events"
         ),
     }
 
 
-def caption_fields(columns: EventColumns, video: Any) -> dict[str, np.ndarray]:
+def caption_fields(batch: EventColumns, video: Any) -> dict[str, np.ndarray]:
     """Text fields [n] of videos, from their other fields [n, ...]; `video` has frames, fps, height and width (px)."""
-    stored = fields(columns["objects/present"].shape[1], video.frames)
+    stored = fields(batch["objects/present"].shape[1], video.frames)
     rows = [
-        captions_of({name: columns[name][i] for name in NEEDED if name in columns}, video, stored)
-        for i in range(len(columns["objects/present"]))
+        video_texts({name: batch[name][i] for name in REQUIRED_FIELDS if name in batch}, video, stored)
+        for i in range(len(batch["objects/present"]))
     ]
     return {name: np.array([row[name] for row in rows], field.dtype) for name, field in stored.items()}
 
 
-NEEDED = (
+REQUIRED_FIELDS = (
     *(f"objects/{name}" for name in ("present", "kind", "shape", "radius", "half_length", "color")),
     *("objects/vertices", "objects/vertex_count", "world/gravity"),
     *(f"states/{name}" for name in ("position", "angle", "velocity", "angular_velocity")),
@@ -82,14 +85,14 @@ NEEDED = (
 )
 
 
-def captions_of(made: EventColumns, video: Any, stored: Mapping[str, Field]) -> dict[str, Any]:
+def video_texts(columns: EventColumns, video: Any, stored: Mapping[str, Field]) -> dict[str, Any]:
     """Text fields of one video, from its other fields."""
-    events = events_of(made, video)
-    missed = int(made["contacts/count"]) > len(made["contacts/kind"])
+    events = video_events(columns, video)
+    missed = int(columns["contacts/count"]) > len(columns["contacts/kind"])
     width = np.dtype(stored["text/events"].dtype).itemsize
     return {
-        "text/caption": caption(made, events, video.fps, missed).encode(),
-        "text/events": as_json(events, width).encode(),
+        "text/caption": caption(columns, events, video.fps, missed).encode(),
+        "text/events": events_json(events, width).encode(),
         "text/event_count": len(events),
     }
 
@@ -97,31 +100,30 @@ def captions_of(made: EventColumns, video: Any, stored: Mapping[str, Field]) -> 
 # ---- The caption
 
 
-def caption(made: EventColumns, events: list[VideoEvent], fps: float, missed: bool = False) -> str:
+def caption(columns: EventColumns, events: list[VideoEvent], fps: float, missed: bool = False) -> str:
     """Caption of the objects and the first events; `missed` says that there were more contacts than are stored."""
-    names, decimals = names_of(made), max(2, math.ceil(math.log10(fps)))
+    names, decimals = object_names(columns), max(2, math.ceil(math.log10(fps)))
 
     def text_of(shown: int) -> str:
         extra = len(events) - shown
         more = [f"{'At least' if missed else 'And'} {extra} more event{'s' if extra > 1 else ''}."] if extra else []
-        return " ".join([opening(made, names), *sentences(made, names, events[:shown], decimals), *more])
+        return " ".join([opening(columns, names), *sentences(columns, names, events[:shown], decimals), *more])
 
     texts = (text_of(shown) for shown in range(min(MAX_EVENTS, len(events)), -1, -1))
     return next(text for text in texts if len(text) <= CAPTION_BYTES)
 
 
-def opening(made: EventColumns, names: Mapping[int, str]) -> str:
+def opening(columns: EventColumns, names: Mapping[int, str]) -> str:
     """First sentence: the objects, the box and gravity."""
-    kinds = nouns(made)
-    moving = [kinds[slot] for slot in moving_slots(made)]
+    kinds = object_nouns(columns)
+    moving = [kinds[slot] for slot in moving_slots(columns)]
     obstacles = [noun for slot, noun in kinds.items() if noun in FIXED_NOUNS and noun != "wall"]
     box = " in a box" if all(f"the {side}" in names.values() for side in BOX) else ""
-    among = f" among {counted(obstacles)}" if obstacles else ""
-    text = f"{counted(moving)}{box}{among}{pulled(made['world/gravity'])}."
-    return text[0].upper() + text[1:]
+    among = f" among {count_phrase(obstacles)}" if obstacles else ""
+    return f"{count_phrase(moving)}{box}{among}{gravity_phrase(columns['world/gravity'])}.".capitalize()
 
 
-def counted(things: list[str]) -> str:
+def count_phrase(things: list[str]) -> str:
     """Nouns with their counts, such as: two balls and one box."""
     plural = {"box": "boxes"}
     parts = [
@@ -131,7 +133,7 @@ def counted(things: list[str]) -> str:
     return " and ".join([", ".join(parts[:-1]), parts[-1]] if parts[1:] else parts or ["nothing that moves"])
 
 
-def pulled(gravity: np.ndarray) -> str:
+def gravity_phrase(gravity: np.ndarray) -> str:
     """Phrase for the direction of gravity, for the end of the first sentence."""
     x, y = gravity.tolist()
     if not (x or y):
@@ -141,24 +143,24 @@ def pulled(gravity: np.ndarray) -> str:
     return f" under gravity to the {'right' if x > 0 else 'left'}"
 
 
-def nouns(made: EventColumns) -> dict[int, str]:
+def object_nouns(columns: EventColumns) -> dict[int, str]:
     """Noun of each object, by slot."""
     by_slot = {}
-    for slot in np.flatnonzero(made["objects/present"]).tolist():
-        shape = int(made["objects/shape"][slot])
-        if made["objects/kind"][slot] == STATIC:
+    for slot in np.flatnonzero(columns["objects/present"]).tolist():
+        shape = int(columns["objects/shape"][slot])
+        if columns["objects/kind"][slot] == STATIC:
             by_slot[slot] = FIXED_NOUNS[shape]
         else:
-            corners = int(made["objects/vertex_count"][slot]) if NOUNS[shape] == "polygon" else 0
+            corners = int(columns["objects/vertex_count"][slot]) if NOUNS[shape] == "polygon" else 0
             by_slot[slot] = CORNERS.get(corners, NOUNS[shape])
     return by_slot
 
 
-def names_of(made: EventColumns) -> dict[int, str]:
+def object_names(columns: EventColumns) -> dict[int, str]:
     """Name of each object, by slot, with its colour, and with a number if several would have the same name."""
-    kinds, walls = nouns(made), walls_of(made)
+    kinds, walls = object_nouns(columns), wall_names(columns)
     bare = {
-        slot: walls.get(slot, noun) if noun in FIXED_NOUNS else f"{color_name(made['objects/color'][slot])} {noun}"
+        slot: walls.get(slot, noun) if noun in FIXED_NOUNS else f"{color_name(columns['objects/color'][slot])} {noun}"
         for slot, noun in kinds.items()
     }
     counts, seen, names = Counter(bare.values()), Counter(), {}
@@ -168,28 +170,26 @@ def names_of(made: EventColumns) -> dict[int, str]:
     return names
 
 
-def walls_of(made: EventColumns) -> dict[int, str]:
+def wall_names(columns: EventColumns) -> dict[int, str]:
     """Names of static segments, by slot: slopes, and otherwise by their side of the bounding box of all of them."""
-    static = made["objects/present"] & (made["objects/kind"] == STATIC) & (made["objects/shape"] == SEGMENT)
+    static = columns["objects/present"] & (columns["objects/kind"] == STATIC) & (columns["objects/shape"] == SEGMENT)
     slots = np.flatnonzero(static)
     if not len(slots):
         return {}
-    ends = view_corners(made, slots)[0, :, :2]
+    ends = core_points(columns, slots)[0, :, :2]
     low, high = ends.min((0, 1)), ends.max((0, 1))
-    names = {}
+    margin, names = (high - low) / 10, {}
     for slot, (a, b) in zip(slots.tolist(), ends, strict=True):
         (width, height), (x, y) = abs(b - a), (a + b) / 2
         if height <= width / 10:  # a single level segment is the floor
-            names[slot] = "floor" if y - low[1] <= (high - low)[1] / 10 else _either(y, high, low, 1, "ceiling")
+            names[slot] = "floor" if y - low[1] <= margin[1] else "ceiling" if high[1] - y <= margin[1] else "wall"
         elif width <= height / 10:
-            names[slot] = "left wall" if x - low[0] <= (high - low)[0] / 10 else _either(x, high, low, 0, "right wall")
+            names[slot] = (
+                "left wall" if x - low[0] <= margin[0] else "right wall" if high[0] - x <= margin[0] else "wall"
+            )
         else:
             names[slot] = "slope"
     return names
-
-
-def _either(place: float, high: np.ndarray, low: np.ndarray, axis: int, name: str) -> str:
-    return name if high[axis] - place <= (high - low)[axis] / 10 else "wall"
 
 
 def color_name(color: np.ndarray) -> str:
@@ -198,7 +198,7 @@ def color_name(color: np.ndarray) -> str:
     return list(COLORS)[int((difference**2 @ np.array([3, 4, 2])).argmin())]
 
 
-def sentences(made: EventColumns, names: Mapping[int, str], events: list[VideoEvent], decimals: int) -> list[str]:
+def sentences(columns: EventColumns, names: Mapping[int, str], events: list[VideoEvent], decimals: int) -> list[str]:
     """Sentences for the events, with times in s; successive hits by one object share a sentence."""
     lines: list[str] = []
     last_hitter = -1  # slot of the object that hits in the last sentence
@@ -208,24 +208,20 @@ def sentences(made: EventColumns, names: Mapping[int, str], events: list[VideoEv
             lines, last_hitter = [*lines, f"All is at rest {at}."], -1
         elif event.kind != "hit":
             action = f"{event.kind} the view {'at' if event.kind == 'leaves' else 'from'} the {event.about['side']}"
-            lines, last_hitter = [*lines, _capitalized(f"{names[event.about['a']]} {action} {at}.")], -1
+            lines, last_hitter = [*lines, f"{names[event.about['a']]} {action} {at}.".capitalize()], -1
         else:
-            hitter, target = _who(made, event)
+            hitter, target = _hitter_and_target(columns, event)
             if hitter == last_hitter:
                 lines[-1] = f"{lines[-1][:-1]}, then {names[target]} {at}."
             else:
-                lines.append(_capitalized(f"{names[hitter]} hits {names[target]} {at}."))
+                lines.append(f"{names[hitter]} hits {names[target]} {at}.".capitalize())
             last_hitter = hitter
     return lines
 
 
-def _capitalized(sentence: str) -> str:
-    return sentence[0].upper() + sentence[1:]
-
-
-def _who(made: EventColumns, event: VideoEvent) -> tuple[int, int]:
+def _hitter_and_target(columns: EventColumns, event: VideoEvent) -> tuple[int, int]:
     """Slots of the hitting object, which was faster one frame earlier, and of its target; static bodies never hit."""
     a, b = event.about["a"], event.about["b"]
-    speed = np.linalg.norm(made["states/velocity"][event.frame - 1, [a, b]], axis=-1)
-    speed[made["objects/kind"][[a, b]] == STATIC] = -1
+    speed = np.linalg.norm(columns["states/velocity"][event.frame - 1, [a, b]], axis=-1)
+    speed[columns["objects/kind"][[a, b]] == STATIC] = -1
     return (a, b) if speed[0] >= speed[1] else (b, a)

@@ -12,8 +12,8 @@ EventColumns = Mapping[str, np.ndarray]
 
 CAPTION_BYTES, EVENT_BYTES = 512, 128  # the second per object and 16 frames
 MAX_EVENTS = 4  # maximum number of events in a caption
-TOGETHER = 0.1  # s; impacts of a pair in successive frames are one hit if they are closer than this
-STILL, STILL_SECONDS = 0.02, 0.1  # rest: all points stay slower than 0.02 m/s until the end, for 0.1 s at least
+SAME_HIT_SECONDS = 0.1  # s; impacts of a pair in successive frames are one hit if they are closer than this
+REST_SPEED, REST_SECONDS = 0.02, 0.1  # rest: all points stay slower than 0.02 m/s until the end, for 0.1 s at least
 DIGITS = 6  # significant digits of numbers in events
 SIDES = ("left", "right", "top", "bottom")
 
@@ -29,11 +29,11 @@ class VideoEvent(NamedTuple):
     @property
     def text(self) -> str:
         """The event as JSON."""
-        entries = {"event": self.kind, "time": rounded(self.time), "frame": self.frame, **self.about}
+        entries = {"event": self.kind, "time": round_number(self.time), "frame": self.frame, **self.about}
         return json.dumps(entries, separators=(",", ":"))
 
 
-def as_json(events: list[VideoEvent], width: int) -> str:
+def events_json(events: list[VideoEvent], width: int) -> str:
     """JSON list of the first events, as many as fit in `width` bytes."""
     texts, used = [], 2
     for event in events:
@@ -44,7 +44,7 @@ def as_json(events: list[VideoEvent], width: int) -> str:
     return f"[{','.join(texts)}]"
 
 
-def rounded(number: float) -> float:
+def round_number(number: float) -> float:
     """The number, rounded to DIGITS significant digits."""
     return float(f"{number:.{DIGITS}g}")
 
@@ -52,45 +52,50 @@ def rounded(number: float) -> float:
 # ---- Events
 
 
-def events_of(made: EventColumns, video: Any) -> list[VideoEvent]:
+def video_events(columns: EventColumns, video: Any) -> list[VideoEvent]:
     """All events of a video, sorted by time."""
-    events = [*hit_events(made), *view_events(made, video), *rest_events(made, video.fps)]
+    events = [*hit_events(columns), *view_events(columns, video), *rest_events(columns, video.fps)]
     return sorted(events, key=lambda event: event.time)  # stable at equal times
 
 
-def hit_events(made: EventColumns) -> list[VideoEvent]:
+def hit_events(columns: EventColumns) -> list[VideoEvent]:
     """Hits: the impacts that begin a contact."""
-    rows = zip(*(made[f"contacts/{name}"].tolist() for name in ("kind", "frame", "time", "a", "b")), strict=True)
+    rows = zip(*(columns[f"contacts/{name}"].tolist() for name in ("kind", "frame", "time", "a", "b")), strict=True)
     last: dict[tuple[int, int], tuple[int, int, float]] = {}  # kind, frame and time of each pair's last row
     events = []
     for row, (kind, frame, time, a, b) in enumerate(rows):
         if not kind:
             break
-        if kind == IMPACT and not _still_touch(last.get((a, b)), frame, time):
-            point, speed = made["contacts/point"][row].tolist(), float(made["contacts/approach_speed"][row])
-            details = {"a": a, "b": b, "point": [rounded(x) for x in point], "speed": rounded(speed)}
+        if kind == IMPACT and not _in_contact_since(last.get((a, b)), frame, time):
+            point, speed = columns["contacts/point"][row].tolist(), float(columns["contacts/approach_speed"][row])
+            details = {
+                "a": a,
+                "b": b,
+                "point": [round_number(x) for x in point],
+                "speed": round_number(speed),
+            }
             events.append(VideoEvent(time, "hit", frame, details))
         last[a, b] = kind, frame, time
     return events
 
 
-def _still_touch(last: tuple[int, int, float] | None, frame: int, time: float) -> bool:
+def _in_contact_since(last: tuple[int, int, float] | None, frame: int, time: float) -> bool:
     """Whether a pair has stayed in contact from its `last` row until an impact at this frame and time."""
     if last is None or last[0] == END or last[1] < frame - 1:
         return False
     # After an impact the pair may have separated. At low frame rates it has.
-    return last[0] != IMPACT or time - last[2] < TOGETHER
+    return last[0] != IMPACT or time - last[2] < SAME_HIT_SECONDS
 
 
-def moving_slots(made: EventColumns) -> np.ndarray:
+def moving_slots(columns: EventColumns) -> np.ndarray:
     """Slots of the bodies that are not static."""
-    return np.flatnonzero(made["objects/present"] & (made["objects/kind"] != STATIC))
+    return np.flatnonzero(columns["objects/present"] & (columns["objects/kind"] != STATIC))
 
 
-def view_events(made: EventColumns, video: Any) -> list[VideoEvent]:
+def view_events(columns: EventColumns, video: Any) -> list[VideoEvent]:
     """Objects that leave or enter the view: their bounding boxes begin or cease to lie outside it."""
-    slots = moving_slots(made)
-    distance = _beyond(made, slots, video)  # px [4, T, M], by SIDES
+    slots = moving_slots(columns)
+    distance = _distance_outside_view(columns, slots, video)  # px [4, T, M], by SIDES
     farthest = distance.max(0)
     is_outside = farthest >= 0
     events = []
@@ -103,44 +108,44 @@ def view_events(made: EventColumns, video: Any) -> list[VideoEvent]:
     return events
 
 
-def _beyond(made: EventColumns, slots: np.ndarray, video: Any) -> np.ndarray:
+def _distance_outside_view(columns: EventColumns, slots: np.ndarray, video: Any) -> np.ndarray:
     """Distance of each object's bounding box beyond each side of the view, px [4, T, M]; negative if not beyond."""
-    scale, angle = (made[f"camera/{name}"].astype(float)[:, None, None] for name in ("scale", "angle"))
-    offset = view_corners(made, slots) - made["camera/center"].astype(float)[:, None, None]  # [T, M, P, 2]
+    scale, angle = (columns[f"camera/{name}"].astype(float)[:, None, None] for name in ("scale", "angle"))
+    offset = core_points(columns, slots) - columns["camera/center"].astype(float)[:, None, None]  # [T, M, P, 2]
     cos, sin = np.cos(angle), np.sin(angle)
     column = video.width / 2 + scale * (offset[..., 0] * cos + offset[..., 1] * sin)
     row = video.height / 2 - scale * (offset[..., 1] * cos - offset[..., 0] * sin)
-    radius = scale[..., 0] * made["objects/radius"][slots]
+    radius = scale[..., 0] * columns["objects/radius"][slots]
     left, right, top, bottom = (f(-1) for f in (column.min, column.max, row.min, row.max))
     return np.stack([-(right + radius), left - radius - video.width, -(bottom + radius), top - radius - video.height])
 
 
-def view_corners(made: EventColumns, slots: np.ndarray) -> np.ndarray:
+def core_points(columns: EventColumns, slots: np.ndarray) -> np.ndarray:
     """Core points of the objects, m [T, M, P, 2]: centre, ends or vertices, with some of them repeated."""
-    half = made["objects/half_length"][slots].astype(float)
+    half = columns["objects/half_length"][slots].astype(float)
     local = np.stack([np.stack([-half, 0 * half], -1), np.stack([half, 0 * half], -1)], axis=1)
-    if "objects/vertices" in made:
-        vertices = made["objects/vertices"][slots].astype(float)
+    if "objects/vertices" in columns:
+        vertices = columns["objects/vertices"][slots].astype(float)
         local = np.concatenate(
-            [local, np.where((made["objects/shape"][slots] == 3)[:, None, None], vertices, local[:, :1])], 1
+            [local, np.where((columns["objects/shape"][slots] == 3)[:, None, None], vertices, local[:, :1])], 1
         )
-    angle = made["states/angle"][:, slots, None].astype(float)
+    angle = columns["states/angle"][:, slots, None].astype(float)
     cos, sin = np.cos(angle), np.sin(angle)
     rotated = np.stack([cos * local[..., 0] - sin * local[..., 1], sin * local[..., 0] + cos * local[..., 1]], -1)
-    return made["states/position"][:, slots, None].astype(float) + rotated
+    return columns["states/position"][:, slots, None].astype(float) + rotated
 
 
-def rest_events(made: EventColumns, fps: float) -> list[VideoEvent]:
+def rest_events(columns: EventColumns, fps: float) -> list[VideoEvent]:
     """Rest event, if all objects come to rest after some motion and stay at rest until the end."""
-    slots = moving_slots(made)
-    reach = np.linalg.norm(view_corners(made, slots)[0] - made["states/position"][0, slots, None], axis=-1).max(
+    slots = moving_slots(columns)
+    reach = np.linalg.norm(core_points(columns, slots)[0] - columns["states/position"][0, slots, None], axis=-1).max(
         -1, initial=0
     )
-    reach = reach + made["objects/radius"][slots]
-    speed = np.linalg.norm(made["states/velocity"][:, slots].astype(float), axis=-1)
-    speed = speed + np.abs(made["states/angular_velocity"][:, slots]) * reach
-    fast = np.flatnonzero((speed >= STILL).any(1))
+    reach = reach + columns["objects/radius"][slots]
+    speed = np.linalg.norm(columns["states/velocity"][:, slots].astype(float), axis=-1)
+    speed = speed + np.abs(columns["states/angular_velocity"][:, slots]) * reach
+    fast = np.flatnonzero((speed >= REST_SPEED).any(1))
     frame = int(fast[-1]) + 1 if len(fast) else 0
-    if frame == 0 or len(speed) - 1 - frame < STILL_SECONDS * fps:
+    if frame == 0 or len(speed) - 1 - frame < REST_SECONDS * fps:
         return []
     return [VideoEvent(frame / fps, "rest", frame, {})]

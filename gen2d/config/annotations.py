@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from gen2d.config import plugins
-from gen2d.config.options import build, plain_of, plain_value, value_of
+from gen2d.config.options import build, parse_value, plain_of, plain_value
 from gen2d.config.plugin_options import Copies, Plugin, contract_of
 from gen2d.config.sections import SimulationAnnotations
 from gen2d.core.errors import ConfigError
@@ -33,10 +33,10 @@ class Annotations:
 
     def plain(self) -> dict[str, Any]:
         """The section as plain YAML and JSON values."""
-        return plain_of(self.simulated) | {plugin.name: _plain(plugin) for plugin in self.pixels}
+        return plain_of(self.simulated) | {plugin.name: _plain_value(plugin) for plugin in self.pixels}
 
 
-def _plain(plugin: Plugin) -> Any:
+def _plain_value(plugin: Plugin) -> Any:
     """`value` or `{option: value, ...}`; always a mapping for a user file, which adds its sha256."""
     digest = {"sha256": plugin.sha256} if plugin.sha256 else {}
     if dataclasses.is_dataclass(plugin.contract.options):
@@ -45,7 +45,7 @@ def _plain(plugin: Plugin) -> Any:
     return digest | {"value": value} if digest else value
 
 
-def annotations_of(values: Any, source: str, copies: Copies) -> Annotations:
+def parse_annotations(values: Any, source: str, copies: Copies) -> Annotations:
     """The section `annotations` of a config, from its mapping.
 
     `copies` holds user files that the dataset stores. Raises ConfigError, naming `source`, if an option is unknown or
@@ -55,9 +55,9 @@ def annotations_of(values: Any, source: str, copies: Copies) -> Annotations:
         raise ConfigError(f"{source}: annotations is {values!r}, but must be a mapping of options")
     simulated = [field.name for field in dataclasses.fields(SimulationAnnotations)]
     built_in = plugins.names("annotation")
-    user_files = [name for name, value in values.items() if plugins.is_own(name) and value is not False]
+    user_files = [name for name, value in values.items() if plugins.is_user_file(name) and value is not False]
     for name in values:
-        if name not in (*simulated, *built_in) and not plugins.is_own(name):
+        if name not in (*simulated, *built_in) and not plugins.is_user_file(name):
             raise ConfigError(
                 f"{source}: annotations.{name} is not an option; {plugins.nearest(name, [*simulated, *built_in])}"
             )
@@ -70,11 +70,11 @@ def annotations_of(values: Any, source: str, copies: Copies) -> Annotations:
         SimulationAnnotations, {k: v for k, v in values.items() if k in simulated}, "annotations", source
     )
     return Annotations(
-        simulation, tuple(_annotation(name, values, source, copies) for name in (*built_in, *user_files))
+        simulation, tuple(_parse_annotation(name, values, source, copies) for name in (*built_in, *user_files))
     )
 
 
-def _annotation(name: str, values: Mapping[str, Any], source: str, copies: Copies) -> Plugin:
+def _parse_annotation(name: str, values: Mapping[str, Any], source: str, copies: Copies) -> Plugin:
     where, value = f"annotations.{name}", values.get(name, False)
     given = dict(value) if isinstance(value, Mapping) else {}
     digest = given.pop("sha256", None)
@@ -83,7 +83,7 @@ def _annotation(name: str, values: Mapping[str, Any], source: str, copies: Copie
         spec = contract.options.metadata["option"]
         single_value = given["value"] if [*given] == ["value"] else value
         try:
-            options = value_of(spec, single_value) if name in values else contract.options.default
+            options = parse_value(spec, single_value) if name in values else contract.options.default
         except ValueError as error:
             raise ConfigError(f"{source}: {where} is {value!r}, but must be {error}") from None
     elif isinstance(value, Mapping | bool):

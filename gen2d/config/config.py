@@ -14,7 +14,7 @@ from typing import Any
 from gen2d.config import matched as matched_module
 from gen2d.config import plugins
 from gen2d.config import quality as quality_module
-from gen2d.config.annotations import Annotations, annotations_of
+from gen2d.config.annotations import Annotations, parse_annotations
 from gen2d.config.joint_distribution import JointDistribution, on_grid
 from gen2d.config.options import build, coordinates, plain_of
 from gen2d.config.plugin_options import NO_COPIES, Copies, Plugin, StoredCopies, named, plugin_of
@@ -57,7 +57,7 @@ class Config:
     def plain(self) -> dict[str, Any]:
         """The config as plain YAML and JSON values, with every default filled in."""
         sections = {s: plain_of(getattr(self, s)) for s in SECTIONS} | {"annotations": self.annotations.plain()}
-        plugs = {p: getattr(self, p).plain() for p in PLUGINS}
+        plugs = {p: getattr(self, p).plain() for p in DEFAULT_PLUGINS}
         splits = {"splits": {split.name: split.plain() for split in self.splits}} if self.splits else {}
         return {"name": self.name, "seed": self.seed, **sections, **plugs, **splits}
 
@@ -72,7 +72,7 @@ class Config:
     @property
     def copies(self) -> Copies:
         """Contents of the user's plug-in files, by their names in the config."""
-        looks = [split.own["look"] for split in self.splits if "look" in split.own]
+        looks = [split.sections["look"] for split in self.splits if "look" in split.sections]
         used = self.scene, self.look, *looks, *self.annotations.pixels
         return {plugin.name: plugin.content for plugin in used if plugin.sha256}
 
@@ -88,26 +88,26 @@ class Config:
         """The split that others are compared with: `train`, else the first; None if the config has no splits."""
         return next((split for split in self.splits if split.name == "train"), next(iter(self.splits), None))
 
-    def row(self, split: str) -> int:
-        """Index of a split in `laws`; 0 if the config has no splits. Raises ConfigError if the name is unknown."""
+    def split_index(self, split: str) -> int:
+        """Index of a split in the config; 0 if there are no splits. Raises ConfigError if the name is unknown."""
         split_names = [s.name for s in self.splits]
         if split_names and split not in split_names:
             raise ConfigError(f"--split is {split!r}, but must be one of the config's: {', '.join(split_names)}")
         return split_names.index(split) if split_names else 0
 
     @property
-    def laws(self) -> list[JointDistribution]:
+    def joint_distributions(self) -> list[JointDistribution]:
         """Joint distributions of the splits, in order; that of the scene alone if there are no splits."""
         return distributions_of_splits(self.scene, self.splits)
 
     def frames_of(self, split: str) -> int:
         """Number of leading frames of a split's videos that its reader gets."""
-        frames = self.splits[self.row(split)].frames if self.splits else None
+        frames = self.splits[self.split_index(split)].frames if self.splits else None
         return frames or self.video.frames
 
     def of_split(self, name: str) -> "Config":
         """The config of one split, with the split's own physics, camera, image or look in place."""
-        return dataclasses.replace(self, **self.splits[self.row(name)].own) if self.splits else self
+        return dataclasses.replace(self, **self.splits[self.split_index(name)].sections) if self.splits else self
 
     def sha256(self) -> str:
         """Hash of the recipe, in hexadecimal."""
@@ -123,15 +123,16 @@ SECTIONS = {
     "quality": QualityOptions,
     "storage": StorageOptions,
 }
-PLUGINS = {"scene": "bouncing", "look": "flat"}
+DEFAULT_PLUGINS = {"scene": "bouncing", "look": "flat"}
 
 
-def _merged(own: Mapping[str, Any], other: Any) -> Any:
+def _merge_section(section: Mapping[str, Any], changes: Any) -> Any:
     """A section with a split's changes; a split that names another plug-in starts from that one's defaults."""
-    other = named(other)
-    if not isinstance(other, Mapping):
-        return other  # reading it raises the error
-    return dict(other) if other.get("name", own.get("name")) != own.get("name") else {**own, **other}
+    changes = named(changes)
+    if not isinstance(changes, Mapping):
+        return changes  # reading it raises the error
+    name = section.get("name")
+    return {**section, **changes} if changes.get("name", name) == name else dict(changes)
 
 
 def checked_seed(value: Any, what: str = "--seed") -> int:
@@ -141,12 +142,12 @@ def checked_seed(value: Any, what: str = "--seed") -> int:
     return value
 
 
-def _section(name: str, values: Any, source: str, copies: Copies) -> Any:
+def _parse_section(name: str, values: Any, source: str, copies: Copies) -> Any:
     """A section's options, or its plug-in."""
-    if name in PLUGINS:
-        return plugin_of(name, values, PLUGINS[name], source, copies)
+    if name in DEFAULT_PLUGINS:
+        return plugin_of(name, values, DEFAULT_PLUGINS[name], source, copies)
     if name == "annotations":
-        return annotations_of({} if values is None else values, source, copies)
+        return parse_annotations({} if values is None else values, source, copies)
     return build(SECTIONS[name], {} if values is None else values, name, source)
 
 
@@ -154,7 +155,7 @@ def from_mapping(values: Any, source: str, name: str = "dataset", copies: Copies
     """The Config of a mapping of sections. Raises ConfigError, naming `source`, if any part of it is invalid."""
     if not isinstance(values, Mapping):
         raise ConfigError(f"{source}: holds {type(values).__name__}, but must hold a mapping of sections")
-    section_names = (*SECTIONS, "annotations", *PLUGINS)
+    section_names = (*SECTIONS, "annotations", *DEFAULT_PLUGINS)
     known = ["name", "seed", *section_names, "splits"]
     for key in values:
         if key not in known:
@@ -163,7 +164,7 @@ def from_mapping(values: Any, source: str, name: str = "dataset", copies: Copies
     if not isinstance(name, str) or not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}", name):
         raise ConfigError(f"{source}: name is {name!r}, but must be letters, digits, '.', '_' and '-', 100 at most")
     seed = checked_seed(values.get("seed", 0), f"{source}: seed")
-    sections: dict[str, Any] = {s: _section(s, values.get(s), source, copies) for s in section_names}
+    sections: dict[str, Any] = {s: _parse_section(s, values.get(s), source, copies) for s in section_names}
     frames, chunk = sections["video"].frames, sections["storage"].chunk_frames
     if chunk is not None and frames % chunk:
         raise ConfigError(f"{source}: storage.chunk_frames is {chunk}, but must divide video.frames, which is {frames}")
@@ -180,7 +181,7 @@ def from_mapping(values: Any, source: str, name: str = "dataset", copies: Copies
         raise ConfigError(f"{source}: quality.{error}") from None
     if values.get("splits"):
         config = _with_splits(config, values["splits"], source, copies)
-    _check_sets(config, source)
+    _check_matched(config, source)
     return config
 
 
@@ -196,25 +197,25 @@ def _with_splits(config: Config, written: Any, source: str, copies: Copies) -> C
         changes, split_sections = split.plain(), {}
         try:
             for name in (name for name in CHANGES if name in changes):
-                split_sections[name] = _section(name, _merged(plain[name], changes[name]), "config", copies)
+                values = _merge_section(plain[name], changes[name])
+                split_sections[name] = _parse_section(name, values, "config", copies)
         except ConfigError as error:
             raise ConfigError(f"{source}: splits.{split.name}: {str(error).removeprefix('config: ')}") from None
         if "look" in split_sections and split_sections["look"].sha256:
             changes["look"] = named(changes["look"]) | {"sha256": split_sections["look"].sha256}
-        resolved.append(dataclasses.replace(split, written=json.dumps(changes), own=split_sections))
+        resolved.append(dataclasses.replace(split, written=json.dumps(changes), sections=split_sections))
     return dataclasses.replace(config, scene=scene, splits=tuple(resolved))
 
 
-def own_files(plain: Mapping[str, Any]) -> dict[str, str]:
+def user_plugin_files(plain: Mapping[str, Any]) -> dict[str, str]:
     """Names of the user's plug-in files in a config (`Config.plain`), by the paths of their copies in a dataset."""
-    declared = [(kind, plain.get(kind)) for kind in PLUGINS]
+    declared = [(kind, plain.get(kind)) for kind in DEFAULT_PLUGINS]
     declared += [
-        (f"splits/{name}/look", _mapping(own).get("look")) for name, own in _mapping(plain.get("splits")).items()
+        (f"splits/{name}/look", _mapping(split).get("look")) for name, split in _mapping(plain.get("splits")).items()
     ]
     names = [(kind, _mapping(named(plugin)).get("name")) for kind, plugin in declared]
     names += [("annotation", name) for name in _mapping(plain.get("annotations"))]
-    own = [(kind, name) for kind, name in names if plugins.is_own(name)]
-    return {plugins.copy_name(kind, name): name for kind, name in own}
+    return {plugins.copy_name(kind, name): name for kind, name in names if plugins.is_user_file(name)}
 
 
 def _mapping(value: Any) -> Mapping[Any, Any]:
@@ -222,14 +223,14 @@ def _mapping(value: Any) -> Mapping[Any, Any]:
     return value if isinstance(value, Mapping) else {}
 
 
-def _check_sets(config: Config, source: str) -> None:
+def _check_matched(config: Config, source: str) -> None:
     """Raise ConfigError if the matched sets are impossible for this scene."""
     sections = config.scene, config.video, config.annotations.simulated, config.camera
     try:
         matched_module.check(config.matched, MatchedOptions(), *sections)
         if config.matched.change and quality_module.ranges(config.quality):
             raise ValueError("change is given, but a set has one scene: quality must ask for nothing")
-        if config.matched.change and any(law.combinations()[0] for law in config.laws):
+        if config.matched.change and any(joint.combinations()[0] for joint in config.joint_distributions):
             raise ValueError("change is given, but its scenes cannot be on a grid")
     except ValueError as error:
         raise ConfigError(f"{source}: matched.{error}") from None
@@ -237,7 +238,9 @@ def _check_sets(config: Config, source: str) -> None:
 
 def _check_grids(config: Config, source: str) -> None:
     """Raise ConfigError if a grid is given for anything but a scene's factor with one number per video."""
-    sections = {name: getattr(config, name) for name in SECTIONS} | {p: getattr(config, p).options for p in PLUGINS}
+    sections = {name: getattr(config, name) for name in SECTIONS} | {
+        p: getattr(config, p).options for p in DEFAULT_PLUGINS
+    }
     for section, options in sections.items():
         for field in dataclasses.fields(options):
             spec, value = field.metadata["option"], getattr(options, field.name)

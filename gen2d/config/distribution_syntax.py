@@ -23,16 +23,16 @@ COMPOSED = ("mixture", "minus", "intersection")
 FORMS = "a number, [low, high], or one of " + ", ".join(f"{{{kind}: [...]}}" for kind in (*KINDS[1:], *COMPOSED))
 
 
-MOST = 10_000  # numbers in a list, at most
-PARTS = 200  # components of a distribution, at most
-LARGEST = 1e12  # in any unit; its square, times other quantities, still fits in a float32
+MAX_NUMBERS = 10_000  # numbers in a list, at most
+MAX_PARTS = 200  # components of a distribution, at most
+MAX_MAGNITUDE = 1e12  # in any unit; its square, times other quantities, still fits in a float32
 
 
 def is_number(value: Any) -> bool:
-    """Whether the value is a real number of magnitude `LARGEST` at most."""
+    """Whether the value is a real number of magnitude `MAX_MAGNITUDE` at most."""
     if isinstance(value, int):  # may be too large for float()
-        return not isinstance(value, bool) and abs(value) <= LARGEST
-    return isinstance(value, Real) and abs(float(value)) <= LARGEST
+        return not isinstance(value, bool) and abs(value) <= MAX_MAGNITUDE
+    return isinstance(value, Real) and abs(float(value)) <= MAX_MAGNITUDE
 
 
 def parse(value: Any, whole: bool = False) -> Distribution:
@@ -41,7 +41,7 @@ def parse(value: Any, whole: bool = False) -> Distribution:
     Raises ValueError, whose message is the syntax allowed, if the value is no distribution.
     """
     if isinstance(value, dict) and value.keys() & set(COMPOSED):
-        return _composed(value, whole)
+        return _parse_composed(value, whole)
     kind: str
     numbers: Any
     if is_number(value):
@@ -53,8 +53,8 @@ def parse(value: Any, whole: bool = False) -> Distribution:
         kind = "integer" if whole and kind == "uniform" else kind
     else:
         raise ValueError(FORMS)
-    if not isinstance(numbers, list | tuple) or not 0 < len(numbers) <= MOST or not all(map(is_number, numbers)):
-        raise ValueError(f"{kind} of finite numbers in a list, {MOST:,} at most")
+    if not isinstance(numbers, list | tuple) or not 0 < len(numbers) <= MAX_NUMBERS or not all(map(is_number, numbers)):
+        raise ValueError(f"{kind} of finite numbers in a list, {MAX_NUMBERS:,} at most")
     if kind in LENGTHS and len(numbers) not in LENGTHS[kind]:
         raise ValueError(f"{kind} of {' or '.join(map(str, LENGTHS[kind]))} numbers")
     if kind in ("uniform", "log_uniform", "integer") and numbers[0] > numbers[1]:
@@ -76,13 +76,13 @@ def parse(value: Any, whole: bool = False) -> Distribution:
     return Distribution(kind, tuple(int(x) if isinstance(x, Integral) else float(x) for x in numbers))
 
 
-def _composed(value: Mapping[str, Any], whole: bool) -> Distribution:
+def _parse_composed(value: Mapping[str, Any], whole: bool) -> Distribution:
     """A mixture, or a distribution restricted by the supports of others."""
     kind, operands = next((kind, value[kind]) for kind in COMPOSED if kind in value)
     if value.keys() - {kind, *(["weights"] if kind == "mixture" else [])}:
         raise ValueError(FORMS)
-    if not isinstance(operands, list | tuple) or not 0 < len(operands) <= PARTS:
-        raise ValueError(f"{kind} of a list of distributions, {PARTS} at most")
+    if not isinstance(operands, list | tuple) or not 0 < len(operands) <= MAX_PARTS:
+        raise ValueError(f"{kind} of a list of distributions, {MAX_PARTS} at most")
     parts = [parse(part, whole) for part in operands]
     if kind == "mixture":
         return truncation.mixture(list(zip(checked_weights(value.get("weights"), len(parts)), parts, strict=True)))
@@ -92,8 +92,8 @@ def _composed(value: Mapping[str, Any], whole: bool) -> Distribution:
         if not pieces:
             raise ValueError(f"{'an' if kind == 'intersection' else 'a'} {kind} that leaves something")
         source = truncation.mixture(pieces)
-        if len(source.weighted) > PARTS:
-            raise ValueError(f"a {kind} that leaves {PARTS} parts at most")
+        if len(source.weighted) > MAX_PARTS:
+            raise ValueError(f"a {kind} that leaves {MAX_PARTS} parts at most")
     return source
 
 

@@ -14,48 +14,45 @@ import jax.numpy as jnp
 import numpy as np
 
 from gen2d.records.axes import Array
-from gen2d.records.parameter import apply
+from gen2d.records.parameter import apply, recorded
 
 
-def _single(value: float) -> float:
+@recorded
+def to_float32(value: float) -> float:
+    """The nearest float32."""
     return float(np.float32(value))
 
 
-def _after(value: float) -> float:
+@recorded
+def next_float32(value: float) -> float:
+    """The next float32 above a number."""
     return float(np.nextafter(np.float32(value), np.float32(np.inf)))
 
 
-def single(value: float) -> float:
-    """The nearest float32."""
-    return apply(_single, value)
-
-
-def after(value: float) -> float:
-    """The next float32 above a number."""
-    return apply(_after, value)
-
-
+@recorded
 def _lowest(*numbers: float) -> float:
     return min(numbers)
 
 
+@recorded
 def _highest(*numbers: float) -> float:
     return max(numbers)
 
 
-def _before(low: float, high: float) -> float:
-    return float(np.nextafter(np.float32(high), np.float32(-np.inf)))
+@recorded
+def _last(low: float, high: float, whole: bool = False) -> float:
+    """Largest float32 of the half-open range [low, high); its largest whole number, if `whole`."""
+    below = float(np.nextafter(np.float32(high), np.float32(-np.inf)))
+    return max(math.ceil(high) - 1, math.ceil(low)) if whole else below
 
 
-def _last_whole(low: float, high: float) -> float:
-    return max(math.ceil(high) - 1, math.ceil(low))
-
-
-def _last(low: float, high: float) -> float:
+@recorded
+def _last_sample(low: float, high: float) -> float:
     """Largest sample of a continuous range, as float32."""
-    return _single(low) if low == high else _before(low, _single(high))
+    return (point(low) if low == high else Span(to_float32(low), to_float32(high))).last
 
 
+@recorded
 def _thresholds(*weights: float) -> np.ndarray:
     """Cumulative probabilities of components, without the last."""
     return np.cumsum(weights)[:-1] / sum(weights)
@@ -71,14 +68,14 @@ class Span(NamedTuple):
     @property
     def last(self) -> float:
         """Largest number of the span, as float32."""
-        return apply(_last_whole if self.whole else _before, self.low, self.high)
+        return _last(self.low, self.high, self.whole)
 
     def contains(self, values: Any) -> np.ndarray:
         """Whether each value, rounded to float32, lies in the span."""
         x = np.asarray(values, np.float32).astype(np.float64)
         return (x >= self.low) & (x < self.high) & (~np.asarray(self.whole) | (x == np.floor(x)))
 
-    def meet(self, other: "Span") -> "Span | None":
+    def intersect(self, other: "Span") -> "Span | None":
         """Intersection of two spans; None if it is empty."""
         overlap = Span(max(self.low, other.low), min(self.high, other.high), self.whole or other.whole)
         first = math.ceil(overlap.low) if overlap.whole and math.isfinite(overlap.low) else overlap.low
@@ -87,10 +84,7 @@ class Span(NamedTuple):
 
 def point(value: float) -> Span:
     """Span of a single float32."""
-    return Span(single(value), after(value))
-
-
-EVERYTHING = Span(-math.inf, math.inf)
+    return Span(to_float32(value), next_float32(value))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -109,10 +103,10 @@ class Distribution:
         """Closed interval (low, high) that contains all values."""
         if self.kind == "mixture":
             ends = [part.support for part in self.parts]
-            return apply(_lowest, *(low for low, _ in ends)), apply(_highest, *(high for _, high in ends))
+            return _lowest(*(low for low, _ in ends)), _highest(*(high for _, high in ends))
         if self.kind == "normal":
             return (self.numbers[2], self.numbers[3]) if len(self.numbers) == 4 else (-math.inf, math.inf)
-        return apply(_lowest, *self.numbers), apply(_highest, *self.numbers)
+        return _lowest(*self.numbers), _highest(*self.numbers)
 
     @property
     def spans(self) -> tuple[Span, ...]:
@@ -124,7 +118,7 @@ class Distribution:
         low, high = self.support
         if self.kind == "integer":
             return (Span(low, high + 1, whole=True),)
-        return (point(low),) if low == high else (Span(single(low), single(high)),)
+        return (point(low),) if low == high else (Span(to_float32(low), to_float32(high)),)
 
     def contains(self, values: Any) -> np.ndarray:
         """Whether each value lies in the support."""
@@ -141,7 +135,7 @@ class Distribution:
         """Independent samples of this shape, float32 (int32 for `integer`)."""
         n = self.numbers
         if self.kind == "mixture":
-            return self._mixed(key, shape)
+            return self._sample_mixture(key, shape)
         if self.kind == "constant":
             return jnp.full(shape, n[0], jnp.float32)
         if self.kind == "integer":
@@ -159,7 +153,7 @@ class Distribution:
             low, high = ((end - n[0]) / n[1] for end in n[2:])
             samples = n[0] + n[1] * jax.random.truncated_normal(key, low, high, shape)
         low, high = self.support
-        return jnp.clip(samples, apply(single, low), apply(_last, low, high))  # rounding may leave the support
+        return jnp.clip(samples, to_float32(low), _last_sample(low, high))  # rounding may leave the support
 
     @property
     def weighted(self) -> list[tuple[float, "Distribution"]]:
@@ -168,9 +162,9 @@ class Distribution:
             return [(1.0, self)]
         return [(weight / sum(self.numbers), part) for weight, part in zip(self.numbers, self.parts, strict=True)]
 
-    def _mixed(self, key: Array, shape: tuple[int, ...]) -> Array:
+    def _sample_mixture(self, key: Array, shape: tuple[int, ...]) -> Array:
         component_key, value_key = jax.random.split(key)
-        thresholds = jnp.asarray(apply(_thresholds, *self.numbers), jnp.float32)
+        thresholds = jnp.asarray(_thresholds(*self.numbers), jnp.float32)
         chosen = (jax.random.uniform(component_key, shape)[..., None] >= thresholds).sum(-1)
         samples = [part.sample(value_key, shape) for part in self.parts]
         return jnp.select([chosen == i for i in range(len(samples))], samples)

@@ -1,18 +1,18 @@
-"""Joint distributions ('laws') over a scene's factors, for splits: products, mixtures, differences and intersections.
+"""Joint distributions of a scene's factors, for splits: products, mixtures, differences and intersections.
 
-In a config a law is written relative to the scene's own distributions, the base:
+In a config a joint distribution J is written relative to the scene's own distributions, the base:
 
     {radius: [1, 2], speed: 3}                      a product: these factors as given, all others as in the base
-    {mixture: [LAW, ...], weights: [...]}           a mixture of laws
-    {minus: [LAW, REGION, ...]}                     the law outside all regions
-    {intersection: [LAW, REGION, ...]}              the law inside all regions
-    {condition: [LAW, {when: REGION, then: {...}}]} the law, with other distributions for some factors in a region
+    {mixture: [J, ...], weights: [...]}             a mixture of joint distributions
+    {minus: [J, REGION, ...]}                       J outside all regions
+    {intersection: [J, REGION, ...]}                J inside all regions
+    {condition: [J, {when: REGION, then: {...}}]}   J, with other distributions for some factors in a region
 
-A region is a product or a mixture of products; factors that it does not name are unconstrained. Every law is stored as
-a mixture of products of one-dimensional distributions, one for each coordinate (`radius`, or `velocity[0]` of a
-vector). This is closed under all operations above, as products truncated by boxes are mixtures of products. Hence laws
-are sampled without rejection, and whether two laws have a point in common is decided exactly: they do if two of their
-products overlap in every coordinate.
+A region is a product or a mixture of products; factors that it does not name are unconstrained. Every joint
+distribution is stored as a mixture of products of one-dimensional distributions, one for each coordinate (`radius`, or
+`velocity[0]` of a vector). This is closed under all operations above, as products truncated by boxes are mixtures of
+products. Hence samples need no rejection, and whether two joint distributions have a point in common is decided
+exactly: they do if two of their products overlap in every coordinate.
 """
 
 import dataclasses
@@ -27,13 +27,13 @@ from gen2d.config import truncation
 from gen2d.config.distribution_syntax import checked_weights
 from gen2d.config.distributions import Distribution, Span
 
-Weighted = dict[str, Distribution]  # distribution of each coordinate
+Marginals = dict[str, Distribution]  # distribution of each coordinate
 SupportBox = dict[str, tuple[Span, ...]]  # support of each coordinate; others are unconstrained
-ReadValue = Callable[[Mapping[str, Any]], Weighted]  # parses {factor: value}; raises ValueError
+ReadValue = Callable[[Mapping[str, Any]], Marginals]  # parses {factor: value}; raises ValueError
 COMPOSED = ("mixture", "minus", "intersection", "condition")
-MOST_PRODUCTS = 1000
-MOST_COMPARED = 20_000_000  # pairs of spans compared for two laws
-MOST_COMBINATIONS = 1_000_000  # of a grid
+MAX_PRODUCTS = 1000
+MAX_COMPARED = 20_000_000  # pairs of spans compared for two joint distributions
+MAX_COMBINATIONS = 1_000_000  # of a grid
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,40 +69,37 @@ class JointDistribution:
     def combinations(self) -> tuple[list[str], np.ndarray]:
         """Names of the G coordinates on a grid, and their M distinct combinations, float32 [M, G]."""
         names = [name for name, part in self.products[0].parts.items() if on_grid(part)]
-        grids = [itertools.product(*(_values(p.parts[name]) for name in names)) for p in self.products]
-        distinct = dict.fromkeys(itertools.islice(itertools.chain(*grids), MOST_COMBINATIONS + 1))
+        axes = [
+            [[x for _, simple in p.parts[name].weighted for x in simple.numbers] for name in names]
+            for p in self.products
+        ]
+        grids = [itertools.product(*values) for values in axes]
+        distinct = dict.fromkeys(itertools.islice(itertools.chain(*grids), MAX_COMBINATIONS + 1))
         return names, np.array(list(distinct), np.float32).reshape(len(distinct), len(names))
 
 
 def on_grid(part: Distribution) -> bool:
+    """Whether a distribution, or a component of it, is a grid."""
     return any(simple.kind == "grid" for _, simple in part.weighted)
 
 
-def _values(part: Distribution) -> list[float]:
-    return [x for _, simple in part.weighted for x in simple.numbers]
+def parse_distribution(written: Any, base: Marginals, read: ReadValue) -> JointDistribution:
+    """The joint distribution written as `written` in a config, relative to a base.
 
-
-def joint_distribution_of(written: Any, base: Weighted, read: ReadValue) -> JointDistribution:
-    """The law written as `written` in a config, relative to a base.
-
-    Raises ValueError, whose message is the syntax allowed, if the value is no law.
+    Raises ValueError, whose message is the syntax allowed, if the value is no joint distribution.
     """
-    products = _products(written, base, read)
+    products = _parse_products(written, base, read)
     total_share = sum(product.share for product in products)
-    law = JointDistribution(tuple(Component(product.share / total_share, product.parts) for product in products))
-    _check_grid(law)
-    return law
+    joint = JointDistribution(tuple(Component(product.share / total_share, product.parts) for product in products))
+    names, combinations = joint.combinations()
+    if names and set(joint.differing) - set(names):
+        raise ValueError("of distributions whose products differ in the grid only, where there is one")
+    if len(combinations) > MAX_COMBINATIONS:
+        raise ValueError(f"a grid of at most {MAX_COMBINATIONS:,} combinations")
+    return joint
 
 
-def _check_grid(law: JointDistribution) -> None:
-    names, combinations = law.combinations()
-    if names and set(law.differing) - set(names):
-        raise ValueError("of laws whose products differ in nothing but the grid, where there is one")
-    if len(combinations) > MOST_COMBINATIONS:
-        raise ValueError(f"a grid of at most {MOST_COMBINATIONS:,} combinations")
-
-
-def _products(written: Any, base: Weighted, read: ReadValue) -> list[Component]:
+def _parse_products(written: Any, base: Marginals, read: ReadValue) -> list[Component]:
     if not isinstance(written, Mapping):
         raise ValueError("a mapping of factors, or one of " + ", ".join(f"{{{kind}: [...]}}" for kind in COMPOSED))
     kind = next((kind for kind in COMPOSED if kind in written), None)
@@ -112,63 +109,63 @@ def _products(written: Any, base: Weighted, read: ReadValue) -> list[Component]:
         raise ValueError(f"{kind} alone, without {', '.join(sorted(written.keys() - {kind}))} beside it")
     operands = written[kind]
     if not isinstance(operands, list | tuple) or not operands:
-        raise ValueError(f"{kind} of a list of laws")
+        raise ValueError(f"{kind} of a list of distributions")
     if kind == "mixture":
         weights = checked_weights(written.get("weights"), len(operands))
-        each = [_products(operand, base, read) for operand in operands]
+        each = [_parse_products(operand, base, read) for operand in operands]
         return [Component(w * p.share, p.parts) for w, products in zip(weights, each, strict=True) for p in products]
-    components = _products(operands[0], base, read)
+    components = _parse_products(operands[0], base, read)
     for operand in operands[1:]:
-        components = _changed(kind, components, operand, read)
+        components = _apply_operand(kind, components, operand, read)
         if not components:
             raise ValueError(f"{kind} that leaves something")
-        if len(components) > MOST_PRODUCTS:
-            raise ValueError(f"a law of at most {MOST_PRODUCTS} products")
+        if len(components) > MAX_PRODUCTS:
+            raise ValueError(f"a distribution of at most {MAX_PRODUCTS} products")
     return components
 
 
-def _changed(kind: str, products: list[Component], operand: Any, read: ReadValue) -> list[Component]:
+def _apply_operand(kind: str, products: list[Component], operand: Any, read: ReadValue) -> list[Component]:
     """The products after one operand of `minus`, `intersection` or `condition`."""
     if kind != "condition":
-        return _cut(products, _region(operand, read), keep=kind == "intersection")
+        return _truncate(products, _parse_region(operand, read), keep=kind == "intersection")
     if not isinstance(operand, Mapping) or operand.keys() != {"when", "then"}:
-        raise ValueError("condition: [law, {when: region, then: {factor: ...}}, ...]")
-    region, changes = _region(operand["when"], read), read(operand["then"])
-    inside = [Component(p.share, {**p.parts, **changes}) for p in _cut(products, region, keep=True)]
-    return _cut(products, region, keep=False) + inside
+        raise ValueError("condition: [distribution, {when: region, then: {factor: ...}}, ...]")
+    region, changes = _parse_region(operand["when"], read), read(operand["then"])
+    inside = [Component(p.share, {**p.parts, **changes}) for p in _truncate(products, region, keep=True)]
+    return _truncate(products, region, keep=False) + inside
 
 
-def _region(written: Any, read: ReadValue) -> list[SupportBox]:
+def _parse_region(written: Any, read: ReadValue) -> list[SupportBox]:
     """Boxes whose union is the region."""
     if isinstance(written, Mapping) and written.keys() & (set(COMPOSED) - {"mixture"}):
         raise ValueError("regions that are products, or mixtures of them")
-    return [{name: part.spans for name, part in p.parts.items()} for p in _products(written, {}, read)]
+    return [{name: part.spans for name, part in p.parts.items()} for p in _parse_products(written, {}, read)]
 
 
-def _cut(products: list[Component], boxes: list[SupportBox], keep: bool) -> list[Component]:
+def _truncate(products: list[Component], boxes: list[SupportBox], keep: bool) -> list[Component]:
     """The parts of the products inside the union of the boxes or, without `keep`, outside it."""
     inside, outside = [], products
     for box in boxes:
-        split = [_split(product, box) for product in outside]
+        split = [_split_at_box(product, box) for product in outside]
         inside += [product for kept, _ in split for product in kept]
         outside = [product for _, left in split for product in left]
     return inside if keep else outside
 
 
-def _split(product: Component, box: SupportBox) -> tuple[list[Component], list[Component]]:
+def _split_at_box(product: Component, box: SupportBox) -> tuple[list[Component], list[Component]]:
     """A product's part inside a box, and its parts outside, cut off one coordinate after the other."""
     outside, inside = [], product
     for name, spans in box.items():
         distribution = inside.parts[name]
-        outside += _with(inside, name, truncation.outside(distribution, spans))
-        kept = _with(inside, name, truncation.inside(distribution, spans))
+        outside += _with_coordinate(inside, name, truncation.outside(distribution, spans))
+        kept = _with_coordinate(inside, name, truncation.inside(distribution, spans))
         if not kept:
             return [], outside
         inside = kept[0]
     return [inside], outside
 
 
-def _with(product: Component, name: str, pieces: truncation.Intervals) -> list[Component]:
+def _with_coordinate(product: Component, name: str, pieces: truncation.Pieces) -> list[Component]:
     """The product with one coordinate truncated to these pieces; an empty list if there are none."""
     if not pieces:
         return []
@@ -176,40 +173,32 @@ def _with(product: Component, name: str, pieces: truncation.Intervals) -> list[C
 
 
 def intersect(one: JointDistribution, other: JointDistribution) -> dict[str, float] | None:
-    """A point in the supports of both laws, by coordinate; None if they are disjoint.
+    """A point in the supports of both, by coordinate; None if they are disjoint.
 
-    Raises ValueError if the laws have too many parts to compare.
+    Raises ValueError if they have too many parts to compare.
     """
-    spans = [max(len(spans) for p in law.products for spans in _spans_of(p)) for law in (one, other)]
-    if len(one.products) * len(other.products) * spans[0] * spans[1] > MOST_COMPARED:
+    spans = [max((len(q.spans) for p in joint.products for q in p.parts.values()), default=0) for joint in (one, other)]
+    if len(one.products) * len(other.products) * spans[0] * spans[1] > MAX_COMPARED:
         raise ValueError("of fewer and simpler parts, as it would take too long to prove that splits are disjoint")
     for a, b in itertools.product(one.products, other.products):
-        point = {name: _common(a.parts[name].spans, b.parts[name].spans) for name in a.parts}
+        point = {name: _common_point(a.parts[name].spans, b.parts[name].spans) for name in a.parts}
         if all(x is not None for x in point.values()):
             return {name: x for name, x in point.items() if x is not None}
     return None
 
 
-def _spans_of(product: Component) -> list[tuple[Span, ...]]:
-    return [part.spans for part in product.parts.values()] or [()]
-
-
-def _common(one: Sequence[Span], other: Sequence[Span]) -> float | None:
+def _common_point(one: Sequence[Span], other: Sequence[Span]) -> float | None:
+    """A number in both: the lowest of the first overlap, or one near 0 if that has no lower end; None if disjoint."""
     for a, b in itertools.product(one, other):
-        overlap = a.meet(b)
+        overlap = a.intersect(b)
         if overlap is not None:
-            return _of(overlap)
+            low = overlap.low if math.isfinite(overlap.low) else min(0.0, overlap.last)
+            return float(math.ceil(low)) if overlap.whole else low
     return None
 
 
-def _of(span: Span) -> float:
-    """A number in the span: its lowest, or one near 0 if it has no lower end."""
-    low = span.low if math.isfinite(span.low) else min(0.0, span.last)
-    return float(math.ceil(low)) if span.whole else low
-
-
-def union_support(laws: Sequence[JointDistribution]) -> Weighted:
-    """For each coordinate, a distribution whose support contains those of all laws."""
-    names = laws[0].products[0].parts
-    products = [product for law in laws for product in law.products]
+def union_support(joints: Sequence[JointDistribution]) -> Marginals:
+    """For each coordinate, a distribution whose support contains those of all joint distributions."""
+    names = joints[0].products[0].parts
+    products = [product for joint in joints for product in joint.products]
     return {name: truncation.mixture([(product.share, product.parts[name]) for product in products]) for name in names}

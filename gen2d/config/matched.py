@@ -8,7 +8,7 @@ import numpy as np
 
 from gen2d.config import plugins
 from gen2d.config.distributions import Distribution
-from gen2d.config.options import drawn_options
+from gen2d.config.options import factor_options
 from gen2d.core.enums import DYNAMIC
 from gen2d.records.layout import Layout
 
@@ -34,16 +34,18 @@ def check(options: Any, default: Any, scene: Any, video: Any, annotations: Any, 
     layout = scene.contract.layout(scene.options)
     for name in options.change:
         if name in INTERVENTIONS:
-            _check_act(name, scene, layout, video, camera)
+            _check_intervention(name, scene, layout, video, camera)
         else:
             _check_factor(name, options, scene, layout)
     annotated = [name for name in ("contacts", "energy", "lyapunov") if getattr(annotations, name)]
     violations = [name for name in options.change if name in VIOLATIONS]
     if annotated and violations:
-        raise ValueError(f"change is {violations[0]}, which has no books: annotations.{annotated[0]} must be off")
+        raise ValueError(
+            f"change is {violations[0]}, which breaks the laws of motion: annotations.{annotated[0]} must be off"
+        )
 
 
-def _check_act(name: str, scene: Any, layout: Layout, video: Any, camera: Any) -> None:
+def _check_intervention(name: str, scene: Any, layout: Layout, video: Any, camera: Any) -> None:
     min_objects = {"gravity_flip": 0, "identity_swap": 2}.get(name, 1)
     if free_slots(layout).sum() < min_objects:
         raise ValueError(f"change is {name}, but the scene has no {min_objects} that move and are on no joint")
@@ -57,7 +59,7 @@ def _check_act(name: str, scene: Any, layout: Layout, video: Any, camera: Any) -
 
 
 def _check_factor(name: str, options: Any, scene: Any, layout: Layout) -> None:
-    specs = drawn_options(scene.contract)
+    specs = factor_options(scene.contract)
     if name not in specs:
         raise ValueError(f"change is {name!r}, which is no factor; {plugins.nearest(name, [*INTERVENTIONS, *specs])}")
     value = getattr(scene.options, name)

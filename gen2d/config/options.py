@@ -77,7 +77,7 @@ def plain_of(options: Any) -> dict[str, Any]:
     return {field.name: plain_value(getattr(options, field.name)) for field in dataclasses.fields(options)}
 
 
-def _check(spec: Option, low: float, high: float) -> bool:
+def _in_range(spec: Option, low: float, high: float) -> bool:
     return (
         (spec.low is None or low >= spec.low)
         and (spec.above is None or low > spec.above)
@@ -85,11 +85,11 @@ def _check(spec: Option, low: float, high: float) -> bool:
     )
 
 
-def _single(spec: Option, value: Any) -> Any:
+def _parse_single(spec: Option, value: Any) -> Any:
     """The checked value. Raises ValueError, whose message is the values allowed."""
     if spec.draw:
         distribution = parse(value, spec.kind is int)
-        if not _check(spec, *distribution.support):
+        if not _in_range(spec, *distribution.support):
             raise ValueError(spec.allowed + (" for every value drawn" if distribution.kind != "constant" else ""))
         return distribution
     if spec.kind is str:
@@ -100,12 +100,12 @@ def _single(spec: Option, value: Any) -> Any:
         return value
     if not is_number(value) or spec.kind is bool:
         raise ValueError(spec.allowed)
-    if (spec.kind is int and not float(value).is_integer()) or not _check(spec, value, value):
+    if (spec.kind is int and not float(value).is_integer()) or not _in_range(spec, value, value):
         raise ValueError(spec.allowed)
     return spec.kind(value)
 
 
-def value_of(spec: Option, value: Any) -> Any:
+def parse_value(spec: Option, value: Any) -> Any:
     """The checked value of an option; a tuple if the option has several values or parts.
 
     Raises ValueError, whose message is the values allowed.
@@ -114,12 +114,12 @@ def value_of(spec: Option, value: Any) -> Any:
         return None
     if spec.several:
         values = value if isinstance(value, list | tuple) and value else [value]
-        return tuple(_single(spec, single) for single in values)
+        return tuple(_parse_single(spec, single) for single in values)
     if not spec.parts:
-        return _single(spec, value)
+        return _parse_single(spec, value)
     if not isinstance(value, list | tuple) or len(value) != spec.parts:
         raise ValueError(spec.allowed)
-    return tuple(_single(spec, part) for part in value)
+    return tuple(_parse_single(spec, part) for part in value)
 
 
 def build(cls: type, values: Any, where: str, source: str) -> Any:
@@ -135,7 +135,7 @@ def build(cls: type, values: Any, where: str, source: str) -> Any:
         if key not in known:
             raise ConfigError(f"{source}: {where}.{key} is not an option; {plugins.nearest(key, list(known))}")
         try:
-            filled[key] = value_of(known[key], value)
+            filled[key] = parse_value(known[key], value)
         except ValueError as error:
             raise ConfigError(f"{source}: {where}.{key} is {value!r}, but must be {error}") from None
     return cls(**filled)
@@ -146,7 +146,7 @@ def coordinates(name: str, value: Any) -> dict[str, Any]:
     return {f"{name}[{i}]": part for i, part in enumerate(value)} if isinstance(value, tuple) else {name: value}
 
 
-def drawn_options(family: Family) -> dict[str, Option]:
+def factor_options(family: Family) -> dict[str, Option]:
     """Options of a family that are factors, by name."""
     specs = {field.name: field.metadata["option"] for field in dataclasses.fields(family.options)}
     return {name: spec for name, spec in specs.items() if spec.draw}

@@ -7,6 +7,7 @@ from typing import Any
 from gen2d.config.config import Config
 from gen2d.config.plugin_options import Plugin
 from gen2d.config.sections import StorageOptions
+from gen2d.config.splits import Split
 from gen2d.records.parameter import Tape
 
 Number = Callable[[Any], Any]
@@ -34,10 +35,7 @@ def parametrized(config: Config, tape: Tape) -> Config:
 
 def _replaced(config: Config, convert: Number) -> Config:
     """The config with its numbers converted, and without its name, seed and storage."""
-    splits = tuple(
-        dataclasses.replace(split, videos=None, written="{}", law=_converted(split.law, convert), own={})
-        for split in config.splits
-    )
+    splits = tuple(Split(s.name, None, "{}", _converted(s.distribution, convert)) for s in config.splits)
     storage = StorageOptions(frames=config.storage.frames)
     static = {"name": "", "seed": 0, "storage": storage, "splits": splits, "annotations": config.annotations}
     names = [f.name for f in dataclasses.fields(config) if f.name not in static]
@@ -56,7 +54,7 @@ def _converted(value: Any, convert: Number, listed: bool = False) -> Any:
     if isinstance(value, Mapping):
         return {key: _converted(part, convert) for key, part in value.items()}
     if isinstance(value, Plugin):
-        return dataclasses.replace(value, options=_converted(value.options, convert), own=None)
+        return dataclasses.replace(value, options=_converted(value.options, convert), written_options=None)
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         parts = {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
         return dataclasses.replace(value, **{name: _converted(part, convert) for name, part in parts.items()})

@@ -27,12 +27,12 @@ class Plugin:
     options: Any
     sha256: str | None = None  # of a user file, which may change
     content: bytes = b""  # of a user file
-    own: Any = None  # the options as written, if the splits widen them
+    written_options: Any = None  # the options as written, if the splits widen them
 
     def plain(self) -> dict[str, Any]:
         """The plug-in as plain YAML and JSON values."""
         digest = {"sha256": self.sha256} if self.sha256 else {}
-        return {"name": self.name, **digest, **plain_of(self.own or self.options)}
+        return {"name": self.name, **digest, **plain_of(self.written_options or self.options)}
 
 
 def named(values: Any) -> Any:
@@ -65,7 +65,7 @@ def contract_of(kind: str, name: str, digest: Any, where: str, copies: Copies) -
     ConfigError, beginning with `where`, if the file has another sha256 than `digest`, or if it is not a plug-in.
     """
     content, actual_digest = b"", None
-    if plugins.is_own(name):
+    if plugins.is_user_file(name):
         copy = copies.get(name)
         if copy is not None and sha256(copy) == digest:
             content = copy

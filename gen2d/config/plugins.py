@@ -39,10 +39,12 @@ def load(kind: str, name: str, where: str = "--set", content: bytes = b"") -> An
     Raises ConfigError, beginning with `where`, if the name is unknown, or if the file fails to run or does not declare
     a contract of this kind.
     """
-    if not is_own(name) and name not in names(kind):
+    if not is_user_file(name) and name not in names(kind):
         raise ConfigError(f"{where} is {name!r}, which is not known; {nearest(name, names(kind))}")
     try:
-        module = _run(kind, pathlib.Path(name).expanduser(), content) if is_own(name) else _module(kind, name)
+        module = (
+            _run_file(kind, pathlib.Path(name).expanduser(), content) if is_user_file(name) else _module(kind, name)
+        )
     except Exception as error:
         raise ConfigError(f"{where} is {name!r}, which cannot be run ({error!r})") from error
     contract = KINDS[kind][1]
@@ -65,7 +67,7 @@ def _module(kind: str, name: str) -> ModuleType:
     return importlib.import_module(f"{KINDS[kind][0]}.{name}")
 
 
-def is_own(name: Any) -> TypeGuard[str]:
+def is_user_file(name: Any) -> TypeGuard[str]:
     """Whether a plug-in's name is the path of a user file."""
     return isinstance(name, str) and name.endswith(".py")
 
@@ -86,7 +88,7 @@ def content_of(name: str, where: str) -> bytes:
 
 
 @functools.lru_cache(maxsize=64)  # one module per content, so that jax finds its compiled programs again
-def _run(kind: str, path: pathlib.Path, content: bytes) -> ModuleType:
+def _run_file(kind: str, path: pathlib.Path, content: bytes) -> ModuleType:
     """The module of a user file's content, with `path` as its file; for a copy, the path of the original."""
     module = ModuleType(f"gen2d_user_{kind}_{path.stem}")
     module.__file__ = str(path)

@@ -7,17 +7,15 @@ from gen2d.config.distributions import Distribution
 from gen2d.config.options import option
 from gen2d.storage.codecs import CODECS
 
-MAX_SLOTS = 254  # mask ids (slot + 1) are one byte; 0 is the background, 255 an occluder
-
 
 @dataclasses.dataclass(frozen=True)
 class VideoOptions:
     """Length, frame rate and size of videos."""
 
-    frames: int = option(64, int, "frames", "in a video, the initial state included", low=1, high=100_000)
-    fps: float = option(30.0, float, "1/s", "frames per second of the world's time", above=0, high=100_000)
-    height: int = option(64, int, "px", "of a frame", low=4, high=8192)
-    width: int = option(64, int, "px", "of a frame", low=4, high=8192)
+    frames: int = option(64, int, "frames", "length of a video, including the initial state", low=1, high=100_000)
+    fps: float = option(30.0, float, "1/s", "frame rate, in simulated time", above=0, high=100_000)
+    height: int = option(64, int, "px", "height of a frame", low=4, high=8192)
+    width: int = option(64, int, "px", "width of a frame", low=4, high=8192)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -25,21 +23,21 @@ class PhysicsOptions:
     """Time steps, damping and contact parameters of the simulation."""
 
     substeps: int | None = option(
-        None, int, "steps/frame", "null: as many as max_step asks for", low=1, high=10_000, optional=True
+        None, int, "steps/frame", "solver steps per frame; null: set by max_step", low=1, high=10_000, optional=True
     )
-    max_step: float = option(1 / 240, float, "s", "longest step where substeps is null", above=0, high=1)
+    max_step: float = option(1 / 240, float, "s", "largest time step if substeps is null", above=0, high=1)
     mixing: str = option(
-        "product", str, "", "of two elasticities or frictions", choices=("product", "mean", "max", "geometric")
+        "product", str, "", "rule for two elasticities or frictions", choices=("product", "mean", "max", "geometric")
     )
-    damping: float = option(0.0, float, "1/s", "rate at which velocity and spin die away", low=0, high=1000)
+    damping: float = option(0.0, float, "1/s", "decay rate of velocity and spin", low=0, high=1000)
     bounce_threshold: float = option(
-        0.01, float, "m/s", "slower impacts do not bounce, nor any that gravity makes in two steps", low=0
+        0.01, float, "m/s", "smallest impact speed that bounces; at least the gain by gravity in two steps", low=0
     )
     contact_hertz: float = option(
-        30.0, float, "Hz", "stiffness of an overlapping contact; at most 1/8 of the step rate", above=0
+        30.0, float, "Hz", "natural frequency of a contact, at most 1/8 of the step rate", above=0
     )
-    contact_damping_ratio: float = option(10.0, float, "1", "of an overlapping contact", above=0)
-    push_speed: float = option(3.0, float, "m/s", "an overlap is undone no faster", above=0)
+    contact_damping_ratio: float = option(10.0, float, "1", "damping ratio of a contact", above=0)
+    push_speed: float = option(3.0, float, "m/s", "largest speed at which an overlap is resolved", above=0)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -47,20 +45,20 @@ class CameraOptions:
     """View of the world and motion of the camera."""
 
     center: tuple[float, ...] | None = option(
-        None, float, "m", "world point in the middle of the frame; null: the scene's", parts=2, optional=True
+        None, float, "m", "world point at the centre of the frame; null: centre of the scene", parts=2, optional=True
     )
     scale: float | None = option(
-        None, float, "px/m", "pixels per metre; null: all of the scene", above=0, high=1e6, optional=True
+        None, float, "px/m", "pixels per metre; null: the scene fits", above=0, high=1e6, optional=True
     )
-    margin: float = option(0.0, float, "m", "shown around the scene where scale is null", low=0)
-    angle: Distribution = option(0.0, float, "rad", "of the camera, counter-clockwise", draw=True)
-    pan: tuple[Distribution, ...] = option([0, 0], float, "m/s", "speed of the camera", parts=2, draw=True)
-    zoom: Distribution = option(0.0, float, "1/s", "rate at which the scale grows", draw=True, low=-100, high=100)
-    turn: Distribution = option(0.0, float, "rad/s", "at which the camera turns", draw=True)
-    shake: Distribution = option(0.0, float, "m", "of a hand's tremor, rms in each direction", draw=True, low=0)
-    shake_hertz: float = option(4.0, float, "Hz", "lowest frequency of the tremor", above=0)
+    margin: float = option(0.0, float, "m", "width of the border around the scene if scale is null", low=0)
+    angle: Distribution = option(0.0, float, "rad", "angle of the camera, counter-clockwise", draw=True)
+    pan: tuple[Distribution, ...] = option([0, 0], float, "m/s", "velocity of the camera", parts=2, draw=True)
+    zoom: Distribution = option(0.0, float, "1/s", "growth rate of the scale", draw=True, low=-100, high=100)
+    turn: Distribution = option(0.0, float, "rad/s", "angular velocity of the camera, counter-clockwise", draw=True)
+    shake: Distribution = option(0.0, float, "m", "RMS displacement of hand shake per axis", draw=True, low=0)
+    shake_hertz: float = option(4.0, float, "Hz", "lowest frequency of hand shake", above=0)
     follow: int | None = option(
-        None, int, "slot", "of the object that stays in the middle of the frame; null: none", low=0, optional=True
+        None, int, "slot", "slot of the object that stays at the centre of the frame; null: none", low=0, optional=True
     )
 
 
@@ -68,30 +66,23 @@ class CameraOptions:
 class ImageOptions:
     """Image formation: blending of colours, motion blur, occluders and sensor noise."""
 
-    blending: str = option(
-        "srgb", str, "", "of a pixel's colours: as most tools do, or in linear light", choices=("srgb", "linear")
-    )
-    exposure: float = option(
-        0.0,
-        float,
-        "frames",
-        "for which the shutter is open, until the frame's instant; 0: no motion blur",
-        low=0,
-        high=1,
-    )
-    exposure_samples: int = option(8, int, "samples", "of an exposure, evenly in time", low=2, high=256)
+    blending: str = option("srgb", str, "", "color space for blending; most tools use srgb", choices=("srgb", "linear"))
+    exposure: float = option(0.0, float, "frames", "exposure before each frame; 0: no motion blur", low=0, high=1)
+    exposure_samples: int = option(8, int, "samples", "instants averaged per exposure", low=2, high=256)
     noise: Distribution = option(
-        0.0, float, "sRGB", "standard deviation of a video's sensor noise", draw=True, low=0, high=255
+        0.0, float, "sRGB", "standard deviation of the sensor noise", draw=True, low=0, high=255
     )
-    occluders: int = option(0, int, "rectangles", "that stand before objects and do not take part", low=0, high=16)
-    occluder_width: Distribution = option([0.1, 0.3], float, "1", "of an occluder, over the frame's", draw=True, low=0)
-    occluder_height: Distribution = option([0.1, 0.6], float, "1", "of an occluder, over the frame's", draw=True, low=0)
+    occluders: int = option(0, int, "rectangles", "number of occluders, fixed in the image", low=0, high=16)
+    occluder_width: Distribution = option([0.1, 0.3], float, "1", "occluder width over frame width", draw=True, low=0)
+    occluder_height: Distribution = option(
+        [0.1, 0.6], float, "1", "occluder height over frame height", draw=True, low=0
+    )
     occluder_front: Distribution = option(
-        1.0, float, "1", "share of the objects that an occluder stands before, in their drawing order",
+        1.0, float, "1", "fraction of the objects, in drawing order, behind an occluder",
         draw=True, low=0, high=1,
     )  # fmt: skip
     occluder_color: tuple[Distribution, ...] = option(
-        [[60, 140]] * 3, int, "sRGB", "of an occluder", parts=3, draw=True, low=0, high=255
+        [[60, 140]] * 3, int, "sRGB", "color of an occluder", parts=3, draw=True, low=0, high=255
     )
 
 
@@ -100,40 +91,44 @@ class SimulationAnnotations:
     """Annotations computed from the simulation, stored beside frames and states."""
 
     contacts: int = option(
-        0, int, "rows", "of contacts, per object and 16 frames; 4 is a good number, 0: none", low=0, high=1000
+        0, int, "rows", "stored contacts per object and 16 frames, such as 4; 0: none", low=0, high=1000
     )
-    energy: bool = option(False, bool, "", "books of energy and momentum, and what they leave unexplained")
-    captions: bool = option(False, bool, "", "a caption and a list of events, as text; they need contacts")
-    lyapunov: bool = option(False, bool, "", "how fast a small change of the start grows")
+    energy: bool = option(False, bool, "", "energy balance and momentum in each frame")
+    captions: bool = option(False, bool, "", "caption and list of events, as text; needs contacts")
+    lyapunov: bool = option(False, bool, "", "growth rate of a small perturbation of the initial state")
 
 
 @dataclasses.dataclass(frozen=True)
 class QualityOptions:
     """Accepted ranges of quality measures (null: no limit); videos outside are replaced by new samples."""
 
-    min_contacts: int | None = option(None, int, "contacts", "that begin in a video", low=0, optional=True)
-    max_contacts: int | None = option(None, int, "contacts", "that begin in a video", low=0, optional=True)
-    min_penetration: float | None = option(None, float, "m", "of a video's deepest overlap", low=0, optional=True)
-    max_penetration: float | None = option(None, float, "m", "of a video's deepest overlap", low=0, optional=True)
+    min_contacts: int | None = option(
+        None, int, "contacts", "lower limit of the number of contacts", low=0, optional=True
+    )
+    max_contacts: int | None = option(
+        None, int, "contacts", "upper limit of the number of contacts", low=0, optional=True
+    )
+    min_penetration: float | None = option(None, float, "m", "lower limit of the deepest overlap", low=0, optional=True)
+    max_penetration: float | None = option(None, float, "m", "upper limit of the deepest overlap", low=0, optional=True)
     min_lyapunov: float | None = option(
-        None, float, "1/s", "of a small change; needs annotations.lyapunov", optional=True
+        None, float, "1/s", "lower limit of the growth rate; needs annotations.lyapunov", optional=True
     )
     max_lyapunov: float | None = option(
-        None, float, "1/s", "of a small change; needs annotations.lyapunov", optional=True
+        None, float, "1/s", "upper limit of the growth rate; needs annotations.lyapunov", optional=True
     )
     min_energy_residual: float | None = option(
-        None, float, "J", "of energy; needs annotations.energy", low=0, optional=True
+        None, float, "J", "lower limit of the energy residual; needs annotations.energy", low=0, optional=True
     )
     max_energy_residual: float | None = option(
-        None, float, "J", "of energy; needs annotations.energy", low=0, optional=True
+        None, float, "J", "upper limit of the energy residual; needs annotations.energy", low=0, optional=True
     )
     min_visibility: float | None = option(
-        None, float, "1", "of the object least seen; needs annotations.visibility", low=0, high=1, optional=True
+        None, float, "1", "lower limit of visible fractions; needs annotations.visibility", low=0, high=1, optional=True
     )
     max_visibility: float | None = option(
-        None, float, "1", "of the object least seen; needs annotations.visibility", low=0, high=1, optional=True
+        None, float, "1", "upper limit of visible fractions; needs annotations.visibility", low=0, high=1, optional=True
     )
-    attempts: int = option(1000, int, "attempts", "at a video, at most", low=1, high=1_000_000)
+    attempts: int = option(1000, int, "attempts", "largest number of attempts at a video", low=1, high=1_000_000)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -144,44 +139,36 @@ class MatchedOptions:
         None,
         str,
         "",
-        "what members differ in: a factor of the scene's, or "
-        f"{', '.join(matched.INTERVENTIONS)}; one of a list for each set",
+        "difference between members: a factor of the scene, or "
+        f"{', '.join(matched.INTERVENTIONS)}; from a list, one per set; null: no sets",
         several=True,
         optional=True,
     )
-    members: int = option(2, int, "videos", "in a set, the original included", low=2, high=256)
+    members: int = option(2, int, "videos", "number of videos in a set, including the original", low=2, high=256)
     scale: Distribution | None = option(
-        None, float, "1", "that a factor is multiplied by; null: it is drawn anew", above=0, draw=True, optional=True
+        None, float, "1", "multiplier of the factor; null: new sample", above=0, draw=True, optional=True
     )
-    objects: str = option(
-        "one", str, "", "whose factor is changed where each has its own: one's or all's", choices=("one", "all")
-    )
+    objects: str = option("one", str, "", "objects that change, for a factor per object", choices=("one", "all"))
     onset: Distribution = option(
-        [0.3, 0.7], float, "1", "share of a video before a violation", low=0, high=1, draw=True
+        [0.3, 0.7], float, "1", "fraction of the video before a violation", low=0, high=1, draw=True
     )
-    distance: Distribution = option([2, 4], float, "m", "that teleport moves an object by", above=0, draw=True)
-    gain: Distribution = option([1.5, 2.5], float, "1", "of an object's speed in energy_gain", low=0, draw=True)
+    distance: Distribution = option([2, 4], float, "m", "distance of a teleport", above=0, draw=True)
+    gain: Distribution = option([1.5, 2.5], float, "1", "speed ratio of energy_gain", low=0, draw=True)
 
 
 @dataclasses.dataclass(frozen=True)
 class StorageOptions:
     """Storage of videos on disk."""
 
-    frames: str = option(
-        "video",
-        str,
-        "",
-        "video: stored; none: left out, to be drawn again with gen2d.render",
-        choices=("video", "none"),
-    )
+    frames: str = option("video", str, "", "stored frames; none: rendered by gen2d.render", choices=("video", "none"))
     codec: str = option(
-        "gzip", str, "", "of the frames: gzip opens everywhere, zstd is smaller, none can be mapped", choices=CODECS
+        "gzip", str, "", "codec of frames: gzip opens everywhere, zstd is smaller, none can be mapped", choices=CODECS
     )
     chunk_frames: int | None = option(
         None,
         int,
         "frames",
-        "compressed together; null: a whole video. Fewer make short windows faster to read and files larger",
+        "frames per compressed chunk; null: a whole video. Small chunks suit short windows but enlarge files",
         low=1,
         optional=True,
     )
@@ -189,7 +176,7 @@ class StorageOptions:
         None,
         int,
         "videos",
-        "null: the largest power of two with raw frames of 1 GiB at most, up to 1024",
+        "videos per shard; null: the power of two up to 1024 that holds at most 1 GiB of raw frames",
         low=1,
         high=65536,
         optional=True,
@@ -198,7 +185,8 @@ class StorageOptions:
         None,
         int,
         "videos",
-        "simulated at once by a device; null: 512, or fewer with many objects. Changes the last bits of a simulation",
+        "number of videos that a device simulates at once; null: 512, or fewer with many objects. "
+        "Affects the last bits of a simulation",
         low=1,
         high=65536,
         optional=True,

@@ -9,12 +9,12 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from gen2d.config.distributions import Distribution, Span
+from gen2d.config.distributions import Distribution, Span, next_float32
 
-Intervals = list[tuple[float, Distribution]]
-MOST_POINTS = 1000  # whole numbers removed from a continuous range, at most
-FAR = 10.0  # standard deviations; a float32 normal never gets farther from its mean
-LEAST = 1e-7  # probability of a piece of a normal; less likely pieces are dropped, and those far in a tail
+Pieces = list[tuple[float, Distribution]]
+MAX_POINTS = 1000  # whole numbers removed from a continuous range, at most
+MAX_DEVIATIONS = 10.0  # standard deviations; a float32 normal never gets farther from its mean
+MIN_PROBABILITY = 1e-7  # probability of a piece of a normal; less likely pieces are dropped, and those far in a tail
 
 
 def far_in_tail(mean: float, deviation: float, low: float, high: float) -> bool:
@@ -33,40 +33,43 @@ def mixture(pieces: Sequence[tuple[float, Distribution]]) -> Distribution:
     return Distribution("mixture", tuple(shares.values()), tuple(shares))
 
 
-def total(pieces: Intervals) -> float:
+def total(pieces: Pieces) -> float:
     """Total probability of the pieces."""
     return sum(share for share, _ in pieces)
 
 
-def inside(source: Distribution, spans: Iterable[Span]) -> Intervals:
+def inside(source: Distribution, spans: Iterable[Span]) -> Pieces:
     """Pieces of a distribution inside the union of the spans."""
     kept, remaining = [], source.weighted
     for span in spans:
-        kept += _within(remaining, span)
-        remaining = _without(remaining, span)
+        kept += _pieces_inside(remaining, span)
+        remaining = _pieces_outside(remaining, span)
     return kept
 
 
-def outside(source: Distribution, spans: Iterable[Span]) -> Intervals:
+def outside(source: Distribution, spans: Iterable[Span]) -> Pieces:
     """Pieces of a distribution outside all spans."""
     remaining = source.weighted
     for span in spans:
-        remaining = _without(remaining, span)
+        remaining = _pieces_outside(remaining, span)
     return remaining
 
 
-def _within(pieces: Intervals, span: Span) -> Intervals:
-    return [(share * part, cut) for share, piece in pieces for part, cut in _meeting(piece, span)]
+def _pieces_inside(pieces: Pieces, span: Span) -> Pieces:
+    return [(share * part, truncated) for share, piece in pieces for part, truncated in _truncated_to(piece, span)]
 
 
-def _without(pieces: Intervals, span: Span) -> Intervals:
+def _pieces_outside(pieces: Pieces, span: Span) -> Pieces:
     """Pieces below and above the span and, for a span of whole numbers, between these numbers."""
     remaining = []
     for share, piece in pieces:
         holes = [span] if not span.whole or piece.kind == "integer" else _points(span)
         parts = [(share, piece)]
         for hole in holes:
-            parts = [*_within(parts, Span(-math.inf, hole.low)), *_within(parts, Span(hole.high, math.inf))]
+            parts = [
+                *_pieces_inside(parts, Span(-math.inf, hole.low)),
+                *_pieces_inside(parts, Span(hole.high, math.inf)),
+            ]
         remaining += parts
     return remaining
 
@@ -74,20 +77,18 @@ def _without(pieces: Intervals, span: Span) -> Intervals:
 def _points(span: Span) -> list[Span]:
     """One span for each whole number of a span. Raises ValueError if there are too many."""
     first = math.ceil(span.low)
-    if not span.last - first < MOST_POINTS:
-        raise ValueError(f"of at most {MOST_POINTS} whole numbers where they are cut out of a range")
-    return [
-        Span(float(x), float(np.nextafter(np.float32(x), np.float32(np.inf)))) for x in range(first, int(span.last) + 1)
-    ]
+    if not span.last - first < MAX_POINTS:
+        raise ValueError(f"of at most {MAX_POINTS} whole numbers where they are cut out of a range")
+    return [Span(float(x), next_float32(x)) for x in range(first, int(span.last) + 1)]
 
 
-def _meeting(piece: Distribution, span: Span) -> Intervals:
+def _truncated_to(piece: Distribution, span: Span) -> Pieces:
     """The part of a piece inside a span; an empty list if there is none."""
     if piece.kind in ("constant", "choice", "grid"):
         kept = np.asarray(piece.numbers)[span.contains(piece.numbers)].tolist()
         return [(len(kept) / len(piece.numbers), Distribution(piece.kind, tuple(kept)))] if kept else []
     support = piece.spans[0]
-    overlap = support.meet(span)
+    overlap = support.intersect(span)
     # Single numbers have probability 0 in a continuous range.
     if overlap is None or (overlap.whole and not support.whole):
         return []
@@ -96,18 +97,19 @@ def _meeting(piece: Distribution, span: Span) -> Intervals:
     if piece.kind == "integer":
         low, high = math.ceil(overlap.low), math.ceil(overlap.high)
         return [((high - low) / (support.high - support.low), Distribution("integer", (low, high - 1)))]
-    share = (_rises(piece, overlap.high) - _rises(piece, overlap.low)) / (
-        _rises(piece, support.high) - _rises(piece, support.low)
+    share = (_unscaled_cdf(piece, overlap.high) - _unscaled_cdf(piece, overlap.low)) / (
+        _unscaled_cdf(piece, support.high) - _unscaled_cdf(piece, support.low)
     )
     if piece.kind == "normal":
         mean, deviation = piece.numbers[:2]
-        low, high = max(overlap.low, mean - FAR * deviation), min(overlap.high, mean + FAR * deviation)
-        cut = Distribution("normal", (mean, deviation, low, high))
-        return [(share, cut)] if share > LEAST and not far_in_tail(*cut.numbers) else []
+        reach = MAX_DEVIATIONS * deviation
+        low, high = max(overlap.low, mean - reach), min(overlap.high, mean + reach)
+        truncated = Distribution("normal", (mean, deviation, low, high))
+        return [(share, truncated)] if share > MIN_PROBABILITY and not far_in_tail(*truncated.numbers) else []
     return [(share, Distribution(piece.kind, (overlap.low, overlap.high)))]
 
 
-def _rises(piece: Distribution, x: float) -> float:
+def _unscaled_cdf(piece: Distribution, x: float) -> float:
     """The cumulative distribution function at x, up to a constant factor and offset."""
     if piece.kind == "uniform":
         return x

@@ -17,7 +17,7 @@ from gen2d.core.errors import ConfigError, UntrustedError
 from gen2d.storage.sealed import open_regular, sha256
 
 _HASH = re.compile(r"[0-9a-f]{64}")
-_BYTES = 2**20  # read from the list, at most
+_MAX_BYTES = 2**20  # read from the list, at most
 
 
 def list_path() -> Path:
@@ -38,7 +38,7 @@ def check_trusted(copies: Mapping[str, bytes], trust: str | Sequence[str], root:
         if not isinstance(entry, str) or not _HASH.fullmatch(entry):
             raise ConfigError(f"--trust is {entry!r}, but must be the sha256 of a file, 64 hexadecimal digits")
     digests = {path: sha256(content) for path, content in copies.items()}
-    allowed = trusted | _listed() if digests.keys() and not set(digests.values()) <= trusted else trusted
+    allowed = trusted | _read_list() if digests.keys() and not set(digests.values()) <= trusted else trusted
     for path, digest in sorted(digests.items()):
         if digest not in allowed:
             raise UntrustedError(
@@ -50,7 +50,7 @@ def check_trusted(copies: Mapping[str, bytes], trust: str | Sequence[str], root:
 def remember(contents: Iterable[bytes]) -> None:
     """Add files that this user generates with to the list; do nothing if the list cannot be written."""
     try:
-        path, known = list_path(), _listed()
+        path, known = list_path(), _read_list()
         new = sorted({sha256(content) for content in contents} - known)
         if new:
             path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
@@ -62,14 +62,14 @@ def remember(contents: Iterable[bytes]) -> None:
         pass
 
 
-def _listed() -> set[str]:
+def _read_list() -> set[str]:
     """Hashes in the user's list; none if another user owns it or can write to it."""
     try:
         with os.fdopen(open_regular(list_path()), "rb") as file:
             status = os.fstat(file.fileno())
             if status.st_uid != os.getuid() or status.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
                 return set()
-            lines = file.read(_BYTES).decode("utf-8", "replace").splitlines()
+            lines = file.read(_MAX_BYTES).decode("utf-8", "replace").splitlines()
     except OSError:
         return set()
     return {words[0] for line in lines if (words := line.split()) and _HASH.fullmatch(words[0])}

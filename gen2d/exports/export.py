@@ -116,9 +116,9 @@ def export(
 def _format(to: str) -> Export:
     """Format with this name, or from this Python file."""
     known = plugins.names("export")
-    if not plugins.is_own(to) and to not in known:
+    if not plugins.is_user_file(to) and to not in known:
         raise ConfigError(f"--to is {to!r}, but must be one of {', '.join(known)}, or a Python file")
-    content = plugins.content_of(to, "--to") if plugins.is_own(to) else b""
+    content = plugins.content_of(to, "--to") if plugins.is_user_file(to) else b""
     return plugins.load("export", to, "--to", content)
 
 

@@ -16,7 +16,7 @@ from gen2d.loading.dataset import Dataset
 from gen2d.loading.protocols import Batch
 from gen2d.storage.paths import Place
 
-FRAMES = Field("uint8", "n T H W 3", "sRGB", "the video")  # equal to the field of stored frames
+FRAMES = Field("uint8", "n T H W 3", "sRGB", "frames of the video")  # equal to the field of stored frames
 RENDERED_BYTES = 2**26  # size of a batch of rendered frames
 
 

@@ -1,6 +1,5 @@
 """Generation of a dataset: its missing videos, batch by batch, written shard by shard."""
 
-import contextlib
 import dataclasses
 import numbers
 import os
@@ -9,7 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from gen2d.config.config import Config, checked_seed, load_config, own_files
+from gen2d.config.config import Config, checked_seed, load_config, user_plugin_files
 from gen2d.config.trust import remember
 from gen2d.core.errors import ConfigError
 from gen2d.core.progress import progress, stopping_on_sigterm
@@ -127,12 +126,12 @@ def generate(
     out = place(out, network) if out is not None else Path("datasets") / config.name
     remember(config.copies.values())
     on = devices.prepare(device)
-    with contextlib.closing(VideoSource(config, on)) as source:
-        dataset = dataset_of(source, out, counts, fingerprint(source.rollout))
-        remaining = [shard for shard in shards.open_folder(dataset, overwrite) if shard.split in counts]
-        todo = shards_of_worker(remaining, *worker)
-        began, video_count = time.perf_counter(), sum(shard.count for shard in todo)
-        size = generate_shards(source, dataset, todo, log)
+    source = VideoSource(config, on)
+    dataset = dataset_of(source, out, counts, fingerprint(source.rollout))
+    remaining = [shard for shard in shards.open_folder(dataset, overwrite) if shard.split in counts]
+    todo = shards_of_worker(remaining, *worker)
+    began, video_count = time.perf_counter(), sum(shard.count for shard in todo)
+    size = generate_shards(source, dataset, todo, log)
     is_complete = complete(dataset)
     seconds = time.perf_counter() - began
     if todo:
@@ -144,7 +143,7 @@ def generate(
 def _counts(config: Config, n: int, split: str | None) -> dict[str, int]:
     """Requested number of videos, by split."""
     if split is not None:
-        config.row(split)  # raises ConfigError if there is no such split
+        config.split_index(split)  # raises ConfigError if there is no such split
         return {split: n}
     return {each.name: each.videos or n for each in config.splits} or {"train": n}
 
@@ -184,7 +183,7 @@ def dataset_of(
         constants=schema.constants,
         conventions=CONVENTIONS,
         command="python -m gen2d --config config.yaml",
-        copies={path: config.copies[name] for path, name in own_files(config.plain()).items()},
+        copies={path: config.copies[name] for path, name in user_plugin_files(config.plain()).items()},
     )
 
 

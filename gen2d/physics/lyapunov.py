@@ -14,7 +14,10 @@ from gen2d.records.trajectory import Trajectory
 
 FIELDS = {
     "quality/lyapunov": Field(
-        "float32", "n", "1/s", "log10 of what a small change of the start is multiplied by, over the video's seconds"
+        "float32",
+        "n",
+        "1/s",
+        "growth rate of a small perturbation of the initial state: log10 of its growth, over the duration of the video",
     )
 }
 SMALL = 1e-18  # size of the perturbation, which may grow by 10^56 in a float32; the derivative is linear in it

@@ -98,7 +98,7 @@ def _compute_hashes(rollout: Rollout) -> dict[str, str]:
         hashes["captions"] = code_hash(caption)
     if rollout.sampler.gridded:
         hashes["grids"] = code_hash(
-            Sampler.combination, epochs.order, permutation.hashed, permutation.feistel, permutation.splitmix64
+            Sampler.grid_values, epochs.order, permutation.hashed, permutation.feistel, permutation.splitmix64
         )
     return hashes
 

@@ -4,7 +4,7 @@ import contextlib
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from gen2d.config.config import Config, load_config, own_files
+from gen2d.config.config import Config, load_config, user_plugin_files
 from gen2d.config.plugin_options import StoredCopies
 from gen2d.config.trust import check_trusted
 from gen2d.core.errors import ConfigError
@@ -54,7 +54,7 @@ def _config_hashes(value: Any) -> set[str]:
 def _stored_copies(root: Place, config: Mapping[str, Any]) -> dict[str, tuple[str, bytes]]:
     """Copies of user files in the dataset: the name in the config and the content, by path."""
     copies = {}
-    for path, name in own_files(config).items():
+    for path, name in user_plugin_files(config).items():
         if PLUGIN.fullmatch(path):
             with reading(root), contextlib.suppress(FileNotFoundError, IsADirectoryError):
                 copies[path] = name, read_bytes(root / path, SOURCE_BYTES)

@@ -5,7 +5,6 @@ stored. A dataset of states alone (`storage: {frames: none}`) can therefore be r
 device.
 """
 
-import contextlib
 import dataclasses
 import functools
 import zlib
@@ -28,7 +27,7 @@ from gen2d.physics.params import solver_params
 from gen2d.physics.simulate import simulate, substeps
 from gen2d.programs import render as render_module
 from gen2d.programs.recipe import Trust, config_of
-from gen2d.programs.rollout import save_at
+from gen2d.programs.simulation import save_at
 from gen2d.programs.source import VideoSource
 from gen2d.records import axes
 from gen2d.records import keys as keys_module
@@ -401,6 +400,6 @@ def _compile(program: Callable, settings: _Settings, *more: float) -> Callable:
 def _regenerate(ds: Dataset, config: Config, numbers: np.ndarray) -> dict[str, Array]:
     """Frames and annotations of videos that are sampled and simulated again, as motion blur needs unsaved states."""
     config = load_config(config, [f"storage.batch_size={ds.manifest.fingerprint['batch_size']}"])
-    with contextlib.closing(VideoSource(config, jax.devices()[:1])) as source:
-        names = ["frames", *annotations.fields(config.annotations, {})]
-        return {name: jnp.asarray(values) for name, values in source.videos(ds.options.split, numbers, names).items()}
+    source = VideoSource(config, jax.devices()[:1])
+    names = ["frames", *annotations.fields(config.annotations, {})]
+    return {name: jnp.asarray(values) for name, values in source.videos(ds.options.split, numbers, names).items()}

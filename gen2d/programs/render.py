@@ -33,7 +33,7 @@ def plan_of(config: Config, layout: Layout) -> FramePlan:
         width=video.width,
         scale=camera.largest_scale(config.camera, layout, video.height, video.width, seconds),
         grow=look.contract.margin(look.options),
-        still=not camera.moves(config.camera),
+        still=not camera.may_move(config.camera),
         linear=image.blending == "linear",
         frames=config.storage.frames != "none",
         owners=annotations.need_owners(config.annotations),
@@ -49,7 +49,9 @@ def paint_of(key: Array, config: Config, scene: Scene, layout: Layout) -> Paint:
 def view_of(key: Array, config: Config, layout: Layout, states: State) -> CameraView:
     """Camera view of one video with this key."""
     video = config.video
-    return camera.filmed(key_for(key, "camera"), config.camera, layout, states, video.fps, video.height, video.width)
+    return camera.sample_view(
+        key_for(key, "camera"), config.camera, layout, states, video.fps, video.height, video.width
+    )
 
 
 def render_scene(
@@ -142,7 +144,7 @@ def render_frames(render_scenes: RenderScene, plan: FramePlan, options: Annotati
     """Frames and annotations [n, ...] of these videos, by stored name."""
     frames, owners = draw(render_scenes, plan)
     rendered = {} if frames is None else {"frames": frames}
-    return rendered | annotations.annotated(render_scenes, owners, plan, options)
+    return rendered | annotations.annotate(render_scenes, owners, plan, options)
 
 
 def painted_colors(paint: Paint, scene: Scene) -> Array:

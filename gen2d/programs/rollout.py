@@ -76,9 +76,9 @@ class Rollout:
 
         Raises NoVideoError if no attempt at some video lies in the ranges that the config requires.
         """
-        root, row = keys_module.seed_words(self.config.seed, zlib.crc32(split.encode())), self.config.row(split)
+        root, row = keys_module.seed_words(self.config.seed, zlib.crc32(split.encode())), self.config.split_index(split)
         numbers = numbers.astype(np.uint32)
-        grid = self.sampler.combination(row, root, numbers)
+        grid = self.sampler.grid_values(row, root, numbers)
 
         def simulate_rows(rows: np.ndarray, attempts: np.ndarray) -> DeviceBatch:
             sharded = self._shard_over_devices((grid[rows], numbers[rows], attempts.astype(np.uint32)))

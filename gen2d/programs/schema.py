@@ -22,9 +22,9 @@ from gen2d.sampling import rejection, sampler
 from gen2d.sampling.matched import sets
 
 CAMERA = (
-    ("center", "n T 2", "m", "world point in the middle of the frame"),
+    ("center", "n T 2", "m", "world point at the centre of the frame"),
     ("scale", "n T", "px/m", "pixels per metre"),
-    ("angle", "n T", "rad", "of the camera, counter-clockwise"),
+    ("angle", "n T", "rad", "angle of the camera, counter-clockwise"),
 )
 
 
@@ -62,16 +62,16 @@ class VideoSchema:
         for name in sets.omitted_fields(config.matched):
             del fields[name]
         if self.plan.frames:
-            fields["frames"] = Field("uint8", "n T H W 3", "sRGB", "the video")
+            fields["frames"] = Field("uint8", "n T H W 3", "sRGB", "frames of the video")
         fields |= self.host_fields
         if config.annotations.simulated.lyapunov:
             fields |= lyapunov.FIELDS
-        fields["index"] = Field("int64", "n", "1", "the video's number in its split")
-        fields["time"] = Field("float64", "T", "s", "of each frame; frame 0 is the initial state")
+        fields["index"] = Field("int64", "n", "1", "number of the video in its split")
+        fields["time"] = Field("float64", "T", "s", "time of each frame; frame 0 is the initial state")
         if self.layout.joints:
-            fields["joints/kind"] = Field("uint8", "J", "1", f"index into {', '.join(JOINT_KINDS)}")
+            fields["joints/kind"] = Field("uint8", "J", "1", f"kind, an index into {', '.join(JOINT_KINDS)}")
             fields |= {f"joints/{side}": Field("int16", "J", "object", f"slot of object {side}") for side in "ab"}
-        fields["quality/rejected_draws"] = Field("int32", "n", "1", "places drawn again as they did not fit")
+        fields["quality/rejected_draws"] = Field("int32", "n", "1", "number of positions rejected for overlap")
         fields |= {"quality/rejected_videos": rejection.FIELD} if quality.ranges(config.quality) else {}
         for name, axis_names, unit, meaning in CAMERA:
             fields[f"camera/{name}"] = Field("float32", axis_names, unit, meaning)
@@ -79,7 +79,7 @@ class VideoSchema:
         return dict(sorted(annotations.fields(config.annotations, fields).items()))
 
     def _scene(self, key: jax.Array) -> scene.Scene:
-        return self.sampler.sampled(key, given=jnp.zeros(len(self.sampler.gridded)))[1].scene
+        return self.sampler.sample(key, given=jnp.zeros(len(self.sampler.gridded)))[1].scene
 
     @functools.cached_property
     def constants(self) -> dict[str, np.ndarray]:
@@ -100,7 +100,7 @@ class VideoSchema:
     def host_fields(self) -> dict[str, Field]:
         """Fields that the host computes from the others: split and captions."""
         longest = max((len(split.name) for split in self.config.splits), default=0)
-        fields = {"split": Field(f"S{longest}", "n", "", "the split that the video belongs to")} if longest else {}
+        fields = {"split": Field(f"S{longest}", "n", "", "split of the video")} if longest else {}
         captioned = self.config.annotations.simulated.captions
         return fields | (caption.fields(self.layout.slots, self.config.video.frames) if captioned else {})
 

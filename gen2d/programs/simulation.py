@@ -56,14 +56,14 @@ class BatchSimulation:
         if config.matched.change:
 
             def member(key: Array, change: FactorChange | None = None) -> tuple[dict[str, Array], SampledScene]:
-                return self.sampler.sampled(key, row, change=change)
+                return self.sampler.sample(key, row, change=change)
 
             factors, sampled, trajectory, matched_columns = simulate_module.simulate_members(
                 keys, numbers, config, self.layout, member, self._trajectory
             )
         else:
             own_keys = rejection.attempt_keys(keys, attempts) if self.quality_ranges else keys
-            factors, sampled = jax.vmap(self.sampler.sampled, (0, None, 0))(own_keys, row, grid)
+            factors, sampled = jax.vmap(self.sampler.sample, (0, None, 0))(own_keys, row, grid)
             trajectory = self._trajectory(sampled.scene, sampled.state)
         scene, between, trajectory = sampled.scene, trajectory.between, dataclasses.replace(trajectory, between=None)
 
@@ -76,7 +76,7 @@ class BatchSimulation:
         columns["objects/color"] = colors
         columns |= render.camera_columns(render_scenes.instants.view)
         columns |= {f"factors/{name}": values.astype(jnp.float32) for name, values in factors.items()}
-        columns |= jax.vmap(self.sampler.outside)(factors)
+        columns |= jax.vmap(self.sampler.ood_distances)(factors)
         columns["quality/rejected_draws"] = sampled.rejected
         if config.annotations.simulated.lyapunov:
             columns["quality/lyapunov"] = self._lyapunov(keys, sampled)

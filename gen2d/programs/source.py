@@ -4,7 +4,6 @@ A request names the videos of one batch. The source simulates it, checks that al
 slices. Its users see neither batches nor slices, padding for idle devices or host-computed fields.
 """
 
-import contextlib
 import itertools
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -14,7 +13,8 @@ import numpy as np
 
 from gen2d.config.config import Config
 from gen2d.core.errors import UserError
-from gen2d.programs.rollout import DeviceBatch, Rollout, per_device
+from gen2d.programs.rollout import Rollout, per_device
+from gen2d.programs.simulation import DeviceBatch
 from gen2d.records.axes import Array
 
 
@@ -87,24 +87,16 @@ class VideoSource:
         self.config, self.rollout = config, Rollout(config, devices)
         self.schema = self.rollout.schema
 
-    def close(self) -> None:
-        """Free the compiled programs."""
-        self.rollout.close()
-
     def of_splits(self, splits: Iterable[str]) -> Iterator[tuple["VideoSource", set[str]]]:
         """Sources of these splits, each with the splits that share it.
 
-        A split with its own look or physics has its own source, which is closed when the next one is requested.
+        A split with its own look or physics has its own source.
         """
         groups: dict[Config, set[str]] = {}
         for split in splits:
             groups.setdefault(self.config.of_split(split), set()).add(split)
         for config, group in groups.items():
-            if config == self.config:
-                yield self, group
-            else:
-                with contextlib.closing(VideoSource(config, self.rollout.devices)) as other:
-                    yield other, group
+            yield self if config == self.config else VideoSource(config, self.rollout.devices), group
 
     def videos(self, split: str, numbers: Any, fields: Sequence[str] | None = None) -> dict[str, np.ndarray]:
         """Fields [n, ...] by name of the videos of a split with these numbers [n]; by default all fields.

@@ -9,15 +9,17 @@ NumPy's functions take parameters (`np.sqrt`, `np.hypot`); those of `math` need 
 """
 
 import contextlib
+import functools
 import math
 import operator
 from collections.abc import Callable, Hashable, Iterator, Sequence
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+R = TypeVar("R")
 SIZE = 4096  # numbers that a program can take
 
 
@@ -201,10 +203,15 @@ for _name in ("lt", "le", "gt", "ge", "eq", "ne"):
     setattr(Parameter, f"__{_name}__", _comparison(getattr(operator, _name)))
 
 # jitted functions such as jnp.where take parameters as trees; inside they are arrays.
-jax.tree_util.register_pytree_node(Parameter, lambda x: ((jnp.asarray(x),), None), lambda _, leaves: leaves[0])
+jax.tree_util.register_pytree_node(Parameter, lambda x: ((jnp.asarray(x),), None), lambda _, leaves: leaves[0])  # pyright: ignore[reportArgumentType]
 
 
 def apply(operation: Callable, *operands: Any) -> Any:
     """Result of a host function of numbers; recorded if one of them is a parameter."""
     tape = next((x.tape for x in operands if isinstance(x, Parameter)), None)
     return operation(*operands) if tape is None else tape.apply(operation, *operands)
+
+
+def recorded(operation: Callable[..., R]) -> Callable[..., R]:
+    """Decorator of a host function of numbers, which `apply` then calls."""
+    return functools.wraps(operation)(functools.partial(apply, operation))

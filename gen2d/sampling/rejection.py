@@ -18,7 +18,7 @@ from gen2d.core.schema import Field
 from gen2d.records.axes import Array
 from gen2d.records.keys import key_for
 
-FIELD = Field("int32", "n", "1", "attempts rejected, as they were outside the ranges that quality asks for")
+FIELD = Field("int32", "n", "1", "number of rejected attempts, which lay outside the ranges of the section quality")
 
 
 class NoVideoError(UserError):
@@ -66,7 +66,7 @@ def accepted_batch(
         chosen[pending[accepted]] = tried + first[accepted]
         source = np.full(len(rows), -1)
         source[pending[accepted]] = (np.arange(len(pending)) * per_video + first)[accepted]
-        batch = _replaced(batch, attempted, source)
+        batch = _replace_rows(batch, attempted, source)
         pending, tried = pending[~accepted], tried + per_video
     return batch, chosen
 
@@ -78,7 +78,7 @@ def _fits(batch: Any, wanted: Mapping[str, tuple[float, float]]) -> np.ndarray:
 
 
 @jax.jit
-def _replaced(old: Any, new: Any, source: Array) -> Any:
+def _replace_rows(old: Any, new: Any, source: Array) -> Any:
     """The old batch, with rows of the new one where `source` [n] is their index and not -1."""
     replaced, row = source >= 0, jnp.maximum(source, 0)
     return jax.tree.map(lambda a, b: jnp.where(replaced.reshape(-1, *[1] * (a.ndim - 1)), b[row], a), old, new)

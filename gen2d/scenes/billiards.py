@@ -16,7 +16,7 @@ from gen2d.plugin import STATIC, Array, Distribution, Family, Layout, SampledSce
 class Options:
     """The table, the rack and the stroke."""
 
-    rows: Distribution = common.count("rows", [3, 5], "rows of the rack: 1, 3, 6, 10, ... balls", high=21)
+    rows: Distribution = common.count("rows", [3, 5], "number of rows of the rack: 1, 3, 6, 10, ... balls", high=21)
     width: float = common.size("width of the table, inside", 10.0)
     height: float = common.size("height of the table, inside", 5.0)
     head_distance: float = option(2.5, float, "m", "largest distance from the left cushion to the cue ball", above=0)

@@ -36,7 +36,9 @@ class Options:
     span: Distribution = common.fraction("distance between two pins, over the chain's length", [0.4, 0.85])
     slope: Distribution = common.angle("slope of the line from the left pin to the right one", [-0.3, 0.3])
     pulled_joint: Distribution = common.fraction("joint that is pulled; 0: the first that is possible, 1: the last")
-    pulled_above: Distribution = option([0, 1], int, "1", "1: pulled up, 0: pulled down", low=0, high=1, draw=True)
+    pulled_above: Distribution = option(
+        [0, 1], int, "1", "direction of the pull; 1: up, 0: down", low=0, high=1, draw=True
+    )
     angle: Distribution = common.angle("angle of a chain with one pin at the start, from hanging down", [-2.0, 2.0])
     friction: Distribution = option(0.0, float, "N m", "largest torque of the friction in a joint", low=0, draw=True)
     gravity: tuple[Distribution, ...] = common.gravity()
@@ -126,5 +128,5 @@ FAMILY = Family(
     sample=sample,
     check=check,
     sizes=sizes,
-    derived={"kink": Field("float32", "n", "1", "joint that it is pulled by at the start, counted from the left pin")},
+    derived={"kink": Field("float32", "n", "1", "joint that is pulled at the start, counted from the left pin")},
 )

@@ -118,10 +118,7 @@ FAMILY = Family(
     sizes=sizes,
     derived={
         "contact_frame": Field(
-            "float32",
-            "n",
-            "frames",
-            "contact of the balls, in units of scene.frame_interval; -1: never",
+            "float32", "n", "frames", "time of the contact of the balls, in units of scene.frame_interval; -1: never"
         )
     },
 )

@@ -70,5 +70,7 @@ FAMILY = Family(
     layout=layout,
     sample=sample,
     check=check,
-    derived={"contact_time": Field("float32", "n", "s", "at which the first of those that move meets one at rest")},
+    derived={
+        "contact_time": Field("float32", "n", "s", "time of the first contact between a moving and a resting ball")
+    },
 )

@@ -114,7 +114,7 @@ FAMILY = Family(
     check=check,
     derived={
         "contact_time": Field(
-            "float32", "n pairs", "s", "at which the two of a pair meet, if nothing else does before"
+            "float32", "n pairs", "s", "time at which the balls of a pair meet, if nothing else hits them before"
         ),
         "mass_ratio": Field("float32", "n pairs", "1", "mass of the left ball over that of the right one"),
     },

@@ -39,8 +39,7 @@ class Options:
         draw=True, each="balls",
     )  # fmt: skip
     relative_position: tuple[Distribution, ...] = common.fractions(
-        "position of each ball: across, 1: at the screen; up, within its own part of the screen",
-        each="balls",
+        "position of each ball: across, 1: at the screen; up, within its own part of the screen", each="balls"
     )
     speed: Distribution = option([2, 5], float, "m/s", "speed of each ball", above=0, draw=True, each="balls")
     density: Distribution = common.density("each ball", each="balls")
@@ -120,8 +119,8 @@ FAMILY = Family(
     check=check,
     derived={
         "hidden_from": Field(
-            "float32", "n balls", "s", "when the ball is first wholly behind the screen, if nothing hits it"
+            "float32", "n balls", "s", "time at which the ball is first wholly behind the screen, if nothing hits it"
         ),
-        "hidden_for": Field("float32", "n balls", "s", "how long it then is"),
+        "hidden_for": Field("float32", "n balls", "s", "duration for which the ball is wholly behind the screen"),
     },
 )

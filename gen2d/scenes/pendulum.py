@@ -100,5 +100,5 @@ FAMILY = Family(
     layout=layout,
     sample=sample,
     sizes=sizes,
-    derived={"period": Field("float32", "n", "s", "of small swings of the first link alone")},
+    derived={"period": Field("float32", "n", "s", "period of small oscillations of the first link alone")},
 )

@@ -100,5 +100,5 @@ FAMILY = Family(
     layout=layout,
     sample=sample,
     check=check,
-    derived={"length": Field("float32", "n", "m", "of the slope")},
+    derived={"length": Field("float32", "n", "m", "length of the slope")},
 )

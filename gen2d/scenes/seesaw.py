@@ -102,5 +102,5 @@ FAMILY = Family(
     layout=layout,
     sample=sample,
     check=check,
-    derived={"torque": Field("float32", "n", "N m", "of all weights about the pivot while the plank is level")},
+    derived={"torque": Field("float32", "n", "N m", "torque of all weights about the pivot while the plank is level")},
 )

@@ -86,12 +86,12 @@ FAMILY = Family(
     layout=layout,
     sample=sample,
     derived={
-        "stable": Field("float32", "n", "1", "1 where statics says that the tower stands, else 0"),
+        "stable": Field("float32", "n", "1", "static stability of the tower; 1: stable, 0: unstable"),
         "margin": Field(
             "float32",
             "n",
             "m",
-            "from the centre of mass above a joint to its edge, at the joint where that is least; below 0: beyond it",
+            "smallest distance, over all joints, from a joint's edge to the centre of mass above it; negative: beyond",
         ),
     },
 )

@@ -1,6 +1,5 @@
 """Contact sheet (videos down, time across) and animation of a dataset or a config."""
 
-import contextlib
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -113,6 +112,6 @@ def _config_frames(
     if seed is not None:
         config = dataclasses.replace(config, seed=checked_seed(seed))
     split = config.training.name if config.training else "train"
-    with contextlib.closing(VideoSource(config.of_split(split), devices.prepare()[:1])) as videos_of:
-        frames = videos_of.videos(split, range(videos), ("frames",))["frames"]
+    videos_of = VideoSource(config.of_split(split), devices.prepare()[:1])
+    frames = videos_of.videos(split, range(videos), ("frames",))["frames"]
     return config.name, frames, config.video.fps

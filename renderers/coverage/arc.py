@@ -7,10 +7,10 @@ import jax.numpy as jnp
 
 from gen2d.records.axes import Array
 
-LARGE = 64.0  # px; discs of this radius or more have a straight rim in each pixel, corrected for curvature
+LARGE_RADIUS = 64.0  # px; discs of this radius or more have a straight rim in each pixel, corrected for curvature
 QUARTER = math.pi / 4
-FAR = 1e12  # px or px^2, beyond every arc
-THIN = 1e-6  # px, width in a row of a vertical line
+BEYOND_ARCS = 1e12  # px or px^2, beyond every arc
+MIN_WIDTH = 1e-6  # px, width in a row of a vertical line
 
 # Polynomial in 1 - u for the integral of sqrt(1 - s^2) from u to 1, divided by (1 - u)^1.5: a least-squares fit with an
 # error of 4e-8 in the integral.

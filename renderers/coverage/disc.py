@@ -5,10 +5,10 @@ from typing import NamedTuple
 import jax.numpy as jnp
 
 from gen2d.records.axes import Array
-from gen2d.renderers.coverage.arc import LARGE, QUARTER, under_arc
+from gen2d.renderers.coverage.arc import LARGE_RADIUS, QUARTER, under_arc
 
 
-def shift(edges: Array) -> tuple[Array, Array]:
+def pixel_edges(edges: Array) -> tuple[Array, Array]:
     """Both edges, 1 px apart, of pixels given by their left or top edges."""
     return edges, edges + 1
 
@@ -32,7 +32,7 @@ class PixelDisc(NamedTuple):
     radius: Array  # [..., 1]
 
 
-def disc_cuts(x: Array, y: Array, radius: Array) -> PixelDisc:
+def disc_edge_terms(x: Array, y: Array, radius: Array) -> PixelDisc:
     """Edge terms of discs of `radius` [...] px.
 
     The pixels have left edges x [..., columns] and top edges y [..., rows], relative to the centre of the disc.
@@ -47,7 +47,7 @@ def disc_cuts(x: Array, y: Array, radius: Array) -> PixelDisc:
         sign = jnp.copysign(1.0, at)
         return DiscEdge(at, sign, under_arc(at, radius) - sign * (QUARTER * square), at * at)
 
-    (left, right), (top, bottom) = map(shift, (x, y))
+    (left, right), (top, bottom) = map(pixel_edges, (x, y))
     return PixelDisc(of_column(left), of_column(right), of_row(top), of_row(bottom), radius)
 
 
@@ -57,14 +57,14 @@ def _corner(x: DiscEdge, y: DiscEdge) -> Array:
     return jnp.where(x.square + y.square < 0, x.at * y.at, y.sign * x.area + x.sign * y.area)
 
 
-def disc_area(disc: PixelDisc, largest: float) -> Array:
+def disc_coverage(disc: PixelDisc, largest: float) -> Array:
     """Coverage [..., rows, columns] of discs whose radius is at most `largest` px."""
     upper = _corner(disc.right, disc.top) - _corner(disc.left, disc.top)
     area = (_corner(disc.right, disc.bottom) - _corner(disc.left, disc.bottom)) - upper
-    if largest < LARGE:
+    if largest < LARGE_RADIUS:
         return area
     radius = disc.radius[..., None]
-    return jnp.where(radius < LARGE, area, _large_disc(disc.left.at + 0.5, disc.top.at + 0.5, radius))
+    return jnp.where(radius < LARGE_RADIUS, area, _large_disc(disc.left.at + 0.5, disc.top.at + 0.5, radius))
 
 
 def _large_disc(x: Array, y: Array, radius: Array) -> Array:

@@ -7,7 +7,7 @@ with left and right edges x0 and x1,
 
 E is a sum over the lines and arcs of the boundary in closed form: a line adds a parabola in x between its ends, an arc
 adds U(t) = integral of sqrt(r^2 - s^2) ds from 0 to t. Nothing is sampled. Terms that depend on a row or a column alone
-are computed first (`disc_cuts`, `rounded_cuts`), which leaves little work per pixel.
+are computed first (`disc_cuts`, `polygon_edge_terms`), which leaves little work per pixel.
 
 float32 sums of order r^2 lose digits: arcs are exact to .1 of 255 grey levels up to r = 64 px. Larger discs use a
 straight rim corrected for its curvature, which is more accurate the larger the disc. Derivatives are those of the exact
@@ -23,8 +23,8 @@ import jax
 import jax.numpy as jnp
 
 from gen2d.records.axes import Array
-from gen2d.renderers.coverage.arc import FAR, THIN, under_arc
-from gen2d.renderers.coverage.disc import shift
+from gen2d.renderers.coverage.arc import BEYOND_ARCS, MIN_WIDTH, under_arc
+from gen2d.renderers.coverage.disc import pixel_edges
 
 
 class PolygonSide(NamedTuple):
@@ -56,7 +56,7 @@ class RoundedPolygon(NamedTuple):
     lefts: list[CornerArc]
 
 
-def rounded_cuts(x: Array, y: Array, vertices: Array, radius: Array | None) -> RoundedPolygon:
+def polygon_edge_terms(x: Array, y: Array, vertices: Array, radius: Array | None) -> RoundedPolygon:
     """Edge terms of convex polygons, for pixels with left edges x [..., columns] and top edges y [..., rows].
 
     The polygons have `vertices` [..., V, 2] px and grow by `radius` [...] px with round corners; None adds nothing.
@@ -68,12 +68,12 @@ def rounded_cuts(x: Array, y: Array, vertices: Array, radius: Array | None) -> R
     lines, rights, lefts = [], [], []
     for i in range(count):
         offset = 0.0 if radius is None else radius[..., None] * normals[i]
-        lines.append(_line(y, corners[i] + offset, corners[(i + 1) % count] + offset))
+        lines.append(_side(y, corners[i] + offset, corners[(i + 1) % count] + offset))
         if radius is not None:
             arc = _arc_ends(normals[i - 1], normals[i])
             from_left, from_top = x - corners[i][..., :1], y - corners[i][..., 1:]
-            rights.append(_arc(from_left, from_top, radius, *arc[0], side=1))
-            lefts.append(_arc(from_left, from_top, radius, *arc[1], side=-1))
+            rights.append(_corner_arc(from_left, from_top, radius, *arc[0], side=1))
+            lefts.append(_corner_arc(from_left, from_top, radius, *arc[1], side=-1))
     return RoundedPolygon(x + jnp.zeros_like(corners[0][..., :1]), lines, rights, lefts)
 
 
@@ -97,7 +97,7 @@ def _normals(corner: list[Array]) -> list[Array]:
     return normals
 
 
-def _line(y: Array, begin: Array, end: Array) -> PolygonSide:
+def _side(y: Array, begin: Array, end: Array) -> PolygonSide:
     side = end - begin
     rise = side[..., 1:]
     flat = jnp.abs(rise) < 1e-9
@@ -107,10 +107,10 @@ def _line(y: Array, begin: Array, end: Array) -> PolygonSide:
         along = jnp.clip((edge - begin[..., 1:]) / jnp.where(flat, 1.0, rise), 0.0, 1.0)
         return jnp.where(flat, (edge > begin[..., 1:]).astype(along.dtype), along)
 
-    (first, second), across = map(crossing, shift(y)), side[..., :1]
+    (first, second), across = map(crossing, pixel_edges(y)), side[..., :1]
     upper, lower = begin[..., :1] + first * across, begin[..., :1] + second * across
     low = jnp.minimum(upper, lower)
-    return PolygonSide(jnp.abs(second - first) * rise, low, jnp.maximum(jnp.abs(upper - lower), THIN))
+    return PolygonSide(jnp.abs(second - first) * rise, low, jnp.maximum(jnp.abs(upper - lower), MIN_WIDTH))
 
 
 def _arc_ends(before: Array, after: Array) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
@@ -128,56 +128,59 @@ def _arc_ends(before: Array, after: Array) -> tuple[tuple[Array, Array], tuple[A
     return half(1.0), half(-1.0)
 
 
-def _arc(x: Array, y: Array, radius: Array, begin: Array, end: Array, side: int) -> CornerArc:
+def _corner_arc(x: Array, y: Array, radius: Array, begin: Array, end: Array, side: int) -> CornerArc:
     radius = jnp.maximum(radius, 1e-6)[..., None]
     low, high = (radius * sine[..., None] for sine in ((begin, end) if side > 0 else (end, begin)))
-    (top, bottom) = (jnp.clip(edge, low, high) for edge in shift(y))
-    columns = shift(x)
+    (top, bottom) = (jnp.clip(edge, low, high) for edge in pixel_edges(y))
+    columns = pixel_edges(x)
     # The point where a column leaves the arc has no first-order effect, so stop its gradient. A column on the other
-    # side of the centre never does: its bound is FAR, since a value equal to its bound loses half of its derivative.
+    # side of the centre never does: its bound is BEYOND_ARCS, since a value equal to its bound loses half of its
+    # derivative.
     distances = [jnp.maximum(side * at, 0.0) for at in columns]
     leave = [jax.lax.stop_gradient(jnp.sqrt(jnp.maximum(radius**2 - at**2, 0.0))) for at in distances]
-    areas = [jnp.where(at > 0, under_arc(value, radius), FAR) for at, value in zip(distances, leave, strict=True)]
-    leave = [jnp.where(at > 0, value, FAR) for at, value in zip(distances, leave, strict=True)]
+    areas = [
+        jnp.where(at > 0, under_arc(value, radius), BEYOND_ARCS) for at, value in zip(distances, leave, strict=True)
+    ]
+    leave = [jnp.where(at > 0, value, BEYOND_ARCS) for at, value in zip(distances, leave, strict=True)]
     begin, end = (top, bottom) if side > 0 else (bottom, top)
     row_terms = begin, under_arc(begin, radius), end, under_arc(end, radius)
     return CornerArc(*row_terms, (columns[0], columns[1]), (leave[0], leave[1]), (areas[0], areas[1]))
 
 
-def _grid(rows: Array) -> Array:
+def _per_row(rows: Array) -> Array:
     return rows[..., :, None]
 
 
-def rounded_area(cuts: RoundedPolygon) -> Array:
+def polygon_coverage(terms: RoundedPolygon) -> Array:
     """Coverage [..., rows, columns] of rounded polygons."""
     area: Any = 0.0
-    for line in cuts.lines:
-        low, width = _grid(line.low), _grid(line.width)
-        left, right = (jnp.maximum(edge[..., None, :] - low, 0.0) for edge in shift(cuts.x))
-        area = area + _grid(line.down) * (_below(left, width) - _below(right, width))
-    for arcs, beyond in ((cuts.rights, _beyond_right), (cuts.lefts, _beyond_left)):
+    for line in terms.lines:
+        low, width = _per_row(line.low), _per_row(line.width)
+        left, right = (jnp.maximum(edge[..., None, :] - low, 0.0) for edge in pixel_edges(terms.x))
+        area = area + _per_row(line.down) * (_mean_excess(left, width) - _mean_excess(right, width))
+    for arcs, beyond in ((terms.rights, _beyond_right), (terms.lefts, _beyond_left)):
         for arc in arcs:
             area = area + beyond(arc, 0) - beyond(arc, 1)
     return area
 
 
-def _below(past: Array, width: Array) -> Array:
+def _mean_excess(past: Array, width: Array) -> Array:
     """Mean of max(past - X, 0) for X uniform from 0 to `width`."""
     inner = jnp.minimum(past, width)
     return inner * inner / (2 * width) + (past - inner)
 
 
 @jax.custom_jvp
-def _within(value: Array, end: Array) -> Array:
+def _clip(value: Array, end: Array) -> Array:
     """Value clipped to [-end, end]."""
     return jnp.clip(value, -end, end)
 
 
-@_within.defjvp
-def _within_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
+@_clip.defjvp
+def _clip_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
     (value, end), (moved, stretched) = primals, tangents
     # A value that rounding put on the bound has the derivative of the bound.
-    return _within(value, end), jnp.where(jnp.abs(value) < end, moved, jnp.sign(value) * stretched)
+    return _clip(value, end), jnp.where(jnp.abs(value) < end, moved, jnp.sign(value) * stretched)
 
 
 def _beyond_right(arc: CornerArc, edge: int) -> Array:
@@ -185,8 +188,8 @@ def _beyond_right(arc: CornerArc, edge: int) -> Array:
     at, leave, area = (a[edge][..., None, :] for a in (arc.at, arc.leave, arc.leave_area))
 
     def to(y: Array, under: Array) -> Array:
-        y, under = _grid(y), _grid(under)
-        return at * (y - _within(y, leave)) - (under - _within(under, area))
+        y, under = _per_row(y), _per_row(under)
+        return at * (y - _clip(y, leave)) - (under - _clip(under, area))
 
     return to(arc.end, arc.end_area) - to(arc.begin, arc.begin_area)
 
@@ -196,7 +199,7 @@ def _beyond_left(arc: CornerArc, edge: int) -> Array:
     at, leave, area = (a[edge][..., None, :] for a in (arc.at, arc.leave, arc.leave_area))
 
     def to(y: Array, under: Array) -> Array:
-        y, under = _grid(y), _grid(under)
-        return at * _within(y, leave) + _within(under, area)
+        y, under = _per_row(y), _per_row(under)
+        return at * _clip(y, leave) + _clip(under, area)
 
     return to(arc.end, arc.end_area) - to(arc.begin, arc.begin_area)

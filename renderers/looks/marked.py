@@ -24,9 +24,9 @@ from gen2d.plugin import (
 class Options(PlainOptions):
     """Options of the marks, in addition to those of plain shapes."""
 
-    mark_width: float = option(0.3, float, "1", "of an object's bar, over its radius", above=0, high=1)
-    rim_width: float = option(0.0, float, "px", "of a dark line along the inside of a rim; 0: none", low=0)
-    rim_color: tuple = option([16, 16, 16], int, "sRGB", "of that line", parts=3, low=0, high=255)
+    mark_width: float = option(0.3, float, "1", "width of the bar, over the object's radius", above=0, high=1)
+    rim_width: float = option(0.0, float, "px", "width of a line along the inside of the rim; 0: none", low=0)
+    rim_color: tuple = option([16, 16, 16], int, "sRGB", "color of the line along the rim", parts=3, low=0, high=255)
 
 
 def paint(scene: Scene, layout: Layout, options: Options, key: Array) -> Paint:

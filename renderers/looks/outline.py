@@ -23,9 +23,9 @@ from gen2d.plugin import (
 class Options(PlainOptions):
     """Options of the outlines, in addition to those of plain shapes."""
 
-    width: float = option(1.5, float, "px", "of the line along the inside of a rim", above=0)
+    width: float = option(1.5, float, "px", "width of the line along the inside of the rim", above=0)
     fill: float = option(
-        0.25, float, "1", "how much of an object's colour is within its line; 0: the background's mean", low=0, high=1
+        0.25, float, "1", "fraction of the object's color in its fill; 0: mean color of the background", low=0, high=1
     )
 
 

@@ -29,7 +29,7 @@ WHITE, RED, BLUE = (255.0, 255.0, 255.0), (255.0, 0.0, 0.0), (0.0, 0.0, 255.0)
 class Options(LineOptions):
     """Options of segments."""
 
-    wall_width: float = option(0.0, float, "px", "of a segment's line, beyond its own radius; 0: not drawn", low=0)
+    wall_width: float = option(0.0, float, "px", "line width of segments beyond their radius; 0: not drawn", low=0)
 
 
 def paint(scene: Scene, layout: Layout, options: Options, key: Array) -> Paint:

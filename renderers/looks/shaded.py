@@ -11,7 +11,7 @@ from gen2d.plugin import Array, Layout, Look, Paint, PlainOptions, Scene, are_li
 class Options(PlainOptions):
     """Options of the shading, in addition to those of plain shapes."""
 
-    shade: float = option(0.6, float, "1", "how much darker an object is opposite the light; 0: not", low=0, high=1)
+    shade: float = option(0.6, float, "1", "relative darkening of the side opposite the light; 0: none", low=0, high=1)
 
 
 def paint(scene: Scene, layout: Layout, options: Options, key: Array) -> Paint:

@@ -25,12 +25,10 @@ from gen2d.plugin import (
 class Options(PlainOptions):
     """Options of the spots, in addition to those of plain shapes."""
 
-    background_kind: str = option("noise", str, "", "what is behind everything", choices=("plain", "gradient", "noise"))
-    background_to: tuple = option([64, 64, 84], int, "sRGB", "where it ends", parts=3, low=0, high=255)
-    texture_contrast: float = option(
-        0.8, float, "1", "contrast of the spots; 1: black or white, the farther from the background", low=0, high=1
-    )
-    cell_size: float = option(0.6, float, "1", "size of a spot, over the largest object's reach", above=0)
+    background_kind: str = option("noise", str, "", "kind of the background", choices=("plain", "gradient", "noise"))
+    background_to: tuple = option([64, 64, 84], int, "sRGB", "second color of the background", parts=3, low=0, high=255)
+    texture_contrast: float = option(0.8, float, "1", "contrast of the spots; 1: black or white", low=0, high=1)
+    cell_size: float = option(0.6, float, "1", "size of the spots, over the reach of the largest object", above=0)
 
 
 def paint(scene: Scene, layout: Layout, options: Options, key: Array) -> Paint:

@@ -141,7 +141,7 @@ def _physics(rollout: Any) -> tuple[Callable, Callable, np.ndarray]:
     params = solver_params(config.physics, config.video.fps, rollout.steps)
 
     def sample_batch(numbers: Any) -> Any:
-        sampled_scene = jax.vmap(rollout.sampler.sampled)(keys.video_keys(jnp.asarray(root), numbers))[1]
+        sampled_scene = jax.vmap(rollout.sampler.sample)(keys.video_keys(jnp.asarray(root), numbers))[1]
         return sampled_scene.scene, sampled_scene.state
 
     def simulate_batch(scene: Any, state: Any) -> Any:

@@ -184,7 +184,7 @@ def rows_of(made: dict[str, np.ndarray]) -> list[tuple[int, ...]]:
 @pytest.mark.parametrize("seed", range(20))
 def test_every_impact_is_told_once_unless_the_pair_was_in_touch(seed: int) -> None:
     made = seen(seed)
-    told = [(e.frame, e.about["a"], e.about["b"]) for e in events_module.events_of(made, VIDEO) if e.kind == "hit"]
+    told = [(e.frame, e.about["a"], e.about["b"]) for e in events_module.video_events(made, VIDEO) if e.kind == "hit"]
     rows, impacts = rows_of(made), []
     for kind, frame, a, b, time in rows:
         before = [r for r in rows if r[1:4] == (frame - 1, a, b)]
@@ -197,7 +197,7 @@ def test_every_impact_is_told_once_unless_the_pair_was_in_touch(seed: int) -> No
 
 @pytest.mark.parametrize("seed", range(20))
 def test_events_are_in_times_order_and_each_lies_in_the_interval_before_its_frame(seed: int) -> None:
-    events = json.loads(events_module.as_json(events_module.events_of(seen(seed), VIDEO), 10**6))
+    events = json.loads(events_module.events_json(events_module.video_events(seen(seed), VIDEO), 10**6))
     times, frames = (np.array([event[name] for event in events]) for name in ("time", "frame"))
     assert (np.diff(times) >= 0).all()
     assert (times <= frames / VIDEO.fps + 1e-5).all()
@@ -242,11 +242,11 @@ def test_rest_is_told_where_all_is_still_to_the_end() -> None:
 @settings(max_examples=50, deadline=None)
 @given(seed=st.integers(0, 1000), width=st.integers(2, 3000))
 def test_events_that_do_not_fit_are_left_out_whole(seed: int, width: int) -> None:
-    events = events_module.events_of(seen(seed), VIDEO)
-    text = events_module.as_json(events, width)
+    events = events_module.video_events(seen(seed), VIDEO)
+    text = events_module.events_json(events, width)
     assert len(text) <= width
     found = json.loads(text)
-    assert found == json.loads(events_module.as_json(events, 10**6))[: len(found)]
+    assert found == json.loads(events_module.events_json(events, 10**6))[: len(found)]
     assert len(found) == len(events) or len(text) + 1 + len(events[len(found)].text) > width
 
 
@@ -267,7 +267,7 @@ def test_a_caption_fits_is_ascii_and_follows_from_the_video_alone(seed: int) -> 
     assert len(text) < events_module.CAPTION_BYTES
     assert text.startswith("Three balls in a box under gravity.")
     assert text.endswith(".")
-    assert one["text/event_count"][0] == len(events_module.events_of(made, VIDEO))
+    assert one["text/event_count"][0] == len(events_module.video_events(made, VIDEO))
 
 
 def still(**changes: Any) -> dict[str, np.ndarray]:
@@ -294,7 +294,7 @@ def test_a_caption_tells_the_first_events_and_how_many_more() -> None:
     for row, (a, b) in enumerate(pairs):
         for name, value in (("kind", 1), ("frame", 2 + 2 * row), ("a", a), ("b", b), ("time", 0.1 * (row + 1))):
             made[f"contacts/{name}"][row] = value
-    text = caption.caption(made, events_module.events_of(made, VIDEO), VIDEO.fps)
+    text = caption.caption(made, events_module.video_events(made, VIDEO), VIDEO.fps)
     assert text == (
         "Three balls in a box under gravity. The red ball hits the floor at 0.10 s, then blue ball 1 at 0.20 s. "
         "Blue ball 1 hits blue ball 2 at 0.30 s. The red ball hits the right wall at 0.40 s. And 2 more events."
@@ -318,7 +318,7 @@ def test_shapes_have_their_nouns() -> None:
     assert caption.caption(made, [], VIDEO.fps) == "One capsule and one triangle in a box among one block."
     made["objects/present"][BALLS + 1 :] = False
     assert caption.caption(made, [], VIDEO.fps) == "One capsule and one triangle among one block."
-    assert caption.names_of(made)[BALLS] == "the floor"
+    assert caption.object_names(made)[BALLS] == "the floor"
 
 
 # ---- In a dataset

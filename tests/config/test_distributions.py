@@ -51,7 +51,7 @@ def test_whole_numbers_are_equally_frequent(value):
 def test_a_factor_does_not_depend_on_the_others():
     def drawn(**scene):
         sampler = Sampler(load_config({"scene": {"name": "bouncing", "balls": 4, "radius": [1, 2]} | scene}))
-        return sampler.drawn(jax.random.key(3))
+        return sampler.sample_factors(jax.random.key(3))
 
     one, other = drawn(), drawn(spin=[0, 1], elasticity=0.5)
     assert_array_equal(one["radius"], other["radius"])

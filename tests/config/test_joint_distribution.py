@@ -13,8 +13,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 from gen2d.config import truncation
 from gen2d.config.config import load_config
 from gen2d.config.distribution_syntax import parse
-from gen2d.config.distributions import Distribution, Span, after
-from gen2d.config.joint_distribution import intersect, joint_distribution_of
+from gen2d.config.distributions import Distribution, Span, next_float32
+from gen2d.config.joint_distribution import intersect, parse_distribution
 from gen2d.core.errors import ConfigError
 from gen2d.records import keys as keys_module
 from gen2d.sampling.sampler import Sampler
@@ -57,17 +57,17 @@ def test_what_is_cut_is_inside_or_outside_and_both_are_all(one, other):
 
 def test_ranges_that_meet_have_nothing_in_common():
     low, high = parse([0.7, 1.4]), parse([1.4, 2.0])
-    assert low.spans[0].meet(high.spans[0]) is None
+    assert low.spans[0].intersect(high.spans[0]) is None
     assert not low.contains(1.4)
     assert high.contains(1.4)
-    assert low.spans[0].last < 1.4 < after(low.spans[0].last) + 1e-6
+    assert low.spans[0].last < 1.4 < next_float32(low.spans[0].last) + 1e-6
 
 
 def test_whole_numbers_and_ranges_meet_in_whole_numbers():
-    both = Span(3, 9, whole=True).meet(Span(4.5, 7.0))
+    both = Span(3, 9, whole=True).intersect(Span(4.5, 7.0))
     assert both is not None
     assert both.contains([4, 5, 5.5, 6, 7]).tolist() == [False, True, False, True, False]
-    assert Span(3, 9, whole=True).meet(Span(4.2, 4.8)) is None
+    assert Span(3, 9, whole=True).intersect(Span(4.2, 4.8)) is None
 
 
 def test_a_composed_distribution_is_read_again_as_it_is_written():
@@ -104,47 +104,47 @@ BASE = {"a": parse([0, 4]), "b": parse({"integer": [1, 6]}), "c": parse({"normal
 def test_a_law_without_a_box_and_the_box_have_nothing_in_common_and_are_all():
     box = {"a": [1, 2], "b": {"choice": [2, 5]}}
     rest, held = (
-        joint_distribution_of({"minus": [{}, box]}, BASE, read),
-        joint_distribution_of({"intersection": [{}, box]}, BASE, read),
+        parse_distribution({"minus": [{}, box]}, BASE, read),
+        parse_distribution({"intersection": [{}, box]}, BASE, read),
     )
     assert intersect(rest, held) is None
     a, b, c = (draws(BASE[name]) for name in "abc")
-    one, other = (law.contains({"a": a, "b": b, "c": c}) for law in (rest, held))
+    one, other = (joint.contains({"a": a, "b": b, "c": c}) for joint in (rest, held))
     assert (one ^ other).all()
     assert_array_equal(other, (a >= 1) & (a < 2) & np.isin(b, [2, 5]))
-    assert intersect(rest, joint_distribution_of(box, BASE, read)) is None
-    point = intersect(joint_distribution_of({}, BASE, read), joint_distribution_of(box, BASE, read))
+    assert intersect(rest, parse_distribution(box, BASE, read)) is None
+    point = intersect(parse_distribution({}, BASE, read), parse_distribution(box, BASE, read))
     assert point is not None
-    assert joint_distribution_of(box, BASE, read).contains(point)
+    assert parse_distribution(box, BASE, read).contains(point)
 
 
 def test_held_out_combinations_are_of_both_and_not_of_one():
     corners = [{"a": [0, 1], "b": {"choice": [1]}}, {"a": [3, 4], "b": {"choice": [6]}}]
     train, test = (
-        joint_distribution_of({"minus": [{}, *corners]}, BASE, read),
-        joint_distribution_of({"mixture": corners}, BASE, read),
+        parse_distribution({"minus": [{}, *corners]}, BASE, read),
+        parse_distribution({"mixture": corners}, BASE, read),
     )
     assert intersect(train, test) is None
     assert train.contains({"a": 0.5, "b": 6})
     assert not train.contains({"a": 0.5, "b": 1})
-    assert intersect(train, joint_distribution_of({"a": [0.5, 1]}, BASE, read)) is not None  # b may be another
+    assert intersect(train, parse_distribution({"a": [0.5, 1]}, BASE, read)) is not None  # b may be another
 
 
 def test_a_condition_changes_other_factors_where_it_holds():
-    law = joint_distribution_of(
+    joint = parse_distribution(
         {"condition": [{}, {"when": {"b": {"choice": [1, 2]}}, "then": {"a": [10, 11]}}]}, BASE, read
     )
-    assert law.contains({"a": 10.5, "b": 2})
-    assert not law.contains({"a": 10.5, "b": 3})
-    assert not law.contains({"a": 3, "b": 2})
-    assert_allclose(sum(p.share for p in law.products if p.parts["a"].contains(10.5)), 1 / 3, atol=1e-6)
+    assert joint.contains({"a": 10.5, "b": 2})
+    assert not joint.contains({"a": 10.5, "b": 3})
+    assert not joint.contains({"a": 3, "b": 2})
+    assert_allclose(sum(p.share for p in joint.products if p.parts["a"].contains(10.5)), 1 / 3, atol=1e-6)
 
 
 @settings(max_examples=25, deadline=None)
 @given(st.lists(st.tuples(DISTRIBUTIONS, DISTRIBUTIONS), min_size=2, max_size=2))
 def test_two_laws_are_disjoint_just_if_no_draw_is_in_both(written):
     base = {"a": parse(0), "b": parse(0)}
-    one, other = (joint_distribution_of({"a": a, "b": b}, base, read) for a, b in written)
+    one, other = (parse_distribution({"a": a, "b": b}, base, read) for a, b in written)
     point = intersect(one, other)
     if point is not None:
         assert one.contains(point)
@@ -164,14 +164,16 @@ def sampler(splits, **scene):
 
 @functools.partial(jax.jit, static_argnums=0)
 def _drawn(of, keys, row, given):
-    drawn = jax.vmap(of.drawn, (0, None, 0))(keys, row, given)
-    return drawn, jax.vmap(of.outside)(drawn)
+    drawn = jax.vmap(of.sample_factors, (0, None, 0))(keys, row, given)
+    return drawn, jax.vmap(of.ood_distances)(drawn)
 
 
 def drawn(config, of, split, count=COUNT):
     words, numbers = keys_module.seed_words(3, 7), np.arange(count, dtype=np.uint32)
-    given = of.combination(config.row(split), words, numbers)
-    found = _drawn(of, keys_module.video_keys(jnp.asarray(words), jnp.asarray(numbers)), config.row(split), given)
+    given = of.grid_values(config.split_index(split), words, numbers)
+    found = _drawn(
+        of, keys_module.video_keys(jnp.asarray(words), jnp.asarray(numbers)), config.split_index(split), given
+    )
     return [{name: np.asarray(values) for name, values in each.items()} for each in found]
 
 

@@ -133,7 +133,7 @@ def foreign(request: pytest.FixtureRequest, home: Path, tmp_path: Path, monkeypa
     assert sha256((tmp_path / "mine.py").read_bytes()) in list_path().read_text()
     (tmp_path / SEEN).unlink()
     monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "of another"))
-    plugins._run.cache_clear()
+    plugins._run_file.cache_clear()
     return tmp_path / "data"
 
 

@@ -94,9 +94,9 @@ def test_the_study_s_splits_have_nothing_in_common_with_training_and_start_in_vi
     assert len(config.splits) == PRESETS[family] + 1
     training, of = config.training, Sampler(config)
     assert training is not None
-    starts = jax.jit(jax.vmap(of.sampled, (0, None)))
+    starts = jax.jit(jax.vmap(of.sample, (0, None)))
     for row, split in enumerate(config.splits):
-        assert (intersect(training.law, split.law) is None) == (split.name not in ("train", "test"))
+        assert (intersect(training.distribution, split.distribution) is None) == (split.name not in ("train", "test"))
         keys = keys_module.video_keys(jnp.asarray(keys_module.seed_words(0, row)), jnp.arange(500, dtype=jnp.uint32))
         drawn, made = jax.tree.map(np.asarray, starts(keys, row))
         position, radius = made.state.position, made.scene.objects.radius

@@ -14,7 +14,7 @@ from gen2d.config.config import load_config
 from gen2d.records.layout import Layout, SlotGroup
 from gen2d.records.scene import State
 from gen2d.renderers import rasterizer
-from gen2d.renderers.camera import CameraView, filmed, fitted, largest_scale, to_pixels, to_world
+from gen2d.renderers.camera import CameraView, fit_bounds, largest_scale, sample_view, to_pixels, to_world
 
 HEIGHT, WIDTH, FPS, FRAMES = 48, 64, 20, 12
 LAYOUT = Layout((SlotGroup("circle", 3),), bounds=(0.0, 0.0, 10.0, 6.0))
@@ -38,7 +38,7 @@ def watched(seed=0, states=None, **options):
     config = load_config({"camera": options})
     if states is None:
         states = State(*(np.zeros((FRAMES, 3, *shape), np.float32) for shape in ((2,), (), (2,), ())))
-    view = filmed(jax.random.key(seed), config.camera, LAYOUT, states, FPS, HEIGHT, WIDTH)
+    view = sample_view(jax.random.key(seed), config.camera, LAYOUT, states, FPS, HEIGHT, WIDTH)
     return CameraView(*(np.asarray(part, float) for part in view))
 
 
@@ -68,7 +68,7 @@ def test_up_is_up_and_the_picture_turns_against_the_camera():
 @pytest.mark.parametrize(("height", "width"), [(50, 100), (100, 100), (37, 11)])
 @pytest.mark.parametrize("margin", [0, 0.7])
 def test_a_fitted_camera_just_shows_the_bounds(bounds, height, width, margin):
-    center, scale = fitted(bounds, height, width, margin)
+    center, scale = fit_bounds(bounds, height, width, margin)
     view = CameraView(*(np.float32(part) for part in ([center], [scale], [0])))
     corners = np.float32([[bounds[:2], bounds[2:]]])
     (left, bottom), (right, top) = np.asarray(to_pixels(view, corners, height, width), float)[0]

@@ -28,13 +28,15 @@ EDGES = np.arange(SIZE + 1)
 def discs(centre, radius, size=SIZE):
     """The coverage [n, size, size] of discs about centres [n, 2]."""
     edges = jnp.arange(size, dtype=centre.dtype)
-    return disc_module.disc_area(disc_module.disc_cuts(edges - centre[:, :1], edges - centre[:, 1:], radius), 1e9)
+    return disc_module.disc_coverage(
+        disc_module.disc_edge_terms(edges - centre[:, :1], edges - centre[:, 1:], radius), 1e9
+    )
 
 
 def rounded(corners, radius):
     """The coverage [n, SIZE, SIZE] of rounded polygons [n, V, 2]; no radius: sharp ones."""
     edges = jnp.broadcast_to(jnp.arange(SIZE, dtype=corners.dtype), (len(corners), SIZE))
-    return polygon.rounded_area(polygon.rounded_cuts(edges, edges, corners, radius))
+    return polygon.polygon_coverage(polygon.polygon_edge_terms(edges, edges, corners, radius))
 
 
 def compared(name, found, exact, mean, most):

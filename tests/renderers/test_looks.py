@@ -150,7 +150,7 @@ def test_one_key_paints_the_same_and_another_key_what_is_random(name):
 def test_random_colours_can_be_told_apart(name):
     made = painted(name, 4, **FREE)
     colors = np.asarray(made.color)[:, :3]
-    behind = np.asarray(jax.vmap(look.shades)(made.background))
+    behind = np.asarray(jax.vmap(look.background_colors)(made.background))
     for shade in range(behind.shape[1]):
         assert least(np.concatenate([behind[:, shade : shade + 1], colors], 1)).min() >= 150
 

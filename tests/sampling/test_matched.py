@@ -178,7 +178,7 @@ def drawn(*sets: str) -> tuple[Videos, Videos]:
 
     def factors(number: jax.Array) -> dict[str, jax.Array]:
         member = sets_module.member_of(key, number, config.matched, 8)
-        return sampler.drawn(key, change=lambda *found: counterfactuals.changed_factors(member, config, *found))
+        return sampler.sample_factors(key, change=lambda *found: counterfactuals.change_factors(member, config, *found))
 
     found = {name: np.asarray(values) for name, values in jax.jit(jax.vmap(factors))(jnp.arange(256)).items()}
     return {name: values[0] for name, values in found.items()}, {name: values[1:] for name, values in found.items()}

@@ -18,8 +18,8 @@ import pytest
 
 from gen2d.config import plugins, truncation
 from gen2d.config.config import Config, load_config
-from gen2d.config.distributions import Distribution, Span, after
-from gen2d.config.options import drawn_options
+from gen2d.config.distributions import Distribution, Span, next_float32
+from gen2d.config.options import factor_options
 from gen2d.config.plugin_options import Plugin
 from gen2d.core.enums import DYNAMIC, SHAPES
 from gen2d.physics.collision import Disc, Hull, Shape, touches
@@ -62,7 +62,7 @@ def program(family: str) -> tuple[Plugin, Layout, Any]:
     layout = scene.contract.layout(scene.options)
 
     def run(keys: jax.Array) -> Made:
-        factors, begun = jax.vmap(Sampler(config).sampled)(keys)
+        factors, begun = jax.vmap(Sampler(config).sample)(keys)
         things, state, fits = begun.scene, begun.state, begun.fits
         on_device = to_device(things), to_device(state)
         shapes = shapes_of(layout, on_device[0].objects, on_device[1])
@@ -172,7 +172,7 @@ def test_what_moves_begins_in_view(family):
 def distance(source: Distribution, values: np.ndarray) -> float:
     """The largest difference of the share of draws up to a number and of its probability."""
     x, counts = np.unique(values, return_counts=True)
-    expected = [truncation.total(truncation.inside(source, [Span(-np.inf, after(value))])) for value in x]
+    expected = [truncation.total(truncation.inside(source, [Span(-np.inf, next_float32(value))])) for value in x]
     return float(np.abs(np.cumsum(counts) / len(values) - expected).max())
 
 
@@ -184,7 +184,7 @@ def test_factors_are_what_they_are_declared_to_be(family):
 def check_factors(scene: Plugin, found: dict[str, np.ndarray], doubt: float = 1e-3) -> None:
     """Asserts that factors are in their support, and drawn as they are declared to be (A. Kolmogorov, N. Smirnov)."""
     most = np.sqrt(-np.log(doubt / 2) / 2)
-    for name, spec in drawn_options(scene.contract).items():
+    for name, spec in factor_options(scene.contract).items():
         source, values = getattr(scene.options, name), found[name]
         parts = source if spec.parts else [source]
         values = values if spec.parts else values[..., None]

@@ -43,7 +43,7 @@ def film(family: str, videos: int, seconds: float, fps: float, *overrides: str, 
 
     @jax.jit
     def run(keys: jax.Array) -> tuple:
-        factors, (things, state, *_) = jax.vmap(Sampler(config).sampled)(keys)
+        factors, (things, state, *_) = jax.vmap(Sampler(config).sample)(keys)
         device = to_device(things), to_device(state)
         made = simulate(*device, layout, rules, frames, steps, SaveAt(energy=energy), sparse=True)
         return factors, things, to_stored(made)

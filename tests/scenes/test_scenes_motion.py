@@ -21,7 +21,7 @@ from gen2d.core.errors import ConfigError
 from gen2d.generation.run import generate
 from gen2d.physics.params import solver_params
 from gen2d.physics.simulate import simulate, substeps
-from gen2d.programs.rollout import save_at
+from gen2d.programs.simulation import save_at
 from gen2d.records.axes import to_device, to_stored
 from gen2d.sampling.sampler import Sampler
 
@@ -49,7 +49,7 @@ def begun(config: Config, n: int, given: dict[str, Any] | None = None) -> Played
 
     def made(key: jax.Array, given: dict) -> tuple:
         draw_key, place_key = jax.random.split(key)
-        drawn = sampler.drawn(draw_key) | given
+        drawn = sampler.sample_factors(draw_key) | given
         found = config.scene.contract.sample(place_key, drawn, config.scene.options)
         return drawn | found.derived, found.scene, found.state
 
@@ -69,7 +69,7 @@ def played(config: Config, n: int, given: dict[str, Any] | None = None) -> Playe
         keep = save_at(config, layout)
         return to_stored(simulate(*device, layout, rules, config.video.frames, steps, keep, sparse=True))
 
-    kinds = jax.eval_shape(lambda: Sampler(config).sampled(jax.random.key(0))[1])
+    kinds = jax.eval_shape(lambda: Sampler(config).sample(jax.random.key(0))[1])
     scene = jax.tree.map(lambda x, like: jnp.asarray(x, like.dtype), start.scene, kinds.scene)
     state = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), start.start)
     made = jax.tree.map(lambda x: np.asarray(x, np.float64), jax.jit(run)(scene, state))

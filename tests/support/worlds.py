@@ -215,7 +215,7 @@ def _straight_motions(config: Config, layout: Layout, keys: jax.Array) -> tuple[
 
 def _straight_motion(config: Config, layout: Layout, key: jax.Array) -> tuple[RenderScene, Scene, State]:
     video, steps = config.video, 4
-    scene, initial, *_ = sampler.Sampler(config).sampled(key)[1]
+    scene, initial, *_ = sampler.Sampler(config).sample(key)[1]
 
     def at(time: jax.Array) -> State:
         def extrapolated(start: jax.Array, rate: jax.Array) -> jax.Array:

@@ -7,25 +7,21 @@ import jax
 import jax.numpy as jnp
 
 from gen2d.config.matched import INTERVENTIONS
-from gen2d.config.options import drawn_options
+from gen2d.config.options import factor_options
 from gen2d.records.axes import Array
 from gen2d.records.keys import key_for
 from gen2d.records.scene import Objects, State
 from gen2d.sampling.matched.sets import SetMember, along_slots
 
 
-def changed_factors(member: SetMember, config: Any, factors: dict[str, Array], draw: Callable) -> dict[str, Array]:
+def change_factors(member: SetMember, config: Any, factors: dict[str, Array], draw: Callable) -> dict[str, Array]:
     """Factors, with the one that the set changes scaled or sampled again; `draw(key)` samples all factors."""
-    specs, matched, redrawn, changed = (
-        drawn_options(config.scene.contract),
-        config.matched,
-        draw(member.own_key),
-        dict(factors),
-    )
+    specs, matched = factor_options(config.scene.contract), config.matched
+    samples, changed = draw(member.own_key), dict(factors)
     for index, name in enumerate(matched.change):
         if name in INTERVENTIONS:
             continue
-        spec, new = specs[name], redrawn[name]
+        spec, new = specs[name], samples[name]
         if matched.scale is not None:
             scale = matched.scale.sample(key_for(member.own_key, "scale"), ())
             new = jnp.clip(factors[name] * scale, spec.low, spec.high)

@@ -43,7 +43,8 @@ def along_slots(values: Array, like: Array) -> Array:
 
 
 UNITS = (
-    "kg removed; m of a teleport or a swap; m/s^2; rad of a ghost contact; times as fast; a factor's factor_codes unit"
+    "remove: kg; teleport, identity_swap: m; gravity_flip: m/s^2; ghost_contact: rad; energy_gain: speed ratio; "
+    "factor of the scene: its unit"
 )
 
 
@@ -53,12 +54,12 @@ def fields(options: Any) -> dict[str, Field]:
         return {}
     codes = ", ".join(f"{code} {name}" for name, code in zip(options.change, change_codes(options), strict=True))
     return {
-        "matched/set": Field("int32", "n", "1", f"its members are {options.members} videos in a row"),
+        "matched/set": Field("int32", "n", "1", f"number of the set, which has {options.members} consecutive videos"),
         "matched/member": Field("uint8", "n", "1", "number of the video in its set; 0: the original"),
-        "matched/kind": Field("uint8", "n", "1", f"change by which the set's members differ: {codes}"),
-        "matched/onset": Field("int32", "n", "1", "first frame whose state differs from the original's; -1: none"),
+        "matched/kind": Field("uint8", "n", "1", f"code of the change: {codes}"),
+        "matched/onset": Field("int32", "n", "1", "first frame that differs from the original; -1: none"),
         "matched/object": Field("int16", "n", "object", "slot of the changed object; -1: none, or more than one"),
-        "matched/partner": Field("int16", "n", "object", "slot of the object that it is swapped with; -1: none"),
+        "matched/partner": Field("int16", "n", "object", "slot of the other object of a swap; -1: none"),
         "matched/size": Field("float32", "n", "1", f"size of the change; 0: none ({UNITS})"),
     }
 

@@ -9,13 +9,13 @@ import jax
 import jax.numpy as jnp
 
 from gen2d.config.matched import INTERVENTIONS, VIOLATIONS, free_slots
-from gen2d.config.options import drawn_options
+from gen2d.config.options import factor_options
 from gen2d.records.axes import Array
 from gen2d.records.layout import Layout
 from gen2d.records.scene import Scene, State
 from gen2d.records.trajectory import Trajectory
 from gen2d.sampling.builder import SampledScene
-from gen2d.sampling.matched.counterfactuals import changed_factors, changed_slot
+from gen2d.sampling.matched.counterfactuals import change_factors, changed_slot
 from gen2d.sampling.matched.sets import SetMember, along_slots, change_codes, fields, member_of
 from gen2d.sampling.matched.violations import INTERVENTION_FUNCTIONS, Intervention, SceneInstant, inside_view
 
@@ -39,25 +39,25 @@ def simulate_members(
     two programs would round differently.
     """
     options, run = config.matched, jax.jit(run)  # traced once
-    numbered = functools.partial(member_of, options=options, frames=config.video.frames)
-    members = jax.vmap(numbered)(keys, numbers % options.members)
+    membership = functools.partial(member_of, options=options, frames=config.video.frames)
+    members = jax.vmap(membership)(keys, numbers % options.members)
 
     def sampled_member(key: Array, member: SetMember) -> tuple[dict[str, Array], SampledScene]:
-        return sample(key, functools.partial(changed_factors, member, config))
+        return sample(key, functools.partial(change_factors, member, config))
 
-    def once(turn: Array, before: MemberVideos) -> MemberVideos:
-        now = members._replace(changed=members.changed & (turn > 0))
+    def simulate_once(iteration: Array, before: MemberVideos) -> MemberVideos:
+        now = members._replace(changed=members.changed & (iteration > 0))
         factors, sampled = jax.vmap(sampled_member)(keys, now)
-        act = functools.partial(_intervene, options=options, layout=layout)
-        stored, scene, start, frame, record = jax.vmap(act)(now, sampled.scene, sampled.state, before.trajectory.states)
+        intervene = jax.vmap(functools.partial(_intervene, options=options, layout=layout))
+        stored, scene, start, frame, record = intervene(now, sampled.scene, sampled.state, before.trajectory.states)
         trajectory = run(scene, start)
         names = ["states"] if trajectory.between is None else ["states", "between"]
-        spliced = {name: _spliced(frame, getattr(before.trajectory, name), getattr(trajectory, name)) for name in names}
+        spliced = {name: _splice(frame, getattr(before.trajectory, name), getattr(trajectory, name)) for name in names}
         trajectory = dataclasses.replace(trajectory, **spliced)
         after = MemberVideos(factors, sampled._replace(scene=stored), trajectory, record)
         return after._replace(record=jax.vmap(functools.partial(_record_change, config=config))(now, before, after))
 
-    videos = jax.lax.fori_loop(0, 2, once, _blank(keys, sample, run))
+    videos = jax.lax.fori_loop(0, 2, simulate_once, _zeros(keys, sample, run))
     kind = jnp.asarray(change_codes(options))[members.kind]
     record = {"set": numbers // options.members, "member": members.number, "kind": kind, **videos.record}
     stored = {
@@ -66,7 +66,7 @@ def simulate_members(
     return videos._replace(record=stored)
 
 
-def _blank(keys: Array, sample: Callable, run: Callable) -> MemberVideos:
+def _zeros(keys: Array, sample: Callable, run: Callable) -> MemberVideos:
     """Zero-filled videos, the initial value of the loop."""
 
     def videos(keys: Array) -> MemberVideos:
@@ -100,7 +100,7 @@ def _intervene(
     return stored, chosen.scene, chosen.state, frame, record
 
 
-def _spliced(frame: Array, before: State, after: State) -> State:
+def _splice(frame: Array, before: State, after: State) -> State:
     """Videos [n, T, ...] `before`, continued from their `frame` [n] on by those in `after` from frame 0 on."""
 
     def spliced(frame: Array, old: Array, new: Array) -> Array:
@@ -112,22 +112,19 @@ def _spliced(frame: Array, before: State, after: State) -> State:
 
 
 def _record_change(member: SetMember, before: MemberVideos, after: MemberVideos, config: Any) -> dict[str, Array]:
-    """Record of a video's change, including that of a factor, and of the first frame that differs."""
-    original, changed = before.sampled, after.sampled
-    record, both = dict(after.record), original.scene.objects.present & changed.scene.objects.present
+    """Record of a video's intervention, or of its changed factor, with the first frame that differs."""
+    record, specs = dict(after.record), factor_options(config.scene.contract)
+    original, changed = ((video.sampled.scene.objects, video.sampled.state) for video in (before, after))
+    present = original[0].present & changed[0].present
     for index, name in enumerate(config.matched.change):
-        if name not in INTERVENTIONS:
-            applies = member.changed & (member.kind == index)
-            slot = changed_slot((original.scene.objects, original.state), (changed.scene.objects, changed.state))
-            record["object"] = jnp.where(applies, slot, record["object"])
-            change = (after.factors[name] - before.factors[name]).astype(jnp.float32)
-            size = (
-                jnp.linalg.norm(change, axis=-1)
-                if drawn_options(config.scene.contract)[name].parts
-                else jnp.abs(change)
-            )
-            record["size"] = jnp.where(applies, jnp.max(size), record["size"])
+        if name in INTERVENTIONS:
+            continue
+        applies = member.changed & (member.kind == index)
+        record["object"] = jnp.where(applies, changed_slot(original, changed), record["object"])
+        change = (after.factors[name] - before.factors[name]).astype(jnp.float32)
+        size = jnp.linalg.norm(change, axis=-1) if specs[name].parts else jnp.abs(change)
+        record["size"] = jnp.where(applies, jnp.max(size), record["size"])
     differ = jnp.zeros(len(after.trajectory.states.angle), bool)
     for a, b in zip(jax.tree.leaves(before.trajectory.states), jax.tree.leaves(after.trajectory.states), strict=True):
-        differ |= ((a != b).reshape(*a.shape[:2], -1).any(axis=-1) & both).any(axis=-1)
+        differ |= ((a != b).reshape(*a.shape[:2], -1).any(axis=-1) & present).any(axis=-1)
     return record | {"onset": jnp.where(differ.any(), jnp.argmax(differ), -1).astype(jnp.int32)}

@@ -37,7 +37,7 @@ class Intervention(NamedTuple):
     partner: Array | int = -1
 
 
-def _removed(member: SetMember, now: SceneInstant, options: Any, layout: Layout) -> Intervention:
+def _remove(member: SetMember, now: SceneInstant, options: Any, layout: Layout) -> Intervention:
     """Remove one object, a different one in each member. Size: its mass in kg."""
     scene, state = now.scene, now.state
     slot, possible = _random_slot(key_for(member.set_key, "object"), now.free, member.number - 1)
@@ -49,7 +49,7 @@ def _removed(member: SetMember, now: SceneInstant, options: Any, layout: Layout)
     return Intervention(dataclasses.replace(scene, objects=objects), state, possible * scene.objects.mass[slot], slot)
 
 
-def _teleported(member: SetMember, now: SceneInstant, options: Any, layout: Layout) -> Intervention:
+def _teleport(member: SetMember, now: SceneInstant, options: Any, layout: Layout) -> Intervention:
     """Move one object to a free position. Size: the distance in m."""
     state = now.state
     slot, possible = _random_slot(key_for(member.set_key, "object"), now.free)
@@ -57,7 +57,7 @@ def _teleported(member: SetMember, now: SceneInstant, options: Any, layout: Layo
     turn, priority = (jax.random.uniform(key_for(member.own_key, name), (DIRECTIONS,)) for name in ("turn", "luck"))
     angle = 2 * jnp.pi * (jnp.arange(DIRECTIONS) + turn[0]) / DIRECTIONS
     jump = distance * jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=-1)
-    clear = jax.vmap(lambda position: _clear(position, slot, now, layout))(state.position[slot] + jump)
+    clear = jax.vmap(lambda position: _is_free(position, slot, now, layout))(state.position[slot] + jump)
     chosen = jnp.argmax(jnp.where(clear, priority, -1))
     position = state.position.at[slot].add(jump[chosen])
     return Intervention(
@@ -65,7 +65,7 @@ def _teleported(member: SetMember, now: SceneInstant, options: Any, layout: Layo
     )
 
 
-def _swapped(member: SetMember, now: SceneInstant, options: Any, layout: Layout) -> Intervention:
+def _swap(member: SetMember, now: SceneInstant, options: Any, layout: Layout) -> Intervention:
     """Swap positions and motions of two objects of the same shape and the most similar size. Size: distance in m."""
     free, objects, slots = now.free, now.scene.objects, jnp.arange(len(now.free))
     size = extent(objects)
@@ -82,26 +82,26 @@ def _swapped(member: SetMember, now: SceneInstant, options: Any, layout: Layout)
     )
 
 
-def _flipped(member: SetMember, now: SceneInstant, options: Any, layout: Layout) -> Intervention:
+def _flip_gravity(member: SetMember, now: SceneInstant, options: Any, layout: Layout) -> Intervention:
     """Reverse gravity. Size: its change in m/s^2."""
     flipped = dataclasses.replace(now.scene, gravity=-now.scene.gravity)
     return Intervention(flipped, now.state, 2 * jnp.linalg.norm(now.scene.gravity))
 
 
-def _bounced(member: SetMember, now: SceneInstant, options: Any, layout: Layout) -> Intervention:
+def _ghost_contact(member: SetMember, now: SceneInstant, options: Any, layout: Layout) -> Intervention:
     """Bounce one object off an invisible wall. Size: the angle in rad by which its velocity turns."""
     state = now.state
     slot, possible = _random_slot(key_for(member.set_key, "object"), _fast_objects(now))
     velocity = state.velocity[slot]
     skew = MAX_INCIDENCE * jax.random.uniform(key_for(member.own_key, "skew"), (), minval=-1)
-    normal = _rotated(velocity, jnp.pi + skew)
+    normal = _rotate(velocity, jnp.pi + skew)
     square = jnp.maximum((normal**2).sum(), 1e-12)
     mirrored = velocity - 2 * (velocity @ normal) / square * normal
     state = dataclasses.replace(state, velocity=state.velocity.at[slot].set(mirrored))
     return Intervention(now.scene, state, possible * (jnp.pi - 2 * jnp.abs(skew)), slot)
 
 
-def _sped_up(member: SetMember, now: SceneInstant, options: Any, layout: Layout) -> Intervention:
+def _gain_energy(member: SetMember, now: SceneInstant, options: Any, layout: Layout) -> Intervention:
     """Speed up one object, in motion and spin. Size: the factor of its speed."""
     state = now.state
     slot, possible = _random_slot(key_for(member.set_key, "object"), _fast_objects(now))
@@ -114,12 +114,12 @@ def _sped_up(member: SetMember, now: SceneInstant, options: Any, layout: Layout)
 
 # By name in matched.change; the order is that of the codes in matched/kind.
 INTERVENTION_FUNCTIONS = {
-    "remove": _removed,
-    "teleport": _teleported,
-    "identity_swap": _swapped,
-    "gravity_flip": _flipped,
-    "ghost_contact": _bounced,
-    "energy_gain": _sped_up,
+    "remove": _remove,
+    "teleport": _teleport,
+    "identity_swap": _swap,
+    "gravity_flip": _flip_gravity,
+    "ghost_contact": _ghost_contact,
+    "energy_gain": _gain_energy,
 }
 
 
@@ -135,7 +135,7 @@ def _fast_objects(now: SceneInstant) -> Array:
     return now.free & (speed > 0) & (speed >= jnp.max(speed) / 2)
 
 
-def _rotated(vector: Array, angle: Array) -> Array:
+def _rotate(vector: Array, angle: Array) -> Array:
     """Vectors [..., 2] rotated counter-clockwise."""
     cos, sin, (x, y) = jnp.cos(angle), jnp.sin(angle), (vector[..., 0], vector[..., 1])
     return jnp.stack([cos * x - sin * y, sin * x + cos * y], axis=-1)
@@ -149,7 +149,7 @@ def extent(objects: Objects) -> Array:
 
 def gaps(point: Array, objects: Objects, state: State) -> Array:
     """Distance [K] m of a point [2] from each object's boundary, negative inside; a lower bound near corners."""
-    local = _rotated(point - state.position, -state.angle)
+    local = _rotate(point - state.position, -state.angle)
     along = jnp.maximum(jnp.abs(local[:, 0]) - objects.half_length, 0)
     distance = jnp.hypot(along, local[:, 1])
     if objects.vertices is not None:
@@ -169,7 +169,7 @@ def inside_view(position: Array, layout: Layout, radius: Any = 0.0) -> Array:
     return ((position >= low) & (position <= high)).all(axis=-1)
 
 
-def _clear(position: Array, slot: Array, now: SceneInstant, layout: Layout) -> Array:
+def _is_free(position: Array, slot: Array, now: SceneInstant, layout: Layout) -> Array:
     """Whether an object at this position would be in view and overlap nothing."""
     objects = now.scene.objects
     reach, others = extent(objects)[slot] + CLEARANCE, objects.present & (jnp.arange(len(now.free)) != slot)
