@@ -54,7 +54,7 @@ class FramePlan:
     @property
     def behind(self) -> list[tuple[SlotGroup, int]]:
         """Runs of the static layer, each with its first slot, back to front; empty if the camera moves."""
-        spans = self.layout.painted
+        spans = self.layout.back_to_front
         first = next((i for i, (run, _) in enumerate(spans) if not self.still or run.kind != STATIC), len(spans))
         return list(spans[:first])
 
@@ -62,7 +62,7 @@ class FramePlan:
     def groups(self) -> "list[TileGroup]":
         """Remaining runs, in consecutive groups that share a tile size."""
         groups: list[TileGroup] = []
-        for run, first in self.layout.painted[len(self.behind) :]:
+        for run, first in self.layout.back_to_front[len(self.behind) :]:
             reach = self._reach(run)
             if groups and groups[-1].reach == reach:
                 groups[-1] = TileGroup((*groups[-1].runs, (run, first)), reach)

@@ -329,7 +329,7 @@ def _stored(ds: Dataset, numbers: np.ndarray) -> dict[str, np.ndarray]:
 
 def from_columns(cls: type, columns: FieldColumns) -> Any:
     """A record of class `cls` from arrays by stored name."""
-    known = axes.described(cls).items()
+    known = axes.stored_fields(cls).items()
     return cls(**{attribute: jnp.asarray(columns[name]) for name, (attribute, _) in known if name in columns})
 
 

@@ -102,7 +102,7 @@ def ends(numbers: dict, scene: Any, state: Any, layout: Layout, steps: int) -> j
         scene, objects=dataclasses.replace(scene.objects, **of_objects), gravity=numbers["gravity"]
     )
     state = dataclasses.replace(state, **of_state)
-    return simulate(scene, state, layout, rules(), 2, steps).states.position[-1, :, : layout.runs[0].count]
+    return simulate(scene, state, layout, rules(), 2, steps).states.position[-1, :, : layout.groups[0].count]
 
 
 def nudged(values: jax.Array, slot: int, axis: int, by: float) -> jax.Array:

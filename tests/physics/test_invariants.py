@@ -78,7 +78,7 @@ def momentum_scales(worlds: list[tuple]) -> tuple[np.ndarray, np.ndarray]:
     linear, angular = [], []
     for scene, state, layout in worlds:
         mass, moment, x, v, w = (
-            np.asarray(a, float)[: layout.runs[0].count]
+            np.asarray(a, float)[: layout.groups[0].count]
             for a in (scene.objects.mass, scene.objects.moment, state.position, state.velocity, state.angular_velocity)
         )
         speed = np.hypot(*v.T)
