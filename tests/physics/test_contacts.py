@@ -13,7 +13,18 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from gen2d.physics.collision import FAR, PAIRS, SLOP, Disc, Hull, Point, Stadium, edge_normals, hull, touches
+from gen2d.physics.collision import (
+    FAR,
+    PAIRS,
+    SLOP,
+    Disc,
+    Hull,
+    ManifoldPoint,
+    Stadium,
+    edge_normals,
+    hull_at,
+    manifold,
+)
 
 MANY = 2000
 V = 5  # corners of a hull, some of them repeated
@@ -80,7 +91,7 @@ def placed(shape: dict, dtype: type = np.float64) -> Disc | Stadium | Hull:
     if len(corners) == 2:
         way = jnp.stack([jnp.cos(x["angle"]), jnp.sin(x["angle"])])
         return Stadium(x["position"], way, corners[1, 0], x["radius"])
-    return hull(corners, edge_normals(corners), x["position"], x["angle"], x["radius"])
+    return hull_at(corners, edge_normals(corners), x["position"], x["angle"], x["radius"])
 
 
 # The reference --------------------------------------------------------------------------------------------------------
@@ -112,7 +123,7 @@ def true_gap(a: dict, b: dict) -> np.ndarray:
     return np.where((along >= 0) | (along == -np.inf), apart, along) - a["radius"] - b["radius"]
 
 
-compiled = jax.jit(touches, compiler_options={"xla_backend_optimization_level": 0})  # LLVM takes longer than the tests
+compiled = jax.jit(manifold, compiler_options={"xla_backend_optimization_level": 0})  # LLVM takes longer than the tests
 
 
 def found(a: dict, b: dict, dtype: type = np.float64):
@@ -125,10 +136,10 @@ def found(a: dict, b: dict, dtype: type = np.float64):
     return normal, gap, a["position"].T + arm_a, b["position"].T + arm_b
 
 
-def gradient(a: dict, b: dict, weights: tuple[Point, ...]) -> tuple[dict, dict]:
+def gradient(a: dict, b: dict, weights: tuple[ManifoldPoint, ...]) -> tuple[dict, dict]:
     """By all that a and b are made of, of their points times the weights; in float32."""
     a, b, weights = jax.tree.map(jnp.float32, (a, b, weights))  # not compiled, as that takes longer
-    return jax.vjp(lambda a, b: touches(placed(a, np.float32), placed(b, np.float32)), a, b)[1](weights)
+    return jax.vjp(lambda a, b: manifold(placed(a, np.float32), placed(b, np.float32)), a, b)[1](weights)
 
 
 def errors(a: dict, b: dict, dtype: type) -> np.ndarray:
@@ -367,9 +378,9 @@ def test_degenerate_scenes_have_unit_normals_and_finite_gradients(kind_a: type, 
         assert np.isfinite(leaf).all()
 
 
-def some_weights(points: int) -> tuple[Point, ...]:
+def some_weights(points: int) -> tuple[ManifoldPoint, ...]:
     vector = jnp.linspace(0.5, 1.7, 2 * MANY).reshape(2, MANY)
-    return points * (Point(vector, vector[0], -vector, vector / 3),)
+    return points * (ManifoldPoint(vector, vector[0], -vector, vector / 3),)
 
 
 @pytest.mark.parametrize(("a", "b"), [(NONE, NONE), (NONE, UNIT), (UNIT, NONE), (NONE, line(0)), (NONE, disc(0, 0, 0))])
@@ -387,7 +398,7 @@ def test_a_gap_opens_along_its_normal(kind_a: type, kind_b: type):
     normal, gap, *_ = found(a, b, np.float32)
     nearest = np.arange(len(gap))[:, None] == gap.argmin(0)
     zero = jnp.zeros((2, MANY))
-    by_a, by_b = gradient(a, b, tuple(Point(zero, jnp.asarray(on), zero, zero) for on in nearest))
+    by_a, by_b = gradient(a, b, tuple(ManifoldPoint(zero, jnp.asarray(on), zero, zero) for on in nearest))
     assert_allclose(by_b["position"].T, normal[0], atol=0.03)  # corners hardly apart in float32
     assert_allclose(by_a["position"].T, -normal[0], atol=0.03)
     assert np.quantile(np.abs(by_b["position"].T - normal[0]), 0.99) < 1e-5
