@@ -1,7 +1,7 @@
 """Contact solver over the pairs that are near each other, found again in every step; for CPUs.
 
 A step looks at every pair once, for a bit: whether the two may meet in it (broad_phase.py). The three passes then run
-over the near pairs of all scenes in chunks, in the order of all_pairs.py. Bodies and what is cached of a pair are rows
+over the near pairs of all scenes in chunks, in the order of all_pairs.py. Bodies and cache entries of pairs are rows
 of packed tables (packing.py): a chunk's rows are gathered, solved and put back. A pair that is not near would change
 nothing, so the result equals that of all_pairs.py up to rounding.
 
@@ -52,7 +52,7 @@ from gen2d.records.axes import Array
 from gen2d.records.trajectory import Contacts
 from gen2d.xla import materialize, max_bodies
 
-NEVER = -2  # the step of what has not happened
+NEVER = -2  # the step of an event that has not happened
 
 
 class StaticSide(NamedTuple):
@@ -112,7 +112,7 @@ class GatherIndices(NamedTuple):
 
 
 class PassBuffers(NamedTuple):
-    """What the passes of a step hand on about the pairs of a batch, by chunk."""
+    """Data of the pairs of a batch that one pass hands to the next, by chunk."""
 
     indices: Array  # [K, 4, C]
     contacts: Array  # [K, F, C]
@@ -138,7 +138,7 @@ class SolvedChunk(NamedTuple):
 
 
 class CachedConstraint(NamedTuple):
-    """What is cached of a pair."""
+    """Cache entry of a pair."""
 
     warm: WarmStart  # counts if it is of the last step
     stamp: Array  # the step that wrote it
@@ -386,7 +386,7 @@ class NearbyPairs(ContactSolver):
     def _unpack_contacts(
         self, listed: ListedPairs, i: int, k: Array
     ) -> tuple[ContactConstraint, WarmStart, list, PassSetup]:
-        """What the warm start stored of chunk k of batch i."""
+        """Constraint, impulses, points and setup of chunk k of batch i, as the warm start stored them."""
         constraint, warm, points, threshold = unpack(list(listed.packed[i][k]), listed.specs[i])
         return constraint, warm, points, self.setup._replace(threshold=threshold)
 
