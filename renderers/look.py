@@ -99,7 +99,7 @@ def are_lines(scene: Scene) -> Array:
 
 def are_moving(layout: Layout) -> np.ndarray:
     """Mask [K] of the slots that are not static."""
-    return np.repeat([run.kind != STATIC for run in layout.runs], [run.count for run in layout.runs])
+    return np.repeat([run.kind != STATIC for run in layout.groups], [run.count for run in layout.groups])
 
 
 def contrasting(colors: Array) -> Array:

@@ -54,7 +54,7 @@ class FramePlan:
     @property
     def static_runs(self) -> list[tuple[SlotGroup, int]]:
         """Runs of the static layer, each with its first slot, back to front; empty if the camera moves."""
-        spans = self.layout.painted
+        spans = self.layout.back_to_front
         first = next((i for i, (run, _) in enumerate(spans) if not self.still or run.kind != STATIC), len(spans))
         return list(spans[:first])
 
@@ -62,7 +62,7 @@ class FramePlan:
     def groups(self) -> "list[TileGroup]":
         """Remaining runs, in consecutive groups that share a tile size."""
         groups: list[TileGroup] = []
-        for run, first in self.layout.painted[len(self.static_runs) :]:
+        for run, first in self.layout.back_to_front[len(self.static_runs) :]:
             reach = self.largest(run)
             if 2 * reach + 2 >= max(self.height, self.width):  # a tile would be as large as the frame
                 reach = math.inf

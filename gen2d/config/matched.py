@@ -18,7 +18,7 @@ VIOLATIONS = INTERVENTIONS[1:]  # physically impossible events in the middle of 
 
 def free_slots(layout: Layout) -> np.ndarray:
     """Whether each slot [K] holds a dynamic object without joints."""
-    free = np.concatenate([np.full(run.count, run.kind == DYNAMIC) for run in layout.runs])
+    free = np.concatenate([np.full(run.count, run.kind == DYNAMIC) for run in layout.groups])
     free[[slot for joint in layout.joints for slot in (joint.a, joint.b)]] = False
     return free
 

@@ -16,9 +16,9 @@ from gen2d.physics.constraint import ContactConstraint, ContactPoint, Impulse
 from gen2d.physics.contact_log import (
     ContactEvent,
     PairEvent,
-    began_touching,
     compact,
     empty_events,
+    next_frame_event,
     pair_event,
     record_event,
 )
@@ -59,12 +59,12 @@ class AllPairs(ContactSolver):
     def start(self, slots: int) -> AllPairsCarry:
         shapes, dtype = [c.present.shape for c in self.constraints], self.setup.threshold.dtype
 
-        def cold(constraint: ContactConstraint, points: int) -> WarmStart:
+        def zero_warm_start(constraint: ContactConstraint, points: int) -> WarmStart:
             zero = jnp.zeros(constraint.present.shape, dtype)
             return WarmStart([Impulse(zero, zero)] * points, None if constraint.rolling is None else zero)
 
         return AllPairsCarry(
-            warm=[cold(*of) for of in zip(self.constraints, self.points, strict=True)],
+            warm=[zero_warm_start(*of) for of in zip(self.constraints, self.points, strict=True)],
             observed={shape[0]: Observed(jnp.zeros(shape, dtype), jnp.zeros(shape, jnp.int32)) for shape in shapes},
             events=[empty_events(shape, dtype) for shape in shapes] if slots else None,
         )
@@ -73,7 +73,7 @@ class AllPairs(ContactSolver):
         return carry
 
     def begin_frame(self, carry: AllPairsCarry) -> AllPairsCarry:
-        events = None if carry.events is None else [began_touching(event) for event in carry.events]
+        events = None if carry.events is None else [next_frame_event(event) for event in carry.events]
         return carry._replace(events=events)
 
     def warm_start(

@@ -25,7 +25,7 @@ def factor(bands: list[Array]) -> BandFactors:
     width, zero = len(bands), jnp.zeros_like(bands[0][0])
 
     def row(less: list, terms: list) -> tuple:
-        """What the rows so far subtract from the next ones, and this row's factors."""
+        """Terms that the rows so far subtract from the next ones, and this row's factors."""
         first, *others = less or [[]]
         own = [x - y for x, y in zip(terms, [*first, zero], strict=True)]
         inverse = 1 / own[0]

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gen2d.physics.collision import Disc, Hull, Shape, Stadium, dot, from_core
+from gen2d.physics.collision import Disc, Hull, Shape, Stadium, dot, offset_from_core
 from gen2d.physics.packing import SAFE
 from gen2d.records.axes import Array
 from gen2d.xla import materialize
@@ -35,7 +35,7 @@ def signed_distance(shape: Shape, centre: Array) -> Array:
     if isinstance(shape, Hull):
         sides = [dot(n, centre - v) for n, v in zip(shape.normals, shape.vertices, strict=True)]
         return functools.reduce(jnp.maximum, sides) - shape.radius
-    offset = centre - shape.centre if isinstance(shape, Disc) else from_core(shape, centre)[0]
+    offset = centre - shape.centre if isinstance(shape, Disc) else offset_from_core(shape, centre)[0]
     return jnp.sqrt(dot(offset, offset)) - shape.radius
 
 

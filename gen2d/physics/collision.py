@@ -58,7 +58,7 @@ class Hull(NamedTuple):
 Shape: TypeAlias = Disc | Stadium | Hull
 
 
-class Point(NamedTuple):
+class ManifoldPoint(NamedTuple):
     """A point of contact, midway between the two surfaces: centre_a + arm_a = centre_b + arm_b."""
 
     normal: Array  # [2, ...], unit, from a to b
@@ -72,7 +72,7 @@ def dot(a: Array, b: Array) -> Array:
     return a[0] * b[0] + a[1] * b[1]
 
 
-def turned(a: Array) -> Array:
+def perpendicular(a: Array) -> Array:
     """Vector rotated by a quarter turn counter-clockwise, as the tangent of a normal."""
     return jnp.stack([-a[1], a[0]])
 
@@ -87,7 +87,7 @@ def direction(a: Array, otherwise: Array) -> Array:
     return jnp.where(dot(a, a) > NEAREST, a * inverse_length(a), otherwise)
 
 
-def from_core(stadium: Stadium, point: Array) -> tuple[Array, Array, Array]:
+def offset_from_core(stadium: Stadium, point: Array) -> tuple[Array, Array, Array]:
     """Offset [2, ...] of a point from the nearest point of a core line, and positions along the line from its middle.
 
     The positions [...] in m are the one on the infinite line and the one clipped to the core line.
@@ -104,10 +104,10 @@ def from_core(stadium: Stadium, point: Array) -> tuple[Array, Array, Array]:
 def edge_normals(vertices: Sequence[Array] | Array) -> tuple[Array, ...]:
     """Outward unit normals of the edges, each [2, ...]; zero for a repeated vertex. Vertices are counter-clockwise."""
     edges = [vertices[(i + 1) % len(vertices)] - vertices[i] for i in range(len(vertices))]
-    return tuple(-turned(edge) * inverse_length(edge) for edge in edges)
+    return tuple(-perpendicular(edge) * inverse_length(edge) for edge in edges)
 
 
-def hull(
+def hull_at(
     vertices: Sequence[Array] | Array, normals: Sequence[Array] | Array, position: Array, angle: Array, radius: Array
 ) -> Hull:
     """Hull in the world at a position and angle, of vertices about its centre of mass and their `edge_normals`."""
@@ -120,9 +120,9 @@ def hull(
     return Hull(position, tuple(position + turn(v) for v in vertices), tuple(turn(n) for n in normals), radius)
 
 
-def core(stadium: Stadium) -> Hull:
+def core_hull(stadium: Stadium) -> Hull:
     """Hull of the two ends of a core line."""
-    reach, normal = stadium.half_length * stadium.direction, turned(stadium.direction)
+    reach, normal = stadium.half_length * stadium.direction, perpendicular(stadium.direction)
     ends = (stadium.centre - reach, stadium.centre + reach)
     return Hull(stadium.centre, ends, (-normal, normal), stadium.radius)
 
@@ -166,7 +166,7 @@ def nearest_ends(low_a: Array, high_a: Array, low_b: Array, high_b: Array) -> tu
     return end_a, end_b, low_low | low_high | high_low | high_high
 
 
-def clipped(low: Array, high: Array, left: Array, right: Array, tangent: Array) -> tuple[Array, Array]:
+def clip_edge(low: Array, high: Array, left: Array, right: Array, tangent: Array) -> tuple[Array, Array]:
     """Both ends of an edge, clipped at `left` and `right` [2, ...] along the tangent."""
     edge = high - low
     inverse = 1 / jnp.maximum(dot(edge, tangent), SLOP)
@@ -179,44 +179,44 @@ def clipped(low: Array, high: Array, left: Array, right: Array, tangent: Array) 
 # Pairs --------------------------------------------------------------------------------------------------------------
 
 
-def point(normal: Array, on_a: Array, on_b: Array, a: Shape, b: Shape) -> Point:
+def manifold_point(normal: Array, on_a: Array, on_b: Array, a: Shape, b: Shape) -> ManifoldPoint:
     """Contact point of two points of the cores [2, ...] with a normal."""
     middle = 0.5 * (on_a + on_b + (a.radius - b.radius) * normal)
-    return Point(normal, dot(normal, on_b - on_a) - a.radius - b.radius, middle - a.centre, middle - b.centre)
+    return ManifoldPoint(normal, dot(normal, on_b - on_a) - a.radius - b.radius, middle - a.centre, middle - b.centre)
 
 
-def disc_disc(a: Disc, b: Disc) -> tuple[Point]:
+def disc_disc(a: Disc, b: Disc) -> tuple[ManifoldPoint]:
     """Contact point of two discs; with equal centres they separate upwards."""
     offset = b.centre - a.centre
     up = jnp.stack([jnp.zeros_like(offset[0]), jnp.ones_like(offset[1])])
-    return (point(direction(offset, up), a.centre, b.centre, a, b),)
+    return (manifold_point(direction(offset, up), a.centre, b.centre, a, b),)
 
 
-def stadium_disc(a: Stadium, b: Disc) -> tuple[Point]:
+def stadium_disc(a: Stadium, b: Disc) -> tuple[ManifoldPoint]:
     """Contact point of a stadium and a disc; one centred on the core line separates across it."""
     along = jnp.clip(dot(b.centre - a.centre, a.direction), -a.half_length, a.half_length)
     nearest = a.centre + along * a.direction
-    return (point(direction(b.centre - nearest, turned(a.direction)), nearest, b.centre, a, b),)
+    return (manifold_point(direction(b.centre - nearest, perpendicular(a.direction)), nearest, b.centre, a, b),)
 
 
-def hull_disc(a: Hull, b: Disc) -> tuple[Point]:
+def hull_disc(a: Hull, b: Disc) -> tuple[ManifoldPoint]:
     """Contact point of a hull and a disc; one centred inside separates through the face of least penetration."""
     only = Hull(b.centre, (b.centre,), (b.centre,), b.radius)
     gap, face = materialize(largest_separation(a, only))
     start, end = facing_edge(a, face)
-    tangent = turned(face)
+    tangent = perpendicular(face)
     along = jnp.clip(dot(b.centre - start, tangent), 0.0, dot(end - start, tangent))
     nearest = start + along * tangent
     normal = jnp.where(gap > 0, direction(b.centre - nearest, face), face)
-    return (point(normal, nearest, b.centre, a, b),)
+    return (manifold_point(normal, nearest, b.centre, a, b),)
 
 
-def hull_hull(a: Hull, b: Hull) -> tuple[Point, Point]:
+def hull_hull(a: Hull, b: Hull) -> tuple[ManifoldPoint, ManifoldPoint]:
     """Contact points of two hulls, in order along the tangent; the second is FAR where two corners are nearest."""
     (gap_a, face_a), (gap_b, face_b) = materialize((largest_separation(a, b), largest_separation(b, a)))
     other = gap_b > gap_a + SLOP
     face = jnp.where(other, -face_b, face_a)
-    tangent = turned(face)
+    tangent = perpendicular(face)
     (low_a, high_a), (high_b, low_b) = materialize((facing_edge(a, face), facing_edge(b, -face)))
 
     end_a, end_b, nearest = nearest_ends(low_a, high_a, low_b, high_b)
@@ -225,24 +225,24 @@ def hull_hull(a: Hull, b: Hull) -> tuple[Point, Point]:
     at_corners = nearest & apart & (jnp.abs(dot(end_b - end_a, tangent)) > SLOP)
     normal = jnp.where(at_corners, direction(end_b - end_a, face), face)
 
-    left_a, right_a = clipped(low_a, high_a, low_b, high_b, tangent)
-    left_b, right_b = clipped(low_b, high_b, low_a, high_a, tangent)
-    first = point(normal, jnp.where(at_corners, end_a, left_a), jnp.where(at_corners, end_b, left_b), a, b)
-    second = point(normal, right_a, right_b, a, b)
+    left_a, right_a = clip_edge(low_a, high_a, low_b, high_b, tangent)
+    left_b, right_b = clip_edge(low_b, high_b, low_a, high_a, tangent)
+    first = manifold_point(normal, jnp.where(at_corners, end_a, left_a), jnp.where(at_corners, end_b, left_b), a, b)
+    second = manifold_point(normal, right_a, right_b, a, b)
     return first, second._replace(gap=jnp.where(at_corners, FAR, second.gap))
 
 
-def hull_stadium(a: Hull, b: Stadium) -> tuple[Point, Point]:
+def hull_stadium(a: Hull, b: Stadium) -> tuple[ManifoldPoint, ManifoldPoint]:
     """Contact points of a hull and a stadium, as `hull_hull`."""
-    return hull_hull(a, core(b))
+    return hull_hull(a, core_hull(b))
 
 
-def stadium_stadium(a: Stadium, b: Stadium) -> tuple[Point, Point]:
+def stadium_stadium(a: Stadium, b: Stadium) -> tuple[ManifoldPoint, ManifoldPoint]:
     """Contact points of two stadiums, as `hull_hull`."""
-    return hull_hull(core(a), core(b))
+    return hull_hull(core_hull(a), core_hull(b))
 
 
-PAIRS: dict[tuple[type, type], Callable[..., tuple[Point, ...]]] = {
+PAIRS: dict[tuple[type, type], Callable[..., tuple[ManifoldPoint, ...]]] = {
     (Disc, Disc): disc_disc,
     (Stadium, Disc): stadium_disc,
     (Hull, Disc): hull_disc,
@@ -252,7 +252,7 @@ PAIRS: dict[tuple[type, type], Callable[..., tuple[Point, ...]]] = {
 }
 
 
-def touches(a: Shape, b: Shape) -> tuple[Point, ...]:
+def manifold(a: Shape, b: Shape) -> tuple[ManifoldPoint, ...]:
     """Contact points of any two shapes.
 
     If only the mirrored pair is in the table, the tangent is reversed, and so is the order of the points.
@@ -260,4 +260,4 @@ def touches(a: Shape, b: Shape) -> tuple[Point, ...]:
     if pair := PAIRS.get((type(a), type(b))):
         return pair(a, b)
     mirrored = PAIRS[type(b), type(a)](b, a)
-    return tuple(Point(-p.normal, p.gap, p.arm_b, p.arm_a) for p in reversed(mirrored))
+    return tuple(ManifoldPoint(-p.normal, p.gap, p.arm_b, p.arm_a) for p in reversed(mirrored))

@@ -9,7 +9,7 @@ from typing import NamedTuple, TypeAlias
 
 import jax.numpy as jnp
 
-from gen2d.physics.collision import FAR, Point, dot, turned
+from gen2d.physics.collision import FAR, ManifoldPoint, dot, perpendicular
 from gen2d.physics.params import SolverParams
 from gen2d.physics.time_of_impact import MISSES
 from gen2d.records.axes import Array
@@ -124,7 +124,7 @@ def frame_of(
     return ContactFrame(*levers, *ks, *(reciprocal(k, near) for k in ks))
 
 
-def frame_at(constraint: ContactConstraint, point: Point) -> ContactFrame:
+def frame_at(constraint: ContactConstraint, point: ManifoldPoint) -> ContactFrame:
     """Frame of a point of contact."""
     (ax, ay), (bx, by), (nx, ny) = point.arm_a, point.arm_b, point.normal
     a = (None, None) if constraint.a is None else (ax * ny - ay * nx, ax * nx + ay * ny)
@@ -164,7 +164,7 @@ def apply_impulse(
     b: Motion,
 ) -> tuple[Motion | None, Motion]:
     """Both motions after the impulse on b and its reaction on a."""
-    frame, directions = point.frame, (point.normal, turned(point.normal))
+    frame, directions = point.frame, (point.normal, perpendicular(point.normal))
     parts = [p * d for p, d in zip(impulse, directions, strict=True) if p is not None]
     linear = sum(parts[1:], parts[0])
     angular = _angular((frame.normal_b, frame.tangent_b), impulse)

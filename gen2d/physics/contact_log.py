@@ -58,8 +58,8 @@ def record_event(event: ContactEvent, solved: SolvedPair, relaxed: SolvedPair, s
     )
 
 
-def began_touching(event: ContactEvent) -> ContactEvent:
-    """Event at the start of the next frame."""
+def next_frame_event(event: ContactEvent) -> ContactEvent:
+    """Event of a pair as the next frame begins."""
     fresh = empty_events(event.time.shape, event.time.dtype)
     return fresh._replace(flags=jnp.where((event.flags & ON) > 0, ON | BEFORE, 0).astype(jnp.int32))
 
@@ -98,24 +98,24 @@ def compact(frames: PairEvent, a: Array, b: Array, fps: float, slots: int) -> Co
     filled, index = wanted[:, None] <= count, jnp.minimum(index, steps * pairs - 1)
     time = jnp.take_along_axis(frames.time.reshape(-1, scenes), index, axis=0)
     time = jnp.where(time >= 0, time, (index // pairs) / fps)  # an end without a touch: the start of the frame
-    order = order_of(jnp.where(filled, time, jnp.inf))
+    order = sort_order(jnp.where(filled, time, jnp.inf))
     time, index = (jnp.take_along_axis(x, order, axis=0) for x in (time, index))
     frame, pair = index // pairs, index % pairs
 
-    def cleared(values: Array) -> Array:
+    def zero_unfilled(values: Array) -> Array:
         return jnp.where(filled, values, jnp.zeros_like(values))
 
-    def taken(values: Array, axis: int = 0) -> Array:
+    def gather(values: Array, axis: int = 0) -> Array:
         parts = values.size // (steps * pairs * scenes)  # 2 in a vector
         where = (frame * parts + axis) * pairs + pair
-        return cleared(jnp.take_along_axis(values.reshape(-1, scenes), where, axis=0))
+        return zero_unfilled(jnp.take_along_axis(values.reshape(-1, scenes), where, axis=0))
 
     def vector(values: Array) -> Array:
-        return jnp.stack([taken(values, 0), taken(values, 1)])
+        return jnp.stack([gather(values, 0), gather(values, 1)])
 
-    events = jax.tree.map(lambda x: vector(x) if x.ndim == 4 else taken(x), frames)._replace(time=cleared(time))
+    events = jax.tree.map(lambda x: vector(x) if x.ndim == 4 else gather(x), frames)._replace(time=zero_unfilled(time))
     number, first, second = frame.astype(jnp.int32) + 1, a[pair, 0], b[pair, 0]
-    return contacts_of(events, cleared(number), cleared(first), cleared(second), count)
+    return contacts_of(events, zero_unfilled(number), zero_unfilled(first), zero_unfilled(second), count)
 
 
 def contacts_of(event: PairEvent, frame: Array, a: Array, b: Array, count: Array) -> Contacts:
@@ -136,7 +136,7 @@ def contacts_of(event: PairEvent, frame: Array, a: Array, b: Array, count: Array
     )
 
 
-def order_of(time: Array) -> Array:
+def sort_order(time: Array) -> Array:
     """Indices [C, n] that sort times in ascending order; the sort is stable.
 
     An odd-even transposition sort takes as many passes as the largest distance of a row from its place, which is small,
@@ -144,16 +144,14 @@ def order_of(time: Array) -> Array:
     """
     rows = jnp.arange(len(time), dtype=jnp.int32)[:, None]
 
-    def neighbour(values: Array, by: int) -> Array:
-        return jnp.roll(values, by, axis=0)
-
     def exchange(state: tuple) -> tuple:
         time, order, turn, idle = state
         first, last = rows % 2 == turn % 2, len(rows) - 1
-        later = first & (rows < last) & (time > neighbour(time, -1))
-        earlier = ~first & (rows > 0) & (neighbour(time, 1) > time)
+        later = first & (rows < last) & (time > jnp.roll(time, -1, axis=0))
+        earlier = ~first & (rows > 0) & (jnp.roll(time, 1, axis=0) > time)
         time, order = (
-            jnp.where(later, neighbour(x, -1), jnp.where(earlier, neighbour(x, 1), x)) for x in (time, order)
+            jnp.where(later, jnp.roll(x, -1, axis=0), jnp.where(earlier, jnp.roll(x, 1, axis=0), x))
+            for x in (time, order)
         )
         return time, order, turn + 1, jnp.where(jnp.any(later), 0, idle + 1)
 

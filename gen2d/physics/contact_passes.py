@@ -24,7 +24,7 @@ from gen2d.physics.constraint import (
 )
 from gen2d.physics.contact_points import bounce_threshold, contact_points, impact_of, two_point_impulses
 from gen2d.physics.contact_state import BodySide, PassSetup, SolvedPair, WarmStart
-from gen2d.physics.energy import dissipated, dissipated_by_discs
+from gen2d.physics.energy import add_disc_dissipation, add_dissipation
 from gen2d.physics.friction import apply_angular_impulse, friction_impulse, rolling_impulse
 from gen2d.physics.params import SolverParams
 from gen2d.records.axes import Array
@@ -49,7 +49,7 @@ def _apply_pass(
         impulses.append(Impulse(normal, materialize(friction_impulse(constraint, contact, normal, slip, old))))
         change = impulse_change(impulses[0], old)
         motions = apply_impulse(constraint, contact, change, *before)
-        work = dissipated_by_discs(b.work, constraint.frame, change, speed, slip)
+        work = add_disc_dissipation(b.work, constraint.frame, change, speed, slip)
     else:
         normals = []
         for i, (contact, old) in enumerate(zip(pair.contacts, pair.impulses, strict=True)):
@@ -66,7 +66,7 @@ def _apply_pass(
             motions = apply_angular_impulse(constraint, roll - pair.roll, *motions)
         changes = [impulse_change(new, old) for new, old in zip(impulses, pair.impulses, strict=True)]
         twist = None if roll is None or pair.roll is None else roll - pair.roll
-        work = dissipated(b.work, constraint, pair.contacts, changes, twist, before, motions)
+        work = add_dissipation(b.work, constraint, pair.contacts, changes, twist, before, motions)
     solved = SolvedPair(pair.contacts, impulses, roll)
     return a._replace(motion=motions[0]), b._replace(motion=motions[1], work=work), solved
 
@@ -88,9 +88,9 @@ def warm_start(
         motions = apply_angular_impulse(constraint, roll, *motions)
     if constraint.frame is not None and roll is None:
         speeds = relative_speed(constraint.frame, points[0].normal, *before)
-        work = dissipated_by_discs(b.work, constraint.frame, olds[0], *speeds)
+        work = add_disc_dissipation(b.work, constraint.frame, olds[0], *speeds)
     else:
-        work = dissipated(b.work, constraint, points, olds, roll, before, motions)
+        work = add_dissipation(b.work, constraint, points, olds, roll, before, motions)
     motion_b = materialize(motions[1]) if constraint.static else motions[1]
     return a._replace(motion=motions[0]), b._replace(motion=motion_b, work=work), points
 
@@ -98,7 +98,9 @@ def warm_start(
 MIN_PUSH = 1e-9  # m/s: marks a contact that holds its bodies without pushing them apart
 
 
-def _push(constraint: ContactConstraint, solved: SolvedPair, a: BodySide, b: BodySide, params: SolverParams) -> Array:
+def _push_bound(
+    constraint: ContactConstraint, solved: SolvedPair, a: BodySide, b: BodySide, params: SolverParams
+) -> Array:
     """Bound on the speed, m/s, that the contact adds to its bodies or passes on between them; 0 without a resting
     contact."""
     rate, *_ = softness(constraint, params)
@@ -110,7 +112,7 @@ def _push(constraint: ContactConstraint, solved: SolvedPair, a: BodySide, b: Bod
     return push
 
 
-def _drifted(old: BodySide, new: BodySide, contacts: list[ActiveContact], push: Array) -> BodySide:
+def _update_drift(old: BodySide, new: BodySide, contacts: list[ActiveContact], push: Array) -> BodySide:
     """The side with its drift reduced by tau times the change of velocity.
 
     If two points bounce in the same step, the mean of their times counts.
@@ -150,10 +152,10 @@ def solve(
 
     pair = SolvedPair(contacts, warm_start_impulses(memory.impulses), memory.roll)
     new_a, new_b, solved = _apply_pass(constraint, pair, normal_impulse, a, b)
-    push = _push(constraint, solved, a, b, params)
-    new_b = _drifted(b, new_b, contacts, push)
+    push = _push_bound(constraint, solved, a, b, params)
+    new_b = _update_drift(b, new_b, contacts, push)
     if constraint.a is not None and a.drift is not None:
-        new_a = _drifted(a, new_a, contacts, push)
+        new_a = _update_drift(a, new_a, contacts, push)
     if constraint.static:
         new_b = materialize(new_b._replace(work=None))._replace(work=new_b.work)
     return new_a, new_b, solved

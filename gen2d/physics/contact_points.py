@@ -4,7 +4,7 @@ from typing import Any
 
 import jax.numpy as jnp
 
-from gen2d.physics.collision import FAR, NEAREST, Disc, dot, from_core, inverse_length, touches
+from gen2d.physics.collision import FAR, NEAREST, Disc, dot, inverse_length, manifold, offset_from_core
 from gen2d.physics.constraint import (
     ActiveContact,
     ContactConstraint,
@@ -25,7 +25,7 @@ from gen2d.physics.time_of_impact import (
     plane_path,
     post_impact_speed,
     round_path,
-    select,
+    select_path,
     time_of_impact,
 )
 from gen2d.records.axes import Array
@@ -35,7 +35,7 @@ UP = (0.0, 1e-6)  # m: the offset of discs whose centres coincide; any would do
 MIDDLE, END, NEIGHBOUR = 1.0, 2.0, 3.0  # the part of a segment that a disc is nearest to, or a neighbouring segment
 
 
-def _nonzero(offset: Array) -> Array:
+def _nonzero_offset(offset: Array) -> Array:
     coincide = dot(offset, offset) < NEAREST
     return jnp.stack([jnp.where(coincide, up, x) for up, x in zip(UP, offset, strict=True)])
 
@@ -47,9 +47,9 @@ def _core_offset(constraint: ContactConstraint, a: Any, b: Disc) -> tuple[Array,
     joint.
     """
     if isinstance(a, Disc):
-        return _nonzero(b.centre - a.centre), None
-    offset, along, inside = from_core(a, b.centre)
-    offset, part = _nonzero(offset), jnp.where(along == inside, MIDDLE, END)
+        return _nonzero_offset(b.centre - a.centre), None
+    offset, along, inside = offset_from_core(a, b.centre)
+    offset, part = _nonzero_offset(offset), jnp.where(along == inside, MIDDLE, END)
     if constraint.left is None or constraint.right is None:
         return offset, part
     sides = zip(constraint.left, constraint.right, strict=True)
@@ -75,7 +75,7 @@ def contact_points(
         position = b.centre if setup.log else None
         normal, core = offset * inverse, CoreOffset(offset, a.radius + b.radius, flat)
         return [ContactPoint(constraint.frame, normal, gap, last_normals[0], acceleration, position, core)]
-    points = materialize(touches(a, b))
+    points = materialize(manifold(a, b))
     positions = [b.centre + p.arm_b if setup.log else None for p in points]
     return [
         ContactPoint(materialize(frame_at(constraint, p)), p.normal, p.gap, last, acceleration, position)
@@ -92,7 +92,7 @@ def impact_of(
     """
     assert b.motion, "only static bodies lack a motion"
     assert b.drift, "only static bodies lack a drift"
-    speed, pull = _closing(point, point.normal, a.motion, b.motion)
+    speed, pull = _speed_and_pull(point, point.normal, a.motion, b.motion)
     shift = b.drift.velocity if a.drift is None else b.drift.velocity - a.drift.velocity
     threshold = bounce_threshold(point, point.last_normal, a, b, setup)
     approach, frame, normal = -speed - pull * h, point.frame, point.normal
@@ -101,7 +101,7 @@ def impact_of(
         tau = materialize(time_of_impact(path, approach, h, threshold))
     else:
         tau, normal = _round_impact(point, point.core, a.motion, b.motion, shift, approach, pull, threshold, h)
-        speed, pull = _closing(point, normal, a.motion, b.motion)
+        speed, pull = _speed_and_pull(point, normal, a.motion, b.motion)
         frame = _frame_of_discs(constraint, point, tau)
     arrival = approach_speed(speed, pull, tau, h)
     target = post_impact_speed(arrival, pull, constraint.elasticity, tau, h)
@@ -113,7 +113,7 @@ def impact_of(
     return ActiveContact(frame, normal, point.gap, tau, arrival, target, position)
 
 
-def _closing(point: ContactPoint, normal: Array, a: Motion | None, b: Motion) -> tuple[Array, Array | float]:
+def _speed_and_pull(point: ContactPoint, normal: Array, a: Motion | None, b: Motion) -> tuple[Array, Array | float]:
     """Speed of b relative to a along a normal, m/s, and acceleration of b towards a, m/s^2."""
     speed, _ = relative_speed(point.frame, normal, a, b)
     return speed, 0.0 if point.acceleration is None else -dot(normal, point.acceleration)
@@ -148,7 +148,7 @@ def _round_impact(
     path = round_path(offset, gap, core.reach, mean)
     if plane is not None:  # a contact that belongs to a neighbouring segment has no impact
         flat, straight, approach = plane
-        path = select(flat, straight, path._replace(c=jnp.where(point.gap < FAR / 2, path.c, FAR**2)))
+        path = select_path(flat, straight, path._replace(c=jnp.where(point.gap < FAR / 2, path.c, FAR**2)))
     tau = time_of_impact(path, approach, h, threshold)
     # The normal is that at the time of impact, when the distance equals the sum of the radii.
     scale = jnp.where((tau >= 0) & (gap > 0), 1 / jnp.maximum(core.reach, SLOWEST), inverse)

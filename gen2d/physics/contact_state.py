@@ -17,7 +17,7 @@ class PassSetup(NamedTuple):
 
 
 class BodySide(NamedTuple):
-    """Bodies on one side of a batch of contacts; what a pass does not need is None."""
+    """Bodies on one side of a batch of contacts; values that a pass does not need are None."""
 
     shape: Shape | None = None  # in the world
     motion: Motion | None = None  # None: static bodies at rest

@@ -41,7 +41,7 @@ class Ledger(NamedTuple):
     joints: Work | None
 
 
-def dissipated_by_discs(
+def add_disc_dissipation(
     work: Work | None, frame: ContactFrame, impulse: Impulse, speed: Array, slip: Array
 ) -> Work | None:
     """Work with that of an impulse whose two directions do not interact; speeds are those before it."""
@@ -55,7 +55,7 @@ def dissipated_by_discs(
 MotionPair: TypeAlias = tuple[Motion | None, Motion]  # of a and b
 
 
-def dissipated(
+def add_dissipation(
     work: Work | None,
     constraint: ContactConstraint,
     points: Sequence[ContactPoint | ActiveContact],
@@ -111,14 +111,14 @@ def record_energy(
     contact or joint. The work of the acceleration over the displacement that differs from the free one belongs to
     contacts and joints. Damping takes the energy and the displacement that an undamped fall would have more.
     """
-    free_way = Motion(h * free.velocity + free_drift.velocity, h * free.spin + free_drift.spin)
-    deviation = Motion(displacement.velocity - free_way.velocity, displacement.spin - free_way.spin)
+    flight = Motion(h * free.velocity + free_drift.velocity, h * free.spin + free_drift.spin)
+    deviation = Motion(displacement.velocity - flight.velocity, displacement.spin - flight.spin)
     lost = work.lost + _work_of(group, acceleration, angular, deviation)
     driven, damped = work.driven, work.damped
     if damped is not None:
         undamped = Motion(old.velocity + h * acceleration, old.spin + h * angular)
-        way = h * old.velocity + 0.5 * h**2 * acceleration, h * old.spin + 0.5 * h**2 * angular
-        missing = Motion(free_way.velocity - way[0], free_way.spin - way[1])
+        fall = Motion(h * old.velocity + 0.5 * h**2 * acceleration, h * old.spin + 0.5 * h**2 * angular)
+        missing = Motion(flight.velocity - fall.velocity, flight.spin - fall.spin)
         damped = damped + _kinetic(undamped, group) - _kinetic(free, group)
         damped = damped + _work_of(group, acceleration, angular, missing)
     if driven is not None:

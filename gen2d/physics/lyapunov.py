@@ -35,16 +35,16 @@ def lyapunov_exponent(
     change = perturbation(keys, scene, state)
     _, after = jax.jvp(lambda start: last_state(run(scene, start).states), (state,), (change,))
     most = jnp.finfo(jnp.float32).max  # an overflow counts as the largest growth
-    grown = jnp.clip(jnp.nan_to_num(perturbation_size(after), nan=most, posinf=most), SMALL * SMALL)
+    size = jnp.clip(jnp.nan_to_num(perturbation_size(after), nan=most, posinf=most), SMALL * SMALL)
     moves = perturbation_size((change.position, change.velocity)) > 0
-    return jnp.where(moves, jnp.log10(grown) - jnp.log10(SMALL), 0.0) / (seconds or 1.0)
+    return jnp.where(moves, jnp.log10(size) - jnp.log10(SMALL), 0.0) / (seconds or 1.0)
 
 
 def perturbation(keys: Array, scene: Scene, state: State) -> State:
     """Random perturbation of the size SMALL."""
     dynamic = scene.objects.present & (scene.objects.kind == DYNAMIC)
-    drawn = jax.vmap(lambda key: jax.random.normal(key_for(key, "lyapunov"), (2, *state.position.shape[:2])))(keys)
-    position, velocity = jnp.where(dynamic, jnp.moveaxis(drawn, 0, -1), 0.0)
+    normal = jax.vmap(lambda key: jax.random.normal(key_for(key, "lyapunov"), (2, *state.position.shape[:2])))(keys)
+    position, velocity = jnp.where(dynamic, jnp.moveaxis(normal, 0, -1), 0.0)
     zero = jnp.zeros_like(state.angle)
     change = State(position, zero, velocity, zero)
     size = perturbation_size((position, velocity))

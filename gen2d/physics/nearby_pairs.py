@@ -1,7 +1,7 @@
 """Contact solver over the pairs that are near each other, found again in every step; for CPUs.
 
 A step looks at every pair once, for a bit: whether the two may meet in it (broad_phase.py). The three passes then run
-over the near pairs of all scenes in chunks, in the order of all_pairs.py. Bodies and what is cached of a pair are rows
+over the near pairs of all scenes in chunks, in the order of all_pairs.py. Bodies and cache entries of pairs are rows
 of packed tables (packing.py): a chunk's rows are gathered, solved and put back. A pair that is not near would change
 nothing, so the result equals that of all_pairs.py up to rounding.
 
@@ -36,15 +36,15 @@ from gen2d.physics.contact_log import (
     ON,
     ContactEvent,
     PairEvent,
-    began_touching,
     contacts_of,
     empty_events,
-    order_of,
+    next_frame_event,
     pair_event,
     record_event,
+    sort_order,
 )
 from gen2d.physics.contact_state import BodySide, PassSetup, WarmStart
-from gen2d.physics.packing import SAFE, PackedTable, TableSpec, make_table, pack, repeat_rows, unpack
+from gen2d.physics.packing import SAFE, PackedTable, TableSpec, make_table, pack, repeat_rows, table_of_rows, unpack
 from gen2d.physics.params import SolverParams
 from gen2d.physics.schedule import bipartite_rounds
 from gen2d.physics.solver_protocol import ContactSolver
@@ -52,7 +52,7 @@ from gen2d.records.axes import Array
 from gen2d.records.trajectory import Contacts
 from gen2d.xla import materialize, max_bodies
 
-NEVER = -2  # the step of what has not happened
+NEVER = -2  # the step of an event that has not happened
 
 
 class StaticSide(NamedTuple):
@@ -112,7 +112,7 @@ class GatherIndices(NamedTuple):
 
 
 class PassBuffers(NamedTuple):
-    """What the passes of a step hand on about the pairs of a batch, by chunk."""
+    """Data of the pairs of a batch that one pass hands to the next, by chunk."""
 
     indices: Array  # [K, 4, C]
     contacts: Array  # [K, F, C]
@@ -138,7 +138,7 @@ class SolvedChunk(NamedTuple):
 
 
 class CachedConstraint(NamedTuple):
-    """What is cached of a pair."""
+    """Cache entry of a pair."""
 
     warm: WarmStart  # counts if it is of the last step
     stamp: Array  # the step that wrote it
@@ -191,14 +191,14 @@ class NearbyPairs(ContactSolver):
     def start(self, slots: int) -> NearbyCarry:
         n, count = self._scenes, jnp.zeros(self._scenes + 1, jnp.int32)
         return NearbyCarry(
-            cache=[repeat_rows(self._cold(batch), batch.a.size * n, self._dtype).rows for batch in self.batches],
+            cache=[repeat_rows(self._empty_entry(b), b.a.size * n, self._dtype) for b in self.batches],
             last_touch=[jnp.full(b.a.size * n + 1, NEVER, jnp.int32) for b in self.batches] if slots else [],
             buffers=None,
             depth=count.astype(self._dtype),
             begins=count,
             step=jnp.zeros((), jnp.int32),
             first=jnp.zeros((), jnp.int32),
-            log=repeat_rows(_empty_row(self._dtype), slots * n, self._dtype).rows if slots else None,
+            log=repeat_rows(_empty_row(self._dtype), slots * n, self._dtype) if slots else None,
             log_count=count if slots else None,
         )
 
@@ -206,19 +206,21 @@ class NearbyPairs(ContactSolver):
         buffers = jax.eval_shape(step, carry).buffers
         return carry._replace(buffers=jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), buffers))
 
-    def _cold(self, batch: PairBatch) -> CachedConstraint:
+    def _empty_entry(self, batch: PairBatch) -> CachedConstraint:
+        """Cache entry of a pair before its first contact."""
         zero = jnp.zeros(1, self._dtype)
         warm = WarmStart([Impulse(zero, zero)] * batch.points, zero if self.rolling else None)
         if not self.setup.log:
             return CachedConstraint(warm, zero + NEVER, None, None)
         return CachedConstraint(warm, zero + NEVER, empty_events((1,), self._dtype), zero)
 
-    def _cached(self, batch: PairBatch, rows: Array) -> PackedTable:
-        return PackedTable(rows, pack(self._cold(batch), (1,), self._dtype)[1])
+    def _cache_tables(self, carry: NearbyCarry) -> list[PackedTable]:
+        entries = [self._empty_entry(batch) for batch in self.batches]
+        return [table_of_rows(*of) for of in zip(carry.cache, entries, strict=True)]
 
     # ---- Broad phase
 
-    def _near(self, sides: list[BodySide], statics: list[BodySide]) -> list[ActivePairs]:
+    def _find_near_pairs(self, sides: list[BodySide], statics: list[BodySide]) -> list[ActivePairs]:
         """Pairs of each batch that may meet in this step."""
         motions = [side.motion for side in sides if side.motion is not None]
         squares = [dot(motion.velocity, motion.velocity) for motion in motions]
@@ -232,11 +234,11 @@ class NearbyPairs(ContactSolver):
                 fastest = jnp.maximum(fastest, speed[0])
         # A body moves as fast as it does now, or as the fastest of all may hit it on its way.
         half = 0.5 * self.params.step * fastest
-        ways = [self.params.step * jnp.sqrt(square) + half for square in squares]
+        distances = [self.params.step * jnp.sqrt(square) + half for square in squares]
         shapes = [side.shape for side in sides if side.shape is not None]
         reaches = [
-            jnp.where(group.material.present, bounding_radius(shape) + way, jnp.nan)  # no pair has an absent body
-            for shape, group, way in zip(shapes, self.groups, ways, strict=True)
+            jnp.where(group.material.present, bounding_radius(shape) + distance, jnp.nan)  # no pair has an absent body
+            for shape, group, distance in zip(shapes, self.groups, distances, strict=True)
         ]
         bodies = [(shape.centre, reach) for shape, reach in zip(shapes, reaches, strict=True)]
         walls = [side.shape for side in statics if side.shape is not None]
@@ -261,7 +263,7 @@ class NearbyPairs(ContactSolver):
         *_, gaps = bipartite_rounds(bodies[batch.first], (centre, reach), play)
         return bits_of(jnp.stack(gaps) < 0)
 
-    def _gather(self, batch: PairBatch, lookup: RowLookup, pair_of_bit: np.ndarray) -> GatherIndices:
+    def _chunk_indices(self, batch: PairBatch, lookup: RowLookup, pair_of_bit: np.ndarray) -> GatherIndices:
         """Table rows of the pairs of a chunk."""
         n, (_, pairs), bits = self._scenes, batch.a.shape, pair_of_bit.shape[1]
         scene, bit = lookup.word % n, jnp.minimum(lookup.word // n * BITS + lookup.bit, bits - 1)
@@ -279,22 +281,20 @@ class NearbyPairs(ContactSolver):
     def _size(self, group: int) -> int:
         return self.groups[group].threshold.shape[0]
 
-    def _indices(self, near: list[ActivePairs], buffers: list[PassBuffers] | None) -> list[Array]:
+    def _all_indices(self, near: list[ActivePairs], buffers: list[PassBuffers] | None) -> list[Array]:
         """Table rows of the pairs of all chunks, in loops of their own, or each gather would compute them again."""
         if buffers is None:
             fields = len(GatherIndices._fields)
             return [jnp.zeros((self._most_chunks(batch), fields, self.chunk), jnp.int32) for batch in self.batches]
 
-        def filled(batch: PairBatch, active: ActivePairs, buffer: Array) -> Array:
-            pair_of_bit = batch.pair_of_bit
+        def of_batch(batch: PairBatch, active: ActivePairs, buffer: PassBuffers) -> Array:
+            def chunk(k: Array, indices: Array) -> Array:
+                new = self._chunk_indices(batch, row_lookup(active, k, self.chunk), batch.pair_of_bit)
+                return indices.at[k].set(jnp.stack(new), mode=SAFE)
 
-            def chunk(k: Array, buffer: Array) -> Array:
-                indices = self._gather(batch, row_lookup(active, k, self.chunk), pair_of_bit)
-                return buffer.at[k].set(jnp.stack(indices), mode=SAFE)
+            return jax.lax.fori_loop(0, active.starts[-1], chunk, buffer.indices)
 
-            return jax.lax.fori_loop(0, active.starts[-1], chunk, buffer)
-
-        return [filled(*of) for of in zip(self.batches, near, [b.indices for b in buffers], strict=True)]
+        return [of_batch(*of) for of in zip(self.batches, near, buffers, strict=True)]
 
     def _most_chunks(self, batch: PairBatch) -> int:
         rounds, pairs = batch.a.shape
@@ -342,7 +342,7 @@ class NearbyPairs(ContactSolver):
                 rows, carries[i] = jax.lax.fori_loop(0, listed.chunks[i], chunk, start)
             for g, x in rows.items():
                 tables[g] = tables[g]._replace(rows=x)
-        return [t.unpacked((self._size(g), self._scenes)) for g, t in enumerate(tables)], carries
+        return [t.unpack((self._size(g), self._scenes)) for g, t in enumerate(tables)], carries
 
     def _store(self, batch: PairBatch, buffer: Array | None, k: Array, values: list[Array]) -> Array:
         """Buffer with the values of chunk k; a new one if there is none."""
@@ -353,13 +353,13 @@ class NearbyPairs(ContactSolver):
     def warm_start(
         self, carry: NearbyCarry, sides: list[BodySide], statics: list[BodySide]
     ) -> tuple[list[BodySide], ListedPairs]:
-        near = self._near(sides, statics)
-        listed = ListedPairs([active.starts[-1] for active in near], self._indices(near, carry.buffers), [], {})
+        near = self._find_near_pairs(sides, statics)
+        listed = ListedPairs([active.starts[-1] for active in near], self._all_indices(near, carry.buffers), [], {})
         groups = [self._table(group, self._size(g)) for g, group in enumerate(self.groups)]
         firsts = [
             self._static_table(list(b.statics.values())) if b.first is None else groups[b.first] for b in self.batches
         ]
-        caches = [self._cached(batch, rows) for batch, rows in zip(self.batches, carry.cache, strict=True)]
+        caches = self._cache_tables(carry)
         specs: dict[int, TableSpec] = {}
 
         def play(
@@ -383,8 +383,10 @@ class NearbyPairs(ContactSolver):
         sides, packed = self._pass(sides, statics, listed, buffers, play)
         return sides, listed._replace(packed=packed, specs=specs)
 
-    def _unpacked(self, listed: ListedPairs, i: int, k: Array) -> tuple[ContactConstraint, WarmStart, list, PassSetup]:
-        """What the warm start stored of chunk k of batch i."""
+    def _unpack_contacts(
+        self, listed: ListedPairs, i: int, k: Array
+    ) -> tuple[ContactConstraint, WarmStart, list, PassSetup]:
+        """Constraint, impulses, points and setup of chunk k of batch i, as the warm start stored them."""
         constraint, warm, points, threshold = unpack(list(listed.packed[i][k]), listed.specs[i])
         return constraint, warm, points, self.setup._replace(threshold=threshold)
 
@@ -395,7 +397,7 @@ class NearbyPairs(ContactSolver):
 
         def play(i: int, k: Array, indices: GatherIndices, a: BodySide, b: BodySide, carried: tuple) -> tuple:
             buffer, depth, begins = carried
-            constraint, warm, points, setup = self._unpacked(contacts, i, k)
+            constraint, warm, points, setup = self._unpack_contacts(contacts, i, k)
             a, b, solved = contact_passes.solve(constraint, warm, points, a, b, setup, self.params)
             values, specs[i] = pack(solved, (self.chunk,), self._dtype, once=True)
             overlap, began = contact_passes.observe(solved, warm)
@@ -412,16 +414,16 @@ class NearbyPairs(ContactSolver):
         self, carry: NearbyCarry, solved: SolvedChunk, sides: list[BodySide], statics: list[BodySide], time: Array
     ) -> tuple[list[BodySide], NearbyCarry]:
         listed = solved.listed
-        caches = [self._cached(batch, rows) for batch, rows in zip(self.batches, carry.cache, strict=True)]
+        caches = self._cache_tables(carry)
 
         def play(i: int, k: Array, indices: GatherIndices, a: BodySide, b: BodySide, carried: tuple) -> tuple:
             cache, touch = caches[i]._replace(rows=carried[0]), carried[1]
-            constraint, _, _, setup = self._unpacked(listed, i, k)
+            constraint, _, _, setup = self._unpack_contacts(listed, i, k)
             pair = unpack(list(solved.packed[i][k]), solved.specs[i])
             a, b, (last, warm) = contact_passes.relax(constraint, pair, a, b, setup)
             new = CachedConstraint(warm, jnp.full(self.chunk, carry.step, self._dtype), None, None)
             if self.setup.log:
-                event = record_event(self._event(carry, cache.at(indices.pair)), pair, last, time)
+                event = record_event(self._event_so_far(carry, cache.at(indices.pair)), pair, last, time)
                 new = new._replace(event=event, elasticity=constraint.elasticity)
                 now = 2 * carry.step + jnp.where((event.flags & ON) > 0, 1, 0)
                 old = touch.at[indices.pair].get(mode=SAFE)
@@ -446,12 +448,12 @@ class NearbyPairs(ContactSolver):
 
     # ---- Logged contacts
 
-    def _event(self, carry: NearbyCarry, cached: CachedConstraint) -> ContactEvent:
+    def _event_so_far(self, carry: NearbyCarry, cached: CachedConstraint) -> ContactEvent:
         """Event of a pair in this frame so far; of an older one only whether the pair touched is kept."""
         assert cached.event is not None, "events are cached where contacts are logged"
         current = cached.stamp >= carry.first
         ended = cached.stamp == carry.first - 1  # written by the last step of the last frame
-        fresh = began_touching(cached.event._replace(flags=jnp.where(ended, cached.event.flags, 0)))
+        fresh = next_frame_event(cached.event._replace(flags=jnp.where(ended, cached.event.flags, 0)))
         return jax.tree.map(lambda x, y: jnp.where(current, x, y), cached.event, fresh)
 
     def begin_frame(self, carry: NearbyCarry) -> NearbyCarry:
@@ -461,31 +463,30 @@ class NearbyPairs(ContactSolver):
         if carry.log is None or carry.log_count is None:
             return carry, None
         log, count = carry.log, carry.log_count
-        for batch, rows, touch in zip(self.batches, carry.cache, carry.last_touch, strict=True):
+        for batch, cache, touch in zip(self.batches, self._cache_tables(carry), carry.last_touch, strict=True):
             recent = touch[:-1].reshape(*batch.a.shape, self._scenes) >= 2 * carry.first - 1
             words = bits_of(recent)
-            log = self._logged(carry, batch, self._cached(batch, rows), words, log, count)
+            log = self._append_to_log(carry, batch, cache, words, log, count)
             new = jnp.sum(count_active(words).reshape(-1, self._scenes), axis=0, dtype=jnp.int32)
             count = count.at[:-1].add(new)
         return carry._replace(log=log, log_count=count), None
 
-    def _logged(
+    def _append_to_log(
         self, carry: NearbyCarry, batch: PairBatch, cache: PackedTable, words: Array, log: Array, count: Array
     ) -> Array:
         """Log with the pairs of a batch that have a bit in words [R, W n], after `count` [n + 1] contacts."""
         n, active = self._scenes, active_pairs(words, self.chunk)
         counts = count_active(words).reshape(-1, n)
         before = count[:-1] + jnp.cumsum(counts, axis=0, dtype=jnp.int32) - counts  # by round and word
-        spec = pack(_empty_row(self._dtype), (1,), self._dtype)[1]
-        slots = [jnp.asarray(x.reshape(-1), jnp.int32) for x in batch.slots]
+        table, slots = self._log_table(log), [jnp.asarray(x.reshape(-1), jnp.int32) for x in batch.slots]
         capacity, width = (len(log) - 1) // n, words.shape[1]
         frame = carry.step // jnp.maximum(carry.step - carry.first, 1)
 
         def chunk(k: Array, log: Array) -> Array:
             lookup = row_lookup(active, k, self.chunk)
-            indices = self._gather(batch, lookup, batch.pairs_in_order)
+            indices = self._chunk_indices(batch, lookup, batch.pairs_in_order)
             cached = cache.at(indices.pair)
-            event, last = self._event(carry, cached), cached.stamp == (carry.step - 1).astype(self._dtype)
+            event, last = self._event_so_far(carry, cached), cached.stamp == (carry.step - 1).astype(self._dtype)
             event = event._replace(flags=jnp.where(last, event.flags, event.flags & ~ON))
             new = pair_event(event, cached.elasticity)
             began = carry.first.astype(self._dtype) * self.params.step  # the time of an end without a touch
@@ -495,18 +496,20 @@ class NearbyPairs(ContactSolver):
             where = jnp.where(lookup.there & (rank < capacity), rank * n + indices.scene, capacity * n)
             pair = jnp.minimum(indices.pair // n, batch.a.size - 1)
             a, b = (x.at[pair].get(mode=SAFE) for x in slots)
-            return PackedTable(log, spec).put(where, ContactRow(new, jnp.full_like(a, frame), a, b)).rows
+            return table._replace(rows=log).put(where, ContactRow(new, jnp.full_like(a, frame), a, b)).rows
 
         return jax.lax.fori_loop(0, active.starts[-1], chunk, log)
+
+    def _log_table(self, rows: Array) -> PackedTable:
+        return table_of_rows(rows, _empty_row(self._dtype))
 
     def results(self, carry: NearbyCarry, events: None, slots: int, fps: float) -> tuple[Array, Array, Contacts | None]:
         depth, begins = carry.depth[:-1], carry.begins[:-1]
         if carry.log is None or carry.log_count is None:
             return depth, begins, None
-        spec = pack(_empty_row(self._dtype), (1,), self._dtype)[1]
-        log, count = PackedTable(carry.log, spec).unpacked((slots, self._scenes)), carry.log_count[:-1]
+        log, count = self._log_table(carry.log).unpack((slots, self._scenes)), carry.log_count[:-1]
         filled = jnp.arange(slots)[:, None] < count
-        order = order_of(jnp.where(filled, log.pair_event.time, jnp.inf))
+        order = sort_order(jnp.where(filled, log.pair_event.time, jnp.inf))
 
         def in_order(x: Array) -> Array:
             x = jnp.where(filled, x, jnp.zeros_like(x))
@@ -520,6 +523,6 @@ def _empty_row(dtype: Any) -> ContactRow:
     return ContactRow(nothing, *[jnp.zeros(1, jnp.int32)] * 3)
 
 
-def chunk_of(scenes: int) -> int:
+def chunk_size(scenes: int) -> int:
     """Pairs to solve at once with so many scenes: a few times fewer than are near in a round."""
     return min(max(16, 1 << (scenes // 16).bit_length()), 256)

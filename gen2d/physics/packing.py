@@ -79,7 +79,7 @@ class PackedTable(NamedTuple):
             return self
         return self._replace(rows=self.rows.at[where].set(materialize(jnp.stack(columns)).T, mode=SAFE))
 
-    def unpacked(self, shape: tuple[int, ...]) -> Any:
+    def unpack(self, shape: tuple[int, ...]) -> Any:
         """Tree with leaves [..., *shape] of all rows but the last."""
         return unpack([column.reshape(shape) for column in self.rows[:-1].T], self.spec)
 
@@ -91,7 +91,12 @@ def make_table(tree: Any, shape: tuple[int, ...], dtype: Any) -> PackedTable:
     return PackedTable(jnp.pad(jnp.stack(columns, axis=-1), ((0, 1), (0, 0))), spec)
 
 
-def repeat_rows(tree: Any, count: int, dtype: Any) -> PackedTable:
-    """Table of `count` equal rows, a tree with leaves [..., 1], and one more."""
-    columns, spec = pack(tree, (1,), dtype)
-    return PackedTable(jnp.broadcast_to(jnp.concatenate(columns), (count + 1, len(columns))), spec)
+def repeat_rows(row: Any, count: int, dtype: Any) -> Array:
+    """`count` equal rows, a tree with leaves [..., 1], and one more."""
+    columns, _ = pack(row, (1,), dtype)
+    return jnp.broadcast_to(jnp.concatenate(columns), (count + 1, len(columns)))
+
+
+def table_of_rows(rows: Array, row: Any) -> PackedTable:
+    """Table of packed rows; `row`, a tree with leaves [..., 1], shows what they hold."""
+    return PackedTable(rows, pack(row, (1,), rows.dtype)[1])

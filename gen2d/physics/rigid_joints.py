@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from gen2d.physics.banded import factor, solve_factored
-from gen2d.physics.collision import dot, turned
+from gen2d.physics.collision import dot, perpendicular
 from gen2d.physics.constraint import Inertia, Motion
 from gen2d.physics.energy import Work
 from gen2d.physics.springs_limits_motors import (
@@ -28,7 +28,7 @@ from gen2d.physics.springs_limits_motors import (
     anchors_of,
     direction_of,
     groups_of,
-    places_of,
+    poses_of,
     table_of,
     take_rows,
 )
@@ -64,13 +64,13 @@ class JointSystemPlan:
         Each entry has both sides and, by row, 1 for the same body with equal signs, -1 with opposite signs, else 0.
         """
         ends, rows = self.ends, len(self.joint) - offset
-        found = []
+        sides = []
         for a in (0, 1):
             for b in (0, 1):
                 same = (ends[a, :rows] == ends[b, offset:]) & (ends[a, :rows] >= 0)
                 if same.any():
-                    found.append((a, b, np.where(same, 1.0 if a == b else -1.0, 0.0)))
-        return found
+                    sides.append((a, b, np.where(same, 1.0 if a == b else -1.0, 0.0)))
+        return sides
 
     @property
     def width(self) -> int:
@@ -163,25 +163,11 @@ def _rows(system: JointSystem, anchors: Anchors) -> JointRows:
         a, other = plan.bodies[0], take_rows(anchors.arm_a, plan.other)
         same = (a[plan.joint] == a[plan.other])[:, None]
         between = take_rows(anchors.arm_a, plan.joint) - jnp.where(same, other, take_rows(anchors.arm_b, plan.other))
-        direction = jnp.where((plan.direction == ACROSS)[:, None], turned(direction_of(between)[0]), direction)
-    lever_a, lever_b = (dot(turned(take_rows(arm, plan.joint)), direction) for arm in (anchors.arm_a, anchors.arm_b))
-    return materialize(JointRows(direction, (lever_a, lever_b)))
-
-
-def _pushed(system: JointSystem, rows: JointRows, table: Motion, impulses: Array) -> Motion:
-    """Motions after the impulses of the rows."""
-    linear, (lever_a, lever_b) = impulses * rows.direction, rows.levers
-    parts = Motion(
-        jnp.concatenate([-linear, linear, jnp.zeros_like(linear[:, :1])], axis=-2),
-        jnp.concatenate([-lever_a * impulses, lever_b * impulses, jnp.zeros_like(impulses[:1])], axis=-2),
+        direction = jnp.where((plan.direction == ACROSS)[:, None], perpendicular(direction_of(between)[0]), direction)
+    lever_a, lever_b = (
+        dot(perpendicular(take_rows(arm, plan.joint)), direction) for arm in (anchors.arm_a, anchors.arm_b)
     )
-    parts, moving = materialize(parts), system.plan.moving
-    each = (take_rows(parts, places) for places in system.plan.rows_of_bodies())
-    total = functools.reduce(lambda x, y: jax.tree.map(jnp.add, x, y), each)
-    mass, moment = (x[:moving] for x in system.inertia)
-    more = Motion(mass * total.velocity, moment * total.spin)
-    new = jax.tree.map(lambda x, y: jnp.concatenate([x[..., :moving, :] + y, x[..., moving:, :]], axis=-2), table, more)
-    return materialize(new)
+    return materialize(JointRows(direction, (lever_a, lever_b)))
 
 
 def _speeds(system: JointSystem, rows: JointRows, table: Motion) -> Array:
@@ -221,7 +207,18 @@ def _bands(system: JointSystem, rows: JointRows) -> list[Array]:
 
 def _apply(system: JointSystem, rows: JointRows, table: Motion, impulses: Array) -> tuple[Motion, Work]:
     """Motions after impulses, and their work, J [1, ...]."""
-    new = _pushed(system, rows, table, impulses)
+    linear, (lever_a, lever_b) = impulses * rows.direction, rows.levers
+    parts = Motion(
+        jnp.concatenate([-linear, linear, jnp.zeros_like(linear[:, :1])], axis=-2),
+        jnp.concatenate([-lever_a * impulses, lever_b * impulses, jnp.zeros_like(impulses[:1])], axis=-2),
+    )
+    parts, moving = materialize(parts), system.plan.moving
+    each = (take_rows(parts, places) for places in system.plan.rows_of_bodies())
+    total = functools.reduce(lambda x, y: jax.tree.map(jnp.add, x, y), each)
+    mass, moment = (x[:moving] for x in system.inertia)
+    more = Motion(mass * total.velocity, moment * total.spin)
+    new = jax.tree.map(lambda x, y: jnp.concatenate([x[..., :moving, :] + y, x[..., moving:, :]], axis=-2), table, more)
+    new = materialize(new)
     gain = 0.5 * impulses * (_speeds(system, rows, table) + _speeds(system, rows, new))
     driven, joint = jnp.zeros_like(gain), system.plan.joint
     for side, lever, sign in zip((system.a, system.b), rows.levers, (-1, 1), strict=True):
@@ -237,8 +234,7 @@ def warm_start(
     system: JointSystem, bodies: list[Any], statics: list[Any], motions: list[Motion], impulses: Array
 ) -> tuple[Anchors, list[Motion], Work]:
     """Anchors at the start of the step, motions with the impulses of the last step, and their work."""
-    places = places_of(bodies, statics)
-    anchors = Anchors(*anchors_of(system.a, system.b, places))
+    anchors = Anchors(*anchors_of(system.a, system.b, poses_of(bodies, statics)))
     now = table_of(motions, [body.motion for body in statics])
     now, work = _apply(system, _rows(system, anchors), now, impulses)
     return anchors, groups_of(now, motions), work
@@ -262,11 +258,11 @@ def solve(
     rows, works = _rows(system, anchors), []
     error = _error(system, rows, anchors.offset)
     remaining = error - jnp.clip(error, -h * FASTEST, h * FASTEST)
-    matrix = _Matrix(system, rows)
+    factored = _FactoredSystem(system, rows)
     for _ in range(NEWTON_ITERATIONS):
         displacement = jax.tree.map(lambda x, y: h * x + y, now, drift)
-        error = _error(system, rows, _moved(system, anchors, displacement).offset)
-        impulses, now, work = matrix.solve(now, impulses, (error - remaining) / h)
+        error = _error(system, rows, _displace(system, anchors, displacement).offset)
+        impulses, now, work = factored.solve(now, impulses, (error - remaining) / h)
         works.append(work)
     return groups_of(now, motions), impulses, jax.tree.map(lambda *x: sum(x), *works)
 
@@ -285,23 +281,23 @@ def relax(
     still = [body.motion for body in statics]
     now = table_of(motions, still)
     displacement = table_of(displacements, [jax.tree.map(lambda x: h * x, m) for m in still])
-    rows = _rows(system, _moved(system, anchors, displacement))
-    impulses, now, work = _Matrix(system, rows).solve(now, impulses, _speeds(system, rows, now))
+    rows = _rows(system, _displace(system, anchors, displacement))
+    impulses, now, work = _FactoredSystem(system, rows).solve(now, impulses, _speeds(system, rows, now))
     return groups_of(now, motions), impulses, work
 
 
-def _moved(system: JointSystem, anchors: Anchors, displacement: Motion) -> Anchors:
+def _displace(system: JointSystem, anchors: Anchors, displacement: Motion) -> Anchors:
     """Anchors after the displacements."""
     arms, offset = [], anchors.offset
     for bodies, arm, sign in zip(system.plan.bodies, anchors[:2], (-1, 1), strict=True):
-        moved = take_rows(displacement, bodies)
-        more = jnp.sin(moved.spin) * turned(arm) - 2 * jnp.sin(moved.spin / 2) ** 2 * arm
+        own = take_rows(displacement, bodies)
+        more = jnp.sin(own.spin) * perpendicular(arm) - 2 * jnp.sin(own.spin / 2) ** 2 * arm
         arms.append(materialize(arm + more))
-        offset = offset + sign * (moved.velocity + more)
+        offset = offset + sign * (own.velocity + more)
     return Anchors(arms[0], arms[1], offset)
 
 
-class _Matrix:
+class _FactoredSystem:
     """Factored system of the rows."""
 
     def __init__(self, system: JointSystem, rows: JointRows) -> None:

@@ -14,17 +14,6 @@ import numpy as np
 from gen2d.records.axes import Array
 
 
-def split_halves(values: Any) -> tuple[Any, Any]:
-    """Halves of arrays [..., N, n] over the bodies; each of the first meets one of the second."""
-    count = jax.tree.leaves(values)[0].shape[-2] // 2
-    return jax.tree.map(lambda x: x[..., :count, :], values), jax.tree.map(lambda x: x[..., count:, :], values)
-
-
-def join_halves(first: Any, second: Any) -> Any:
-    """Inverse of `split_halves`."""
-    return jax.tree.map(lambda x, y: jnp.concatenate([x, y], axis=-2), first, second)
-
-
 def rotate(first: Any, second: Any) -> tuple[Any, Any]:
     """Both halves after one rotation of the circle method; N - 1 rotations restore the start."""
 
@@ -40,13 +29,18 @@ def rotate(first: Any, second: Any) -> tuple[Any, Any]:
 
 
 def round_robin(values: Any, rounds: int, play: Callable) -> tuple[Any, list]:
-    """Bodies after all rounds, and the `out` of `play(k, first, second) -> (first, second, out)` in each."""
-    first, second, outs = *split_halves(values), []
+    """Bodies [..., N, n] after all rounds, and the `out` of `play(k, first, second) -> (first, second, out)` in each.
+
+    Each body of the first half meets one of the second.
+    """
+    count, outs = jax.tree.leaves(values)[0].shape[-2] // 2, []
+    first = jax.tree.map(lambda x: x[..., :count, :], values)
+    second = jax.tree.map(lambda x: x[..., count:, :], values)
     for k in range(rounds):
         first, second, out = play(k, first, second)
         outs.append(out)
         first, second = rotate(first, second)
-    return join_halves(first, second), outs
+    return jax.tree.map(lambda x, y: jnp.concatenate([x, y], axis=-2), first, second), outs
 
 
 def bipartite_rounds(first: Any, second: Any, play: Callable) -> tuple[Any, Any, list]:

@@ -15,10 +15,10 @@ from gen2d.core.enums import DYNAMIC, KINEMATIC
 from gen2d.physics import rigid_joints, springs_limits_motors
 from gen2d.physics.all_pairs import AllPairs
 from gen2d.physics.broad_phase import round_robin_of
-from gen2d.physics.collision import FAR, Stadium, dot, from_core
+from gen2d.physics.collision import FAR, Stadium, dot, offset_from_core
 from gen2d.physics.constraint import ContactConstraint, Inertia, Motion, frame_of, mix_materials, reciprocal
 from gen2d.physics.contact_state import PassSetup
-from gen2d.physics.nearby_pairs import DynamicSide, NearbyPairs, PairBatch, StaticSide, chunk_of
+from gen2d.physics.nearby_pairs import DynamicSide, NearbyPairs, PairBatch, StaticSide, chunk_size
 from gen2d.physics.params import SolverParams
 from gen2d.physics.schedule import matches, pairings, run_schedule
 from gen2d.physics.shapes import BodyShape, CapsuleShape, DiscShape, body_shape_of, to_world
@@ -50,8 +50,8 @@ def without_empty(scene: Scene, state: State) -> tuple[Scene, State]:
     return Scene(clean(scene.objects), scene.gravity, scene.joints), clean(state)
 
 
-def pad_groups(count: int) -> int:
-    """Size of the group of `count` bodies; a round robin needs an even number."""
+def padded_size(count: int) -> int:
+    """Size of a group of `count` bodies with its padding, as a round robin needs an even number."""
     return count + count % 2 if count > 1 else count
 
 
@@ -65,7 +65,7 @@ def slots_of(value: Any, first: int, count: int, size: int | None = None) -> Any
     return jax.tree.map(some, value)
 
 
-def moving(layout: Layout) -> list[tuple[SlotGroup, int]]:
+def dynamic_groups(layout: Layout) -> list[tuple[SlotGroup, int]]:
     """Slot groups of dynamic bodies, with their first slots."""
     return [(group, first) for group, first in layout.spans if group.kind == DYNAMIC]
 
@@ -81,7 +81,7 @@ def _inverse(value: Array, present: Array) -> Array:
 
 
 def _group(objects: Objects, group: SlotGroup, first: int) -> BodyGroupState:
-    own = slots_of(objects, first, group.count, pad_groups(group.count))
+    own = slots_of(objects, first, group.count, padded_size(group.count))
     inverse = Inertia(_inverse(own.mass, own.present), _inverse(own.moment, own.present))
     mass, moment = (_inverse(x, x > 0) for x in inverse)
     return BodyGroupState(body_shape_of(own, group, slice(None)), inverse, mass, moment, group.collides)
@@ -95,8 +95,8 @@ def _static(objects: Objects, state: State, group: SlotGroup, slot: int) -> Stat
 
 
 def _material(objects: Objects, first: int, count: int, inverse: Inertia | None) -> Material:
-    own = slots_of(objects, first, count, pad_groups(count))
-    slots = jnp.broadcast_to(jnp.arange(first, first + pad_groups(count))[:, None], own.radius.shape)
+    own = slots_of(objects, first, count, padded_size(count))
+    slots = jnp.broadcast_to(jnp.arange(first, first + padded_size(count))[:, None], own.radius.shape)
     resistance = own.rolling_resistance
     rolling = None if resistance is None else resistance * own.radius
     return Material(inverse, own.present, own.radius, own.elasticity, own.friction, rolling, slots)
@@ -104,11 +104,13 @@ def _material(objects: Objects, first: int, count: int, inverse: Inertia | None)
 
 def _materials(objects: Objects, layout: Layout, groups: list[BodyGroupState]) -> tuple[list[Material], list[Material]]:
     """Materials of the groups and of the static bodies; a kinematic body has infinite inertia."""
-    dynamic = [_material(objects, s, run.count, g.inverse) for (run, s), g in zip(moving(layout), groups, strict=True)]
+    spans = zip(dynamic_groups(layout), groups, strict=True)
+    dynamic = [_material(objects, first, group.count, own.inverse) for (group, first), own in spans]
     zero = jnp.zeros_like(objects.radius[:1])
-    infinite = Inertia(zero, zero)
-    of_slots = static_slots(layout)
-    return dynamic, [_material(objects, s, 1, infinite if run.kind == KINEMATIC else None) for run, s in of_slots]
+    static = []
+    for group, slot in static_slots(layout):
+        static.append(_material(objects, slot, 1, Inertia(zero, zero) if group.kind == KINEMATIC else None))
+    return dynamic, static
 
 
 def _collide(a: Material, b: Material, layout: Layout) -> Array:
@@ -130,18 +132,20 @@ def _constraint(
     if a.rolling is not None and b.rolling is not None:
         rolling = jnp.maximum(a.rolling, b.rolling) + jnp.zeros_like(b.radius)
     assert b.inverse is not None, "the second body is dynamic"
-    values = jax.tree.map(lambda x: jnp.broadcast_to(x, b.radius.shape), a._replace(inverse=None))
-    a = values._replace(inverse=a.inverse)
+    inverse = a.inverse
+    a = jax.tree.map(lambda x: jnp.broadcast_to(x, b.radius.shape), a._replace(inverse=None))._replace(inverse=inverse)
     present = a.present & b.present & (b.inverse.mass > 0) & _collide(a, b, layout)
     if a.inverse is not None and not static:
         present = present & (a.inverse.mass > 0)
     elasticity = mix_materials(a.elasticity, b.elasticity, mixing)
     friction = mix_materials(a.friction, b.friction, mixing)
     constraint = ContactConstraint(a.inverse, b.inverse, present, elasticity, friction, rolling, None, static)
-    # The levers of two discs, and of a disc on a static body at rest, do not change.
-    at_rest, round_a = a.inverse is None, isinstance(shapes[0], DiscShape)
-    constant = (round_a and (not static or at_rest)) or (isinstance(shapes[0], CapsuleShape) and static and at_rest)
-    if not (isinstance(shapes[1], DiscShape) and constant):
+    # Constant levers: of a disc on a dynamic disc, or on a disc or segment at rest.
+    if a.inverse is None:
+        constant = isinstance(shapes[0], DiscShape | CapsuleShape)
+    else:
+        constant = isinstance(shapes[0], DiscShape) and not static
+    if not (constant and isinstance(shapes[1], DiscShape)):
         return constraint
     levers = None, None, None if a.inverse is None else a.radius, -b.radius
     return constraint._replace(frame=frame_of(constraint, levers, present))
@@ -150,15 +154,15 @@ def _constraint(
 ENDS_MEET = 1e-4  # m: ends that are so near to another segment lie on it
 
 
-def _directions_onward(ends: Array, own: np.ndarray, shapes: Stadium) -> tuple[Array, Array]:
+def _continuing_directions(ends: Array, own: np.ndarray, shapes: Stadium) -> tuple[Array, Array]:
     """Two directions in which other segments continue at the ends [2, E, n] of segments `own` [E]; zero without one.
 
     Segments [S, ..., 1, n] are visited in a loop, so that its body is compiled once.
     """
 
-    def visit(found: tuple[Array, Array], other: tuple[Stadium, Array]) -> tuple[tuple[Array, Array], None]:
-        (first, second), (shape, number) = found, other
-        offset, along, _ = from_core(shape, ends)
+    def visit(directions: tuple[Array, Array], other: tuple[Stadium, Array]) -> tuple[tuple[Array, Array], None]:
+        (first, second), (shape, number) = directions, other
+        offset, along, _ = offset_from_core(shape, ends)
         meets = (dot(offset, offset) < ENDS_MEET**2) & (shape.half_length > ENDS_MEET) & (number != own)[:, None]
         for sign, goes in ((1, along < shape.half_length - ENDS_MEET), (-1, along > ENDS_MEET - shape.half_length)):
             new, empty = meets & goes, dot(first, first) == 0
@@ -182,7 +186,7 @@ def _neighbours(statics: list[StaticBody]) -> dict[int, list]:
     ends = jnp.stack([shapes.centre - reach, shapes.centre + reach], axis=1)  # [S, 2 ends, 2, 1, n]
     numbers = np.arange(2 * len(segments))
     ends = jnp.moveaxis(ends[..., 0, :], 2, 0).reshape(2, len(numbers), -1)
-    directions = _directions_onward(ends, numbers // 2, shapes)
+    directions = _continuing_directions(ends, numbers // 2, shapes)
     each = [tuple(x[:, k : k + 1] for x in directions) for k in numbers]
     return {i: each[2 * k : 2 * k + 2] for k, i in enumerate(segments)}
 
@@ -195,7 +199,7 @@ def _all_pairs(
     setup: PassSetup,
     params: SolverParams,
 ) -> AllPairs:
-    order = matches([pad_groups(group.count) for group, _ in moving(layout)], len(statics))
+    order = matches([padded_size(group.count) for group, _ in dynamic_groups(layout)], len(statics))
     neighbours, rounds = _neighbours(statics), [match for match in order for _ in range(match.rounds)]
     pairs = [((statics if m.static else groups)[m.first].body_shape, groups[m.second].body_shape) for m in rounds]
 
@@ -227,8 +231,8 @@ def _nearby_pairs(
     params: SolverParams,
 ) -> NearbyPairs:
     dynamic, static = _materials(objects, layout, groups)
-    sizes, firsts = [material.slot.shape[0] for material in dynamic], [first for _, first in moving(layout)]
-    solid, solid_static = ([group.collides for group, _ in of] for of in (moving(layout), static_slots(layout)))
+    sizes, firsts = [material.slot.shape[0] for material in dynamic], [first for _, first in dynamic_groups(layout)]
+    solid, solid_static = ([group.collides for group, _ in of] for of in (dynamic_groups(layout), static_slots(layout)))
     slots_of_statics, neighbours, batches = [slot for _, slot in static_slots(layout)], _neighbours(statics), []
 
     def add(shapes: tuple[BodyShape, BodyShape], slots_a: np.ndarray, b: np.ndarray, **more: Any) -> None:
@@ -268,7 +272,7 @@ def _nearby_pairs(
         gravity = jnp.broadcast_to(setup.gravity, (2, *material.slot.shape))
         sides.append(DynamicSide(material, gravity, jnp.broadcast_to(setup.threshold, material.slot.shape)))
     rolling = objects.rolling_resistance is not None
-    return NearbyPairs(batches, sides, rolling, setup, params, chunk_of(setup.threshold.shape[-1]))
+    return NearbyPairs(batches, sides, rolling, setup, params, chunk_size(setup.threshold.shape[-1]))
 
 
 def _joints(
@@ -279,9 +283,10 @@ def _joints(
         return [], None
     values, zero = scene.joints, jnp.zeros_like(scene.objects.mass[:1])
     assert values is not None, "a layout with joints needs scene.joints"
-    sizes, static = [pad_groups(group.count) for group, _ in moving(layout)], [slot for _, slot in static_slots(layout)]
+    sizes = [padded_size(group.count) for group, _ in dynamic_groups(layout)]
+    static = [slot for _, slot in static_slots(layout)]
     rows = {slot: sum(sizes) + i for i, slot in enumerate(static)}
-    for g, (group, first) in enumerate(moving(layout)):
+    for g, (group, first) in enumerate(dynamic_groups(layout)):
         rows |= {first + i: sum(sizes[:g]) + i for i in range(group.count)}
     infinite = [Inertia(zero, zero)] * len(static)
     inverse = jax.tree.map(lambda *x: jnp.concatenate(x, axis=-2), *(g.inverse for g in groups), *infinite)
@@ -313,7 +318,7 @@ def build_model(
 ) -> Model:
     """Constants of a video; `log` asks for the positions of contacts, `sparse` for the solver of near pairs."""
     objects = scene.objects
-    groups = [_group(objects, group, first) for group, first in moving(layout)]
+    groups = [_group(objects, group, first) for group, first in dynamic_groups(layout)]
     statics = [_static(objects, state, group, slot) for group, slot in static_slots(layout)]
     one = 1.0 + jax.lax.stop_gradient(jnp.maximum(-jnp.max(objects.radius), 0.0))  # 1.0, unknown to the compiler
     # A pile at rest is stopped anew in each step from the speed that gravity gave it, which is not a bounce.

@@ -4,7 +4,7 @@ from typing import NamedTuple, TypeAlias, overload
 
 import jax.numpy as jnp
 
-from gen2d.physics.collision import Disc, Shape, Stadium, edge_normals, hull
+from gen2d.physics.collision import Disc, Shape, Stadium, edge_normals, hull_at
 from gen2d.records.axes import Array
 from gen2d.records.layout import SlotGroup
 from gen2d.records.scene import Objects
@@ -56,4 +56,4 @@ def to_world(shape: BodyShape, position: Array, angle: Array) -> Shape:
         return Disc(position, shape.radius)
     if isinstance(shape, CapsuleShape):
         return Stadium(position, jnp.stack([jnp.cos(angle), jnp.sin(angle)]), shape.half_length, shape.radius)
-    return hull(shape.vertices, shape.normals, position, angle, shape.radius)
+    return hull_at(shape.vertices, shape.normals, position, angle, shape.radius)

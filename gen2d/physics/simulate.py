@@ -14,7 +14,7 @@ from gen2d.physics import rigid_joints, springs_limits_motors
 from gen2d.physics.constraint import Motion
 from gen2d.physics.energy import Ledger, Work, balance, close_balance
 from gen2d.physics.params import SolverParams
-from gen2d.physics.setup import build_model, moving, pad_groups, slots_of, without_empty
+from gen2d.physics.setup import build_model, dynamic_groups, padded_size, slots_of, without_empty
 from gen2d.physics.state import BodyState, Model, WorldState
 from gen2d.physics.step import step
 from gen2d.records.axes import Array, check_shapes
@@ -118,8 +118,8 @@ def _substep_states(start: State, every: list[BodyState], layout: Layout, step: 
 
 def _start(state: State, layout: Layout, model: Model, keep: SaveAt, params: SolverParams) -> WorldState:
     bodies, ledger = [], None
-    for group, first in moving(layout):
-        own = slots_of(state, first, group.count, pad_groups(group.count))
+    for group, first in dynamic_groups(layout):
+        own = slots_of(state, first, group.count, padded_size(group.count))
         zero = Motion(jnp.zeros_like(own.position), jnp.zeros_like(own.angle))
         bodies.append(BodyState(own.position, own.angle, Motion(own.velocity, own.angular_velocity), zero))
     time, contacts = jnp.zeros((), state.angle.dtype), model.solver.start(keep.contacts)
@@ -178,7 +178,7 @@ def _states(start: State, bodies: list[BodyState], layout: Layout, times: Array)
 
 def _group_forces(scene: Scene, start: State, layout: Layout, forces: Forces | None) -> Callable | None:
     """Function from bodies and time to force and torque on each group; None without forces."""
-    force, torque, groups = scene.objects.force, scene.objects.torque, moving(layout)
+    force, torque, groups = scene.objects.force, scene.objects.torque, dynamic_groups(layout)
     if forces is None and force is None and torque is None:
         return None
     force = jnp.zeros_like(start.position) if force is None else force
@@ -190,6 +190,6 @@ def _group_forces(scene: Scene, start: State, layout: Layout, forces: Forces | N
             now = _states(start, jax.tree.map(lambda x: x[None], bodies), layout, time[None])
             more = forces(jax.tree.map(lambda x: x[-1], now), time)
             total = force + more[0], torque + more[1]
-        return [slots_of(total, first, group.count, pad_groups(group.count)) for group, first in groups]
+        return [slots_of(total, first, group.count, padded_size(group.count)) for group, first in groups]
 
     return on_groups

@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gen2d.physics.collision import dot, turned
+from gen2d.physics.collision import dot, perpendicular
 from gen2d.physics.constraint import Inertia, Motion, reciprocal
 from gen2d.physics.energy import Work
 from gen2d.physics.params import SolverParams
@@ -72,12 +72,12 @@ def joint_rounds(joints: Sequence[JointSpec], moving: int) -> list[list[int]]:
     rounds: list[tuple[str, set[int], list[int]]] = []
     for number, joint in enumerate(joints):
         bodies = {row for row in (joint.a, joint.b) if row < moving}
-        place = next((r for r in rounds if r[0] == joint.kind and not r[1] & bodies), None)
-        if place is None:
-            place = joint.kind, set(), []
-            rounds.append(place)
-        place[1].update(bodies)
-        place[2].append(number)
+        free = next((r for r in rounds if r[0] == joint.kind and not r[1] & bodies), None)
+        if free is None:
+            free = joint.kind, set(), []
+            rounds.append(free)
+        free[1].update(bodies)
+        free[2].append(number)
     return [numbers for *_, numbers in rounds]
 
 
@@ -91,7 +91,7 @@ def table_of(groups: Sequence[Any], statics: Sequence[Any]) -> Any:
     return jax.tree.map(lambda *x: jnp.concatenate(x, axis=-2), *groups, *statics)
 
 
-def places_of(bodies: Sequence[Any], statics: Sequence[Any]) -> Any:
+def poses_of(bodies: Sequence[Any], statics: Sequence[Any]) -> Any:
     """Positions and angles of all bodies in one table."""
     return table_of(*([(body.position, body.angle) for body in some] for some in (bodies, statics)))
 
@@ -107,8 +107,8 @@ def groups_of(table: Any, groups: list[Any]) -> list[Any]:
     return [jax.tree.map(lambda x, span=slice(*span): x[..., span, :], table) for span in itertools.pairwise(ends)]
 
 
-def rotated(vector: Array, angle: Array) -> Array:
-    """Vectors [2, ...] rotated by an angle."""
+def rotate(vector: Array, angle: Array) -> Array:
+    """Vectors [2, ...] rotated counter-clockwise by an angle."""
     cos, sin = jnp.cos(angle), jnp.sin(angle)
     return jnp.stack([cos * vector[0] - sin * vector[1], sin * vector[0] + cos * vector[1]])
 
@@ -120,11 +120,11 @@ def direction_of(offset: Array) -> tuple[Array, Array]:
     return jnp.where(squared > SHORTEST**2, offset / length, 0.0), jnp.where(squared > SHORTEST**2, length, 0.0)
 
 
-def anchors_of(a: JointSide, b: JointSide, places: Any) -> tuple[Array, Array, Array]:
+def anchors_of(a: JointSide, b: JointSide, poses: Any) -> tuple[Array, Array, Array]:
     """Both arms, and the offset between the anchors, m [2, P, ...], from a table of positions and angles."""
-    (place_a, angle_a), (place_b, angle_b) = (take_rows(places, side.rows) for side in (a, b))
-    arm_a, arm_b = materialize((rotated(a.anchor, angle_a), rotated(b.anchor, angle_b)))
-    return arm_a, arm_b, place_b + arm_b - place_a - arm_a
+    (position_a, angle_a), (position_b, angle_b) = (take_rows(poses, side.rows) for side in (a, b))
+    arm_a, arm_b = materialize((rotate(a.anchor, angle_a), rotate(b.anchor, angle_b)))
+    return arm_a, arm_b, position_b + arm_b - position_a - arm_a
 
 
 def _put(table: Any, joint: JointState, a: Any, b: Any) -> Any:
@@ -139,9 +139,9 @@ def _put(table: Any, joint: JointState, a: Any, b: Any) -> Any:
     return jax.tree.map(put, table, a, b)
 
 
-def _pushed(side: JointSide, arm: Array, motion: Motion, impulse: Array) -> Motion:
+def _apply_impulse(side: JointSide, arm: Array, motion: Motion, impulse: Array) -> Motion:
     """Motion after an impulse at an arm."""
-    spin = side.inertia.moment * dot(turned(arm), impulse)
+    spin = side.inertia.moment * dot(perpendicular(arm), impulse)
     return Motion(motion.velocity + side.inertia.mass * impulse, motion.spin + spin)
 
 
@@ -156,12 +156,12 @@ def warm_start(
     """Joints of every round in this step, motions with the impulses of the last step, and their work."""
     if not batches:
         return [], motions, []
-    places = places_of(bodies, statics)
+    poses = poses_of(bodies, statics)
     now, joints, works = table_of(motions, [body.motion for body in statics]), [], []
     for batch, old in zip(batches, impulses, strict=True):
-        angle_a, angle_b = (take_rows(places[1], side.rows) for side in (batch.a, batch.b))
+        angle_a, angle_b = (take_rows(poses[1], side.rows) for side in (batch.a, batch.b))
         angle = angle_b - angle_a - batch.rest
-        joint = JointState(batch, *anchors_of(batch.a, batch.b, places), angle, old)
+        joint = JointState(batch, *anchors_of(batch.a, batch.b, poses), angle, old)
         joints.append(joint)
         if batch.kind != "distance":
             hinges = _Hinges(joint, now)
@@ -274,29 +274,33 @@ def _spring(
     sides = (batch.a, joint.arm_a, -1), (batch.b, joint.arm_b, 1)
     axis, length = direction_of(joint.offset)
     olds = [take_rows(now, side.rows) for side, *_ in sides]
-    inverse = sum(side.inertia.mass + side.inertia.moment * dot(turned(arm), axis) ** 2 for side, arm, _ in sides)
+    inverse = sum(
+        side.inertia.mass + side.inertia.moment * dot(perpendicular(arm), axis) ** 2 for side, arm, _ in sides
+    )
 
-    def stretching(motions: list[Motion]) -> Array:
-        of_a, of_b = (m.velocity + m.spin * turned(arm) for m, (_, arm, _) in zip(motions, sides, strict=True))
+    def stretch_rate(motions: list[Motion]) -> Array:
+        of_a, of_b = (m.velocity + m.spin * perpendicular(arm) for m, (_, arm, _) in zip(motions, sides, strict=True))
         return dot(axis, of_b - of_a)
 
-    speed = stretching(olds)
+    speed = stretch_rate(olds)
     stretch = length - batch.rest + 0.5 * h * speed
     size = -h * (k * stretch + c * speed) / (1 + inverse * h * (0.25 * h * k + 0.5 * c))
     size, axis = materialize((size, axis))
     impulse = size * axis
-    news = [_pushed(side, arm, old, sign * impulse) for (side, arm, sign), old in zip(sides, olds, strict=True)]
-    lost = -0.5 * size * (speed + stretching(news))
+    news = [_apply_impulse(side, arm, old, sign * impulse) for (side, arm, sign), old in zip(sides, olds, strict=True)]
+    lost = -0.5 * size * (speed + stretch_rate(news))
     driven = jnp.zeros_like(lost)
     for (side, arm, sign), motion in zip(sides, news, strict=True):
         if side.static.any():  # a kinematic body does work where it is held
-            work = dot(motion.velocity + motion.spin * turned(arm), impulse)
+            work = dot(motion.velocity + motion.spin * perpendicular(arm), impulse)
             driven = driven - sign * jnp.where(side.static[:, None], work, 0.0)
     # The work of the acceleration over the spring's own change of displacement is not that of contacts.
     over_drift = jnp.zeros_like(lost)
     for side, _, sign in sides:
         over_drift = over_drift + 0.5 * h * sign * dot(take_rows(acceleration, side.rows), impulse)
-    drifts = [_pushed(side, arm, take_rows(drift, side.rows), -0.5 * h * sign * impulse) for side, arm, sign in sides]
+    drifts = [
+        _apply_impulse(side, arm, take_rows(drift, side.rows), -0.5 * h * sign * impulse) for side, arm, sign in sides
+    ]
     work = Work(_total(-over_drift), _total(driven), _total(lost + over_drift))
     return _put(now, joint, *news), _put(drift, joint, *drifts), work
 
@@ -306,9 +310,9 @@ def springs_energy(batches: list[JointBatch], bodies: list[Any], statics: list[A
     springs = [batch for batch in batches if batch.kind == "distance"]
     if not springs:
         return 0.0
-    places, energy = places_of(bodies, statics), 0.0
+    poses, energy = poses_of(bodies, statics), 0.0
     for batch in springs:
-        length = direction_of(anchors_of(batch.a, batch.b, places)[2])[1]
+        length = direction_of(anchors_of(batch.a, batch.b, poses)[2])[1]
         stiffness = jnp.where(batch.present & jnp.isfinite(batch.stiffness), batch.stiffness, 0.0)
         energy = energy + jnp.sum(0.5 * stiffness * (length - batch.rest) ** 2, axis=-2)
     return energy

@@ -79,7 +79,7 @@ def _total_drift(side: BodySide, free: Motion) -> Motion:
     return jax.tree.map(lambda x, y: x + unheld * y, side.drift, free)
 
 
-def _displaced(body: BodyState, displacement: Motion, motion: Motion) -> BodyState:
+def _displace(body: BodyState, displacement: Motion, motion: Motion) -> BodyState:
     """Body after a displacement, with a compensated sum (W. Kahan, 1965), and its motion."""
     assert body.remainder is not None, "moving bodies have a remainder"
     old, add = Motion(body.position, body.angle), jax.tree.map(jnp.add, displacement, body.remainder)
@@ -162,7 +162,7 @@ def step(world: WorldState, model: Model, params: SolverParams) -> WorldState:
     displacements = [jax.tree.map(lambda x, y: h * x + y, *of) for of in zip(motions, drifts, strict=True)]
     solid = [s if g.collides else None for s, g in zip(shapes, groups, strict=True)]
     displacements = clamp_displacement(displacements, solid, model.segments)
-    bodies = [_displaced(*of) for of in zip(world.bodies, displacements, motions, strict=True)]
+    bodies = [_displace(*of) for of in zip(world.bodies, displacements, motions, strict=True)]
 
     joints, motions, _, work_relax = springs_limits_motors.solve(
         joints, motions, displacements, accelerations, fixed, params, biased=False

@@ -42,7 +42,7 @@ def plane_path(gap: Array, approach: Array, pull: Array | float) -> ApproachPath
     return ApproachPath(jnp.full_like(gap, -0.5) * pull, -0.5 * approach, gap)
 
 
-def select(which: Array, x: ApproachPath, y: ApproachPath) -> ApproachPath:
+def select_path(which: Array, x: ApproachPath, y: ApproachPath) -> ApproachPath:
     """Path x where `which`, else y."""
     return ApproachPath(*(jnp.where(which, *of) for of in zip(x, y, strict=True)))
 

@@ -313,7 +313,7 @@ def _with_all_fields(ds: Dataset) -> Dataset:
 
 def from_columns(cls: type, columns: FieldColumns) -> Any:
     """A record of class `cls` from arrays by stored name."""
-    fields = axes.described(cls).items()
+    fields = axes.stored_fields(cls).items()
     return cls(**{attribute: jnp.asarray(columns[name]) for name, (attribute, _) in fields if name in columns})
 
 

@@ -60,7 +60,7 @@ class Rollout:
         frame_bytes = video.frames * video.height * video.width * 3
         default_shard = min(SHARD_VIDEOS, _power_of_two(SHARD_BYTES // frame_bytes))
         self.videos_per_shard = config.storage.videos_per_shard or default_shard
-        moving = sum(run.count for run in self.layout.runs if run.kind == enums.DYNAMIC)
+        moving = sum(run.count for run in self.layout.groups if run.kind == enums.DYNAMIC)
         pairs = moving * (self.layout.slots - moving) + moving * (moving - 1) // 2
         default_batch = min(BATCH_SIZE, _power_of_two(PAIRS // max(pairs, 1)))
         # A shard size in the config must not change the videos.

@@ -45,7 +45,7 @@ class VideoSchema:
         sizes = {"T": video.frames, "K": self.layout.slots, "H": video.height, "W": video.width}
         sizes |= {"C": self.save_at.contacts} if self.save_at.contacts else {}
         sizes |= {"J": len(self.layout.joints)} if self.layout.joints else {}
-        corners = max(group.vertices for group in self.layout.runs)
+        corners = max(group.vertices for group in self.layout.groups)
         sizes |= {"V": corners} if corners else {}
         return annotations.sizes(self.config.annotations, self.plan, sizes | self.sampler.lengths)
 
@@ -55,7 +55,7 @@ class VideoSchema:
         config = self.config
         records = [scene.State, trajectory.Quality, *([trajectory.Contacts] if self.save_at.contacts else [])]
         records += [trajectory.Energy] if self.save_at.energy else []
-        fields = {name: field for record in records for name, (_, field) in axes.described(record).items()}
+        fields = {name: field for record in records for name, (_, field) in axes.stored_fields(record).items()}
         fields |= axes.fields_of(jax.eval_shape(self._scene, jax.eval_shape(lambda: jax.random.key(0))))
         if not self.save_at.energy:
             del fields["quality/energy_residual"]

@@ -30,7 +30,7 @@ def record(cls: type[Record]) -> type[Record]:
     return jax.tree_util.register_dataclass(dataclasses.dataclass(frozen=True, eq=False)(cls))
 
 
-def described(cls: type) -> dict[str, tuple[str, Field]]:
+def stored_fields(cls: type) -> dict[str, tuple[str, Field]]:
     """Stored fields of a record class: stored name -> (attribute, Field)."""
     fields = [f for f in dataclasses.fields(cls) if "field" in f.metadata]
     return {f.metadata["name"]: (f.name, f.metadata["field"]) for f in fields}
@@ -38,7 +38,7 @@ def described(cls: type) -> dict[str, tuple[str, Field]]:
 
 def fields_of(value: Any) -> dict[str, Field]:
     """Fields of a record and of its inner records, by stored name; fields that are None are left out."""
-    stored = described(type(value)).items()
+    stored = stored_fields(type(value)).items()
     fields = {name: field for name, (attribute, field) in stored if getattr(value, attribute) is not None}
     inner_records = [getattr(value, f.name) for f in dataclasses.fields(value) if "field" not in f.metadata]
     for record in inner_records:
@@ -48,7 +48,7 @@ def fields_of(value: Any) -> dict[str, Field]:
 
 def columns(value: Any) -> dict[str, Array]:
     """Arrays of a record and of its inner records, by stored name; fields that are None are left out."""
-    arrays = {name: getattr(value, attribute) for name, (attribute, _) in described(type(value)).items()}
+    arrays = {name: getattr(value, attribute) for name, (attribute, _) in stored_fields(type(value)).items()}
     for field in dataclasses.fields(value):
         if "field" not in field.metadata and getattr(value, field.name) is not None:
             arrays |= columns(getattr(value, field.name))
@@ -77,14 +77,14 @@ def _device_order(stored: str, dimensions: int) -> list[int]:
     return sorted(range(len(tokens)), key=lambda i: rank.get(tokens[i], 1))
 
 
-def _transposed(value: Any, back: bool) -> Any:
+def _transpose(value: Any, back: bool) -> Any:
     changes = {}
     for field in dataclasses.fields(value):
         array = getattr(value, field.name)
         if array is None:
             continue
         if "field" not in field.metadata:
-            changes[field.name] = _transposed(array, back)
+            changes[field.name] = _transpose(array, back)
             continue
         order = _device_order(field.metadata["field"].axes, array.ndim)
         changes[field.name] = jnp.transpose(array, [order.index(i) for i in range(array.ndim)] if back else order)
@@ -93,9 +93,9 @@ def _transposed(value: Any, back: bool) -> Any:
 
 def to_device(value: Record) -> Record:
     """The record in device layout (videos last), from stored layout (videos first)."""
-    return _transposed(value, back=False)
+    return _transpose(value, back=False)
 
 
 def to_stored(value: Record) -> Record:
     """The record in stored layout (videos first), from device layout (videos last)."""
-    return _transposed(value, back=True)
+    return _transpose(value, back=True)

@@ -20,11 +20,6 @@ class SlotGroup:
     layer: int | None = None  # lower layers are rendered first; None: 0 for static objects, 1 for others
     collides: bool = True  # False: rendered, and joints may attach to it, but without contacts
 
-    @property
-    def painted(self) -> int:
-        """Layer in which the group is rendered."""
-        return (0 if self.kind == STATIC else 1) if self.layer is None else self.layer
-
 
 @dataclasses.dataclass(frozen=True)
 class JointSpec:
@@ -40,12 +35,12 @@ class JointSpec:
 class Layout:
     """Slots, joints and bounds of a scene family, the same for all videos of a config.
 
-    runs: groups of slots, in slot order.
+    groups: groups of slots, in slot order.
     bounds: region of the world that the default camera shows, (left, bottom, right, top) in m.
     reach: largest distance from the centre of a moving object to its outline, m.
     """
 
-    runs: tuple[SlotGroup, ...]
+    groups: tuple[SlotGroup, ...]
     bounds: tuple[float, float, float, float] = (0.0, 0.0, 1.0, 1.0)
     reach: float = 1.0
     joints: tuple[JointSpec, ...] = ()
@@ -53,21 +48,26 @@ class Layout:
     @property
     def slots(self) -> int:
         """Number of slots, the length of the axis K."""
-        return sum(group.count for group in self.runs)
+        return sum(group.count for group in self.groups)
 
     @property
     def spans(self) -> tuple[tuple[SlotGroup, int], ...]:
         """Each group of slots with its first slot."""
-        starts = itertools.accumulate((group.count for group in self.runs), initial=0)
-        return tuple(zip(self.runs, starts, strict=False))
+        starts = itertools.accumulate((group.count for group in self.groups), initial=0)
+        return tuple(zip(self.groups, starts, strict=False))
 
     @property
-    def painted(self) -> tuple[tuple[SlotGroup, int], ...]:
-        """The groups of `spans` in rendering order, back to front: by layer, then by slot."""
-        return tuple(sorted(self.spans, key=lambda span: (span[0].painted, span[1])))
+    def back_to_front(self) -> tuple[tuple[SlotGroup, int], ...]:
+        """The groups of `spans` in rendering order: by layer, then by slot."""
+
+        def order(span: tuple[SlotGroup, int]) -> tuple[int, int]:
+            group, first = span
+            return int(group.kind != STATIC) if group.layer is None else group.layer, first
+
+        return tuple(sorted(self.spans, key=order))
 
     @property
     def depths(self) -> np.ndarray:
         """Rank of each slot in the rendering order, int16 [K], 0 farthest back; stored as `objects/depth`."""
-        order = [slot for group, first in self.painted for slot in range(first, first + group.count)]
+        order = [slot for group, first in self.back_to_front for slot in range(first, first + group.count)]
         return np.argsort(order).astype(np.int16)

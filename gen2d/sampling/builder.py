@@ -206,7 +206,7 @@ def assemble(
     Raises AssertionError unless the layout has the same slot groups.
     """
     runs = tuple(group.run for group in groups)
-    assert runs == layout.runs, f"the groups are {runs}, but the layout has {layout.runs}"
+    assert runs == layout.groups, f"the groups are {runs}, but the layout has {layout.groups}"
     corners = max(run.vertices for run in runs)
     names = [*groups[0].objects, *(name for name in OPTIONAL if any(name in group.objects for group in groups))]
     fields = {

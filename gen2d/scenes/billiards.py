@@ -66,8 +66,8 @@ def sizes(options: Options) -> dict[str, int]:
 
 def layout(options: Options) -> Layout:
     """The cue ball and the rack's, then floor, right, ceiling and left cushion."""
-    runs = SlotGroup("circle", 1 + sizes(options)["rack"]), SlotGroup("segment", 4, STATIC)
-    return Layout(runs, (0.0, 0.0, options.width, options.height), options.radius.support[1])
+    groups = SlotGroup("circle", 1 + sizes(options)["rack"]), SlotGroup("segment", 4, STATIC)
+    return Layout(groups, (0.0, 0.0, options.width, options.height), options.radius.support[1])
 
 
 def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledScene:

@@ -53,8 +53,8 @@ def check(options: Options) -> None:
 
 def layout(options: Options) -> Layout:
     """The balls, then floor, right wall, ceiling, left wall."""
-    runs = SlotGroup("circle", int(options.balls.support[1])), SlotGroup("segment", 4, STATIC)
-    return Layout(runs, (0.0, 0.0, options.width, options.height), options.radius.support[1])
+    groups = SlotGroup("circle", int(options.balls.support[1])), SlotGroup("segment", 4, STATIC)
+    return Layout(groups, (0.0, 0.0, options.width, options.height), options.radius.support[1])
 
 
 def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledScene:

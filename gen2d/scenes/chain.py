@@ -63,11 +63,11 @@ def check(options: Options) -> None:
 def layout(options: Options) -> Layout:
     """The pins, then the links, each hung from the previous one."""
     n, pins, radius = options.links, options.ends, options.radius.support[1]
-    ties = [JointSpec("revolute", pins + i - 1 if i else 0, pins + i) for i in range(n)]
-    ties += [JointSpec("revolute", 1, pins + n - 1)] if pins == 2 else []
-    runs = SlotGroup("circle", pins, STATIC, layer=2, collides=False), SlotGroup("capsule", n, collides=False)
+    joints = [JointSpec("revolute", pins + i - 1 if i else 0, pins + i) for i in range(n)]
+    joints += [JointSpec("revolute", 1, pins + n - 1)] if pins == 2 else []
+    groups = SlotGroup("circle", pins, STATIC, layer=2, collides=False), SlotGroup("capsule", n, collides=False)
     length = options.length.support[1]
-    return Layout(runs, _bounds(options, n * length), length / 2 + radius, tuple(ties))
+    return Layout(groups, _bounds(options, n * length), length / 2 + radius, tuple(joints))
 
 
 def _bounds(options: Options, whole: float) -> tuple[float, float, float, float]:

@@ -44,16 +44,14 @@ def check(options: Options) -> None:
 
 def layout(options: Options) -> Layout:
     """The balls, from left to right."""
-    runs = (SlotGroup("circle", int(options.balls.support[1])),)
-    return Layout(runs, (0.0, 0.0, options.width, options.height), options.radius.support[1])
+    groups = (SlotGroup("circle", int(options.balls.support[1])),)
+    return Layout(groups, (0.0, 0.0, options.width, options.height), options.radius.support[1])
 
 
 def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledScene:
     """One video's scene and initial state: the balls at rest in the middle, the others to their left."""
-    number, (moving, radius, gap) = (
-        jnp.arange(len(factors["density"])),
-        (factors[x] for x in ("moving_balls", "radius", "gap")),
-    )
+    number = jnp.arange(len(factors["density"]))
+    moving, radius, gap = (factors[name] for name in ("moving_balls", "radius", "gap"))
     pitch, resting = 2 * radius + gap, factors["balls"] - moving
     x = options.width / 2 + (number - moving - (resting - 1) / 2) * pitch
     x = jnp.where(number < moving, x - factors["approach_distance"] + gap, x)

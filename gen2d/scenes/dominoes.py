@@ -42,26 +42,24 @@ def check(options: Options) -> None:
 def layout(options: Options) -> Layout:
     """The floor, the ball, then the dominoes from left to right."""
     most = int(options.dominoes.support[1])
-    ends = {
-        name: getattr(options, name).support[1]
-        for name in ("height", "thickness", "gap", "radius", "ball_distance", "ball_height")
-    }
-    row = most * ends["thickness"] + (most - 1) * ends["gap"]
-    width = 2 * ends["radius"] + ends["ball_distance"] + row + ends["height"]  # room for the last one to fall
-    runs = SlotGroup("segment", 1, STATIC), SlotGroup("circle", 1), SlotGroup("polygon", most, vertices=4)
-    top = max(1.2 * ends["height"], ends["ball_height"] * ends["height"] + ends["radius"])
-    reach = max((ends["height"] ** 2 + ends["thickness"] ** 2) ** 0.5 / 2, ends["radius"])
-    return Layout(runs, (0.0, 0.0, width, top), reach)
+    names = ("height", "thickness", "gap", "radius", "ball_distance", "ball_height")
+    height, thickness, gap, radius, ball_distance, ball_height = (getattr(options, name).support[1] for name in names)
+    row = most * thickness + (most - 1) * gap
+    width = 2 * radius + ball_distance + row + height  # room for the last one to fall
+    groups = SlotGroup("segment", 1, STATIC), SlotGroup("circle", 1), SlotGroup("polygon", most, vertices=4)
+    top = max(1.2 * height, ball_height * height + radius)
+    reach = max((height**2 + thickness**2) ** 0.5 / 2, radius)
+    return Layout(groups, (0.0, 0.0, width, top), reach)
 
 
 def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledScene:
     """One video's scene and initial state: the ball, the row and room for its fall, centred in the view."""
-    layers = layout(options)
+    scene_layout = layout(options)
     count, most = factors["dominoes"], int(options.dominoes.support[1])
     height, thickness, gap, radius = (factors[name] for name in ("height", "thickness", "gap", "radius"))
     run_up, numbers = 2 * radius + factors["ball_distance"], jnp.arange(most)
     length = run_up + count * thickness + (count - 1) * gap + height
-    first = (layers.bounds[2] - length) / 2 + run_up
+    first = (scene_layout.bounds[2] - length) / 2 + run_up
     x = first + thickness / 2 + numbers * (thickness + gap)
     positions = jnp.stack([x, jnp.full(most, 1.0) * height / 2], -1)
     is_first = numbers == 0
@@ -76,8 +74,8 @@ def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledSc
         velocity=jnp.stack([factors["speed"], jnp.zeros(())]),
         **builder.material(factors) | builder.material(factors, "ball"),
     )  # fmt: skip
-    ground = builder.floor(layers, 2.0, **builder.material(factors, "floor"))
-    return SampledScene(*builder.assemble(layers, [ground, ball, row], factors["gravity"]))
+    ground = builder.floor(scene_layout, 2.0, **builder.material(factors, "floor"))
+    return SampledScene(*builder.assemble(scene_layout, [ground, ball, row], factors["gravity"]))
 
 
 FAMILY = Family(options=Options, layout=layout, sample=sample, check=check)

@@ -46,12 +46,12 @@ def check(options: Options) -> None:
 
 def layout(options: Options) -> Layout:
     """The balls, then floor, right wall, ceiling, left wall, then the left and the right slope."""
-    runs = (
+    groups = (
         SlotGroup("circle", int(options.balls.support[1])),
         SlotGroup("segment", 4, STATIC),
         SlotGroup("segment", 2, STATIC),
     )
-    return Layout(runs, (0.0, 0.0, options.width, options.height), options.radius.support[1])
+    return Layout(groups, (0.0, 0.0, options.width, options.height), options.radius.support[1])
 
 
 def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledScene:

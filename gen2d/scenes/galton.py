@@ -74,19 +74,20 @@ def pegs(options: Options) -> list[tuple[float, float]]:
 def layout(options: Options) -> Layout:
     """The balls, the pegs from the top, the walls between bins from the left, then floor, right wall, ceiling, left."""
     largest, most = options.radius.support[1], int(options.balls.support[1])
-    runs = (
+    groups = (
         SlotGroup("circle", most),
         SlotGroup("circle", len(pegs(options)), STATIC),
         SlotGroup("segment", options.rows, STATIC),
         SlotGroup("segment", 4, STATIC),
     )
     top = top_peg(options) + options.spacing + (most - 1) * options.ball_spacing + 2 * largest
-    return Layout(runs, (0.0, 0.0, width(options), top), largest)
+    return Layout(groups, (0.0, 0.0, width(options), top), largest)
 
 
 def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledScene:
     """One video's scene and initial state: balls at rest above the first peg, slightly off centre."""
-    scene_layout, (_, _, right, top) = layout(options), layout(options).bounds
+    scene_layout = layout(options)
+    _, _, right, top = scene_layout.bounds
     number = jnp.arange(len(factors["radius"]))
     heights = top_peg(options) + options.spacing + number * options.ball_spacing
     positions = jnp.stack([right / 2 + factors["jitter"], heights], axis=-1)

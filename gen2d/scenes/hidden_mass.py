@@ -72,8 +72,8 @@ def check(options: Options) -> None:
 
 def layout(options: Options) -> Layout:
     """The left and right ball of each pair in turn, then floor, right wall, ceiling, left wall."""
-    runs = SlotGroup("circle", 2 * int(options.pairs.support[1])), SlotGroup("segment", 4, STATIC)
-    return Layout(runs, (0.0, 0.0, options.width, options.height), options.radius.support[1])
+    groups = SlotGroup("circle", 2 * int(options.pairs.support[1])), SlotGroup("segment", 4, STATIC)
+    return Layout(groups, (0.0, 0.0, options.width, options.height), options.radius.support[1])
 
 
 def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledScene:
@@ -92,12 +92,11 @@ def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledSc
         """Values of the balls [2 pairs, ...], from those of the pairs [pairs, 2, ...]."""
         return values.reshape(-1, *values.shape[2:])
 
-    material = {name: each(factors[name]) for name in ("density", "elasticity", "friction")} | {
-        "color": factors["color"]
-    }
+    material = {name: each(factors[name]) for name in ("density", "elasticity", "friction")}
     balls = builder.discs(
-        each(jnp.stack([x, y], axis=-1)), radius, jnp.repeat(present, 2), velocity=each(velocity), **material
-    )
+        each(jnp.stack([x, y], axis=-1)), radius, jnp.repeat(present, 2), velocity=each(velocity),
+        color=factors["color"], **material,
+    )  # fmt: skip
     walls = builder.box_walls(options.width, options.height, **builder.material(factors, "wall"))
     closing, gap = factors["speed"].sum(-1), x[:, 1] - x[:, 0] - jnp.sqrt(4 * radius**2 - aside**2)
     derived = {

@@ -63,12 +63,12 @@ def headroom(options: Options) -> float:
 
 def layout(options: Options) -> Layout:
     """The ball, the ramps from top to bottom, then floor, right wall, ceiling, left wall."""
-    runs = (
+    groups = (
         SlotGroup("circle", 1),
         SlotGroup("segment", int(options.ramps.support[1]), STATIC),
         SlotGroup("segment", 4, STATIC),
     )
-    return Layout(runs, (0.0, 0.0, options.width, options.height), options.radius.support[1])
+    return Layout(groups, (0.0, 0.0, options.width, options.height), options.radius.support[1])
 
 
 def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledScene:

@@ -76,8 +76,8 @@ def layout(options: Options) -> Layout:
     largest = options.radius.support[1]
     box = (SlotGroup("segment", 4, STATIC),) if options.walls else ()
     screen = SlotGroup("polygon", 1, STATIC, vertices=4, layer=2, collides=False)
-    runs = (SlotGroup("circle", int(options.balls.support[1])), *box, screen)
-    return Layout(runs, (0.0, 0.0, options.width, options.height), largest)
+    groups = (SlotGroup("circle", int(options.balls.support[1])), *box, screen)
+    return Layout(groups, (0.0, 0.0, options.width, options.height), largest)
 
 
 def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledScene:
@@ -96,20 +96,20 @@ def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledSc
     y = corner[1] + number * part_height + radius + factors["relative_position"][:, 1] * (part_height - 2 * radius)
     velocity = jnp.stack([-side * speed, jnp.zeros_like(speed)], axis=-1)
     balls = builder.discs(jnp.stack([x, y], axis=-1), radius, present, velocity=velocity, **builder.material(factors))
-    walls = (
-        [builder.box_walls(options.width, options.height, **builder.material(factors, "wall"))] if options.walls else []
-    )
-    collisionless = {"kind": STATIC, "layer": 2, "collides": False}
-    screen = builder.boxes(
-        (corner + size / 2)[None], 0.0, *size, **collisionless, **builder.material(factors, "screen")
-    )
+    parts = [balls]
+    if options.walls:
+        parts.append(builder.box_walls(options.width, options.height, **builder.material(factors, "wall")))
+    parts.append(
+        builder.boxes(
+            (corner + size / 2)[None], 0.0, *size,
+            kind=STATIC, layer=2, collides=False, **builder.material(factors, "screen"),
+        )
+    )  # fmt: skip
     divisor = jnp.where(present, speed, 1.0)
     hidden_from = (jnp.where(side < 0, left, right) - distance + radius) / divisor
     derived = {"hidden_from": hidden_from, "hidden_for": (size[0] - 2 * radius) / divisor}
     derived = {name: jnp.where(present, values, 0.0) for name, values in derived.items()}
-    return SampledScene(
-        *builder.assemble(layout(options), [balls, *walls, screen], factors["gravity"]), derived=derived
-    )
+    return SampledScene(*builder.assemble(layout(options), parts, factors["gravity"]), derived=derived)
 
 
 FAMILY = Family(

@@ -50,15 +50,14 @@ def layout(options: Options) -> Layout:
     rods, bobs = SlotGroup("capsule", n, layer=1, collides=False), SlotGroup("circle", n, layer=2, collides=False)
     pin = SlotGroup("circle", 1, STATIC, layer=3, collides=False)
     # A bob turns about the pin or the bob above it; its light rod is fixed to it at both ends.
-    ties = [
-        (JointSpec("revolute", n + i if i else 0, 1 + n + i), *[JointSpec("revolute", 1 + i, 1 + n + i)] * 2)
-        for i in range(n)
-    ]
+    joints: list[JointSpec] = []
+    for i in range(n):
+        rod, bob = 1 + i, 1 + n + i
+        joints += [JointSpec("revolute", bob - 1 if i else 0, bob), *[JointSpec("revolute", rod, bob)] * 2]
     room, widest = n * length + radius, max(map(abs, options.angle.support))
     low = n == 1 and options.spin.support == (0.0, 0.0) and widest < math.pi / 2
-    bounds = (-room, -room, room, radius - math.cos(widest) * options.length.support[0] if low else room)
-    joints = tuple(tie for link in ties for tie in link)
-    return Layout((pin, rods, bobs), (*bounds[:3], max(bounds[3], PIN)), max(length / 2 + ROD, radius), joints)
+    top = max(radius - math.cos(widest) * options.length.support[0] if low else room, PIN)
+    return Layout((pin, rods, bobs), (-room, -room, room, top), max(length / 2 + ROD, radius), tuple(joints))
 
 
 def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledScene:

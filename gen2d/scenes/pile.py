@@ -72,13 +72,13 @@ def check(options: Options) -> None:
 def layout(options: Options) -> Layout:
     """The discs, the boxes, the capsules, then floor, right wall, ceiling, left wall."""
     most = [int(counted.support[1]) for counted in (options.discs, options.boxes, options.capsules)]
-    runs = (
+    groups = (
         SlotGroup("circle", most[0]),
         SlotGroup("polygon", most[1], vertices=4),
         SlotGroup("capsule", most[2]),
         SlotGroup("segment", 4, STATIC),
     )
-    return Layout(runs, (0.0, 0.0, options.width, options.height), reach(options))
+    return Layout(groups, (0.0, 0.0, options.width, options.height), reach(options))
 
 
 def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledScene:
@@ -87,11 +87,8 @@ def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledSc
     kinds = ("discs", "boxes", "capsules")
     radii_of = [radius, jnp.linalg.norm(size, axis=-1) / 2, half + factors["capsule_radius"]]
     present_of = [jnp.arange(len(r)) < factors[kind] for r, kind in zip(radii_of, kinds, strict=True)]
-    radii, present, room = (
-        jnp.concatenate(radii_of),
-        jnp.concatenate(present_of),
-        jnp.asarray([options.width, options.height]),
-    )
+    radii, present = jnp.concatenate(radii_of), jnp.concatenate(present_of)
+    room = jnp.asarray([options.width, options.height])
     positions, rejected, fits = place(jax.random.fold_in(key, 0), radii, present, jnp.zeros(2), room)
     positions_of = jnp.split(positions, [len(present_of[0]), len(present_of[0]) + len(present_of[1])])
     disc, box, capsule = (

@@ -70,8 +70,8 @@ def check(options: Options) -> None:
 def layout(options: Options) -> Layout:
     """The body on the slope; slope, floor and wall."""
     long = options.half_length.support[1] if options.shape == "capsule" else 0.0
-    runs = SlotGroup("circle" if options.shape == "ball" else "capsule", 1), SlotGroup("segment", 3, STATIC)
-    return Layout(runs, (0.0, 0.0, options.width, options.height), options.radius.support[1] + long)
+    groups = SlotGroup("circle" if options.shape == "ball" else "capsule", 1), SlotGroup("segment", 3, STATIC)
+    return Layout(groups, (0.0, 0.0, options.width, options.height), options.radius.support[1] + long)
 
 
 def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledScene:

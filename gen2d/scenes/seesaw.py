@@ -59,7 +59,7 @@ def layout(options: Options) -> Layout:
     """The floor, the stand, the plank, then the weights from left to right."""
     most = int(options.weights.support[1])
     length, width, height = (getattr(options, name).support[1] for name in ("length", "width", "height"))
-    runs = (
+    groups = (
         SlotGroup("segment", 1, STATIC),
         SlotGroup("polygon", 1, STATIC, vertices=3),
         SlotGroup("polygon", 1, vertices=4, layer=1),
@@ -68,21 +68,22 @@ def layout(options: Options) -> Layout:
     top = options.pivot_height.support[1] + options.thickness.support[1] / 2 + options.drop_height.support[1] + height
     half = length / 2 + max(width, height)  # room for weights that slide off
     reach = max(length**2 + options.thickness.support[1] ** 2, width**2 + height**2) ** 0.5 / 2
-    return Layout(runs, (-half, 0.0, half, max(top, length / 2)), reach, (JointSpec("revolute", 1, 2),))
+    return Layout(groups, (-half, 0.0, half, max(top, length / 2)), reach, (JointSpec("revolute", 1, 2),))
 
 
 def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledScene:
     """One video's scene and initial state: the plank level, its weights on it or above it."""
-    layers, pivot, length, thickness = layout(options), factors["pivot_height"], factors["length"], factors["thickness"]
+    scene_layout = layout(options)
+    pivot, length, thickness = (factors[name] for name in ("pivot_height", "length", "thickness"))
     surface = {name: factors[name] for name in ("elasticity", "friction")}
-    ground = builder.floor(layers, friction=factors["friction"])
+    ground = builder.floor(scene_layout, friction=factors["friction"])
     # The upper corner is the pivot, and the centre of mass lies at a third of the height.
     corners = pivot * jnp.asarray([[-0.4, -1 / 3], [0.4, -1 / 3], [0.0, 2 / 3]])
     stand = builder.polygons(jnp.stack([jnp.zeros(()), pivot / 3])[None], 0.0, corners[None], kind=STATIC, **surface)
-    plank_position = jnp.stack([jnp.zeros(()), pivot])[None]
     plank = builder.boxes(
-        plank_position, 0.0, length, thickness, layer=1, **surface, **builder.material(factors, "plank")
-    )
+        jnp.stack([jnp.zeros(()), pivot])[None], 0.0, length, thickness,
+        layer=1, **surface, **builder.material(factors, "plank"),
+    )  # fmt: skip
     numbers, part = jnp.arange(len(factors["width"])), length / factors["weights"]
     x = numbers * part + factors["width"] / 2 + factors["relative_position"] * (part - factors["width"]) - length / 2
     y = pivot + (thickness + factors["height"]) / 2 + factors["drop_height"]
@@ -92,7 +93,7 @@ def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledSc
     )  # fmt: skip
     centre = jnp.zeros((1, 2))
     joint = builder.distance_joints(jnp.asarray([[0.0, 2 / 3]]) * pivot, centre)
-    scene, state = builder.assemble(layers, [ground, stand, plank, weights], factors["gravity"], joint)
+    scene, state = builder.assemble(scene_layout, [ground, stand, plank, weights], factors["gravity"], joint)
     torque = factors["gravity"][1] * jnp.sum(weights.objects["mass"] * x)
     return SampledScene(scene, state, derived={"torque": torque})
 

@@ -43,8 +43,8 @@ def check(options: Options) -> None:
 def layout(options: Options) -> Layout:
     """The balls, then their floors, both from the lowest up."""
     most = int(options.balls.support[1])
-    runs = SlotGroup("circle", most), SlotGroup("segment", most, STATIC)
-    return Layout(runs, (0.0, 0.0, options.width, most * options.floor_spacing), options.radius.support[1])
+    groups = SlotGroup("circle", most), SlotGroup("segment", most, STATIC)
+    return Layout(groups, (0.0, 0.0, options.width, most * options.floor_spacing), options.radius.support[1])
 
 
 def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledScene:

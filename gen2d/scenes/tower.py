@@ -45,8 +45,8 @@ def layout(options: Options) -> Layout:
     most, width, height = int(options.blocks.support[1]), options.width.support[1], options.height.support[1]
     aside = max(map(abs, options.offset.support))
     half = max(AROUND * most * height, width / 2 * (1 + aside * (most - 1) / 2)) + width / 2
-    runs = SlotGroup("segment", 1, STATIC), SlotGroup("polygon", most, vertices=4)
-    return Layout(runs, (-half, 0.0, half, most * height), (width**2 + height**2) ** 0.5 / 2)
+    groups = SlotGroup("segment", 1, STATIC), SlotGroup("polygon", most, vertices=4)
+    return Layout(groups, (-half, 0.0, half, most * height), (width**2 + height**2) ** 0.5 / 2)
 
 
 def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledScene:
@@ -57,12 +57,12 @@ def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledSc
     x, y = jnp.cumsum(steps), jnp.cumsum(height) - height / 2
     left, right = (jnp.where(present, x + s * width / 2, s * -jnp.inf) for s in (-1, 1))
     x = x - (left.min() + right.max()) / 2
-    layers = layout(options)
-    ground = builder.floor(layers, **builder.material(factors, "floor"))
+    scene_layout = layout(options)
+    ground = builder.floor(scene_layout, **builder.material(factors, "floor"))
     blocks = builder.boxes(jnp.stack([x, y], -1), 0.0, width, height, present, **builder.material(factors))
     margin = _margin(x, width, blocks.objects["mass"], present)
     derived = {"stable": (margin > 0).astype(jnp.float32), "margin": margin}
-    return SampledScene(*builder.assemble(layers, [ground, blocks], factors["gravity"]), derived=derived)
+    return SampledScene(*builder.assemble(scene_layout, [ground, blocks], factors["gravity"]), derived=derived)
 
 
 def _margin(x: Array, width: Array, mass: Array, present: Array) -> Array:
@@ -74,10 +74,8 @@ def _margin(x: Array, width: Array, mass: Array, present: Array) -> Array:
     above = jnp.cumsum(mass[::-1])[::-1]
     centre = jnp.cumsum((mass * x)[::-1])[::-1] / jnp.where(above > 0, above, 1.0)
     left, right = x - width / 2, x + width / 2
-    left, right = (
-        jnp.concatenate([end[:1], choose(end[1:], end[:-1])])
-        for end, choose in ((left, jnp.maximum), (right, jnp.minimum))
-    )
+    left = jnp.concatenate([left[:1], jnp.maximum(left[1:], left[:-1])])
+    right = jnp.concatenate([right[:1], jnp.minimum(right[1:], right[:-1])])
     return jnp.where(present, jnp.minimum(centre - left, right - centre), jnp.inf).min()
 
 

@@ -60,26 +60,26 @@ def layout(options: Options) -> Layout:
     width, height, radius, chain = (
         getattr(options, x).support[1] for x in ("width", "height", "radius", "chain_length")
     )
-    runs = (
+    groups = (
         SlotGroup("segment", 1, STATIC),
         SlotGroup("circle", 1, STATIC, layer=3, collides=False),
         SlotGroup("capsule", n, layer=2, collides=False),
         SlotGroup("circle", 1, layer=3),
         SlotGroup("polygon", most, vertices=4),
     )
-    ties = [JointSpec("revolute", 1 + i, 2 + i) for i in range(n)] + [JointSpec("revolute", 2 + n, 1 + n)]
+    joints = [JointSpec("revolute", 1 + i, 2 + i) for i in range(n)] + [JointSpec("revolute", 2 + n, 1 + n)]
     tower = most * height
     left = -2 * radius - options.gap.support[1] - chain
     top = max(options.ball_height.support[1] * tower + chain + PIN, tower)
     reach = max(chain / n / 2 + LINK, radius, (width**2 + height**2) ** 0.5 / 2)
-    return Layout(runs, (left, 0.0, width + DEBRIS * tower, top), reach, tuple(ties))
+    return Layout(groups, (left, 0.0, width + DEBRIS * tower, top), reach, tuple(joints))
 
 
 def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledScene:
     """One video's scene and initial state: the tower's left side at x = 0, and the ball at rest on its taut chain."""
-    layers, n, most = layout(options), options.links, int(options.blocks.support[1])
+    scene_layout, n, most = layout(options), options.links, int(options.blocks.support[1])
     width, height, radius, chain, angle = (factors[x] for x in ("width", "height", "radius", "chain_length", "angle"))
-    ground = builder.floor(layers, friction=factors["friction"])
+    ground = builder.floor(scene_layout, friction=factors["friction"])
     lowest = factors["ball_height"] * factors["blocks"] * height
     top = jnp.stack([-radius - factors["gap"], lowest + chain])
     pin = builder.discs(top[None], PIN, kind=STATIC, layer=3, collides=False)
@@ -92,8 +92,8 @@ def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledSc
     numbers = jnp.arange(most)
     positions = jnp.stack([jnp.full(most, 0.5) * width, (numbers + 0.5) * height], -1)
     blocks = builder.boxes(positions, 0.0, width, height, numbers < factors["blocks"], **builder.material(factors))
-    parts = [ground, pin, links, ball, blocks]
-    return SampledScene(*builder.assemble(layers, parts, factors["gravity"], builder.hinge_chain(links, tail=True)))
+    parts, joints = [ground, pin, links, ball, blocks], builder.hinge_chain(links, tail=True)
+    return SampledScene(*builder.assemble(scene_layout, parts, factors["gravity"], joints))
 
 
 FAMILY = Family(options=Options, layout=layout, sample=sample, check=check)

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from gen2d.core.enums import DYNAMIC
-from gen2d.physics.collision import touches
+from gen2d.physics.collision import manifold
 from gen2d.physics.params import SolverParams
 from gen2d.physics.shapes import body_shape_of, to_world
 from gen2d.physics.simulate import Forces, SaveAt, simulate
@@ -42,7 +42,7 @@ def slot_order(body: Body) -> tuple:
     return body.kind, ("circle", "capsule", "polygon").index(shape_family(body)), corners
 
 
-def fill_vertices(vertices: np.ndarray, corners: int) -> np.ndarray:
+def pad_vertices(vertices: np.ndarray, corners: int) -> np.ndarray:
     """Corners [corners, 2], padded with copies of the last; zeros if there are none."""
     if not len(vertices):
         return np.zeros((corners, 2))
@@ -59,33 +59,33 @@ def world_anchor(shape: str) -> Body:
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def touching_points(
-    runs: tuple[SlotGroup, SlotGroup], objects: Objects, sides: Sequence[jax.Array], places: Sequence
+def closest_points(
+    groups: tuple[SlotGroup, SlotGroup], objects: Objects, sides: Sequence[jax.Array], poses: Sequence
 ) -> list[tuple]:
     """Gap, point and normal of the closest points of pairs of bodies.
 
-    `runs` are two slot groups, `sides` the slots of each pair in them, `places` the positions and angles of these.
+    `sides` are the slots of each pair in the two groups, `poses` the positions and angles of these.
     """
-    shapes = (body_shape_of(objects, run, side) for run, side in zip(runs, sides, strict=True))
-    a, b = (to_world(form, *place) for form, place in zip(shapes, places, strict=True))
-    return [(point.gap, a.centre + point.arm_a, point.normal) for point in touches(a, b)]
+    shapes = (body_shape_of(objects, group, side) for group, side in zip(groups, sides, strict=True))
+    a, b = (to_world(shape, *pose) for shape, pose in zip(shapes, poses, strict=True))
+    return [(point.gap, a.centre + point.arm_a, point.normal) for point in manifold(a, b)]
 
 
 @functools.lru_cache(maxsize=8)  # a program takes up to thousands of memory maps, of which a process has some 60,000
 def compiled_program(
-    layout: Layout, rules: SolverParams, frames: int, steps: int, keep: SaveAt, forces: Any
+    layout: Layout, params: SolverParams, frames: int, steps: int, keep: SaveAt, forces: Any
 ) -> Callable:
     """Compiled simulation of a layout; scenes, states and trajectories have the videos first."""
-    hook = None if forces is None else _by_slot(*forces)
+    hook = None if forces is None else _slot_forces(*forces)
 
     def run(scene: Scene, state: State) -> Any:
         device = to_device(scene), to_device(state)
-        return to_stored(simulate(*device, layout, rules, frames, steps, keep, hook, on_cpu()))
+        return to_stored(simulate(*device, layout, params, frames, steps, keep, hook, on_cpu()))
 
     return jax.jit(run)
 
 
-def _by_slot(forces: Callable, slots: tuple[int, ...]) -> Forces:
+def _slot_forces(forces: Callable, slots: tuple[int, ...]) -> Forces:
     """Forces on slots, as the solver expects them, from a function of forces on bodies by number."""
     order = np.array(slots)
 

@@ -35,7 +35,7 @@ class PlotCanvas:
         self.image = np.full((height, width, 3), WHITE, np.uint8)  # even sizes, which video codecs need
         self.thickness = max(1, round(size / 300))
 
-    def at(self, points: Any) -> np.ndarray:
+    def to_pixels(self, points: Any) -> np.ndarray:
         """World points [..., 2] in OpenCV's fixed-point pixels; pixel centres are integers."""
         pixels = (np.asarray(points) - (self.left, self.top)) * (self.scale, -self.scale) - 0.5
         return np.clip(np.round(pixels * 2**SHIFT), -(2**30), 2**30).astype(np.int32)
@@ -44,18 +44,18 @@ class PlotCanvas:
         """Draw a disc or its outline."""
         thickness = -1 if filled else self.thickness
         pixels = round(radius * self.scale * 2**SHIFT)
-        cv2.circle(self.image, self.at(centre).tolist(), pixels, color, thickness, cv2.LINE_AA, SHIFT)
+        cv2.circle(self.image, self.to_pixels(centre).tolist(), pixels, color, thickness, cv2.LINE_AA, SHIFT)
 
     def outline(self, points: Any, color: tuple, filled: bool) -> None:
         """Draw a convex polygon or its outline."""
         if filled:
-            cv2.fillConvexPoly(self.image, self.at(points), color, cv2.LINE_AA, SHIFT)
+            cv2.fillConvexPoly(self.image, self.to_pixels(points), color, cv2.LINE_AA, SHIFT)
         else:
-            cv2.polylines(self.image, [self.at(points)], True, color, self.thickness, cv2.LINE_AA, SHIFT)
+            cv2.polylines(self.image, [self.to_pixels(points)], True, color, self.thickness, cv2.LINE_AA, SHIFT)
 
     def line(self, a: Any, b: Any, color: tuple, thickness: int | None = None) -> None:
         """Draw a line between two points."""
-        start, end = (self.at(point).tolist() for point in (a, b))
+        start, end = (self.to_pixels(point).tolist() for point in (a, b))
         cv2.line(self.image, start, end, color, thickness or self.thickness, cv2.LINE_AA, SHIFT)
 
     def arrow(self, start: Any, along: np.ndarray) -> None:
@@ -78,26 +78,26 @@ def picture(
     if not -len(of.position) <= frame < len(of.position):
         raise ConfigError(f"frame is {frame}, but must be from 0 to {len(of.position) - 1}")
     frame %= len(of.position)
-    canvas = PlotCanvas(view or _seen(of), size)
+    canvas = PlotCanvas(view or _default_view(of), size)
     for body, position, angle in sorted(
         zip(of.bodies, of.position[frame], of.angle[frame], strict=True), key=lambda b: b[0].kind == DYNAMIC
     ):
-        _body(canvas, body, position, angle, filled=True)
-    _joints(canvas, of, frame)
+        _draw_body(canvas, body, position, angle, filled=True)
+    _draw_joints(canvas, of, frame)
     if contacts:
-        _arrows(canvas, of, frame)
+        _draw_contacts(canvas, of, frame)
     return canvas.image
 
 
 def overlay(of: Drawable, *, view: ViewBounds | None = None, size: int = 400, contacts: bool = False) -> np.ndarray:
     """Image of all frames over each other, uint8 [H, W, 3], with moving bodies as outlines; options as in `picture`."""
-    canvas = PlotCanvas(view or _seen(of), size)
+    canvas = PlotCanvas(view or _default_view(of), size)
     for i, body in enumerate(of.bodies):
         moves = bool(np.ptp(of.position[:, i], axis=0).any() or np.ptp(of.angle[:, i]))
         for frame in range(len(of.position) if moves else 1):
-            _body(canvas, body, of.position[frame, i], of.angle[frame, i], filled=body.kind != DYNAMIC)
+            _draw_body(canvas, body, of.position[frame, i], of.angle[frame, i], filled=body.kind != DYNAMIC)
     for frame in range(len(of.position) if contacts else 0):
-        _arrows(canvas, of, frame)
+        _draw_contacts(canvas, of, frame)
     return canvas.image
 
 
@@ -113,7 +113,7 @@ def save(of: Film, path: str | Path, **options: Any) -> Path:
     if path.suffix == ".png":
         write(path, overlay(of, **options))
         return path
-    view = options.pop("view", None) or _seen(of)
+    view = options.pop("view", None) or _default_view(of)
     film = np.stack([picture(of, frame, view=view, **options) for frame in range(len(of.position))])
     if path.suffix == ".webp":
         animate(path, film[None], of.fps)
@@ -122,15 +122,15 @@ def save(of: Film, path: str | Path, **options: Any) -> Path:
     return path
 
 
-def _placed(points: Any, position: np.ndarray, angle: float) -> np.ndarray:
+def _to_world(points: Any, position: np.ndarray, angle: float) -> np.ndarray:
     """Points [V, 2] of a body's frame in world coordinates."""
     cos, sin = np.cos(angle), np.sin(angle)
     return np.asarray(points) @ np.array([[cos, sin], [-sin, cos]]) + position
 
 
-def _body(canvas: PlotCanvas, body: Body, position: np.ndarray, angle: float, filled: bool) -> None:
+def _draw_body(canvas: PlotCanvas, body: Body, position: np.ndarray, angle: float, filled: bool) -> None:
     if body.shape == "polygon":
-        corners = _placed(body.vertices, position, angle)
+        corners = _to_world(body.vertices, position, angle)
         canvas.outline(corners, body.color, filled)
         if filled and body.kind == DYNAMIC:
             canvas.outline(corners, DARK, False)
@@ -138,12 +138,12 @@ def _body(canvas: PlotCanvas, body: Body, position: np.ndarray, angle: float, fi
         canvas.disc(position, body.radius, body.color, filled)
         if filled and body.kind == DYNAMIC:
             canvas.disc(position, body.radius, DARK, False)
-            canvas.line(position, _placed([(body.radius, 0)], position, angle)[0], DARK)
+            canvas.line(position, _to_world([(body.radius, 0)], position, angle)[0], DARK)
     elif body.radius * canvas.scale < canvas.thickness:
-        a, b = _placed([(-body.half_length, 0), (body.half_length, 0)], position, angle)
+        a, b = _to_world([(-body.half_length, 0), (body.half_length, 0)], position, angle)
         canvas.line(a, b, body.color, canvas.thickness + 1)
     else:
-        rim = _placed(_stadium(body), position, angle)
+        rim = _to_world(_stadium(body), position, angle)
         canvas.outline(rim, body.color, filled)
         if filled and body.kind == DYNAMIC:
             canvas.outline(rim, DARK, False)
@@ -155,10 +155,10 @@ def _stadium(body: Body) -> np.ndarray:
     return np.concatenate([cap, -cap])
 
 
-def _joints(canvas: PlotCanvas, of: Drawable, frame: int) -> None:
+def _draw_joints(canvas: PlotCanvas, of: Drawable, frame: int) -> None:
     for joint in of.joints:
         ends = [
-            anchor if i < 0 else _placed(anchor, of.position[frame, i], of.angle[frame, i])
+            anchor if i < 0 else _to_world(anchor, of.position[frame, i], of.angle[frame, i])
             for i, anchor in ((joint.a, joint.anchor_a), (joint.b, joint.anchor_b))
         ]
         canvas.line(ends[0], ends[1], DARK)
@@ -166,7 +166,7 @@ def _joints(canvas: PlotCanvas, of: Drawable, frame: int) -> None:
             canvas.disc(end, 1.5 * canvas.thickness / canvas.scale, DARK, True)
 
 
-def _arrows(canvas: PlotCanvas, of: Drawable, frame: int) -> None:
+def _draw_contacts(canvas: PlotCanvas, of: Drawable, frame: int) -> None:
     contacts = of.contacts
     if contacts is None:
         return
@@ -176,7 +176,7 @@ def _arrows(canvas: PlotCanvas, of: Drawable, frame: int) -> None:
         canvas.arrow(point, normal)
 
 
-def _seen(of: Drawable) -> ViewBounds:
+def _default_view(of: Drawable) -> ViewBounds:
     """Rectangle around everything that the bodies and joints ever cover, with a margin."""
     low, high = [], []
     for i, body in enumerate(of.bodies):
@@ -184,9 +184,9 @@ def _seen(of: Drawable) -> ViewBounds:
             corners = body.vertices
         else:
             corners = np.array([(-body.half_length, 0.0), (body.half_length, 0.0)])
-        turned = np.stack([_placed(corners, p, a) for p, a in zip(of.position[:, i], of.angle[:, i], strict=True)])
-        low.append(turned.min((0, 1)) - body.radius)
-        high.append(turned.max((0, 1)) + body.radius)
+        points = np.stack([_to_world(corners, p, a) for p, a in zip(of.position[:, i], of.angle[:, i], strict=True)])
+        low.append(points.min((0, 1)) - body.radius)
+        high.append(points.max((0, 1)) + body.radius)
     anchors = [anchor for j in of.joints for i, anchor in ((j.a, j.anchor_a), (j.b, j.anchor_b)) if i < 0]
     (left, bottom), (right, top) = np.min([*low, *anchors], axis=0), np.max([*high, *anchors], axis=0)
     margin = MARGIN * max(right - left, top - bottom)

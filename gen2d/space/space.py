@@ -34,13 +34,13 @@ from gen2d.records.layout import JointSpec, Layout, SlotGroup
 from gen2d.records.scene import Joints, Objects, Scene, State
 from gen2d.space.arrange import (
     body_numbers,
+    closest_points,
     compiled_program,
-    fill_vertices,
     filled_contacts,
+    pad_vertices,
     shape_family,
     slot_order,
     slots_of_span,
-    touching_points,
     world_anchor,
 )
 from gen2d.space.bodies import KINDS, Body, BodyOptions, Joint, Overlaps, Pair, Poses
@@ -108,7 +108,7 @@ class Space:
         """
         name = "add_circle"
         radius = checked_number(f"{name}: radius", radius, above=0)
-        return self._added(name, "circle", checked_pair(f"{name}: position", position), angle, radius=radius, **options)
+        return self._add(name, "circle", checked_pair(f"{name}: position", position), angle, radius=radius, **options)
 
     def add_segment(self, a: Pair, b: Pair, *, radius: float = 0.0, **options: Unpack[BodyOptions]) -> int:
         """Add a line segment, which is static by default.
@@ -133,7 +133,7 @@ class Space:
             If an argument is invalid.
         """
         radius = checked_number("add_segment: radius", radius, low=0)
-        return self._added_line("add_segment", a, b, radius, **{"kind": "static", **options})
+        return self._add_line("add_segment", a, b, radius, **{"kind": "static", **options})
 
     def add_capsule(self, a: Pair, b: Pair, radius: float, **options: Unpack[BodyOptions]) -> int:
         """Add a capsule: all points within `radius` of the line segment from a to b.
@@ -157,7 +157,7 @@ class Space:
         ConfigError
             If an argument is invalid.
         """
-        return self._added_line("add_capsule", a, b, checked_number("add_capsule: radius", radius, above=0), **options)
+        return self._add_line("add_capsule", a, b, checked_number("add_capsule: radius", radius, above=0), **options)
 
     def add_box(
         self, position: Pair, width: float, height: float, *, angle: float = 0.0, **options: Unpack[BodyOptions]
@@ -188,7 +188,7 @@ class Space:
         name = "add_box"
         w, h = (checked_number(f"{name}: {n}", x, above=0) / 2 for n, x in (("width", width), ("height", height)))
         corners = np.array([(-w, -h), (w, -h), (w, h), (-w, h)])
-        return self._added(
+        return self._add(
             name, "polygon", checked_pair(f"{name}: position", position), angle, vertices=corners, **options
         )
 
@@ -215,7 +215,7 @@ class Space:
         corners = checked_corners("add_polygon: vertices", vertices)
         with jax.enable_x64(True):
             centre = np.asarray(inertia.polygon_centroid(jnp.asarray(corners)))
-        return self._added("add_polygon", "polygon", centre, 0.0, vertices=corners - centre, **options)
+        return self._add("add_polygon", "polygon", centre, 0.0, vertices=corners - centre, **options)
 
     def add_joint(
         self, kind: str, a: int, b: int | None = None, *, anchor_a: Pair | None = None, anchor_b: Pair | None = None,
@@ -263,7 +263,7 @@ class Space:
         name = "add_joint"
         if kind not in ("distance", "revolute"):
             raise ConfigError(f"{name}: kind is {kind!r}, but must be one of distance, revolute")
-        ends = [self._known(f"{name}: {n}", i) for n, i in (("a", a), ("b", b)) if i is not None]
+        ends = [self._checked_body(f"{name}: {n}", i) for n, i in (("a", a), ("b", b)) if i is not None]
         if len(set(ends)) == 1 and b is not None:
             raise ConfigError(f"{name}: a and b are both {a}, but must be two bodies")
         if all(self.bodies[i].kind != DYNAMIC for i in ends):
@@ -293,11 +293,11 @@ class Space:
         if kind == "distance":
             now = float(np.hypot(*(points[1] - points[0])))
             numbers["rest"] = now if length is None else checked_number(f"{name}: length", length, low=0)
-        inside = [self._inside(i, p) for (i, _), p in zip(pairs, points, strict=True)]
+        inside = [self._to_body_frame(i, p) for (i, _), p in zip(pairs, points, strict=True)]
         self.joints.append(Joint(kind, one, two, inside[0], inside[1], bool(collide), numbers))
         return len(self.joints) - 1
 
-    def _known(self, name: str, number: Any) -> int:
+    def _checked_body(self, name: str, number: Any) -> int:
         if not isinstance(number, int | np.integer) or isinstance(number, bool) or not 0 <= number < len(self.bodies):
             raise ConfigError(f"{name} is {number!r}, but must be the number of a body, 0 to {len(self.bodies) - 1}")
         return int(number)
@@ -305,22 +305,20 @@ class Space:
     def _angle(self, number: int) -> float:
         return 0.0 if number < 0 else self.bodies[number].angle
 
-    def _inside(self, number: int, point: np.ndarray) -> np.ndarray:
+    def _to_body_frame(self, number: int, point: np.ndarray) -> np.ndarray:
         if number < 0:
             return point
         return rotate(point - self.bodies[number].position, -self.bodies[number].angle)
 
-    def _added_line(self, name: str, a: Pair, b: Pair, radius: float, **options: Any) -> int:
+    def _add_line(self, name: str, a: Pair, b: Pair, radius: float, **options: Any) -> int:
         first, last = checked_pair(f"{name}: a", a), checked_pair(f"{name}: b", b)
         x, y = last - first
         if x == 0 and y == 0:
             raise ConfigError(f"{name}: a and b are both {first.tolist()}, but must be two points")
         shape, half = name.removeprefix("add_"), math.hypot(x, y) / 2
-        return self._added(
-            name, shape, (first + last) / 2, math.atan2(y, x), radius=radius, half_length=half, **options
-        )
+        return self._add(name, shape, (first + last) / 2, math.atan2(y, x), radius=radius, half_length=half, **options)
 
-    def _added(
+    def _add(
         self, name: str, shape: str, position: np.ndarray, angle: float, *,
         radius: float = 0.0, half_length: float = 0.0, vertices: np.ndarray | None = None,
         kind: str = "dynamic", velocity: Pair = (0.0, 0.0), spin: float = 0.0,
@@ -364,7 +362,7 @@ class Space:
     @property
     def slots(self) -> np.ndarray:
         """Slot of each body in `scene()`, [K]."""
-        return self._arranged()[1]
+        return self._arrange()[1]
 
     def scene(self) -> tuple[Scene, State, Layout]:
         """Scene and initial state of one video, as a sampler returns them, and their layout.
@@ -386,14 +384,14 @@ class Space:
         ConfigError
             If no body is dynamic.
         """
-        runs, slots, bodies = self._arranged()
+        groups, slots, bodies = self._arrange()
         real = np.dtype(jnp.result_type(float))
 
         def column(name: str, dtype: Any = real) -> jax.Array:
             return jnp.asarray(np.array([getattr(body, name) for body in bodies]).astype(dtype))
 
-        corners = max((run.vertices for run in runs), default=0)
-        vertices = np.array([fill_vertices(body.vertices, corners) for body in bodies])
+        corners = max((group.vertices for group in groups), default=0)
+        vertices = np.array([pad_vertices(body.vertices, corners) for body in bodies])
         counts = np.array([len(body.vertices) for body in bodies], np.uint8)
         numbers = body_numbers(slots, len(bodies))  # -1: the world's
         objects = Objects(
@@ -413,8 +411,8 @@ class Space:
         scene = Scene(objects, jnp.asarray(self.gravity, real), self._joints(real))
         # The last one, -1, is the world's if a joint needs it.
         slot = [*slots.tolist(), *np.flatnonzero(numbers < 0).tolist()]
-        ties = tuple(JointSpec(j.kind, slot[j.a], slot[j.b], j.collide) for j in self.joints)
-        return scene, state, Layout(runs, joints=ties)
+        joints = tuple(JointSpec(j.kind, slot[j.a], slot[j.b], j.collide) for j in self.joints)
+        return scene, state, Layout(groups, joints=joints)
 
     def _joints(self, real: Any) -> Joints | None:
         if not self.joints:
@@ -426,7 +424,7 @@ class Space:
             **anchors, **{n: jnp.asarray([j.numbers[n] for j in self.joints], real) for n in self.joints[0].numbers}
         )
 
-    def _arranged(self) -> tuple[tuple[SlotGroup, ...], np.ndarray, list[Body]]:
+    def _arrange(self) -> tuple[tuple[SlotGroup, ...], np.ndarray, list[Body]]:
         """Slot groups, the slot of each body, and the bodies by slot, including the world's if a joint needs it."""
         bodies = list(self.bodies)
         moving = [shape_family(body) for body in bodies if body.kind == DYNAMIC]
@@ -437,12 +435,12 @@ class Space:
             shape = min(dict.fromkeys(moving), key=lambda s: moving.count(s) % 2 == 0)
             bodies.append(world_anchor(shape))
         order = sorted(range(len(bodies)), key=lambda i: slot_order(bodies[i]))
-        runs = []
+        groups = []
         for _, group in itertools.groupby((bodies[i] for i in order), key=slot_order):
             members = list(group)
             corners = max(len(body.vertices) for body in members)
-            runs.append(SlotGroup(shape_family(members[0]), len(members), members[0].kind, corners))
-        return tuple(runs), np.argsort(order)[: len(self.bodies)], [bodies[i] for i in order]
+            groups.append(SlotGroup(shape_family(members[0]), len(members), members[0].kind, corners))
+        return tuple(groups), np.argsort(order)[: len(self.bodies)], [bodies[i] for i in order]
 
     # ---- Simulation
 
@@ -500,10 +498,10 @@ class Space:
             if contacts is None
             else int(checked_number("simulate: contacts", contacts, low=0))
         )
-        rules, steps = self._rules(fps, substeps)
+        params, steps = self._solver_params(fps, substeps)
         slots = self.slots
         slot_forces = None if forces is None else (forces, tuple(int(s) for s in slots))
-        program = compiled_program(layout, rules, frames, steps, SaveAt(rows, energy), slot_forces)
+        program = compiled_program(layout, params, frames, steps, SaveAt(rows, energy), slot_forces)
         trajectory = jax.tree.map(lambda x: np.asarray(x[0]), program(*jax.tree.map(lambda x: x[None], (scene, state))))
         states = trajectory.states
         return Video(
@@ -519,7 +517,7 @@ class Space:
             quality=trajectory.quality,
         )
 
-    def _rules(self, fps: float, asked: int | None) -> tuple[SolverParams, int]:
+    def _solver_params(self, fps: float, asked: int | None) -> tuple[SolverParams, int]:
         physics = self.physics
         if asked is not None:
             asked = int(checked_number("simulate: substeps", asked, low=1))
@@ -568,7 +566,7 @@ class Space:
         scene, _, layout = self.scene()
         objects = to_device(jax.tree.map(lambda x: x[None], scene.objects))
         number = body_numbers(self.slots, layout.slots)
-        exempt = {frozenset((tie.a, tie.b)) for tie in layout.joints if not tie.collide}
+        exempt = {frozenset((joint.a, joint.b)) for joint in layout.joints if not joint.collide}
         body_poses = jnp.asarray(position.transpose(2, 1, 0)), jnp.asarray(angle.T)
         overlaps = []
         for span_a, span_b in itertools.combinations_with_replacement(layout.spans, 2):
@@ -576,15 +574,14 @@ class Space:
                 (i, j)
                 for i in slots_of_span(span_a)
                 for j in slots_of_span(span_b)
-                if i < j and number[i] >= 0 <= number[j]
+                if i < j and number[i] >= 0 <= number[j] and frozenset((i, j)) not in exempt
             ]
-            pairs = [pair for pair in pairs if frozenset(pair) not in exempt]
             if not pairs or (span_a[0].kind != DYNAMIC and span_b[0].kind != DYNAMIC):
                 continue
             sides = [np.array(side) for side in zip(*pairs, strict=True)]
             first, second = (number[side] for side in sides)
             poses = [[x[..., who, :] for x in body_poses] for who in (first, second)]
-            for gap, point, normal in touching_points((span_a[0], span_b[0]), objects, sides, poses):
+            for gap, point, normal in closest_points((span_a[0], span_b[0]), objects, sides, poses):
                 pair, frame = np.nonzero(np.asarray(gap) < 0)
                 points, normals = (np.asarray(x)[:, pair, frame].T for x in (point, normal))
                 overlaps.append(

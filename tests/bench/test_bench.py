@@ -95,7 +95,7 @@ def test_both_ways_of_reading_pymunk_agree() -> None:
 def test_the_engines_of_the_physics_section_start_from_the_same_scene(shape: str) -> None:
     start = bench_physics.sample(bench_physics.Case(shape, 5, 1, (1, 0), 1), 0)
     (scene, state, layout), space = bench_physics.gen2d_scene(start), bench_physics.chipmunk_space(start)
-    assert [run.count for run in layout.runs] == [5, 4]
+    assert [run.count for run in layout.groups] == [5, 4]
     chipmunk = np.array([(*b.position, b.angle, *b.velocity, b.mass, b.moment) for b in space.bodies])
     columns = state.position, state.angle, state.velocity, scene.objects.mass, scene.objects.moment
     np.testing.assert_allclose(np.column_stack([x[:5] for x in columns]), chipmunk, rtol=1e-6)

@@ -119,7 +119,7 @@ HEIGHT, ELASTICITIES = 3.0, (1.0, 0.9, 0.8, 0.5)
 
 
 @functools.cache
-def dropped() -> Motion:
+def drop() -> Motion:
     """A disc of each elasticity dropped from 3 m: 16.7 s, every step."""
     return watch(
         [Case([{"x": (0, RADIUS + HEIGHT), "elasticity": e}], [FLOOR], DOWN) for e in ELASTICITIES], frames=4001
@@ -128,7 +128,7 @@ def dropped() -> Motion:
 
 def test_c7_bounces_rise_to_e_squared_of_the_height_before():
     first, later, elastic = [], [], []
-    for e, poses in zip(ELASTICITIES, dropped().x[..., 0, 1] - RADIUS, strict=True):
+    for e, poses in zip(ELASTICITIES, drop().x[..., 0, 1] - RADIUS, strict=True):
         for y in poses:
             tops = y[1:-1][(y[:-2] < y[1:-1]) & (y[1:-1] >= y[2:])]
             exact = HEIGHT * e ** (2.0 * np.arange(1, 11))
@@ -139,7 +139,7 @@ def test_c7_bounces_rise_to_e_squared_of_the_height_before():
     holds("C7 first bounce height, relative", first, 5e-4)
     holds("C7 bounce heights down to 0.2 m, relative", later, 2e-3)
     holds("C7 bounce heights, e = 1, 10 bounces, relative", elastic, 1e-3)
-    top = dropped().x[0, ..., 0, 1].max() - RADIUS
+    top = drop().x[0, ..., 0, 1].max() - RADIUS
     holds("C7 elastic bounce rises above its start, relative", max(top / HEIGHT - 1, 0), 1e-4)
 
 
@@ -147,7 +147,7 @@ def test_c8_bounces_happen_in_time_and_end_in_time():
     """To the time of rest count bounces of all sizes; a threshold above which they count must be that small."""
     fall, t = np.sqrt(2 * HEIGHT / GRAVITY), times(4001)
     events, rest = [], []
-    for e, poses in zip(ELASTICITIES, dropped().v[..., 0, :], strict=True):
+    for e, poses in zip(ELASTICITIES, drop().v[..., 0, :], strict=True):
         for v in poses:
             when = t[1:][(v[:-1, 1] < 0) & (v[1:, 1] > 0)] - STEP / 2
             n = np.arange(len(when))

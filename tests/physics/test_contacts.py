@@ -2,7 +2,7 @@
 
 The reference is brute force in NumPy and float64: the nearest points of two convex cores are a corner of one and a
 point on an edge of the other; cores that overlap part along an edge normal of either. A shape is a dict of corners,
-position, angle and radius here, with scenes first, from which `placed` makes the shape of `contacts`.
+position, angle and radius here, with scenes first, from which `world_shape` makes a shape of `collision`.
 """
 
 from functools import cache
@@ -14,7 +14,18 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from gen2d.physics.collision import FAR, PAIRS, SLOP, Disc, Hull, Point, Stadium, edge_normals, hull, touches
+from gen2d.physics.collision import (
+    FAR,
+    PAIRS,
+    SLOP,
+    Disc,
+    Hull,
+    ManifoldPoint,
+    Stadium,
+    edge_normals,
+    hull_at,
+    manifold,
+)
 
 MANY = 2000
 V = 5  # corners of a hull, some of them repeated
@@ -72,8 +83,8 @@ def world(shape: dict) -> np.ndarray:
     return shape["position"][:, None] + np.stack([cos * x - sin * y, sin * x + cos * y], -1)
 
 
-def placed(shape: dict, dtype: type = np.float64) -> Disc | Stadium | Hull:
-    """The shape as `contacts` takes it."""
+def world_shape(shape: dict, dtype: type = np.float64) -> Disc | Stadium | Hull:
+    """Shape in the world."""
     x = {name: jnp.moveaxis(jnp.asarray(value, dtype), 0, -1) for name, value in shape.items()}
     corners = x["corners"]
     if len(corners) == 1:
@@ -81,7 +92,7 @@ def placed(shape: dict, dtype: type = np.float64) -> Disc | Stadium | Hull:
     if len(corners) == 2:
         way = jnp.stack([jnp.cos(x["angle"]), jnp.sin(x["angle"])])
         return Stadium(x["position"], way, corners[1, 0], x["radius"])
-    return hull(corners, edge_normals(corners), x["position"], x["angle"], x["radius"])
+    return hull_at(corners, edge_normals(corners), x["position"], x["angle"], x["radius"])
 
 
 # The reference --------------------------------------------------------------------------------------------------------
@@ -113,27 +124,27 @@ def true_gap(a: dict, b: dict) -> np.ndarray:
     return np.where((along >= 0) | (along == -np.inf), apart, along) - a["radius"] - b["radius"]
 
 
-compiled = jax.jit(touches, compiler_options={"xla_backend_optimization_level": 0})  # LLVM takes longer than the tests
+compiled = jax.jit(manifold, compiler_options={"xla_backend_optimization_level": 0})  # LLVM takes longer than the tests
 
 
-def found(a: dict, b: dict, dtype: type = np.float64):
+def contacts_of(a: dict, b: dict, dtype: type = np.float64):
     """The points of contact, in NumPy, as normal [points, 2, n], gap [points, n] and world points [points, 2, n] by a
     and by b."""
     with jax.enable_x64(dtype == np.float64):
-        points = compiled(placed(a, dtype), placed(b, dtype))
+        points = compiled(world_shape(a, dtype), world_shape(b, dtype))
         assert all(x.dtype == dtype for point in points for x in point)
         normal, gap, arm_a, arm_b = (np.stack(x) for x in zip(*points, strict=True))
     return normal, gap, a["position"].T + arm_a, b["position"].T + arm_b
 
 
-def gradient(a: dict, b: dict, weights: tuple[Point, ...]) -> tuple[dict, dict]:
-    """By all that a and b are made of, of their points times the weights; in float32."""
+def gradient(a: dict, b: dict, weights: tuple[ManifoldPoint, ...]) -> tuple[dict, dict]:
+    """Gradient with respect to both shapes of the sum of their points times the weights; in float32."""
     a, b, weights = jax.tree.map(jnp.float32, (a, b, weights))  # not compiled, as that takes longer
-    return jax.vjp(lambda a, b: touches(placed(a, np.float32), placed(b, np.float32)), a, b)[1](weights)
+    return jax.vjp(lambda a, b: manifold(world_shape(a, np.float32), world_shape(b, np.float32)), a, b)[1](weights)
 
 
 def errors(a: dict, b: dict, dtype: type) -> np.ndarray:
-    return np.abs(found(a, b, dtype)[1].min(0) - true_gap(a, b))
+    return np.abs(contacts_of(a, b, dtype)[1].min(0) - true_gap(a, b))
 
 
 # Distance -------------------------------------------------------------------------------------------------------------
@@ -155,12 +166,12 @@ def test_so_it_is_in_single_precision(kind_a: type, kind_b: type):
     assert errors(*pair_of_shapes(kind_a, kind_b), np.float32).max() < 3 * SLOP
 
 
-def moved(shape: dict, angle: float, shift: np.ndarray) -> dict:
+def move(shape: dict, angle: float, shift: np.ndarray) -> dict:
     turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
     return shape | {"position": shape["position"] @ turn.T + shift, "angle": shape["angle"] + angle}
 
 
-def mirrored(shape: dict) -> dict:
+def mirror(shape: dict) -> dict:
     """In the line x = 0, still counter-clockwise."""
     flip = np.array([-1, 1])
     corners = shape["corners"] * flip if shape["corners"].shape[1] != 2 else shape["corners"][:, ::-1] * flip
@@ -171,7 +182,7 @@ def mirrored(shape: dict) -> dict:
 @pytest.mark.parametrize(("kind_a", "kind_b"), EVERY_PAIR)
 class TestFrames:
     def test_points_meet_and_normals_are_unit(self, kind_a: type, kind_b: type):
-        normal, gap, by_a, by_b = found(*pair_of_shapes(kind_a, kind_b))
+        normal, gap, by_a, by_b = contacts_of(*pair_of_shapes(kind_a, kind_b))
         assert_allclose(by_a, by_b, atol=1e-12)
         assert_allclose(np.linalg.norm(normal, axis=1), 1, atol=1e-12)
         tangent = np.stack([-normal[0, 1], normal[0, 0]])
@@ -181,8 +192,8 @@ class TestFrames:
     def test_a_moved_scene_gives_moved_points(self, kind_a: type, kind_b: type):
         a, b = pair_of_shapes(kind_a, kind_b)
         angle, shift = 2.1, np.array([3.0, -5])
-        normal, gap, point, _ = found(a, b)
-        normal_, gap_, point_, _ = found(moved(a, angle, shift), moved(b, angle, shift))
+        normal, gap, point, _ = contacts_of(a, b)
+        normal_, gap_, point_, _ = contacts_of(move(a, angle, shift), move(b, angle, shift))
         turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
         assert_allclose(gap_, gap, atol=1e-11)
         assert_allclose(normal_, turn @ normal, atol=1e-6)
@@ -190,12 +201,12 @@ class TestFrames:
 
     def test_swapped_shapes_give_mirrored_points(self, kind_a: type, kind_b: type):
         a, b = pair_of_shapes(kind_a, kind_b)
-        same_points(found(a, b), found(b, a), lambda v: v, lambda n: -n)
+        same_points(contacts_of(a, b), contacts_of(b, a), lambda v: v, lambda n: -n)
 
     def test_a_mirrored_scene_gives_mirrored_points(self, kind_a: type, kind_b: type):
         a, b = pair_of_shapes(kind_a, kind_b)
         flip = np.array([-1, 1])[:, None]
-        same_points(found(a, b), found(mirrored(a), mirrored(b)), lambda v: flip * v, lambda n: flip * n)
+        same_points(contacts_of(a, b), contacts_of(mirror(a), mirror(b)), lambda v: flip * v, lambda n: flip * n)
 
 
 def same_points(one: tuple, other: tuple, place, way):
@@ -215,21 +226,21 @@ def same_points(one: tuple, other: tuple, place, way):
 # Known scenes ---------------------------------------------------------------------------------------------------------
 
 
-def one(corners: list, x: float = 0.0, y: float = 0.0, angle: float = 0.0, radius: float = 0.0) -> dict:
+def hull_arrays(corners: list, x: float = 0.0, y: float = 0.0, angle: float = 0.0, radius: float = 0.0) -> dict:
     return {"corners": np.array(corners), "position": np.array([x, y]), "angle": angle, "radius": radius}
 
 
 def disc(x: float, y: float, radius: float) -> dict:
-    return one([[0.0, 0]], x, y, 0, radius)
+    return hull_arrays([[0.0, 0]], x, y, 0, radius)
 
 
 def line(half_length: float, x: float = 0.0, y: float = 0.0, angle: float = 0.0, radius: float = 0.0) -> dict:
-    return one([[-half_length, 0], [half_length, 0.0]], x, y, angle, radius)
+    return hull_arrays([[-half_length, 0], [half_length, 0.0]], x, y, angle, radius)
 
 
 def box(width: float, height: float, x: float = 0.0, y: float = 0.0, angle: float = 0.0) -> dict:
     x2, y2 = width / 2, height / 2
-    return one([[-x2, -y2], [x2, -y2], [x2, y2], [-x2, y2], [-x2, y2]], x, y, angle)
+    return hull_arrays([[-x2, -y2], [x2, -y2], [x2, y2], [-x2, y2], [-x2, y2]], x, y, angle)
 
 
 def batch(scenes: list[dict]) -> dict:
@@ -237,17 +248,17 @@ def batch(scenes: list[dict]) -> dict:
     return {k: np.resize(np.stack([s[k] for s in scenes]), (MANY, *np.shape(scenes[0][k]))) for k in scenes[0]}
 
 
-def found_each(scenes: list[tuple[dict, dict]]) -> zip:
+def contacts_of_each(scenes: list[tuple[dict, dict]]) -> zip:
     """For each scene, normal [points, 2], gap [points] and world point [points, 2]."""
     a, b = (batch(list(side)) for side in zip(*scenes, strict=True))
-    normal, gap, point, _ = found(a, b)
+    normal, gap, point, _ = contacts_of(a, b)
     return zip(*(np.moveaxis(x, -1, 0)[: len(scenes)] for x in (normal, gap, point)), strict=True)
 
 
 def test_a_box_flat_on_a_box_stands_on_its_corners():
     cases = [(gap, shift) for gap in (-1e-3, 0.0, 1e-6, 1e-3, 0.4) for shift in (0.0, 1e-7, 0.2, -0.2)]
     scenes = [(box(2, 1), box(2, 0.6, shift, 0.8 + gap)) for gap, shift in cases]
-    for (gap, shift), (normals, gaps, points) in zip(cases, found_each(scenes), strict=True):
+    for (gap, shift), (normals, gaps, points) in zip(cases, contacts_of_each(scenes), strict=True):
         right, left = min(1, 1 + shift), max(-1, -1 + shift)  # the tangent of 'up' runs to the left
         assert_allclose(gaps, gap, atol=1e-12)
         assert_allclose(normals, [[0, 1], [0, 1]], atol=1e-12)
@@ -257,7 +268,7 @@ def test_a_box_flat_on_a_box_stands_on_its_corners():
 def test_a_box_on_a_floor_stands_on_its_corners():
     radii = [0.0, 0.1]
     scenes = [(line(10, radius=r), box(1, 1, 3, 0.5 + r)) for r in radii]
-    for radius, (normals, gaps, points) in zip(radii, found_each(scenes), strict=True):
+    for radius, (normals, gaps, points) in zip(radii, contacts_of_each(scenes), strict=True):
         assert_allclose(gaps, 0, atol=1e-12)
         assert_allclose(normals, [[0, 1], [0, 1]], atol=1e-12)
         assert_allclose(points, [[3.5, radius], [2.5, radius]], atol=1e-12)
@@ -268,14 +279,14 @@ TILTS = [0.0, 1e-9, -1e-9, np.pi]
 
 @pytest.mark.parametrize("floor", [line(10), box(20, 2, 0, -1)], ids=["line", "box"])
 def test_a_capsule_lies_on_two_points(floor: dict):
-    for _, gaps, points in found_each([(floor, line(0.5, 3, 0.2, tilt, 0.2)) for tilt in TILTS]):
+    for _, gaps, points in contacts_of_each([(floor, line(0.5, 3, 0.2, tilt, 0.2)) for tilt in TILTS]):
         assert_allclose(gaps, 0, atol=1e-8)
         assert_allclose(points, [[3.5, 0], [2.5, 0]], atol=1e-8)
 
 
 @pytest.mark.parametrize("floor", [line(10), box(20, 2, 0, -1)], ids=["line", "box"])
 def test_a_capsule_stands_on_one_point(floor: dict):
-    for _, gaps, points in found_each([(floor, line(0.5, 3, 0.7, tilt + np.pi / 2, 0.2)) for tilt in TILTS]):
+    for _, gaps, points in contacts_of_each([(floor, line(0.5, 3, 0.7, tilt + np.pi / 2, 0.2)) for tilt in TILTS]):
         assert_allclose(sorted(gaps), [0, 1], atol=1e-8)
         assert_allclose(points[gaps.argmin()], [3, 0], atol=1e-8)
 
@@ -285,7 +296,7 @@ def test_a_capsule_stands_at_the_very_end(floor: dict):
     over = [0.0, 1e-9, 1e-7, -1e-7, 5e-6, 2e-5, -2e-5]
     cases = [(side, x, angle) for side in (-1, 1) for x in over for angle in (np.pi / 2, -np.pi / 2)]
     scenes = [(floor, line(0.5, side * (10 + x), 0.7, angle, 0.2)) for side, x, angle in cases]
-    for (side, *_), (_, gaps, points) in zip(cases, found_each(scenes), strict=True):
+    for (side, *_), (_, gaps, points) in zip(cases, contacts_of_each(scenes), strict=True):
         assert_allclose(gaps.min(), 0, atol=SLOP)
         assert_allclose(points[gaps.argmin()], [10 * side, 0], atol=3 * SLOP)
 
@@ -296,7 +307,7 @@ def test_lines_in_line_are_as_far_apart_as_their_ends():
         (line(1, 0, 0, 0.3, 0.1), line(0.5, (1.5 + apart) * way[0], (1.5 + apart) * way[1], 0.3, 0.2))
         for apart in cases
     ]
-    for apart, (normals, gaps, points) in zip(cases, found_each(scenes), strict=True):
+    for apart, (normals, gaps, points) in zip(cases, contacts_of_each(scenes), strict=True):
         assert_allclose(gaps, [apart - 0.3, FAR], atol=1e-12)
         assert_allclose(normals, [way, way], atol=1e-9)
         assert_allclose(points[0], (1.1 + (apart - 0.3) / 2) * way, atol=1e-12)
@@ -306,7 +317,7 @@ def test_lines_in_line_are_as_far_apart_as_their_ends():
 def test_repeated_corners_change_nothing(repeats: list):
     a, b = pair_of_shapes(Hull, Hull)
     more = a | {"corners": a["corners"][:, repeats]}
-    for x, y in zip(found(a, b), found(more, b), strict=True):
+    for x, y in zip(contacts_of(a, b), contacts_of(more, b), strict=True):
         assert_allclose(x, y, atol=1e-9)
 
 
@@ -361,21 +372,21 @@ DEGENERATE = {
 def test_degenerate_scenes_have_unit_normals_and_finite_gradients(kind_a: type, kind_b: type):
     scenes = DEGENERATE[kind_a, kind_b]
     a, b = (batch(list(side)) for side in zip(*scenes, strict=True))
-    normal, gap, *_ = found(a, b, np.float32)
+    normal, gap, *_ = contacts_of(a, b, np.float32)
     assert_allclose(np.linalg.norm(normal, axis=1), 1, atol=1e-6)
     assert_allclose(gap.min(0), true_gap(a, b), atol=1e-5)
     chex.assert_tree_all_finite(gradient(a, b, some_weights(len(gap))))
 
 
-def some_weights(points: int) -> tuple[Point, ...]:
+def some_weights(points: int) -> tuple[ManifoldPoint, ...]:
     vector = jnp.linspace(0.5, 1.7, 2 * MANY).reshape(2, MANY)
-    return points * (Point(vector, vector[0], -vector, vector / 3),)
+    return points * (ManifoldPoint(vector, vector[0], -vector, vector / 3),)
 
 
 @pytest.mark.parametrize(("a", "b"), [(NONE, NONE), (NONE, UNIT), (UNIT, NONE), (NONE, line(0)), (NONE, disc(0, 0, 0))])
 def test_empty_slots_give_numbers(a: dict, b: dict):
     a, b = batch([a]), batch([b])
-    points = found(a, b, np.float32)
+    points = contacts_of(a, b, np.float32)
     chex.assert_tree_all_finite((points, gradient(a, b, some_weights(len(points[1])))))
 
 
@@ -383,10 +394,10 @@ def test_empty_slots_give_numbers(a: dict, b: dict):
 def test_a_gap_opens_along_its_normal(kind_a: type, kind_b: type):
     """d gap / d position of b is the normal; of a, what is opposite."""
     a, b = pair_of_shapes(kind_a, kind_b)
-    normal, gap, *_ = found(a, b, np.float32)
+    normal, gap, *_ = contacts_of(a, b, np.float32)
     nearest = np.arange(len(gap))[:, None] == gap.argmin(0)
     zero = jnp.zeros((2, MANY))
-    by_a, by_b = gradient(a, b, tuple(Point(zero, jnp.asarray(on), zero, zero) for on in nearest))
+    by_a, by_b = gradient(a, b, tuple(ManifoldPoint(zero, jnp.asarray(on), zero, zero) for on in nearest))
     assert_allclose(by_b["position"].T, normal[0], atol=0.03)  # corners hardly apart in float32
     assert_allclose(by_a["position"].T, -normal[0], atol=0.03)
     assert np.quantile(np.abs(by_b["position"].T - normal[0]), 0.99) < 1e-5

@@ -102,17 +102,17 @@ def ends(numbers: dict, scene: Any, state: Any, layout: Layout, steps: int) -> j
         scene, objects=dataclasses.replace(scene.objects, **of_objects), gravity=numbers["gravity"]
     )
     state = dataclasses.replace(state, **of_state)
-    return simulate(scene, state, layout, rules(), 2, steps).states.position[-1, :, : layout.runs[0].count]
+    return simulate(scene, state, layout, rules(), 2, steps).states.position[-1, :, : layout.groups[0].count]
 
 
-def nudged(values: jax.Array, slot: int, axis: int, by: float) -> jax.Array:
+def nudge(values: jax.Array, slot: int, axis: int, by: float) -> jax.Array:
     """The values with one number changed in all videos: [2, K, n], [K, n] or, of gravity, [2, n]."""
     place = (axis, slot) if values.ndim == 3 else (axis if values.shape[0] == 2 else slot,)
     return values.at[place].add(by)
 
 
 @functools.cache
-def measured() -> tuple[dict, dict]:
+def both_gradients() -> tuple[dict, dict]:
     """For each event and number the derivative by jax.grad, and by differences of 1e-5 and of .05."""
     with jax.enable_x64(True):
         worlds = to_double([
@@ -127,18 +127,18 @@ def measured() -> tuple[dict, dict]:
         def total(numbers: dict) -> jax.Array:
             return jnp.sum(ends(numbers, scene, state, layout, steps) * weight)
 
-        def looked(numbers: dict) -> jax.Array:
+        def per_case(numbers: dict) -> jax.Array:
             return jnp.sum(ends(numbers, scene, state, layout, steps) * weight, axis=(0, 1))
 
-        by_grad, forward = jax.jit(jax.grad(total))(numbers), jax.jit(looked)
+        by_grad, forward = jax.jit(jax.grad(total))(numbers), jax.jit(per_case)
         found, wide = {}, {}
         wanted = sorted({number for event in EVENTS.values() for number in event.by})
         for field, slot, axis in wanted:
             for eps, into in ((EPS, found), (0.05, wide)):
-                up, down = (forward({**numbers, field: nudged(numbers[field], slot, axis, s * eps)}) for s in (1, -1))
+                up, down = (forward({**numbers, field: nudge(numbers[field], slot, axis, s * eps)}) for s in (1, -1))
                 into[field, slot, axis] = np.asarray((up - down) / (2 * eps))
         grads = {
-            (field, slot, axis): np.asarray(nudged(jnp.zeros_like(by_grad[field]), slot, axis, 1) * by_grad[field]).sum(
+            (field, slot, axis): np.asarray(nudge(jnp.zeros_like(by_grad[field]), slot, axis, 1) * by_grad[field]).sum(
                 tuple(range(by_grad[field].ndim - 1))
             )
             for field, slot, axis in wanted
@@ -157,7 +157,7 @@ def measured() -> tuple[dict, dict]:
 def test_gradient_is_the_closed_form_and_the_difference(name):
     event, largest = EVENTS[name], 0.0
     for number, exact in event.by.items():
-        by_grad, by_difference = measured()[0][name, number]
+        by_grad, by_difference = both_gradients()[0][name, number]
         largest = max(largest, abs(by_grad))
         # The stop is of first order in the step: of 204 steps.
         relative, bound = (abs(exact or 1), 1e-2) if "stop" in name else (1, 1e-3)
@@ -170,13 +170,13 @@ def test_gradient_is_the_closed_form_and_the_difference(name):
 @pytest.mark.parametrize("x", [-2.0, -2.005, -2.01])
 def test_differences_across_several_steps_agree_at_a_wall(x):
     for number, exact in ((("position", 0, X), -1), (("velocity", 0, X), -SECONDS)):
-        holds("Differences of .05 at a wall", measured()[1][f"wall hit from {x}", number] - exact, 0.05)
+        holds("Differences of .05 at a wall", both_gradients()[1][f"wall hit from {x}", number] - exact, 0.05)
 
 
 # Nothing and never NaN ----------------------------------------------------------------------------------------------
 
 
-def some(seed: int, discs: int = 4) -> tuple:
+def random_world(seed: int, discs: int = 4) -> tuple:
     """Discs that fly at each other between two walls that meet below them."""
     rng = np.random.default_rng(seed)
     rows = [
@@ -207,7 +207,7 @@ def gradients(worlds: list[tuple]) -> dict[str, np.ndarray]:
 
 def test_gradients_are_never_nan():
     """16 random scenes, 120 steps."""
-    found = gradients([some(seed) for seed in range(16)])
+    found = gradients([random_world(seed) for seed in range(16)])
     for name, values in found.items():
         assert np.isfinite(values).all(), name
     assert np.abs(found["velocity"]).max() > 0.1
@@ -228,7 +228,7 @@ def test_gradients_of_degenerate_scenes_are_finite():
         "nothing": ([], [floor]),
     }
     worlds = [world(discs, [*walls, FAR_WALL][:2], DOWN, 4) for discs, walls in scenes.values()]
-    found = gradients([*worlds, *[some(seed) for seed in range(10)]])
+    found = gradients([*worlds, *[random_world(seed) for seed in range(10)]])
     bad = {
         (scene, name)
         for name, values in found.items()
@@ -239,7 +239,7 @@ def test_gradients_of_degenerate_scenes_are_finite():
 
 
 def test_gradients_by_empty_slots_are_zero():
-    found = gradients([some(seed, discs=3) for seed in range(16)])
+    found = gradients([random_world(seed, discs=3) for seed in range(16)])
     for name, values in found.items():
         if name != "gravity":
             assert_array_equal(values[..., 3, :], 0, err_msg=name)

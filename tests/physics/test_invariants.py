@@ -78,7 +78,7 @@ def momentum_scales(worlds: list[tuple]) -> tuple[np.ndarray, np.ndarray]:
     linear, angular = [], []
     for scene, state, layout in worlds:
         mass, moment, x, v, w = (
-            np.asarray(a, float)[: layout.runs[0].count]
+            np.asarray(a, float)[: layout.groups[0].count]
             for a in (scene.objects.mass, scene.objects.moment, state.position, state.velocity, state.angular_velocity)
         )
         speed = np.hypot(*v.T)
@@ -101,7 +101,7 @@ def test_i1_i2_momentum_is_conserved_without_fixed_objects(seed, elasticity, fri
     holds("I2 angular momentum, relative", np.abs(angular - angular[:, :1]).max(1) / angular_sizes, 3e-4, asked=1e-4)
 
 
-def gained(worlds: list[tuple]) -> np.ndarray:
+def energy_gains(worlds: list[tuple]) -> np.ndarray:
     """The largest gain of energy in a step of 2 s, relative to that at the start, by world."""
     energy = energies(worlds, run(worlds, 481, 1))
     return np.diff(energy).max(1) / energy[:, 0]
@@ -111,21 +111,21 @@ def gained(worlds: list[tuple]) -> np.ndarray:
 @given(SEEDS, st.floats(0, 1), st.floats(0, 1))
 def test_i3_energy_never_grows_among_free_discs(seed, elasticity, friction):
     worlds = [cluster(seed + i, elasticity, friction) for i in range(8)]
-    holds("I3 energy gained in a step, free discs, relative", gained(worlds), 5e-4, asked=1e-4)
+    holds("I3 energy gained in a step, free discs, relative", energy_gains(worlds), 5e-4, asked=1e-4)
 
 
 @settings(max_examples=8, deadline=None, derandomize=True)
 @given(SEEDS, st.floats(0, 1), st.floats(0, 1))
 def test_i3_energy_never_grows_in_a_box(seed, elasticity, friction):
     worlds = [gas(seed + i, elasticity, friction, DOWN) for i in range(8)]
-    holds("I3 energy gained in a step, box, relative", gained(worlds), 4e-3, asked=1e-4)
+    holds("I3 energy gained in a step, box, relative", energy_gains(worlds), 4e-3, asked=1e-4)
 
 
 @settings(max_examples=8, deadline=None, derandomize=True)
 @given(SEEDS, st.floats(0, 1), st.floats(0, 1))
 def test_i3_energy_never_grows_in_a_wedge(seed, elasticity, friction):
     worlds = [wedge(seed + i, elasticity, friction) for i in range(8)]
-    holds("I3 energy gained in a step, wedge, relative", gained(worlds), 2e-2, asked=1e-4)
+    holds("I3 energy gained in a step, wedge, relative", energy_gains(worlds), 2e-2, asked=1e-4)
 
 
 def test_i3_simultaneous_impacts_gain_no_energy():
@@ -254,7 +254,7 @@ def test_angle_is_not_wrapped():
 # Invariances --------------------------------------------------------------------------------------------------------
 
 
-def changed(one: tuple, **states: Any) -> tuple:
+def replace_state(one: tuple, **states: Any) -> tuple:
     """The world with other fields of its state."""
     scene, state, layout = one
     return scene, dataclasses.replace(state, **states), layout
@@ -264,7 +264,7 @@ def test_mirror_image_moves_as_the_mirror_image():
     worlds = [gas(seed, 0.8, 0.3, DOWN) for seed in range(4)]
     flip = jnp.asarray([-1.0, 1.0])
     mirrored = [
-        changed(w, position=w[1].position * flip, velocity=w[1].velocity * flip, angle=-w[1].angle,
+        replace_state(w, position=w[1].position * flip, velocity=w[1].velocity * flip, angle=-w[1].angle,
                 angular_velocity=-w[1].angular_velocity)
         for w in worlds
     ]  # fmt: skip
@@ -306,7 +306,7 @@ def test_twice_the_unit_of_length_gives_the_same_bits():
         o = scene.objects
         objects = dataclasses.replace(o, radius=2 * o.radius, half_length=2 * o.half_length, moment=4 * o.moment)
         scene = dataclasses.replace(scene, objects=objects, gravity=2 * scene.gravity)
-        return changed((scene, state, layout), position=2 * state.position, velocity=2 * state.velocity)
+        return replace_state((scene, state, layout), position=2 * state.position, velocity=2 * state.velocity)
 
     ordinary = rules()
     larger = rules(bounce_threshold=2 * ordinary.bounce_threshold, push_speed=2 * ordinary.push_speed)
@@ -345,14 +345,14 @@ def test_the_order_of_the_discs_does_not_matter():
 def test_empty_slots_change_nothing_whatever_they_hold():
     scene, state, layout = gas(3, 0.9, 0.2, DOWN, discs=5, slots=8)
 
-    def stuffed(value: float, record: Any) -> Any:
+    def fill_empty_slots(value: float, record: Any) -> Any:
         def fill(x: jax.Array) -> jax.Array:
             return x.at[5:8].set(value) if jnp.issubdtype(x.dtype, jnp.floating) else x
 
         return jax.tree.map(fill, record)
 
     worlds = [
-        (dataclasses.replace(scene, objects=stuffed(v, scene.objects)), stuffed(v, state), layout)
+        (dataclasses.replace(scene, objects=fill_empty_slots(v, scene.objects)), fill_empty_slots(v, state), layout)
         for v in (0.0, np.nan, 1e9, np.inf)
     ]
     made = run([*worlds, *worlds], 61, 8)
@@ -381,7 +381,7 @@ print(hashlib.sha256(run(worlds, 61, 8).states.position[:1].tobytes()).hexdigest
 """
 
 
-def printed(lanes: int, flags: str, cores: int) -> str:
+def printed_hash(lanes: int, flags: str, cores: int) -> str:
     """The hash of a video made by a fresh process in a batch of that size."""
     here = Path(__file__).parent
     code = PRINT.format(here=str(here), support=str(here.parent / "support"), root=str(here.parents[1]), lanes=lanes)
@@ -393,8 +393,8 @@ def printed(lanes: int, flags: str, cores: int) -> str:
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux" or (os.cpu_count() or 1) < 2, reason="binds processes to cores")
 def test_bits_do_not_depend_on_threads_nor_with_avx_alone_on_the_batch():
-    assert printed(8, "", 1) == printed(8, "", 2)
-    assert len({printed(lanes, "--xla_cpu_max_isa=AVX", 2) for lanes in (1, 7, 64)}) == 1
+    assert printed_hash(8, "", 1) == printed_hash(8, "", 2)
+    assert len({printed_hash(lanes, "--xla_cpu_max_isa=AVX", 2) for lanes in (1, 7, 64)}) == 1
 
 
 # Order of convergence -----------------------------------------------------------------------------------------------

@@ -15,7 +15,7 @@ from gen2d.physics.broad_phase import (
     row_lookup,
     signed_distance,
 )
-from gen2d.physics.collision import Disc, Hull, Stadium, edge_normals, hull
+from gen2d.physics.collision import Disc, Hull, Stadium, edge_normals, hull_at
 from gen2d.physics.schedule import Match, pairings
 from gen2d.physics.simulate import SaveAt, simulate
 from gen2d.records import axes, trajectory
@@ -143,7 +143,7 @@ def test_a_shape_is_nowhere_nearer_than_its_clearance_nor_beyond_its_circle():
     shapes = [
         (Disc(at, jnp.full(1, 0.7)), [at[:, 0]], 0.7),
         (Stadium(at, jnp.array([[0.8], [0.6]]), jnp.ones(1), jnp.full(1, 0.2)), _along(at, 1.0), 0.2),
-        (hull(square, edge_normals(square), at, tilt, zero), None, 0.0),
+        (hull_at(square, edge_normals(square), at, tilt, zero), None, 0.0),
     ]
     for shape, core, radius in shapes:
         outline = _outline(shape) if core is None else np.array(core).T

@@ -76,13 +76,13 @@ def flights(elasticity: float) -> tuple[list[Setting], list[list[Impact]], list[
     return settings, [firsts(exact_path(s, 8), elasticity) for s in settings], paths
 
 
-def clear(exact: Events) -> bool:
+def is_clear(exact: Events) -> bool:
     """Whether the order of the first three is beyond doubt: they and the fourth are more than a frame apart."""
     return bool((np.diff([e.time for e in exact[: EVENTS + 1]]) > FRAME).all())
 
 
-def late(exact: Events, found: Events) -> float:
-    """By how much the first events are early or late at most, in s."""
+def delay(exact: Events, found: Events) -> float:
+    """Largest difference in time of the first events, s."""
     return max(abs(e.time - f.time) for e, f in zip(exact[:EVENTS], found[:EVENTS], strict=True))
 
 
@@ -91,9 +91,9 @@ def disagree(exact: Sequence[Events], found: Sequence[Events]) -> tuple[list[int
     ordered, sets = [], []
     for i, (own, other) in enumerate(zip(exact, found, strict=True)):
         pairs = [[e.pair for e in events[:EVENTS]] for events in (own, other)]
-        if not clear(own):
+        if not is_clear(own):
             sets += [i] * (set(pairs[0]) != set(pairs[1]))
-        elif pairs[0] != pairs[1] or late(own, other) > FRAME:
+        elif pairs[0] != pairs[1] or delay(own, other) > FRAME:
             ordered.append(i)
     return ordered, sets
 
@@ -101,7 +101,7 @@ def disagree(exact: Sequence[Events], found: Sequence[Events]) -> tuple[list[int
 def same_events(name: str, exact: Sequence[Events], found: Sequence[Events]) -> None:
     """Asserts that all clear scenes agree, and of the others, whose events have no certain order, 9 of 10 sets."""
     ordered, sets = disagree(exact, found)
-    certain = sum(clear(e) for e in exact)
+    certain = sum(is_clear(e) for e in exact)
     print(f"{name}: {len(ordered)} of {certain} in order differ, {len(sets)} of {len(exact) - certain} others as sets")
     assert certain >= len(exact) / 2
     assert not ordered, f"{name}: {ordered} differ"
@@ -114,7 +114,7 @@ def test_first_events_are_the_exact_ones(elasticity):
     same_events(f"e = {elasticity:g}, exact", exact, [p.events for p in paths])
     holds(
         f"e = {elasticity:g}: time of event, s",
-        [late(e, p.events) for e, p in zip(exact, paths, strict=True) if clear(e)],
+        [delay(e, p.events) for e, p in zip(exact, paths, strict=True) if is_clear(e)],
         STEP,
     )
 
@@ -123,7 +123,7 @@ def test_speeds_after_the_first_events_are_the_exact_ones():
     """Relative to the faster one of the pair. All speeds stay as they are until the next event, a frame later."""
     _, exact, paths = flights(1.0)
     errors = []
-    for impact, path in ((i, p) for own, p in zip(exact, paths, strict=True) if clear(own) for i in own[:EVENTS]):
+    for impact, path in ((i, p) for own, p in zip(exact, paths, strict=True) if is_clear(own) for i in own[:EVENTS]):
         pair, frame = [i for i in impact.pair if i >= 0], math.floor(impact.time / FRAME) + 1
         error, speed = path.speeds[frame, pair, :2] - impact.after[pair], np.linalg.norm(impact.after[pair], axis=1)
         errors.append(np.linalg.norm(error, axis=1).max() / speed.max())
@@ -136,7 +136,7 @@ def test_first_events_are_those_of_chipmunk(elasticity):
     """Scenes in which Chipmunk itself is off the exact path do not count; they are few."""
     settings, exact, paths = flights(elasticity)
     theirs = [firsts(chipmunk_path(s, SECONDS, FINE, events=24).events, elasticity) for s in settings]
-    agreed(f"e = {elasticity:g}, Chipmunk", exact, theirs, [p.events for p in paths], range(SCENES))
+    assert_agreement(f"e = {elasticity:g}, Chipmunk", exact, theirs, [p.events for p in paths], range(SCENES))
 
 
 @pytest.mark.parametrize("elasticity", [1.0, 0.0])
@@ -145,10 +145,10 @@ def test_first_events_are_those_of_box2d(elasticity):
     settings, exact, paths = flights(elasticity)
     theirs = [firsts(box2d_path(s, SECONDS, FINE, events=24).events, elasticity) for s in settings]
     fast = [i for i in range(SCENES) if min(e.approach for e in exact[i][:EVENTS]) > SLOW]
-    agreed(f"e = {elasticity:g}, Box2D", exact, theirs, [p.events for p in paths], fast)
+    assert_agreement(f"e = {elasticity:g}, Box2D", exact, theirs, [p.events for p in paths], fast)
 
 
-def agreed(name: str, exact: list, theirs: list, ours: list, scenes: Sequence[int]) -> None:
+def assert_agreement(name: str, exact: list, theirs: list, ours: list, scenes: Sequence[int]) -> None:
     """Asserts that another engine finds gen2d's events in these scenes, but where it is off the exact ones."""
     off = {scenes[i] for found in disagree([exact[i] for i in scenes], [theirs[i] for i in scenes]) for i in found}
     kept = [i for i in scenes if i not in off]
@@ -168,7 +168,7 @@ def channel(width: float) -> list:
     return [((0.0, 0.0), (width, 0.0)), ((width, 0.0), (width, 20.0)), ((0.0, 20.0), (0.0, 0.0))]
 
 
-def piled(things: list[Thing], walls: list, elasticity: float = 0.0) -> Setting:
+def pile_in(things: list[Thing], walls: list, elasticity: float = 0.0) -> Setting:
     """The scene of a pile."""
     return Setting(things, walls, GRAVITY, elasticity, FRICTION)
 
@@ -177,12 +177,12 @@ def pyramid(elasticity: float) -> Setting:
     """Six rows of discs between walls, a millimetre apart."""
     air, rise = 1.001, math.sqrt(0.75)
     places = [(air * (0.5 + 0.5 * k + i), air * (0.5 + k * rise)) for k in range(6) for i in range(6 - k)]
-    return piled([Thing(x) for x in places], channel(6 * air), elasticity)
+    return pile_in([Thing(x) for x in places], channel(6 * air), elasticity)
 
 
 def column(elasticity: float) -> Setting:
     """Ten discs that fall against the walls of a channel 1.2 diameters wide."""
-    return piled([Thing((0.5 + 0.2 * (k % 2), 0.5 + k)) for k in range(10)], channel(1.2), elasticity)
+    return pile_in([Thing((0.5 + 0.2 * (k % 2), 0.5 + k)) for k in range(10)], channel(1.2), elasticity)
 
 
 def bin_of_32(elasticity: float) -> Setting:
@@ -192,19 +192,19 @@ def bin_of_32(elasticity: float) -> Setting:
         Thing((0.5 + k % 4 + rng.uniform(-0.05, 0.05), 0.5 + 1.05 * (k // 4)), radius=rng.uniform(0.3, 0.45))
         for k in range(32)
     ]
-    return piled(things, channel(4.0), elasticity)
+    return pile_in(things, channel(4.0), elasticity)
 
 
 def tower(count: int) -> Setting:
     """Boxes on each other, 5 mm apart."""
-    return piled([Thing((0, 0.5 + 1.005 * k), size=(1, 1)) for k in range(count)], FLOOR)
+    return pile_in([Thing((0, 0.5 + 1.005 * k), size=(1, 1)) for k in range(count)], FLOOR)
 
 
 def bricks(courses: int) -> Setting:
     """A wall, two bricks long, with half bricks at the ends of every other course."""
     odd, even = [(-0.505, 1.0), (0.505, 1.0)], [(-0.7575, 0.5), (0.0, 1.0), (0.7575, 0.5)]
     rows = [(k, x, width) for k in range(courses) for x, width in (even if k % 2 else odd)]
-    return piled([Thing((x, 0.25 + 0.505 * k), size=(width, 0.5)) for k, x, width in rows], FLOOR)
+    return pile_in([Thing((x, 0.25 + 0.505 * k), size=(width, 0.5)) for k, x, width in rows], FLOOR)
 
 
 def heap(rows: int) -> Setting:
@@ -215,7 +215,7 @@ def heap(rows: int) -> Setting:
         sizes = [(rng.uniform(0.7, 0.95), height) for _ in range(rows - k)]
         things += [Thing((i - (rows - 1 - k) / 2, base + height / 2), size=s) for i, s in enumerate(sizes)]
         base += 1.005 * height
-    return piled(things, FLOOR)
+    return pile_in(things, FLOOR)
 
 
 def figures(setting: Setting, path: Path, settle: int, skin: float = 0.0) -> tuple[float, float, float]:
@@ -287,8 +287,8 @@ def kolmogorov_smirnov(one: np.ndarray, two: np.ndarray) -> float:
     return min(1.0, max(0.0, sum(terms))) if reach > 0.2 else 1.0
 
 
-def settled_to(setting: Setting, path: Path) -> dict[str, float]:
-    """What is left of the kinetic energy, and how high the discs lie."""
+def settling_figures(setting: Setting, path: Path) -> dict[str, float]:
+    """Kinetic energy left over, as a fraction, and heights of the discs in m."""
     mass, moment = (np.array([getattr(t, n) for t in setting.things]) for n in ("mass", "moment"))
     energy = 0.5 * (mass * (path.speeds[..., :2] ** 2).sum(-1) + moment * path.speeds[..., 2] ** 2).sum(-1)
     left = {f"kinetic energy after {t:g} s": float(energy[round(60 * t)] / energy[0]) for t in (0.5, 1, 2, 3)}
@@ -302,7 +302,7 @@ def test_many_hits_are_distributed_as_in_chipmunk(elasticity):
     settings = [Setting(discs(seed, 8), box(SIDE), GRAVITY, elasticity, FRICTION) for seed in range(500)]
     paths = gen2d_paths(run([gen2d_world(s, 8) for s in settings], 6 * 60 + 1, 4), settings)
     ours, theirs = (
-        [settled_to(s, p) for s, p in zip(settings, of, strict=True)]
+        [settling_figures(s, p) for s, p in zip(settings, of, strict=True)]
         for of in (paths, [chipmunk_path(s, 6) for s in settings])
     )
     chances = {}

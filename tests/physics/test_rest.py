@@ -21,7 +21,7 @@ def wall(x: float, height: float = 60.0) -> dict:
     return {"a": (x, -1.0), "b": (x, height), "elasticity": 1.0, "friction": 0.0}
 
 
-def rested(case: Case, slots: int, settle: int, walls: int = 4) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def rest_measures(case: Case, slots: int, settle: int, walls: int = 4) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Overlap in m, way in m and speed in m/s over the 10 s after `settle` s, at most, by pose; the bodies upright and
     mirrored, at 60 frames per s."""
     worlds = [pose_world(case, pose, slots, walls) for pose in (QUARTERS[0], POSES[4])]
@@ -46,7 +46,7 @@ def test_one_disc_rests():
 def test_column_of_ten_in_a_channel_rests():
     discs = [{"x": (0, RADIUS * (1 + 2 * k)), "elasticity": 0.5, "friction": 0.5} for k in range(10)]
     case = Case(discs, [FLOOR, wall(-RADIUS), wall(RADIUS)], DOWN)
-    depth, way, speed = rested(case, 16, settle=5)
+    depth, way, speed = rest_measures(case, 16, settle=5)
     holds("Rest: column of 10, overlap, m", np.maximum(depth, 0), 0.005)
     holds("Rest: column of 10, way in 10 s, m", way, 1e-3)
     holds("Rest: column of 10, speed, m/s", speed, 1e-3)
@@ -58,7 +58,7 @@ def test_zigzag_channel_of_sixteen_rests():
     side, rise = width / 2 - RADIUS, np.sqrt((2 * RADIUS) ** 2 - (width - 2 * RADIUS) ** 2)
     discs = [{"x": ((-1) ** k * side, RADIUS + k * rise), "elasticity": 0} for k in range(16)]
     case = Case(discs, [FLOOR, wall(-width / 2), wall(width / 2)], DOWN)
-    depth, way, speed = rested(case, 16, settle=5)
+    depth, way, speed = rest_measures(case, 16, settle=5)
     holds("Rest: zigzag channel of 16, overlap, m", np.maximum(depth, 0), 0.011)
     holds("Rest: zigzag channel of 16, way in 10 s, m", way, 1e-3)
     holds("Rest: zigzag channel of 16, speed, m/s", speed, 1e-3)
@@ -69,7 +69,7 @@ def test_walled_pyramid_of_six_rows_rests():
     places = [(k - (n - 1) / 2, 0.5 + (rows - n) * np.sqrt(0.75)) for n in range(rows, 0, -1) for k in range(n)]
     discs = [{"x": x, "elasticity": 0, "friction": np.sqrt(0.5)} for x in places]
     case = Case(discs, [{**FLOOR, "friction": np.sqrt(0.5)}, wall(-rows / 2), wall(rows / 2)], DOWN)
-    depth, way, speed = rested(case, 22, settle=5)
+    depth, way, speed = rest_measures(case, 22, settle=5)
     holds("Rest: pyramid of 6 rows, overlap, m", np.maximum(depth, 0), 0.005)
     holds("Rest: pyramid of 6 rows, way in 10 s, m", way, 1e-3)
     holds("Rest: pyramid of 6 rows, speed, m/s", speed, 1e-3)
@@ -93,7 +93,7 @@ def bin_of(count: int, width: float) -> Case:
 
 @pytest.mark.parametrize(("count", "width"), [(32, 6.0), pytest.param(64, 8.0, marks=pytest.mark.slow)])
 def test_full_bin_rests(count, width):
-    depth, way, speed = rested(bin_of(count, width), count, settle=15)
+    depth, way, speed = rest_measures(bin_of(count, width), count, settle=15)
     holds(f"Rest: bin of {count}, overlap, m", np.maximum(depth, 0), 0.01)
     holds(f"Rest: bin of {count}, speed, m/s", speed, 2e-2)
     holds(f"Rest: bin of {count}, way in 10 s, m", way, 1e-3)
@@ -107,7 +107,7 @@ def test_bowl_of_the_article_rests():
     ]
     places = [(2, 2 + 2), (4, 3 + 2), (3, 6 + 2), (6, 5 + 2), (5, 7 + 2)]
     discs = [{"x": x, "radius": 1, "mass": 1, "moment": 0.5, "elasticity": 0.5, "friction": 0.2} for x in places]
-    depth, way, speed = rested(Case(discs, bowl, DOWN), 8, settle=30)
+    depth, way, speed = rest_measures(Case(discs, bowl, DOWN), 8, settle=30)
     holds("Rest: bowl of the article, overlap, m", np.maximum(depth, 0), 0.005)
     holds("Rest: bowl of the article, way in 10 s, m", way, 1e-3)
     holds("Rest: bowl of the article, speed, m/s", speed, 1e-3)
@@ -119,7 +119,7 @@ def test_heavy_disc_rests_on_a_light_one(ratio, bound):
     for name, first, second in (("heavy on light", *discs), ("light on heavy", *discs[::-1])):
         pair = [{**first, "x": discs[0]["x"]}, {**second, "x": discs[1]["x"]}]
         pair = [{**d, "elasticity": 0, "friction": 0.5} for d in pair]
-        depth, way, speed = rested(Case(pair, [FLOOR, wall(-RADIUS), wall(RADIUS)], DOWN), 8, settle=5)
+        depth, way, speed = rest_measures(Case(pair, [FLOOR, wall(-RADIUS), wall(RADIUS)], DOWN), 8, settle=5)
         holds(f"Mass ratio {ratio}, {name}: overlap, m", np.maximum(depth, 0), bound)
         holds(f"Mass ratio {ratio}, {name}: way in 10 s, m", way, 1e-3)
         holds(f"Mass ratio {ratio}, {name}: speed, m/s", speed, 1e-3)
@@ -139,7 +139,7 @@ def test_c17_disc_rests_in_a_v_groove_without_swinging():
     holds("C17 V-groove: speed after 0.5 s, m/s", made.v[..., 120:, 0, :], 1e-4)
 
 
-def joined(pieces: int, length: float) -> list[dict]:
+def floor_of_segments(pieces: int, length: float) -> list[dict]:
     """A floor from -length / 2 to length / 2 in collinear pieces; an even number has a joint at 0."""
     ends = np.linspace(-length / 2, length / 2, pieces + 1)
     return [{**FLOOR, "a": (a, 0), "b": (b, 0)} for a, b in itertools.pairwise(ends)]
@@ -151,10 +151,10 @@ DROP = 1.0  # m
 
 
 @functools.cache
-def dropped_on_joints() -> tuple[np.ndarray, np.ndarray]:
+def drop_on_joints() -> tuple[np.ndarray, np.ndarray]:
     """Places and velocities, [elasticity, pieces, offset, pose, frame, 2], of a disc that falls 1 m on a floor."""
     cases = [
-        Case([{"x": (x, RADIUS + DROP), "elasticity": e, "friction": 0.5}], joined(pieces, 8.0), DOWN)
+        Case([{"x": (x, RADIUS + DROP), "elasticity": e, "friction": 0.5}], floor_of_segments(pieces, 8.0), DOWN)
         for e in ELASTICITIES
         for pieces in PIECES
         for x in OFFSETS
@@ -168,7 +168,7 @@ def dropped_on_joints() -> tuple[np.ndarray, np.ndarray]:
 @pytest.mark.parametrize("elasticity", ELASTICITIES)
 def test_c18_disc_dropped_on_a_joint_moves_as_on_one_segment(elasticity, pieces):
     """The article's disc fell through, or rebounded at 2.1 times the speed."""
-    x, v = (a[ELASTICITIES.index(elasticity)] for a in dropped_on_joints())
+    x, v = (a[ELASTICITIES.index(elasticity)] for a in drop_on_joints())
     case = f"C18 {pieces} pieces, e = {elasticity:g}"
     arrival = np.sqrt(2 * DROP * GRAVITY)
     frame = round(arrival / GRAVITY / STEP) + 2
@@ -181,7 +181,7 @@ def test_c18_disc_dropped_on_a_joint_moves_as_on_one_segment(elasticity, pieces)
 def test_c19_disc_rolls_over_joints_without_feeling_them():
     u = 3.0
     disc = {"x": (-4.5, RADIUS), "v": (u, 0), "spin": -u / RADIUS, "elasticity": 0, "friction": 0.5}
-    made = watch([Case([{**disc, "elasticity": e}], joined(16, 11.2), DOWN) for e in (0, 0.5)], walls=16)
+    made = watch([Case([{**disc, "elasticity": e}], floor_of_segments(16, 11.2), DOWN) for e in (0, 0.5)], walls=16)
     holds("C19 rolling over joints: height, m", made.x[..., 0, 1] - RADIUS, SLOP)
     holds("C19 rolling over joints: speed along, m/s", made.v[..., 0, 0] - u, 1e-4)
     holds("C19 rolling over joints: speed up, m/s", made.v[..., 0, 1], 1e-4)
@@ -194,8 +194,8 @@ SPEEDS, SIZES, PHASES = (5.0, 50.0, 500.0), (0.05, 0.25, 1.0), range(16)
 SHOTS = [(r, v, STEP * phase / 16, e) for r in SIZES for v in SPEEDS for phase in PHASES for e in (0, 1)]
 
 
-def beyond(shots: list[Case]) -> np.ndarray:
-    """Places of the discs, [shot, turn, frame, slot, 2], in the frame of the shots; every step of 0.5 s, 4 turns."""
+def shot_positions(shots: list[Case]) -> np.ndarray:
+    """Positions of the discs, [shot, turn, frame, slot, 2], in the frame of the shots; every step of 0.5 s, 4 turns."""
     found = []
     for k in range(0, len(shots), len(SHOTS)):  # one size of batch, one program
         worlds = [pose_world(case, turn, 2, 2) for turn in QUARTERS for case in shots[k : k + len(SHOTS)]]
@@ -213,7 +213,7 @@ def shots_at(segments: list[dict], aims: list[float]) -> list[Case]:
     ]
 
 
-def none(crossed: Any) -> None:
+def assert_none(crossed: Any) -> None:
     """Asserts that no shot, [shot, turn], has crossed; the message tells sizes and speeds of those that have."""
     bad = np.resize(np.array(SHOTS), (len(crossed), 4))[crossed.any(1)]
     kinds = sorted({(float(r), float(v)) for r, v, *_ in bad})
@@ -221,19 +221,19 @@ def none(crossed: Any) -> None:
 
 
 def test_no_disc_passes_a_segment():
-    x = beyond(shots_at([{"a": (0, -5), "b": (0, 5)}], [0.01]))
-    none((x[..., 0, 0] >= 0).any(2))
+    x = shot_positions(shots_at([{"a": (0, -5), "b": (0, 5)}], [0.01]))
+    assert_none((x[..., 0, 0] >= 0).any(2))
 
 
 def test_no_disc_passes_a_segment_near_its_end():
-    x = beyond(shots_at([{"a": (0, -5), "b": (0, 0)}], [-0.01, -0.5]))[..., 0, :]
-    none(((x[:, :, 1:, 0] >= 0) & (x[:, :, :-1, 0] < 0) & (x[:, :, 1:, 1] <= 0)).any(2))
+    x = shot_positions(shots_at([{"a": (0, -5), "b": (0, 0)}], [-0.01, -0.5]))[..., 0, :]
+    assert_none(((x[:, :, 1:, 0] >= 0) & (x[:, :, :-1, 0] < 0) & (x[:, :, 1:, 1] <= 0)).any(2))
 
 
 def test_no_disc_passes_an_end_cap():
     """Along the segment, head on: it is thrown back or stopped."""
-    x = beyond(shots_at([{"a": (0, 0), "b": (20, 0)}], [0]))
-    none((x[..., 0, 0] >= 0).any(2))
+    x = shot_positions(shots_at([{"a": (0, 0), "b": (20, 0)}], [0]))
+    assert_none((x[..., 0, 0] >= 0).any(2))
 
 
 @pytest.mark.parametrize("half", [15, 45, 80])
@@ -246,9 +246,9 @@ def test_no_disc_leaves_a_wedge_through_its_corner(half):
         for y in (0, 0.3)
         for r, v, late, e in SHOTS
     ]
-    x = beyond(shots)[..., 0, :]
+    x = shot_positions(shots)[..., 0, :]
     sin, cos = np.sin(np.radians(half)), np.cos(np.radians(half))
-    none((-sin * x[..., 0] <= cos * np.abs(x[..., 1])).any(2))
+    assert_none((-sin * x[..., 0] <= cos * np.abs(x[..., 1])).any(2))
 
 
 @pytest.mark.parametrize("mass", [1, 100])
@@ -259,8 +259,8 @@ def test_no_disc_passes_a_disc(mass):
               {"x": (2 * r, 0), "v": (-v / 2, 0), "radius": r, "elasticity": e, "mass": 1}])
         for r, v, late, e in SHOTS
     ]  # fmt: skip
-    x = beyond(shots)
-    none((x[..., 1, 0] <= x[..., 0, 0]).any(2))
+    x = shot_positions(shots)
+    assert_none((x[..., 1, 0] <= x[..., 0, 0]).any(2))
 
 
 def test_far_things_are_far():

@@ -54,7 +54,7 @@ def test_other_axes_are_refused_with_the_name_of_the_field(wrong: dict):
 def test_simulate_refuses_records_of_another_layout():
     scene, state, layout = world([{"x": (k, 0)} for k in range(SLOTS)])
     scene, state = (to_device(jax.tree.map(lambda x: x[None], record)) for record in (scene, state))
-    other = dataclasses.replace(layout, runs=(SlotGroup("circle", SLOTS + 1), *layout.runs[1:]))
+    other = dataclasses.replace(layout, groups=(SlotGroup("circle", SLOTS + 1), *layout.groups[1:]))
     fewer = dataclasses.replace(state, velocity=state.velocity[:, 1:])
     for given, where, name in ((state, other, "objects/present"), (fewer, layout, "states/velocity")):
         with pytest.raises(AssertionError, match=name):

@@ -29,7 +29,7 @@ HEIGHT, WIDTH = 40, 44
 PATCHES, DENSE = (jax.jit(form, static_argnums=1) for form in (rasterizer.draw_tiles, rasterizer.draw_dense))
 DISCS = Layout((SlotGroup("circle", 4),), (0.0, 0.0, 10.0, 10.0), 1.6)
 SHAPES_ALL = Layout(
-    (*DISCS.runs, *(SlotGroup(shape, 2) for shape in SHAPES[2:]), SlotGroup("segment", 4, STATIC)), DISCS.bounds, 1.6
+    (*DISCS.groups, *(SlotGroup(shape, 2) for shape in SHAPES[2:]), SlotGroup("segment", 4, STATIC)), DISCS.bounds, 1.6
 )
 
 
@@ -44,7 +44,7 @@ def scene_of(layout):
     places = [(2.5, 3), (7, 7.1), (7.3, 2), (0, 0)]
     discs = [{"x": place, "radius": radius} for place, radius in zip(places, (1.6, 1.2, 1.3, 0), strict=True)]
     scene, state, _ = world(discs + [{"radius": 0}] * (layout.slots - 4))
-    shape = np.repeat([SHAPES.index(run.shape) for run in layout.runs], [run.count for run in layout.runs])
+    shape = np.repeat([SHAPES.index(run.shape) for run in layout.groups], [run.count for run in layout.groups])
     present = np.arange(layout.slots) != 3
     colors = rng.integers(0, 256, (layout.slots, 3)) * present[:, None]
     objects = dataclasses.replace(

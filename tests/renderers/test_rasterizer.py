@@ -36,7 +36,7 @@ REACH = 1.5  # m, of all that moves
 
 def shapes(rng, layout):
     """Bodies of every run, with polygons that are convex and of REACH at most, some corners given more than once."""
-    slots, most = layout.slots, max(run.vertices for run in layout.runs)
+    slots, most = layout.slots, max(run.vertices for run in layout.groups)
     radius, half = rng.uniform(0.1, REACH / 2, slots), rng.uniform(0, REACH / 2, slots)
     vertices = np.zeros((slots, most, 2))
     for run, first in layout.spans:

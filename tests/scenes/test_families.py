@@ -22,7 +22,7 @@ from gen2d.config.distributions import Distribution, Span, next_float32
 from gen2d.config.options import factor_options
 from gen2d.config.plugin_options import Plugin
 from gen2d.core.enums import DYNAMIC, SHAPES
-from gen2d.physics.collision import Disc, Hull, Shape, touches
+from gen2d.physics.collision import Disc, Hull, Shape, manifold
 from gen2d.physics.params import solver_params
 from gen2d.physics.shapes import body_shape_of, to_world
 from gen2d.physics.simulate import simulate, substeps
@@ -110,7 +110,7 @@ def overlap(layout: Layout, shapes: list[Any], present: jax.Array) -> jax.Array:
         if not pairs:
             continue
         i, j = np.array(pairs).T
-        gaps = jnp.stack([point.gap for point in touches(of_a(i), of_b(j))]).min(0)
+        gaps = jnp.stack([point.gap for point in manifold(of_a(i), of_b(j))]).min(0)
         both = present[first + i] & present[second + j]
         deepest = jnp.maximum(deepest, jnp.where(both, -gaps, -jnp.inf).max(0))
     return deepest

@@ -68,7 +68,7 @@ def test_a_scene_can_be_batched():
     space.add_segment((-5, 0), (5, 0), elasticity=1)
     space.add_circle((0, 1), 0.5, elasticity=0.5)
     scene, state, layout = space.scene()
-    rules, steps = space._rules(30.0, None)
+    rules, steps = space._solver_params(30.0, None)
     scenes, states = (jax.tree.map(lambda x: jnp.stack([x, x]), record) for record in (scene, state))
     made = to_stored(
         jax.jit(lambda s, t: simulate(to_device(s), to_device(t), layout, rules, 31, steps))(scenes, states)

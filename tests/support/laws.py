@@ -111,8 +111,8 @@ def to_double(worlds: Sequence[tuple]) -> list[tuple]:
 def overlaps(one: tuple, position: np.ndarray) -> np.ndarray:
     """Deepest overlap at each frame, m [T], of a world with its discs at `position` [T, K, 2]."""
     scene, state, layout = one
-    n, present = layout.runs[0].count, np.asarray(scene.objects.present)
-    radius, x = np.asarray(scene.objects.radius, float), np.asarray(position, float)[:, : layout.runs[0].count]
+    n, present = layout.groups[0].count, np.asarray(scene.objects.present)
+    radius, x = np.asarray(scene.objects.radius, float), np.asarray(position, float)[:, : layout.groups[0].count]
     distance = np.linalg.norm(x[:, :, None] - x[:, None], axis=-1)
     pairs = present[:n, None] & present[None, :n] & ~np.eye(n, dtype=bool)
     depths = np.where(pairs, radius[:n, None] + radius[None, :n] - distance, -np.inf).max((1, 2))

@@ -174,7 +174,7 @@ def energies(worlds: Sequence[tuple[Scene, State, Layout]], trajectory: Trajecto
     """Kinetic and potential energy of each video and frame, J [n, T]."""
     total = []
     for i, (scene, _, layout) in enumerate(worlds):
-        mass, moment, x, v, w = _disc_states(scene, trajectory, i, layout.runs[0].count)
+        mass, moment, x, v, w = _disc_states(scene, trajectory, i, layout.groups[0].count)
         fall = -np.einsum("tkd,d->tk", x, np.asarray(scene.gravity, float)) * mass
         total.append((0.5 * mass * (v**2).sum(-1) + 0.5 * moment * w**2 + fall).sum(-1))
     return np.array(total)
@@ -184,7 +184,7 @@ def momenta(worlds: Sequence[tuple[Scene, State, Layout]], trajectory: Trajector
     """Linear [n, T, 2] and angular [n, T] momentum about the origin."""
     linear, angular = [], []
     for i, (scene, _, layout) in enumerate(worlds):
-        mass, moment, x, v, w = _disc_states(scene, trajectory, i, layout.runs[0].count)
+        mass, moment, x, v, w = _disc_states(scene, trajectory, i, layout.groups[0].count)
         linear.append((mass[:, None] * v).sum(1))
         cross = x[..., 0] * v[..., 1] - x[..., 1] * v[..., 0]
         angular.append((mass * cross + moment * w).sum(-1))
