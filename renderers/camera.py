@@ -9,11 +9,12 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from gen2d.records.axes import Array
 from gen2d.records.keys import key_for
 from gen2d.records.layout import Layout
-from gen2d.records.parameter import apply
+from gen2d.records.parameter import maximum, minimum
 from gen2d.records.scene import State
 
 TREMOR = (1.0, 1.37, 2.11)  # frequencies of hand shake, relative to the lowest
@@ -55,7 +56,7 @@ def pixel_at(column: Array, row: Array, height: int, width: int) -> tuple[Array,
 def fit_bounds(bounds: tuple[float, ...], height: int, width: int, margin: float) -> tuple[tuple[float, float], float]:
     """Centre (m) and scale (px/m) that fit `bounds` (left, bottom, right, top) and `margin` in m into a frame."""
     left, bottom, right, top = bounds
-    scale = apply(min, width / (right - left + 2 * margin), height / (top - bottom + 2 * margin))
+    scale = minimum(width / (right - left + 2 * margin), height / (top - bottom + 2 * margin))
     return ((left + right) / 2, (bottom + top) / 2), scale
 
 
@@ -76,8 +77,8 @@ def initial_view(options: Any, layout: Layout, height: int, width: int) -> tuple
 
 def largest_scale(options: Any, layout: Layout, height: int, width: int, seconds: float) -> float:
     """Upper bound of the scale (px/m) over a video of `seconds`; infinite if zoom may reach a factor of exp(50)."""
-    rate = apply(max, options.zoom.support[1], 0.0) * seconds
-    return initial_view(options, layout, height, width)[1] * apply(math.exp, rate) if rate < 50 else math.inf
+    rate = maximum(options.zoom.support[1], 0.0) * seconds
+    return initial_view(options, layout, height, width)[1] * np.exp(rate) if rate < 50 else math.inf
 
 
 def sample_view(

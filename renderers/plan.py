@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import operator
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -13,7 +14,7 @@ from gen2d.renderers.camera import to_pixels
 from gen2d.renderers.paint import Paint
 from gen2d.renderers.primitives import BodyGeometry, Instants, PixelWindow
 
-LANES = 8  # px; the sides of tiles are multiples of this: whole SIMD vectors, and few programs
+LANES = 8  # px; tile widths are rounded up to multiples of this, whole SIMD vectors
 
 
 class Occluders(NamedTuple):
@@ -97,8 +98,9 @@ class TileGroup(NamedTuple):
         """Rows and columns of a tile."""
         if self.reach == math.inf:
             return height, width
-        side = int(-(-(math.floor(2 * self.reach) + 2) // LANES)) * LANES
-        return min(side, height), min(side, width)
+        # Even, so that fewer reaches need a program of their own.
+        rows = operator.index(-(-math.floor(2 * self.reach) // 2)) * 2 + 2
+        return min(rows, height), min(-(-rows // LANES) * LANES, width)
 
 
 def tile_windows(plan: FramePlan, group: TileGroup, at: Instants, run: SlotGroup, first: int) -> PixelWindow:

@@ -5,6 +5,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from gen2d.config.config import Config
+from gen2d.config.distributions import Distribution
 from gen2d.config.plugin_options import Plugin
 from gen2d.config.sections import StorageOptions
 from gen2d.config.splits import Split
@@ -19,7 +20,7 @@ def split_numbers(config: Config) -> tuple[str, list[Any]]:
 
     def take(number: Any) -> str:
         numbers.append(number)
-        return "number"
+        return type(number).__name__
 
     return repr(_replaced(config, take)), numbers
 
@@ -53,6 +54,10 @@ def _converted(value: Any, convert: Number, listed: bool = False) -> Any:
         return tuple(_converted(part, convert, listed=True) for part in value)
     if isinstance(value, Mapping):
         return {key: _converted(part, convert) for key, part in value.items()}
+    if isinstance(value, Distribution):
+        kind = int if value.kind == "integer" else float
+        numbers, parts = tuple(convert(kind(x)) for x in value.numbers), _converted(value.parts, convert)
+        return dataclasses.replace(value, numbers=numbers, parts=parts)
     if isinstance(value, Plugin):
         return dataclasses.replace(value, options=_converted(value.options, convert), written_options=None)
     if dataclasses.is_dataclass(value) and not isinstance(value, type):

@@ -4,7 +4,7 @@ import dataclasses
 import math
 
 from gen2d.config.sections import PhysicsOptions
-from gen2d.records.parameter import apply
+from gen2d.records.parameter import minimum
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,7 +35,7 @@ def solver_params(physics: PhysicsOptions, fps: float, steps: int) -> SolverPara
     return SolverParams(
         step=step,
         bounce_threshold=physics.bounce_threshold,
-        hertz=apply(min, physics.contact_hertz, 0.125 / step),
+        hertz=minimum(physics.contact_hertz, 0.125 / step),
         damping_ratio=physics.contact_damping_ratio,
         push_speed=physics.push_speed,
         damping=physics.damping,

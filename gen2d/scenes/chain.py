@@ -4,9 +4,9 @@ Links collide neither with each other nor with the pins.
 """
 
 import dataclasses
-import math
 
 import jax.numpy as jnp
+import numpy as np
 
 from gen2d.plugin import (
     STATIC,
@@ -20,6 +20,8 @@ from gen2d.plugin import (
     SlotGroup,
     builder,
     common,
+    maximum,
+    minimum,
     option,
 )
 
@@ -74,11 +76,11 @@ def _bounds(options: Options, whole: float) -> tuple[float, float, float, float]
     """Bounds in m of the region that a chain of this length can reach, without its rarely reached upper part."""
     rim = 2 * options.radius.support[1]
     if options.ends == 1:
-        turn = min(max(map(abs, options.angle.support)), math.pi)
-        return -whole - rim, -whole - rim, whole + rim, max(-math.cos(turn), 0.2) * whole + rim
+        turn = minimum(maximum(*map(abs, options.angle.support)), np.pi)
+        return -whole - rim, -whole - rim, whole + rim, maximum(-np.cos(turn), 0.2) * whole + rim
     # An ellipse with the pins as its foci.
-    depth = whole / 2 * math.sqrt(1 - options.span.support[0] ** 2)
-    tilt = whole / 2 * math.sin(min(max(map(abs, options.slope.support)), math.pi / 2))
+    depth = whole / 2 * np.sqrt(1 - options.span.support[0] ** 2)
+    tilt = whole / 2 * np.sin(minimum(maximum(*map(abs, options.slope.support)), np.pi / 2))
     top = depth if options.pulled_above.support[1] else 0.2 * depth
     return -whole / 2 - rim, -depth - tilt - rim, whole / 2 + rim, top + tilt + rim
 

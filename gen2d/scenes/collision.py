@@ -22,6 +22,7 @@ from gen2d.plugin import (
     SlotGroup,
     builder,
     common,
+    maximum,
     option,
 )
 
@@ -76,7 +77,7 @@ def sizes(options: Options) -> dict[str, int]:
 
 def layout(options: Options) -> Layout:
     """The first ball and the second."""
-    reach = max(options.radius_1.support[1], options.radius_2.support[1])
+    reach = maximum(options.radius_1.support[1], options.radius_2.support[1])
     return Layout((SlotGroup("circle", 2),), (0.0, 0.0, options.width, options.height), reach)
 
 

@@ -4,7 +4,7 @@ import dataclasses
 
 import jax.numpy as jnp
 
-from gen2d.plugin import STATIC, Array, Distribution, Family, Layout, SampledScene, SlotGroup, builder, common
+from gen2d.plugin import STATIC, Array, Distribution, Family, Layout, SampledScene, SlotGroup, builder, common, maximum
 
 
 @dataclasses.dataclass(frozen=True)
@@ -47,8 +47,8 @@ def layout(options: Options) -> Layout:
     row = most * thickness + (most - 1) * gap
     width = 2 * radius + ball_distance + row + height  # room for the last one to fall
     groups = SlotGroup("segment", 1, STATIC), SlotGroup("circle", 1), SlotGroup("polygon", most, vertices=4)
-    top = max(1.2 * height, ball_height * height + radius)
-    reach = max((height**2 + thickness**2) ** 0.5 / 2, radius)
+    top = maximum(1.2 * height, ball_height * height + radius)
+    reach = maximum((height**2 + thickness**2) ** 0.5 / 2, radius)
     return Layout(groups, (0.0, 0.0, width, top), reach)
 
 

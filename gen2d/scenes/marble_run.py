@@ -4,6 +4,7 @@ import dataclasses
 import math
 
 import jax.numpy as jnp
+import numpy as np
 
 from gen2d.plugin import STATIC, Array, Distribution, Family, Layout, SampledScene, SlotGroup, builder, common, option
 
@@ -58,7 +59,7 @@ def check(options: Options) -> None:
 def headroom(options: Options) -> float:
     """Height that the ball needs above the first ramp's upper end, m."""
     largest = options.radius.support[1]
-    return largest * (1 + 1 / math.cos(options.slope.support[1])) + options.drop_height.support[1]
+    return largest * (1 + 1 / np.cos(options.slope.support[1])) + options.drop_height.support[1]
 
 
 def layout(options: Options) -> Layout:

@@ -1,9 +1,9 @@
 """A pendulum of one link or two: rods with a bob at the end of each, which do not collide."""
 
 import dataclasses
-import math
 
 import jax.numpy as jnp
+import numpy as np
 
 from gen2d.plugin import (
     STATIC,
@@ -17,6 +17,7 @@ from gen2d.plugin import (
     SlotGroup,
     builder,
     common,
+    maximum,
     option,
 )
 
@@ -54,10 +55,10 @@ def layout(options: Options) -> Layout:
     for i in range(n):
         rod, bob = 1 + i, 1 + n + i
         joints += [JointSpec("revolute", bob - 1 if i else 0, bob), *[JointSpec("revolute", rod, bob)] * 2]
-    room, widest = n * length + radius, max(map(abs, options.angle.support))
-    low = n == 1 and options.spin.support == (0.0, 0.0) and widest < math.pi / 2
-    top = max(radius - math.cos(widest) * options.length.support[0] if low else room, PIN)
-    return Layout((pin, rods, bobs), (-room, -room, room, top), max(length / 2 + ROD, radius), tuple(joints))
+    room, widest = n * length + radius, maximum(*map(abs, options.angle.support))
+    low = n == 1 and options.spin.support == (0.0, 0.0) and widest < np.pi / 2
+    top = maximum(radius - np.cos(widest) * options.length.support[0] if low else room, PIN)
+    return Layout((pin, rods, bobs), (-room, -room, room, top), maximum(length / 2 + ROD, radius), tuple(joints))
 
 
 def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledScene:

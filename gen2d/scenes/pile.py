@@ -5,6 +5,7 @@ import math
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from gen2d.plugin import (
     STATIC,
@@ -16,6 +17,7 @@ from gen2d.plugin import (
     SlotGroup,
     builder,
     common,
+    maximum,
     option,
     place,
 )
@@ -57,7 +59,8 @@ class Options:
 def reach(options: Options) -> float:
     """Largest distance of an object's boundary from its centre, m."""
     stadium = options.capsule_radius.support[1] + options.capsule_half_length.support[1]
-    return max(options.disc_radius.support[1], math.hypot(*(side.support[1] for side in options.box_size)) / 2, stadium)
+    diagonal = np.hypot(*(side.support[1] for side in options.box_size))
+    return maximum(options.disc_radius.support[1], diagonal / 2, stadium)
 
 
 def check(options: Options) -> None:

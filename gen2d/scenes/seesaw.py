@@ -16,6 +16,7 @@ from gen2d.plugin import (
     SlotGroup,
     builder,
     common,
+    maximum,
 )
 
 
@@ -66,9 +67,9 @@ def layout(options: Options) -> Layout:
         SlotGroup("polygon", most, vertices=4, layer=1),
     )
     top = options.pivot_height.support[1] + options.thickness.support[1] / 2 + options.drop_height.support[1] + height
-    half = length / 2 + max(width, height)  # room for weights that slide off
-    reach = max(length**2 + options.thickness.support[1] ** 2, width**2 + height**2) ** 0.5 / 2
-    return Layout(groups, (-half, 0.0, half, max(top, length / 2)), reach, (JointSpec("revolute", 1, 2),))
+    half = length / 2 + maximum(width, height)  # room for weights that slide off
+    reach = maximum(length**2 + options.thickness.support[1] ** 2, width**2 + height**2) ** 0.5 / 2
+    return Layout(groups, (-half, 0.0, half, maximum(top, length / 2)), reach, (JointSpec("revolute", 1, 2),))
 
 
 def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledScene:

@@ -15,6 +15,7 @@ from gen2d.plugin import (
     SlotGroup,
     builder,
     common,
+    maximum,
     option,
 )
 
@@ -43,8 +44,8 @@ class Options:
 def layout(options: Options) -> Layout:
     """The floor, then the blocks from the lowest up."""
     most, width, height = int(options.blocks.support[1]), options.width.support[1], options.height.support[1]
-    aside = max(map(abs, options.offset.support))
-    half = max(AROUND * most * height, width / 2 * (1 + aside * (most - 1) / 2)) + width / 2
+    aside = maximum(*map(abs, options.offset.support))
+    half = maximum(AROUND * most * height, width / 2 * (1 + aside * (most - 1) / 2)) + width / 2
     groups = SlotGroup("segment", 1, STATIC), SlotGroup("polygon", most, vertices=4)
     return Layout(groups, (-half, 0.0, half, most * height), (width**2 + height**2) ** 0.5 / 2)
 

@@ -15,6 +15,7 @@ from gen2d.plugin import (
     SlotGroup,
     builder,
     common,
+    maximum,
     option,
 )
 
@@ -70,8 +71,8 @@ def layout(options: Options) -> Layout:
     joints = [JointSpec("revolute", 1 + i, 2 + i) for i in range(n)] + [JointSpec("revolute", 2 + n, 1 + n)]
     tower = most * height
     left = -2 * radius - options.gap.support[1] - chain
-    top = max(options.ball_height.support[1] * tower + chain + PIN, tower)
-    reach = max(chain / n / 2 + LINK, radius, (width**2 + height**2) ** 0.5 / 2)
+    top = maximum(options.ball_height.support[1] * tower + chain + PIN, tower)
+    reach = maximum(chain / n / 2 + LINK, radius, (width**2 + height**2) ** 0.5 / 2)
     return Layout(groups, (left, 0.0, width + DEBRIS * tower, top), reach, tuple(joints))
 
 
