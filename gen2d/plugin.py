@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from gen2d.media import films
     from gen2d.records.axes import Array
     from gen2d.records.layout import JointSpec, Layout, SlotGroup
+    from gen2d.records.parameter import maximum, minimum
     from gen2d.records.scene import Scene
     from gen2d.renderers import extents
     from gen2d.renderers.camera import pixel_at, to_pixels

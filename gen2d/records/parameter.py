@@ -5,8 +5,8 @@ the host and is recorded on a `Tape`; where one meets a jax array, it becomes an
 needs a value, for a branch, a length or `int()`, the value is recorded as a guard. The program thus serves every config
 of the same structure whose numbers satisfy the guards, and the tape computes its arguments from these numbers.
 
-NumPy's functions take parameters (`np.sqrt`, `np.hypot`), and so do `maximum` and `minimum`. Those of `math` need values,
-`max` and `min` comparisons, so they leave guards.
+NumPy's functions take parameters (`np.sqrt`, `np.hypot`), and so do `maximum` and `minimum`. Those of `math` need
+values, and `max` and `min` comparisons, so they leave guards.
 """
 
 import contextlib

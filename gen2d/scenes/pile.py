@@ -59,8 +59,8 @@ class Options:
 def reach(options: Options) -> float:
     """Largest distance of an object's boundary from its centre, m."""
     stadium = options.capsule_radius.support[1] + options.capsule_half_length.support[1]
-    diagonal = np.hypot(*(side.support[1] for side in options.box_size))
-    return maximum(options.disc_radius.support[1], diagonal / 2, stadium)
+    width, height = (side.support[1] for side in options.box_size)
+    return maximum(options.disc_radius.support[1], np.hypot(width, height) / 2, stadium)
 
 
 def check(options: Options) -> None:
