@@ -126,15 +126,20 @@ class Rollout:
             return list(pool.map(draw, scenes_by_device))
 
     def lowered(self) -> dict[str, str]:
-        """Text of each program, lowered for one device."""
+        """Text of each program, lowered for one device, and its arguments that come from the numbers of the config."""
         numbers, scalar = jax.ShapeDtypeStruct((self.batch_size,), np.uint32), jax.ShapeDtypeStruct((), np.int32)
         grid = jax.ShapeDtypeStruct((self.batch_size, len(self.sampler.gridded)), np.float32)
         with jax.default_device(self.devices[0]):
             args = jax.ShapeDtypeStruct((3,), np.uint32), scalar, grid, numbers, numbers
-            simulation = self._simulation_program(self.devices[:1], args).lower(*args)
+            simulate = self._simulation_program(self.devices[:1], args)
+            simulation = simulate.lower(*args)
             args = simulation.out_info.render_scenes, scalar
-            rendering = self._draw_program(self.slice, args).lower(*args)
-        return {"simulate": simulation.as_text(), "draw": rendering.as_text()}
+            draw = self._draw_program(self.slice, args)
+            rendering = draw.lower(*args)
+        return {
+            "simulate": f"{simulation.as_text()}{simulate.values}",
+            "draw": f"{rendering.as_text()}{draw.values}",
+        }
 
     def _simulation_program(self, devices: Sequence[Any], args: tuple) -> BoundProgram:
         """Program that samples and simulates `batch_size` videos on each device."""

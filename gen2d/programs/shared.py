@@ -39,6 +39,11 @@ class BoundProgram(NamedTuple):
         """Result of the program, which is compiled on its first call for a device."""
         return self.program.jitted(self.numbers, *args, **named)
 
+    @property
+    def values(self) -> list[int]:
+        """Words of the arguments that the program uses."""
+        return self.numbers[: self.program.tape.size].tolist()
+
     def lower(self, *args: Any) -> Any:
         """The program, lowered for these arguments."""
         return self.program.jitted.lower(self.numbers, *args)
@@ -81,6 +86,15 @@ def program_for(config: Config, key: Hashable, build: Build, args: tuple, wrap: 
             for old in _programs.popitem(last=False)[1]:
                 old.jitted.clear_cache()
         return BoundProgram(program, numbers)
+
+
+def clear() -> None:
+    """Free all programs."""
+    with _lock:
+        for programs in _programs.values():
+            for program in programs:
+                program.jitted.clear_cache()
+        _programs.clear()
 
 
 def _traced(config: Config, build: Build, args: tuple, wrap: Wrap | None) -> Program:

@@ -19,6 +19,7 @@ import gen2d
 from gen2d.config.reading import yaml_text
 from gen2d.core.errors import ConfigError, FolderError, UserError
 from gen2d.generation.run import generate
+from gen2d.programs import shared
 from gen2d.programs.rollout import Rollout
 
 N = 21
@@ -110,18 +111,18 @@ def test_a_video_does_not_depend_on_the_number_of_devices(tiny: Path, tmp_path: 
         same(everything(tiny), everything(out))
 
 
-def test_a_run_leaves_none_of_its_compiled_programs_behind(tmp_path: Path):
-    def live_programs() -> list[str]:
-        names = [each.hlo_modules()[0].name for each in jax.devices()[0].client.live_executables()]
-        return sorted(name for name in names if name in ("jit__simulate_batch", "jit_render_slice"))
+def test_few_compiled_programs_are_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """A process may have 65,530 memory maps, of which a program takes up to thousands."""
 
+    def live_programs() -> int:
+        names = [each.hlo_modules()[0].name for each in jax.devices()[0].client.live_executables()]
+        return sum(name in ("jit_simulate_batch", "jit_render_slice") for name in names)
+
+    monkeypatch.setattr(shared, "MAX_PROGRAMS", 2)
     before = live_programs()
-    for balls in (1, 2):
-        programs = []
-        config = tiny_config(scene={"balls": balls})
-        generate(config, 4, tmp_path / str(balls), log=lambda line, programs=programs: programs.append(live_programs()))
-        assert len(max(programs, key=len)) > len(before)  # while it ran
-        assert live_programs() == before
+    for balls in (1, 2, 3):
+        generate(tiny_config(scene={"balls": balls}), 4, tmp_path / str(balls))
+        assert live_programs() <= before + 2 * len(jax.devices())
 
 
 def test_workers_together_make_what_one_makes(tiny: Path, tmp_path: Path):

@@ -480,7 +480,7 @@ def test_batches_share_one_program():
         for start in (0, 2):
             (made,) = rollout.draw(batch, start, 2)
             assert made["frames"].shape[0] == 2
-    assert rollout._draw_programs[2]._cache_size() == 1
+    assert rollout._draws[2].program.jitted._cache_size() == 1
 
 
 # ---- Derivatives
