@@ -86,9 +86,9 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _report(summary: "Summary") -> str:
-    if not summary.made:
+    if not summary.generated:
         ready = "is complete" if summary.complete else "has all of this worker's shards"
         return f"{summary.out} {ready}: nothing to do."
-    speed = f"{in_time(summary.seconds)} ({summary.videos_per_second:,.0f} videos/s)"
-    text = f"{summary.made:,} videos in {speed}, {in_bytes(summary.bytes)}, in {summary.out}"
+    speed = f"{in_time(summary.seconds)} ({summary.videos_per_second:,.0f} videos/s after compiling)"
+    text = f"{summary.generated:,} videos in {speed}, {in_bytes(summary.bytes)}, in {summary.out}"
     return text if summary.complete else text + "; other workers' shards are still missing"

@@ -50,6 +50,9 @@ class Family(_Contract):
     layout(options): the `Layout`, large enough for every scene that `sample` may return.
     sample(key, factors, options): the `SampledScene` of one video, traced by jax. `factors` has one array per factor:
         [], or [count] with `each`, [parts] with `parts`, [count, parts] with both.
+        Numbers of the options are arguments of the compiled program here and in `layout`: jax, NumPy, arithmetic,
+        `maximum` and `minimum` take them as they are. A comparison, `int`, or a function of `math` makes the program
+        one for this outcome alone, so another number compiles again.
     check(options): raises ValueError if no scene is possible with these options; the message begins with an option's
         name.
     sizes(options): lengths of the axes named by `each`, for names that are not factors themselves.

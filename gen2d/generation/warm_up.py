@@ -23,10 +23,11 @@ class DeviceMemoryError(UserError):
 
 def warm_up(
     source: VideoSource, encoder: Encoder, ranges: Sequence[VideoRange], count: int, log: Callable[[str], None]
-) -> None:
-    """Compile, and report the estimated size and duration of a run of `count` videos.
+) -> float:
+    """Compile, and report the estimated size and duration of a run of `count` videos; return the seconds of compiling.
 
-    Raises FolderError if the disk is too small, and DeviceMemoryError if a batch does not fit the device.
+    The source keeps the first batch, so that a run of a single one simulates no more. Raises FolderError if the disk
+    is too small, and DeviceMemoryError if a batch does not fit the device.
     """
     rollout = source.rollout
     name = f"{len(rollout.devices)} {rollout.devices[0].platform} device{'s' if len(rollout.devices) > 1 else ''}"
@@ -38,10 +39,12 @@ def warm_up(
     except jax.errors.JaxRuntimeError as error:
         raise _device_error(error) from None
     _fit_slice(rollout, batch)
+    source.keep(request, batch)
     compiled = time.perf_counter() - began
-    block, seconds = _measure(source, encoder, batch, next(source.requests(ranges[:1])))
-    size, duration = block.nbytes / len(block) * count, seconds * count
-    log(f"Compiled in {compiled:.1f} s. {count:,} videos will take about {in_bytes(size)} and {in_time(duration)}.")
+    single = count <= len(request.numbers)
+    block, seconds = _measure(source, encoder, batch, next(source.requests(ranges[:1])), single)
+    size, duration = block.nbytes / len(block) * count, "" if single else f" and {in_time(seconds * count)}"
+    log(f"Compiled in {compiled:.1f} s. {count:,} videos will take about {in_bytes(size)}{duration}.")
     _warn_of_low_compression(encoder.dataset, block, log)
     free = shards.free_bytes(encoder.dataset.root)
     if size > free:
@@ -49,6 +52,7 @@ def warm_up(
             f"{encoder.dataset.root} would need about {in_bytes(size)}, but its disk has {in_bytes(free)} free; "
             "ask for fewer videos, or name another disk with --out"
         )
+    return compiled
 
 
 def _fit_slice(rollout: Rollout, batch: DeviceBatch) -> None:
@@ -63,10 +67,13 @@ def _fit_slice(rollout: Rollout, batch: DeviceBatch) -> None:
             rollout.slice = divisor(rollout.batch_size, rollout.slice // 2)
 
 
-def _measure(source: VideoSource, encoder: Encoder, batch: DeviceBatch, request: Request) -> tuple[Block, float]:
-    """The first block, and the estimated time for a video in s."""
+def _measure(
+    source: VideoSource, encoder: Encoder, batch: DeviceBatch, request: Request, single: bool
+) -> tuple[Block, float]:
+    """The first block, and the estimated time for a video in s, without that of the simulation in a `single` batch."""
     rollout, part, marks = source.rollout, request.parts[0], [time.perf_counter()]
-    jax.block_until_ready(rollout.start(request.split, request.numbers))
+    if not single:
+        jax.block_until_ready(rollout.start(request.split, request.numbers))
     marks.append(time.perf_counter())
     rendered = jax.block_until_ready(rollout.draw(batch, part.start, rollout.slice))
     marks.append(time.perf_counter())

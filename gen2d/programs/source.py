@@ -86,6 +86,7 @@ class VideoSource:
     def __init__(self, config: Config, devices: Sequence[Any]) -> None:
         self.config, self.rollout = config, Rollout(config, devices)
         self.schema = self.rollout.schema
+        self._kept: tuple[Request, DeviceBatch] | None = None
 
     def of_splits(self, splits: Iterable[str]) -> Iterator[tuple["VideoSource", set[str]]]:
         """Sources of these splits, each with the splits that share it.
@@ -152,6 +153,16 @@ class VideoSource:
                     wanted[part.device, part.rows] = True
                 yield Request(split, numbers, wanted.ravel(), parts)
 
+    def keep(self, request: Request, batch: DeviceBatch) -> None:
+        """Use this batch when the same videos are requested next."""
+        self._kept = request, batch
+
+    def _start(self, request: Request) -> DeviceBatch:
+        kept, self._kept = self._kept, None
+        if kept and kept[0].split == request.split and np.array_equal(kept[0].numbers, request.numbers):
+            return kept[1]
+        return self.rollout.start(request.split, request.numbers)
+
     def batches(self, requests: Iterable[Request], ahead: int = 0) -> Iterator[tuple[Request, DeviceBatch]]:
         """Simulated batches in order; up to `ahead` more are in flight.
 
@@ -159,7 +170,7 @@ class VideoSource:
         """
         started: deque[tuple[Request, DeviceBatch]] = deque()
         for request in requests:
-            started.append((request, self.rollout.start(request.split, request.numbers)))
+            started.append((request, self._start(request)))
             if len(started) > ahead:
                 yield self._check_placed(*started.popleft())
         while started:

@@ -37,7 +37,7 @@ PRESETS = {"uniform_motion": 7, "parabola": 7, "collision": 13}
 def whole(tmp_path_factory):
     root = tmp_path_factory.mktemp("data") / "whole"
     summary = gen2d.generate(CONFIG | {"splits": SPLITS}, 12, root, seed=4)
-    assert (summary.made, summary.complete) == (24, True)
+    assert (summary.generated, summary.complete) == (24, True)
     return root
 
 

@@ -148,7 +148,7 @@ def test_running_again_does_nothing_and_a_larger_n_extends(tiny: Path, tmp_path:
     out = tmp_path / "data"
     generate(CONFIG, 9, out)
     first = (out / "shards" / "train-00000.h5").stat()
-    assert generate(CONFIG, 9, out).made == 0
+    assert generate(CONFIG, 9, out).generated == 0
     assert generate(CONFIG, N, out).complete
     assert (out / "shards" / "train-00000.h5").stat().st_mtime_ns == first.st_mtime_ns
     same(everything(tiny), everything(out))

@@ -79,7 +79,7 @@ def test_a_shared_program_gives_the_bits_of_an_own_one(tmp_path: Path) -> None:
         "scene.gravity=[0.5,-3]",
         "look.background=[90,0,7]",
         "scene.radius=[0.45,1.0]",
-        "video.fps=29",
+        "video.fps=31",
     ]
     generate("bouncing.yaml", 8, tmp_path / "first", overrides=[*SMALL, "scene.gravity=[0,-9.8]"])
     counts = cache_sizes()

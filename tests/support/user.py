@@ -13,7 +13,7 @@ import gen2d
 def train(root: Path) -> float:
     config = gen2d.load_config("bouncing.yaml", ["video.fps=30"])
     summary = gen2d.generate(config, n=64, out=root, seed=7)
-    print(summary.made, summary.out, summary.videos_per_second)
+    print(summary.generated, summary.out, summary.videos_per_second)
     ds = gen2d.open(root, fields=["frames", "states/*"], window=16)
     assert_type(ds, gen2d.Dataset)
     assert_type(ds[0], dict[str, np.ndarray])
