@@ -15,7 +15,7 @@ from typing import Any
 
 import jax
 import numpy as np
-from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from jax.sharding import Mesh, NamedSharding, PartitionSpec, SingleDeviceSharding
 
 from gen2d.config import quality
 from gen2d.config.config import Config
@@ -97,6 +97,8 @@ class Rollout:
 
     def _shard_over_devices(self, arrays: Any) -> Any:
         """Arrays [n, ...], sharded over the devices."""
+        if len(self.devices) == 1:  # without a mesh, as in `lowered`, so that the program is traced only once
+            return jax.device_put(arrays, self.devices[0])
         return jax.device_put(arrays, NamedSharding(self.mesh, VIDEOS))
 
     def _with_visibility(self, batch: DeviceBatch) -> DeviceBatch:
@@ -127,15 +129,18 @@ class Rollout:
 
     def lowered(self) -> dict[str, str]:
         """Text of each program, lowered for one device, and its arguments that come from the numbers of the config."""
-        numbers, scalar = jax.ShapeDtypeStruct((self.batch_size,), np.uint32), jax.ShapeDtypeStruct((), np.int32)
-        grid = jax.ShapeDtypeStruct((self.batch_size, len(self.sampler.gridded)), np.float32)
-        with jax.default_device(self.devices[0]):
-            args = jax.ShapeDtypeStruct((3,), np.uint32), scalar, grid, numbers, numbers
-            simulate = self._simulation_program(self.devices[:1], args)
-            simulation = simulate.lower(*args)
-            args = simulation.out_info.render_scenes, scalar
-            draw = self._draw_program(self.slice, args)
-            rendering = draw.lower(*args)
+        one = SingleDeviceSharding(self.devices[0])
+        numbers = jax.ShapeDtypeStruct((self.batch_size,), np.uint32, sharding=one)
+        grid = jax.ShapeDtypeStruct((self.batch_size, len(self.sampler.gridded)), np.float32, sharding=one)
+        scalar = jax.ShapeDtypeStruct((), np.int32)
+        args = jax.ShapeDtypeStruct((3,), np.uint32), scalar, grid, numbers, numbers
+        simulate = self._simulation_program(self.devices[:1], args)
+        simulation = simulate.lower(*args)
+        scenes = jax.tree.map(
+            lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=one), simulation.out_info.render_scenes
+        )
+        draw = self._draw_program(self.slice, (scenes, scalar))
+        rendering = draw.lower(scenes, scalar)
         return {
             "simulate": f"{simulation.as_text()}{simulate.values}",
             "draw": f"{rendering.as_text()}{draw.values}",
