@@ -4,7 +4,6 @@ The numbers of a config are arguments of its programs (records/parameter.py), so
 no other program.
 """
 
-import collections
 import threading
 from collections.abc import Callable, Hashable
 from typing import Any, NamedTuple
@@ -49,7 +48,7 @@ class BoundProgram(NamedTuple):
         return self.program.jitted.lower(self.numbers, *args)
 
 
-_programs: collections.OrderedDict[Hashable, list[Program]] = collections.OrderedDict()
+_programs: list[tuple[Hashable, Program]] = []  # with their keys, the last used at the end
 _lock = threading.Lock()
 
 
@@ -70,31 +69,28 @@ def program_for(config: Config, key: Hashable, build: Build, args: tuple, wrap: 
         Transformation of the function `run(numbers, *args)` before it is jitted.
     """
     structure, leaves = split_numbers(config)
+    key = build.__name__, key, structure
     with _lock:
-        key = build.__name__, key, structure
-        programs = _programs.setdefault(key, [])
-        _programs.move_to_end(key)
-        for program in programs:
-            numbers = program.tape.arguments(leaves)
+        for entry in _programs:
+            numbers = entry[1].tape.arguments(leaves) if entry[0] == key else None
             if numbers is not None:
-                return BoundProgram(program, numbers)
-        program = _traced(config, build, args, wrap)
-        programs.append(program)
-        numbers = program.tape.arguments(leaves)
-        assert numbers is not None, "a program serves the config that it is traced for"
-        while sum(map(len, _programs.values())) > MAX_PROGRAMS:
-            for old in _programs.popitem(last=False)[1]:
-                old.jitted.clear_cache()
-        return BoundProgram(program, numbers)
+                _programs.remove(entry)
+                break
+        else:
+            entry = key, _traced(config, build, args, wrap)
+            numbers = entry[1].tape.arguments(leaves)
+            assert numbers is not None, "a program serves the config that it is traced for"
+        _programs.append(entry)
+        while len(_programs) > MAX_PROGRAMS:
+            _programs.pop(0)[1].jitted.clear_cache()
+        return BoundProgram(entry[1], numbers)
 
 
 def clear() -> None:
     """Free all programs."""
     with _lock:
-        for programs in _programs.values():
-            for program in programs:
-                program.jitted.clear_cache()
-        _programs.clear()
+        while _programs:
+            _programs.pop()[1].jitted.clear_cache()
 
 
 def _traced(config: Config, build: Build, args: tuple, wrap: Wrap | None) -> Program:

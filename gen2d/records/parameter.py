@@ -13,6 +13,7 @@ import contextlib
 import functools
 import math
 import operator
+import threading
 from collections.abc import Callable, Hashable, Iterator, Sequence
 from typing import Any, TypeVar
 
@@ -31,9 +32,9 @@ class Tape:
         self._nodes: list[tuple[Callable, tuple]] = []  # operation and operands, in order of evaluation
         self._parameters: dict[Hashable, Parameter] = {}
         self._guards: dict[int, Any] = {}  # value by node
-        self._arguments: dict[int, int] = {}  # first place by node
+        self._arguments: dict[int, tuple[int, Parameter]] = {}  # first place, by node
         self._used = 0
-        self._traced: jax.Array | None = None
+        self._trace = threading.local()  # its `arguments`: those of the program that this thread traces
 
     def apply(self, operation: Callable, *operands: Any) -> "Parameter":
         """Result of an operation on parameters and constants; the same object for the same operands."""
@@ -62,38 +63,42 @@ class Tape:
     @contextlib.contextmanager
     def tracing(self, arguments: jax.Array) -> Iterator[None]:
         """Context of a program's trace, in which parameters are read from `arguments`, uint32 [SIZE]."""
-        outer, self._traced = self._traced, arguments
+        outer, self._trace.arguments = getattr(self._trace, "arguments", None), arguments
         try:
             yield
         finally:
-            self._traced = outer
+            self._trace.arguments = outer
 
     def traced(self, parameter: "Parameter") -> jax.Array:
         """A parameter as a float32 or int32 array of the program that is being traced."""
-        if self._traced is None:
+        arguments = getattr(self._trace, "arguments", None)
+        if arguments is None:
             raise RuntimeError("a parameter is an array only while its program is traced")
         if parameter.node not in self._arguments:
-            self._arguments[parameter.node], self._used = self._used, self._used + parameter.size
+            self._arguments[parameter.node] = self._used, parameter
+            self._used += parameter.size
             assert self._used <= SIZE, f"a program takes at most {SIZE} numbers"
-        start, dtype = self._arguments[parameter.node], parameter.dtype
-        words = self._traced[start : start + parameter.size].reshape(parameter.shape)
-        return jax.lax.bitcast_convert_type(words, dtype)
+        start, _ = self._arguments[parameter.node]
+        words = arguments[start : start + parameter.size].reshape(parameter.shape)
+        return jax.lax.bitcast_convert_type(words, parameter.dtype)
 
     def arguments(self, leaves: Sequence[Any]) -> np.ndarray | None:
-        """Arguments of the programs, uint32 [SIZE], for other leaves; None if these do not satisfy the guards."""
+        """Arguments of the programs, uint32 [SIZE], for other leaves; None if the programs do not serve these."""
         values: list[Any] = []
         try:
             with np.errstate(all="ignore"):
                 for operation, operands in self._nodes:
                     inputs = (values[x.node] if isinstance(x, Parameter) else x for x in operands)
                     values.append(leaves[next(inputs)] if operation is _leaf else operation(*inputs))
-        except (ArithmeticError, ValueError):
+        except (ArithmeticError, LookupError, ValueError):
             return None
         if not all(_identity(values[node]) == _identity(value) for node, value in self._guards.items()):
             return None
         words = np.zeros(SIZE, np.uint32)
-        for node, start in self._arguments.items():
+        for node, (start, parameter) in self._arguments.items():
             argument = _as_argument(values[node])
+            if (argument.dtype, argument.shape) != (parameter.dtype, parameter.shape):
+                return None  # `maximum` of a whole number and a fraction may be either
             words[start : start + argument.size] = argument.ravel().view(np.uint32)
         return words
 

@@ -39,7 +39,7 @@ def trace(config: Config) -> tuple[shared.BoundProgram, shared.BoundProgram]:
 
 def cache_sizes() -> list[int]:
     """Number of compiled forms of each program."""
-    return [program.jitted._cache_size() for programs in shared._programs.values() for program in programs]
+    return [program.jitted._cache_size() for _, program in shared._programs]
 
 
 def edits(plain: Any, path: str = "") -> Iterator[tuple[str, Any]]:

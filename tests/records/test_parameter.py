@@ -67,6 +67,7 @@ def test_one_trace_serves_other_numbers(name: str) -> None:
         (lambda a, n: jnp.arange(5)[int(n)], (0.0, 3), (0.0, 2)),
         (lambda a, n: float(a == 2.5), (2.5, 4), (2.0, 3)),
         (lambda a, n: 1 / a, (5.0, 3), (0.0, 3)),
+        (lambda a, n: maximum(a, n), (0.5, 9), (9.5, 1)),  # whole, or a fraction
     ],
 )
 def test_numbers_that_python_branches_on_are_guarded(use: Callable, served: tuple, refused: tuple) -> None:
