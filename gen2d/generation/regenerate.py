@@ -35,7 +35,8 @@ from gen2d.generation.complete import publication
 from gen2d.generation.run import dataset_of, generate_shards
 from gen2d.loading import dataset as loader
 from gen2d.programs import devices
-from gen2d.programs.fingerprint import fingerprint, machine, sources
+from gen2d.programs.environment import sources
+from gen2d.programs.fingerprint import fingerprint, machine
 from gen2d.programs.recipe import Trust, config_from
 from gen2d.programs.source import VideoRange, VideoSource
 from gen2d.storage.atomic import publish_changed, remove_tree, sync

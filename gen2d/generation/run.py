@@ -19,7 +19,8 @@ from gen2d.generation.encoder import Encoder, shard_ranges, threads_for
 from gen2d.generation.warm_up import warm_up
 from gen2d.generation.writers import ShardWriters
 from gen2d.programs import devices
-from gen2d.programs.fingerprint import fingerprint, sources
+from gen2d.programs.environment import sources
+from gen2d.programs.fingerprint import fingerprint
 from gen2d.programs.source import VideoSource
 from gen2d.records.keys import MAX_VIDEOS
 from gen2d.storage.paths import Place, place

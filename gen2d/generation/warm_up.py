@@ -35,14 +35,15 @@ def warm_up(
     began = time.perf_counter()
     request = next(source.requests(ranges[:1]))
     try:
-        batch = jax.block_until_ready(rollout.start(request.split, request.numbers))
+        rollout.compile()
+        batches = jax.block_until_ready(rollout.start(request.split, request.numbers))
     except jax.errors.JaxRuntimeError as error:
         raise _device_error(error) from None
-    _fit_slice(rollout, batch)
-    source.keep(request, batch)
+    _fit_slice(rollout, batches)
+    source.keep(request, batches)
     compiled = time.perf_counter() - began
     single = count <= len(request.numbers)
-    block, seconds = _measure(source, encoder, batch, next(source.requests(ranges[:1])), single)
+    block, seconds = _measure(source, encoder, batches, next(source.requests(ranges[:1])), single)
     size, duration = block.nbytes / len(block) * count, "" if single else f" and {in_time(seconds * count)}"
     log(f"Compiled in {compiled:.1f} s. {count:,} videos will take about {in_bytes(size)}{duration}.")
     _warn_of_low_compression(encoder.dataset, block, log)
@@ -55,11 +56,11 @@ def warm_up(
     return compiled
 
 
-def _fit_slice(rollout: Rollout, batch: DeviceBatch) -> None:
+def _fit_slice(rollout: Rollout, batches: list[DeviceBatch]) -> None:
     """Compile the rendering, and halve the slice until it fits the memory of the device."""
     while True:
         try:
-            jax.block_until_ready(rollout.draw(batch, 0, rollout.slice))
+            jax.block_until_ready(rollout.draw(batches, 0, rollout.slice))
             return
         except jax.errors.JaxRuntimeError as error:
             if "RESOURCE_EXHAUSTED" not in str(error) or rollout.slice == 1:
@@ -68,16 +69,16 @@ def _fit_slice(rollout: Rollout, batch: DeviceBatch) -> None:
 
 
 def _measure(
-    source: VideoSource, encoder: Encoder, batch: DeviceBatch, request: Request, single: bool
+    source: VideoSource, encoder: Encoder, batches: list[DeviceBatch], request: Request, single: bool
 ) -> tuple[Block, float]:
     """The first block, and the estimated time for a video in s, without that of the simulation in a `single` batch."""
     rollout, part, marks = source.rollout, request.parts[0], [time.perf_counter()]
     if not single:
         jax.block_until_ready(rollout.start(request.split, request.numbers))
     marks.append(time.perf_counter())
-    rendered = jax.block_until_ready(rollout.draw(batch, part.start, rollout.slice))
+    rendered = jax.block_until_ready(rollout.draw(batches, part.start, rollout.slice))
     marks.append(time.perf_counter())
-    columns = rollout.host_columns(batch)
+    columns = rollout.host_columns(batches)
     block = encoder.encode(VideoSlice(part, columns[part.device], rendered[part.device], source.schema.host_columns))
     marks.append(time.perf_counter())
     count, threads = len(rollout.devices), threads_for(devices.cores())

@@ -6,38 +6,19 @@ does not.
 """
 
 import ast
-import functools
 import hashlib
 import inspect
-import os
-import pathlib
-import re
 import textwrap
 from importlib.metadata import version
 from typing import Any
 
-import jax
-
-import gen2d
 from gen2d.captions import caption
 from gen2d.core import permutation
 from gen2d.loading import epochs
 from gen2d.programs.devices import instruction_set
+from gen2d.programs.environment import flags
 from gen2d.programs.rollout import Rollout
 from gen2d.sampling.sampler import Sampler
-from gen2d.storage.atomic import publish
-from gen2d.storage.sealed import as_json, parse_json, read_bytes, sha256
-
-# Prefixes of XLA flags that leave all results unchanged to the bit; any other flag is assumed to change some.
-HARMLESS = (
-    "--xla_dump_",
-    "--xla_force_host_platform_device_count",
-    "--xla_hlo_profile",
-    "--xla_cpu_parallel_codegen_split_count",
-    "--xla_gpu_force_compilation_parallelism",
-    "--xla_gpu_kernel_cache_file",
-    "--xla_gpu_per_fusion_autotune_cache_dir",
-)
 
 
 def fingerprint(rollout: Rollout) -> dict[str, Any]:
@@ -49,8 +30,7 @@ def machine(rollout: Rollout) -> dict[str, Any]:
     """Part of the fingerprint that is known before anything is traced."""
     device = rollout.devices[0]
     kind = device.device_kind if device.platform != "cpu" else f"cpu {instruction_set()}"
-    flags = sorted(flag for flag in os.environ.get("XLA_FLAGS", "").split() if not flag.startswith(HARMLESS))
-    return {"jaxlib": version("jaxlib"), "device": kind, "batch_size": rollout.batch_size, "xla_flags": " ".join(flags)}
+    return {"jaxlib": version("jaxlib"), "device": kind, "batch_size": rollout.batch_size, "xla_flags": flags()}
 
 
 def _program_hashes(rollout: Rollout) -> dict[str, str]:
@@ -63,37 +43,15 @@ def _program_hashes(rollout: Rollout) -> dict[str, str]:
         names.setdefault(config.of_split(name), name)
     for split_config, name in names.items():
         if split_config == config:
-            hashes |= _cached_hashes(rollout)
+            hashes |= _hashes(rollout)
         else:
-            programs = _cached_hashes(Rollout(split_config, rollout.devices[:1]))
+            programs = _hashes(Rollout(split_config, rollout.devices[:1]))
             hashes |= {f"{name}.{kind}": digest for kind, digest in programs.items()}
     return hashes
 
 
-def _cached_hashes(rollout: Rollout) -> dict[str, str]:
-    """Hashes of a config's programs, cached per version of the sources because tracing is slow."""
-    folder = jax.config.values["jax_compilation_cache_dir"]
-    platform, versions = rollout.devices[0].platform, [version("jax"), version("jaxlib")]
-    key = [rollout.config.recipe(), sources(), *versions, platform, rollout.batch_size, rollout.slice]
-    path = pathlib.Path(folder or "") / "fingerprints" / sha256(as_json(key))
-    try:
-        cached = parse_json(read_bytes(path, 10**5)) if folder else None
-    except OSError:
-        cached = None
-    if cached is not None and all(isinstance(digest, str) for digest in cached.values()):
-        return cached
-    hashes = _compute_hashes(rollout)
-    if folder:
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            publish(path, as_json(hashes))
-        except OSError:
-            pass
-    return hashes
-
-
-def _compute_hashes(rollout: Rollout) -> dict[str, str]:
-    hashes = {name: sha256(canonical(text).encode()) for name, text in rollout.lowered().items()}
+def _hashes(rollout: Rollout) -> dict[str, str]:
+    hashes = {name: program.sha256 for name, program in rollout.programs().items()}
     if rollout.config.annotations.simulated.captions:
         hashes["captions"] = code_hash(caption)
     if rollout.sampler.gridded:
@@ -101,15 +59,6 @@ def _compute_hashes(rollout: Rollout) -> dict[str, str]:
             Sampler.grid_values, epochs.order, permutation.hashed, permutation.feistel, permutation.splitmix64
         )
     return hashes
-
-
-def canonical(text: str) -> str:
-    """Text of a lowered program with functions renamed to numbers and names of arguments and results removed."""
-    names = re.findall(r"func\.func (?:public |private )?@([\w.$-]+)\(", text)
-    numbers = {name: f"@f{number}" for number, name in enumerate(dict.fromkeys(names))}
-    text = re.sub(r"@([\w.$-]+)", lambda match: numbers.get(match[1], match[0]), text)
-    text = re.sub(r'jax\.(?:result_info|arg_info) = "[^"]*"', "", text)
-    return re.sub(r"^module @\S+", "module", text, count=1, flags=re.M)
 
 
 def code_hash(*parts: Any) -> str:
@@ -125,18 +74,3 @@ def code_hash(*parts: Any) -> str:
                     node.body = body[1:]
         digest.update(ast.dump(tree).encode())
     return digest.hexdigest()
-
-
-@functools.cache
-def sources() -> dict[str, str]:
-    """First 12 digits of the sha256 of each source file of gen2d, by path.
-
-    They only serve to name the edited files when a program differs.
-    """
-    package = pathlib.Path(gen2d.__file__).parent
-    renderers = package / "renderers"
-    files = {f"gen2d/{path.relative_to(package).as_posix()}": path for path in package.rglob("*.py")}
-    files |= {f"renderers/{path.relative_to(renderers).as_posix()}": path for path in renderers.rglob("*.py")}
-    return {
-        name: sha256(path.read_bytes())[:12] for name, path in sorted(files.items()) if "gen2d/renderers/" not in name
-    }

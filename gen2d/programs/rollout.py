@@ -1,9 +1,10 @@
 """Compiled programs of a config: video numbers in, ground truth and frames out, in batches of a fixed size.
 
-There are two programs. `simulate` samples and simulates `batch_size` videos on every device. `draw` renders slices of
-them, small enough that the frames stay in the cache until they are compressed. `batch_size` comes from the config, not
-from the machine: more devices run more batches, not larger ones. Video i is always in row i % batch_size of the same
-program, so its bits do not depend on how many videos are generated, or where.
+There are two programs. `simulate` samples and simulates `batch_size` videos. `draw` renders slices of them, small
+enough that the frames stay in the cache until they are compressed. Every device runs the same executables on its own
+batches. `batch_size` comes from the config, not from the machine: more devices run more batches, not larger ones. Video
+i is always in row i % batch_size of the same program, so its bits do not depend on how many videos are generated, or
+where.
 """
 
 import dataclasses
@@ -11,17 +12,16 @@ import functools
 import zlib
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any
 
 import jax
 import numpy as np
-from jax.sharding import Mesh, NamedSharding, PartitionSpec, SingleDeviceSharding
 
 from gen2d.config import quality
 from gen2d.config.config import Config
 from gen2d.config.sections import MatchedOptions, PhysicsOptions, QualityOptions
 from gen2d.core import enums
 from gen2d.programs import render
+from gen2d.programs.devices import Device
 from gen2d.programs.schema import VideoSchema
 from gen2d.programs.shared import BoundProgram, program_for
 from gen2d.programs.simulation import BatchSimulation, DeviceBatch
@@ -35,7 +35,6 @@ SHARD_BYTES = 2**30  # of raw frames in a shard
 SHARD_VIDEOS = 1024  # largest default number of videos in a shard
 # Limits of a default batch: videos, and pairs of their bodies, which take 300 bytes each.
 BATCH_SIZE, PAIRS = 512, 2**20
-VIDEOS = PartitionSpec("videos")
 
 
 def _power_of_two(limit: int) -> int:
@@ -50,7 +49,7 @@ def divisor(number: int, limit: int) -> int:
 class Rollout:
     """Compiled programs of one config on some devices."""
 
-    def __init__(self, config: Config, devices: Sequence[Any]) -> None:
+    def __init__(self, config: Config, devices: Sequence[Device]) -> None:
         self.config, self.devices = config, list(devices)
         video, self.sparse = config.video, self.devices[0].platform == "cpu"
         self.simulation = BatchSimulation(config, self.sparse)
@@ -66,130 +65,109 @@ class Rollout:
         # A shard size in the config must not change the videos.
         self.batch_size = config.storage.batch_size or min(default_batch, default_shard)
         self.slice = divisor(self.batch_size, max(1, SLICE_BYTES // frame_bytes))
-        self.mesh = Mesh(np.array(self.devices), ("videos",))
-        self._simulate: BoundProgram | None = None
         self._draws: dict[int, BoundProgram] = {}  # by number of videos
-        self._compiled: set[int] = set()  # keys of `_draws` that are compiled
 
-    def start(self, split: str, numbers: np.ndarray) -> DeviceBatch:
-        """Start to simulate the videos of a split with these numbers [devices * batch_size].
+    def start(self, split: str, numbers: np.ndarray) -> list[DeviceBatch]:
+        """Start to simulate the videos of a split with these numbers [devices * batch_size]; each device's batch.
 
         Raises NoVideoError if no attempt at some video lies in the ranges that the config requires.
         """
-        root, row = keys_module.seed_words(self.config.seed, zlib.crc32(split.encode())), self.config.split_index(split)
-        numbers = numbers.astype(np.uint32)
-        grid = self.sampler.grid_values(row, root, numbers)
-
-        def simulate_rows(rows: np.ndarray, attempts: np.ndarray) -> DeviceBatch:
-            sharded = self._shard_over_devices((grid[rows], numbers[rows], attempts.astype(np.uint32)))
-            args = root, np.int32(row), *sharded
-            if self._simulate is None:
-                self._simulate = self._simulation_program(self.devices, args)
-            batch = self._simulate(*args)
-            return self._with_visibility(batch) if quality.VISIBILITY in self.quality_ranges else batch
-
+        parts = zip(self.devices, numbers.astype(np.uint32).reshape(len(self.devices), -1), strict=True)
         if not self.quality_ranges:
-            return simulate_rows(np.arange(len(numbers)), np.zeros(len(numbers)))
-        batch, attempts = rejection.accepted_batch(simulate_rows, numbers, self.config.quality)
+            return [self._start_on(device, split, part) for device, part in parts]
+        with ThreadPoolExecutor(len(self.devices)) as pool:  # each device may need another number of attempts
+            return list(pool.map(lambda part: self._accept_on(part[0], split, part[1]), parts))
+
+    def _start_on(
+        self, device: Device, split: str, numbers: np.ndarray, attempts: np.ndarray | None = None
+    ) -> DeviceBatch:
+        """Start to simulate videos [batch_size] on a device, with these attempts, by default the first."""
+        root, row = keys_module.seed_words(self.config.seed, zlib.crc32(split.encode())), self.config.split_index(split)
+        grid = self.sampler.grid_values(row, root, numbers)
+        attempts = np.zeros_like(numbers) if attempts is None else attempts.astype(np.uint32)
+        return self.simulate_program(device, root, np.int32(row), grid, numbers, attempts)
+
+    def _accept_on(self, device: Device, split: str, numbers: np.ndarray) -> DeviceBatch:
+        """Batch of videos that lie in the ranges that the config requires."""
+
+        def attempt(rows: np.ndarray, attempts: np.ndarray) -> DeviceBatch:
+            batch = self._start_on(device, split, numbers[rows], attempts)
+            if quality.VISIBILITY not in self.quality_ranges:
+                return batch
+            starts = range(0, self.batch_size, self.slice)  # only rendering gives the visibility
+            visibility = [self._draw_on(device, batch, start, self.slice)[quality.VISIBILITY] for start in starts]
+            column = jax.device_put(np.concatenate(jax.device_get(visibility)), device)
+            return batch._replace(columns=batch.columns | {quality.VISIBILITY: column})
+
+        batch, attempts = rejection.accepted_batch(attempt, numbers, self.config.quality)
         batch.columns.pop(quality.VISIBILITY, None)  # `draw` returns it
-        rejected = self._shard_over_devices(attempts.astype(np.int32))
+        rejected = jax.device_put(attempts.astype(np.int32), device)
         return batch._replace(columns=batch.columns | {"quality/rejected_videos": rejected})
 
-    def _shard_over_devices(self, arrays: Any) -> Any:
-        """Arrays [n, ...], sharded over the devices."""
-        if len(self.devices) == 1:  # without a mesh, as in `lowered`, so that the program is traced only once
-            return jax.device_put(arrays, self.devices[0])
-        return jax.device_put(arrays, NamedSharding(self.mesh, VIDEOS))
+    def draw(self, batches: Sequence[DeviceBatch], start: int, count: int) -> list[dict[str, Array]]:
+        """Start to render `count` videos of each device's batch, from row `start` on.
 
-    def _with_visibility(self, batch: DeviceBatch) -> DeviceBatch:
-        """The batch with its visibility, which only rendering gives."""
-        slices = [self.draw(batch, start, self.slice) for start in range(0, self.batch_size, self.slice)]
-        visibility = [np.asarray(part[quality.VISIBILITY]) for parts in zip(*slices, strict=True) for part in parts]
-        sharded = self._shard_over_devices(np.concatenate(visibility))  # devices first, then their slices
-        return batch._replace(columns=batch.columns | {quality.VISIBILITY: sharded})
-
-    def draw(self, batch: DeviceBatch, start: int, count: int) -> list[dict[str, Array]]:
-        """Start to render `count` videos of each device, from row `start` on.
-
-        Returns each device's frames [count, T, H, W, 3] and annotations by stored name. Each device runs a separate
-        program, because a program for several devices would round differently.
+        Returns each device's frames [count, T, H, W, 3] and annotations by stored name.
         """
-        scenes_by_device = [
-            jax.tree.map(lambda array, d=d: _device_shards(array)[d].data, batch.render_scenes)
-            for d in range(len(self.devices))
-        ]
-        if count not in self._draws:
-            self._draws[count] = self._draw_program(count, (scenes_by_device[0], np.int32(start)))
-        draw = functools.partial(self._draws[count], start=np.int32(start))
-        if count in self._compiled:
-            return [draw(scenes) for scenes in scenes_by_device]
-        self._compiled.add(count)
-        with ThreadPoolExecutor(len(scenes_by_device)) as pool:  # compiles for all devices in parallel
-            return list(pool.map(draw, scenes_by_device))
+        parts = zip(self.devices, batches, strict=True)
+        return [self._draw_on(device, batch, start, count) for device, batch in parts]
 
-    def lowered(self) -> dict[str, str]:
-        """Text of each program, lowered for one device, and its arguments that come from the numbers of the config."""
-        one = SingleDeviceSharding(self.devices[0])
-        numbers = jax.ShapeDtypeStruct((self.batch_size,), np.uint32, sharding=one)
-        grid = jax.ShapeDtypeStruct((self.batch_size, len(self.sampler.gridded)), np.float32, sharding=one)
-        scalar = jax.ShapeDtypeStruct((), np.int32)
-        args = jax.ShapeDtypeStruct((3,), np.uint32), scalar, grid, numbers, numbers
-        simulate = self._simulation_program(self.devices[:1], args)
-        simulation = simulate.lower(*args)
-        scenes = jax.tree.map(
-            lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=one), simulation.out_info.render_scenes
-        )
-        draw = self._draw_program(self.slice, (scenes, scalar))
-        rendering = draw.lower(scenes, scalar)
-        return {
-            "simulate": f"{simulation.as_text()}{simulate.values}",
-            "draw": f"{rendering.as_text()}{draw.values}",
-        }
+    def _draw_on(self, device: Device, batch: DeviceBatch, start: int, count: int) -> dict[str, Array]:
+        return self.draw_program(count)(device, batch.render_scenes, np.int32(start))
 
-    def _simulation_program(self, devices: Sequence[Any], args: tuple) -> BoundProgram:
-        """Program that samples and simulates `batch_size` videos on each device."""
+    # ---- Programs
+
+    def programs(self) -> dict[str, BoundProgram]:
+        """Programs of the config, by name."""
+        return {"simulate": self.simulate_program, "draw": self.draw_program(self.slice)}
+
+    def compile(self) -> None:
+        """Compile the programs, at the same time, and load them on all devices."""
+        programs = self.programs().values()
+        with ThreadPoolExecutor(len(programs)) as pool:
+            for _ in pool.map(lambda bound: [bound.program.load(device) for device in self.devices], programs):
+                pass
+
+    @functools.cached_property
+    def simulate_program(self) -> BoundProgram:
+        """Program that samples and simulates a batch."""
         annotations = dataclasses.replace(self.config.annotations, pixels=())
-        config, mesh = dataclasses.replace(self.config, annotations=annotations), Mesh(np.array(devices), ("videos",))
+        config, numbers = (
+            dataclasses.replace(self.config, annotations=annotations),
+            np.zeros(self.batch_size, np.uint32),
+        )
+        grid = np.zeros((self.batch_size, len(self.sampler.gridded)), np.float32)
+        args = np.zeros(3, np.uint32), np.int32(0), grid, numbers, numbers
 
         def simulate_batch(config: Config) -> BatchSimulation:
             return BatchSimulation(config, self.sparse)
 
-        def over_devices(run: Any) -> Any:
-            specs = PartitionSpec(), PartitionSpec(), PartitionSpec(), VIDEOS, VIDEOS, VIDEOS
-            return jax.shard_map(run, mesh=mesh, in_specs=specs, out_specs=VIDEOS, check_vma=False)
+        return program_for(config, self.batch_size, simulate_batch, args, self.devices[0])
 
-        wrap = over_devices if len(devices) > 1 else None
-        return program_for(config, (tuple(devices), self.batch_size), simulate_batch, args, wrap)
+    def draw_program(self, count: int) -> BoundProgram:
+        """Program that renders `count` videos of a batch."""
+        if count not in self._draws:
+            config = dataclasses.replace(
+                self.config, physics=PhysicsOptions(), matched=MatchedOptions(), quality=QualityOptions(), splits=()
+            )
 
-    def _draw_program(self, count: int, args: tuple) -> BoundProgram:
-        """Program that renders `count` videos."""
-        config = dataclasses.replace(
-            self.config, physics=PhysicsOptions(), matched=MatchedOptions(), quality=QualityOptions(), splits=()
-        )
+            def render_slice(config: Config) -> Callable[[RenderScene, Array], dict[str, Array]]:
+                plan = render.plan_of(config, config.scene.contract.layout(config.scene.options))
 
-        def render_slice(config: Config) -> Callable[[RenderScene, Array], dict[str, Array]]:
-            plan = render.plan_of(config, config.scene.contract.layout(config.scene.options))
+                def run(render_scenes: RenderScene, start: Array) -> dict[str, Array]:
+                    part = jax.tree.map(lambda x: jax.lax.dynamic_slice_in_dim(x, start, count), render_scenes)
+                    return render.render_frames(part, plan, config.annotations)
 
-            def run(render_scenes: RenderScene, start: Array) -> dict[str, Array]:
-                part = jax.tree.map(lambda x: jax.lax.dynamic_slice_in_dim(x, start, count), render_scenes)
-                return render.render_frames(part, plan, config.annotations)
+                return run
 
-            return run
+            args = self.simulate_program.program.trace.results.render_scenes, np.int32(0)
+            self._draws[count] = program_for(config, count, render_slice, args, self.devices[0])
+        return self._draws[count]
 
-        return program_for(config, (count, self.batch_size), render_slice, args)
-
-    def host_columns(self, batch: DeviceBatch) -> list[dict[str, np.ndarray]]:
+    def host_columns(self, batches: Sequence[DeviceBatch]) -> list[dict[str, np.ndarray]]:
         """Each device's columns as NumPy arrays; waits for the devices."""
-        columns = {name: per_device(array) for name, array in batch.columns.items()}
-        if "contacts/time" in columns:  # a device may have no float64
-            columns["contacts/time"] = [array.astype(np.float64) for array in columns["contacts/time"]]
-        return [{name: arrays[d] for name, arrays in columns.items()} for d in range(len(self.devices))]
-
-
-def _device_shards(array: Array) -> list[Any]:
-    return sorted(array.addressable_shards, key=lambda shard: shard.index[0].start or 0)
-
-
-def per_device(array: Array) -> list[np.ndarray]:
-    """Each device's part of an array, as NumPy arrays."""
-    return [np.asarray(shard.data) for shard in _device_shards(array)]
+        columns = [{name: np.asarray(array) for name, array in batch.columns.items()} for batch in batches]
+        for arrays in columns:
+            if "contacts/time" in arrays:  # a device may have no float64
+                arrays["contacts/time"] = arrays["contacts/time"].astype(np.float64)
+        return columns

@@ -1,31 +1,63 @@
-"""Programs that are traced and compiled once for all configs of one structure.
+"""Programs that are traced and compiled once for all configs of one structure and all devices of one kind.
 
 The numbers of a config are arguments of its programs (records/parameter.py), so another gravity, radius or colour needs
-no other program.
+no other program. Compiled programs are kept in memory and on disk (programs/executables.py).
 """
 
+import re
 import threading
 from collections.abc import Callable, Hashable
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
+from jax.sharding import SingleDeviceSharding
 
 from gen2d.config.config import Config
 from gen2d.config.parameters import parametrized, split_numbers
+from gen2d.programs import executables
+from gen2d.programs.devices import Device
+from gen2d.programs.executables import Trace
 from gen2d.records.parameter import SIZE, Tape
+from gen2d.storage.sealed import as_json, sha256
 
-MAX_PROGRAMS = 12  # kept in memory; each takes up to thousands of the 65,530 memory maps that a process may have
+MAX_PROGRAMS = 12  # loaded at once; each takes up to thousands of the 65,530 memory maps that a process may have
 
 Build = Callable[[Config], Callable[..., Any]]
-Wrap = Callable[[Callable[..., Any]], Callable[..., Any]]
 
 
-class Program(NamedTuple):
-    """A traced program and the tape of its parameters."""
+class Program:
+    """A traced program, which is compiled when it first runs and loaded on each device where it runs.
 
-    jitted: Any  # called with the arguments of the tape, uint32 [SIZE], and others
-    tape: Tape
+    Attributes
+    ----------
+    trace : Trace
+        Its parameters, the hash of its text without names and source locations, and the shapes of its results.
+    executable : bytes or None
+        Its executable, for all devices of its kind; None until it is compiled.
+    """
+
+    def __init__(self, trace: Trace, lowered: Any = None, executable: bytes | None = None) -> None:
+        self.trace, self.executable = trace, executable
+        self._lowered = lowered  # jax.stages.Lowered, where there is no executable yet
+        self._loaded: dict[Device, Callable[..., Any]] = {}
+        self._lock = threading.Lock()
+
+    def load(self, device: Device) -> Callable[..., Any]:
+        """The program on a device, as a function of leaves; compiled on the first call for any device."""
+        with self._lock:
+            if device not in self._loaded:
+                if self.executable is None:
+                    self.executable = executables.compiled(self._lowered)
+                    executables.store_executable(self.trace.digest, device, self.executable)
+                    self._lowered = None
+                self._loaded[device] = executables.loaded(self.executable, device)
+            return self._loaded[device]
+
+    def unload(self) -> None:
+        """Free the memory of the program on all devices; the next call loads it again."""
+        with self._lock:
+            self._loaded.clear()
 
 
 class BoundProgram(NamedTuple):
@@ -34,25 +66,22 @@ class BoundProgram(NamedTuple):
     program: Program
     numbers: np.ndarray  # uint32 [SIZE]
 
-    def __call__(self, *args: Any, **named: Any) -> Any:
-        """Result of the program, which is compiled on its first call for a device."""
-        return self.program.jitted(self.numbers, *args, **named)
+    def __call__(self, device: Device, *args: Any) -> Any:
+        """Result of the program on a device."""
+        leaves = self.program.load(device)(self.numbers, *jax.tree.leaves(args))
+        return jax.tree.unflatten(jax.tree.structure(self.program.trace.results), leaves)
 
     @property
-    def values(self) -> list[int]:
-        """Words of the arguments that the program uses."""
-        return self.numbers[: self.program.tape.size].tolist()
-
-    def lower(self, *args: Any) -> Any:
-        """The program, lowered for these arguments."""
-        return self.program.jitted.lower(self.numbers, *args)
+    def sha256(self) -> str:
+        """Hash of the program's text and of the words of its arguments that come from the config."""
+        return sha256(as_json([self.program.trace.digest, self.numbers[: self.program.trace.tape.size].tolist()]))
 
 
 _programs: list[tuple[Hashable, Program]] = []  # with their keys, the last used at the end
 _lock = threading.Lock()
 
 
-def program_for(config: Config, key: Hashable, build: Build, args: tuple, wrap: Wrap | None = None) -> BoundProgram:
+def program_for(config: Config, key: Hashable, build: Build, args: tuple, device: Device) -> BoundProgram:
     """The program of a config: one that is already there if it serves the config, else a new one, traced for `args`.
 
     Parameters
@@ -60,48 +89,92 @@ def program_for(config: Config, key: Hashable, build: Build, args: tuple, wrap: 
     config : Config
         The config; sections that the program does not depend on should have their defaults.
     key : hashable
-        Everything else that determines the program, such as its devices and sizes.
+        Everything else that determines the program, such as its sizes.
     build : callable
         `build(config)` returns the function to be traced, for a config whose numbers are parameters.
     args : tuple
         Arguments of the function, or their shapes.
-    wrap : callable
-        Transformation of the function `run(numbers, *args)` before it is jitted.
+    device : jax.Device
+        Any device of the kind that the program shall run on.
     """
     structure, leaves = split_numbers(config)
-    key = build.__name__, key, structure
+    shapes = [(np.shape(x), str(x.dtype)) for x in jax.tree.leaves(args)]
+    # Addresses of functions differ between processes; their sources are part of the key on disk.
+    structure = re.sub(r" at 0x[0-9a-f]+", "", structure)
+    key = build.__qualname__, key, structure, str(jax.tree.structure(args)), str(shapes), device.device_kind
+    disk = key, device, bool(config.copies)
     with _lock:
         for entry in _programs:
-            numbers = entry[1].tape.arguments(leaves) if entry[0] == key else None
+            numbers = entry[1].trace.tape.arguments(leaves) if entry[0] == key else None
             if numbers is not None:
                 _programs.remove(entry)
                 break
         else:
-            entry = key, _traced(config, build, args, wrap)
-            numbers = entry[1].tape.arguments(leaves)
+            program = _stored(disk, leaves)
+            if program is None:
+                program = _traced(config, build, args, device)
+                executables.store_trace(*disk, program.trace)
+            entry = key, program
+            numbers = program.trace.tape.arguments(leaves)
             assert numbers is not None, "a program serves the config that it is traced for"
         _programs.append(entry)
         while len(_programs) > MAX_PROGRAMS:
-            _programs.pop(0)[1].jitted.clear_cache()
+            _programs.pop(0)[1].unload()
         return BoundProgram(entry[1], numbers)
 
 
 def clear() -> None:
-    """Free all programs."""
+    """Forget all programs in memory."""
     with _lock:
         while _programs:
-            _programs.pop()[1].jitted.clear_cache()
+            _programs.pop()[1].unload()
 
 
-def _traced(config: Config, build: Build, args: tuple, wrap: Wrap | None) -> Program:
-    tape = Tape()
+def _stored(disk: tuple[Hashable, Device, bool], leaves: list[Any]) -> Program | None:
+    """The program on disk that serves these numbers; None if there is none."""
+    device = disk[1]
+    for trace in executables.find_traces(*disk):
+        if trace.tape.arguments(leaves) is not None:
+            return _loadable(trace, device)
+    return None
+
+
+def _loadable(trace: Trace, device: Device) -> Program | None:
+    """The program with this trace, if its executable is on disk and can be loaded."""
+    executable = executables.find_executable(trace.digest, device)
+    try:
+        program = None if executable is None else Program(trace, executable=executable)
+        if program is not None:
+            program.load(device)
+        return program
+    except Exception:  # XLA may fail in any way for a foreign executable, which is compiled again
+        return None
+
+
+def _traced(config: Config, build: Build, args: tuple, device: Device) -> Program:
+    tape, tree, one = Tape(), jax.tree.structure(args), SingleDeviceSharding(device)
     function = build(parametrized(config, tape))
+    results: Any = None
 
-    def run(numbers: jax.Array, *args: Any, **named: Any) -> Any:
+    def run(numbers: jax.Array, *leaves: Any) -> list[jax.Array]:
+        nonlocal results
         with tape.tracing(numbers):
-            return function(*args, **named)
+            results = function(*tree.unflatten(leaves))
+        return jax.tree.leaves(results)
 
     run.__name__ = build.__name__
-    jitted = jax.jit(run if wrap is None else wrap(run))
-    jitted.trace(jax.ShapeDtypeStruct((SIZE,), np.uint32), *args)
-    return Program(jitted, tape)
+    numbers = jax.ShapeDtypeStruct((SIZE,), np.uint32)
+    shapes = [jax.ShapeDtypeStruct(np.shape(x), x.dtype, sharding=one) for x in (numbers, *jax.tree.leaves(args))]
+    lowered = jax.jit(run).lower(*shapes)
+    results = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), results)
+    trace = Trace(tape, sha256(canonical(lowered.as_text()).encode()), results)
+    return _loadable(trace, device) or Program(trace, lowered)
+
+
+def canonical(text: str) -> str:
+    """Text of a lowered program with functions renamed to numbers and names of arguments and results removed."""
+    names = re.findall(r"func\.func (?:public |private )?@([\w.$-]+)\(", text)
+    numbers = {name: f"@f{number}" for number, name in enumerate(dict.fromkeys(names))}
+    text = re.sub(r"@([\w.$-]+)", lambda match: numbers.get(match[1], match[0]), text)
+    text = re.sub(r'jax\.(?:result_info|arg_info) = "[^"]*"', "", text)
+    return re.sub(r"^module @\S+", "module", text, count=1, flags=re.M)

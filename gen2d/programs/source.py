@@ -13,7 +13,7 @@ import numpy as np
 
 from gen2d.config.config import Config
 from gen2d.core.errors import UserError
-from gen2d.programs.rollout import Rollout, per_device
+from gen2d.programs.rollout import Rollout
 from gen2d.programs.simulation import DeviceBatch
 from gen2d.records.axes import Array
 
@@ -86,7 +86,7 @@ class VideoSource:
     def __init__(self, config: Config, devices: Sequence[Any]) -> None:
         self.config, self.rollout = config, Rollout(config, devices)
         self.schema = self.rollout.schema
-        self._kept: tuple[Request, DeviceBatch] | None = None
+        self._kept: tuple[Request, list[DeviceBatch]] | None = None
 
     def of_splits(self, splits: Iterable[str]) -> Iterator[tuple["VideoSource", set[str]]]:
         """Sources of these splits, each with the splits that share it.
@@ -116,10 +116,10 @@ class VideoSource:
 
         The next batch is started when the caller has taken the last slice of the current one.
         """
-        for request, batch in self.batches(self.requests(ranges)):
-            columns = self.rollout.host_columns(batch)
+        for request, batches in self.batches(self.requests(ranges)):
+            columns = self.rollout.host_columns(batches)
             for start in sorted({part.start for part in request.parts}):
-                rendered = self.rollout.draw(batch, start, self.rollout.slice)
+                rendered = self.rollout.draw(batches, start, self.rollout.slice)
                 for part in request.parts:
                     if part.start == start:
                         at = part.device
@@ -153,22 +153,22 @@ class VideoSource:
                     wanted[part.device, part.rows] = True
                 yield Request(split, numbers, wanted.ravel(), parts)
 
-    def keep(self, request: Request, batch: DeviceBatch) -> None:
-        """Use this batch when the same videos are requested next."""
-        self._kept = request, batch
+    def keep(self, request: Request, batches: list[DeviceBatch]) -> None:
+        """Use these batches when the same videos are requested next."""
+        self._kept = request, batches
 
-    def _start(self, request: Request) -> DeviceBatch:
+    def _start(self, request: Request) -> list[DeviceBatch]:
         kept, self._kept = self._kept, None
         if kept and kept[0].split == request.split and np.array_equal(kept[0].numbers, request.numbers):
             return kept[1]
         return self.rollout.start(request.split, request.numbers)
 
-    def batches(self, requests: Iterable[Request], ahead: int = 0) -> Iterator[tuple[Request, DeviceBatch]]:
-        """Simulated batches in order; up to `ahead` more are in flight.
+    def batches(self, requests: Iterable[Request], ahead: int = 0) -> Iterator[tuple[Request, list[DeviceBatch]]]:
+        """Simulated batches in order, one for each device; up to `ahead` more requests are in flight.
 
         Raises NoPlaceError if the objects of a wanted video do not fit.
         """
-        started: deque[tuple[Request, DeviceBatch]] = deque()
+        started: deque[tuple[Request, list[DeviceBatch]]] = deque()
         for request in requests:
             started.append((request, self._start(request)))
             if len(started) > ahead:
@@ -176,8 +176,8 @@ class VideoSource:
         while started:
             yield self._check_placed(*started.popleft())
 
-    def _check_placed(self, request: Request, batch: DeviceBatch) -> tuple[Request, DeviceBatch]:
-        misplaced = request.wanted & ~np.concatenate(per_device(batch.placed))
+    def _check_placed(self, request: Request, batches: list[DeviceBatch]) -> tuple[Request, list[DeviceBatch]]:
+        misplaced = request.wanted & ~np.concatenate([np.asarray(batch.placed) for batch in batches])
         if misplaced.any():
             options = [f"scene.{name}" for name in self.config.scene.contract.crowded_by]
             cause = f": it depends on {', '.join(options)}" if options else ""
@@ -185,4 +185,4 @@ class VideoSource:
                 f"scene: video {request.numbers[np.argmax(misplaced)]} could not be placed without overlap in 100 "
                 f"attempts{cause}; ask for fewer or smaller objects, or for more room"
             )
-        return request, batch
+        return request, batches

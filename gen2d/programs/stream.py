@@ -195,7 +195,7 @@ class Stream:
     def _batches(self) -> Generator[Arrays, None, None]:
         parts: list[Arrays] = []
         cells: deque[_Cell] = deque()
-        for _, batch in self.source.batches(self._requests(cells), ahead=1):  # the next is simulated meanwhile
+        for _, (batch,) in self.source.batches(self._requests(cells), ahead=1):  # the next is simulated meanwhile
             for index in range(min(len(cells), self.source.rollout.batch_size // self.cell)):
                 cell = cells.popleft()
                 parts.append(self._cell_fields(batch, index * self.cell, cell))
@@ -239,7 +239,7 @@ class Stream:
 
     def _host_fields(self, batch: DeviceBatch, row: int, names: Set[str]) -> Arrays:
         """Host-computed fields of a cell; text stays on the host."""
-        columns = self.source.rollout.host_columns(batch)[0]
+        columns = self.source.rollout.host_columns([batch])[0]
         cell_columns = {name: column[row : row + self.cell] for name, column in columns.items()}
         fields = self.source.schema.host_columns(cell_columns, self.options.split)
         return {name: v if self.fields[name].is_text else jnp.asarray(v) for name, v in fields.items() if name in names}
@@ -247,7 +247,7 @@ class Stream:
     def _render_cell(self, batch: DeviceBatch, row: int) -> Arrays:
         """Rendered fields of a cell, computed in slices that fit the cache."""
         size = divisor(self.cell, self.source.rollout.slice)
-        parts = [self.source.rollout.draw(batch, start, size)[0] for start in range(row, row + self.cell, size)]
+        parts = [self.source.rollout.draw([batch], start, size)[0] for start in range(row, row + self.cell, size)]
         names = self.fields.keys() & parts[0].keys()
         return {name: jnp.concatenate([part[name] for part in parts]) for name in names}
 

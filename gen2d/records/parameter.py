@@ -31,10 +31,17 @@ class Tape:
     def __init__(self) -> None:
         self._nodes: list[tuple[Callable, tuple]] = []  # operation and operands, in order of evaluation
         self._parameters: dict[Hashable, Parameter] = {}
-        self._guards: dict[int, Any] = {}  # value by node
+        self.guards: dict[int, Any] = {}  # value that each of these nodes must have
         self._arguments: dict[int, tuple[int, Parameter]] = {}  # first place, by node
         self._used = 0
         self._trace = threading.local()  # its `arguments`: those of the program that this thread traces
+
+    def __getstate__(self) -> tuple[Any, ...]:
+        return self._nodes, self.guards, self._arguments, self._used
+
+    def __setstate__(self, state: tuple[Any, ...]) -> None:
+        self.__init__()
+        self._nodes, self.guards, self._arguments, self._used = state
 
     def apply(self, operation: Callable, *operands: Any) -> "Parameter":
         """Result of an operation on parameters and constants; the same object for the same operands."""
@@ -57,7 +64,7 @@ class Tape:
 
     def guard(self, parameter: "Parameter") -> Any:
         """Value of a parameter, on which the programs then depend."""
-        self._guards[parameter.node] = parameter.value
+        self.guards[parameter.node] = parameter.value
         return parameter.value
 
     @contextlib.contextmanager
@@ -92,7 +99,7 @@ class Tape:
                     values.append(leaves[next(inputs)] if operation is _leaf else operation(*inputs))
         except (ArithmeticError, LookupError, ValueError):
             return None
-        if not all(_identity(values[node]) == _identity(value) for node, value in self._guards.items()):
+        if not all(_identity(values[node]) == _identity(value) for node, value in self.guards.items()):
             return None
         words = np.zeros(SIZE, np.uint32)
         for node, (start, parameter) in self._arguments.items():

@@ -12,7 +12,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from gen2d.config import plugins
 from gen2d.config.config import load_config
 from gen2d.programs import redraw, render
-from gen2d.programs.rollout import Rollout, per_device
+from gen2d.programs.rollout import Rollout
 from gen2d.records import keys as keys_module
 from gen2d.records import scene as scene_module
 
@@ -36,11 +36,11 @@ CASES = {
 def simulated():
     """Some videos' fields, and the keys of the videos; their pictures are drawn in several ways."""
     rollout = Rollout(load_config("bouncing.yaml", SMALL), jax.devices()[:1])
-    batch = rollout.start("train", np.arange(rollout.batch_size))
-    assert per_device(batch.placed)[0].all()
+    (batch,) = rollout.start("train", np.arange(rollout.batch_size))
+    assert np.asarray(batch.placed).all()
     words = jnp.asarray(keys_module.seed_words(3, zlib.crc32(b"train")))
     keys = keys_module.video_keys(words, jnp.arange(4, dtype=jnp.uint32))
-    return rollout.host_columns(batch)[0], keys
+    return rollout.host_columns([batch])[0], keys
 
 
 class Made:

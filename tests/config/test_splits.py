@@ -119,7 +119,7 @@ def test_the_study_s_splits_have_nothing_in_common_with_training_and_start_in_vi
 def columns(numbers, **asked):
     """The columns of the training videos with these numbers, a lane each."""
     config = CONFIG | {"quality": asked, "storage": {"batch_size": len(numbers)}}
-    batch = Rollout(load_config(config), devices.prepare("cpu")[:1]).start("train", np.array(numbers))
+    (batch,) = Rollout(load_config(config), devices.prepare("cpu")[:1]).start("train", np.array(numbers))
     return {name: np.asarray(values) for name, values in batch.columns.items()}
 
 

@@ -14,7 +14,8 @@ from tiny import command, tiny_config
 
 import gen2d
 from gen2d.config.reading import yaml_text
-from gen2d.programs.fingerprint import canonical, code_hash
+from gen2d.programs.fingerprint import code_hash
+from gen2d.programs.shared import canonical
 
 Edit = Callable[[str, str, str], None]
 ROOT = Path(gen2d.__file__).parent.parent

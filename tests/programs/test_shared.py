@@ -4,7 +4,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
 import pytest
 
@@ -20,7 +19,9 @@ STATIC = ("video.frames", "video.height", "video.width", "storage.", "annotation
 
 
 @pytest.fixture(autouse=True)
-def _no_programs() -> Iterator[None]:
+def _no_programs(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[None]:
+    """No program in memory or on disk."""
+    monkeypatch.setattr("gen2d.programs.executables._folder", lambda *_: None)
     shared.clear()
     yield
     shared.clear()
@@ -28,18 +29,13 @@ def _no_programs() -> Iterator[None]:
 
 def trace(config: Config) -> tuple[shared.BoundProgram, shared.BoundProgram]:
     """The two programs of a config, traced and not compiled."""
-    rollout, one = Rollout(config, devices.prepare("cpu")[:1]), jax.ShapeDtypeStruct((), np.int32)
-    numbers = jax.ShapeDtypeStruct((rollout.batch_size,), np.uint32)
-    grid = jax.ShapeDtypeStruct((rollout.batch_size, len(rollout.sampler.gridded)), np.float32)
-    args = jax.ShapeDtypeStruct((3,), np.uint32), one, grid, numbers, numbers
-    simulate = rollout._simulation_program(rollout.devices, args)
-    scenes = simulate.program.jitted.trace(simulate.numbers, *args).out_info.render_scenes
-    return simulate, rollout._draw_program(rollout.slice, (scenes, one))
+    programs = Rollout(config, devices.prepare("cpu")[:1]).programs()
+    return programs["simulate"], programs["draw"]
 
 
-def cache_sizes() -> list[int]:
-    """Number of compiled forms of each program."""
-    return [program.jitted._cache_size() for _, program in shared._programs]
+def programs() -> list[shared.Program]:
+    """All programs in memory."""
+    return [program for _, program in shared._programs]
 
 
 def edits(plain: Any, path: str = "") -> Iterator[tuple[str, Any]]:
@@ -82,9 +78,9 @@ def test_a_shared_program_gives_the_bits_of_an_own_one(tmp_path: Path) -> None:
         "video.fps=31",
     ]
     generate("bouncing.yaml", 8, tmp_path / "first", overrides=[*SMALL, "scene.gravity=[0,-9.8]"])
-    counts = cache_sizes()
+    before = set(programs())
     generate("bouncing.yaml", 8, tmp_path / "shared", overrides=overrides)
-    assert cache_sizes() == counts
+    assert set(programs()) == before
     shared.clear()
     generate("bouncing.yaml", 8, tmp_path / "own", overrides=overrides)
     both = [gen2d.open(tmp_path / name, fields="*")[:] for name in ("shared", "own", "first")]

@@ -13,7 +13,7 @@ from numpy.testing import assert_array_equal
 
 from gen2d.config.config import load_config
 from gen2d.core.errors import ConfigError
-from gen2d.programs.rollout import Rollout, per_device
+from gen2d.programs.rollout import Rollout
 
 # Of each family what a law needs beside its config.
 LAWS = {
@@ -45,11 +45,11 @@ def rollout_of(name: str) -> Rollout:
 def made(name: str) -> dict[str, np.ndarray]:
     """All that is stored of a batch of a family's videos, and what is seen of each object; [n, ...]."""
     rollout = rollout_of(name)
-    batch = rollout.start("train", np.arange(rollout.batch_size))
-    assert per_device(batch.placed)[0].all()
-    columns = rollout.host_columns(batch)[0] | {"time": rollout.schema.time}
+    (batch,) = rollout.start("train", np.arange(rollout.batch_size))
+    assert np.asarray(batch.placed).all()
+    columns = rollout.host_columns([batch])[0] | {"time": rollout.schema.time}
     if "visibility" in rollout.config.annotations.enabled:
-        columns |= rollout.draw(batch, 0, rollout.batch_size)[0]
+        columns |= rollout.draw([batch], 0, rollout.batch_size)[0]
     return {key: np.asarray(values, float) for key, values in columns.items() if key != "frames"}
 
 
