@@ -62,8 +62,7 @@ def prepare(device: str = "auto") -> list[Device]:
             "jax is in 64-bit mode (JAX_ENABLE_X64), but gen2d stores and computes in 32 bits: switch it off"
         )
     if jax.config.values["jax_compilation_cache_dir"] is None:
-        cache = pathlib.Path(os.environ.get("XDG_CACHE_HOME") or pathlib.Path.home() / ".cache")
-        jax.config.update("jax_compilation_cache_dir", str(cache / "gen2d" / instruction_set()))
+        jax.config.update("jax_compilation_cache_dir", str(default_cache()))
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
     try:
         jax.config.update("jax_num_cpu_devices", cores())
@@ -82,6 +81,11 @@ def prepare(device: str = "auto") -> list[Device]:
     except RuntimeError as error:
         hint = "; install gen2d[cuda], or use --device cpu" if device == "gpu" else ""
         raise DeviceError(f"--device is {device!r}, but jax finds none{hint} ({error})") from None
+
+
+def default_cache() -> pathlib.Path:
+    """Folder of compiled programs, where the user names none."""
+    return pathlib.Path(os.environ.get("XDG_CACHE_HOME") or pathlib.Path.home() / ".cache") / "gen2d" / "programs"
 
 
 def instruction_set() -> str:

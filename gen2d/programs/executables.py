@@ -28,7 +28,7 @@ from jax.experimental import serialize_executable
 from jax.experimental.compilation_cache import compilation_cache
 
 from gen2d.programs import environment
-from gen2d.programs.devices import Device
+from gen2d.programs.devices import Device, default_cache
 from gen2d.records.parameter import Tape
 from gen2d.storage.atomic import publish
 from gen2d.storage.sealed import as_json, read_bytes, sha256
@@ -214,9 +214,10 @@ def _is_private(path: pathlib.Path) -> bool:
 
 
 def _evict() -> None:
-    """Remove the least recently used files beyond MAX_BYTES."""
+    """Remove the least recently used files beyond MAX_BYTES; in a folder of gen2d's own, also those of jax."""
     root = _root()
-    states = [(path.stat(), path) for path in root.rglob("*") if path.is_file()] if root else []
+    folder = root.parent if root and root.parent == default_cache() else root
+    states = [(path.stat(), path) for path in folder.rglob("*") if path.is_file()] if folder else []
     total = 0
     for state, path in sorted(states, key=lambda pair: -pair[0].st_mtime):
         total += state.st_size

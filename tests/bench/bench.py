@@ -251,6 +251,7 @@ class Ran(NamedTuple):
     """A completed command."""
 
     seconds: float
+    cpu: float  # s, of all its processes
     peak: int  # memory, bytes
     text: str
 
@@ -270,7 +271,7 @@ def run(command: Sequence[object], cores: Sequence[int] = CORES, env: Mapping[st
     process.returncode = os.waitstatus_to_exitcode(status)
     if process.returncode:
         raise SystemExit(f"{text}\nbench.py: {' '.join(line)} failed")
-    return Ran(time.perf_counter() - began, usage.ru_maxrss * 1024, text)
+    return Ran(time.perf_counter() - began, usage.ru_utime + usage.ru_stime, usage.ru_maxrss * 1024, text)
 
 
 def measure(work: Callable, folder: Path, cores: Sequence[int] = CORES, **options: Any) -> Any:
@@ -279,9 +280,9 @@ def measure(work: Callable, folder: Path, cores: Sequence[int] = CORES, **option
     return json.loads(next(line for line in ran.text.splitlines() if line.startswith("{")))
 
 
-def command(videos: int, out: Path, *overrides: str, cache: Path | None = None) -> Ran:
+def command(videos: int, out: Path, *overrides: str, cache: Path | None = None, config: str = CONFIG) -> Ran:
     """Run `python -m gen2d` to generate a new dataset."""
-    arguments = ["--config", CONFIG, "--n", videos, "--out", out, *(part for s in overrides for part in ("--set", s))]
+    arguments = ["--config", config, "--n", videos, "--out", out, *(part for s in overrides for part in ("--set", s))]
     env = {"JAX_COMPILATION_CACHE_DIR": str(cache)} if cache else {}
     return run([sys.executable, "-m", "gen2d", *arguments], env=env)
 
@@ -397,15 +398,22 @@ def scaling_section(folder: Path, quick: bool) -> Results:
     yield Promise("6 two cores against one", _ratio(two, one), target=1.7, note=note)
 
 
+EDIT = ("video.fps=29", "physics.push_speed=0.9", "look.background=[12, 30, 61]")
+
+
 def start_section(folder: Path, quick: bool) -> Results:
-    """Time from process start to the first complete shard, with a cold and a warm compilation cache."""
-    seconds = []
-    for turn in range(4):
-        out, began = folder / f"start{turn}", time.time()
-        command(64, out, "storage.videos_per_shard=64", cache=folder / "cache")
-        seconds.append(next((out / "shards").glob("train-00000*.h5")).stat().st_mtime - began)
-    yield Promise("7 first shard, warm cache", statistics.median(seconds[1:]), "s", 8, most=True)
-    yield Promise("  first shard, cold cache", seconds[0], "s", 40, most=True)
+    """CPU seconds of a small job: the first of a family, one with edited numbers, and one that ran before."""
+    for config, most in ({"bouncing": 20} if quick else {"bouncing": 20, "pile": 50}).items():
+        jobs: dict[str, tuple[str, ...]] = {"cold": (), "edited": EDIT, "warm": (), "warm again": ()}
+        runs = {
+            job: command(16, folder / config / job, *overrides, cache=folder / config / "cache", config=f"{config}.yaml")
+            for job, overrides in jobs.items()
+        }
+        warm = [runs[job].cpu for job in ("warm", "warm again")]
+        name = f"7 --n 16, {config}"
+        yield Promise(f"{name}, cold", runs["cold"].cpu, "CPU s", most, most=True, note=f"{runs['cold'].seconds:.0f} s")
+        yield Promise("  after editing numbers", runs["edited"].cpu, "CPU s", 6, most=True)
+        yield Promise("  warm", min(warm), "CPU s", 4, most=True, note=f"{runs['warm again'].seconds:.1f} s")
 
 
 def physics_section(folder: Path, quick: bool) -> Results:

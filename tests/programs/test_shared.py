@@ -21,7 +21,7 @@ STATIC = ("video.frames", "video.height", "video.width", "storage.", "annotation
 @pytest.fixture(autouse=True)
 def _no_programs(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[None]:
     """No program in memory or on disk."""
-    monkeypatch.setattr("gen2d.programs.executables._folder", lambda *_: None)
+    monkeypatch.setattr("gen2d.programs.executables._root", lambda: None)
     shared.clear()
     yield
     shared.clear()
