@@ -85,7 +85,9 @@ def prepare(device: str = "auto") -> list[Device]:
 
 def default_cache() -> pathlib.Path:
     """Folder of compiled programs, where the user names none."""
-    return pathlib.Path(os.environ.get("XDG_CACHE_HOME") or pathlib.Path.home() / ".cache") / "gen2d" / instruction_set()
+    return (
+        pathlib.Path(os.environ.get("XDG_CACHE_HOME") or pathlib.Path.home() / ".cache") / "gen2d" / instruction_set()
+    )
 
 
 def instruction_set() -> str:

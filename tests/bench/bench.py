@@ -406,7 +406,9 @@ def start_section(folder: Path, quick: bool) -> Results:
     for config, most in ({"bouncing": 20} if quick else {"bouncing": 20, "pile": 50}).items():
         jobs: dict[str, tuple[str, ...]] = {"cold": (), "edited": EDIT, "warm": (), "warm again": ()}
         runs = {
-            job: command(16, folder / config / job, *overrides, cache=folder / config / "cache", config=f"{config}.yaml")
+            job: command(
+                16, folder / config / job, *overrides, cache=folder / config / "cache", config=f"{config}.yaml"
+            )
             for job, overrides in jobs.items()
         }
         warm = [runs[job].cpu for job in ("warm", "warm again")]
