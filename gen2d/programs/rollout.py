@@ -11,7 +11,8 @@ import dataclasses
 import functools
 import zlib
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -46,8 +47,24 @@ def divisor(number: int, limit: int) -> int:
     return next(d for d in range(min(number, limit), 0, -1) if number % d == 0)
 
 
+class Lane(NamedTuple):
+    """A device, and the thread that starts programs on it."""
+
+    device: Device
+    thread: ThreadPoolExecutor
+
+    def start(self, program: Callable[..., Any], *args: Any) -> Future[Any]:
+        """Start a program, called with the device and these arguments, after those started before it."""
+        return self.thread.submit(program, self.device, *args)
+
+
 class Rollout:
-    """Compiled programs of one config on some devices."""
+    """Compiled programs of one config on some devices.
+
+    Devices are lanes: each runs one program at a time, and all run at once. CPU devices are lanes of the first of them,
+    as jax runs programs from several threads at once on one CPU device. So an executable is loaded only once; it takes
+    up to thousands of the memory maps that a process may have.
+    """
 
     def __init__(self, config: Config, devices: Sequence[Device]) -> None:
         self.config, self.devices = config, list(devices)
@@ -65,6 +82,8 @@ class Rollout:
         # A shard size in the config must not change the videos.
         self.batch_size = config.storage.batch_size or min(default_batch, default_shard)
         self.slice = divisor(self.batch_size, max(1, SLICE_BYTES // frame_bytes))
+        lanes = [self.devices[0] if self.sparse else device for device in self.devices]
+        self._lanes = [Lane(device, ThreadPoolExecutor(1, "lane")) for device in lanes]
         self._draws: dict[int, BoundProgram] = {}  # by number of videos
 
     def start(self, split: str, numbers: np.ndarray) -> list[DeviceBatch]:
@@ -72,36 +91,38 @@ class Rollout:
 
         Raises NoVideoError if no attempt at some video lies in the ranges that the config requires.
         """
-        parts = zip(self.devices, numbers.astype(np.uint32).reshape(len(self.devices), -1), strict=True)
+        parts = list(zip(self._lanes, numbers.astype(np.uint32).reshape(len(self._lanes), -1), strict=True))
         if not self.quality_ranges:
-            return [self._start_on(device, split, part) for device, part in parts]
-        with ThreadPoolExecutor(len(self.devices)) as pool:  # each device may need another number of attempts
+            futures = [self._start_on(lane, split, part) for lane, part in parts]
+            return [future.result() for future in futures]
+        with ThreadPoolExecutor(len(parts)) as pool:  # each lane may need another number of attempts
             return list(pool.map(lambda part: self._accept_on(part[0], split, part[1]), parts))
 
     def _start_on(
-        self, device: Device, split: str, numbers: np.ndarray, attempts: np.ndarray | None = None
-    ) -> DeviceBatch:
-        """Start to simulate videos [batch_size] on a device, with these attempts, by default the first."""
+        self, lane: Lane, split: str, numbers: np.ndarray, attempts: np.ndarray | None = None
+    ) -> Future[DeviceBatch]:
+        """Start to simulate videos [batch_size] with these attempts, by default the first."""
         root, row = keys_module.seed_words(self.config.seed, zlib.crc32(split.encode())), self.config.split_index(split)
         grid = self.sampler.grid_values(row, root, numbers)
         attempts = np.zeros_like(numbers) if attempts is None else attempts.astype(np.uint32)
-        return self.simulate_program(device, root, np.int32(row), grid, numbers, attempts)
+        return lane.start(self.simulate_program, root, np.int32(row), grid, numbers, attempts)
 
-    def _accept_on(self, device: Device, split: str, numbers: np.ndarray) -> DeviceBatch:
+    def _accept_on(self, lane: Lane, split: str, numbers: np.ndarray) -> DeviceBatch:
         """Batch of videos that lie in the ranges that the config requires."""
 
         def attempt(rows: np.ndarray, attempts: np.ndarray) -> DeviceBatch:
-            batch = self._start_on(device, split, numbers[rows], attempts)
+            batch = self._start_on(lane, split, numbers[rows], attempts).result()
             if quality.VISIBILITY not in self.quality_ranges:
                 return batch
             starts = range(0, self.batch_size, self.slice)  # only rendering gives the visibility
-            visibility = [self._draw_on(device, batch, start, self.slice)[quality.VISIBILITY] for start in starts]
-            column = jax.device_put(np.concatenate(jax.device_get(visibility)), device)
+            slices = [self._draw_on(lane, batch, start, self.slice).result() for start in starts]
+            visibility = np.concatenate([np.asarray(part[quality.VISIBILITY]) for part in slices])
+            column = jax.device_put(visibility, lane.device)
             return batch._replace(columns=batch.columns | {quality.VISIBILITY: column})
 
         batch, attempts = rejection.accepted_batch(attempt, numbers, self.config.quality)
         batch.columns.pop(quality.VISIBILITY, None)  # `draw` returns it
-        rejected = jax.device_put(attempts.astype(np.int32), device)
+        rejected = jax.device_put(attempts.astype(np.int32), lane.device)
         return batch._replace(columns=batch.columns | {"quality/rejected_videos": rejected})
 
     def draw(self, batches: Sequence[DeviceBatch], start: int, count: int) -> list[dict[str, Array]]:
@@ -109,11 +130,12 @@ class Rollout:
 
         Returns each device's frames [count, T, H, W, 3] and annotations by stored name.
         """
-        parts = zip(self.devices, batches, strict=True)
-        return [self._draw_on(device, batch, start, count) for device, batch in parts]
+        parts = zip(self._lanes, batches, strict=True)
+        futures = [self._draw_on(lane, batch, start, count) for lane, batch in parts]
+        return [future.result() for future in futures]
 
-    def _draw_on(self, device: Device, batch: DeviceBatch, start: int, count: int) -> dict[str, Array]:
-        return self.draw_program(count)(device, batch.render_scenes, np.int32(start))
+    def _draw_on(self, lane: Lane, batch: DeviceBatch, start: int, count: int) -> Future[dict[str, Array]]:
+        return lane.start(self.draw_program(count), batch.render_scenes, np.int32(start))
 
     # ---- Programs
 
@@ -125,7 +147,7 @@ class Rollout:
         """Compile the programs, at the same time, and load them on all devices."""
         programs = self.programs().values()
         with ThreadPoolExecutor(len(programs)) as pool:
-            for _ in pool.map(lambda bound: [bound.program.load(device) for device in self.devices], programs):
+            for _ in pool.map(lambda bound: [bound.program.load(lane.device) for lane in self._lanes], programs):
                 pass
 
     @functools.cached_property
