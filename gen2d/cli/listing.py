@@ -11,6 +11,9 @@ def add_arguments(parser: Parser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     from gen2d.cli.report import plugins
+    from gen2d.core.progress import waiting
 
-    print(plugins(options.name))
+    with waiting("Importing all plug-ins"):
+        text = plugins(options.name)
+    print(text)
     return 0
