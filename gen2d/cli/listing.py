@@ -11,9 +11,6 @@ def add_arguments(parser: Parser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     from gen2d.cli.report import plugins
-    from gen2d.core.progress import waiting
 
-    with waiting("Importing all plug-ins"):
-        text = plugins(options.name)
-    print(text)
+    print(plugins(options.name))
     return 0

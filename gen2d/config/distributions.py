@@ -158,9 +158,9 @@ class Distribution:
         if self.kind in ("constant", "choice", "grid"):
             return [(to_float32(x), to_float32(x)) for x in self.numbers]
         low, high = self.support
-        return [
-            (low, high) if self.form in (("integer", 2), ("normal", 2)) else (to_float32(low), _last_sample(low, high))
-        ]
+        if self.form in (("integer", 2), ("normal", 2)):
+            return [(low, high)]
+        return [(to_float32(low), _last_sample(low, high))]
 
     def sample(self, key: Array, shape: tuple[int, ...]) -> Array:
         """Independent samples of this shape, float32 (int32 for `integer`)."""

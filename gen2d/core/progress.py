@@ -14,7 +14,7 @@ from typing import Any
 
 from gen2d.core.humanize import in_time
 
-PATIENCE, PERIOD = 1.0, 10.0  # seconds after which a wait is announced, and between two lines about it
+PATIENCE, PERIOD = 2.0, 10.0  # seconds after which a wait is announced, and between two lines about it
 LOGGER = logging.getLogger("gen2d")
 Log = Callable[[str], None]
 
@@ -43,7 +43,7 @@ def logged_to_stderr() -> Iterator[None]:
 
 @contextmanager
 def waiting(what: str, log: Log | None = None, status: Callable[[float], str] | None = None) -> Iterator[None]:
-    """Log what a block does if it takes more than a second, and then its status every ten seconds.
+    """Log what a block does if it takes more than two seconds, and then its status every ten seconds.
 
     `status(seconds)` describes the progress after these seconds; by default it is the time elapsed. Also a decorator of
     functions.
@@ -69,7 +69,7 @@ def waiting(what: str, log: Log | None = None, status: Callable[[float], str] | 
 
 @contextmanager
 def progress(what: str, count: int, log: Log | None = None, unit: str = "videos") -> Iterator[Callable[[int], None]]:
-    """Progress bar on a terminal; elsewhere `what` after a second, and then one line every ten seconds.
+    """Progress bar on a terminal; elsewhere `what` after two seconds, and then one line every ten seconds.
 
     Yields a function that advances the progress by a number of units.
     """

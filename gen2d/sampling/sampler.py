@@ -200,7 +200,7 @@ class Sampler:
         return list(zip(self._coordinates(name), parts, strict=True))
 
     def _distances(self, name: str, values: Array) -> Array:
-        """Distance of each value of a coordinate from its support in each of the training split's P products [..., P]."""
+        """Distance [..., P] of each value of a coordinate from its support in each product of the training split."""
         assert self.training is not None
         distributions, places = _distinct(self.training.products, name)
         intervals = [source.intervals for source in distributions]
