@@ -103,7 +103,7 @@ SPLIT_EDITS: dict[str, dict[str, Any]] = {
         "far": {"radius": [1.15, 1.2], "spin": {"log_uniform": [19, 31]}},
         "hole": {"radius": {"choice": [0.75, 0.76]}, "balls": {"choice": [3, 4]}},
     },
-    "two equal": {"far": {"radius": [0.45, 0.49], "spin": {"log_uniform": [20, 30]}}},
+    "two equal": {"near": {"radius": [1.1, 1.2], "spin": {"normal": [20, 1, 19, 22]}}},
     "swapped": {
         "near": {"radius": [1.1, 1.2], "spin": {"normal": [20, 1, 19, 22]}},
         "far": {"radius": [0.45, 0.49], "spin": {"log_uniform": [20, 30]}},
@@ -169,6 +169,8 @@ def test_no_edited_number_of_a_split_needs_another_program(sampled: Any, edit: s
 
 
 def test_equal_and_different_splits_of_a_config_share_its_programs() -> None:
+    """The largest radius stays, as it decides the size of tiles."""
+
     def programs(config: Config) -> list[shared.Program]:
         return [bound.program for bound in trace(config)]
 
