@@ -6,6 +6,9 @@
     for batch in gen2d.DataLoader(ds, batch_size=32): ...
 
 Each name is imported on first use, so a training process that only reads data does not import jax.
+
+The logger "gen2d" says at level INFO what a wait of more than two seconds is; `logging.basicConfig(level="INFO")` shows
+it.
 """
 
 import os
