@@ -220,7 +220,7 @@ def sample_one_of(sources: Sequence[Distribution], index: Any, key: Array, shape
         counts = [len(source.parts) for source in sources]
         ends = table([thresholds(max(counts), *source.numbers) for source in sources])[place]
         component = (jax.random.uniform(component_key, shape)[..., None] >= ends).sum(-1)
-        firsts = table(np.cumsum([0, *counts[:-1]]), jnp.int32)[place]
+        firsts = table(np.cumsum([0, *counts[:-1]]).tolist(), jnp.int32)[place]
         return sample_one_of([part for source in sources for part in source.parts], firsts + component, key, shape)
     columns = list(zip(*(source.constants for source in sources), strict=True))
     if kind in ("choice", "grid"):

@@ -129,7 +129,7 @@ def sampled() -> Iterator[Any]:
     def draw(config: Config, shared: bool) -> tuple[dict[str, dict[str, np.ndarray]], Any]:
         (structure, leaves), host = split_numbers(config), Sampler(config)
         words, numbers = seed_words(3, 7), np.arange(64, dtype=np.uint32)
-        keys = video_keys(np.asarray(words), numbers)
+        keys = video_keys(jax.numpy.asarray(words), jax.numpy.asarray(numbers))
         served = (entry for entry in programs if entry[0] == structure and entry[1].arguments(leaves) is not None)
         entry = next(served, None) if shared else None
         if entry is None:
