@@ -6,8 +6,12 @@
     for batch in gen2d.DataLoader(ds, batch_size=32): ...
 
 Each name is imported on first use, so a training process that only reads data does not import jax.
+
+The logger "gen2d" says at level INFO what a wait of more than two seconds is; `logging.basicConfig(level="INFO")` shows
+it.
 """
 
+import os
 from typing import TYPE_CHECKING
 
 from gen2d._version import __version__ as __version__
@@ -62,3 +66,6 @@ __all__ = [
 ]  # fmt: skip
 
 __getattr__, __dir__ = attach(__name__, _HOMES)
+
+# XLA reads it when jax is imported. Its log says that it is slow, and nothing that is not raised as an error too.
+os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")

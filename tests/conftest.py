@@ -11,7 +11,6 @@ import pytest
 _CACHE = tempfile.TemporaryDirectory(prefix="gen2d-test-cache-")
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", _CACHE.name)
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.2")
-os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
 os.environ["XDG_CONFIG_HOME"] = str(pathlib.Path(_CACHE.name) / "config")  # the user's list of trusted code is not ours
 
 

@@ -59,9 +59,11 @@ def _worker(text: str) -> tuple[int, int]:
 
 
 def run(options: argparse.Namespace) -> int:
-    from gen2d.core.progress import to_stderr
-    from gen2d.generation.run import generate  # imports jax
-    from gen2d.storage.filesystems import redact_url
+    from gen2d.core.progress import to_stderr, waiting
+
+    with waiting("Importing jax"):
+        from gen2d.generation.run import generate
+        from gen2d.storage.filesystems import redact_url
 
     try:
         summary = generate(

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from gen2d.cli import clean, export, generate, info, listing, preview, verify
 from gen2d.cli.parser import parse
 from gen2d.core.errors import Error
+from gen2d.core.progress import logged_to_stderr
 from gen2d.storage.explain import reading_error
 
 VERBS = {
@@ -32,7 +33,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             stream.reconfigure(errors="backslashreplace")  # not every terminal encodes every character
     try:
         options = parse(sys.argv[1:] if arguments is None else arguments, VERBS)
-        code = options.run(options)
+        with logged_to_stderr():
+            code = options.run(options)
         sys.stdout.flush()
         return code
     except Error as error:

@@ -46,8 +46,10 @@ def run(options: argparse.Namespace) -> int:
             raise UserError(f"{root} is not a dataset that gen2d made")
 
     def repair(shards: list[str]) -> list[str]:
-        from gen2d.core.progress import to_stderr
-        from gen2d.generation import regenerate  # imports jax
+        from gen2d.core.progress import to_stderr, waiting
+
+        with waiting("Importing jax"):
+            from gen2d.generation import regenerate
 
         return regenerate.repair(root, shards, to_stderr, trust=options.trust, **limits(options))
 

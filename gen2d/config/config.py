@@ -230,14 +230,14 @@ def _check_matched(config: Config, source: str) -> None:
         matched_module.check(config.matched, MatchedOptions(), *sections)
         if config.matched.change and quality_module.ranges(config.quality):
             raise ValueError("change is given, but a set has one scene: quality must ask for nothing")
-        if config.matched.change and any(joint.combinations()[0] for joint in config.joint_distributions):
+        if config.matched.change and any(joint.gridded for joint in config.joint_distributions):
             raise ValueError("change is given, but its scenes cannot be on a grid")
     except ValueError as error:
         raise ConfigError(f"{source}: matched.{error}") from None
 
 
 def _check_grids(config: Config, source: str) -> None:
-    """Raise ConfigError if a grid is given for anything but a scene's factor with one number per video."""
+    """Raise ConfigError if a grid is too large, or given for anything but a scene's factor with a number per video."""
     sections = {name: getattr(config, name) for name in SECTIONS} | {
         p: getattr(config, p).options for p in DEFAULT_PLUGINS
     }
@@ -249,6 +249,10 @@ def _check_grids(config: Config, source: str) -> None:
                 raise ConfigError(
                     f"{source}: {section}.{field.name} is on a grid, but only a scene's numbers of a whole video can be"
                 )
+    try:
+        config.joint_distributions[0].combinations()
+    except ValueError as error:
+        raise ConfigError(f"{source}: scene must be {error}") from None
 
 
 def load_config(

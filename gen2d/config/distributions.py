@@ -7,6 +7,7 @@ truncated exactly (truncation.py), without sampling.
 
 import dataclasses
 import math
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -53,9 +54,17 @@ def _last_sample(low: float, high: float) -> float:
 
 
 @recorded
-def _thresholds(*weights: float) -> np.ndarray:
-    """Cumulative probabilities of components, without the last."""
-    return np.cumsum(weights)[:-1] / sum(weights)
+def thresholds(length: int, *weights: float) -> np.ndarray:
+    """Cumulative probabilities [length - 1] of components, without the last; 2 where there is none."""
+    ends = np.full(length - 1, 2.0)
+    ends[: len(weights) - 1] = np.cumsum(weights)[:-1] / sum(weights)
+    return ends
+
+
+@recorded
+def stacked(*values: Any) -> np.ndarray:
+    """Numbers, or arrays of one shape, along a new first axis."""
+    return np.stack(values)
 
 
 class Span(NamedTuple):
@@ -131,29 +140,31 @@ class Distribution:
             return {"mixture": [part.plain() for part in self.parts], "weights": list(self.numbers)}
         return numbers[0] if self.kind == "constant" else {self.kind: numbers}
 
+    @property
+    def form(self) -> tuple[str, int]:
+        """Kind, and number of parameters: distributions of one form are sampled alike. Mixtures are of one form."""
+        return self.kind, 0 if self.kind == "mixture" else len(self.numbers)
+
+    @property
+    def flat_numbers(self) -> tuple[float, ...]:
+        """All numbers, followed by those of the parts."""
+        return *self.numbers, *(x for part in self.parts for x in part.flat_numbers)
+
+    @property
+    def intervals(self) -> list[tuple[float, float]]:
+        """Closed intervals of float32 numbers, some of which may be equal; the samples are those inside one of them."""
+        if self.kind == "mixture":
+            return [interval for part in self.parts for interval in part.intervals]
+        if self.kind in ("constant", "choice", "grid"):
+            return [(to_float32(x), to_float32(x)) for x in self.numbers]
+        low, high = self.support
+        if self.form in (("integer", 2), ("normal", 2)):
+            return [(low, high)]
+        return [(to_float32(low), _last_sample(low, high))]
+
     def sample(self, key: Array, shape: tuple[int, ...]) -> Array:
         """Independent samples of this shape, float32 (int32 for `integer`)."""
-        n = self.numbers
-        if self.kind == "mixture":
-            return self._sample_mixture(key, shape)
-        if self.kind == "constant":
-            return jnp.full(shape, n[0], jnp.float32)
-        if self.kind == "integer":
-            return jax.random.randint(key, shape, apply(int, n[0]), apply(int, n[1]) + 1)
-        if self.kind in ("choice", "grid"):
-            return jnp.asarray(n, jnp.float32)[jax.random.randint(key, shape, 0, len(n))]
-        if self.kind == "normal" and len(n) == 2:
-            return n[0] + n[1] * jax.random.normal(key, shape)
-        if self.kind == "uniform":
-            samples = jax.random.uniform(key, shape, minval=n[0], maxval=n[1])
-        elif self.kind == "log_uniform":
-            low, high = (apply(math.log, x) for x in n)
-            samples = jnp.exp(jax.random.uniform(key, shape, minval=low, maxval=high))
-        else:
-            low, high = ((end - n[0]) / n[1] for end in n[2:])
-            samples = n[0] + n[1] * jax.random.truncated_normal(key, low, high, shape)
-        low, high = self.support
-        return jnp.clip(samples, to_float32(low), _last_sample(low, high))  # rounding may leave the support
+        return sample_one_of([self], 0, key, shape)
 
     @property
     def weighted(self) -> list[tuple[float, "Distribution"]]:
@@ -162,9 +173,69 @@ class Distribution:
             return [(1.0, self)]
         return [(weight / sum(self.numbers), part) for weight, part in zip(self.numbers, self.parts, strict=True)]
 
-    def _sample_mixture(self, key: Array, shape: tuple[int, ...]) -> Array:
-        component_key, value_key = jax.random.split(key)
-        thresholds = jnp.asarray(_thresholds(*self.numbers), jnp.float32)
-        chosen = (jax.random.uniform(component_key, shape)[..., None] >= thresholds).sum(-1)
-        samples = [part.sample(value_key, shape) for part in self.parts]
-        return jnp.select([chosen == i for i in range(len(samples))], samples)
+    @property
+    def constants(self) -> tuple[Any, ...]:
+        """Numbers that `sample_one_of` needs of a distribution that is no mixture, computed in float64."""
+        n = self.numbers
+        if self.kind == "integer":
+            return apply(int, n[0]), apply(int, n[1]) + 1
+        if self.kind in ("choice", "grid"):
+            return (stacked(*n),)
+        if self.form in (("constant", 1), ("normal", 2)):
+            return n
+        if self.kind == "log_uniform":
+            n = tuple(apply(math.log, x) for x in n)
+        elif self.kind == "normal":
+            n = n[0], n[1], (n[2] - n[0]) / n[1], (n[3] - n[0]) / n[1]
+        return *n, *self.intervals[0]
+
+
+def sample_one_of(sources: Sequence[Distribution], index: Any, key: Array, shape: tuple[int, ...]) -> Array:
+    """Independent samples of this shape, from distribution number `index` of the sources.
+
+    The index is a number, or has one for each sample. Samples are those of `sources[index].sample(key, shape)`. All
+    distributions of one form are sampled at once, from numbers that are gathered by index, so a program depends on the
+    forms alone.
+    """
+    forms = [source.form for source in sources]
+    if len(set(forms)) > 1:
+        samples, distinct = [], list(dict.fromkeys(forms))
+        for form in distinct:
+            own = np.array([other == form for other in forms])
+            places = np.maximum(np.cumsum(own) - 1, 0)  # among those of this form; of others, any
+            group = [source for source, is_own in zip(sources, own, strict=True) if is_own]
+            samples.append(sample_one_of(group, jnp.asarray(places)[index], key, shape))
+        chosen = jnp.asarray([distinct.index(form) for form in forms])[index]
+        return jnp.select([chosen == i for i in range(len(distinct))], samples)
+
+    kind, count = forms[0]
+    place = (index,) if len(sources) > 1 else ()
+
+    def table(values: Sequence[Any], dtype: Any = jnp.float32) -> Array:
+        """Values of all sources along the first axis, or those of the only one."""
+        return jnp.asarray(stacked(*values) if place else values[0], dtype)
+
+    if kind == "mixture":
+        component_key, key = jax.random.split(key)
+        counts = [len(source.parts) for source in sources]
+        ends = table([thresholds(max(counts), *source.numbers) for source in sources])[place]
+        component = (jax.random.uniform(component_key, shape)[..., None] >= ends).sum(-1)
+        firsts = table(np.cumsum([0, *counts[:-1]]).tolist(), jnp.int32)[place]
+        return sample_one_of([part for source in sources for part in source.parts], firsts + component, key, shape)
+    columns = list(zip(*(source.constants for source in sources), strict=True))
+    if kind in ("choice", "grid"):
+        return table(columns[0])[(*place, jax.random.randint(key, shape, 0, count))]
+    if kind == "integer":
+        low, stop = (table(column, jnp.int32)[place] for column in columns)
+        return jax.random.randint(key, shape, low, stop)
+    n = [table(column)[place] for column in columns]
+    if kind == "constant":
+        return jnp.broadcast_to(n[0], shape)
+    if kind == "normal" and count == 2:
+        return n[0] + n[1] * jax.random.normal(key, shape)
+    if kind == "normal":
+        samples = n[0] + n[1] * jax.random.truncated_normal(key, n[2], n[3], shape)
+    else:
+        samples = jax.random.uniform(key, shape, minval=n[0], maxval=n[1])
+    samples = jnp.exp(samples) if kind == "log_uniform" else samples
+    return jnp.clip(samples, *n[-2:])  # rounding may leave the support

@@ -66,16 +66,26 @@ class JointDistribution:
         """Support of one coordinate, as spans."""
         return tuple(dict.fromkeys(span for product in self.products for span in product.parts[name].spans))
 
-    def combinations(self) -> tuple[list[str], np.ndarray]:
-        """Names of the G coordinates on a grid, and their M distinct combinations, float32 [M, G]."""
-        names = [name for name, part in self.products[0].parts.items() if on_grid(part)]
+    @property
+    def gridded(self) -> list[str]:
+        """Names of the coordinates on a grid."""
+        return [name for name, part in self.products[0].parts.items() if on_grid(part)]
+
+    def combinations(self) -> np.ndarray:
+        """Distinct combinations [M, G] float32 of the values of the G coordinates on a grid.
+
+        Raises ValueError if there are too many.
+        """
+        names = self.gridded
         axes = [
             [[x for _, simple in p.parts[name].weighted for x in simple.numbers] for name in names]
             for p in self.products
         ]
         grids = [itertools.product(*values) for values in axes]
         distinct = dict.fromkeys(itertools.islice(itertools.chain(*grids), MAX_COMBINATIONS + 1))
-        return names, np.array(list(distinct), np.float32).reshape(len(distinct), len(names))
+        if len(distinct) > MAX_COMBINATIONS:
+            raise ValueError(f"a grid of at most {MAX_COMBINATIONS:,} combinations")
+        return np.array(list(distinct), np.float32).reshape(len(distinct), len(names))
 
 
 def on_grid(part: Distribution) -> bool:
@@ -91,11 +101,9 @@ def parse_distribution(written: Any, base: Marginals, read: ReadValue) -> JointD
     products = _parse_products(written, base, read)
     total_share = sum(product.share for product in products)
     joint = JointDistribution(tuple(Component(product.share / total_share, product.parts) for product in products))
-    names, combinations = joint.combinations()
-    if names and set(joint.differing) - set(names):
+    if joint.gridded and set(joint.differing) - set(joint.gridded):
         raise ValueError("of distributions whose products differ in the grid only, where there is one")
-    if len(combinations) > MAX_COMBINATIONS:
-        raise ValueError(f"a grid of at most {MAX_COMBINATIONS:,} combinations")
+    joint.combinations()  # raises ValueError if there are too many
     return joint
 
 
@@ -166,10 +174,14 @@ def _split_at_box(product: Component, box: SupportBox) -> tuple[list[Component],
 
 
 def _with_coordinate(product: Component, name: str, pieces: truncation.Pieces) -> list[Component]:
-    """The product with one coordinate truncated to these pieces; an empty list if there are none."""
+    """The product with one coordinate truncated to these pieces; an empty list if there are none.
+
+    The truncated distribution is a new object, even if it equals the old one (`union_support` says why).
+    """
     if not pieces:
         return []
-    return [Component(product.share * truncation.total(pieces), {**product.parts, name: truncation.mixture(pieces)})]
+    part = dataclasses.replace(truncation.mixture(pieces))
+    return [Component(product.share * truncation.total(pieces), {**product.parts, name: part})]
 
 
 def intersect(one: JointDistribution, other: JointDistribution) -> dict[str, float] | None:
@@ -198,7 +210,19 @@ def _common_point(one: Sequence[Span], other: Sequence[Span]) -> float | None:
 
 
 def union_support(joints: Sequence[JointDistribution]) -> Marginals:
-    """For each coordinate, a distribution whose support contains those of all joint distributions."""
-    names = joints[0].products[0].parts
+    """For each coordinate, a distribution whose support contains those of all joint distributions.
+
+    It is a mixture of the distinct objects among their distributions, whether or not some are equal: which numbers
+    programs take must not depend on their values.
+    """
     products = [product for joint in joints for product in joint.products]
-    return {name: truncation.mixture([(product.share, product.parts[name]) for product in products]) for name in names}
+    distinct = {name: distinct_parts(products, name) for name in products[0].parts}
+    return {
+        name: parts[0] if len(parts) == 1 else Distribution("mixture", (1.0,) * len(parts), parts)
+        for name, parts in distinct.items()
+    }
+
+
+def distinct_parts(products: Sequence[Component], name: str) -> tuple[Distribution, ...]:
+    """Distributions of a coordinate in these products, each object once."""
+    return tuple({id(product.parts[name]): product.parts[name] for product in products}.values())

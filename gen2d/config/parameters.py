@@ -6,6 +6,7 @@ from typing import Any
 
 from gen2d.config.config import Config
 from gen2d.config.distributions import Distribution
+from gen2d.config.joint_distribution import Component, JointDistribution
 from gen2d.config.plugin_options import Plugin
 from gen2d.config.sections import StorageOptions
 from gen2d.config.splits import Split
@@ -20,7 +21,7 @@ def split_numbers(config: Config) -> tuple[str, list[Any]]:
 
     def take(number: Any) -> str:
         numbers.append(number)
-        return type(number).__name__
+        return f"{type(number).__name__} {len(numbers) - 1}"
 
     return repr(_replaced(config, take)), numbers
 
@@ -36,11 +37,30 @@ def parametrized(config: Config, tape: Tape) -> Config:
 
 def _replaced(config: Config, convert: Number) -> Config:
     """The config with its numbers converted, and without its name, seed and storage."""
-    splits = tuple(Split(s.name, None, "{}", _converted(s.distribution, convert)) for s in config.splits)
+    parts: dict[tuple[str, int], Distribution] = {}
+    splits = tuple(Split(s.name, None, "{}", _converted_joint(s.distribution, convert, parts)) for s in config.splits)
     storage = StorageOptions(frames=config.storage.frames)
     static = {"name": "", "seed": 0, "storage": storage, "splits": splits, "annotations": config.annotations}
     names = [f.name for f in dataclasses.fields(config) if f.name not in static]
     return dataclasses.replace(config, **static, **{n: _converted(getattr(config, n), convert) for n in names})
+
+
+def _converted_joint(
+    joint: JointDistribution, convert: Number, parts: dict[tuple[str, int], Distribution]
+) -> JointDistribution:
+    """A joint distribution with its numbers converted.
+
+    Distributions that are one object, such as those that splits inherit from the scene, remain one: `parts` holds those
+    converted, by coordinate and object.
+    """
+    products = []
+    for product in joint.products:
+        for name, part in product.parts.items():
+            if (name, id(part)) not in parts:
+                parts[name, id(part)] = _converted(part, convert)
+        own = {name: parts[name, id(part)] for name, part in product.parts.items()}
+        products.append(Component(convert(product.share), own))
+    return JointDistribution(tuple(products))
 
 
 def _converted(value: Any, convert: Number, listed: bool = False) -> Any:

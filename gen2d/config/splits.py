@@ -11,7 +11,14 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from gen2d.config import plugins
-from gen2d.config.joint_distribution import JointDistribution, Marginals, intersect, parse_distribution, union_support
+from gen2d.config.joint_distribution import (
+    Component,
+    JointDistribution,
+    Marginals,
+    intersect,
+    parse_distribution,
+    union_support,
+)
 from gen2d.config.options import coordinates, factor_options, parse_value
 from gen2d.config.plugin_options import Plugin, check_plugin
 from gen2d.core.errors import ConfigError
@@ -50,7 +57,7 @@ def _scene_marginals(scene: Plugin) -> Marginals:
 
 def distributions_of_splits(scene: Plugin, splits: Sequence[Split]) -> list[JointDistribution]:
     """Joint distributions of the splits, in order; that of the scene alone if there are no splits."""
-    return [split.distribution for split in splits] or [parse_distribution({}, _scene_marginals(scene), lambda _: {})]
+    return [split.distribution for split in splits] or [JointDistribution((Component(1.0, _scene_marginals(scene)),))]
 
 
 def with_splits(scene: Plugin, written: Any, source: str) -> tuple[Plugin, tuple[Split, ...]]:

@@ -1,5 +1,9 @@
-"""Progress display of long tasks, and interruption by signals."""
+"""Progress display of long tasks, and interruption by signals.
 
+Lines go to a caller's `log` or, by default, to the logger "gen2d" at level INFO, which the command line shows.
+"""
+
+import logging
 import signal
 import sys
 import threading
@@ -8,9 +12,11 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from tqdm import tqdm
-
 from gen2d.core.humanize import in_time
+
+PATIENCE, PERIOD = 2.0, 10.0  # seconds after which a wait is announced, and between two lines about it
+LOGGER = logging.getLogger("gen2d")
+Log = Callable[[str], None]
 
 
 def to_stderr(line: str) -> None:
@@ -19,31 +25,78 @@ def to_stderr(line: str) -> None:
 
 
 @contextmanager
-def progress(count: int, log: Callable[[str], None]) -> Iterator[Callable[[int], None]]:
-    """Progress bar on a terminal; elsewhere one line every ten seconds, passed to `log`.
+def logged_to_stderr() -> Iterator[None]:
+    """Print the lines of the logger "gen2d" to standard error inside the block."""
+    handler = logging.Handler()
+    handler.emit = lambda record: to_stderr(record.getMessage())
+    level, propagate = LOGGER.level, LOGGER.propagate
+    LOGGER.addHandler(handler)
+    LOGGER.setLevel(logging.INFO)
+    LOGGER.propagate = False
+    try:
+        yield
+    finally:
+        LOGGER.removeHandler(handler)
+        LOGGER.setLevel(level)
+        LOGGER.propagate = propagate
 
-    Yields a function that advances the progress by a number of videos.
+
+@contextmanager
+def waiting(what: str, log: Log | None = None, status: Callable[[float], str] | None = None) -> Iterator[None]:
+    """Log what a block does if it takes more than two seconds, and then its status every ten seconds.
+
+    `status(seconds)` describes the progress after these seconds; by default it is the time elapsed. Also a decorator of
+    functions.
+    """
+    write, start, done = log or LOGGER.info, time.perf_counter(), threading.Event()
+
+    def speak() -> None:
+        if done.wait(PATIENCE):
+            return
+        write(f"{what} ...")
+        while not done.wait(PERIOD):
+            seconds = time.perf_counter() - start
+            write(status(seconds) if status else f"{what} ... {in_time(seconds)}")
+
+    thread = threading.Thread(target=speak, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        done.set()
+        thread.join()
+
+
+@contextmanager
+def progress(what: str, count: int, log: Log | None = None, unit: str = "videos") -> Iterator[Callable[[int], None]]:
+    """Progress bar on a terminal; elsewhere `what` after two seconds, and then one line every ten seconds.
+
+    Yields a function that advances the progress by a number of units.
     """
     if sys.stderr.isatty():
-        with tqdm(total=count, unit=" videos", smoothing=0.1, dynamic_ncols=True) as bar:
+        from tqdm import tqdm
 
-            def update(videos: int) -> None:
-                bar.update(videos)
+        with tqdm(desc=what, total=count, unit=f" {unit}", smoothing=0.1, dynamic_ncols=True) as bar:
+
+            def update(number: int) -> None:
+                bar.update(number)
 
             yield update
         return
-    start = printed = time.perf_counter()
     done = 0
 
-    def advance(videos: int) -> None:
-        nonlocal done, printed
-        done += videos
-        now = time.perf_counter()
-        if now - printed >= 10 and done < count:
-            printed, speed = now, done / (now - start)
-            log(f"{done:,} of {count:,} videos, {speed:,.0f} videos/s, {in_time((count - done) / speed)} left")
+    def status(seconds: float) -> str:
+        if not done:
+            return f"{what}: 0 of {count:,} {unit} after {in_time(seconds)}"
+        left = in_time((count - done) * seconds / done)
+        return f"{what}: {done:,} of {count:,} {unit}, {done / seconds:,.0f} {unit}/s, {left} left"
 
-    yield advance
+    def advance(number: int) -> None:
+        nonlocal done
+        done += number
+
+    with waiting(what, log, status):
+        yield advance
 
 
 @contextmanager

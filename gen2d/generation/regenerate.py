@@ -12,6 +12,7 @@ import numpy as np
 
 from gen2d.config.config import Config
 from gen2d.core.errors import DamagedError, FolderError
+from gen2d.core.progress import LOGGER, waiting
 from gen2d.dataset import folder, hdf5
 from gen2d.dataset.hdf5_check import faults
 from gen2d.dataset.manifest import Manifest, identity_of, read_manifest
@@ -69,7 +70,9 @@ def check_fingerprint(root: Place, source: VideoSource, identity: Identity) -> N
     stored = dict(identity["fingerprint"])
     programs = stored.pop("programs", {})
     _check_equal(root, stored, machine(source.rollout))  # first, because tracing the programs is slow
-    _check_equal(root, {"programs": programs}, {"programs": fingerprint(source.rollout)["programs"]})
+    with waiting("Tracing the programs (kept for later runs)"):
+        traced = fingerprint(source.rollout)["programs"]
+    _check_equal(root, {"programs": programs}, {"programs": traced})
 
 
 def _check_equal(root: Place, expected: Identity, actual: Identity) -> None:
@@ -179,7 +182,7 @@ def repair(
     with folder.translate_errors(root), _staging(root) as stage:
         if todo:
             check_fingerprint(root, source, identity)
-            staged = _regenerate_shards(source, spec, stage, todo, records, manifest, log or (lambda line: None))
+            staged = _regenerate_shards(source, spec, stage, todo, records, manifest, log or LOGGER.info)
         try:
             with folder.folder_lock(root):
                 check_current(root, manifest)

@@ -11,7 +11,7 @@ from typing import Any
 from gen2d.config.config import Config, checked_seed, load_config, user_plugin_files
 from gen2d.config.trust import remember
 from gen2d.core.errors import ConfigError
-from gen2d.core.progress import progress, stopping_on_sigterm
+from gen2d.core.progress import LOGGER, progress, stopping_on_sigterm, waiting
 from gen2d.dataset import folder as shards
 from gen2d.dataset.spec import SPLIT, DatasetSpec, Shard, shards_of_worker
 from gen2d.generation.complete import complete
@@ -92,7 +92,7 @@ def generate(
     overwrite : bool
         Whether to delete a dataset in the folder first; only with a single worker.
     log : callable, optional
-        Receives lines of progress for a person.
+        Receives lines of progress for a person; by default, the logger "gen2d" does, at level INFO.
     timeout, deadline : float
         Limits in s of a server's silence and of a whole request, as in `open`.
 
@@ -120,7 +120,7 @@ def generate(
     >>> summary = gen2d.generate("bouncing.yaml", 10_000, "datasets/bouncing", overrides=["video.height=128"])
     >>> print(summary.videos_per_second, "videos/s")
     """
-    log = log or (lambda line: None)
+    log = log or LOGGER.info
     config = load_config(config, overrides)
     if seed is not None:
         config = dataclasses.replace(config, seed=checked_seed(seed))
@@ -128,17 +128,21 @@ def generate(
     network = Network(timeout, deadline)
     out = place(out, network) if out is not None else Path("datasets") / config.name
     remember(config.copies.values())
-    on = devices.prepare(device)
-    source = VideoSource(config, on)
-    if sum(counts.values()) <= source.rollout.batch_size:  # a single batch: one device, whose programs compile once
-        on = on[:1]
+    with waiting("Starting the devices", log):
+        on = devices.prepare(device)
+    with waiting("Tracing the programs (kept for later runs)", log):
         source = VideoSource(config, on)
-    dataset = dataset_of(source, out, counts, fingerprint(source.rollout))
-    remaining = [shard for shard in shards.open_folder(dataset, overwrite) if shard.split in counts]
+        if sum(counts.values()) <= source.rollout.batch_size:  # a single batch: one device, whose programs compile once
+            on = on[:1]
+            source = VideoSource(config, on)
+        dataset = dataset_of(source, out, counts, fingerprint(source.rollout))
+    with waiting(f"Reading {out}", log):
+        remaining = [shard for shard in shards.open_folder(dataset, overwrite) if shard.split in counts]
     todo = shards_of_worker(remaining, *worker)
     began, video_count = time.perf_counter(), sum(shard.count for shard in todo)
     size, compile_seconds = generate_shards(source, dataset, todo, log)
-    is_complete = complete(dataset)
+    with waiting("Writing tables, cards and the manifest", log):
+        is_complete = complete(dataset)
     seconds = time.perf_counter() - began
     if todo:
         entry = {"time": time.time(), "host": os.uname().nodename, "videos": video_count, "seconds": seconds}
@@ -214,7 +218,7 @@ def _generate_from(
         try:
             count = sum(shard.count for shard in todo)
             seconds = warm_up(source, encoder, ranges, count, log)
-            with progress(count, log) as advance:
+            with progress("Generating", count, log) as advance:
                 for shard, block in encoder.blocks(ranges):
                     writers.put(shard, block)
                     size += block.nbytes

@@ -8,6 +8,7 @@ import numpy as np
 
 from gen2d.core.errors import FolderError, UserError
 from gen2d.core.humanize import in_bytes, in_time
+from gen2d.core.progress import waiting
 from gen2d.dataset import folder as shards
 from gen2d.dataset.block import Block
 from gen2d.dataset.spec import DatasetSpec
@@ -31,19 +32,22 @@ def warm_up(
     """
     rollout = source.rollout
     name = f"{len(rollout.devices)} {rollout.devices[0].platform} device{'s' if len(rollout.devices) > 1 else ''}"
-    log(f"Compiling for {name} (seconds; up to a minute for dozens of objects; kept for the next run) ...")
     began = time.perf_counter()
     request = next(source.requests(ranges[:1]))
-    try:
+    with waiting(f"Compiling for {name} (seconds; up to a minute for dozens of objects; kept for later runs)", log):
         rollout.compile()
-        batches = jax.block_until_ready(rollout.start(request.split, request.numbers))
-    except jax.errors.JaxRuntimeError as error:
-        raise _device_error(error) from None
-    _fit_slice(rollout, batches)
+    with waiting("Simulating the first batch", log):
+        try:
+            batches = jax.block_until_ready(rollout.start(request.split, request.numbers))
+        except jax.errors.JaxRuntimeError as error:
+            raise _device_error(error) from None
+    with waiting("Rendering its first videos", log):
+        _fit_slice(rollout, batches)
     source.keep(request, batches)
     compiled = time.perf_counter() - began
     single = count <= len(request.numbers)
-    block, seconds = _measure(source, encoder, batches, next(source.requests(ranges[:1])), single)
+    with waiting("Measuring the speed", log):
+        block, seconds = _measure(source, encoder, batches, next(source.requests(ranges[:1])), single)
     size, duration = block.nbytes / len(block) * count, "" if single else f" and {in_time(seconds * count)}"
     log(f"Compiled in {compiled:.1f} s. {count:,} videos will take about {in_bytes(size)}{duration}.")
     _warn_of_low_compression(encoder.dataset, block, log)

@@ -54,7 +54,6 @@ def prepare(device: str = "auto") -> list[Device]:
     """
     if device not in DEVICES:
         raise DeviceError(f"--device is {device!r}, but must be one of {', '.join(DEVICES)}")
-    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
     keep_freed_memory()
     jax.config.update("jax_threefry_partitionable", True)  # sampled values depend on it
     if jax.config.values["jax_enable_x64"]:

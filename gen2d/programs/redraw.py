@@ -21,6 +21,7 @@ from gen2d.config.annotations import Annotations
 from gen2d.config.config import Config, load_config
 from gen2d.config.plugin_options import named
 from gen2d.core.errors import ConfigError
+from gen2d.core.progress import waiting
 from gen2d.loading.dataset import Dataset
 from gen2d.loading.protocols import Numbers
 from gen2d.physics.params import solver_params
@@ -73,6 +74,7 @@ def render(
 ) -> dict[str, Array]: ...
 
 
+@waiting("Compiling, and rendering videos")
 def render(
     ds: Dataset,
     indices: Numbers,
@@ -148,6 +150,7 @@ def render(
     return {name: rendered[name] for name in fields}
 
 
+@waiting("Compiling, and rendering videos")
 def render_soft(
     ds: Dataset,
     indices: Numbers,
@@ -202,6 +205,7 @@ def render_soft(
     return _compile(_render_soft_frames, settings, float(sigma))(_render_scenes(ds, settings, numbers, states))
 
 
+@waiting("Compiling, and simulating videos")
 def simulate_again(
     ds: Dataset,
     indices: Numbers,

@@ -21,6 +21,7 @@ import numpy as np
 
 from gen2d.config.config import Config, checked_seed, load_config
 from gen2d.core.errors import ConfigError
+from gen2d.core.progress import waiting
 from gen2d.core.schema import Field
 from gen2d.loading.column import LAYOUTS
 from gen2d.loading.dataloader import without_text
@@ -182,7 +183,12 @@ class Stream:
         return len(self.epoch_sampler)
 
     def __iter__(self) -> Iterator[Arrays]:
-        return self._batches()
+        batches = self._batches()
+        with waiting(f"Compiling, and simulating the first batch of {self.source.config.name}"):
+            first = next(batches, None)
+        if first is not None:
+            yield first
+            yield from batches
 
     def state_dict(self) -> dict[str, Any]:
         """State of the iteration, after the last batch that was delivered."""

@@ -22,7 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 
 R = TypeVar("R")
-SIZE = 4096  # numbers that a program can take
+SIZE = 2**14  # numbers that a program can take
 
 
 class Tape:

@@ -9,7 +9,7 @@ of the split is an argument.
 """
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -17,9 +17,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from gen2d.config.config import Config
-from gen2d.config.distributions import Span
-from gen2d.config.joint_distribution import JointDistribution
-from gen2d.config.options import Option, coordinates, factor_options
+from gen2d.config.distributions import Distribution, sample_one_of, stacked, thresholds
+from gen2d.config.joint_distribution import Component, JointDistribution, distinct_parts
+from gen2d.config.options import coordinates, factor_options
 from gen2d.config.plugin_options import Plugin
 from gen2d.core.permutation import hashed
 from gen2d.core.schema import Field
@@ -64,18 +64,23 @@ class Sampler:
         self.training = config.training.distribution if config.training else None
         self.lengths = sizes(config.scene)
         self.products = [product for joint in self.distributions for product in joint.products]
-        self.combinations = [joint.combinations() for joint in self.distributions]
-        self.gridded = sorted({name for names, _ in self.combinations for name in names})
+        self.gridded = sorted({name for joint in self.distributions for name in joint.gridded})
+
+    @functools.cached_property
+    def combinations(self) -> list[np.ndarray]:
+        """Combinations [M, G] of the values of each split's factors on a grid."""
+        return [joint.combinations() for joint in self.distributions]
 
     def grid_values(self, row: int, words: np.ndarray, numbers: np.ndarray) -> np.ndarray:
         """Values [n, G] float32 of the factors on a grid: a combination for each video number [n].
 
         Every combination occurs once before any is repeated, in an order that depends on `words` (seed and split).
         """
-        names, every = self.combinations[row]
+        names = self.distributions[row].gridded
         values = np.zeros((len(numbers), len(self.gridded)), np.float32)
         if not names:
             return values
+        every = self.combinations[row]
         seed = int(hashed(*map(int, words))[0] >> np.uint64(1))
         rounds, places = np.divmod(np.asarray(numbers, np.int64), len(every))
         for number in np.unique(rounds):
@@ -126,17 +131,12 @@ class Sampler:
 
     def _coordinate(self, key: Array, name: str, shape: tuple[int, ...], which: Array, row: Any, given: Any) -> Array:
         """Samples of one coordinate, from its distribution in the chosen product."""
-        distributions = [product.parts[name] for product in self.products]
-        distinct = list(dict.fromkeys(distributions))
-        draws = [source.sample(key, shape) for source in distinct]
-        if len(draws) > 1:
-            index = jnp.asarray([distinct.index(source) for source in distributions])[which]
-            values = jnp.select([index == i for i in range(len(draws))], draws)
-        else:
-            values = draws[0]
+        distributions, places = _distinct(self.products, name)
+        index = jnp.asarray(places)[which] if len(distributions) > 1 else 0
+        values = sample_one_of(distributions, index, key, shape)
         if name not in self.gridded:
             return values
-        on_grid = jnp.asarray([name in names for names, _ in self.combinations])[row]
+        on_grid = jnp.asarray([name in joint.gridded for joint in self.distributions])[row]
         return jnp.where(on_grid, given[self.gridded.index(name)].astype(values.dtype), values)
 
     def _components(self, key: Array, row: Any) -> dict[str, Array]:
@@ -148,24 +148,26 @@ class Sampler:
         counts = [len(joint.products) for joint in self.distributions]
         firsts = jnp.asarray(np.cumsum([0, *counts[:-1]]))[row]
         if max(counts) == 1:
-            return {"": firsts} | {axis: jnp.full(length, firsts) for axis, length in self.lengths.items()}
+            return dict.fromkeys(["", *self.lengths], firsts)
         shares = [[product.share for product in joint.products] for joint in self.distributions]
-        ends = jnp.asarray([_thresholds(max(counts), *own) for own in shares], jnp.float32)
-        product_key, axes = key_for(key, "product"), [self._axis(joint) for joint in self.distributions]
+        ends = jnp.asarray(stacked(*(thresholds(max(counts), *own) for own in shares)), jnp.float32)
+        axes = jnp.asarray(stacked(*map(self._axis, self.distributions)))[row]
+        product_key = key_for(key, "product")
 
         def pick(key: Array, shape: tuple[int, ...]) -> Array:
             return firsts + (jax.random.uniform(key, shape)[..., None] >= ends[row]).sum(-1)
 
         common = pick(product_key, ())
         components = {"": common}
-        for axis, length in self.lengths.items():
-            each = jnp.asarray([a == axis for a in axes])[row]
-            components[axis] = jnp.where(each, pick(key_for(product_key, axis), (length,)), common)
+        for number, (axis, length) in enumerate(self.lengths.items(), 1):
+            components[axis] = jnp.where(axes == number, pick(key_for(product_key, axis), (length,)), common)
         return components
 
-    def _axis(self, joint: JointDistribution) -> str:
-        axes = {self.options[name.partition("[")[0]].each for name in joint.differing}
-        return axes.pop() if len(axes) == 1 else ""
+    def _axis(self, joint: JointDistribution) -> Any:
+        """Number of the only axis (from 1) of the factors in which the products differ; 0 if there are several."""
+        names = [*joint.products[0].parts]
+        axes = [["", *self.lengths].index(self.options[name.partition("[")[0]].each) for name in names]
+        return _only(tuple(axes), *(_differ(distinct_parts(joint.products, name)) for name in names))
 
     def _zero_absent(self, name: str, values: Array, factors: SampledFactors) -> Array:
         each = self.options[name].each
@@ -180,54 +182,78 @@ class Sampler:
         """
         if self.training is None:
             return {}
-        distances = {}
+        distances, inside = {}, {}
         for name, spec in self.options.items():
-            parts = self._distances(name, factors, self.training.spans)
-            distance = jnp.stack(parts, axis=-1) if spec.parts else parts[0]
-            distances[f"ood_distance/{name}"] = self._zero_absent(name, distance, factors)
-        return distances | {"out_of_distribution": ~self._in_support(self.training, factors)}
+            # Of each coordinate, from the support of each product.
+            parts = jnp.stack([self._distances(*each) for each in self._values(name, factors)], axis=-2)
+            nearest = parts.min(-1) if spec.parts else parts[..., 0, :].min(-1)
+            distances[f"ood_distance/{name}"] = self._zero_absent(name, nearest, factors)
+            inside[name] = (parts == 0).all(-2)
+            if spec.each in factors:
+                inside[name] |= ~_present(spec.each, inside[name], factors)
+        return distances | {"out_of_distribution": ~self._in_support(inside)}
 
-    def _distances(self, name: str, factors: SampledFactors, spans_of: Callable[[str], Any]) -> list[Array]:
-        """Distance of each coordinate of a factor from its spans."""
-        values, names = factors[name], self._coordinates(name)
+    def _values(self, name: str, factors: SampledFactors) -> list[tuple[str, Array]]:
+        """Coordinates of a factor, and their values."""
+        values = factors[name].astype(jnp.float32)
         parts = jnp.moveaxis(values, -1, 0) if self.options[name].parts else values[None]
-        return [_distance_to(part, spans_of(name)) for part, name in zip(parts, names, strict=True)]
+        return list(zip(self._coordinates(name), parts, strict=True))
 
-    def _in_support(self, joint: JointDistribution, factors: SampledFactors) -> Array:
-        """Whether these factors lie in the support: all in one product, or those of each object in its own product."""
-        axis = self._axis(joint)
-        fits = []
-        for product in joint.products:
-            of_video, of_each = jnp.asarray(True), jnp.ones(self.lengths[axis] if axis else (), bool)
+    def _distances(self, name: str, values: Array) -> Array:
+        """Distance [..., P] of each value of a coordinate from its support in each product of the training split."""
+        assert self.training is not None
+        distributions, places = _distinct(self.training.products, name)
+        intervals = [source.intervals for source in distributions]
+        most = max(map(len, intervals))
+        ends = [end for own in intervals for interval in [*own, *[own[0]] * (most - len(own))] for end in interval]
+        low, last = jnp.moveaxis(jnp.asarray(stacked(*ends), jnp.float32).reshape(-1, most, 2), -1, 0)
+        values = values[..., None, None]
+        distances = jnp.maximum(jnp.maximum(low - values, values - last), 0).min(-1)
+        return distances if len(distributions) == len(places) else distances[..., places]
+
+    def _in_support(self, inside: dict[str, Array]) -> Array:
+        """Whether the factors lie in the training split's support, from whether they do in each product [..., P].
+
+        All must lie in one product or, if the products differ in factors of one axis, those of each object in its own.
+        """
+        assert self.training is not None
+        results = []
+        for axis in ["", *self.lengths] if len(self.training.products) > 1 else [""]:
+            fits = jnp.asarray(True)
             for name, spec in self.options.items():
-                distances = self._distances(name, factors, lambda of, parts=product.parts: parts[of].spans)
-                inside = functools.reduce(jnp.logical_and, [distance == 0 for distance in distances])
-                if spec.each and spec.each == axis:
-                    of_each &= inside | ~self._are_present(spec, inside, factors)
-                else:
-                    of_video &= jnp.all(inside | ~self._are_present(spec, inside, factors))
-            fits.append(of_video & of_each)
-        return jnp.all(functools.reduce(jnp.logical_or, fits))
+                fits &= inside[name] if spec.each in ("", axis) else inside[name].all(0)
+            results.append(fits.any(-1).all())
+        return jnp.stack(results)[jnp.asarray(self._axis(self.training))] if len(results) > 1 else results[0]
 
-    def _are_present(self, spec: Option, inside: Array, factors: SampledFactors) -> Array:
-        return _present(spec.each, inside, factors) if spec.each in factors else jnp.ones_like(inside)
+
+def _distinct(products: Sequence[Component], name: str) -> tuple[tuple[Distribution, ...], np.ndarray]:
+    """Distinct distributions of a coordinate in these products, and the place of each product's among them."""
+    distributions = distinct_parts(products, name)
+    places = {id(source): place for place, source in enumerate(distributions)}
+    return distributions, np.array([places[id(product.parts[name])] for product in products])
+
+
+def _differ(distributions: Sequence[Distribution]) -> Any:
+    """Whether some of these distributions differ."""
+    kinds = {(source.form, *(part.form for part in source.parts)) for source in distributions}
+    if len(kinds) > 1 or len(distributions) == 1:
+        return len(kinds) > 1
+    return _rows_differ(len(distributions), *(x for source in distributions for x in source.flat_numbers))
 
 
 @recorded
-def _thresholds(length: int, *shares: float) -> np.ndarray:
-    """Cumulative probabilities [length] of products, without the last; 2 where there is none."""
-    thresholds = np.full(length, 2.0)
-    thresholds[: len(shares) - 1] = np.cumsum(shares)[:-1]
-    return thresholds
+def _rows_differ(count: int, *numbers: float) -> bool:
+    rows = np.reshape(numbers, (count, -1))
+    return bool((rows != rows[0]).any())
+
+
+@recorded
+def _only(axes: tuple[int, ...], *differing: bool) -> int:
+    """The only axis of the coordinates that differ; 0 if there are several, or none."""
+    distinct = {axis for axis, differs in zip(axes, differing, strict=True) if differs}
+    return distinct.pop() if len(distinct) == 1 else 0
 
 
 def _present(each: str, values: Array, factors: SampledFactors) -> Array:
     """Whether each of the counted objects is present; broadcasts to `values` [K, ...]."""
     return (jnp.arange(values.shape[0]) < factors[each]).reshape(-1, *[1] * (values.ndim - 1))
-
-
-def _distance_to(values: Array, spans: tuple[Span, ...]) -> Array:
-    """Distance of each value from the nearest span; 0 inside one."""
-    x = values.astype(jnp.float32)
-    low, last = (jnp.asarray(ends, jnp.float32) for ends in ([s.low for s in spans], [s.last for s in spans]))
-    return jnp.maximum(jnp.maximum(low - x[..., None], x[..., None] - last), 0).min(-1)

@@ -12,6 +12,7 @@ import numpy as np
 
 from gen2d.core.enums import DYNAMIC
 from gen2d.core.errors import ConfigError
+from gen2d.core.progress import waiting
 from gen2d.media import films
 from gen2d.media.images import animate, write
 from gen2d.space.bodies import Body, Drawable, Film
@@ -67,6 +68,7 @@ class PlotCanvas:
         self.outline([end, neck + side, neck - side], RED, filled=True)
 
 
+@waiting("Drawing a space")
 def picture(
     of: Drawable, frame: int = 0, *, view: ViewBounds | None = None, size: int = 400, contacts: bool = True
 ) -> np.ndarray:
@@ -89,6 +91,7 @@ def picture(
     return canvas.image
 
 
+@waiting("Drawing a space")
 def overlay(of: Drawable, *, view: ViewBounds | None = None, size: int = 400, contacts: bool = False) -> np.ndarray:
     """Image of all frames over each other, uint8 [H, W, 3], with moving bodies as outlines; options as in `picture`."""
     canvas = PlotCanvas(view or _default_view(of), size)
@@ -101,6 +104,7 @@ def overlay(of: Drawable, *, view: ViewBounds | None = None, size: int = 400, co
     return canvas.image
 
 
+@waiting("Drawing a space")
 def save(of: Film, path: str | Path, **options: Any) -> Path:
     """Write an image of all frames over each other (.png) or a film (.webp, which loops, or .mp4); return the path.
 

@@ -26,6 +26,7 @@ from gen2d.config.options import build
 from gen2d.config.sections import PhysicsOptions
 from gen2d.core.enums import DYNAMIC, SHAPES
 from gen2d.core.errors import ConfigError
+from gen2d.core.progress import waiting
 from gen2d.physics import inertia
 from gen2d.physics.params import SolverParams, solver_params
 from gen2d.physics.simulate import Forces, SaveAt, substeps
@@ -444,6 +445,7 @@ class Space:
 
     # ---- Simulation
 
+    @waiting("Compiling, and simulating a space")
     def simulate(
         self, seconds: float, fps: float = 30.0, *, substeps: int | None = None, contacts: int | None = None,
         energy: bool = True, forces: Forces | None = None,

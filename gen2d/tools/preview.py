@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from gen2d.core.errors import UserError
+from gen2d.core.progress import waiting
 from gen2d.loading.dataset import Dataset
 from gen2d.loading.dataset import open as open_dataset
 from gen2d.media.contact_sheet import contact_sheet
@@ -71,7 +72,7 @@ def preview(
     else:
         name, frames, fps = _config_frames(str(source), videos, seed, overrides)
     sheet, animation = out / f"{name}-sheet.png", out / f"{name}.webp"
-    with writing(out):
+    with writing(out), waiting(f"Writing {sheet.name} and {animation.name}"):
         write(sheet, contact_sheet(frames))
         animate(animation, frames, fps)
     return [sheet, animation]
@@ -93,7 +94,8 @@ def _dataset_frames(ds: Dataset, numbers: Sequence[int], trust: Sequence[str]) -
     """Frames [n, T, H, W, 3] of a dataset's videos, rendered if they are not stored."""
     if "frames" in ds.manifest.fields:
         return ds.batch(numbers)["frames"]
-    from gen2d.programs.redraw import render
+    with waiting("Importing jax"):
+        from gen2d.programs.redraw import render
 
     return np.asarray(render(ds, numbers, trust=trust))
 
@@ -104,14 +106,16 @@ def _config_frames(
     """Name of a config, and frames [n, T, H, W, 3] and frame rate of its first videos."""
     import dataclasses
 
-    from gen2d.config.config import checked_seed, load_config
-    from gen2d.programs import devices
-    from gen2d.programs.source import VideoSource
+    with waiting("Importing jax"):
+        from gen2d.config.config import checked_seed, load_config
+        from gen2d.programs import devices
+        from gen2d.programs.source import VideoSource
 
     config = load_config(source, [*overrides, "storage.frames=video"])
     if seed is not None:
         config = dataclasses.replace(config, seed=checked_seed(seed))
     split = config.training.name if config.training else "train"
-    videos_of = VideoSource(config.of_split(split), devices.prepare()[:1])
-    frames = videos_of.videos(split, range(videos), ("frames",))["frames"]
+    with waiting(f"Compiling the programs of {config.name} (up to a minute; kept for later runs), and running them"):
+        videos_of = VideoSource(config.of_split(split), devices.prepare()[:1])
+        frames = videos_of.videos(split, range(videos), ("frames",))["frames"]
     return config.name, frames, config.video.fps

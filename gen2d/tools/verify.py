@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from gen2d.core.errors import ConfigError, DamagedError, Error, IncompleteError, UnreachableError, UserError, one_line
+from gen2d.core.progress import waiting
 from gen2d.dataset.croissant import croissant
 from gen2d.dataset.folder import is_foreign
 from gen2d.dataset.hdf5_check import faults
@@ -188,10 +189,17 @@ def _problems_of(
     yield from [*files, *tables, *others, *sizes]
     if level != "quick":
         reported = {problem.shard for problem in [*tables, *sizes]}
-        with _ShardChecker(root, manifest, rows) as checker:
-            for problems in checker.check([shard for shard in shards if shard.name not in reported]):
+        unreported, checked = [shard for shard in shards if shard.name not in reported], 0
+
+        def status(_: float) -> str:
+            return f"Checked {checked:,} of {len(unreported):,} shards"
+
+        with _ShardChecker(root, manifest, rows) as checker, waiting("Checking every byte of the shards", None, status):
+            for problems in checker.check(unreported):
                 yield from problems
-    yield from changed
+                checked += 1
+    with waiting(f"Compiling, and regenerating {videos} videos"):
+        yield from changed
 
 
 def _changed_videos(root: Place, manifest: Manifest, videos: int, seed: int, trust: Sequence[str]) -> Iterator[Problem]:
@@ -199,7 +207,8 @@ def _changed_videos(root: Place, manifest: Manifest, videos: int, seed: int, tru
 
     Raises FolderError, before anything is yielded, if this machine generates other bits.
     """
-    from gen2d.generation import regenerate  # imports jax
+    with waiting("Importing jax"):
+        from gen2d.generation import regenerate
 
     source = regenerate.source_of(root, manifest.identity, trust)
     regenerate.check_fingerprint(root, source, manifest.identity)
