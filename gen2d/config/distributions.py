@@ -10,10 +10,19 @@ import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
+from gen2d.config.random_requests import (
+    Draws,
+    Request,
+    answer_together,
+    integers,
+    normal,
+    split,
+    truncated_normal,
+    uniform,
+)
 from gen2d.records.axes import Array
 from gen2d.records.parameter import apply, recorded
 
@@ -193,9 +202,16 @@ class Distribution:
 def sample_one_of(sources: Sequence[Distribution], index: Any, key: Array, shape: tuple[int, ...]) -> Array:
     """Independent samples of this shape, from distribution number `index` of the sources.
 
-    The index is a number, or has one for each sample. Samples are those of `sources[index].sample(key, shape)`. All
-    distributions of one form are sampled at once, from numbers that are gathered by index, so a program depends on the
-    forms alone.
+    The index is a number, or has one for each sample. Samples are those of `sources[index].sample(key, shape)`.
+    """
+    return answer_together([draws(sources, index, key, shape)])[0]
+
+
+def draws(sources: Sequence[Distribution], index: Any, key: Array, shape: tuple[int, ...]) -> Draws:
+    """Requests of `sample_one_of`, and its samples.
+
+    All distributions of one form are sampled at once, from numbers that are gathered by index, so a program depends on
+    the forms alone.
     """
     forms = [source.form for source in sources]
     if len(set(forms)) > 1:
@@ -204,7 +220,7 @@ def sample_one_of(sources: Sequence[Distribution], index: Any, key: Array, shape
             own = np.array([other == form for other in forms])
             places = np.maximum(np.cumsum(own) - 1, 0)  # among those of this form; of others, any
             group = [source for source, is_own in zip(sources, own, strict=True) if is_own]
-            samples.append(sample_one_of(group, jnp.asarray(places)[index], key, shape))
+            samples.append((yield from draws(group, jnp.asarray(places)[index], key, shape)))
         chosen = jnp.asarray([distinct.index(form) for form in forms])[index]
         return jnp.select([chosen == i for i in range(len(distinct))], samples)
 
@@ -216,26 +232,26 @@ def sample_one_of(sources: Sequence[Distribution], index: Any, key: Array, shape
         return jnp.asarray(stacked(*values) if place else values[0], dtype)
 
     if kind == "mixture":
-        component_key, key = jax.random.split(key)
+        component_key, key = yield Request(split, key, (2,))
         counts = [len(source.parts) for source in sources]
         ends = table([thresholds(max(counts), *source.numbers) for source in sources])[place]
-        component = (jax.random.uniform(component_key, shape)[..., None] >= ends).sum(-1)
-        firsts = table(np.cumsum([0, *counts[:-1]]).tolist(), jnp.int32)[place]
-        return sample_one_of([part for source in sources for part in source.parts], firsts + component, key, shape)
+        component = ((yield Request(uniform, component_key, shape, (0.0, 1.0)))[..., None] >= ends).sum(-1)
+        firsts = table(np.cumsum([0, *counts[:-1]]), jnp.int32)[place]
+        return (yield from draws([part for source in sources for part in source.parts], firsts + component, key, shape))
     columns = list(zip(*(source.constants for source in sources), strict=True))
     if kind in ("choice", "grid"):
-        return table(columns[0])[(*place, jax.random.randint(key, shape, 0, count))]
+        return table(columns[0])[(*place, (yield Request(integers, key, shape, (0, count))))]
     if kind == "integer":
         low, stop = (table(column, jnp.int32)[place] for column in columns)
-        return jax.random.randint(key, shape, low, stop)
+        return (yield Request(integers, key, shape, (low, stop)))
     n = [table(column)[place] for column in columns]
     if kind == "constant":
         return jnp.broadcast_to(n[0], shape)
     if kind == "normal" and count == 2:
-        return n[0] + n[1] * jax.random.normal(key, shape)
+        return n[0] + n[1] * (yield Request(normal, key, shape))
     if kind == "normal":
-        samples = n[0] + n[1] * jax.random.truncated_normal(key, n[2], n[3], shape)
+        samples = n[0] + n[1] * (yield Request(truncated_normal, key, shape, (n[2], n[3])))
     else:
-        samples = jax.random.uniform(key, shape, minval=n[0], maxval=n[1])
+        samples = yield Request(uniform, key, shape, (n[0], n[1]))
     samples = jnp.exp(samples) if kind == "log_uniform" else samples
     return jnp.clip(samples, *n[-2:])  # rounding may leave the support

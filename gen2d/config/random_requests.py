@@ -83,7 +83,7 @@ def split(key: Array, shape: tuple[int, ...]) -> Array:
     return jax.random.split(key, shape)
 
 
-def uniform(key: Array, shape: tuple[int, ...], low: Any = 0.0, high: Any = 1.0) -> Array:
+def uniform(key: Array, shape: tuple[int, ...], low: Any, high: Any) -> Array:
     """Samples from low to high, without high."""
     return jax.random.uniform(key, shape, minval=low, maxval=high)
 

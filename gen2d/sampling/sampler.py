@@ -17,10 +17,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from gen2d.config.config import Config
-from gen2d.config.distributions import Distribution, sample_one_of, stacked, thresholds
+from gen2d.config.distributions import Distribution, draws, stacked, thresholds
 from gen2d.config.joint_distribution import Component, JointDistribution, distinct_parts
 from gen2d.config.options import coordinates, factor_options
 from gen2d.config.plugin_options import Plugin
+from gen2d.config.random_requests import Draws, Request, answer_requests, answer_together, split
 from gen2d.core.permutation import hashed
 from gen2d.core.schema import Field
 from gen2d.loading.epochs import order
@@ -113,27 +114,30 @@ class Sampler:
 
     def _unmasked_factors(self, key: Array, row: Any, given: Any) -> SampledFactors:
         """All factors by name; each has its own key, so its samples do not depend on the other factors."""
-        components = self._components(key, row)
-        factors = {}
-        for (name, spec), factor_key in zip(self.options.items(), keys_for(key, [*self.options]), strict=True):
-            shape = (self.lengths[spec.each],) if spec.each else ()
-            keys = jax.random.split(factor_key, spec.parts) if spec.parts else [factor_key]
-            which = components[spec.each]
-            parts = [
-                self._coordinate(k, coordinate, shape, which, row, given)
-                for k, coordinate in zip(keys, self._coordinates(name), strict=True)
-            ]
+        components, factors = self._components(key, row), {}
+        keys = dict(zip(self.options, keys_for(key, [*self.options]), strict=True))
+        several = {name: spec.parts for name, spec in self.options.items() if spec.parts}
+        part_keys = answer_requests([Request(split, keys[name], (parts,)) for name, parts in several.items()])
+        keys_of = {name: [key] for name, key in keys.items()} | dict(zip(several, part_keys, strict=True))
+        coordinate_draws = [
+            self._draws(k, coordinate, self.options[name].each, components, row, given)
+            for name, own in keys_of.items()
+            for k, coordinate in zip(own, self._coordinates(name), strict=True)
+        ]
+        samples = iter(answer_together(coordinate_draws))
+        for name, spec in self.options.items():
+            parts = [next(samples) for _ in keys_of[name]]
             factors[name] = jnp.stack(parts, axis=-1) if spec.parts else parts[0]
         return factors
 
     def _coordinates(self, name: str) -> list[str]:
         return list(coordinates(name, getattr(self.scene.options, name)))
 
-    def _coordinate(self, key: Array, name: str, shape: tuple[int, ...], which: Array, row: Any, given: Any) -> Array:
+    def _draws(self, key: Array, name: str, each: str, components: dict[str, Array], row: Any, given: Any) -> Draws:
         """Samples of one coordinate, from its distribution in the chosen product."""
         distributions, places = _distinct(self.products, name)
-        index = jnp.asarray(places)[which] if len(distributions) > 1 else 0
-        values = sample_one_of(distributions, index, key, shape)
+        index = jnp.asarray(places)[components[each]] if len(distributions) > 1 else 0
+        values = yield from draws(distributions, index, key, (self.lengths[each],) if each else ())
         if name not in self.gridded:
             return values
         on_grid = jnp.asarray([name in joint.gridded for joint in self.distributions])[row]

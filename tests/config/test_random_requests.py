@@ -44,7 +44,7 @@ def test_generators_of_any_length_end() -> None:
         for _ in range(length):
             keys = yield Request(split, key, (2,))
             key = keys[0]
-            total += yield Request(uniform, keys[1])
+            total += yield Request(uniform, keys[1], (), (0.0, 1.0))
         return total
 
     together = answer_together([draws(n) for n in (0, 3, 1)])
