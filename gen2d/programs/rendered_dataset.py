@@ -1,0 +1,248 @@
+"""Datasets whose frames are rendered when they are read, from the stored scenes and states.
+
+Frames are rendered in slices of a fixed number of videos, by programs that are compiled once. Neither the batch nor the
+number of threads affects their bits.
+"""
+
+import dataclasses
+import functools
+import logging
+import os
+import sys
+import threading
+from collections.abc import Collection, Mapping
+from typing import Any
+
+import jax
+import numpy as np
+
+from gen2d import annotations
+from gen2d.config.config import Config
+from gen2d.core.errors import ConfigError, UserError
+from gen2d.core.schema import Field
+from gen2d.dataset.folder import describe_differences
+from gen2d.dataset.manifest import Manifest
+from gen2d.loading.column import Column
+from gen2d.loading.dataset import Dataset, RenderOptions, ViewOptions, select_fields
+from gen2d.loading.protocols import Batch, Numbers
+from gen2d.programs import devices
+from gen2d.programs.fingerprint import fingerprint, machine, sources
+from gen2d.programs.recipe import Trust, config_from
+from gen2d.programs.redraw import (
+    RenderSettings,
+    build_render_scenes,
+    configs_of,
+    regenerate,
+    render_frames,
+    seed_words_of,
+)
+from gen2d.programs.rollout import Rollout
+from gen2d.records import axes
+from gen2d.records.axes import Array
+from gen2d.records.scene import Joints, Objects, State
+from gen2d.storage.paths import Place
+
+FRAMES = Field("uint8", "n T H W 3", "sRGB", "frames of the video")  # equal to the field of stored frames
+SLICE_BYTES = 2**20  # of frames rendered at once; a slice that is not full costs as much as a full one
+RECORDS = {name for record in (Objects, Joints, State) for name in axes.stored_fields(record)}
+
+_PID = os.getpid()  # of the process that imported jax
+_LOCK = threading.Lock()  # programs are traced and compiled by one thread at a time
+_log = logging.getLogger(__name__)
+
+
+class RenderedDataset(Dataset):
+    """A Dataset whose frames and pixel annotations are rendered on jax's default device, as `gen2d.open` returns it.
+
+    All other fields are read. A window's frames are rendered from its own states alone, unless the config has sensor
+    noise or annotations are read, too. With motion blur, whole batches are simulated again, which is slow.
+
+    Parameters
+    ----------
+    root : Place
+        Folder of the dataset.
+    manifest : Manifest
+        Contents of its manifest.json.
+    options : ViewOptions
+        Split, fields (names or patterns), window, layout and so on.
+    render : RenderOptions, optional
+        Options of the frames. By default only fields that are not stored are rendered, with the dataset's settings.
+
+    Raises
+    ------
+    ConfigError
+        If an option is invalid, or if there is no such field.
+    UntrustedError
+        If the dataset needs code that is not trusted.
+    """
+
+    def __init__(
+        self, root: Place, manifest: Manifest, options: ViewOptions, render: RenderOptions | None = None
+    ) -> None:
+        self.render, self._started = render, None
+        base, config = _configs(
+            Dataset(root, manifest, dataclasses.replace(options, fields=())), options.fields, render
+        )
+        renderable = {"frames": FRAMES}
+        for plugin in config.annotations.pixels:
+            renderable |= plugin.contract.fields
+        names = select_fields(f"{root}", manifest.fields, options.fields, renderable)
+        rendered = {
+            n: renderable[n] for n in names if n in renderable and (render is not None or n not in manifest.fields)
+        }
+        stored = tuple(name for name in names if name not in rendered)
+        super().__init__(root, manifest, dataclasses.replace(options, fields=stored))
+        self.options = dataclasses.replace(options, fields=names)
+        self._settings = settings = RenderSettings(base, _with_annotations(config, rendered))
+
+        video, image = config.video, config.image
+        # Noise depends on the number of the frame, motion blur and some annotations on neighbouring frames.
+        whole = rendered.keys() != {"frames"} or image.exposure > 0 or image.noise.support != (0.0, 0.0)
+        inputs = tuple(name for name in manifest.fields if name in RECORDS or name.startswith(("camera/", "world/")))
+        every_frame = {"window": None, "stride": 1, "start": "first"} if whole else {}
+        view = dataclasses.replace(options, fields=inputs, **every_frame)
+        self._inputs, self._whole = Dataset(root, manifest, view), whole
+
+        sizes = {"T": video.frames, "K": settings.layout.slots, "H": video.height, "W": video.width}
+        self.sizes |= annotations.sizes(settings.config.annotations, settings.plan, sizes)
+        frames = sizes["T"] if whole or options.window is None else options.window
+        shown = dataclasses.replace(manifest, fields=manifest.fields | rendered, sizes=self.sizes | {"T": frames})
+        window = options.window if whole else None
+        columns = {n: Column(n, shown, options.layout, window, options.stride, options.dtype) for n in rendered}
+        self._rendered_columns = list(columns.values())
+        columns |= {column.name: column for column in self._stored_columns}
+        self._columns = [columns[name] for name in names]
+        self.fields = {name: columns[name].field for name in names}
+        video_bytes = sum(column.size for column in self._rendered_columns)
+        self.slice = max(1, SLICE_BYTES // video_bytes)  # videos
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return RenderedDataset, (self.root, self.manifest, self.options, self.render)
+
+    def _at(self, manifest: Manifest) -> "RenderedDataset":
+        return RenderedDataset(self.root, manifest, self.options, self.render)
+
+    @property
+    def exact(self) -> bool:
+        """Whether rendered frames equal, to the bit, those that the run of the dataset stored or would have stored."""
+        return self._renderer.exact
+
+    @property
+    def _renderer(self) -> "_Renderer":
+        """Programs that render this dataset, compiled when they are first needed."""
+        if os.getpid() != _PID:
+            raise UserError(
+                f"{self.root}: frames are rendered by jax, which does not work in a forked process: load with "
+                "gen2d.DataLoader or num_workers=0, or start the workers with multiprocessing_context='spawn'"
+            )
+        with _LOCK:
+            if self._started is None:
+                self._started = _Renderer(self, self._settings, self._inputs.empty(self.slice))
+            return self._started
+
+    def fill(self, out: Batch, rows: Numbers, indices: Numbers, starts: Numbers | None = None) -> None:
+        """Read and render the videos with these indices into `out`. Parameters and errors are those of `Dataset.fill`.
+
+        Raises UserError in a process that was forked from the one that opened the dataset.
+        """
+        renderer = self._renderer
+        super().fill(out, rows, indices, starts)
+        numbers, targets = self.numbers(indices), np.asarray(rows).tolist()
+        begins = self._begins(numbers, starts).tolist()
+        columns = self._inputs.batch(numbers, None if self._whole else begins)
+        size = len(numbers) if self._settings.config.image.exposure else self.slice
+        for first in range(0, len(numbers), size):
+            part = np.minimum(np.arange(first, first + size), len(numbers) - 1)  # padded with the last video
+            rendered = renderer(numbers[part], {name: values[part] for name, values in columns.items()})
+            for column in self._rendered_columns:
+                videos, target = np.asarray(rendered[column.name]), out[column.name]
+                for row in range(min(size, len(numbers) - first)):
+                    to = targets[first + row]
+                    column.convert(videos[row : row + 1], begins[first + row], target[to : to + 1])
+
+
+class _Renderer:
+    """Programs that render slices of a dataset's videos."""
+
+    def __init__(self, ds: RenderedDataset, settings: RenderSettings, inputs: Batch) -> None:
+        if "torch" in sys.modules:  # leave it its share of a GPU's memory
+            os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
+        devices.prepare()
+        self._ds, self._config, self._words = ds, settings.config, seed_words_of(ds)
+        self.exact = _is_exact(ds, settings)
+        if not settings.config.image.exposure:
+            shapes = tuple((name, values.shape, values.dtype.str) for name, values in inputs.items())
+            self._build, self._draw = _compile(settings, shapes)
+
+    def __call__(self, numbers: np.ndarray, columns: Batch) -> Mapping[str, Array]:
+        """Rendered fields [n, ...] of videos, from their numbers [n] and their stored fields [n, ...]."""
+        if self._config.image.exposure:
+            with _LOCK:
+                return regenerate(self._ds, self._config, numbers)
+        return self._draw(self._build(columns, self._words, numbers.astype(np.uint32)))
+
+
+@functools.lru_cache(maxsize=8)  # splits, and loaders that are opened again, share programs
+def _compile(settings: RenderSettings, shapes: tuple[tuple[str, tuple[int, ...], str], ...]) -> tuple[Any, Any]:
+    """Compiled programs that build render scenes from stored fields of these shapes, and render them."""
+    columns = {name: jax.ShapeDtypeStruct(shape, dtype) for name, shape, dtype in shapes}
+    words, numbers = (jax.ShapeDtypeStruct(shape, np.uint32) for shape in ((3,), shapes[0][1][:1]))
+    build = jax.jit(functools.partial(build_render_scenes, settings=settings)).lower(columns, words, numbers)
+    scenes = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), build.out_info)
+    draw = jax.jit(functools.partial(render_frames, settings=settings)).lower(scenes)
+    return build.compile(), draw.compile()
+
+
+def _configs(ds: Dataset, names: Collection[str], render: RenderOptions | None) -> tuple[Config, Config]:
+    """The dataset's config, and the config of the requested frames. Raises ConfigError for an invalid option."""
+    options = dict(render or {})
+    known = RenderOptions.__annotations__
+    wrong = [name for name in options if name not in known]
+    if wrong:
+        raise ConfigError(f"render has {wrong[0]!r}, but may have {', '.join(known)}")
+    return configs_of(ds, fields=[*names], **options)
+
+
+def _with_annotations(config: Config, names: Collection[str]) -> Config:
+    """The config with only those pixel annotations that have some of these fields."""
+    section = config.annotations
+    pixels = (
+        plugin if plugin.contract.fields.keys() & names else dataclasses.replace(plugin, options=None)
+        for plugin in section.pixels
+    )
+    return dataclasses.replace(config, annotations=dataclasses.replace(section, pixels=tuple(pixels)))
+
+
+def _is_exact(ds: RenderedDataset, settings: RenderSettings) -> bool:
+    """Whether these settings, on this machine, give the frames of the dataset to the bit; logs the answer."""
+    base, config = settings.base, settings.config
+    if dataclasses.replace(config, annotations=base.annotations, storage=base.storage) != base:
+        _log.info("%s: frames are rendered with other settings than those of the dataset", ds.root)
+        return False
+    difference = _fingerprint_difference(ds, (ds.render or {}).get("trust", ()))
+    if difference:
+        _log.warning(
+            "%s: rendered frames may differ by a grey level from those of the dataset: %s", ds.root, difference
+        )
+    else:
+        _log.info("%s: rendered frames are those of the dataset, to the bit", ds.root)
+    return not difference
+
+
+def _fingerprint_difference(ds: Dataset, trust: Trust) -> str:
+    """What differs between the fingerprint of the dataset and that of this machine; empty if they are equal."""
+    made_by, here = ds.manifest.producer.get("sources") or {}, sources()
+    stored = dict(ds.manifest.fingerprint)
+    rollout = Rollout(config_from(ds.root, ds.manifest.identity, trust), jax.local_devices()[:1])
+    own = machine(rollout)
+    if own == {name: value for name, value in stored.items() if name != "programs"}:
+        own = fingerprint(rollout)
+    else:
+        stored.pop("programs", None)  # tracing programs is slow
+    difference = describe_differences({"fingerprint": stored}, {"fingerprint": own}, made_by, here)
+    if difference or "frames" in ds.manifest.fields:
+        return difference
+    # The fingerprint of a run without frames does not cover the rasterizer.
+    names = (name for name in made_by.keys() | here.keys() if name.startswith("renderers/"))
+    edited = sorted(name for name in names if made_by.get(name) != here.get(name))
+    return f"{', '.join(edited[:5])} differ" if edited else ""
