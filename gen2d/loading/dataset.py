@@ -295,6 +295,7 @@ class Dataset:
         self.fields, self.sizes = {name: manifest.fields[name] for name in options.fields}, dict(manifest.sizes)
         self.stats = {name: values for name, values in manifest.stats[options.split].items() if name in self.fields}
         view = options.layout, options.window, options.stride, options.dtype
+        self.slice_size = 1  # videos that are best filled together
         self._columns = self._stored_columns = [Column(name, manifest, *view) for name in self.fields]
         cache = None
         if isinstance(root, Url) and options.cache_dir is not None:

@@ -107,6 +107,11 @@ class Mixture:
         return f"<{len(self)} videos, in every {sum(self.shares)} {', '.join(parts)}>"
 
     @property
+    def slice_size(self) -> int:
+        """Number of videos that are best filled together."""
+        return self._concatenation.slice_size
+
+    @property
     def snapshot(self) -> Snapshot:
         """Snapshots of the datasets, in their order."""
         return self._concatenation.snapshot

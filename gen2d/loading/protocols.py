@@ -34,6 +34,9 @@ class VideoReader(Protocol):
     def fields(self) -> dict[str, Field]: ...
 
     @property
+    def slice_size(self) -> int: ...  # number of videos that are best filled together
+
+    @property
     def stats(self) -> FieldStats: ...
 
     @property

@@ -39,12 +39,14 @@ from gen2d.programs.redraw import (
 from gen2d.programs.rollout import Rollout
 from gen2d.records import axes
 from gen2d.records.axes import Array
-from gen2d.records.scene import Joints, Objects, State
+from gen2d.records.scene import Joints, Objects, Scene, State
+from gen2d.renderers.plan import RenderScene
 from gen2d.storage.paths import Place
 
 FRAMES = Field("uint8", "n T H W 3", "sRGB", "frames of the video")  # equal to the field of stored frames
-SLICE_BYTES = 2**20  # of frames rendered at once; a slice that is not full costs as much as a full one
-RECORDS = {name for record in (Objects, Joints, State) for name in axes.stored_fields(record)}
+SLICE_BYTES = 2**22  # of frames rendered at once; a slice that is not full costs as much as a full one
+# Fields of a scene and its states, without the camera's.
+RECORDS = {name for record in (Scene, Objects, Joints, State) for name in axes.stored_fields(record)}
 
 _PID = os.getpid()  # of the process that imported jax
 _LOCK = threading.Lock()  # programs are traced and compiled by one thread at a time
@@ -79,7 +81,7 @@ class RenderedDataset(Dataset):
     def __init__(
         self, root: Place, manifest: Manifest, options: ViewOptions, render: RenderOptions | None = None
     ) -> None:
-        self.render, self._started = render, None
+        self.render = render
         base, config = _configs(
             Dataset(root, manifest, dataclasses.replace(options, fields=())), options.fields, render
         )
@@ -98,10 +100,9 @@ class RenderedDataset(Dataset):
         video, image = config.video, config.image
         # Noise depends on the number of the frame, motion blur and some annotations on neighbouring frames.
         whole = rendered.keys() != {"frames"} or image.exposure > 0 or image.noise.support != (0.0, 0.0)
-        inputs = tuple(name for name in manifest.fields if name in RECORDS or name.startswith(("camera/", "world/")))
         every_frame = {"window": None, "stride": 1, "start": "first"} if whole else {}
-        view = dataclasses.replace(options, fields=inputs, **every_frame)
-        self._inputs, self._whole = Dataset(root, manifest, view), whole
+        self._inputs, self._whole = dataclasses.replace(options, fields=(), **every_frame), whole
+        self._started: _Renderer | None = None
 
         sizes = {"T": video.frames, "K": settings.layout.slots, "H": video.height, "W": video.width}
         self.sizes |= annotations.sizes(settings.config.annotations, settings.plan, sizes)
@@ -113,8 +114,8 @@ class RenderedDataset(Dataset):
         columns |= {column.name: column for column in self._stored_columns}
         self._columns = [columns[name] for name in names]
         self.fields = {name: columns[name].field for name in names}
-        video_bytes = sum(column.size for column in self._rendered_columns)
-        self.slice = max(1, SLICE_BYTES // video_bytes)  # videos
+        fitting = SLICE_BYTES // sum(column.size for column in self._rendered_columns)
+        self.slice_size = 1 << max(0, fitting.bit_length() - 1)
 
     def __reduce__(self) -> tuple[Any, ...]:
         return RenderedDataset, (self.root, self.manifest, self.options, self.render)
@@ -137,7 +138,7 @@ class RenderedDataset(Dataset):
             )
         with _LOCK:
             if self._started is None:
-                self._started = _Renderer(self, self._settings, self._inputs.empty(self.slice))
+                self._started = _Renderer(self, self._settings, self._inputs, self.slice_size)
             return self._started
 
     def fill(self, out: Batch, rows: Numbers, indices: Numbers, starts: Numbers | None = None) -> None:
@@ -146,51 +147,78 @@ class RenderedDataset(Dataset):
         Raises UserError in a process that was forked from the one that opened the dataset.
         """
         renderer = self._renderer
-        super().fill(out, rows, indices, starts)
-        numbers, targets = self.numbers(indices), np.asarray(rows).tolist()
-        begins = self._begins(numbers, starts).tolist()
-        columns = self._inputs.batch(numbers, None if self._whole else begins)
-        size = len(numbers) if self._settings.config.image.exposure else self.slice
+        if self._stored_columns:
+            super().fill(out, rows, indices, starts)
+        numbers, targets = self.numbers(indices), np.asarray(rows)
+        begins = self._begins(numbers, starts)
+        inputs = renderer.inputs.batch(numbers, None if self._whole else begins)
+        size = len(numbers) if self._settings.config.image.exposure else self.slice_size
         for first in range(0, len(numbers), size):
-            part = np.minimum(np.arange(first, first + size), len(numbers) - 1)  # padded with the last video
-            rendered = renderer(numbers[part], {name: values[part] for name, values in columns.items()})
+            part = np.arange(first, min(first + size, len(numbers)))
+            padded = np.minimum(np.arange(first, first + size), len(numbers) - 1)  # with the last video
+            rendered = renderer(numbers[padded], {name: values[padded] for name, values in inputs.items()})
             for column in self._rendered_columns:
-                videos, target = np.asarray(rendered[column.name]), out[column.name]
-                for row in range(min(size, len(numbers) - first)):
-                    to = targets[first + row]
-                    column.convert(videos[row : row + 1], begins[first + row], target[to : to + 1])
+                _write(column, np.asarray(rendered[column.name])[: len(part)], begins[part], out, targets[part])
+
+
+def _write(column: Column, videos: np.ndarray, begins: np.ndarray, out: Batch, rows: np.ndarray) -> None:
+    """Copy the windows of rendered videos that begin at these frames to these rows of a batch."""
+    target, first = out[column.name], int(rows[0])
+    if column.is_direct and (np.diff(rows) == 1).all():
+        target[first : first + len(rows)] = videos  # a quarter faster than single videos
+        return
+    for video, begin, row in zip(videos, begins.tolist(), rows.tolist(), strict=True):
+        column.convert(video[None], begin, target[row : row + 1])
 
 
 class _Renderer:
-    """Programs that render slices of a dataset's videos."""
+    """Programs that render slices of `size` videos of a dataset; `inputs` is the dataset of the fields that they read.
 
-    def __init__(self, ds: RenderedDataset, settings: RenderSettings, inputs: Batch) -> None:
+    `view` holds the options with which these fields are read.
+    """
+
+    def __init__(self, ds: RenderedDataset, settings: RenderSettings, view: ViewOptions, size: int) -> None:
         if "torch" in sys.modules:  # leave it its share of a GPU's memory
             os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
         devices.prepare()
         self._ds, self._config, self._words = ds, settings.config, seed_words_of(ds)
         self.exact = _is_exact(ds, settings)
+        fields: tuple[str, ...] = ()
         if not settings.config.image.exposure:
-            shapes = tuple((name, values.shape, values.dtype.str) for name, values in inputs.items())
-            self._build, self._draw = _compile(settings, shapes)
+            fields = tuple(name for name in ds.manifest.fields if name in RECORDS or name.startswith("camera/"))
+            like = Dataset(ds.root, ds.manifest, dataclasses.replace(view, fields=fields)).empty(size)
+            shapes = tuple((name, values.shape, values.dtype.str) for name, values in like.items())
+            fields, self._build, self._draw = _compile(settings, shapes)
+        self.inputs = Dataset(ds.root, ds.manifest, dataclasses.replace(view, fields=fields))
 
     def __call__(self, numbers: np.ndarray, columns: Batch) -> Mapping[str, Array]:
-        """Rendered fields [n, ...] of videos, from their numbers [n] and their stored fields [n, ...]."""
+        """Rendered fields [n, ...] of videos, from their numbers [n] and their `inputs` [n, ...]."""
         if self._config.image.exposure:
             with _LOCK:
                 return regenerate(self._ds, self._config, numbers)
         return self._draw(self._build(columns, self._words, numbers.astype(np.uint32)))
 
 
+Shapes = tuple[tuple[str, tuple[int, ...], str], ...]  # name, shape and dtype of each field
+
+
 @functools.lru_cache(maxsize=8)  # splits, and loaders that are opened again, share programs
-def _compile(settings: RenderSettings, shapes: tuple[tuple[str, tuple[int, ...], str], ...]) -> tuple[Any, Any]:
-    """Compiled programs that build render scenes from stored fields of these shapes, and render them."""
+def _compile(settings: RenderSettings, shapes: Shapes) -> tuple[tuple[str, ...], Any, Any]:
+    """Stored fields that frames depend on, and the compiled programs: fields to render scenes, and these to frames."""
     columns = {name: jax.ShapeDtypeStruct(shape, dtype) for name, shape, dtype in shapes}
     words, numbers = (jax.ShapeDtypeStruct(shape, np.uint32) for shape in ((3,), shapes[0][1][:1]))
-    build = jax.jit(functools.partial(build_render_scenes, settings=settings)).lower(columns, words, numbers)
-    scenes = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), build.out_info)
-    draw = jax.jit(functools.partial(render_frames, settings=settings)).lower(scenes)
-    return build.compile(), draw.compile()
+    jaxpr = jax.make_jaxpr(functools.partial(build_render_scenes, settings=settings))(columns, words, numbers).jaxpr
+    used = {id(variable) for equation in jaxpr.eqns for variable in equation.invars} | set(map(id, jaxpr.outvars))
+    fields = tuple(name for name, variable in zip(sorted(columns), jaxpr.invars, strict=False) if id(variable) in used)
+    unused = {name: np.zeros(like.shape, like.dtype) for name, like in columns.items() if name not in fields}
+
+    def build(columns: dict[str, Array], words: Array, numbers: Array) -> RenderScene:
+        return build_render_scenes(columns | unused, words, numbers, settings)
+
+    building = jax.jit(build).lower({name: columns[name] for name in fields}, words, numbers)
+    scenes = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), building.out_info)
+    drawing = jax.jit(functools.partial(render_frames, settings=settings)).lower(scenes)
+    return fields, building.compile(), drawing.compile()
 
 
 def _configs(ds: Dataset, names: Collection[str], render: RenderOptions | None) -> tuple[Config, Config]:
