@@ -125,7 +125,7 @@ def open(
         An earlier `Dataset.snapshot`, to open the dataset as it was before it grew last. Only for a single path.
     render : RenderOptions, optional
         Arguments of `gen2d.render`, such as `{"height": 128, "width": 128, "look": "shaded"}`, with which frames and
-        pixel annotations are rendered even if they are stored. `{}` renders them with the settings of the dataset.
+        pixel annotations are rendered even if they are stored. With `{}`, only those that are not stored are rendered.
         `Dataset.exact` says whether they are those of the dataset to the bit. Rendering imports jax and compiles a
         program when the first video is read; it does not work in processes that are forked afterwards.
     timeout : float
@@ -163,8 +163,7 @@ def open(
         view = split, fields, window, stride, start, layout, dtype, verify, cache_dir, cache_bytes
         if snapshot is not None:
             raise ConfigError("snapshot must be None for a list of datasets")
-        limits = {"timeout": timeout, "deadline": deadline}
-        return _concatenate([open(one, *view, render=render, **limits) for one in path])
+        return _concatenate([open(one, *view, render=render, timeout=timeout, deadline=deadline) for one in path])
     root = place(path, Network(timeout, deadline))
     manifest = read_manifest(root, snapshot)
     split = _select_split(root, manifest, split)

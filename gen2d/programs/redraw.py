@@ -343,10 +343,11 @@ class RenderSettings:
     def plan(self) -> FramePlan:
         return render_module.plan_of(self.config, self.layout)
 
-    def rescale(self, view: CameraView) -> CameraView:
-        """A stored view, scaled to frames of another size so that everything stays in view."""
+    @property
+    def zoom(self) -> float:
+        """Scale of the requested frames, relative to those of the dataset: everything stays in view."""
         old, new = self.base.video, self.config.video
-        return view._replace(scale=view.scale * min(new.height / old.height, new.width / old.width))
+        return min(new.height / old.height, new.width / old.width)
 
 
 def _render_scenes(
@@ -364,7 +365,8 @@ def build_render_scenes(columns: FieldColumns, words: Array, numbers: Array, set
     """Render scenes of the videos with these numbers [n], from their stored fields [n, ...]."""
     config, plan = settings.config, settings.plan
     scene, states = scene_of(columns), from_columns(State, columns)
-    view = settings.rescale(CameraView(*(jnp.asarray(columns[f"camera/{name}"]) for name in CameraView._fields)))
+    view = CameraView(*(jnp.asarray(columns[f"camera/{name}"]) for name in CameraView._fields))
+    view = view._replace(scale=view.scale * settings.zoom)
 
     def build(key: Array, scene: Scene, states: State, view: CameraView) -> RenderScene:
         return render_module.render_scene(key, config, plan, scene, states, view)

@@ -56,8 +56,9 @@ _log = logging.getLogger(__name__)
 class RenderedDataset(Dataset):
     """A Dataset whose frames and pixel annotations are rendered on jax's default device, as `gen2d.open` returns it.
 
-    All other fields are read. A window's frames are rendered from its own states alone, unless the config has sensor
-    noise or annotations are read, too. With motion blur, whole batches are simulated again, which is slow.
+    All other fields are read; `camera/scale` is that of the rendered frames. A window's frames are rendered alone,
+    unless there is sensor noise or annotations are rendered, too. With motion blur, whole batches are simulated again,
+    which is slow.
 
     Parameters
     ----------
@@ -68,7 +69,7 @@ class RenderedDataset(Dataset):
     options : ViewOptions
         Split, fields (names or patterns), window, layout and so on.
     render : RenderOptions, optional
-        Options of the frames. By default only fields that are not stored are rendered, with the dataset's settings.
+        Options of the frames. If none but `trust` is given, only fields that are not stored are rendered.
 
     Raises
     ------
@@ -82,16 +83,14 @@ class RenderedDataset(Dataset):
         self, root: Place, manifest: Manifest, options: ViewOptions, render: RenderOptions | None = None
     ) -> None:
         self.render = render
-        base, config = _configs(
-            Dataset(root, manifest, dataclasses.replace(options, fields=())), options.fields, render
-        )
+        changes = {name for name in render or {} if name != "trust"}
+        without_fields = Dataset(root, manifest, dataclasses.replace(options, fields=()))
+        base, config = _configs(without_fields, options.fields, render)
         renderable = {"frames": FRAMES}
         for plugin in config.annotations.pixels:
             renderable |= plugin.contract.fields
         names = select_fields(f"{root}", manifest.fields, options.fields, renderable)
-        rendered = {
-            n: renderable[n] for n in names if n in renderable and (render is not None or n not in manifest.fields)
-        }
+        rendered = {n: renderable[n] for n in names if n in renderable and (changes or n not in manifest.fields)}
         stored = tuple(name for name in names if name not in rendered)
         super().__init__(root, manifest, dataclasses.replace(options, fields=stored))
         self.options = dataclasses.replace(options, fields=names)
@@ -104,17 +103,18 @@ class RenderedDataset(Dataset):
         self._inputs, self._whole = dataclasses.replace(options, fields=(), **every_frame), whole
         self._started: _Renderer | None = None
 
-        sizes = {"T": video.frames, "K": settings.layout.slots, "H": video.height, "W": video.width}
+        sizes = {name: self.sizes[name] for name in "TK"} | {"H": video.height, "W": video.width}
         self.sizes |= annotations.sizes(settings.config.annotations, settings.plan, sizes)
         frames = sizes["T"] if whole or options.window is None else options.window
-        shown = dataclasses.replace(manifest, fields=manifest.fields | rendered, sizes=self.sizes | {"T": frames})
+        shown = dataclasses.replace(manifest, fields={**manifest.fields, **rendered}, sizes=self.sizes | {"T": frames})
         window = options.window if whole else None
         columns = {n: Column(n, shown, options.layout, window, options.stride, options.dtype) for n in rendered}
         self._rendered_columns = list(columns.values())
         columns |= {column.name: column for column in self._stored_columns}
         self._columns = [columns[name] for name in names]
         self.fields = {name: columns[name].field for name in names}
-        fitting = SLICE_BYTES // sum(column.size for column in self._rendered_columns)
+        video_bytes = sum(column.size for column in self._rendered_columns)
+        fitting = SLICE_BYTES // video_bytes if rendered else 1
         self.slice_size = 1 << max(0, fitting.bit_length() - 1)
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -149,7 +149,11 @@ class RenderedDataset(Dataset):
         renderer = self._renderer
         if self._stored_columns:
             super().fill(out, rows, indices, starts)
+        if not self._rendered_columns:
+            return
         numbers, targets = self.numbers(indices), np.asarray(rows)
+        if "camera/scale" in self.fields:
+            out["camera/scale"][targets] *= np.float32(self._settings.zoom)  # px of these frames
         begins = self._begins(numbers, starts)
         inputs = renderer.inputs.batch(numbers, None if self._whole else begins)
         size = len(numbers) if self._settings.config.image.exposure else self.slice_size
@@ -223,11 +227,10 @@ def _compile(settings: RenderSettings, shapes: Shapes) -> tuple[tuple[str, ...],
 
 def _configs(ds: Dataset, names: Collection[str], render: RenderOptions | None) -> tuple[Config, Config]:
     """The dataset's config, and the config of the requested frames. Raises ConfigError for an invalid option."""
-    options = dict(render or {})
-    known = RenderOptions.__annotations__
-    wrong = [name for name in options if name not in known]
-    if wrong:
-        raise ConfigError(f"render has {wrong[0]!r}, but may have {', '.join(known)}")
+    options: RenderOptions = {} if render is None else render
+    for name in options:
+        if name not in RenderOptions.__annotations__:
+            raise ConfigError(f"render has {name!r}, but may have {', '.join(RenderOptions.__annotations__)}")
     return configs_of(ds, fields=[*names], **options)
 
 
