@@ -236,12 +236,12 @@ def _configs(ds: Dataset, names: Collection[str], render: RenderOptions | None) 
 
 def _with_annotations(config: Config, names: Collection[str]) -> Config:
     """The config with only those pixel annotations that have some of these fields."""
-    section = config.annotations
-    pixels = (
-        plugin if plugin.contract.fields.keys() & names else dataclasses.replace(plugin, options=None)
-        for plugin in section.pixels
-    )
-    return dataclasses.replace(config, annotations=dataclasses.replace(section, pixels=tuple(pixels)))
+    pixels = []
+    for plugin in config.annotations.pixels:
+        off = getattr(plugin.contract.options, "default", None)  # a dataclass of options has none
+        wanted = plugin.contract.fields.keys() & names
+        pixels.append(plugin if wanted else dataclasses.replace(plugin, options=off))
+    return dataclasses.replace(config, annotations=dataclasses.replace(config.annotations, pixels=tuple(pixels)))
 
 
 def _is_exact(ds: RenderedDataset, settings: RenderSettings) -> bool:

@@ -233,7 +233,8 @@ def test_a_foreign_fingerprint_is_told(
     ds = gen2d.open(roots[1], fields="frames")
     for part, values in change.items():
         for name, value in values.items():
-            getattr(ds.manifest, part)[name] = value
+            own = getattr(ds.manifest, part)
+            own[name] = {**own[name], **value} if isinstance(value, dict) else value
     with caplog.at_level(logging.INFO, "gen2d"):
         actual = ds[:]["frames"]
     assert not ds.exact
