@@ -264,8 +264,9 @@ def states(folder: Path, videos: int = 512, turns: int = 7, window: int = 16, ov
         works[f"make {name}"] = timed(remake, videos)
         for view, length in (("videos", None), ("windows", window)):
             ds = gen2d.open(root, fields=["frames"], window=length)
+            out = ds.empty(batch)
 
-            def load(ds: Any = ds, out: Any = ds.empty(batch)) -> None:
+            def load(ds: Any = ds, out: Any = out) -> None:
                 for first in range(0, videos - batch + 1, batch):
                     ds.batch(order[first : first + batch], out=out)
 
