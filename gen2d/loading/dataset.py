@@ -1,6 +1,7 @@
 """Datasets for reading: `open`, and `Dataset` with videos by index and batches.
 
-Neither jax nor h5py is imported, and no file descriptor is shared across a fork, so fork and spawn are both safe.
+Neither jax nor h5py is imported, and no file descriptor is shared across a fork, so fork and spawn are both safe. Only
+frames that must be rendered need jax, and a process that was not forked.
 """
 
 import contextlib

@@ -107,6 +107,11 @@ class Mixture:
         return f"<{len(self)} videos, in every {sum(self.shares)} {', '.join(parts)}>"
 
     @property
+    def exact(self) -> bool:
+        """Whether all fields are those of the datasets to the bit, as `Dataset.exact`."""
+        return self._concatenation.exact
+
+    @property
     def slice_size(self) -> int:
         """Number of videos that are best filled together."""
         return self._concatenation.slice_size

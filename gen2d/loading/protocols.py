@@ -37,6 +37,9 @@ class VideoReader(Protocol):
     def slice_size(self) -> int: ...  # number of videos that are best filled together
 
     @property
+    def exact(self) -> bool: ...
+
+    @property
     def stats(self) -> FieldStats: ...
 
     @property
