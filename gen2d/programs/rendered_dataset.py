@@ -146,15 +146,14 @@ class RenderedDataset(Dataset):
 
         Raises UserError in a process that was forked from the one that opened the dataset.
         """
-        renderer = self._renderer
         if self._stored_columns:
             super().fill(out, rows, indices, starts)
-        if not self._rendered_columns:
-            return
         numbers, targets = self.numbers(indices), np.asarray(rows)
         if "camera/scale" in self.fields:
             out["camera/scale"][targets] *= np.float32(self._settings.zoom)  # px of these frames
-        begins = self._begins(numbers, starts)
+        if not self._rendered_columns:
+            return
+        renderer, begins = self._renderer, self._begins(numbers, starts)
         inputs = renderer.inputs.batch(numbers, None if self._whole else begins)
         size = len(numbers) if self._settings.config.image.exposure else self.slice_size
         for first in range(0, len(numbers), size):
