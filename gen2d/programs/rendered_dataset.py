@@ -155,7 +155,7 @@ class RenderedDataset(Dataset):
             return
         renderer, begins = self._renderer, self._begins(numbers, starts)
         inputs = renderer.inputs.batch(numbers, None if self._whole else begins)
-        size = len(numbers) if self._settings.config.image.exposure else self.slice_size
+        size = max(1, len(numbers)) if self._settings.config.image.exposure else self.slice_size
         for first in range(0, len(numbers), size):
             part = np.arange(first, min(first + size, len(numbers)))
             padded = np.minimum(np.arange(first, first + size), len(numbers) - 1)  # with the last video
