@@ -31,6 +31,8 @@ LAYERS = (
     ("cli",),
 )
 RANKS = {room: rank for rank, layer in enumerate(LAYERS) for room in layer}
+# Imports inside functions that go up, so that frames that are not stored are rendered where they are asked for.
+UPWARD = {("gen2d.loading.dataset", "gen2d.programs.rendered_dataset")}
 # None of these imports jax when it is imported.
 WITHOUT_JAX = ("core", "storage", "dataset", "media", "loading", "captions", "exports", "tools.verify", "cli")
 
@@ -51,7 +53,7 @@ MODULES = sources()
 
 
 def imports(path: Path) -> set[str]:
-    """The modules of gen2d that a file imports, anywhere in it."""
+    """The modules of gen2d that a file imports, anywhere in it, but for those that it may import from above."""
     found = set()
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.ImportFrom) and node.module and node.module.split(".")[0] == "gen2d":
@@ -59,7 +61,8 @@ def imports(path: Path) -> set[str]:
             found |= {name if name in MODULES else node.module for name in names}
         if isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names if alias.name.startswith("gen2d.")}
-    return found - {"gen2d", "gen2d._version"}
+    own = {name for name, file in MODULES.items() if file == path}
+    return found - {"gen2d", "gen2d._version"} - {above for below, above in UPWARD if below in own}
 
 
 def room_of(module: str) -> str:

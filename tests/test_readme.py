@@ -60,6 +60,7 @@ def test_every_block_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
         "violations",
         "told",
         "drop",
+        "states",
     }
 
 

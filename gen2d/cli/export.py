@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from gen2d.cli.parser import Parser, add_dataset, add_network, add_trust, limits
+from gen2d.cli.parser import Parser, add_dataset, add_network, add_overrides, add_trust, limits, whole_number
 from gen2d.config.plugins import names
 from gen2d.core.humanize import in_bytes, in_time
 
@@ -24,6 +24,12 @@ def add_arguments(parser: Parser) -> None:
         help="fields to export, by name or pattern such as 'states/*'; where the format can hold any (default: all)",
     )
     parser.add_argument("--overwrite", action="store_true", help="replace an export of another dataset")
+    sides = ("height", "H"), ("width", "W")
+    for name, letter in sides:
+        meaning = f"{name} in px of the frames, which are rendered again (default: that of the dataset)"
+        parser.add_argument(f"--{name}", type=whole_number, metavar=letter, help=meaning)
+    parser.add_argument("--look", metavar="NAME", help="look of the frames, which are rendered again")
+    add_overrides(parser)
     add_trust(parser)
     add_network(parser)
 
@@ -31,7 +37,10 @@ def add_arguments(parser: Parser) -> None:
 def run(options: argparse.Namespace) -> int:
     from gen2d.core.progress import to_stderr
     from gen2d.exports.export import export
+    from gen2d.loading.dataset import RenderOptions
 
+    asked = {name: getattr(options, name) for name in ("height", "width", "look", "overrides")}
+    render = RenderOptions(**{name: value for name, value in asked.items() if value})  # pyright: ignore
     exported = export(
         options.dataset,
         options.to,
@@ -41,6 +50,7 @@ def run(options: argparse.Namespace) -> int:
         overwrite=options.overwrite,
         log=to_stderr,
         trust=options.trust,
+        render=render or None,
         **limits(options),
     )
     size = f"{in_time(exported.seconds)}, {in_bytes(exported.bytes)}"

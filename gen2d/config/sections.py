@@ -160,7 +160,9 @@ class MatchedOptions:
 class StorageOptions:
     """Storage of videos on disk."""
 
-    frames: str = option("video", str, "", "stored frames; none: rendered by gen2d.render", choices=("video", "none"))
+    frames: str = option(
+        "video", str, "", "stored frames; none: rendered when they are read", choices=("video", "none")
+    )
     codec: str = option(
         "gzip", str, "", "codec of frames: gzip opens everywhere, zstd is smaller, none can be mapped", choices=CODECS
     )

@@ -12,6 +12,7 @@ from gen2d.config.contracts import Export
 from gen2d.core.errors import ConfigError, FolderError
 from gen2d.core.progress import LOGGER, progress, stopping_on_sigterm
 from gen2d.exports.source import Source, source_of
+from gen2d.loading.dataset import RenderOptions
 from gen2d.storage.atomic import publishing, publishing_folder, sweep_beside
 from gen2d.storage.explain import writing_error
 from gen2d.storage.paths import Place, Url, place
@@ -43,6 +44,7 @@ def export(
     overwrite: bool = False,
     log: Callable[[str], None] | None = None,
     trust: Sequence[str] = (),
+    render: RenderOptions | None = None,
     timeout: float = 30.0,
     deadline: float = 300.0,
 ) -> Exported:
@@ -71,7 +73,9 @@ def export(
     log : callable, optional
         Function that is called with each line of progress.
     trust : sequence of str
-        sha256 of code that came with the dataset and may run to render frames, as in `render`.
+        sha256 of code that came with the dataset and may run to render frames, as in `gen2d.render`.
+    render : RenderOptions, optional
+        Size, look and other options of the frames, such as `{"height": 256, "width": 256}`, as in `open`.
     timeout : float
         Maximum time, in s, to wait for a server to connect or to send the next part of an answer.
     deadline : float
@@ -102,7 +106,7 @@ def export(
     """
     start, format_, name = time.perf_counter(), _format(to), Path(to).name
     folder = place(root, Network(timeout, deadline))
-    source = source_of(folder, split, _patterns(to, format_, fields), trust)
+    source = source_of(folder, split, _patterns(to, format_, fields), trust, render)
     out = Path(out) if out is not None else _default_out(folder, f"{name.removesuffix('.py')}{format_.suffix}")
     description = _export_description(source, name)
     format_.check(source)
@@ -144,8 +148,8 @@ def _default_out(root: Place, ending: str) -> Path:
 def _export_description(source: Source, to: str) -> dict[str, Any]:
     """Contents of a folder's export.json, without the list of files."""
     manifest = source.ds.manifest
-    keys = ("name", "seed", "fps", "sizes", "conventions", "licence", "manifest_sha256", "config_sha256")
-    origin = {key: manifest.plain[key] for key in keys} | {"split": source.ds.options.split}
+    keys = ("name", "seed", "fps", "conventions", "licence", "manifest_sha256", "config_sha256")
+    origin = {key: manifest.plain[key] for key in keys} | {"split": source.ds.options.split, "sizes": source.ds.sizes}
     fields = {name: dataclasses.asdict(field) for name, field in source.fields.items()}
     return origin | {"schema": SCHEMA, "format": to, "fields": fields, "videos": len(source)}
 

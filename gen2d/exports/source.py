@@ -7,17 +7,15 @@ from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 
-import numpy as np
-
+from gen2d.core.errors import ConfigError
 from gen2d.core.schema import Field
 from gen2d.dataset.block import stored_bytes
 from gen2d.loading import dataset as loader
-from gen2d.loading.dataset import Dataset
-from gen2d.loading.protocols import Batch
+from gen2d.loading.dataset import Dataset, RenderOptions
+from gen2d.loading.protocols import Batch, unbatch
 from gen2d.storage.paths import Place
 
-FRAMES = Field("uint8", "n T H W 3", "sRGB", "frames of the video")  # equal to the field of stored frames
-RENDERED_BYTES = 2**26  # size of a batch of rendered frames
+BATCH_BYTES = 2**26  # of videos that are read, or rendered, at once
 
 
 @dataclasses.dataclass(frozen=True)
@@ -25,8 +23,6 @@ class Source:
     """Videos of one split to export, in their order."""
 
     ds: Dataset
-    renders: bool  # whether frames are rendered, because they are not stored
-    trust: Sequence[str]  # sha256 of code that came with the dataset and may run to render
     advance: Callable[[int], None]  # to be called with the number of videos just written
 
     def __len__(self) -> int:
@@ -35,7 +31,7 @@ class Source:
     @property
     def fields(self) -> dict[str, Field]:
         """The fields of each video, by name."""
-        return ({"frames": FRAMES} if self.renders else {}) | self.ds.fields
+        return self.ds.fields
 
     @property
     def fps(self) -> float:
@@ -45,12 +41,12 @@ class Source:
     @property
     def frame_size(self) -> tuple[int, int]:
         """Height and width of frames, px."""
-        return self.ds.manifest.sizes["H"], self.ds.manifest.sizes["W"]
+        return self.ds.sizes["H"], self.ds.sizes["W"]
 
     @property
     def video_bytes(self) -> int:
         """Size of one video before compression, bytes."""
-        return sum(stored_bytes(field, self.ds.manifest.sizes) for field in self.fields.values())
+        return sum(stored_bytes(field, self.ds.sizes) for field in self.fields.values())
 
     def key(self, number: int) -> str:
         """File name of a video, without suffix: the split and the index, padded so that names sort by index."""
@@ -58,9 +54,9 @@ class Source:
 
     def videos(self) -> Iterator[Batch]:
         """Videos one at a time, as dictionaries of arrays by field name."""
-        frames = self._rendered_frames() if self.renders else iter(())
-        for number in range(len(self)):
-            yield ({"frames": next(frames)} if self.renders else {}) | self.ds[number]
+        count = max(1, BATCH_BYTES // max(1, self.video_bytes))
+        for first in range(0, len(self), count):
+            yield from unbatch(self.ds.batch(range(first, min(first + count, len(self)))))
 
     def each(self, write: Callable[[str, Batch], None]) -> None:
         """Call `write(key, video)` for every video in several threads, and report the progress to `advance`."""
@@ -76,22 +72,22 @@ class Source:
                 future.result()
                 self.advance(1)
 
-    def _rendered_frames(self) -> Iterator[np.ndarray]:
-        """Rendered frames [T, H, W, 3] of each video; batches have equal sizes, so one program is compiled."""
-        from gen2d.programs.redraw import render  # imports jax
 
-        count = max(1, min(128, len(self), RENDERED_BYTES // stored_bytes(FRAMES, self.ds.manifest.sizes)))
-        for first in range(0, len(self), count):
-            numbers = np.minimum(np.arange(first, first + count), len(self) - 1)
-            yield from np.asarray(render(self.ds, numbers, trust=self.trust))[: len(self) - first]
-
-
-def source_of(root: str | Place, split: str | None, patterns: Sequence[str], trust: Sequence[str] = ()) -> Source:
+def source_of(
+    root: str | Place,
+    split: str | None,
+    patterns: Sequence[str],
+    trust: Sequence[str] = (),
+    render: RenderOptions | None = None,
+) -> Source:
     """Videos of a split with the fields that match `patterns`; frames that match but are not stored are rendered.
 
     Raises the errors of `open`.
     """
     ds = loader.open(root, split, fields=())
-    renders = "frames" not in ds.manifest.fields and any(fnmatch.fnmatch("frames", p) for p in patterns)
-    stored = [pattern for pattern in patterns if pattern != "frames"] if renders else patterns
-    return Source(loader.open(root, ds.options.split, stored), renders, trust, lambda videos: None)
+    if any(fnmatch.fnmatch("frames", pattern) for pattern in patterns):
+        if render is not None or "frames" not in ds.manifest.fields:
+            render, patterns = {"trust": trust, **(render or {})}, ["frames", *patterns]
+    elif render is not None:
+        raise ConfigError(f"render is {render!r}, but must be None where no frames are exported")
+    return Source(loader.open(root, ds.options.split, patterns, render=render), lambda videos: None)

@@ -57,6 +57,16 @@ class ConcatDataset:
         return self.datasets[0].fields
 
     @property
+    def exact(self) -> bool:
+        """Whether all fields are those of the datasets to the bit, as `Dataset.exact`."""
+        return all(source.exact for source in self.datasets)
+
+    @property
+    def slice_size(self) -> int:
+        """Number of videos that are best filled together."""
+        return max(source.slice_size for source in self.datasets)
+
+    @property
     def time(self) -> np.ndarray:
         """Times of all frames of a video, s, float64 [T]."""
         return self.datasets[0].time

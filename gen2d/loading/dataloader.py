@@ -249,9 +249,10 @@ class DataLoader(Generic[A]):
         starts = self.dataset.starts(indices, self.epoch_sampler.window_bits(step, positions))
         # A new batch each time, because jax may keep the memory of the arrays that it receives.
         out = self.dataset.empty(len(indices))
+        slices = -(-len(indices) // self.dataset.slice_size)
         parts = [
             pool.submit(self.dataset.fill, out, part, indices[part], None if starts is None else starts[part])
-            for part in np.array_split(np.arange(len(indices)), min(self.threads, len(indices) or 1))
+            for part in np.array_split(np.arange(len(indices)), min(self.threads, slices or 1))
             if len(part)
         ]
         # No deadlock: this task is queued after its parts, so all of them have started when a thread waits for them.

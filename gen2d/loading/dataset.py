@@ -1,6 +1,7 @@
 """Datasets for reading: `open`, and `Dataset` with videos by index and batches.
 
-Neither jax nor h5py is imported, and no file descriptor is shared across a fork, so fork and spawn are both safe.
+Neither jax nor h5py is imported, and no file descriptor is shared across a fork, so fork and spawn are both safe. Only
+frames that must be rendered need jax, and a process that was not forked.
 """
 
 import contextlib
@@ -8,9 +9,9 @@ import dataclasses
 import difflib
 import fnmatch
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, TypeVar, overload
+from typing import Any, TypedDict, TypeVar, overload
 
 import numpy as np
 
@@ -48,6 +49,7 @@ def open(
     cache_bytes: int | None = None,
     *,
     snapshot: str | None = None,
+    render: "RenderOptions | None" = None,
     timeout: float = 30.0,
     deadline: float = 300.0,
 ) -> "Dataset": ...
@@ -65,6 +67,7 @@ def open(
     cache_dir: str | Path | None = None,
     cache_bytes: int | None = None,
     *,
+    render: "RenderOptions | None" = None,
     timeout: float = 30.0,
     deadline: float = 300.0,
 ) -> ConcatDataset: ...
@@ -82,6 +85,7 @@ def open(
     cache_bytes: int | None = None,
     *,
     snapshot: str | None = None,
+    render: "RenderOptions | None" = None,
     timeout: float = 30.0,
     deadline: float = 300.0,
 ) -> "Dataset | ConcatDataset":
@@ -98,7 +102,8 @@ def open(
     split : str, optional
         Name of the split. The default is "train", or the only split.
     fields : sequence of str, optional
-        Names or patterns of fields, such as "states/*". The default is the frames, where stored, and all states.
+        Names or patterns of fields, such as "states/*". The default is the frames, where stored, and all states. If
+        "frames" is named but not stored, frames are rendered when they are read.
     window : int, optional
         Number of frames in a window. By default a video is returned whole.
     stride : int
@@ -119,6 +124,11 @@ def open(
         first. By default the size is not limited.
     snapshot : str, optional
         An earlier `Dataset.snapshot`, to open the dataset as it was before it grew last. Only for a single path.
+    render : RenderOptions, optional
+        Arguments of `gen2d.render`, such as `{"height": 128, "width": 128, "look": "shaded"}`, with which frames and
+        pixel annotations are rendered even if they are stored. With `{}`, only those that are not stored are rendered.
+        `Dataset.exact` says whether they are those of the dataset to the bit. Rendering imports jax and compiles a
+        program when the first video is read; it does not work in processes that are forked afterwards.
     timeout : float
         Maximum time, in s, to wait for a server to connect or to send the next part of an answer.
     deadline : float
@@ -133,6 +143,8 @@ def open(
     ------
     ConfigError
         If an argument is invalid, or if the datasets of several paths do not agree.
+    UntrustedError
+        If rendering needs code of the dataset that is not in `render["trust"]`.
     FolderError
         If the folder cannot be read, holds no complete dataset (IncompleteError), or no longer has the snapshot.
     DamagedError
@@ -152,15 +164,33 @@ def open(
         view = split, fields, window, stride, start, layout, dtype, verify, cache_dir, cache_bytes
         if snapshot is not None:
             raise ConfigError("snapshot must be None for a list of datasets")
-        return _concatenate([open(one, *view, timeout=timeout, deadline=deadline) for one in path])
+        return _concatenate([open(one, *view, render=render, timeout=timeout, deadline=deadline) for one in path])
     root = place(path, Network(timeout, deadline))
     manifest = read_manifest(root, snapshot)
     split = _select_split(root, manifest, split)
-    names = select_fields(f"{root}", manifest.fields, fields)
+    if fields is None and render is not None:
+        fields = "frames", "states/*"
+    named = (fields,) if isinstance(fields, str) else tuple(fields or ())
+    renders = render is not None or ("frames" in named and "frames" not in manifest.fields)
+    names = named if renders else select_fields(f"{root}", manifest.fields, fields)
     options = ViewOptions(split, names, window, stride, start, layout, dtype, verify, cache_dir, cache_bytes)
     options = options.within(manifest.frames[split], manifest.sizes.get("T", 0))
     _check_cache(options, max(table.largest for table in manifest.tables.values()))
-    return Dataset(root, manifest, options)
+    if not renders:
+        return Dataset(root, manifest, options)
+    from gen2d.programs.rendered_dataset import RenderedDataset  # imports jax
+
+    return RenderedDataset(root, manifest, options, render)
+
+
+class RenderOptions(TypedDict, total=False):
+    """Options with which frames are rendered; `gen2d.render` describes them."""
+
+    height: int  # px
+    width: int
+    look: str | Mapping[str, object]
+    overrides: Sequence[str]
+    trust: str | Sequence[str]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -240,6 +270,11 @@ class Dataset:
         `dtype="float32"`.
     time : ndarray, float64 [T]
         Times of the frames, s.
+    sizes : dict of str to int
+        Sizes of the axes of the fields, before the window is applied.
+    exact : bool
+        Whether all fields are those of the dataset to the bit. False only for rendered frames: of another size or look,
+        or rendered by other versions or another kind of device, which changes values by a grey level.
     snapshot : str
         sha256 of the manifest, which identifies the current state of a growing dataset.
     manifest : Manifest
@@ -257,10 +292,11 @@ class Dataset:
 
     def __init__(self, root: Place, manifest: Manifest, options: ViewOptions) -> None:
         self.root, self.manifest, self.options = root, manifest, options
-        self.fields = {name: manifest.fields[name] for name in options.fields}
+        self.fields, self.sizes = {name: manifest.fields[name] for name in options.fields}, dict(manifest.sizes)
         self.stats = {name: values for name, values in manifest.stats[options.split].items() if name in self.fields}
         view = options.layout, options.window, options.stride, options.dtype
-        self._columns = [Column(name, manifest, *view) for name in self.fields]
+        self.slice_size = 1  # videos that are best filled together
+        self._columns = self._stored_columns = [Column(name, manifest, *view) for name in self.fields]
         cache = None
         if isinstance(root, Url) and options.cache_dir is not None:
             cache = Cache(Path(options.cache_dir), options.cache_bytes)
@@ -287,6 +323,9 @@ class Dataset:
         manifest = read_manifest(self.root, snapshot)
         if manifest.identity != self.manifest.identity or self.options.split not in manifest.splits:
             raise ConfigError(f"the state is of another dataset than {self.root}")
+        return self._at(manifest)
+
+    def _at(self, manifest: Manifest) -> "Dataset":
         return Dataset(self.root, manifest, self.options)
 
     def __len__(self) -> int:
@@ -302,6 +341,11 @@ class Dataset:
 
     def __repr__(self) -> str:
         return f"<{len(self)} {self.options.split} videos of {self.root}: {', '.join(self.fields)}>"
+
+    @property
+    def exact(self) -> bool:
+        """Whether all fields are those of the dataset to the bit."""
+        return True
 
     @property
     def time(self) -> np.ndarray:
@@ -368,16 +412,12 @@ class Dataset:
             First frame of each video's window, as in `batch`.
         """
         numbers = self.numbers(indices)
-        first = np.full(len(numbers), self.options.first) if starts is None else np.asarray(starts)
-        last = self._frames - self.options.span
-        if first.shape != numbers.shape or ((first < 0) | (first > last)).any():
-            raise ConfigError(f"starts must be a frame from 0 to {last} for each video, but are {first.tolist()}")
-        begins, targets = first.tolist(), np.asarray(rows).tolist()
+        begins, targets = self._begins(numbers, starts).tolist(), np.asarray(rows).tolist()
         with self._lookup_errors(numbers):
             videos = self._files.videos(numbers)
-            chunks = [self._files.chunks_of(column, numbers, videos, begins) for column in self._columns]
+            chunks = [self._files.chunks_of(column, numbers, videos, begins) for column in self._stored_columns]
             read = self._files.reader(chunks)
-        for column, column_chunks in zip(self._columns, chunks, strict=True):
+        for column, column_chunks in zip(self._stored_columns, chunks, strict=True):
             scratch = None if column.is_direct else np.empty((1, *column.stored_shape), column.field.dtype)
             for step, video_chunks in enumerate(column_chunks):
                 target = out[column.name][targets[step] : targets[step] + 1]
@@ -386,6 +426,14 @@ class Dataset:
                     self._read(read, column, chunk, int(numbers[step]), column.chunk_view(buffer, number))
                 if scratch is not None:
                     column.convert(scratch, begin, target)
+
+    def _begins(self, numbers: np.ndarray, starts: Numbers | None) -> np.ndarray:
+        """First frame of the window of each of these videos. Raises ConfigError if `starts` do not fit."""
+        first = np.full(len(numbers), self.options.first) if starts is None else np.asarray(starts)
+        last = self._frames - self.options.span
+        if first.shape != numbers.shape or ((first < 0) | (first > last)).any():
+            raise ConfigError(f"starts must be a frame from 0 to {last} for each video, but are {first.tolist()}")
+        return first
 
     @contextlib.contextmanager
     def _lookup_errors(self, numbers: np.ndarray) -> Iterator[None]:
@@ -452,7 +500,7 @@ def _required_equal(ds: Dataset) -> Iterator[tuple[str, Any]]:
     """Names and values in which concatenated datasets must agree."""
     yield "split", ds.options.split
     yield "fps", ds.manifest.fps
-    yield from ((f"size {axis}", size) for axis, size in ds.manifest.sizes.items())
+    yield from ((f"size {axis}", size) for axis, size in ds.sizes.items())
     for name, field in ds.fields.items():
         yield f"field {name}", f"{field.dtype} {field.axes}, {field.unit or 'no unit'}"
 
@@ -468,25 +516,31 @@ def _select_split(root: Place, manifest: Manifest, split: str | None) -> str:
     return split
 
 
-def select_fields(source: str, fields: Mapping[str, Field], patterns: Sequence[str] | str | None) -> tuple[str, ...]:
+def select_fields(
+    source: str,
+    fields: Mapping[str, Field],
+    patterns: Sequence[str] | str | None,
+    rendered: Collection[str] = (),
+) -> tuple[str, ...]:
     """Names of the per-video fields that match the patterns; frames and states if `patterns` is None.
 
-    Raises ConfigError if a pattern matches no field.
+    Fields that can be rendered must be named in full. Raises ConfigError if a pattern matches no field.
     """
     names = [name for name, field in fields.items() if field.per_video]
     if patterns is None:
         patterns = [*({"frames"} & fields.keys()), "states/*"]
     selected: dict[str, None] = {}
     for pattern in [patterns] if isinstance(patterns, str) else patterns:
-        matches = fnmatch.filter(names, pattern)
+        matches = [pattern] if pattern in rendered else fnmatch.filter(names, pattern)
         if not matches:
-            raise ConfigError(f"{source} has no field {pattern!r}{_suggestion(pattern, names)}")
+            known = dict.fromkeys([*names, *rendered])
+            raise ConfigError(f"{source} has no field {pattern!r}{_suggestion(pattern, known)}")
         selected |= dict.fromkeys(matches)
     return tuple(selected)
 
 
 def _suggestion(name: str, names: Sequence[str] | Mapping[str, Any]) -> str:
-    near = difflib.get_close_matches(name, names, n=1, cutoff=0.4)
+    near = difflib.get_close_matches(name, [*names], n=1, cutoff=0.4)
     return f": did you mean {near[0]!r}?" if near else f": it has {', '.join(names)}"
 
 

@@ -107,6 +107,16 @@ class Mixture:
         return f"<{len(self)} videos, in every {sum(self.shares)} {', '.join(parts)}>"
 
     @property
+    def exact(self) -> bool:
+        """Whether all fields are those of the datasets to the bit, as `Dataset.exact`."""
+        return self._concatenation.exact
+
+    @property
+    def slice_size(self) -> int:
+        """Number of videos that are best filled together."""
+        return self._concatenation.slice_size
+
+    @property
     def snapshot(self) -> Snapshot:
         """Snapshots of the datasets, in their order."""
         return self._concatenation.snapshot

@@ -34,6 +34,12 @@ class VideoReader(Protocol):
     def fields(self) -> dict[str, Field]: ...
 
     @property
+    def slice_size(self) -> int: ...  # number of videos that are best filled together
+
+    @property
+    def exact(self) -> bool: ...
+
+    @property
     def stats(self) -> FieldStats: ...
 
     @property

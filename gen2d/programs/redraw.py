@@ -134,14 +134,15 @@ def render(
     >>> frames = gen2d.render(ds, [0, 1], height=256, width=256, look="shaded")
     >>> masks = gen2d.render(ds, range(8), fields=["masks/instance"])["masks/instance"]
     """
-    base, config, numbers = _configs_and_numbers(ds, indices, height, width, look, overrides, fields, trust)
+    base, config = configs_of(ds, height, width, look, overrides, fields, trust)
+    numbers = ds.numbers(np.atleast_1d(indices))
     if config.image.exposure and states is not None:
         raise ConfigError("states have no motion between frames: image.exposure must be 0 where they are given")
     if config.image.exposure:
-        rendered = _regenerate(ds, config, numbers)
+        rendered = regenerate(ds, config, numbers)
     else:
-        settings = _Settings(base, config)
-        rendered = _compile(_render_frames, settings)(_render_scenes(ds, settings, numbers, states))
+        settings = RenderSettings(base, config)
+        rendered = _compile(render_frames, settings)(_render_scenes(ds, settings, numbers, states))
     if fields is None:
         return rendered["frames"]
     missing = [name for name in fields if name not in rendered]
@@ -200,8 +201,8 @@ def render_soft(
     if not 0 <= sigma <= 1000:
         raise ConfigError(f"sigma is {sigma!r}, but must be a number of pixels from 0 to 1000")
     plain = [*overrides, "image.exposure=0", "image.noise=0"]
-    base, config, numbers = _configs_and_numbers(ds, indices, height, width, look, plain, None, trust)
-    settings = _Settings(base, config)
+    base, config = configs_of(ds, height, width, look, plain, None, trust)
+    numbers, settings = ds.numbers(np.atleast_1d(indices)), RenderSettings(base, config)
     return _compile(_render_soft_frames, settings, float(sigma))(_render_scenes(ds, settings, numbers, states))
 
 
@@ -265,26 +266,25 @@ def simulate_again(
     config = load_config(base, changes)
     if not set(matched.VIOLATIONS).isdisjoint(config.matched.change or ()):
         raise ConfigError(f"{ds.root}: matched.change has violations, which cannot be simulated again from a scene")
-    simulated = _compile(_simulate_columns, _Settings(base, config))
-    columns = simulated(_with_all_fields(ds).batch(numbers), _seed_words(ds), jnp.asarray(numbers, jnp.uint32))
+    simulated = _compile(_simulate_columns, RenderSettings(base, config))
+    columns = simulated(_with_all_fields(ds).batch(numbers), seed_words_of(ds), jnp.asarray(numbers, jnp.uint32))
     return columns | {"time": jnp.arange(config.video.frames) / config.video.fps}
 
 
 # ---- Configs
 
 
-def _configs_and_numbers(
+def configs_of(
     ds: Dataset,
-    indices: Numbers,
-    height: int | None,
-    width: int | None,
-    look: str | Mapping[str, object] | None,
-    overrides: Sequence[str],
-    fields: Sequence[str] | None,
-    trust: Trust,
-) -> tuple[Config, Config, np.ndarray]:
-    """The dataset's config, the config of the requested frames, and the numbers of the videos."""
-    base, numbers = config_of(ds, (), trust), ds.numbers(np.atleast_1d(indices))
+    height: int | None = None,
+    width: int | None = None,
+    look: str | Mapping[str, object] | None = None,
+    overrides: Sequence[str] = (),
+    fields: Sequence[str] | None = None,
+    trust: Trust = (),
+) -> tuple[Config, Config]:
+    """The dataset's config, and the config of the requested frames. Parameters and errors are those of `render`."""
+    base = config_of(ds, (), trust)
     size = [f"video.{name}={value}" for name, value in (("height", height), ("width", width)) if value is not None]
     config = load_config(base, [*overrides, *size, "storage.frames=video"])
     changes: dict[str, Any] = {} if look is None else {"look": named(look)}
@@ -292,7 +292,7 @@ def _configs_and_numbers(
         changes["annotations"] = config.annotations.plain() | annotation_changes
     if changes:
         config = load_config(config.plain() | changes, copies=config.copies)
-    return base, config, numbers
+    return base, config
 
 
 def _annotation_changes(fields: Sequence[str] | None, section: Annotations) -> dict[str, Any]:
@@ -327,12 +327,13 @@ def scene_of(columns: FieldColumns) -> Scene:
     return Scene(from_columns(Objects, columns), jnp.asarray(columns["world/gravity"]), joints)
 
 
-def _seed_words(ds: Dataset) -> np.ndarray:
+def seed_words_of(ds: Dataset) -> np.ndarray:
+    """Words of the keys of a split's videos, uint32 [3]."""
     return keys_module.seed_words(ds.manifest.seed, zlib.crc32(ds.options.split.encode()))
 
 
 @dataclasses.dataclass(frozen=True)
-class _Settings:
+class RenderSettings:
     """Key of a compiled program: the config of the dataset and that of the requested videos."""
 
     base: Config
@@ -346,25 +347,30 @@ class _Settings:
     def plan(self) -> FramePlan:
         return render_module.plan_of(self.config, self.layout)
 
-    def rescale(self, view: CameraView) -> CameraView:
-        """A stored view, scaled to frames of another size so that everything stays in view."""
+    @property
+    def zoom(self) -> float:
+        """Scale of the requested frames, relative to those of the dataset: everything stays in view."""
         old, new = self.base.video, self.config.video
-        return view._replace(scale=view.scale * min(new.height / old.height, new.width / old.width))
+        return min(new.height / old.height, new.width / old.width)
 
 
-def _render_scenes(ds: Dataset, settings: _Settings, numbers: np.ndarray, states: FieldColumns | None) -> RenderScene:
+def _render_scenes(
+    ds: Dataset, settings: RenderSettings, numbers: np.ndarray, states: FieldColumns | None
+) -> RenderScene:
     """Render scenes of these videos; `states` replace the stored ones."""
     columns: FieldColumns = {**_with_all_fields(ds).batch(numbers), **(states or {})}
     shapes = [np.shape(columns[name]) for name in ("states/position", "camera/scale")]
     if len({len(shape) and shape[1] for shape in shapes}) > 1:
         raise ConfigError("states and camera have other numbers of frames: give all that simulate_again returned")
-    return _compile(_build_render_scenes, settings)(columns, _seed_words(ds), jnp.asarray(numbers, jnp.uint32))
+    return _compile(build_render_scenes, settings)(columns, seed_words_of(ds), jnp.asarray(numbers, jnp.uint32))
 
 
-def _build_render_scenes(columns: FieldColumns, words: Array, numbers: Array, settings: _Settings) -> RenderScene:
+def build_render_scenes(columns: FieldColumns, words: Array, numbers: Array, settings: RenderSettings) -> RenderScene:
+    """Render scenes of the videos with these numbers [n], from their stored fields [n, ...]."""
     config, plan = settings.config, settings.plan
     scene, states = scene_of(columns), from_columns(State, columns)
-    view = settings.rescale(CameraView(*(jnp.asarray(columns[f"camera/{name}"]) for name in CameraView._fields)))
+    view = CameraView(*(jnp.asarray(columns[f"camera/{name}"]) for name in CameraView._fields))
+    view = view._replace(scale=view.scale * settings.zoom)
 
     def build(key: Array, scene: Scene, states: State, view: CameraView) -> RenderScene:
         return render_module.render_scene(key, config, plan, scene, states, view)
@@ -372,16 +378,18 @@ def _build_render_scenes(columns: FieldColumns, words: Array, numbers: Array, se
     return jax.vmap(build)(sets_module.keys_of(words, numbers, settings.base.matched), scene, states, view)
 
 
-def _render_frames(render_scenes: RenderScene, settings: _Settings) -> dict[str, Array]:
+def render_frames(render_scenes: RenderScene, settings: RenderSettings) -> dict[str, Array]:
     """Frames and annotations, from a separate program as in a run, so that they round alike."""
     return render_module.render_frames(render_scenes, settings.plan, settings.config.annotations)
 
 
-def _render_soft_frames(render_scenes: RenderScene, settings: _Settings, sigma: float) -> Array:
+def _render_soft_frames(render_scenes: RenderScene, settings: RenderSettings, sigma: float) -> Array:
     return jax.vmap(lambda render_scene: draw_soft(render_scene, settings.plan, sigma))(render_scenes)
 
 
-def _simulate_columns(columns: FieldColumns, words: Array, numbers: Array, settings: _Settings) -> dict[str, Array]:
+def _simulate_columns(
+    columns: FieldColumns, words: Array, numbers: Array, settings: RenderSettings
+) -> dict[str, Array]:
     config, layout = settings.config, settings.layout
     scene = scene_of(columns)
     first = jax.tree.map(lambda a: a[:, 0], from_columns(State, columns))
@@ -396,12 +404,12 @@ def _simulate_columns(columns: FieldColumns, words: Array, numbers: Array, setti
 
 
 @functools.lru_cache(maxsize=16)  # a program takes up to thousands of memory maps, of which a process has some 60,000
-def _compile(program: Callable, settings: _Settings, *more: float) -> Callable:
+def _compile(program: Callable, settings: RenderSettings, *more: float) -> Callable:
     """One of the functions above, compiled for these settings."""
     return jax.jit(lambda *arrays: program(*arrays, settings, *more))
 
 
-def _regenerate(ds: Dataset, config: Config, numbers: np.ndarray) -> dict[str, Array]:
+def regenerate(ds: Dataset, config: Config, numbers: np.ndarray) -> dict[str, Array]:
     """Frames and annotations of videos that are sampled and simulated again, as motion blur needs unsaved states."""
     config = load_config(config, [f"storage.batch_size={ds.manifest.fingerprint['batch_size']}"])
     source = VideoSource(config, jax.devices()[:1])

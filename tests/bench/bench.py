@@ -6,6 +6,7 @@
     python tests/bench/bench.py --only render   # cost of rendering and annotations: bench_render.py
     python tests/bench/bench.py --only families # cost of sampling, for every scene family
     python tests/bench/bench.py --only storage  # cost of writing and reading: bench_storage.py
+    python tests/bench/bench.py --only states   # cost of datasets of states whose frames are rendered when loaded
     python tests/bench/bench.py --only shards   # cost of a folder of 100,000 shards
 
 Machines are noisy, so quantities that are compared are measured in turns, and a ratio is the median over the turns.
@@ -241,7 +242,40 @@ def storage(folder: Path, case: str, turns: int) -> Turns:
     return in_turns(bench_storage.works(bench_storage.CASES[case], folder), turns)
 
 
-MEASUREMENTS = {work.__name__: work for work in (stages, steady, bounds, physics, render, annotated, family, storage)}
+def states(folder: Path, videos: int = 512, turns: int = 7, window: int = 16, overrides: Sequence[str] = ()) -> Turns:
+    """CPU seconds per video to make datasets with frames and of states alone, and to load frames of both; their sizes.
+
+    Videos are loaded in random order by one thread, into preallocated arrays: whole, and windows of some frames.
+    """
+    import gen2d
+
+    works: dict[str, Callable[[], float]] = {}
+    sizes: dict[str, list[float]] = {}
+    order, batch = np.random.default_rng(0).permutation(videos), min(64, videos)
+    for name, frames in (("frames", "video"), ("states", "none")):
+        source, root = source_of((f"storage.frames={frames}", *overrides)), folder / name
+        make(source, videos, root)
+        sizes[f"bytes {name}"] = [sum(path.stat().st_size for path in root.rglob("*") if path.is_file()) / videos]
+
+        def remake(source: Any = source) -> None:
+            with tempfile.TemporaryDirectory(dir=folder) as out:
+                make(source, videos, Path(out))
+
+        works[f"make {name}"] = timed(remake, videos)
+        for view, length in (("videos", None), ("windows", window)):
+            ds = gen2d.open(root, fields=["frames"], window=length)
+            out = ds.empty(batch)
+
+            def load(ds: Any = ds, out: Any = out) -> None:
+                for first in range(0, videos - batch + 1, batch):
+                    ds.batch(order[first : first + batch], out=out)
+
+            works[f"load {view} of {name}"] = timed(load, videos // batch * batch)
+    return in_turns(works, turns) | sizes
+
+
+MEASURED = (stages, steady, bounds, physics, render, annotated, family, storage, states)
+MEASUREMENTS = {work.__name__: work for work in MEASURED}
 
 
 # ---- Processes
@@ -492,6 +526,21 @@ def storage_section(folder: Path, quick: bool) -> Results:
         )
 
 
+def states_section(folder: Path, quick: bool) -> Results:
+    """Datasets of states alone, whose frames are rendered when they are loaded, beside datasets with frames."""
+    turns = measure(states, folder, CORES[:1], turns=3 if quick else 9)
+    middle = medians(turns)
+    for name, seconds in middle.items():
+        if not name.startswith("bytes"):
+            yield Row(name, 1 / seconds)
+    for name in ("frames", "states"):
+        yield Promise(f"a dataset of {name}", middle[f"bytes {name}"] / 1e3, "kB a video")
+    yield Promise("9 size of stored frames, against states", middle["bytes frames"] / middle["bytes states"])
+    for work, target in (("make", None), ("load videos of", 1), ("load windows of", 1)):
+        ratio = _ratio(turns[f"{work} frames"], turns[f"{work} states"])
+        yield Promise(f"  {work} states, against frames", ratio, target=target)
+
+
 def shards_section(folder: Path, quick: bool) -> Results:
     """CPU seconds of a worker's start and end in a folder of many shards."""
     count = 10_000 if quick else 100_000
@@ -517,7 +566,8 @@ def families_section(folder: Path, quick: bool) -> Results:
 SECTIONS = {
     "parts": parts_section, "steady": steady_section, "command": command_section, "memory": memory_section,
     "scaling": scaling_section, "start": start_section, "physics": physics_section,
-    "render": render_section, "families": families_section, "storage": storage_section, "shards": shards_section,
+    "render": render_section, "families": families_section, "storage": storage_section, "states": states_section,
+    "shards": shards_section,
 }  # fmt: skip
 QUICK = ("parts", "steady")
 

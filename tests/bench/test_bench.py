@@ -48,6 +48,13 @@ def test_every_stage_is_timed(tmp_path: Path) -> None:
     assert all(seconds > 0 for (seconds,) in turns.values())
 
 
+@pytest.mark.slow
+def test_states_are_made_and_loaded(tmp_path: Path) -> None:
+    turns = bench.states(tmp_path, videos=8, turns=1, window=2, overrides=TINY)
+    assert all(seconds > 0 for values in turns.values() for seconds in values)
+    assert turns["bytes states"][0] < turns["bytes frames"][0]
+
+
 def test_every_way_to_store_is_timed(tmp_path: Path) -> None:
     case = bench_storage.Case(16, 4, 8, 1, 1, 1, 1)
     code = f"""

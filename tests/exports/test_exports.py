@@ -284,7 +284,7 @@ def test_frames_that_are_not_stored_are_drawn(balls: Path, tmp_path: Path, monke
     if "frames" in ds.manifest.fields:
         return  # the case of one ball
     monkeypatch.setattr(
-        "gen2d.exports.source.RENDERED_BYTES", 4 * 4 * 64 * 96 * 3
+        "gen2d.exports.source.BATCH_BYTES", 5 * 4 * 64 * 96 * 3
     )  # four videos at a time: the last are two
     out, expected = gen2d.export(balls, "npz", tmp_path / "npz").out, np.asarray(gen2d.render(ds, range(6)))
     for number in range(6):

@@ -29,6 +29,8 @@ def train(root: Path) -> float:
         total += tensors["frames"].float().mean().item()
     for arrays in gen2d.stream(config, batch_size=8, n=8, epochs=1, fields=["states/position"]):
         total += float(arrays["states/position"].sum())
+    larger = gen2d.open(root, fields=["frames"], render={"height": 128, "width": 128, "look": "shaded"})
+    print(assert_type(larger, gen2d.Dataset).exact, larger.sizes["H"])
     both = gen2d.open([root, root])
     mixture = gen2d.mix({"one": ds, "other": both}, [3, 1])
     print(len(mixture), mixture[0]["frames"].shape)
@@ -42,7 +44,7 @@ def train(root: Path) -> float:
     space.add_segment((-5.0, 0.0), (5.0, 0.0))
     video = space.simulate(2.0, fps=60.0)
     print(video.position[:, ball], video.energy, video.contacts)
-    exported = gen2d.export(root, "npz", root / "npz")
+    exported = gen2d.export(root, "npz", root / "npz", render={"height": 128})
     problems: list[str] = gen2d.verify(root)
     previews: list[Path] = gen2d.preview(root, out=root)
     try:
