@@ -236,7 +236,7 @@ def draws(sources: Sequence[Distribution], index: Any, key: Array, shape: tuple[
         counts = [len(source.parts) for source in sources]
         ends = table([thresholds(max(counts), *source.numbers) for source in sources])[place]
         component = ((yield Request(uniform, component_key, shape, (0.0, 1.0)))[..., None] >= ends).sum(-1)
-        firsts = table(np.cumsum([0, *counts[:-1]]), jnp.int32)[place]
+        firsts = table([*np.cumsum([0, *counts[:-1]])], jnp.int32)[place]
         return (yield from draws([part for source in sources for part in source.parts], firsts + component, key, shape))
     columns = list(zip(*(source.constants for source in sources), strict=True))
     if kind in ("choice", "grid"):

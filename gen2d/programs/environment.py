@@ -29,13 +29,21 @@ HARMLESS = (
 _HARMLESS_OPTIONS = ("cache", "log", "num_cpu_devices", "platform", "traceback", "profiler", "dump", "distributed")
 
 
+def compiler_options(device: Device) -> dict[str, Any]:
+    """XLA's options for all programs on a device.
+
+    On CPUs, LLVM's level 1 compiles in four fifths of the time of level 3, and the programs are no slower (measured).
+    """
+    return {"xla_backend_optimization_level": 1} if device.platform == "cpu" else {}
+
+
 def of_compiler(device: Device) -> dict[str, Any]:
     """What the executable of a given program depends on."""
     return {
         "versions": [version("jax"), version("jaxlib")],
         "device": [device.platform, device.device_kind, device.client.platform_version],
         "processor": [instruction_set(), processor()] if device.platform == "cpu" else [],
-        "flags": flags(),
+        "flags": [flags(), compiler_options(device)],
         "options": _options(),
     }
 

@@ -23,7 +23,7 @@ from typing import Any
 
 import jax
 import numpy as np
-from jax._src.lib import xla_client
+from jax._src.lib import xla_client  # pyright: ignore[reportPrivateImportUsage]
 from jax.experimental import serialize_executable
 from jax.experimental.compilation_cache import compilation_cache
 
@@ -47,10 +47,10 @@ class Trace:
     results: Any  # tree of jax.ShapeDtypeStruct
 
 
-def compiled(lowered: Any) -> bytes:
-    """Bytes of the executable of a program that jax lowered."""
+def compiled(lowered: Any, device: Device) -> bytes:
+    """Bytes of the executable of a program that jax lowered for a device."""
     with _without_jax_cache():  # an executable that jax loads from its cache cannot be serialized again
-        return serialize_executable.serialize(lowered.compile())[0]
+        return serialize_executable.serialize(lowered.compile(environment.compiler_options(device)))[0]
 
 
 def loaded(executable: bytes, device: Device) -> Callable[..., list[jax.Array]]:

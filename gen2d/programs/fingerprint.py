@@ -16,7 +16,7 @@ from gen2d.captions import caption
 from gen2d.core import permutation
 from gen2d.loading import epochs
 from gen2d.programs.devices import instruction_set
-from gen2d.programs.environment import flags
+from gen2d.programs.environment import compiler_options, flags
 from gen2d.programs.rollout import Rollout
 from gen2d.sampling.sampler import Sampler
 
@@ -30,7 +30,9 @@ def machine(rollout: Rollout) -> dict[str, Any]:
     """Part of the fingerprint that is known before anything is traced."""
     device = rollout.devices[0]
     kind = device.device_kind if device.platform != "cpu" else f"cpu {instruction_set()}"
-    return {"jaxlib": version("jaxlib"), "device": kind, "batch_size": rollout.batch_size, "xla_flags": flags()}
+    options = " ".join(f"{name}={value}" for name, value in compiler_options(device).items())
+    own = {"batch_size": rollout.batch_size, "xla_flags": flags(), "xla_options": options}
+    return {"jaxlib": version("jaxlib"), "device": kind, **own}
 
 
 def _program_hashes(rollout: Rollout) -> dict[str, str]:

@@ -27,6 +27,7 @@ from gen2d.loading.protocols import Numbers
 from gen2d.physics.params import solver_params
 from gen2d.physics.simulate import simulate, substeps
 from gen2d.programs import render as render_module
+from gen2d.programs.environment import compiler_options
 from gen2d.programs.recipe import Trust, config_of
 from gen2d.programs.simulation import save_at
 from gen2d.programs.source import VideoSource
@@ -406,7 +407,8 @@ def _simulate_columns(
 @functools.lru_cache(maxsize=16)  # a program takes up to thousands of memory maps, of which a process has some 60,000
 def _compile(program: Callable, settings: RenderSettings, *more: float) -> Callable:
     """One of the functions above, compiled for these settings."""
-    return jax.jit(lambda *arrays: program(*arrays, settings, *more))
+    options = compiler_options(jax.devices()[0])  # as in a run, so that they round alike
+    return jax.jit(lambda *arrays: program(*arrays, settings, *more), compiler_options=options)
 
 
 def regenerate(ds: Dataset, config: Config, numbers: np.ndarray) -> dict[str, Array]:

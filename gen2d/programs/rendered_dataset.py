@@ -26,7 +26,8 @@ from gen2d.loading.column import Column
 from gen2d.loading.dataset import Dataset, RenderOptions, ViewOptions, select_fields
 from gen2d.loading.protocols import Batch, Numbers
 from gen2d.programs import devices
-from gen2d.programs.fingerprint import fingerprint, machine, sources
+from gen2d.programs.environment import compiler_options, sources
+from gen2d.programs.fingerprint import fingerprint, machine
 from gen2d.programs.recipe import Trust, config_from
 from gen2d.programs.redraw import (
     RenderSettings,
@@ -221,7 +222,8 @@ def _compile(settings: RenderSettings, shapes: Shapes) -> tuple[tuple[str, ...],
     building = jax.jit(build).lower({name: columns[name] for name in fields}, words, numbers)
     scenes = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), building.out_info)
     drawing = jax.jit(functools.partial(render_frames, settings=settings)).lower(scenes)
-    return fields, building.compile(), drawing.compile()
+    options = compiler_options(jax.devices()[0])
+    return fields, building.compile(options), drawing.compile(options)
 
 
 def _configs(ds: Dataset, names: Collection[str], render: RenderOptions | None) -> tuple[Config, Config]:

@@ -48,7 +48,7 @@ class Program:
         with self._lock:
             if device not in self._loaded:
                 if self.executable is None:
-                    self.executable = executables.compiled(self._lowered)
+                    self.executable = executables.compiled(self._lowered, device)
                     executables.store_executable(self.trace.digest, device, self.executable)
                     self._lowered = None
                 self._loaded[device] = executables.loaded(self.executable, device)

@@ -209,6 +209,17 @@ def test_a_shared_program_gives_the_bits_of_an_own_one(tmp_path: Path) -> None:
     assert not np.array_equal(both[0]["frames"], both[2]["frames"])
 
 
+@pytest.mark.parametrize("name", ["bouncing", "phyworld_collision"])
+def test_the_fingerprint_does_not_depend_on_what_was_traced_first(name: str) -> None:
+    """A program that was traced for other numbers has the text of one that is traced for these."""
+    config = load_config(f"{name}.yaml", ["storage.batch_size=4"])
+    trace(config)
+    changed = load_config(config, [f"{where}={value}" for where, value in edits({"scene": config.plain()["scene"]})])
+    shared_hashes = [bound.sha256 for bound in trace(changed)]
+    shared.clear()
+    assert [bound.sha256 for bound in trace(changed)] == shared_hashes
+
+
 def test_an_annotation_needs_another_program_for_drawing_alone() -> None:
     plain = trace(load_config("bouncing.yaml", SMALL))
     masks = trace(load_config("bouncing.yaml", [*SMALL, "annotations.masks=true"]))
