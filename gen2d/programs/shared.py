@@ -167,7 +167,8 @@ def _traced(config: Config, build: Build, args: tuple, device: Device) -> Progra
     shapes = [jax.ShapeDtypeStruct(np.shape(x), x.dtype, sharding=one) for x in (numbers, *jax.tree.leaves(args))]
     lowered = jax.jit(run).lower(*shapes)
     results = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), results)
-    trace = Trace(tape, sha256(canonical(lowered.as_text()).encode()), results)
+    inputs = [f"{x.dtype}{x.shape}" for x in shapes]  # jax leaves those out of the text that are not used
+    trace = Trace(tape, sha256(as_json([canonical(lowered.as_text()), inputs])), results)
     return _loadable(trace, device) or Program(trace, lowered)
 
 
