@@ -1,4 +1,4 @@
-"""Every test shares one cache of compiled programs, also the processes that tests start."""
+"""Every test shares one cache of compiled programs, which outlives the run, also with the processes that tests start."""
 
 import gc
 import os
@@ -8,15 +8,22 @@ import tempfile
 
 import pytest
 
-_CACHE = tempfile.TemporaryDirectory(prefix="gen2d-test-cache-")
-os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", _CACHE.name)
+_CACHE = pathlib.Path(os.environ.get("XDG_CACHE_HOME") or pathlib.Path.home() / ".cache") / "gen2d-tests"
+_CACHE_BYTES = 2**32
+_CONFIG = tempfile.TemporaryDirectory(prefix="gen2d-test-config-")
+os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(_CACHE))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.2")
-os.environ["XDG_CONFIG_HOME"] = str(pathlib.Path(_CACHE.name) / "config")  # the user's list of trusted code is not ours
+os.environ["XDG_CONFIG_HOME"] = _CONFIG.name  # the user's list of trusted code is not ours
 
 
 def pytest_configure() -> None:
-    """Each of several test processes has a core of its own: it then has one device, and compiles for one only."""
+    """Empty a cache that has grown too large; give each of several test processes a core, and so a device, of its own."""
     worker = os.environ.get("PYTEST_XDIST_WORKER")
+    if not worker:
+        files = [(path.stat(), path) for path in _CACHE.rglob("*") if path.is_file()]
+        if sum(state.st_size for state, _ in files) > _CACHE_BYTES:
+            for _, path in files:
+                path.unlink(missing_ok=True)
     if worker and hasattr(os, "sched_setaffinity"):
         cores = sorted(os.sched_getaffinity(0))
         os.sched_setaffinity(0, {cores[int(worker.removeprefix("gw")) % len(cores)]})

@@ -80,6 +80,7 @@ def test_fields_are_as_described(made):
         assert array.dtype == field.dtype or name == "contacts/time", name
 
 
+@pytest.mark.full
 def test_the_form_for_gpus_tells_the_same(made, monkeypatch):
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     told = jax.jit(lambda stages: render.render_frames(stages, made.rollout.plan, made.options))(made.stages)

@@ -74,6 +74,7 @@ print(json.dumps({{name: work() for name, work in works({case}, Path({str(tmp_pa
     assert bench_storage.table([bench_storage.stored_of(case, seconds)])
 
 
+@pytest.mark.full
 def test_bounds_counts_whole_videos_only(tmp_path: Path) -> None:
     bench.make(bench.source_of(TINY), 8, tmp_path)
     checks = bench.bounds(tmp_path)
@@ -138,6 +139,7 @@ def test_the_chart_of_the_physics_section_draws_what_was_measured(tmp_path: Path
 SMALL = bench_render.Case(32, 2, 4)
 
 
+@pytest.mark.full
 def test_opencv_draws_the_pictures_of_gen2d() -> None:
     rollout = bench.source_of(SMALL.overrides).rollout
     batch = first_batch(rollout)
@@ -163,6 +165,7 @@ def test_every_way_of_drawing_is_timed(monkeypatch: pytest.MonkeyPatch, tmp_path
     assert "32 px, 2 discs" in bench.text_of({}, [drawing])
 
 
+@pytest.mark.full
 def test_what_annotations_add_is_timed_and_weighed(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(bench_render, "ANNOTATED", SMALL)
     monkeypatch.setattr(bench_render, "ANNOTATIONS", {"frames": (), "flow": ("flow=true",)})

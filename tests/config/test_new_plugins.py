@@ -206,7 +206,7 @@ def copy_with(kind: str, copy: Path) -> Path:
     return copy
 
 
-@pytest.mark.parametrize("kind", SOURCES)
+@pytest.mark.parametrize("kind", ["scene", *(pytest.param(kind, marks=pytest.mark.full) for kind in [*SOURCES][1:])])
 def test_one_file_in_its_folder_adds_a_plug_in(kind: str, plain: Path, tmp_path: Path) -> None:
     copy = copy_with(kind, tmp_path / "copy")
     here = {"cwd": copy, "PYTHONPATH": str(copy)}

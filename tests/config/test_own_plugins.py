@@ -238,6 +238,7 @@ def test_another_dataset_takes_the_place_of_the_copies_too(tmp_path: Path) -> No
     assert verify(tmp_path) == [f"{tmp_path / COPIES[1]} does not belong to the dataset"]
 
 
+@pytest.mark.full
 def test_a_look_of_a_split_s_own_goes_with_the_dataset_too(home: Path, tmp_path: Path) -> None:
     look = tmp_path / "mine.py"
     look.write_bytes((home / "looks" / "mine.py").read_bytes() + b"# another\n")

@@ -134,6 +134,7 @@ def test_videos_of_a_kind_are_those_that_are_and_others_in_place_of_the_rest():
     assert (every["states/position"][tried > 0] != some["states/position"][tried > 0]).any((1, 2, 3)).all()
 
 
+@pytest.mark.full
 def test_how_little_may_be_seen_of_an_object_can_be_asked_for(tmp_path):
     seen = {"annotations": {"visibility": True}, "scene": {"name": "bouncing", "balls": 4, "radius": [0.8, 1.0]}}
     every, some = ({"quality": asked} | seen for asked in ({}, {"min_visibility": 0.7}))

@@ -143,7 +143,9 @@ def pristine(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return synthetic.folder(synthetic.make(synthetic.dataset(tmp_path_factory.mktemp("pristine") / "data", train=10)))
 
 
-@pytest.mark.parametrize("count", [200, pytest.param(10_000, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "count", [60, pytest.param(200, marks=pytest.mark.full), pytest.param(10_000, marks=pytest.mark.slow)]
+)
 def test_a_crafted_dataset_does_no_harm(
     pristine: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, count: int
 ) -> None:

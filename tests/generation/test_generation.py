@@ -111,6 +111,7 @@ def test_a_video_does_not_depend_on_the_number_of_devices(tiny: Path, tmp_path: 
         same(everything(tiny), everything(out))
 
 
+@pytest.mark.full
 def test_few_compiled_programs_are_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """A process may have 65,530 memory maps, of which a program takes up to thousands."""
 

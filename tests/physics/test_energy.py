@@ -1,5 +1,6 @@
 """What a simulation says about itself: the books of energy and momentum, and the rows of contacts."""
 
+import pytest
 import jax
 import numpy as np
 from laws import DOWN, GRAVITY, holds, to_double
@@ -53,6 +54,7 @@ def test_books_and_rows_agree_with_the_states():
         holds("rows: impulses against change of momentum, N s", np.quantile(np.abs(given[:, :8] - change), 0.999), 2e-3)
 
 
+@pytest.mark.full
 def test_falling_disc_tells_its_bounces():
     """Where, when, how fast and how hard are closed forms; in double precision the books close to rounding."""
     with jax.enable_x64(True):

@@ -205,6 +205,7 @@ def gradients(worlds: list[tuple]) -> dict[str, np.ndarray]:
     return jax.tree.map(np.asarray, program(layout)(numbers, scene, state))
 
 
+@pytest.mark.full
 def test_gradients_are_never_nan():
     """16 random scenes, 120 steps."""
     found = gradients([random_world(seed) for seed in range(16)])

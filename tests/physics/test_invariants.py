@@ -144,6 +144,7 @@ def test_i3_simultaneous_impacts_gain_no_energy():
     holds("I3 energy gained in a step, simultaneous impacts, relative", np.diff(energy).max(-1), 1e-4)
 
 
+@pytest.mark.full
 def test_i3_elastic_gas_keeps_its_energy():
     worlds = [gas(seed, 1.0, 0.0, (0, -g)) for seed in range(4) for g in (0.0, GRAVITY)]
     energy = energies(worlds, run(worlds, 101, 24))
@@ -157,6 +158,7 @@ def test_i3_elastic_gas_keeps_its_energy_for_a_minute():
     holds("I3 elastic gas of 16, 60 s, relative", energy / energy[:, :1] - 1, 1e-3)
 
 
+@pytest.mark.full
 def test_elastic_gas_in_double_precision_conserves_to_the_ninth_digit():
     with jax.enable_x64(True):
         free = to_double([cluster(seed, 1.0, mu) for seed in range(8) for mu in (0.0, 0.5)])
@@ -214,6 +216,7 @@ def test_i4_resting_disc_is_held_by_m_g_h_in_every_step():
     holds("I4 impulse on a resting disc, relative to m g h", impulse[..., 1:] / (GRAVITY * STEP) - 1, 1e-3)
 
 
+@pytest.mark.full
 def test_i5_resting_disc_does_not_move_in_ten_thousand_steps():
     disc = {"x": (0, 0.5), "friction": 0.5}
     made = watch([Case([{**disc, "elasticity": e}], [FLOOR], DOWN) for e in (0, 0.5, 1)], 101, 100)
@@ -287,6 +290,7 @@ def few_events(shift: Any = (0, 0), boost: Any = (0, 0), order: Any = (0, 1, 2),
     return Case([discs[k] for k in order], around, (0, -2) if walls else (0, 0))
 
 
+@pytest.mark.full
 def test_a_quarter_turn_turns_the_motion():
     worlds = [pose_world(few_events(), turn, 8, 4) for turn in QUARTERS] * 2
     made = run(worlds, 241, 1)
@@ -297,6 +301,7 @@ def test_a_quarter_turn_turns_the_motion():
     assert made.quality.contacts[0] >= 3
 
 
+@pytest.mark.full
 def test_twice_the_unit_of_length_gives_the_same_bits():
     """All lengths, speeds and accelerations twice as large, a power of two: hidden constants would show."""
     worlds = [gas(seed, 0.8, 0.3, DOWN) for seed in range(8)]
@@ -407,6 +412,7 @@ def slope(errors: np.ndarray) -> float:
     return -np.polyfit(np.log(PER_SIXTIETH), np.log(np.abs(errors)), 1)[0]
 
 
+@pytest.mark.full
 def test_order_of_convergence_in_double_precision():
     """Free fall and a bounce are exact or of first order, a sliding stop (locked) is of first order."""
     u, mu, height = 5.0, 0.3, 1.0

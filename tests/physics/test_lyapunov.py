@@ -50,6 +50,7 @@ def change() -> scene_module.State:
     return jax.tree.map(lambda x: np.asarray(x, float) / SMALL, perturbation(keys, scene, state))
 
 
+@pytest.mark.full
 def test_a_change_has_the_size_one_and_is_of_what_moves() -> None:
     whole = change()
     assert_allclose((whole.position**2 + whole.velocity**2).sum((0, 1)), 1, rtol=1e-5)

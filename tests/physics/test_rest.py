@@ -178,6 +178,7 @@ def test_c18_disc_dropped_on_a_joint_moves_as_on_one_segment(elasticity, pieces)
     holds(f"{case}: against one segment, 1 s, m", x[PIECES.index(pieces)] - x[0], 1e-4)
 
 
+@pytest.mark.full
 def test_c19_disc_rolls_over_joints_without_feeling_them():
     u = 3.0
     disc = {"x": (-4.5, RADIUS), "v": (u, 0), "spin": -u / RADIUS, "elasticity": 0, "friction": 0.5}

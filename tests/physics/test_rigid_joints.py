@@ -43,6 +43,7 @@ def ends(video: Video, number: int, half: float) -> np.ndarray:
     return np.stack([video.position[:, number] - way, video.position[:, number] + way])
 
 
+@pytest.mark.full
 def test_light_links_hold_a_weight_that_is_a_hundred_times_as_heavy():
     space = Space()
     links = [space.add_capsule((i, 0), (i + 1, 0), 0.05, mass=0.01) for i in range(6)]
@@ -58,6 +59,7 @@ def test_light_links_hold_a_weight_that_is_a_hundred_times_as_heavy():
     assert video.position[:, weight, 1].min() < -5
 
 
+@pytest.mark.full
 def test_a_mechanism_that_is_held_twice_over_stays_whole_and_keeps_its_momentum():
     """A square of bars with more rods between its corners than it takes, and two bars in one, free in space."""
     space = Space(gravity=(0, 0))

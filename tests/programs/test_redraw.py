@@ -33,7 +33,10 @@ def plain(tmp_path_factory):
     return dataset(tmp_path_factory.mktemp("plain") / "ds", [])
 
 
-@pytest.mark.parametrize("case", [*CASES, pytest.param("blurred", marks=pytest.mark.slow)])
+TIERS = {"moving": pytest.mark.full, "blurred": pytest.mark.slow}
+
+
+@pytest.mark.parametrize("case", [pytest.param(case, marks=TIERS.get(case, ())) for case in (*CASES, "blurred")])
 def test_drawn_again_the_frames_are_those_stored(case, tmp_path, plain):
     ds = plain if case == "plain" else dataset(tmp_path / "ds", {**CASES, "blurred": BLURRED}[case])
     assert_array_equal(gen2d.render(ds, range(6)), ds[:]["frames"])
@@ -60,6 +63,7 @@ def test_soft_frames_are_the_frames_but_for_rounding(plain):
     assert np.abs(soft - plain[[3, 1]]["frames"]).max() < 2.5  # every layer is rounded there
 
 
+@pytest.mark.full
 def test_slopes_of_soft_frames_are_those_of_differences_and_reach_from_afar(plain):
     position = jnp.asarray(gen2d.open(plain.root, fields="states/position")[[0]]["states/position"])
 

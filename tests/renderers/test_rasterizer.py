@@ -241,7 +241,8 @@ CASES = {
         {"videos": 4, "features": (*ALL, "noise"), "occluders": 3},
     ),
 }
-SLOW = [pytest.param(case, marks=pytest.mark.slow) if case == "everything" else case for case in CASES]
+TIERS = {"everything": pytest.mark.slow, "painted": pytest.mark.full}
+TIERED = [pytest.param(case, marks=TIERS.get(case, ())) for case in CASES]
 
 
 @functools.cache
@@ -252,7 +253,7 @@ def drawn(case):
     return some, *(tuple(None if a is None else np.asarray(a) for a in form(some, plan)) for form in (PATCHES, DENSE))
 
 
-@pytest.mark.parametrize("case", SLOW)
+@pytest.mark.parametrize("case", TIERED)
 def test_patches_and_dense_are_one_image(case):
     some, (frames, owners), (dense_frames, dense_owners) = drawn(case)
     apart = np.abs(frames.astype(int) - dense_frames)
@@ -421,6 +422,7 @@ def centroids(frames):
     return np.stack([columns, rows], -1) / total[..., None]
 
 
+@pytest.mark.full
 def test_a_moving_ball_is_blurred_along_its_path():
     blurred, plan, _, _ = straight_motion({**BALL, "image": {"exposure": 1, "exposure_samples": 8}}, 16)
     frames = np.asarray(PATCHES(blurred, plan)[0])

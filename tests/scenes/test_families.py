@@ -139,7 +139,12 @@ def ends(shape: Shape) -> tuple[jax.Array, jax.Array]:
     return shape.centre - half - shape.radius, shape.centre + half + shape.radius
 
 
-@pytest.mark.parametrize("family", FAMILIES)
+LONG = ("seesaw", "pile", "tower", "dominoes", "wrecking_ball", "galton", "funnel", "marble_run")
+
+
+@pytest.mark.parametrize(
+    "family", [pytest.param(name, marks=pytest.mark.full) if name in LONG else name for name in FAMILIES]
+)
 def test_slots_hold_what_the_layout_tells(family):
     (_, layout, _), objects = program(family), made(family).scene.objects
     assert layout.slots <= 254
@@ -241,6 +246,7 @@ def test_a_hundred_thousand_videos_are_numbers_begin_apart_and_stay_within_walls
     check_factors(scene, jax.tree.map(lambda *x: np.concatenate(x), *factors), doubt=1e-3 / 300)
 
 
+@pytest.mark.full
 def test_the_page_of_all_families_has_a_row_of_each(tmp_path, monkeypatch):
     names, few = plugins.names, {"scene": ["bouncing"], "look": ["flat"]}
     monkeypatch.setattr(plugins, "names", lambda kind: few.get(kind) or names(kind))

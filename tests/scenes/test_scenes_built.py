@@ -100,6 +100,7 @@ def test_a_tower_does_what_statics_says():
 # Dominoes -----------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.full
 def test_dominoes_fall_in_order_in_a_steady_wave_unless_their_gap_is_too_wide():
     made = film("dominoes", 8, 3.0, 40, "scene.dominoes=10", "scene.height=1.5", "scene.gap={choice: [0.6, 1.7]}")
     fallen = made.states.angle[:, :, slots(made, 2)] < -0.3
@@ -125,6 +126,7 @@ def when(angle: np.ndarray, time: np.ndarray) -> np.ndarray:
 # Seesaws ------------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.full
 def test_a_seesaw_tips_to_the_side_of_the_larger_torque():
     made = film("seesaw", 32, 1.5, 20, "scene.drop_height=0", "scene.plank_density=0.2", energy=True)
     torque, angle = made.factors["torque"], made.states.angle[:, -1, slots(made, 2)][:, 0]
@@ -202,6 +204,7 @@ def parameter(share: float) -> float:
 # Wrecking balls -----------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.full
 def test_a_wrecking_ball_hits_a_tower_that_stands():
     made = film("wrecking_ball", 8, 2.0, 30, energy=True)
     ball = made.states.position[:, :, slots(made, 3)][:, :, 0, 0] + made.factors["radius"][:, None]
