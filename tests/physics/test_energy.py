@@ -1,8 +1,8 @@
 """What a simulation says about itself: the books of energy and momentum, and the rows of contacts."""
 
-import pytest
 import jax
 import numpy as np
+import pytest
 from laws import DOWN, GRAVITY, holds, to_double
 from test_invariants import gas
 from worlds import STEP, energies, momenta, run, world
