@@ -1,4 +1,4 @@
-"""Every test shares one cache of compiled programs, which outlives the run, also with the processes that tests start."""
+"""Tests, and the processes that they start, share one cache of compiled programs, which outlives the run."""
 
 import gc
 import os
@@ -17,7 +17,7 @@ os.environ["XDG_CONFIG_HOME"] = _CONFIG.name  # the user's list of trusted code 
 
 
 def pytest_configure() -> None:
-    """Empty a cache that has grown too large; give each of several test processes a core, and so a device, of its own."""
+    """Empty a cache that has grown too large, and give each of several test processes a core of its own."""
     worker = os.environ.get("PYTEST_XDIST_WORKER")
     if not worker:
         files = [(path.stat(), path) for path in _CACHE.rglob("*") if path.is_file()]

@@ -174,9 +174,7 @@ class Parameter:
         return self._concrete(len)
 
     def __hash__(self) -> int:
-        return id(
-            self.tape
-        )  # not of the value: sets and dicts must compare equal ones and others, which leaves a guard
+        return id(self.tape)  # not of the value: sets and dicts must compare, which leaves a guard
 
     def __repr__(self) -> str:
         return f"Parameter({self.value!r})"
