@@ -74,7 +74,7 @@ class Config:
         """Contents of the user's plug-in files, by their names in the config."""
         looks = [split.sections["look"] for split in self.splits if "look" in split.sections]
         used = self.scene, self.look, *looks, *self.annotations.pixels
-        return {plugin.name: plugin.content for plugin in used if plugin.sha256}
+        return {plugin.name: plugin.content for plugin in used if plugin and plugin.sha256}
 
     def recipe(self) -> dict[str, Any]:
         """The plain config without the splits' video counts and the seed, which a dataset compares separately."""

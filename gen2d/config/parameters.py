@@ -4,11 +4,12 @@ import dataclasses
 from collections.abc import Callable, Mapping
 from typing import Any
 
+from gen2d.config.annotations import Annotations
 from gen2d.config.config import Config
 from gen2d.config.distributions import Distribution
 from gen2d.config.joint_distribution import Component, JointDistribution
 from gen2d.config.plugin_options import Plugin
-from gen2d.config.sections import StorageOptions
+from gen2d.config.sections import SimulationAnnotations, StorageOptions
 from gen2d.config.splits import Split
 from gen2d.records.parameter import Tape
 
@@ -33,6 +34,20 @@ def parametrized(config: Config, tape: Tape) -> Config:
     """
     count = iter(range(2**31))
     return _replaced(config, lambda number: tape.leaf(next(count), number))
+
+
+def only_sections(config: Config, *sections: str, simulated: bool = False, pixels: bool = False) -> Config:
+    """The config of a program that depends on these sections alone; the others are None, empty or their defaults.
+
+    `simulated` and `pixels` say whether it depends on annotations of the simulation or of pixels.
+    """
+    kept = {"name", "seed", "annotations", *sections}
+    changes: dict[str, Any] = {f.name: None for f in dataclasses.fields(config) if f.name not in kept}
+    changes |= {"splits": ()} if "splits" in changes else {}
+    changes |= {"storage": StorageOptions()} if "storage" in changes else {}
+    own = config.annotations
+    annotations = Annotations(own.simulated if simulated else SimulationAnnotations(), own.pixels if pixels else ())
+    return dataclasses.replace(config, annotations=annotations, **changes)
 
 
 def _replaced(config: Config, convert: Number) -> Config:

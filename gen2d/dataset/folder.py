@@ -49,8 +49,15 @@ from gen2d.storage.paths import Place, Url
 from gen2d.storage.sealed import JSON_BYTES, as_json, read_sealed, seal
 
 # What each program of a fingerprint does.
-PROGRAMS = {"simulate": "samples and simulates", "draw": "draws", "captions": "writes captions"}
-PROGRAMS |= {"grids": "orders the combinations on grids"}
+PROGRAMS = {
+    "sample": "samples scenes",
+    "simulate": "simulates",
+    "members": "samples and simulates matched sets",
+    "stage": "prepares rendering",
+    "draw": "draws",
+    "captions": "writes captions",
+    "grids": "orders the combinations on grids",
+}
 
 FOLDERS = ("", "shards", "index", f"{MARK}", f"{RECORDS}")  # those that may hold temporary files
 LOCK_SECONDS = 300.0  # how long to wait for another process that changes the folder

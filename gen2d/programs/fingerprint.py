@@ -53,7 +53,8 @@ def _program_hashes(rollout: Rollout) -> dict[str, str]:
 
 
 def _hashes(rollout: Rollout) -> dict[str, str]:
-    hashes = {name: program.sha256 for name, program in rollout.programs().items()}
+    programs = rollout.programs | {"draw": rollout.draw_program(rollout.slice)}
+    hashes = {name: program.sha256 for name, program in programs.items()}
     if rollout.config.annotations.simulated.captions:
         hashes["captions"] = code_hash(caption)
     if rollout.sampler.gridded:

@@ -1,16 +1,15 @@
 """Compiled programs of a config: video numbers in, ground truth and frames out, in batches of a fixed size.
 
-There are two programs. `simulate` samples and simulates `batch_size` videos. `draw` renders slices of them, small
-enough that the frames stay in the cache until they are compressed. Every device runs the same executables on its own
-batches. `batch_size` comes from the config, not from the machine: more devices run more batches, not larger ones. Video
-i is always in row i % batch_size of the same program, so its bits do not depend on how many videos are generated, or
-where.
+Four programs follow each other: `sample`, `simulate` and `stage` (programs/simulation.py) for a batch, and `draw` for
+slices of it, small enough that the frames stay in the cache until they are compressed. Every device runs the same
+executables on its own batches. `batch_size` comes from the config, not from the machine: more devices run more batches,
+not larger ones. Video i is always in row i % batch_size of the same program, so its bits do not depend on how many
+videos are generated, or where.
 """
 
-import dataclasses
 import functools
 import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any, NamedTuple
 
@@ -19,17 +18,28 @@ import numpy as np
 
 from gen2d.config import quality
 from gen2d.config.config import Config
-from gen2d.config.sections import MatchedOptions, PhysicsOptions, QualityOptions
+from gen2d.config.parameters import only_sections
 from gen2d.core import enums
 from gen2d.programs import render
 from gen2d.programs.devices import Device
 from gen2d.programs.schema import VideoSchema
 from gen2d.programs.shared import BoundProgram, program_for
-from gen2d.programs.simulation import BatchSimulation, DeviceBatch
+from gen2d.programs.simulation import (
+    DeviceBatch,
+    Members,
+    Sampling,
+    Simulation,
+    Staging,
+    device_batch,
+    save_at,
+    steps_of,
+)
 from gen2d.records import keys as keys_module
 from gen2d.records.axes import Array
+from gen2d.records.layout import Layout
 from gen2d.renderers.plan import RenderScene
 from gen2d.sampling import rejection
+from gen2d.sampling.sampler import Sampler
 
 SLICE_BYTES = 16 * 2**20  # of raw frames rendered at once; larger buffers cost page faults
 SHARD_BYTES = 2**30  # of raw frames in a shard
@@ -69,10 +79,11 @@ class Rollout:
     def __init__(self, config: Config, devices: Sequence[Device]) -> None:
         self.config, self.devices = config, list(devices)
         video, self.sparse = config.video, self.devices[0].platform == "cpu"
-        self.simulation = BatchSimulation(config, self.sparse)
-        self.layout, self.plan, self.sampler = self.simulation.layout, self.simulation.plan, self.simulation.sampler
-        self.steps, self.quality_ranges = self.simulation.steps, self.simulation.quality_ranges
-        self.schema = VideoSchema(config, self.layout, self.plan, self.simulation.save_at, self.sampler)
+        self.layout = config.scene.contract.layout(config.scene.options)
+        self.plan, self.sampler = render.plan_of(config, self.layout), Sampler(config)
+        self.steps, self.quality_ranges = steps_of(config), quality.ranges(config.quality)
+        self.save_at = save_at(config, self.layout)
+        self.schema = VideoSchema(config, self.layout, self.plan, self.save_at, self.sampler)
         frame_bytes = video.frames * video.height * video.width * 3
         default_shard = min(SHARD_VIDEOS, _power_of_two(SHARD_BYTES // frame_bytes))
         self.videos_per_shard = config.storage.videos_per_shard or default_shard
@@ -105,7 +116,19 @@ class Rollout:
         root, row = keys_module.seed_words(self.config.seed, zlib.crc32(split.encode())), self.config.split_index(split)
         grid = self.sampler.grid_values(row, root, numbers)
         attempts = np.zeros_like(numbers) if attempts is None else attempts.astype(np.uint32)
-        return lane.start(self.simulate_program, root, np.int32(row), grid, numbers, attempts)
+        args = root, np.int32(row), grid, numbers, attempts
+        return lane.start(self._simulate_on, *args)
+
+    def _simulate_on(self, device: Device, *args: Any) -> DeviceBatch:
+        """A batch, from programs that are started one after the other."""
+        if self.config.matched.change:
+            sampled, simulated = self.programs["members"](device, *args)
+        else:
+            sampled = self.programs["sample"](device, *args)
+            simulated = self.programs["simulate"](device, sampled.keys, sampled.scene, sampled.state)
+        states, between = simulated.trajectory.states, simulated.trajectory.between
+        staged = self.programs["stage"](device, sampled.keys, sampled.scene, states, between)
+        return device_batch(self.config, sampled, simulated, staged)
 
     def _accept_on(self, lane: Lane, split: str, numbers: np.ndarray) -> DeviceBatch:
         """Batch of videos that lie in the ranges that the config requires."""
@@ -139,41 +162,49 @@ class Rollout:
 
     # ---- Programs
 
-    def programs(self) -> dict[str, BoundProgram]:
-        """Programs of the config, by name."""
-        return {"simulate": self.simulate_program, "draw": self.draw_program(self.slice)}
-
     def compile(self) -> None:
         """Compile the programs, at the same time, and load them on all devices."""
-        programs = self.programs().values()
+        programs = [*self.programs.values(), self.draw_program(self.slice)]
         with ThreadPoolExecutor(len(programs)) as pool:
             for _ in pool.map(lambda bound: [bound.program.load(lane.device) for lane in self._lanes], programs):
                 pass
 
     @functools.cached_property
-    def simulate_program(self) -> BoundProgram:
-        """Program that samples and simulates a batch."""
-        annotations = dataclasses.replace(self.config.annotations, pixels=())
-        config, numbers = (
-            dataclasses.replace(self.config, annotations=annotations),
-            np.zeros(self.batch_size, np.uint32),
-        )
-        grid = np.zeros((self.batch_size, len(self.sampler.gridded)), np.float32)
+    def programs(self) -> dict[str, BoundProgram]:
+        """Programs from video numbers to render scenes, by name."""
+        config, size, programs = self.config, self.batch_size, {}
+        numbers, grid = np.zeros(size, np.uint32), np.zeros((size, len(self.sampler.gridded)), np.float32)
         args = np.zeros(3, np.uint32), np.int32(0), grid, numbers, numbers
+        keep, sparse, physical = self.save_at, self.sparse, Layout(self.layout.groups, joints=self.layout.joints)
 
-        def simulate_batch(config: Config) -> BatchSimulation:
-            return BatchSimulation(config, self.sparse)
+        def members(config: Config) -> Members:
+            return Members(config, keep, sparse)
 
-        return program_for(config, self.batch_size, simulate_batch, args, self.devices[0])
+        def simulate(config: Config) -> Simulation:
+            return Simulation(config, physical, keep, sparse)
+
+        if config.matched.change:
+            sections = "scene", "splits", "quality", "matched", "video", "physics"
+            programs["members"] = self._program(only_sections(config, *sections, simulated=True), keep, members, args)
+            sampled, simulated = programs["members"].results
+        else:
+            sample_config = only_sections(config, "scene", "splits", "quality", "matched")
+            programs["sample"] = self._program(sample_config, None, Sampling, args)
+            sampled = programs["sample"].results
+            args = sampled.keys, sampled.scene, sampled.state
+            simulate_config = only_sections(config, "video", "physics", simulated=True)
+            programs["simulate"] = self._program(simulate_config, (keep, physical), simulate, args)
+            simulated = programs["simulate"].results
+        args = sampled.keys, sampled.scene, simulated.trajectory.states, simulated.trajectory.between
+        stage_config = only_sections(config, "scene", "video", "camera", "image", "look")
+        programs["stage"] = self._program(stage_config, None, Staging, args)
+        return programs
 
     def draw_program(self, count: int) -> BoundProgram:
         """Program that renders `count` videos of a batch."""
         if count not in self._draws:
-            config = dataclasses.replace(
-                self.config, physics=PhysicsOptions(), matched=MatchedOptions(), quality=QualityOptions(), splits=()
-            )
 
-            def render_slice(config: Config) -> Callable[[RenderScene, Array], dict[str, Array]]:
+            def draw(config: Config) -> Callable[[RenderScene, Array], dict[str, Array]]:
                 plan = render.plan_of(config, config.scene.contract.layout(config.scene.options))
 
                 def run(render_scenes: RenderScene, start: Array) -> dict[str, Array]:
@@ -182,9 +213,13 @@ class Rollout:
 
                 return run
 
-            args = self.simulate_program.program.trace.results.render_scenes, np.int32(0)
-            self._draws[count] = program_for(config, count, render_slice, args, self.devices[0])
+            config = only_sections(self.config, "scene", "video", "camera", "image", "look", "storage", pixels=True)
+            args = self.programs["stage"].results.render_scenes, np.int32(0)
+            self._draws[count] = self._program(config, count, draw, args)
         return self._draws[count]
+
+    def _program(self, config: Config, key: Hashable, build: Callable[[Config], Any], args: tuple) -> BoundProgram:
+        return program_for(config, key, build, args, self.devices[0])
 
     def host_columns(self, batches: Sequence[DeviceBatch]) -> list[dict[str, np.ndarray]]:
         """Each device's columns as NumPy arrays; waits for the devices."""

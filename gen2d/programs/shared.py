@@ -21,7 +21,7 @@ from gen2d.programs.executables import Trace
 from gen2d.records.parameter import SIZE, Tape
 from gen2d.storage.sealed import as_json, sha256
 
-MAX_PROGRAMS = 12  # loaded at once; each takes up to thousands of the 65,530 memory maps that a process may have
+MAX_PROGRAMS = 24  # loaded at once; each takes up to thousands of the 65,530 memory maps that a process may have
 
 Build = Callable[[Config], Callable[..., Any]]
 
@@ -70,6 +70,11 @@ class BoundProgram(NamedTuple):
         """Result of the program on a device."""
         leaves = self.program.load(device)(self.numbers, *jax.tree.leaves(args))
         return jax.tree.unflatten(jax.tree.structure(self.program.trace.results), leaves)
+
+    @property
+    def results(self) -> Any:
+        """Tree of jax.ShapeDtypeStruct: shapes and types of its results."""
+        return self.program.trace.results
 
     @property
     def sha256(self) -> str:

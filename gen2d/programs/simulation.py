@@ -1,4 +1,9 @@
-"""Simulation of a batch of videos from their numbers: everything but the frames."""
+"""Programs from the numbers of a batch's videos to their render scenes: sample, simulate, stage.
+
+Each program depends on few sections of a config, whose numbers may be parameters: another look compiles `stage` alone,
+another distribution `sample` alone. The members of a matched set are sampled and simulated by one program, `members`,
+because two programs would round differently.
+"""
 
 import dataclasses
 import functools
@@ -16,6 +21,7 @@ from gen2d.physics.simulate import SaveAt, simulate, substeps
 from gen2d.programs import render
 from gen2d.records import axes
 from gen2d.records.axes import Array
+from gen2d.records.keys import unwrapped, wrapped
 from gen2d.records.layout import Layout
 from gen2d.records.scene import Scene, State
 from gen2d.records.trajectory import Trajectory
@@ -24,84 +30,153 @@ from gen2d.sampling import rejection
 from gen2d.sampling.builder import SampledScene
 from gen2d.sampling.matched import sets
 from gen2d.sampling.matched import simulate as simulate_module
-from gen2d.sampling.sampler import FactorChange, Sampler
+from gen2d.sampling.sampler import FactorChange, SampledFactors, Sampler
+
+Columns = dict[str, Array]  # stored fields [n, ...], by name
 
 
 class DeviceBatch(NamedTuple):
-    """`batch_size` simulated videos on each device, ready to be rendered."""
+    """`batch_size` simulated videos on one device, ready to be rendered."""
 
-    columns: dict[str, Array]  # stored fields [n, ...] except rendered ones
+    columns: Columns  # except rendered ones
     render_scenes: RenderScene
     placed: Array  # [n] whether all objects could be placed
 
 
-class BatchSimulation:
-    """Sampling, simulation and render scenes of a config's videos; numbers of the config may be parameters.
+class SampledBatch(NamedTuple):
+    """Sampled videos of a batch."""
 
-    `sparse` selects the solver of nearby pairs, for CPUs.
-    """
+    keys: Array  # uint32 [n, 2]
+    scene: Scene
+    state: State
+    columns: Columns
+    placed: Array  # [n] whether all objects could be placed
 
-    def __init__(self, config: Config, sparse: bool) -> None:
-        self.config, self.sparse = config, sparse
-        self.layout = config.scene.contract.layout(config.scene.options)
+
+class SimulatedBatch(NamedTuple):
+    """Simulated videos of a batch."""
+
+    trajectory: Trajectory
+    lyapunov: Array | None  # [n] 1/s
+
+
+class StagedBatch(NamedTuple):
+    """Videos of a batch, ready to be rendered."""
+
+    render_scenes: RenderScene
+    columns: Columns  # colours and camera
+
+
+class Sampling:
+    """Sampled videos of a batch from their numbers [n]."""
+
+    def __init__(self, config: Config) -> None:
+        self.config = config
         self.sampler, self.quality_ranges = Sampler(config), quality.ranges(config.quality)
-        self.plan = render.plan_of(config, self.layout)
-        self.steps = substeps(config.video.fps, config.physics.substeps, config.physics.max_step)
-        self.save_at = save_at(config, self.layout)
 
-    def __call__(self, root: Array, row: Array, grid: Array, numbers: Array, attempts: Array) -> DeviceBatch:
-        """One device's part of a batch, from video numbers [batch_size]."""
-        config = self.config
-        keys, matched_columns = sets.keys_of(root, numbers, config.matched), {}
-        if config.matched.change:
+    def __call__(self, root: Array, row: Array, grid: Array, numbers: Array, attempts: Array) -> SampledBatch:
+        """Videos of the split `row`; `grid` [n, G] are their `Sampler.grid_values`."""
+        keys = sets.keys_of(root, numbers, self.config.matched)
+        own_keys = rejection.attempt_keys(keys, attempts) if self.quality_ranges else keys
+        factors, sampled = jax.vmap(self.sampler.sample, (0, None, 0))(own_keys, row, grid)
+        return self.batch(keys, factors, sampled)
 
-            def member(key: Array, change: FactorChange | None = None) -> tuple[dict[str, Array], SampledScene]:
-                return self.sampler.sample(key, row, change=change)
-
-            factors, sampled, trajectory, matched_columns = simulate_module.simulate_members(
-                keys, numbers, config, self.layout, member, self._trajectory
-            )
-        else:
-            own_keys = rejection.attempt_keys(keys, attempts) if self.quality_ranges else keys
-            factors, sampled = jax.vmap(self.sampler.sample, (0, None, 0))(own_keys, row, grid)
-            trajectory = self._trajectory(sampled.scene, sampled.state)
-        scene, between, trajectory = sampled.scene, trajectory.between, dataclasses.replace(trajectory, between=None)
-
-        def build(key: Array, scene: Scene, states: State, between: State | None) -> tuple[RenderScene, Array]:
-            render_scene = render.render_scene(key, config, self.plan, scene, states, between=between)
-            return render_scene, render.painted_colors(render_scene.paint, scene)
-
-        render_scenes, colors = jax.vmap(build)(keys, scene, trajectory.states, between)
-        columns = axes.columns(scene) | axes.columns(trajectory)
-        columns["objects/color"] = colors
-        columns |= render.camera_columns(render_scenes.instants.view)
+    def batch(self, keys: Array, factors: SampledFactors, sampled: SampledScene) -> SampledBatch:
+        """The batch of sampled factors and scenes."""
+        columns = axes.columns(sampled.scene)
         columns |= {f"factors/{name}": values.astype(jnp.float32) for name, values in factors.items()}
         columns |= jax.vmap(self.sampler.ood_distances)(factors)
         columns["quality/rejected_draws"] = sampled.rejected
-        if config.annotations.simulated.lyapunov:
-            columns["quality/lyapunov"] = self._lyapunov(keys, sampled)
-        columns = {name: values for name, values in columns.items() if name not in sets.omitted_fields(config.matched)}
-        return DeviceBatch(columns | matched_columns, render_scenes, sampled.fits)
+        return SampledBatch(unwrapped(keys), sampled.scene, sampled.state, columns, sampled.fits)
 
-    def _device_trajectory(self, scene: Scene, state: State, keep: SaveAt) -> Trajectory:
-        """Trajectories from these initial states, in the device's layout."""
-        video, rules = self.config.video, solver_params(self.config.physics, self.config.video.fps, self.steps)
-        return simulate(scene, state, self.layout, rules, video.frames, self.steps, keep, sparse=self.sparse)
 
-    def _trajectory(self, scene: Scene, state: State) -> Trajectory:
-        """Trajectories from these initial states, with the videos first."""
-        trajectory = self._device_trajectory(axes.to_device(scene), axes.to_device(state), self.save_at)
+class Simulation:
+    """Trajectories of a batch. `sparse` selects the solver of nearby pairs, for CPUs."""
+
+    def __init__(self, config: Config, layout: Layout, keep: SaveAt, sparse: bool) -> None:
+        self.config, self.layout, self.keep, self.sparse = config, layout, keep, sparse
+        self.steps = steps_of(config)
+
+    def __call__(self, keys: Array, scene: Scene, state: State) -> SimulatedBatch:
+        """Trajectories from these initial states [n, ...]."""
+        trajectory, exponents = self.trajectory(scene, state), None
+        if self.config.annotations.simulated.lyapunov:
+            video, rerun = self.config.video, functools.partial(self._device_trajectory, keep=SaveAt())
+            start, seconds = (axes.to_device(scene), axes.to_device(state)), (video.frames - 1) / video.fps
+            exponents = lyapunov.lyapunov_exponent(wrapped(keys), *start, rerun, seconds)
+        return SimulatedBatch(trajectory, exponents)
+
+    def trajectory(self, scene: Scene, state: State) -> Trajectory:
+        """Trajectories with the videos first."""
+        trajectory = self._device_trajectory(axes.to_device(scene), axes.to_device(state), self.keep)
         between = trajectory.between
         if between is not None:  # from [T - 1, steps, (2,) K, n] to [n, T - 1, steps, K(, 2)]
             between = jax.tree.map(lambda x: jnp.moveaxis(jnp.moveaxis(x, -1, 0), -1, 3), between)
         stored = axes.to_stored(dataclasses.replace(trajectory, between=None))
         return dataclasses.replace(stored, between=between)
 
-    def _lyapunov(self, keys: Array, sampled: SampledScene) -> Array:
-        rerun = functools.partial(self._device_trajectory, keep=SaveAt())
-        start = axes.to_device(sampled.scene), axes.to_device(sampled.state)
-        video = self.config.video
-        return lyapunov.lyapunov_exponent(keys, *start, rerun, (video.frames - 1) / video.fps)
+    def _device_trajectory(self, scene: Scene, state: State, keep: SaveAt) -> Trajectory:
+        """Trajectories from these initial states, in the device's layout."""
+        video, rules = self.config.video, solver_params(self.config.physics, self.config.video.fps, self.steps)
+        return simulate(scene, state, self.layout, rules, video.frames, self.steps, keep, sparse=self.sparse)
+
+
+class Members:
+    """Sampled and simulated members of matched sets."""
+
+    def __init__(self, config: Config, keep: SaveAt, sparse: bool) -> None:
+        self.config, self.layout = config, config.scene.contract.layout(config.scene.options)
+        self.sampling, self.simulation = Sampling(config), Simulation(config, self.layout, keep, sparse)
+
+    def __call__(
+        self, root: Array, row: Array, grid: Array, numbers: Array, attempts: Array
+    ) -> tuple[SampledBatch, SimulatedBatch]:
+        """Videos with these numbers [n]."""
+        keys = sets.keys_of(root, numbers, self.config.matched)
+
+        def member(key: Array, change: FactorChange | None = None) -> tuple[SampledFactors, SampledScene]:
+            return self.sampling.sampler.sample(key, row, change=change)
+
+        factors, sampled, trajectory, record = simulate_module.simulate_members(
+            keys, numbers, self.config, self.layout, member, self.simulation.trajectory
+        )
+        batch = self.sampling.batch(keys, factors, sampled)
+        simulated = self.simulation(batch.keys, batch.scene, batch.state)._replace(trajectory=trajectory)
+        return batch._replace(columns=batch.columns | record), simulated
+
+
+class Staging:
+    """Render scenes of a batch."""
+
+    def __init__(self, config: Config) -> None:
+        self.config = config
+        self.plan = render.plan_of(config, config.scene.contract.layout(config.scene.options))
+
+    def __call__(self, keys: Array, scene: Scene, states: State, between: State | None) -> StagedBatch:
+        """Render scenes of these videos [n, ...]."""
+
+        def build(key: Array, scene: Scene, states: State, between: State | None) -> tuple[RenderScene, Array]:
+            render_scene = render.render_scene(key, self.config, self.plan, scene, states, between=between)
+            return render_scene, render.painted_colors(render_scene.paint, scene)
+
+        render_scenes, colors = jax.vmap(build)(wrapped(keys), scene, states, between)
+        columns = {"objects/color": colors} | render.camera_columns(render_scenes.instants.view)
+        return StagedBatch(render_scenes, columns)
+
+
+def device_batch(config: Config, sampled: SampledBatch, simulated: SimulatedBatch, staged: StagedBatch) -> DeviceBatch:
+    """The stored fields and render scenes of a batch."""
+    columns = sampled.columns | axes.columns(dataclasses.replace(simulated.trajectory, between=None)) | staged.columns
+    if simulated.lyapunov is not None:
+        columns["quality/lyapunov"] = simulated.lyapunov
+    omitted = sets.omitted_fields(config.matched)
+    kept = {name: values for name, values in columns.items() if name not in omitted}
+    return DeviceBatch(kept, staged.render_scenes, sampled.placed)
+
+
+def steps_of(config: Config) -> int:
+    """Number of steps of a frame."""
+    return substeps(config.video.fps, config.physics.substeps, config.physics.max_step)
 
 
 def save_at(config: Config, layout: Layout) -> SaveAt:

@@ -32,4 +32,14 @@ def video_keys(words: Array, numbers: Array) -> Array:
     return jax.vmap(lambda i: jax.random.fold_in(root, i))(numbers)
 
 
+def unwrapped(keys: Array) -> Array:
+    """Words uint32 [n, 2] of keys [n], as programs pass them to each other."""
+    return jax.random.key_data(keys)
+
+
+def wrapped(words: Array) -> Array:
+    """Keys [n] of these words."""
+    return jax.random.wrap_key_data(words, impl="threefry2x32")
+
+
 MAX_VIDEOS = 2**32 - 1

@@ -56,7 +56,7 @@ def cache(stock: tuple[Path, dict[str, np.ndarray]], tmp_path: Path) -> Iterator
 def test_programs_are_found_before_anything_is_traced(
     stock: tuple[Path, dict[str, np.ndarray]], cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    assert len(entry_files(cache)) == 4  # a trace and an executable of each program
+    assert len(entry_files(cache)) == 8  # a trace and an executable of each program
     monkeypatch.setattr(shared, "_traced", lambda *_: pytest.fail("a program was traced"))
     same(make(tmp_path / "data", cache), stock[1])
     marks = [(root / "manifest.json").read_text().split('"fingerprint"')[1] for root in (stock[0].parent / "data",)]
@@ -72,7 +72,7 @@ def test_damaged_entries_are_replaced(stock: tuple[Path, dict[str, np.ndarray]],
             path.write_bytes(damaged)
             assert executables._read(path) is None
     same(make(tmp_path / "data", cache), stock[1])
-    assert len(entry_files(cache)) == 4
+    assert len(entry_files(cache)) == 8
     assert all(executables._read(path) for path in entry_files(cache))
 
 
@@ -141,7 +141,8 @@ from pathlib import Path
 from gen2d.generation.run import generate
 assert len(jax.devices()) == 3
 generate({config!r}, 24, {out!r}, device="cpu")
-Path({log!r}).write_text(" ".join(name for name in compiled if "simulate_batch" in name or "render_slice" in name))
+names = [f"jit({{name}})" for name in ("Sampling", "simulate", "Staging", "draw")]
+Path({log!r}).write_text(" ".join(name for name in compiled if name in names))
 """
 
 
@@ -151,7 +152,7 @@ def test_several_devices_run_one_executable(tmp_path: Path) -> None:
     config, out, log = (str(tmp_path / name) for name in ("tiny.yaml", "data", "log"))
     cache = str(tmp_path / "cache")
     run_on(3, COMPILED.format(config=config, out=out, log=log), JAX_COMPILATION_CACHE_DIR=cache)
-    assert sorted(Path(log).read_text().split()) == ["jit(render_slice)", "jit(simulate_batch)"]
+    assert sorted(Path(log).read_text().split()) == ["jit(Sampling)", "jit(Staging)", "jit(draw)", "jit(simulate)"]
     shared.clear()
     generate(CONFIG, 24, tmp_path / "one", device="cpu")
     same(everything(Path(out)), everything(tmp_path / "one"))

@@ -45,14 +45,14 @@ def package(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 LOOK = "paint = plain(scene, layout, options, key)\n    return paint._replace(color=255 - paint.color)"
 EDITS = {
-    "scene": ("gen2d/scenes/bouncing.py", "jnp.zeros(2), box", "jnp.zeros(2) + 0.25, box", "samples and simulates"),
+    "scene": ("gen2d/scenes/bouncing.py", "jnp.zeros(2), box", "jnp.zeros(2) + 0.25, box", "samples scenes"),
     "solver": (
         "gen2d/physics/time_of_impact.py",
         "elasticity * arrival",
         "0.99 * elasticity * arrival",
-        "samples and simulates",
+        "simulates",
     ),
-    "look": ("renderers/looks/flat.py", "return plain(scene, layout, options, key)", LOOK, "samples and simulates"),
+    "look": ("renderers/looks/flat.py", "return plain(scene, layout, options, key)", LOOK, "prepares rendering"),
     "rasterizer": ("renderers/compositing.py", "((product + 16) >> 5)", "((product + 15) >> 5)", "draws"),
     "captions": ("gen2d/captions/caption.py", '"ball", "rod"', '"sphere", "rod"', "writes captions"),
 }

@@ -32,10 +32,10 @@ def _no_programs(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[No
     shared.clear()
 
 
-def trace(config: Config) -> tuple[shared.BoundProgram, shared.BoundProgram]:
-    """The two programs of a config, traced and not compiled."""
-    programs = Rollout(config, devices.prepare("cpu")[:1]).programs()
-    return programs["simulate"], programs["draw"]
+def trace(config: Config) -> dict[str, shared.BoundProgram]:
+    """The programs of a config, traced and not compiled."""
+    rollout = Rollout(config, devices.prepare("cpu")[:1])
+    return rollout.programs | {"draw": rollout.draw_program(rollout.slice)}
 
 
 def programs() -> list[shared.Program]:
@@ -60,7 +60,7 @@ def edits(plain: Any, path: str = "") -> Iterator[tuple[str, Any]]:
 @pytest.mark.parametrize("name", [name for name in CONFIGS if not name.startswith("phyworld")])
 def test_no_edited_number_of_a_shipped_config_needs_another_program(name: str) -> None:
     config = load_config(f"{name}.yaml", [f"storage.batch_size={4}"])
-    programs = [bound.program for bound in trace(config)]
+    programs = [bound.program for bound in trace(config).values()]
     overrides = dict(edits({section: config.plain()[section] for section in ("look", "scene")}))
     overrides |= {
         "camera.margin": config.camera.margin + 1e-4,
@@ -71,7 +71,7 @@ def test_no_edited_number_of_a_shipped_config_needs_another_program(name: str) -
     assert len(overrides) > 10
     for where, value in overrides.items():
         changed = load_config(config, [f"{where}={value}"])
-        assert [bound.program for bound in trace(changed)] == programs, where
+        assert [bound.program for bound in trace(changed).values()] == programs, where
 
 
 def splits(**changes: Any) -> dict[str, Any]:
@@ -215,13 +215,25 @@ def test_the_fingerprint_does_not_depend_on_what_was_traced_first(name: str) -> 
     config = load_config(f"{name}.yaml", ["storage.batch_size=4"])
     trace(config)
     changed = load_config(config, [f"{where}={value}" for where, value in edits({"scene": config.plain()["scene"]})])
-    shared_hashes = [bound.sha256 for bound in trace(changed)]
+    shared_hashes = [bound.sha256 for bound in trace(changed).values()]
     shared.clear()
-    assert [bound.sha256 for bound in trace(changed)] == shared_hashes
+    assert [bound.sha256 for bound in trace(changed).values()] == shared_hashes
 
 
-def test_an_annotation_needs_another_program_for_drawing_alone() -> None:
-    plain = trace(load_config("bouncing.yaml", SMALL))
-    masks = trace(load_config("bouncing.yaml", [*SMALL, "annotations.masks=true"]))
-    assert masks[0].program is plain[0].program
-    assert masks[1].program is not plain[1].program
+NEEDS = {
+    "annotations.masks=true": {"draw"},
+    "storage.frames=none": {"draw"},
+    "look=outline": {"stage", "draw"},
+    "camera.motion=pan": {"stage", "draw"},
+    "image.noise=4": {"stage", "draw"},
+    "scene.radius={normal: [0.6, 0.1, 0.5, 0.9]}": {"sample"},
+    "physics.substeps=3": {"simulate"},
+    "physics.damping=0.1": {"simulate"},
+    "annotations.energy=true": {"simulate"},
+}
+
+
+@pytest.mark.parametrize("change", NEEDS)
+def test_another_effect_needs_only_the_programs_that_it_concerns(change: str) -> None:
+    before, after = (trace(load_config("bouncing.yaml", [*SMALL, *changes])) for changes in ([], [change]))
+    assert {name for name in after if after[name].program is not before[name].program} == NEEDS[change]
