@@ -11,29 +11,34 @@ from gen2d.config.joint_distribution import Component, JointDistribution
 from gen2d.config.plugin_options import Plugin
 from gen2d.config.sections import SimulationAnnotations, StorageOptions
 from gen2d.config.splits import Split
+from gen2d.records.layout import Layout
 from gen2d.records.parameter import Tape
 
 Number = Callable[[Any], Any]
 
 
-def split_numbers(config: Config) -> tuple[str, list[Any]]:
-    """Structure of a config as text, equal for configs that differ in numbers only, and these numbers."""
+def split_numbers(config: Config, layout: Layout | None = None) -> tuple[str, list[Any]]:
+    """Structure of a config and a layout as text, equal for those that differ in numbers only, and these numbers."""
     numbers: list[Any] = []
 
     def take(number: Any) -> str:
         numbers.append(number)
         return f"{type(number).__name__} {len(numbers) - 1}"
 
-    return repr(_replaced(config, take)), numbers
+    return repr((_replaced(config, take), _converted(layout, take))), numbers
 
 
-def parametrized(config: Config, tape: Tape) -> Config:
-    """The config with a parameter of the tape in place of each number; leaf i is number i of `split_numbers`.
+def parametrized(config: Config, tape: Tape, layout: Layout | None = None) -> tuple[Config, Any]:
+    """Config and layout with a parameter of the tape in place of each number; leaf i is number i of `split_numbers`.
 
     It holds only what programs depend on.
     """
     count = iter(range(2**31))
-    return _replaced(config, lambda number: tape.leaf(next(count), number))
+
+    def parameter(number: Any) -> Any:
+        return tape.leaf(next(count), number)
+
+    return _replaced(config, parameter), _converted(layout, parameter)
 
 
 def only_sections(config: Config, *sections: str, simulated: bool = False, pixels: bool = False) -> Config:

@@ -23,7 +23,7 @@ from gen2d.core import enums
 from gen2d.programs import render
 from gen2d.programs.devices import Device
 from gen2d.programs.schema import VideoSchema
-from gen2d.programs.shared import BoundProgram, program_for
+from gen2d.programs.shared import BoundProgram, Build, program_for
 from gen2d.programs.simulation import (
     DeviceBatch,
     Members,
@@ -177,35 +177,42 @@ class Rollout:
         args = np.zeros(3, np.uint32), np.int32(0), grid, numbers, numbers
         keep, sparse, physical = self.save_at, self.sparse, Layout(self.layout.groups, joints=self.layout.joints)
 
-        def members(config: Config) -> Members:
-            return Members(config, keep, sparse)
+        def members(config: Config, layout: Layout) -> Members:
+            return Members(config, layout, keep, sparse)
 
-        def simulate(config: Config) -> Simulation:
-            return Simulation(config, physical, keep, sparse)
+        def sample(config: Config, layout: Layout) -> Sampling:
+            return Sampling(config)
+
+        def simulate(config: Config, layout: Layout) -> Simulation:
+            return Simulation(config, layout, keep, sparse)
+
+        def stage(config: Config, layout: Layout) -> Staging:
+            return Staging(config, layout)
 
         if config.matched.change:
             sections = "scene", "splits", "quality", "matched", "video", "physics"
-            programs["members"] = self._program(only_sections(config, *sections, simulated=True), keep, members, args)
+            members_config = only_sections(config, *sections, simulated=True)
+            programs["members"] = self._program(members_config, self.layout, keep, members, args)
             sampled, simulated = programs["members"].results
         else:
             sample_config = only_sections(config, "scene", "splits", "quality", "matched")
-            programs["sample"] = self._program(sample_config, None, Sampling, args)
+            programs["sample"] = self._program(sample_config, physical, None, sample, args)
             sampled = programs["sample"].results
             args = sampled.keys, sampled.scene, sampled.state
             simulate_config = only_sections(config, "video", "physics", simulated=True)
-            programs["simulate"] = self._program(simulate_config, (keep, physical), simulate, args)
+            programs["simulate"] = self._program(simulate_config, physical, keep, simulate, args)
             simulated = programs["simulate"].results
         args = sampled.keys, sampled.scene, simulated.trajectory.states, simulated.trajectory.between
-        stage_config = only_sections(config, "scene", "video", "camera", "image", "look")
-        programs["stage"] = self._program(stage_config, None, Staging, args)
+        stage_config = only_sections(config, "video", "camera", "image", "look")
+        programs["stage"] = self._program(stage_config, self.layout, None, stage, args)
         return programs
 
     def draw_program(self, count: int) -> BoundProgram:
         """Program that renders `count` videos of a batch."""
         if count not in self._draws:
 
-            def draw(config: Config) -> Callable[[RenderScene, Array], dict[str, Array]]:
-                plan = render.plan_of(config, config.scene.contract.layout(config.scene.options))
+            def draw(config: Config, layout: Layout) -> Callable[[RenderScene, Array], dict[str, Array]]:
+                plan = render.plan_of(config, layout)
 
                 def run(render_scenes: RenderScene, start: Array) -> dict[str, Array]:
                     part = jax.tree.map(lambda x: jax.lax.dynamic_slice_in_dim(x, start, count), render_scenes)
@@ -213,13 +220,13 @@ class Rollout:
 
                 return run
 
-            config = only_sections(self.config, "scene", "video", "camera", "image", "look", "storage", pixels=True)
+            config = only_sections(self.config, "video", "camera", "image", "look", "storage", pixels=True)
             args = self.programs["stage"].results.render_scenes, np.int32(0)
-            self._draws[count] = self._program(config, count, draw, args)
+            self._draws[count] = self._program(config, self.layout, count, draw, args)
         return self._draws[count]
 
-    def _program(self, config: Config, key: Hashable, build: Callable[[Config], Any], args: tuple) -> BoundProgram:
-        return program_for(config, key, build, args, self.devices[0])
+    def _program(self, config: Config, layout: Layout, key: Hashable, build: Build, args: tuple) -> BoundProgram:
+        return program_for(config, layout, key, build, args, self.devices[0])
 
     def host_columns(self, batches: Sequence[DeviceBatch]) -> list[dict[str, np.ndarray]]:
         """Each device's columns as NumPy arrays; waits for the devices."""

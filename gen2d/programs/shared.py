@@ -18,12 +18,13 @@ from gen2d.config.parameters import parametrized, split_numbers
 from gen2d.programs import executables
 from gen2d.programs.devices import Device
 from gen2d.programs.executables import Trace
+from gen2d.records.layout import Layout
 from gen2d.records.parameter import SIZE, Tape
 from gen2d.storage.sealed import as_json, sha256
 
 MAX_PROGRAMS = 24  # loaded at once; each takes up to thousands of the 65,530 memory maps that a process may have
 
-Build = Callable[[Config], Callable[..., Any]]
+Build = Callable[[Config, Layout], Callable[..., Any]]
 
 
 class Program:
@@ -86,23 +87,27 @@ _programs: list[tuple[Hashable, Program]] = []  # with their keys, the last used
 _lock = threading.Lock()
 
 
-def program_for(config: Config, key: Hashable, build: Build, args: tuple, device: Device) -> BoundProgram:
+def program_for(
+    config: Config, layout: Layout, key: Hashable, build: Build, args: tuple, device: Device
+) -> BoundProgram:
     """The program of a config: one that is already there if it serves the config, else a new one, traced for `args`.
 
     Parameters
     ----------
     config : Config
         The config; sections that the program does not depend on should have their defaults.
+    layout : Layout
+        Layout of the videos.
     key : hashable
         Everything else that determines the program, such as its sizes.
     build : callable
-        `build(config)` returns the function to be traced, for a config whose numbers are parameters.
+        `build(config, layout)` returns the function to be traced, for a config and layout whose numbers are parameters.
     args : tuple
         Arguments of the function, or their shapes.
     device : jax.Device
         Any device of the kind that the program shall run on.
     """
-    structure, leaves = split_numbers(config)
+    structure, leaves = split_numbers(config, layout)
     shapes = [(np.shape(x), str(x.dtype)) for x in jax.tree.leaves(args)]
     # Addresses of functions differ between processes; their sources are part of the key on disk.
     structure = re.sub(r" at 0x[0-9a-f]+", "", structure)
@@ -117,7 +122,7 @@ def program_for(config: Config, key: Hashable, build: Build, args: tuple, device
         else:
             program = _stored(disk, leaves)
             if program is None:
-                program = _traced(config, build, args, device)
+                program = _traced(config, layout, build, args, device)
                 executables.store_trace(*disk, program.trace)
             entry = key, program
             numbers = program.trace.tape.arguments(leaves)
@@ -156,9 +161,9 @@ def _loadable(trace: Trace, device: Device) -> Program | None:
         return None
 
 
-def _traced(config: Config, build: Build, args: tuple, device: Device) -> Program:
+def _traced(config: Config, layout: Layout, build: Build, args: tuple, device: Device) -> Program:
     tape, tree, one = Tape(), jax.tree.structure(args), SingleDeviceSharding(device)
-    function = build(parametrized(config, tape))
+    function = build(*parametrized(config, tape, layout))
     results: Any = None
 
     def run(numbers: jax.Array, *leaves: Any) -> list[jax.Array]:

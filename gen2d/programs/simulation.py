@@ -124,8 +124,8 @@ class Simulation:
 class Members:
     """Sampled and simulated members of matched sets."""
 
-    def __init__(self, config: Config, keep: SaveAt, sparse: bool) -> None:
-        self.config, self.layout = config, config.scene.contract.layout(config.scene.options)
+    def __init__(self, config: Config, layout: Layout, keep: SaveAt, sparse: bool) -> None:
+        self.config, self.layout = config, layout
         self.sampling, self.simulation = Sampling(config), Simulation(config, self.layout, keep, sparse)
 
     def __call__(
@@ -148,9 +148,8 @@ class Members:
 class Staging:
     """Render scenes of a batch."""
 
-    def __init__(self, config: Config) -> None:
-        self.config = config
-        self.plan = render.plan_of(config, config.scene.contract.layout(config.scene.options))
+    def __init__(self, config: Config, layout: Layout) -> None:
+        self.config, self.plan = config, render.plan_of(config, layout)
 
     def __call__(self, keys: Array, scene: Scene, states: State, between: State | None) -> StagedBatch:
         """Render scenes of these videos [n, ...]."""

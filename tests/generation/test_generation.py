@@ -117,7 +117,7 @@ def test_few_compiled_programs_are_kept(tmp_path: Path, monkeypatch: pytest.Monk
 
     def live_programs() -> int:
         names = [each.hlo_modules()[0].name for each in jax.devices()[0].client.live_executables()]
-        return sum(name in ("jit_Sampling", "jit_simulate", "jit_Staging", "jit_draw") for name in names)
+        return sum(name in ("jit_sample", "jit_simulate", "jit_stage", "jit_draw") for name in names)
 
     monkeypatch.setattr(shared, "MAX_PROGRAMS", 4)
     before = live_programs()

@@ -141,7 +141,7 @@ from pathlib import Path
 from gen2d.generation.run import generate
 assert len(jax.devices()) == 3
 generate({config!r}, 24, {out!r}, device="cpu")
-names = [f"jit({{name}})" for name in ("Sampling", "simulate", "Staging", "draw")]
+names = [f"jit({{name}})" for name in ("sample", "simulate", "stage", "draw")]
 Path({log!r}).write_text(" ".join(name for name in compiled if name in names))
 """
 
@@ -152,7 +152,7 @@ def test_several_devices_run_one_executable(tmp_path: Path) -> None:
     config, out, log = (str(tmp_path / name) for name in ("tiny.yaml", "data", "log"))
     cache = str(tmp_path / "cache")
     run_on(3, COMPILED.format(config=config, out=out, log=log), JAX_COMPILATION_CACHE_DIR=cache)
-    assert sorted(Path(log).read_text().split()) == ["jit(Sampling)", "jit(Staging)", "jit(draw)", "jit(simulate)"]
+    assert sorted(Path(log).read_text().split()) == ["jit(draw)", "jit(sample)", "jit(simulate)", "jit(stage)"]
     shared.clear()
     generate(CONFIG, 24, tmp_path / "one", device="cpu")
     same(everything(Path(out)), everything(tmp_path / "one"))

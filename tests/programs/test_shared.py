@@ -131,7 +131,7 @@ def sampled() -> Iterator[Any]:
         entry = next(served, None) if shared else None
         if entry is None:
             tape = Tape()
-            sampler = Sampler(parametrized(config, tape))
+            sampler = Sampler(parametrized(config, tape)[0])
 
             def run(arguments: jax.Array, row: jax.Array, given: jax.Array) -> dict[str, jax.Array]:
                 with tape.tracing(arguments):
@@ -169,7 +169,7 @@ def test_equal_and_different_splits_of_a_config_share_its_programs() -> None:
     """The largest radius stays, as it decides the size of tiles."""
 
     def programs(config: Config) -> list[shared.Program]:
-        return [bound.program for bound in trace(config)]
+        return [bound.program for bound in trace(config).values()]
 
     first = programs(load_config(splits()))
     for changes in SPLIT_EDITS.values():
@@ -179,14 +179,14 @@ def test_equal_and_different_splits_of_a_config_share_its_programs() -> None:
 @pytest.mark.parametrize("name", [name for name in CONFIGS if name.startswith("phyworld")])
 def test_no_edited_split_of_a_preset_needs_another_program(name: str) -> None:
     plain = load_config(f"{name}.yaml", ["storage.batch_size=4"]).plain()
-    programs = [bound.program for bound in trace(load_config(plain))]
+    programs = [bound.program for bound in trace(load_config(plain)).values()]
     held_out = {split: own for split, own in plain["splits"].items() if "factors" in own}
     for split, own in held_out.items():
         for factor, (low, high) in own["factors"].items():
             for numbers in ([low, high * 0.99], next(iter(held_out.values()))["factors"].get(factor, [low, high])):
                 changed = own | {"factors": own["factors"] | {factor: numbers}}
                 config = load_config(plain | {"splits": plain["splits"] | {split: changed}})
-                assert [bound.program for bound in trace(config)] == programs, (split, factor, numbers)
+                assert [bound.program for bound in trace(config).values()] == programs, (split, factor, numbers)
 
 
 def test_a_shared_program_gives_the_bits_of_an_own_one(tmp_path: Path) -> None:
@@ -224,7 +224,7 @@ NEEDS = {
     "annotations.masks=true": {"draw"},
     "storage.frames=none": {"draw"},
     "look=outline": {"stage", "draw"},
-    "camera.motion=pan": {"stage", "draw"},
+    "camera.pan=[1, 0]": {"stage", "draw"},
     "image.noise=4": {"stage", "draw"},
     "scene.radius={normal: [0.6, 0.1, 0.5, 0.9]}": {"sample"},
     "physics.substeps=3": {"simulate"},
