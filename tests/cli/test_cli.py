@@ -6,7 +6,7 @@ from pathlib import Path
 
 import jax
 import pytest
-from tiny import CONFIG, run_command, run_main
+from tiny import CONFIG, run_command, run_main, sentences
 
 from gen2d.cli.main import VERBS
 from gen2d.cli.parser import Parser, parse
@@ -78,7 +78,7 @@ def test_a_misspelt_verb_is_an_error_that_names_it(verb: str) -> None:
 )
 def test_an_error_says_what_to_write(words: tuple[str, ...], sentence: str) -> None:
     done = run_main(*words)
-    assert (done.returncode, done.stdout, done.stderr.count("\n")) == (2, "", 1)
+    assert (done.returncode, done.stdout, len(sentences(done.stderr))) == (2, "", 1)
     assert done.stderr.startswith(f"gen2d: {sentence}")
 
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import fuzz
 import pytest
-from tiny import run_main
+from tiny import run_main, sentences
 
 from gen2d.config.config import Config, from_mapping, load_config
 from gen2d.config.reading import parse_yaml
@@ -69,6 +69,6 @@ def test_the_command_line_says_it_in_one_sentence_too(tmp_path: Any) -> None:
             from_mapping(parse_yaml(text, str(path)) or {}, str(path))
         except ConfigError:
             done = run_main("--config", path, "--n", 1, "--out", tmp_path / "out")
-            assert (done.returncode, done.stdout, done.stderr.count("\n")) == (2, "", 1)
+            assert (done.returncode, done.stdout, len(sentences(done.stderr))) == (2, "", 1)
             assert str(path) in done.stderr
     assert not (tmp_path / "out").exists()

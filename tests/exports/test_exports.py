@@ -406,13 +406,13 @@ def test_bad_input_gets_one_line_and_code_2(toy: Path, tmp_path: Path, words: li
     done = tiny.run_main("export", toy, *words, cwd=tmp_path)
     assert done.returncode == 2, done
     assert told in done.stderr
-    assert len(done.stderr.splitlines()) == 1
+    assert len(tiny.sentences(done.stderr)) == 1
     assert not done.stdout
 
 
 def test_a_folder_that_is_no_dataset_is_told(tmp_path: Path) -> None:
     done = tiny.run_command("export", tmp_path, "--to", "npz")
-    assert (done.returncode, len(done.stderr.splitlines())) == (2, 1)
+    assert (done.returncode, len(tiny.sentences(done.stderr))) == (2, 1)
     assert "is not a gen2d dataset" in done.stderr
 
 

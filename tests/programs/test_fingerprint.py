@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import pytest
 import synthetic
-from tiny import command, tiny_config
+from tiny import command, sentences, tiny_config
 
 import gen2d
 from gen2d.config.reading import yaml_text
@@ -86,7 +86,7 @@ def test_an_edited_program_is_refused_by_name(
     for arguments in (("--config", "tiny.yaml", "--n", 9, "--out", "data"), *regen):
         done = run(package, *arguments)
         assert done.returncode == 2
-        assert done.stderr.count("\n") == 1
+        assert len(sentences(done.stderr)) == 1
         assert f"{does} is another, as these files differ: {file}" in done.stderr
     assert synthetic.tree(package / "data") == before
 

@@ -53,6 +53,11 @@ def run_command(*arguments: object, cwd: Path | None = None, **changes: str) -> 
     return subprocess.run(argv, env=environment, cwd=cwd, capture_output=True, text=True, timeout=300, check=False)
 
 
+def sentences(stderr: str) -> list[str]:
+    """Lines of standard error without those that say what is waited for, which depend on the machine."""
+    return [line for line in stderr.splitlines() if " ..." not in line]
+
+
 def run_on(devices: int, code: str, **changes: str) -> None:
     """Run code in a new process with this many CPU devices, in the folder of this file, and assert its success."""
     prelude = f"import jax; jax.config.update('jax_num_cpu_devices', {devices}); jax.devices();"
