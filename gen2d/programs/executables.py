@@ -47,10 +47,14 @@ class Trace:
     results: Any  # tree of jax.ShapeDtypeStruct
 
 
-def compiled(lowered: Any, device: Device) -> bytes:
-    """Bytes of the executable of a program that jax lowered for a device."""
+def compiled(lowered: Any, device: Device) -> tuple[Callable[..., list[jax.Array]], bytes | None]:
+    """The executable of a program that jax lowered for a device, and its bytes; None where XLA cannot give them."""
     with _without_jax_cache():  # an executable that jax loads from its cache cannot be serialized again
-        return serialize_executable.serialize(lowered.compile(environment.compiler_options(device)))[0]
+        executable = lowered.compile(environment.compiler_options(device))
+    try:
+        return executable, serialize_executable.serialize(executable)[0]
+    except (ValueError, NotImplementedError, jax.errors.JaxRuntimeError):
+        return executable, None
 
 
 def loaded(executable: bytes, device: Device) -> Callable[..., list[jax.Array]]:
@@ -79,16 +83,18 @@ class _Unpickler(serialize_executable._JaxPjrtUnpickler):
 
 
 _compiling = 0  # number of threads in `_without_jax_cache`
+_was_enabled = True  # jax's own cache, before the first of them
 _lock = threading.Lock()
 
 
 @contextlib.contextmanager
 def _without_jax_cache() -> Iterator[None]:
     """Context in which jax's own cache of compiled programs is off, for all threads."""
-    global _compiling
+    global _compiling, _was_enabled
     with _lock:
         _compiling += 1
         if _compiling == 1:
+            _was_enabled = jax.config.values["jax_enable_compilation_cache"]
             _enable_jax_cache(False)
     try:
         yield
@@ -96,7 +102,7 @@ def _without_jax_cache() -> Iterator[None]:
         with _lock:
             _compiling -= 1
             if not _compiling:
-                _enable_jax_cache(True)
+                _enable_jax_cache(_was_enabled)
 
 
 def _enable_jax_cache(enabled: bool) -> None:

@@ -35,12 +35,12 @@ class Program:
     trace : Trace
         Its parameters, the hash of its text without names and source locations, and the shapes of its results.
     executable : bytes or None
-        Its executable, for all devices of its kind; None until it is compiled.
+        Its executable, for all devices of its kind; None until it is compiled, and where XLA cannot give the bytes.
     """
 
-    def __init__(self, trace: Trace, lowered: Any = None, executable: bytes | None = None) -> None:
+    def __init__(self, trace: Trace, device: Device, lowered: Any = None, executable: bytes | None = None) -> None:
         self.trace, self.executable = trace, executable
-        self._lowered = lowered  # jax.stages.Lowered, where there is no executable yet
+        self._device, self._lowered = device, lowered  # lowered for this device, where there is no executable yet
         self._loaded: dict[Device, Callable[..., Any]] = {}
         self._lock = threading.Lock()
 
@@ -49,10 +49,13 @@ class Program:
         with self._lock:
             if device not in self._loaded:
                 if self.executable is None:
-                    self.executable = executables.compiled(self._lowered, device)
-                    executables.store_executable(self.trace.digest, device, self.executable)
-                    self._lowered = None
-                self._loaded[device] = executables.loaded(self.executable, device)
+                    self._loaded[self._device], self.executable = executables.compiled(self._lowered, self._device)
+                    if self.executable is not None:
+                        executables.store_executable(self.trace.digest, device, self.executable)
+                        self._lowered = None
+                if device not in self._loaded:
+                    assert self.executable is not None, f"XLA has no executable for {device}"
+                    self._loaded[device] = executables.loaded(self.executable, device)
             return self._loaded[device]
 
     def unload(self) -> None:
@@ -153,7 +156,7 @@ def _loadable(trace: Trace, device: Device) -> Program | None:
     """The program with this trace, if its executable is on disk and can be loaded."""
     executable = executables.find_executable(trace.digest, device)
     try:
-        program = None if executable is None else Program(trace, executable=executable)
+        program = None if executable is None else Program(trace, device, executable=executable)
         if program is not None:
             program.load(device)
         return program
@@ -179,7 +182,7 @@ def _traced(config: Config, layout: Layout, build: Build, args: tuple, device: D
     results = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), results)
     inputs = [f"{x.dtype}{x.shape}" for x in shapes]  # jax leaves those out of the text that are not used
     trace = Trace(tape, sha256(as_json([canonical(lowered.as_text()), inputs])), results)
-    return _loadable(trace, device) or Program(trace, lowered)
+    return _loadable(trace, device) or Program(trace, device, lowered)
 
 
 def canonical(text: str) -> str:
