@@ -21,6 +21,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from gen2d.core.errors import ConfigError
+
 R = TypeVar("R")
 SIZE = 2**14  # numbers that a program can take
 
@@ -77,14 +79,21 @@ class Tape:
             self._trace.arguments = outer
 
     def traced(self, parameter: "Parameter") -> jax.Array:
-        """A parameter as a float32 or int32 array of the program that is being traced."""
+        """A parameter as a float32 or int32 array of the program that is being traced.
+
+        Raises ConfigError if the program has too many.
+        """
         arguments = getattr(self._trace, "arguments", None)
         if arguments is None:
             raise RuntimeError("a parameter is an array only while its program is traced")
         if parameter.node not in self._arguments:
             self._arguments[parameter.node] = self._used, parameter
             self._used += parameter.size
-            assert self._used <= SIZE, f"a program takes at most {SIZE} numbers"
+            if self._used > SIZE:
+                raise ConfigError(
+                    f"config: one of its programs takes {self._used:,} numbers or more, but at most {SIZE:,} are "
+                    "possible: shorten its longest choice, grid or palette"
+                )
         start, _ = self._arguments[parameter.node]
         words = arguments[start : start + parameter.size].reshape(parameter.shape)
         return jax.lax.bitcast_convert_type(words, parameter.dtype)

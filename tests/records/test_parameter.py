@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from gen2d.core.errors import ConfigError
 from gen2d.records.parameter import SIZE, Parameter, Tape, apply, maximum, minimum
 
 LEAVES = (2.5, -1.25, 7.0, 3)
@@ -74,6 +75,18 @@ def test_numbers_that_python_branches_on_are_guarded(use: Callable, served: tupl
     tape, _, _ = program(lambda a, b, c, n: use(a, n))
     assert tape.arguments((served[0], 0.0, 0.0, served[1])) is not None
     assert tape.arguments((refused[0], 0.0, 0.0, refused[1])) is None
+
+
+def test_too_many_numbers_are_an_error_of_the_config() -> None:
+    tape = Tape()
+    number: Any = tape.leaf(0, np.zeros(SIZE + 1))
+    with pytest.raises(ConfigError, match=r"takes 16,385 numbers or more, but at most 16,384 are possible"):
+        jax.make_jaxpr(lambda words: _within(tape, words, number))(np.zeros(SIZE, np.uint32))
+
+
+def _within(tape: Tape, words: Any, number: Any) -> Any:
+    with tape.tracing(words):
+        return jnp.asarray(number)
 
 
 def test_a_parameter_is_an_array_within_its_trace_only() -> None:
