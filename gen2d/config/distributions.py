@@ -15,7 +15,7 @@ import numpy as np
 
 from gen2d.config.random_requests import (
     Draws,
-    Request,
+    RandomRequest,
     answer_together,
     integers,
     normal,
@@ -232,26 +232,26 @@ def draws(sources: Sequence[Distribution], index: Any, key: Array, shape: tuple[
         return jnp.asarray(stacked(*values) if place else values[0], dtype)
 
     if kind == "mixture":
-        component_key, key = yield Request(split, key, (2,))
+        component_key, key = yield RandomRequest(split, key, (2,))
         counts = [len(source.parts) for source in sources]
         ends = table([thresholds(max(counts), *source.numbers) for source in sources])[place]
-        component = ((yield Request(uniform, component_key, shape, (0.0, 1.0)))[..., None] >= ends).sum(-1)
+        component = ((yield RandomRequest(uniform, component_key, shape, (0.0, 1.0)))[..., None] >= ends).sum(-1)
         firsts = table([*np.cumsum([0, *counts[:-1]])], jnp.int32)[place]
         return (yield from draws([part for source in sources for part in source.parts], firsts + component, key, shape))
     columns = list(zip(*(source.constants for source in sources), strict=True))
     if kind in ("choice", "grid"):
-        return table(columns[0])[(*place, (yield Request(integers, key, shape, (0, count))))]
+        return table(columns[0])[(*place, (yield RandomRequest(integers, key, shape, (0, count))))]
     if kind == "integer":
         low, stop = (table(column, jnp.int32)[place] for column in columns)
-        return (yield Request(integers, key, shape, (low, stop)))
+        return (yield RandomRequest(integers, key, shape, (low, stop)))
     n = [table(column)[place] for column in columns]
     if kind == "constant":
         return jnp.broadcast_to(n[0], shape)
     if kind == "normal" and count == 2:
-        return n[0] + n[1] * (yield Request(normal, key, shape))
+        return n[0] + n[1] * (yield RandomRequest(normal, key, shape))
     if kind == "normal":
-        samples = n[0] + n[1] * (yield Request(truncated_normal, key, shape, (n[2], n[3])))
+        samples = n[0] + n[1] * (yield RandomRequest(truncated_normal, key, shape, (n[2], n[3])))
     else:
-        samples = yield Request(uniform, key, shape, (n[0], n[1]))
+        samples = yield RandomRequest(uniform, key, shape, (n[0], n[1]))
     samples = jnp.exp(samples) if kind == "log_uniform" else samples
     return jnp.clip(samples, *n[-2:])  # rounding may leave the support

@@ -25,7 +25,7 @@ def split_numbers(config: Config, layout: Layout | None = None) -> tuple[str, li
         numbers.append(number)
         return f"{type(number).__name__} {len(numbers) - 1}"
 
-    return repr((_replaced(config, take), _converted(layout, take))), numbers
+    return repr((_replaced(config, take), _converted_layout(layout, take))), numbers
 
 
 def parametrized(config: Config, tape: Tape, layout: Layout | None = None) -> tuple[Config, Any]:
@@ -38,7 +38,7 @@ def parametrized(config: Config, tape: Tape, layout: Layout | None = None) -> tu
     def parameter(number: Any) -> Any:
         return tape.leaf(next(count), number)
 
-    return _replaced(config, parameter), _converted(layout, parameter)
+    return _replaced(config, parameter), _converted_layout(layout, parameter)
 
 
 def only_sections(config: Config, *sections: str, simulated: bool = False, pixels: bool = False) -> Config:
@@ -63,6 +63,14 @@ def _replaced(config: Config, convert: Number) -> Config:
     static = {"name": "", "seed": 0, "storage": storage, "splits": splits, "annotations": config.annotations}
     names = [f.name for f in dataclasses.fields(config) if f.name not in static]
     return dataclasses.replace(config, **static, **{n: _converted(getattr(config, n), convert) for n in names})
+
+
+def _converted_layout(layout: Layout | None, convert: Number) -> Any:
+    """A layout with its lengths converted, also those that are whole numbers."""
+    if layout is None:
+        return None
+    bounds = tuple(convert(float(x)) for x in layout.bounds)
+    return dataclasses.replace(layout, bounds=bounds, reach=convert(float(layout.reach)))
 
 
 def _converted_joint(

@@ -1,7 +1,7 @@
 """Random numbers of several samplers from few calls of jax.random.
 
 Each call is a dozen loops and kernels to compile, whatever its size. A sampler is therefore a generator that yields
-requests, such as `Request(uniform, key, shape, (low, high))`, and is sent their results. `answer_together`
+requests, such as `RandomRequest(uniform, key, shape, (low, high))`, and is sent their results. `answer_together`
 runs many such generators, and answers requests of one kind by a single call, with the bits of separate calls.
 """
 
@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from gen2d.records.axes import Array
 
 
-class Request(NamedTuple):
+class RandomRequest(NamedTuple):
     """Samples of one of the functions below."""
 
     function: Callable[..., Array]  # called with the key, the shape and the parameters
@@ -24,7 +24,7 @@ class Request(NamedTuple):
     parameters: tuple[Any, ...] = ()  # broadcast to the shape
 
 
-Draws = Generator[Request, Array, Array]  # yields requests, and returns its samples
+Draws = Generator[RandomRequest, Array, Array]  # yields requests, and returns its samples
 
 
 def answer_together(draws: Sequence[Draws]) -> list[Array]:
@@ -32,7 +32,7 @@ def answer_together(draws: Sequence[Draws]) -> list[Array]:
     results: dict[int, Array] = {}
     answers: dict[int, Any] = dict.fromkeys(range(len(draws)))  # of the generators that are not finished
     while answers:
-        requests: dict[int, Request] = {}
+        requests: dict[int, RandomRequest] = {}
         for number, answer in answers.items():
             try:
                 requests[number] = draws[number].send(answer)
@@ -42,7 +42,7 @@ def answer_together(draws: Sequence[Draws]) -> list[Array]:
     return [results[number] for number in range(len(draws))]
 
 
-def answer_requests(requests: Sequence[Request]) -> list[Array]:
+def answer_requests(requests: Sequence[RandomRequest]) -> list[Array]:
     """The result of each request; those of one function are computed at once."""
     answers: dict[int, Array] = {}
     for function in dict.fromkeys(request.function for request in requests):
@@ -51,7 +51,7 @@ def answer_requests(requests: Sequence[Request]) -> list[Array]:
     return [answers[number] for number in range(len(requests))]
 
 
-def _call(function: Callable[..., Array], requests: Sequence[Request]) -> list[Array]:
+def _call(function: Callable[..., Array], requests: Sequence[RandomRequest]) -> list[Array]:
     """Results of requests of one function, from one call for the largest of them.
 
     Sample i depends on the key and on i alone, so a smaller request takes the first samples.

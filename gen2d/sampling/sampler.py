@@ -21,7 +21,7 @@ from gen2d.config.distributions import Distribution, draws, stacked, thresholds
 from gen2d.config.joint_distribution import Component, JointDistribution, distinct_parts
 from gen2d.config.options import coordinates, factor_options
 from gen2d.config.plugin_options import Plugin
-from gen2d.config.random_requests import Draws, Request, answer_requests, answer_together, split
+from gen2d.config.random_requests import Draws, RandomRequest, answer_requests, answer_together, split
 from gen2d.core.permutation import hashed
 from gen2d.core.schema import Field
 from gen2d.loading.epochs import order
@@ -117,7 +117,7 @@ class Sampler:
         components, factors = self._components(key, row), {}
         keys = dict(zip(self.options, keys_for(key, [*self.options]), strict=True))
         several = {name: spec.parts for name, spec in self.options.items() if spec.parts}
-        part_keys = answer_requests([Request(split, keys[name], (parts,)) for name, parts in several.items()])
+        part_keys = answer_requests([RandomRequest(split, keys[name], (parts,)) for name, parts in several.items()])
         keys_of = {name: [key] for name, key in keys.items()} | dict(zip(several, part_keys, strict=True))
         coordinate_draws = [
             self._draws(k, coordinate, self.options[name].each, components, row, given)

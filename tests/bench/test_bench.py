@@ -156,6 +156,7 @@ def test_opencv_draws_the_pictures_of_gen2d() -> None:
     assert (ours != peer.BACKGROUND).any()
 
 
+@pytest.mark.full
 def test_every_way_of_drawing_is_timed(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setitem(bench_render.CASES, SMALL.name, SMALL)
     turns = bench.render(tmp_path, SMALL.name, turns=1)

@@ -239,6 +239,7 @@ def test_a_grid_gives_every_combination_once_before_any_twice():
         assert ((0, 0.5) in combinations) == (split == "all")
 
 
+@pytest.mark.full
 def test_draws_of_a_split_do_not_depend_on_the_others():
     near = {"factors": {"radius": [0.3, 0.4]}}
     one, other = (

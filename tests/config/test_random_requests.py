@@ -6,7 +6,7 @@ import numpy as np
 
 from gen2d.config.random_requests import (
     Draws,
-    Request,
+    RandomRequest,
     answer_together,
     integers,
     normal,
@@ -20,13 +20,13 @@ FUNCTIONS = {uniform: (-2.0, 3.0), normal: (), truncated_normal: (-0.5, 2.0), in
 
 def test_answers_have_the_bits_of_separate_calls() -> None:
     requests = [
-        Request(function, jax.random.key(seed), shape, numbers)
+        RandomRequest(function, jax.random.key(seed), shape, numbers)
         for seed, shape in enumerate([(), (7,), (2, 3), (1,)])
         for function, numbers in FUNCTIONS.items()
     ]
-    requests += [Request(split, jax.random.key(20 + n), (n,)) for n in (1, 2, 5)]
+    requests += [RandomRequest(split, jax.random.key(20 + n), (n,)) for n in (1, 2, 5)]
 
-    def one(request: Request) -> Draws:
+    def one(request: RandomRequest) -> Draws:
         return (yield request)
 
     together = answer_together([one(request) for request in requests])
@@ -42,9 +42,9 @@ def test_generators_of_any_length_end() -> None:
     def draws(length: int) -> Draws:
         key, total = jax.random.key(length), jnp.zeros(())
         for _ in range(length):
-            keys = yield Request(split, key, (2,))
+            keys = yield RandomRequest(split, key, (2,))
             key = keys[0]
-            total += yield Request(uniform, keys[1], (), (0.0, 1.0))
+            total += yield RandomRequest(uniform, keys[1], (), (0.0, 1.0))
         return total
 
     together = answer_together([draws(n) for n in (0, 3, 1)])

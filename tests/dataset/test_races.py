@@ -370,6 +370,7 @@ def test_a_fork_while_a_thread_reads(tmp_path: Path) -> None:
     thread.join()
 
 
+@pytest.mark.full
 def test_nothing_is_left_of_a_growth_that_crashed(tmp_path: Path) -> None:
     """After a crash another number of videos is asked for than before, or only `clean` is called."""
     root, base = tmp_path / "data", tmp_path / "base"

@@ -215,6 +215,7 @@ def test_a_signal_stops_it_and_says_how_to_go_on(tmp_path: Path, number: int):
     assert not list((out / "shards").glob("*.tmp*"))
 
 
+@pytest.mark.full
 def test_scenes_that_cannot_be_placed_are_an_error_with_the_options_to_change(tmp_path: Path):
     with pytest.raises(UserError, match="video 0 could not be placed"):
         generate(tiny_config(scene=CROWDED), 4, tmp_path / "data")

@@ -45,6 +45,7 @@ def test_c2_constant_force_and_torque():
     holds("C2 torque, relative", made.spin[:, :, 1:, 0] / (torque * t / (MASS * RADIUS**2 / 2)) - 1, 1e-4)
 
 
+@pytest.mark.full
 def test_c2_damping_is_exponential_whatever_the_step():
     rate, runs = 0.5, {}
     for per_frame in (1, 4, 8):  # steps of 1/60, 1/240, 1/480 s

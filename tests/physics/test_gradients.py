@@ -214,6 +214,7 @@ def test_gradients_are_never_nan():
     assert np.abs(found["velocity"]).max() > 0.1
 
 
+@pytest.mark.full
 def test_gradients_of_degenerate_scenes_are_finite():
     """Coincident centres, a disc on a segment's line, overlapping statics, rest, and nothing there."""
     floor = {**FLOOR, "a": (-5, 0), "b": (5, 0)}

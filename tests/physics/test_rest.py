@@ -164,6 +164,7 @@ def drop_on_joints() -> tuple[np.ndarray, np.ndarray]:
     return made.x[..., 0, :].reshape(shape), made.v[..., 0, :].reshape(shape)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("pieces", PIECES)
 @pytest.mark.parametrize("elasticity", ELASTICITIES)
 def test_c18_disc_dropped_on_a_joint_moves_as_on_one_segment(elasticity, pieces):

@@ -112,6 +112,7 @@ def test_annotations_that_are_not_stored(roots: tuple[Path, Path]) -> None:
 # ---- Other sizes and looks
 
 
+@pytest.mark.full
 def test_another_size_and_look(roots: tuple[Path, Path]) -> None:
     stored, ds = (gen2d.open(root, fields=["frames", "camera/scale"], render=OTHER) for root in roots)
     batch = ds[[3, 9]]

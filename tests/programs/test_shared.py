@@ -57,7 +57,13 @@ def edits(plain: Any, path: str = "") -> Iterator[tuple[str, Any]]:
             yield where, [x + (x == min(value)) for x in value]  # the largest count is a number of slots
 
 
-@pytest.mark.parametrize("name", [name for name in CONFIGS if not name.startswith("phyworld")])
+FIRST = ("bouncing", "collision", "chain", "occluder", "uniform_motion")
+FAMILIES = [name for name in CONFIGS if not name.startswith("phyworld")]
+
+
+@pytest.mark.parametrize(
+    "name", [name if name in FIRST else pytest.param(name, marks=pytest.mark.full) for name in FAMILIES]
+)
 def test_no_edited_number_of_a_shipped_config_needs_another_program(name: str) -> None:
     config = load_config(f"{name}.yaml", [f"storage.batch_size={4}"])
     programs = [bound.program for bound in trace(config).values()]

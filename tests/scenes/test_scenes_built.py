@@ -219,6 +219,7 @@ def test_a_wrecking_ball_hits_a_tower_that_stands():
 # Files --------------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.full
 def test_joints_and_polygons_are_stored_whole(tmp_path):
     options = ["video.frames=3", "video.height=16", "video.width=24", "storage.batch_size=2", "scene.weights=2"]
     overrides = [word for option in options for word in ("--set", option)]

@@ -289,6 +289,7 @@ def test_rack_is_whole_and_its_balls_are_a_gap_apart():
     holds("aim_angle, rad", np.arcsin(sine) - made.factors["aim_angle"], 1e-5)
 
 
+@pytest.mark.full
 def test_break_keeps_momentum_until_a_cushion_is_hit_and_never_gains_energy():
     overrides = ["scene.rows=2", "video.frames=48", "annotations.contacts=8"]
     config = load_config("billiards.yaml", overrides)

@@ -191,6 +191,7 @@ def test_chain():
     assert abs(energy[-1] - energy[0]) < 0.02 * np.ptp(video.energy.potential)
 
 
+@pytest.mark.full
 def test_bridge():
     space = Space(gravity=(0, -GRAVITY))
     ends = [(0, 0), (0.75, -0.25), (1.5, -0.4), (2.25, -0.25), (3, 0)]
@@ -248,6 +249,7 @@ def test_box_on_a_ramp(friction, tmp_path):
     total(video)
 
 
+@pytest.mark.full
 def test_tower():
     space = Space(gravity=(0, -GRAVITY))
     space.add_segment((-3, 0), (3, 0))

@@ -424,7 +424,7 @@ def test_memory_takes_a_dataset_too(toy: Path) -> None:
     assert gen2d.verify("memory://written", "full") == []
 
 
-@pytest.mark.parametrize("kind", ["fail", "cut"])
+@pytest.mark.parametrize("kind", [pytest.param("fail", marks=pytest.mark.full), "cut"])
 def test_uploads_are_tried_again(server: Server, toy: Path, kind: str) -> None:
     server.fault = first_time(kind)
     synthetic.make(at(f"s3://bucket/again-{kind}"))
