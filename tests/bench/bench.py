@@ -432,7 +432,12 @@ def scaling_section(folder: Path, quick: bool) -> Results:
     yield Promise("6 two cores against one", _ratio(two, one), target=1.7, note=note)
 
 
-EDIT = ("video.fps=29", "physics.push_speed=0.9", "look.background=[12, 30, 61]")
+EDIT = (
+    "scene.elasticity=[0.1, 0.4]",
+    "scene.friction=[0.3, 0.6]",
+    "physics.push_speed=0.9",
+    "look.background=[12, 30, 61]",
+)
 
 
 def start_section(folder: Path, quick: bool) -> Results:
