@@ -39,8 +39,8 @@ def run(options: argparse.Namespace) -> int:
     from gen2d.exports.export import export
     from gen2d.loading.dataset import RenderOptions
 
-    asked = {name: getattr(options, name) for name in ("height", "width", "look", "overrides")}
-    render = RenderOptions(**{name: value for name, value in asked.items() if value})  # pyright: ignore
+    keys = "height", "width", "look", "overrides"
+    render = RenderOptions(**{key: value for key in keys if (value := getattr(options, key))})  # pyright: ignore
     exported = export(
         options.dataset,
         options.to,

@@ -34,13 +34,13 @@ def warm_up(
     name = f"{len(rollout.devices)} {rollout.devices[0].platform} device{'s' if len(rollout.devices) > 1 else ''}"
     began = time.perf_counter()
     request = next(source.requests(ranges[:1]))
-    with waiting(f"Compiling for {name} (seconds; up to a minute for dozens of objects; kept for later runs)", log):
-        rollout.compile()
-    with waiting("Simulating the first batch", log):
-        try:
+    try:
+        with waiting(f"Compiling for {name} (seconds; up to a minute for dozens of objects; kept for later runs)", log):
+            rollout.compile()
+        with waiting("Simulating the first batch", log):
             batches = jax.block_until_ready(rollout.start(request.split, request.numbers))
-        except jax.errors.JaxRuntimeError as error:
-            raise _device_error(error) from None
+    except jax.errors.JaxRuntimeError as error:
+        raise _device_error(error) from None
     with waiting("Rendering its first videos", log):
         _fit_slice(rollout, batches)
     source.keep(request, batches)

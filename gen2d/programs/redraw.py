@@ -25,11 +25,11 @@ from gen2d.core.progress import waiting
 from gen2d.loading.dataset import Dataset
 from gen2d.loading.protocols import Numbers
 from gen2d.physics.params import solver_params
-from gen2d.physics.simulate import simulate, substeps
+from gen2d.physics.simulate import simulate
 from gen2d.programs import render as render_module
 from gen2d.programs.environment import compiler_options
 from gen2d.programs.recipe import Trust, config_of
-from gen2d.programs.simulation import save_at
+from gen2d.programs.simulation import save_at, steps_of
 from gen2d.programs.source import VideoSource
 from gen2d.records import axes
 from gen2d.records import keys as keys_module
@@ -394,7 +394,7 @@ def _simulate_columns(
     config, layout = settings.config, settings.layout
     scene = scene_of(columns)
     first = jax.tree.map(lambda a: a[:, 0], from_columns(State, columns))
-    steps = substeps(config.video.fps, config.physics.substeps, config.physics.max_step)
+    steps = steps_of(config)
     rules = solver_params(config.physics, config.video.fps, steps)
     saved = dataclasses.replace(save_at(config, layout), between=False)
     start = axes.to_device(scene), axes.to_device(first)

@@ -19,7 +19,6 @@ import numpy as np
 from gen2d import annotations
 from gen2d.config.config import Config
 from gen2d.core.errors import ConfigError, UserError
-from gen2d.core.schema import Field
 from gen2d.dataset.folder import describe_differences
 from gen2d.dataset.manifest import Manifest
 from gen2d.loading.column import Column
@@ -37,14 +36,14 @@ from gen2d.programs.redraw import (
     render_frames,
     seed_words_of,
 )
-from gen2d.programs.rollout import Rollout
+from gen2d.programs.rollout import Rollout, power_of_two
+from gen2d.programs.schema import FRAMES
 from gen2d.records import axes
 from gen2d.records.axes import Array
 from gen2d.records.scene import Joints, Objects, Scene, State
 from gen2d.renderers.plan import RenderScene
 from gen2d.storage.paths import Place
 
-FRAMES = Field("uint8", "n T H W 3", "sRGB", "frames of the video")  # equal to the field of stored frames
 SLICE_BYTES = 2**22  # of frames rendered at once; a slice that is not full costs as much as a full one
 # Fields of a scene and its states, without the camera's.
 RECORDS = {name for record in (Scene, Objects, Joints, State) for name in axes.stored_fields(record)}
@@ -115,8 +114,7 @@ class RenderedDataset(Dataset):
         self._columns = [columns[name] for name in names]
         self.fields = {name: columns[name].field for name in names}
         video_bytes = sum(column.size for column in self._rendered_columns)
-        fitting = SLICE_BYTES // video_bytes if rendered else 1
-        self.slice_size = 1 << max(0, fitting.bit_length() - 1)
+        self.slice_size = power_of_two(SLICE_BYTES // video_bytes) if rendered else 1
 
     def __reduce__(self) -> tuple[Any, ...]:
         return RenderedDataset, (self.root, self.manifest, self.options, self.render)

@@ -48,7 +48,8 @@ SHARD_VIDEOS = 1024  # largest default number of videos in a shard
 BATCH_SIZE, PAIRS = 512, 2**20
 
 
-def _power_of_two(limit: int) -> int:
+def power_of_two(limit: int) -> int:
+    """Largest power of two that does not exceed the limit; 1 for a smaller limit."""
     return 1 << max(0, limit.bit_length() - 1)
 
 
@@ -85,11 +86,11 @@ class Rollout:
         self.save_at = save_at(config, self.layout)
         self.schema = VideoSchema(config, self.layout, self.plan, self.save_at, self.sampler)
         frame_bytes = video.frames * video.height * video.width * 3
-        default_shard = min(SHARD_VIDEOS, _power_of_two(SHARD_BYTES // frame_bytes))
+        default_shard = min(SHARD_VIDEOS, power_of_two(SHARD_BYTES // frame_bytes))
         self.videos_per_shard = config.storage.videos_per_shard or default_shard
         moving = sum(run.count for run in self.layout.groups if run.kind == enums.DYNAMIC)
         pairs = moving * (self.layout.slots - moving) + moving * (moving - 1) // 2
-        default_batch = min(BATCH_SIZE, _power_of_two(PAIRS // max(pairs, 1)))
+        default_batch = min(BATCH_SIZE, power_of_two(PAIRS // max(pairs, 1)))
         # A shard size in the config must not change the videos.
         self.batch_size = config.storage.batch_size or min(default_batch, default_shard)
         self.slice = divisor(self.batch_size, max(1, SLICE_BYTES // frame_bytes))
@@ -116,8 +117,7 @@ class Rollout:
         root, row = keys_module.seed_words(self.config.seed, zlib.crc32(split.encode())), self.config.split_index(split)
         grid = self.sampler.grid_values(row, root, numbers)
         attempts = np.zeros_like(numbers) if attempts is None else attempts.astype(np.uint32)
-        args = root, np.int32(row), grid, numbers, attempts
-        return lane.start(self._simulate_on, *args)
+        return lane.start(self._simulate_on, root, np.int32(row), grid, numbers, attempts)
 
     def _simulate_on(self, device: Device, *args: Any) -> DeviceBatch:
         """A batch, from programs that are started one after the other."""

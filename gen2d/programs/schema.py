@@ -21,6 +21,7 @@ from gen2d.renderers.plan import FramePlan
 from gen2d.sampling import rejection, sampler
 from gen2d.sampling.matched import sets
 
+FRAMES = Field("uint8", "n T H W 3", "sRGB", "frames of the video")
 CAMERA = (
     ("center", "n T 2", "m", "world point at the centre of the frame"),
     ("scale", "n T", "px/m", "pixels per metre"),
@@ -62,7 +63,7 @@ class VideoSchema:
         for name in sets.omitted_fields(config.matched):
             del fields[name]
         if self.plan.frames:
-            fields["frames"] = Field("uint8", "n T H W 3", "sRGB", "frames of the video")
+            fields["frames"] = FRAMES
         fields |= self.host_fields
         if config.annotations.simulated.lyapunov:
             fields |= lyapunov.FIELDS

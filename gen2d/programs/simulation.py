@@ -99,12 +99,7 @@ class Simulation:
 
     def __call__(self, keys: Array, scene: Scene, state: State) -> SimulatedBatch:
         """Trajectories from these initial states [n, ...]."""
-        trajectory, exponents = self.trajectory(scene, state), None
-        if self.config.annotations.simulated.lyapunov:
-            video, rerun = self.config.video, functools.partial(self._device_trajectory, keep=SaveAt())
-            start, seconds = (axes.to_device(scene), axes.to_device(state)), (video.frames - 1) / video.fps
-            exponents = lyapunov.lyapunov_exponent(wrapped(keys), *start, rerun, seconds)
-        return SimulatedBatch(trajectory, exponents)
+        return SimulatedBatch(self.trajectory(scene, state), self.exponents(keys, scene, state))
 
     def trajectory(self, scene: Scene, state: State) -> Trajectory:
         """Trajectories with the videos first."""
@@ -114,6 +109,14 @@ class Simulation:
             between = jax.tree.map(lambda x: jnp.moveaxis(jnp.moveaxis(x, -1, 0), -1, 3), between)
         stored = axes.to_stored(dataclasses.replace(trajectory, between=None))
         return dataclasses.replace(stored, between=between)
+
+    def exponents(self, keys: Array, scene: Scene, state: State) -> Array | None:
+        """Lyapunov exponents [n] of the videos, in 1/s; None if the config does not enable them."""
+        if not self.config.annotations.simulated.lyapunov:
+            return None
+        video, rerun = self.config.video, functools.partial(self._device_trajectory, keep=SaveAt())
+        start, seconds = (axes.to_device(scene), axes.to_device(state)), (video.frames - 1) / video.fps
+        return lyapunov.lyapunov_exponent(wrapped(keys), *start, rerun, seconds)
 
     def _device_trajectory(self, scene: Scene, state: State, keep: SaveAt) -> Trajectory:
         """Trajectories from these initial states, in the device's layout."""
@@ -141,8 +144,8 @@ class Members:
             keys, numbers, self.config, self.layout, member, self.simulation.trajectory
         )
         batch = self.sampling.batch(keys, factors, sampled)
-        simulated = self.simulation(batch.keys, batch.scene, batch.state)._replace(trajectory=trajectory)
-        return batch._replace(columns=batch.columns | record), simulated
+        exponents = self.simulation.exponents(batch.keys, batch.scene, batch.state)
+        return batch._replace(columns=batch.columns | record), SimulatedBatch(trajectory, exponents)
 
 
 class Staging:

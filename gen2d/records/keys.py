@@ -28,17 +28,17 @@ def seed_words(seed: int, split: int) -> np.ndarray:
 
 def video_keys(words: Array, numbers: Array) -> Array:
     """One key per video, `fold_in(fold_in(key(seed), split), i)`, from `words = seed_words(seed, split)`."""
-    root = jax.random.fold_in(jax.random.wrap_key_data(words[:2], impl="threefry2x32"), words[2])
+    root = jax.random.fold_in(wrapped(words[:2]), words[2])
     return jax.vmap(lambda i: jax.random.fold_in(root, i))(numbers)
 
 
 def unwrapped(keys: Array) -> Array:
-    """Words uint32 [n, 2] of keys [n], as programs pass them to each other."""
+    """Words uint32 [..., 2] of keys [...], as programs pass them to each other."""
     return jax.random.key_data(keys)
 
 
 def wrapped(words: Array) -> Array:
-    """Keys [n] of these words."""
+    """Keys [...] of these words [..., 2]."""
     return jax.random.wrap_key_data(words, impl="threefry2x32")
 
 

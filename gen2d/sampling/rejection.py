@@ -16,7 +16,7 @@ from gen2d.config.quality import ranges
 from gen2d.core.errors import UserError
 from gen2d.core.schema import Field
 from gen2d.records.axes import Array
-from gen2d.records.keys import key_for
+from gen2d.records.keys import key_for, unwrapped, wrapped
 
 FIELD = Field("int32", "n", "1", "number of rejected attempts, which lay outside the ranges of the section quality")
 
@@ -29,9 +29,8 @@ def attempt_keys(keys: Array, attempts: Array) -> Array:
     """Keys of these attempts [n] at videos with these keys [n]; attempt 0 has the video's own key."""
 
     def key_of(key: Array, attempt: Array) -> Array:
-        data = jax.random.key_data
         other = jax.random.fold_in(key_for(key, "attempt"), attempt)
-        return jax.random.wrap_key_data(jnp.where(attempt == 0, data(key), data(other)), impl="threefry2x32")
+        return wrapped(jnp.where(attempt == 0, unwrapped(key), unwrapped(other)))
 
     return jax.vmap(key_of)(keys, attempts)
 
