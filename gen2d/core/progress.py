@@ -1,6 +1,7 @@
 """Progress display of long tasks, and interruption by signals.
 
-Lines go to a caller's `log` or, by default, to the logger "gen2d" at level INFO, which the command line shows.
+Lines go to a caller's `log` or, by default, to the logger "gen2d" at level INFO. The command line shows them, and so do
+a terminal and a notebook in which no handler of logging is set.
 """
 
 import logging
@@ -22,6 +23,19 @@ Log = Callable[[str], None]
 def to_stderr(line: str) -> None:
     """Print a line to standard error and flush."""
     print(line, file=sys.stderr, flush=True)
+
+
+def is_interactive() -> bool:
+    """Whether a person reads standard error now: on a terminal, or in a notebook."""
+    shell = getattr(sys.modules.get("IPython"), "get_ipython", lambda: None)()
+    return sys.stderr.isatty() or hasattr(shell, "kernel")
+
+
+def inform(line: str) -> None:
+    """Log a line at level INFO; print it for a person who has set no handler of logging."""
+    LOGGER.info(line)
+    if not LOGGER.hasHandlers() and is_interactive():
+        to_stderr(line)
 
 
 @contextmanager
@@ -48,7 +62,7 @@ def waiting(what: str, log: Log | None = None, status: Callable[[float], str] | 
     `status(seconds)` describes the progress after these seconds; by default it is the time elapsed. Also a decorator of
     functions.
     """
-    write, start, done = log or LOGGER.info, time.perf_counter(), threading.Event()
+    write, start, done = log or inform, time.perf_counter(), threading.Event()
 
     def speak() -> None:
         if done.wait(PATIENCE):
@@ -69,11 +83,11 @@ def waiting(what: str, log: Log | None = None, status: Callable[[float], str] | 
 
 @contextmanager
 def progress(what: str, count: int, log: Log | None = None, unit: str = "videos") -> Iterator[Callable[[int], None]]:
-    """Progress bar on a terminal; elsewhere `what` after two seconds, and then one line every ten seconds.
+    """Progress bar for a person; elsewhere `what` after two seconds, and then one line every ten seconds.
 
     Yields a function that advances the progress by a number of units.
     """
-    if sys.stderr.isatty():
+    if is_interactive():
         from tqdm import tqdm
 
         with tqdm(desc=what, total=count, unit=f" {unit}", smoothing=0.1, dynamic_ncols=True) as bar:

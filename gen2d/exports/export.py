@@ -10,7 +10,7 @@ from typing import Any
 from gen2d.config import plugins
 from gen2d.config.contracts import Export
 from gen2d.core.errors import ConfigError, FolderError
-from gen2d.core.progress import LOGGER, progress, stopping_on_sigterm
+from gen2d.core.progress import inform, progress, stopping_on_sigterm
 from gen2d.exports.source import Source, source_of
 from gen2d.loading.dataset import RenderOptions
 from gen2d.storage.atomic import publishing, publishing_folder, sweep_beside
@@ -111,7 +111,7 @@ def export(
     description = _export_description(source, name)
     format_.check(source)
     _check_out(out, format_, description, overwrite)
-    log = log or LOGGER.info
+    log = log or inform
     with _translate_errors(out), stopping_on_sigterm(log), progress("Exporting", len(source), log) as advance:
         size = _write_output(out, format_, dataclasses.replace(source, advance=advance), description)
     return Exported(out, len(source), size, time.perf_counter() - start, format_.loss)

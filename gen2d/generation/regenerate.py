@@ -12,7 +12,7 @@ import numpy as np
 
 from gen2d.config.config import Config
 from gen2d.core.errors import DamagedError, FolderError
-from gen2d.core.progress import LOGGER, waiting
+from gen2d.core.progress import inform, waiting
 from gen2d.dataset import folder, hdf5
 from gen2d.dataset.hdf5_check import faults
 from gen2d.dataset.manifest import Manifest, identity_of, read_manifest
@@ -182,7 +182,7 @@ def repair(
     with folder.translate_errors(root), _staging(root) as stage:
         if todo:
             check_fingerprint(root, source, identity)
-            staged = _regenerate_shards(source, spec, stage, todo, records, manifest, log or LOGGER.info)
+            staged = _regenerate_shards(source, spec, stage, todo, records, manifest, log or inform)
         try:
             with folder.folder_lock(root):
                 check_current(root, manifest)

@@ -11,7 +11,7 @@ from typing import Any
 from gen2d.config.config import Config, checked_seed, load_config, user_plugin_files
 from gen2d.config.trust import remember
 from gen2d.core.errors import ConfigError
-from gen2d.core.progress import LOGGER, progress, stopping_on_sigterm, waiting
+from gen2d.core.progress import inform, progress, stopping_on_sigterm, waiting
 from gen2d.dataset import folder as shards
 from gen2d.dataset.spec import SPLIT, DatasetSpec, Shard, shards_of_worker
 from gen2d.generation.complete import complete
@@ -92,7 +92,8 @@ def generate(
     overwrite : bool
         Whether to delete a dataset in the folder first; only with a single worker.
     log : callable, optional
-        Receives lines of progress for a person; by default, the logger "gen2d" does, at level INFO.
+        Receives lines of progress; by default, the logger "gen2d" does, at level INFO, and a terminal or notebook where
+        no handler of logging is set.
     timeout, deadline : float
         Limits in s of a server's silence and of a whole request, as in `open`.
 
@@ -120,7 +121,7 @@ def generate(
     >>> summary = gen2d.generate("bouncing.yaml", 10_000, "datasets/bouncing", overrides=["video.height=128"])
     >>> print(summary.videos_per_second, "videos/s")
     """
-    log = log or LOGGER.info
+    log = log or inform
     config = load_config(config, overrides)
     if seed is not None:
         config = dataclasses.replace(config, seed=checked_seed(seed))

@@ -82,6 +82,12 @@ def prepare(device: str = "auto") -> list[Device]:
         raise DeviceError(f"--device is {device!r}, but jax finds none{hint} ({error})") from None
 
 
+def default() -> Device:
+    """Device on which jax computes where no other is named."""
+    device = jax.config.values["jax_default_device"]
+    return jax.devices(device)[0] if device is None or isinstance(device, str) else device
+
+
 def default_cache() -> pathlib.Path:
     """Folder of compiled programs, where the user names none."""
     return (

@@ -17,7 +17,7 @@ import pickle
 import stat
 import sys
 import threading
-from collections.abc import Callable, Hashable, Iterator
+from collections.abc import Callable, Iterator
 from importlib import import_module
 from typing import Any
 
@@ -128,7 +128,7 @@ def _wrapped(module: str, name: str) -> Any:
 # ---- On disk
 
 
-def find_traces(key: Hashable, device: Device, own_code: bool) -> Iterator[Trace]:
+def find_traces(key: str, device: Device, own_code: bool) -> Iterator[Trace]:
     """Traces of programs with this key for this kind of device; damaged and foreign ones are left out.
 
     `own_code` says whether a user's file can reach the program.
@@ -141,7 +141,7 @@ def find_traces(key: Hashable, device: Device, own_code: bool) -> Iterator[Trace
                 yield Trace(*pickle.loads(content))
 
 
-def store_trace(key: Hashable, device: Device, own_code: bool, trace: Trace) -> None:
+def store_trace(key: str, device: Device, own_code: bool, trace: Trace) -> None:
     """Keep a trace on disk, if there is a folder for it and its operations have names."""
     folder, buffer = _trace_folder(key, device, own_code), io.BytesIO()
     if folder is not None:
@@ -166,9 +166,9 @@ def store_executable(digest: str, device: Device, executable: bytes) -> None:
         _write(path, executable)
 
 
-def _trace_folder(key: Hashable, device: Device, own_code: bool) -> pathlib.Path | None:
+def _trace_folder(key: str, device: Device, own_code: bool) -> pathlib.Path | None:
     root, own_sources = _root(), environment.local_sources() if own_code else {}
-    reach = [repr(key), environment.of_compiler(device), environment.of_trace(), own_sources]
+    reach = [key, environment.of_compiler(device), environment.of_trace(), own_sources]
     return None if root is None else root / "traces" / sha256(as_json(reach))[:32]
 
 
@@ -178,9 +178,9 @@ def _executable_path(digest: str, device: Device) -> pathlib.Path | None:
 
 
 def _root() -> pathlib.Path | None:
-    """Folder of all programs; None if compiled programs are not kept."""
-    cache = jax.config.values["jax_compilation_cache_dir"]
-    return pathlib.Path(cache) / "programs" if cache and "://" not in cache else None
+    """Folder of all programs; None if jax keeps its own at a URL."""
+    cache = str(jax.config.values["jax_compilation_cache_dir"] or default_cache())
+    return None if "://" in cache else pathlib.Path(cache) / "programs"
 
 
 def _write(path: pathlib.Path, content: bytes) -> None:

@@ -27,8 +27,8 @@ from gen2d.loading.protocols import Numbers
 from gen2d.physics.params import solver_params
 from gen2d.physics.simulate import simulate
 from gen2d.programs import render as render_module
-from gen2d.programs.environment import compiler_options
 from gen2d.programs.recipe import Trust, config_of
+from gen2d.programs.shared import cached_jit
 from gen2d.programs.simulation import save_at, steps_of
 from gen2d.programs.source import VideoSource
 from gen2d.records import axes
@@ -349,6 +349,12 @@ class RenderSettings:
         return render_module.plan_of(self.config, self.layout)
 
     @property
+    def texts(self) -> tuple[str, ...]:
+        """Everything that the settings hold, as text."""
+        copies = {**self.base.copies, **self.config.copies}
+        return self.base.recipe_text(), self.config.recipe_text(), repr(sorted(copies.items()))
+
+    @property
     def zoom(self) -> float:
         """Scale of the requested frames, relative to those of the dataset: everything stays in view."""
         old, new = self.base.video, self.config.video
@@ -404,11 +410,15 @@ def _simulate_columns(
     return axes.columns(trajectory) | render_module.camera_columns(view)
 
 
-@functools.lru_cache(maxsize=16)  # a program takes up to thousands of memory maps, of which a process has some 60,000
+@functools.lru_cache(maxsize=16)
 def _compile(program: Callable, settings: RenderSettings, *more: float) -> Callable:
-    """One of the functions above, compiled for these settings."""
-    options = compiler_options(jax.devices()[0])  # as in a run, so that they round alike
-    return jax.jit(lambda *arrays: program(*arrays, settings, *more), compiler_options=options)
+    """One of the functions above, compiled for these settings with the options of a run, so that they round alike."""
+
+    def run(*arrays: Any) -> Any:
+        return program(*arrays, settings, *more)
+
+    key = program.__name__, *settings.texts, more
+    return cached_jit(run, key, own_code=bool(settings.config.copies))
 
 
 def regenerate(ds: Dataset, config: Config, numbers: np.ndarray) -> dict[str, Array]:

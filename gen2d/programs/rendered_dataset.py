@@ -25,7 +25,7 @@ from gen2d.loading.column import Column
 from gen2d.loading.dataset import Dataset, RenderOptions, ViewOptions, select_fields
 from gen2d.loading.protocols import Batch, Numbers
 from gen2d.programs import devices
-from gen2d.programs.environment import compiler_options, sources
+from gen2d.programs.environment import sources
 from gen2d.programs.fingerprint import fingerprint, machine
 from gen2d.programs.recipe import Trust, config_from
 from gen2d.programs.redraw import (
@@ -38,6 +38,7 @@ from gen2d.programs.redraw import (
 )
 from gen2d.programs.rollout import Rollout, power_of_two
 from gen2d.programs.schema import FRAMES
+from gen2d.programs.shared import cached_jit
 from gen2d.records import axes
 from gen2d.records.axes import Array
 from gen2d.records.scene import Joints, Objects, Scene, State
@@ -206,7 +207,7 @@ Shapes = tuple[tuple[str, tuple[int, ...], str], ...]  # name, shape and dtype o
 
 @functools.lru_cache(maxsize=8)  # splits, and loaders that are opened again, share programs
 def _compile(settings: RenderSettings, shapes: Shapes) -> tuple[tuple[str, ...], Any, Any]:
-    """Stored fields that frames depend on, and the compiled programs: fields to render scenes, and these to frames."""
+    """Stored fields that frames depend on, and the programs: from these fields to render scenes, and on to frames."""
     columns = {name: jax.ShapeDtypeStruct(shape, dtype) for name, shape, dtype in shapes}
     words, numbers = (jax.ShapeDtypeStruct(shape, np.uint32) for shape in ((3,), shapes[0][1][:1]))
     jaxpr = jax.make_jaxpr(functools.partial(build_render_scenes, settings=settings))(columns, words, numbers).jaxpr
@@ -217,11 +218,11 @@ def _compile(settings: RenderSettings, shapes: Shapes) -> tuple[tuple[str, ...],
     def build(columns: dict[str, Array], words: Array, numbers: Array) -> RenderScene:
         return build_render_scenes(columns | unused, words, numbers, settings)
 
-    building = jax.jit(build).lower({name: columns[name] for name in fields}, words, numbers)
-    scenes = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), building.out_info)
-    drawing = jax.jit(functools.partial(render_frames, settings=settings)).lower(scenes)
-    options = compiler_options(jax.devices()[0])
-    return fields, building.compile(options), drawing.compile(options)
+    def draw(render_scenes: RenderScene) -> dict[str, Array]:
+        return render_frames(render_scenes, settings)
+
+    key, own_code = (*settings.texts, shapes), bool(settings.config.copies)
+    return fields, cached_jit(build, key, own_code), cached_jit(draw, key, own_code)
 
 
 def _configs(ds: Dataset, names: Collection[str], render: RenderOptions | None) -> tuple[Config, Config]:

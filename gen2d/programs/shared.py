@@ -6,7 +6,7 @@ no other program. Compiled programs are kept in memory and on disk (programs/exe
 
 import re
 import threading
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -15,7 +15,7 @@ from jax.sharding import SingleDeviceSharding
 
 from gen2d.config.config import Config
 from gen2d.config.parameters import parametrized, split_numbers
-from gen2d.programs import executables
+from gen2d.programs import devices, executables
 from gen2d.programs.devices import Device
 from gen2d.programs.executables import Trace
 from gen2d.records.layout import Layout
@@ -86,7 +86,7 @@ class BoundProgram(NamedTuple):
         return sha256(as_json([self.program.trace.digest, self.numbers[: self.program.trace.tape.size].tolist()]))
 
 
-_programs: list[tuple[Hashable, Program]] = []  # with their keys, the last used at the end
+_programs: list[tuple[str, Program]] = []  # with their keys, the last used at the end
 _lock = threading.Lock()
 
 
@@ -111,23 +111,76 @@ def program_for(
         Any device of the kind that the program shall run on.
     """
     structure, leaves = split_numbers(config, layout)
+
+    def function(tape: Tape) -> Callable[..., Any]:
+        return build(*parametrized(config, tape, layout))
+
+    own_code = bool(config.copies)
+    return _bound(_Request(build.__qualname__, (key, structure), leaves, function, args, device, own_code))
+
+
+def cached_jit(function: Callable[..., Any], key: Hashable | None, own_code: bool = False) -> Callable[..., Any]:
+    """A function whose compiled programs are kept in memory and on disk, as those of configs are.
+
+    Parameters
+    ----------
+    function : callable
+        A function of trees of arrays. Where it is differentiated or traced, it is only jitted.
+    key : hashable or None
+        Everything that determines its programs, besides gen2d's sources and the shapes and types of its arguments.
+        Equal keys have the same `repr`. None where nobody can say; the function is then only jitted.
+    own_code : bool
+        Whether a user's file can reach the function.
+    """
+    device, name = devices.default(), f"{function.__module__}.{function.__qualname__}"
+    jitted = jax.jit(function)
+    programs: dict[Hashable, BoundProgram] = {}  # by structure, shapes and types of the arguments
+
+    def call(*args: Any) -> Any:
+        leaves, tree = jax.tree.flatten(args)
+        if key is None or any(isinstance(leaf, jax.core.Tracer) for leaf in leaves):
+            return jitted(*args)
+        leaves = jax.device_put(leaves, device)
+        args = tree.unflatten(leaves)
+        like = tree, *((leaf.shape, leaf.dtype) for leaf in leaves)
+        if like not in programs:
+            programs[like] = _bound(_Request(name, key, [], lambda tape: function, args, device, own_code))
+        return programs[like](device, *args)
+
+    return call
+
+
+class _Request(NamedTuple):
+    """What a program is wanted for."""
+
+    name: str
+    key: Hashable
+    leaves: Sequence[Any]  # numbers of the config
+    function: Callable[[Tape], Callable[..., Any]]  # to be traced
+    args: tuple
+    device: Device
+    own_code: bool
+
+
+def _bound(request: _Request) -> BoundProgram:
+    """The program that serves a request: one that is in memory or on disk, else a new one."""
+    name, key, leaves, _, args, device, own_code = request
     shapes = [(np.shape(x), str(x.dtype)) for x in jax.tree.leaves(args)]
     # Addresses of functions differ between processes; their sources are part of the key on disk.
-    structure = re.sub(r" at 0x[0-9a-f]+", "", structure)
-    key = build.__qualname__, key, structure, str(jax.tree.structure(args)), str(shapes), device.device_kind
-    disk = key, device, bool(config.copies)
+    text = re.sub(r" at 0x[0-9a-f]+", "", repr((name, key, str(jax.tree.structure(args)), shapes, device.device_kind)))
     with _lock:
         for entry in _programs:
-            numbers = entry[1].trace.tape.arguments(leaves) if entry[0] == key else None
+            numbers = entry[1].trace.tape.arguments(leaves) if entry[0] == text else None
             if numbers is not None:
                 _programs.remove(entry)
                 break
         else:
+            disk = text, device, own_code
             program = _stored(disk, leaves)
             if program is None:
-                program = _traced(config, layout, build, args, device)
+                program = _traced(request)
                 executables.store_trace(*disk, program.trace)
-            entry = key, program
+            entry = text, program
             numbers = program.trace.tape.arguments(leaves)
             assert numbers is not None, "a program serves the config that it is traced for"
         _programs.append(entry)
@@ -143,7 +196,7 @@ def clear() -> None:
             _programs.pop()[1].unload()
 
 
-def _stored(disk: tuple[Hashable, Device, bool], leaves: list[Any]) -> Program | None:
+def _stored(disk: tuple[str, Device, bool], leaves: Sequence[Any]) -> Program | None:
     """The program on disk that serves these numbers; None if there is none."""
     device = disk[1]
     for trace in executables.find_traces(*disk):
@@ -164,9 +217,9 @@ def _loadable(trace: Trace, device: Device) -> Program | None:
         return None
 
 
-def _traced(config: Config, layout: Layout, build: Build, args: tuple, device: Device) -> Program:
-    tape, tree, one = Tape(), jax.tree.structure(args), SingleDeviceSharding(device)
-    function = build(*parametrized(config, tape, layout))
+def _traced(request: _Request) -> Program:
+    device, tape, one = request.device, Tape(), SingleDeviceSharding(request.device)
+    function, (leaves, tree) = request.function(tape), jax.tree.flatten(request.args)
     results: Any = None
 
     def run(numbers: jax.Array, *leaves: Any) -> list[jax.Array]:
@@ -175,9 +228,9 @@ def _traced(config: Config, layout: Layout, build: Build, args: tuple, device: D
             results = function(*tree.unflatten(leaves))
         return jax.tree.leaves(results)
 
-    run.__name__ = build.__name__
+    run.__name__ = request.name.rpartition(".")[2]
     numbers = jax.ShapeDtypeStruct((SIZE,), np.uint32)
-    shapes = [jax.ShapeDtypeStruct(np.shape(x), x.dtype, sharding=one) for x in (numbers, *jax.tree.leaves(args))]
+    shapes = [jax.ShapeDtypeStruct(np.shape(x), x.dtype, sharding=one) for x in (numbers, *leaves)]
     lowered = jax.jit(run).lower(*shapes)
     results = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), results)
     inputs = [f"{x.dtype}{x.shape}" for x in shapes]  # jax leaves those out of the text that are not used

@@ -16,6 +16,7 @@ from gen2d.physics.collision import manifold
 from gen2d.physics.params import SolverParams
 from gen2d.physics.shapes import body_shape_of, to_world
 from gen2d.physics.simulate import Forces, SaveAt, simulate
+from gen2d.programs.shared import cached_jit
 from gen2d.records.axes import to_device, to_stored
 from gen2d.records.layout import Layout, SlotGroup
 from gen2d.records.scene import Objects, Scene, State
@@ -75,14 +76,17 @@ def closest_points(
 def compiled_program(
     layout: Layout, params: SolverParams, frames: int, steps: int, keep: SaveAt, forces: Any
 ) -> Callable:
-    """Compiled simulation of a layout; scenes, states and trajectories have the videos first."""
+    """Compiled simulation of a layout; scenes, states and trajectories have the videos first.
+
+    It is kept on disk, unless it holds forces, which are a function of the user's.
+    """
     hook = None if forces is None else _slot_forces(*forces)
 
     def run(scene: Scene, state: State) -> Any:
         device = to_device(scene), to_device(state)
         return to_stored(simulate(*device, layout, params, frames, steps, keep, hook, on_cpu()))
 
-    return jax.jit(run)
+    return cached_jit(run, None if forces else (layout, params, frames, steps, keep))
 
 
 def _slot_forces(forces: Callable, slots: tuple[int, ...]) -> Forces:

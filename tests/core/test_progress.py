@@ -5,6 +5,7 @@ import os
 import subprocess
 import sys
 import time
+import types
 
 import pytest
 
@@ -67,6 +68,26 @@ def test_a_library_logs_and_the_command_line_prints(
         rest()
     assert capsys.readouterr().err.startswith("Resting ...\n")
     assert logging.getLogger("gen2d").handlers == []
+
+
+@pytest.mark.parametrize("where", ["terminal", "notebook"])
+def test_a_person_without_logging_reads_the_waits(
+    where: str, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if where == "terminal":
+        monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
+    else:
+        shell = types.SimpleNamespace(kernel=None)
+        monkeypatch.setitem(sys.modules, "IPython", types.SimpleNamespace(get_ipython=lambda: shell))
+
+    def waited() -> str:
+        with waiting("Resting"):
+            time.sleep(0.3)
+        return capsys.readouterr().err
+
+    assert waited() == ""  # a handler is set, which has the lines
+    monkeypatch.setattr(logging.getLogger(), "handlers", [])
+    assert waited().startswith("Resting ...\nResting ... 0.")
 
 
 def test_xla_logs_nothing_below_a_crash() -> None:

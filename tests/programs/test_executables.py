@@ -3,17 +3,20 @@
 import os
 import shutil
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
 import pytest
 from tiny import everything, run_on, same, tiny_config
 
+from gen2d import Space
 from gen2d.config.reading import yaml_text
 from gen2d.generation.run import generate
 from gen2d.programs import devices, environment, executables, shared
+from gen2d.space.arrange import compiled_program
 
 CONFIG = tiny_config(video={"frames": 3}, scene={"balls": 1})
 
@@ -141,6 +144,48 @@ generate({config!r}, 24, {out!r}, device="cpu")
 names = [f"jit({{name}})" for name in ("sample", "simulate", "stage", "draw")]
 Path({log!r}).write_text(" ".join(name for name in compiled if name in names))
 """
+
+
+def test_a_cached_function_is_traced_once(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its programs are found on disk by another process; another key, shape or type has a program of its own."""
+    traced = []
+
+    def power(exponent: int, key: object) -> Callable[..., Any]:
+        def function(values: Any, shift: Any) -> dict[str, jax.Array]:
+            traced.append(exponent)
+            return {"power": values["x"] ** exponent + shift}
+
+        return shared.cached_jit(function, key)
+
+    x, one = np.arange(3.0, dtype=np.float32), np.float32(1)
+    for _ in range(2):  # as in two processes
+        square = power(2, "square")
+        np.testing.assert_array_equal(square({"x": x}, one)["power"], x**2 + 1)
+        np.testing.assert_array_equal(square({"x": x + 1}, one)["power"], (x + 1) ** 2 + 1)
+        shared.clear()
+    assert traced == [2]
+    np.testing.assert_array_equal(power(3, "cube")({"x": x}, one)["power"], x**3 + 1)
+    np.testing.assert_array_equal(power(2, "square")({"x": x[:2]}, one)["power"], x[:2] ** 2 + 1)
+    np.testing.assert_array_equal(power(2, "square")({"x": np.arange(3)}, 1)["power"], [1, 2, 5])
+    assert traced == [2, 3, 2, 2]
+    gradient = jax.grad(lambda x: power(3, "cube")({"x": x}, 0.0)["power"].sum())(x)
+    np.testing.assert_allclose(gradient, 3 * x**2)
+    before = len(entry_files(cache))
+    power(5, None)({"x": x}, one)
+    assert len(entry_files(cache)) == before
+
+
+def test_a_space_is_not_traced_again(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fall() -> np.ndarray:
+        space = Space(gravity=(0, -9.8))
+        space.add_circle((0, 3), 0.5)
+        return space.simulate(0.5, fps=10).position
+
+    first = fall()
+    shared.clear()
+    compiled_program.cache_clear()
+    monkeypatch.setattr(shared, "_traced", lambda *_: pytest.fail("a program was traced"))
+    np.testing.assert_array_equal(fall(), first)
 
 
 def test_several_devices_run_one_executable(tmp_path: Path) -> None:
