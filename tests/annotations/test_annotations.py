@@ -63,7 +63,7 @@ class Made:
         self.stages, self.options = stages, config.annotations
 
 
-@pytest.fixture(scope="module", params=CASES, ids=list(CASES))
+@pytest.fixture(scope="module", params=["still", "moving", pytest.param("marked", marks=pytest.mark.full)])
 def made(request):
     return drawn_as(request.param)
 

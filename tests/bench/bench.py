@@ -152,23 +152,38 @@ def _physics(rollout: Any) -> tuple[Callable, Callable, np.ndarray]:
     return jax.jit(sample_batch), jax.jit(simulate_batch), np.arange(rollout.batch_size, dtype=np.uint32)
 
 
-def steady(folder: Path, videos: int = 4096, turns: int = 3, peer_videos: int = 0) -> Turns:
-    """Videos/s of compiled gen2d, from first batch to manifest, and of the peer; shares of cores used and idle."""
+def steady(folder: Path, videos: int = 4096, turns: int = 3, peer_videos: int = 0, lanes: int = 0) -> Turns:
+    """Videos/s of compiled gen2d, from first batch to manifest, and of the peer; shares of cores used and idle.
+
+    `peer_videos` also measures states alone. `lanes` is the number of devices and encoder threads; by default one for
+    each core.
+    """
+    from gen2d.programs import devices
+
+    if lanes:
+        devices.cores = lambda: lanes
     source, used, idle = source_of(), [], []
 
-    def ours() -> float:
+    def rate(source: Any) -> float:
         with tempfile.TemporaryDirectory(dir=folder) as out:
-            before, began = _cpu_seconds(), time.perf_counter()
+            began = time.perf_counter()
             make(source, videos, Path(out))
-            seconds = time.perf_counter() - began
+            return videos / (time.perf_counter() - began)
+
+    def ours() -> float:
+        before, began = _cpu_seconds(), time.perf_counter()
+        result, seconds = rate(source), time.perf_counter() - began
         used_seconds, idle_seconds = (after - b for after, b in zip(_cpu_seconds(), before, strict=True))
         used.append(used_seconds / seconds / len(os.sched_getaffinity(0)))
         idle.append(idle_seconds / seconds / (os.cpu_count() or 1))
-        return videos / seconds
+        return result
 
-    reads = ("body", "batch") if peer_videos else ()
-    works = {f"peer {read}": lambda read=read: peer_command(peer_videos, read)[0] for read in reads}
-    return in_turns({"gen2d": ours} | works, turns) | {"used": used[1:], "idle": idle[1:]}
+    works: dict[str, Callable[[], float]] = {"gen2d": ours}
+    if peer_videos:
+        states_alone = source_of(["storage.frames=none"])
+        works["states"] = lambda: rate(states_alone)
+        works |= {f"peer {read}": lambda read=read: peer_command(peer_videos, read)[0] for read in ("body", "batch")}
+    return in_turns(works, turns) | {"used": used[1:], "idle": idle[1:]}
 
 
 def make(source: Any, videos: int, out: Path) -> None:
@@ -395,6 +410,7 @@ def steady_section(folder: Path, quick: bool) -> Results:
     yield Row(f"end to end, {len(CORES)} cores", middle["gen2d"], middle["peer body"], note=note)
     yield Promise("1 end to end, against the peer", _ratio(turns["gen2d"], turns["peer body"]), target=5)
     yield Promise("  the same, it with pymunk.batch", _ratio(turns["gen2d"], turns["peer batch"]), note=BETA)
+    yield Promise("  states alone, against the peer's frames", _ratio(turns["states"], turns["peer body"]), target=12)
 
 
 def command_section(folder: Path, quick: bool) -> Results:
@@ -408,7 +424,7 @@ def command_section(folder: Path, quick: bool) -> Results:
     ratio = _ratio(theirs[1:], ours[1:])
     seconds = [statistics.median(values[1:]) for values in (ours, theirs)]
     note = f"{seconds[0]:.1f} s; the peer {seconds[1]:.1f} s, scaled from {peer_count} videos"
-    yield Promise(f"2 whole command, {count} videos", ratio, target=3, note=note)
+    yield Promise(f"2 whole command, {count} videos", ratio, target=5, note=note)
 
 
 def memory_section(folder: Path, quick: bool) -> Results:
@@ -429,7 +445,10 @@ def scaling_section(folder: Path, quick: bool) -> Results:
     one, two = ([max(run["gen2d"]) for run in runs[k::2]] for k in (0, 1))
     used = statistics.median(max(run["used"]) for run in runs[1::2])
     note = f"{statistics.median(one):.0f} and {statistics.median(two):.0f} videos/s; of two cores gen2d got {used:.0%}"
-    yield Promise("6 two cores against one", _ratio(two, one), target=1.7, note=note)
+    yield Promise("6 two cores against one", _ratio(two, one), target=1.8, note=note)
+    rates = {lanes: max(measure(steady, folder, videos=2048, turns=2, lanes=lanes)["gen2d"]) for lanes in (2, 3, 4, 8)}
+    for lanes in (3, 4, 8):
+        yield Promise(f"  {lanes} devices on {len(CORES)} cores, against two", rates[lanes] / rates[2], target=0.95)
 
 
 EDIT = (
@@ -438,6 +457,19 @@ EDIT = (
     "physics.push_speed=0.9",
     "look.background=[12, 30, 61]",
 )
+
+
+SPACE = """
+from gen2d import Space
+space = Space(gravity=(0, -9.8))
+space.add_segment((-6, 0), (6, 0), friction=0.8)
+for k in range(4):
+    space.add_box((0, 0.5 + k), width=1, height=1)
+space.add_circle((-4, 1), radius=0.5, velocity=(8, 0), elasticity=0.5)
+weight = space.add_circle((4, 2), radius=0.3)
+space.add_joint("revolute", weight, anchor_a=(2.5, 4))
+space.simulate(seconds=2, fps=30)
+"""
 
 
 def start_section(folder: Path, quick: bool) -> Results:
@@ -455,6 +487,14 @@ def start_section(folder: Path, quick: bool) -> Results:
         yield Promise(f"{name}, cold", runs["cold"].cpu, "CPU s", most, most=True, note=f"{runs['cold'].seconds:.0f} s")
         yield Promise("  after editing numbers", runs["edited"].cpu, "CPU s", 6, most=True)
         yield Promise("  warm", min(warm), "CPU s", 4, most=True, note=f"{runs['warm again'].seconds:.1f} s")
+    small = {
+        "preview bouncing": [sys.executable, "-m", "gen2d", "preview", "bouncing.yaml", "--out", folder / "preview"],
+        "a Space of the README": [sys.executable, "-c", SPACE],
+    }
+    for name, words in small.items():
+        first, again = (run(words, env={"JAX_COMPILATION_CACHE_DIR": str(folder / "small")}) for _ in range(2))
+        yield Promise(f"  {name}, cold", first.cpu, "CPU s", 20, most=True, note=f"{first.seconds:.0f} s")
+        yield Promise(f"  {name}, warm", again.cpu, "CPU s", 4, most=True, note=f"{again.seconds:.1f} s")
 
 
 def physics_section(folder: Path, quick: bool) -> Results:

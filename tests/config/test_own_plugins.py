@@ -45,11 +45,11 @@ def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def config(home: Path) -> dict:
     names = {
-        "scene": {"name": f"{home}/families/mine.py", "balls": 2},
+        "scene": {"name": f"{home}/families/mine.py", "balls": 3},
         "look": {"name": f"{home}/looks/mine.py"},
         "annotations": {f"{home}/annotations/mine.py": 2},
     }
-    return tiny_config(video={"frames": 3}, physics={"substeps": 1}, storage={"videos_per_shard": 4}, **names)
+    return tiny_config(storage={"videos_per_shard": 4}, **names)
 
 
 GONE = {
@@ -120,14 +120,14 @@ def test_a_damaged_copy_is_found_and_comes_back_where_the_original_is_there(
 SEEN = "seen.txt"  # written by the look below when it runs
 
 
-@pytest.fixture(params=["look", "annotation"])
+@pytest.fixture(params=["look", pytest.param("annotation", marks=pytest.mark.full)])
 def foreign(request: pytest.FixtureRequest, home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A dataset whose look or annotation leaves a trace when it runs, for a user who has never generated with it."""
     trace = f"import pathlib\npathlib.Path({str(tmp_path / SEEN)!r}).touch()\n"
     (tmp_path / "mine.py").write_bytes((home / f"{request.param}s" / "mine.py").read_bytes() + trace.encode())
     path = str(tmp_path / "mine.py")
     own = {"look": path} if request.param == "look" else {"annotations": {path: 1}}
-    states = tiny_config(video={"frames": 3}, physics={"substeps": 1}, storage={"frames": "none"})
+    states = tiny_config(storage={"frames": "none"})
     monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "of whoever made it"))
     generate(states | own, 3, tmp_path / "data")
     assert sha256((tmp_path / "mine.py").read_bytes()) in list_path().read_text()

@@ -130,7 +130,7 @@ def repaired(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(regenerate, "generate_shards", make)
 
 
-@pytest.mark.parametrize("damage", DAMAGES)
+@pytest.mark.parametrize("damage", [pytest.param("a shard", marks=pytest.mark.full), *list(DAMAGES)[1:]])
 def test_while_a_dataset_is_repaired(
     grown: dict[int, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, damage: str
 ) -> None:

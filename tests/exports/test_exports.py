@@ -172,7 +172,7 @@ def centre(frame: np.ndarray) -> np.ndarray:
     return np.array([(cover.sum(0) * x).sum(), (cover.sum(1) * y).sum()]) / cover.sum() * 10 / width
 
 
-@pytest.fixture(scope="module", params=[1, 2])
+@pytest.fixture(scope="module", params=[pytest.param(1, marks=pytest.mark.full), 2])
 def balls(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """One ball with its frames stored, or two whose frames are yet to be drawn."""
     colors = {1: [230, 20, 20], 2: [[20, 230], 20, 20]}[request.param]

@@ -261,6 +261,7 @@ def test_impossible_runs_are_refused(tmp_path: Path, n: int, worker: tuple[int, 
         generate(CONFIG, n, tmp_path, worker=worker)
 
 
+@pytest.mark.full
 def test_the_frame_rate_does_not_change_the_motion(tmp_path: Path):
     """Frame t is the state at t / fps: two rates agree where their frames fall together, at steps of one length."""
     slow = tiny_config(

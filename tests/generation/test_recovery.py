@@ -57,7 +57,7 @@ def flip(root: Path, name: str, bit: int) -> None:
     (root / name).write_bytes(content)
 
 
-@pytest.mark.parametrize("share", [pytest.param(0.03, id="some"), pytest.param(1.0, id="every kilobyte", marks=slow)])
+@pytest.mark.parametrize("share", [pytest.param(0.015, id="some"), pytest.param(1.0, id="every kilobyte", marks=slow)])
 def test_a_flipped_bit_is_repaired_to_the_byte(pristine: Path, tmp_path: Path, share: float) -> None:
     root, before, chance = tmp_path / "data", contents(pristine), random.Random(4)
     every = places(pristine)

@@ -169,6 +169,7 @@ def cradle(gap: float, speed: float) -> Case:
     return Case([{"x": (-2 * RADIUS - 1, 0), "v": (speed, 0)}, *row])
 
 
+@pytest.mark.full
 def test_c9_cradle_hands_the_speed_to_the_last():
     speed = 2.0
     made = watch([cradle(0.05, speed), cradle(2 * speed * STEP, speed)], 361, 2, slots=8)
@@ -259,6 +260,7 @@ def test_c14_locked_disc_stands_on_a_slope_up_to_the_angle_of_friction():
     assert (np.diff(downhill(made.v[1, :, ::240, 0])) > 0).all()
 
 
+@pytest.mark.full
 def test_c15_pyramid_of_three_stands_from_2_minus_sqrt_3_on():
     """Friction between the discs; that of the floor is 1."""
 

@@ -240,6 +240,7 @@ def test_gradients_of_degenerate_scenes_are_finite():
     assert not bad, sorted(bad)
 
 
+@pytest.mark.full
 def test_gradients_by_empty_slots_are_zero():
     found = gradients([random_world(seed, discs=3) for seed in range(16)])
     for name, values in found.items():

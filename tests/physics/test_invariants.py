@@ -321,6 +321,7 @@ def test_twice_the_unit_of_length_gives_the_same_bits():
     assert_array_equal(one.states.angular_velocity, other.states.angular_velocity)
 
 
+@pytest.mark.full
 def test_translation_translates():
     far = np.array([64.0, -32.0])
     made = run([pose_world(few_events(shift), QUARTERS[0], 8, 4) for shift in ((0, 0), far)] * 4, 241, 1)

@@ -59,6 +59,7 @@ def test_a_change_has_the_size_one_and_is_of_what_moves() -> None:
     assert len(np.unique(whole.position[0, 0])) == len(VELOCITIES)  # each video has its own
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("name", ["apart", "walls"])
 def test_in_free_flight_and_off_flat_walls_it_grows_as_its_speed_carries_it(name: str) -> None:
     """A mirror keeps every length, so that a bounce changes nothing."""
@@ -68,6 +69,7 @@ def test_in_free_flight_and_off_flat_walls_it_grows_as_its_speed_carries_it(name
     assert_allclose(growths()[name], np.log10(after) / SECONDS, rtol=1e-3, atol=1e-4)
 
 
+@pytest.mark.full
 def test_balls_that_meet_again_and_again_are_harder_to_foretell() -> None:
     found = growths()
     assert found["meet"] > 2 * max(found["apart"], found["walls"])

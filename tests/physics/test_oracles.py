@@ -248,12 +248,14 @@ def rests_as_box2d(
         holds(f"{name}: speed, m/s", speed, fast)
 
 
+@pytest.mark.full
 def test_discs_rest_as_well_as_in_box2d():
     piles = {f"pyramid, e = {e:g}": (pyramid(e), 0.005, 1e-3) for e in (0.0, 0.5)}
     piles |= {f"column of 10, e = {e:g}": (column(e), 0.011, 1e-3) for e in (0.0, 0.5)}
     rests_as_box2d(piles, 22, settle=3, watch=3)
 
 
+@pytest.mark.full
 def test_boxes_rest_as_well_as_in_box2d():
     piles = {"tower of 5": (tower(5), None, 1e-3), "wall of 2 courses": (bricks(2), None, 1e-3)}
     rests_as_box2d(piles, None, settle=3, watch=3)

@@ -64,6 +64,7 @@ def test_zigzag_channel_of_sixteen_rests():
     holds("Rest: zigzag channel of 16, speed, m/s", speed, 1e-3)
 
 
+@pytest.mark.full
 def test_walled_pyramid_of_six_rows_rests():
     rows = 6
     places = [(k - (n - 1) / 2, 0.5 + (rows - n) * np.sqrt(0.75)) for n in range(rows, 0, -1) for k in range(n)]
@@ -99,6 +100,7 @@ def test_full_bin_rests(count, width):
     holds(f"Rest: bin of {count}, way in 10 s, m", way, 1e-3)
 
 
+@pytest.mark.full
 def test_bowl_of_the_article_rests():
     """Demonstration D4: three segments, five discs of 1 m that fall into the bowl."""
     segments = [{"a": (-4, 4), "b": (0, 0)}, {"a": (0, 0), "b": (4, 0)}, {"a": (4, 0), "b": (8, 4)}]

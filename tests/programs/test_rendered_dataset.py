@@ -263,6 +263,7 @@ def test_exports_have_frames(roots: tuple[Path, Path], frames: np.ndarray, to: s
             assert_array_equal(np.load(other)["frames"], frames[number])
 
 
+@pytest.mark.full
 def test_exports_at_another_size(roots: tuple[Path, Path], tmp_path: Path) -> None:
     words = "--to", "npz", "--fields", "frames", "--height", 48, "--width", 64, "--look", "marked"
     done = tiny.run_main("export", roots[1], *words, "--set", "look.background=[0,0,0]", "--out", tmp_path / "out")

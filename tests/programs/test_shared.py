@@ -195,6 +195,7 @@ def test_no_edited_split_of_a_preset_needs_another_program(name: str) -> None:
                 assert [bound.program for bound in trace(config).values()] == programs, (split, factor, numbers)
 
 
+@pytest.mark.full
 def test_a_shared_program_gives_the_bits_of_an_own_one(tmp_path: Path) -> None:
     overrides = [
         *SMALL,

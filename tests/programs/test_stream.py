@@ -122,6 +122,7 @@ def test_a_wrong_option_is_told(options: dict, message: str):
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.full
 def test_a_scene_that_does_not_fit_is_told():
     with pytest.raises(NoPlaceError, match="could not be placed"):
         next(iter(gen2d.stream(tiny_config(scene=CROWDED), batch_size=4)))

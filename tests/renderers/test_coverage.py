@@ -241,7 +241,7 @@ def test_a_disc_moves_and_grows_as_its_slopes_say(low, high, mean, most):
     alike(f"discs of {low} to {high} px, radius", slope[1], exact[:, 2], mean, most)
 
 
-@pytest.mark.parametrize("kind", ["capsule", "polygon", "rounded"])
+@pytest.mark.parametrize("kind", [pytest.param("capsule", marks=pytest.mark.full), "polygon", "rounded"])
 def test_a_shape_changes_as_its_slopes_say(kind):
     rng, weight = np.random.default_rng(13), weights()
     corners, radius = capsules(rng, special=False)

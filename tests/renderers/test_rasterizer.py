@@ -446,6 +446,7 @@ def test_a_moving_ball_is_blurred_along_its_path():
     assert_allclose(frames, np.asarray(drawn, float).reshape(*shape[:3], *frames.shape[2:]).mean(2), atol=0.51)
 
 
+@pytest.mark.full
 def test_a_parser_of_colours_measures_the_speed_of_a_ball():
     """As in PhyWorld (Kang et al., arXiv 2411.02385); frames aligned by their corners would be off by 1/255 of it."""
     scene = {**BALL["scene"], "radius": [0.7, 1.4], "velocity": [[-3, 3], [-3, 3]], "color": [255, 0, 0]}

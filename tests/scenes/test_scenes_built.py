@@ -87,6 +87,7 @@ def gained(made: Film) -> np.ndarray:
 # Towers -------------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.full
 def test_a_tower_does_what_statics_says():
     made = film("tower", 64, 3.0, 20, "scene.offset=[-0.9,0.9]")
     way, margin = moved(made, 1), made.factors["margin"]
@@ -167,6 +168,7 @@ def test_a_pendulum_has_the_period_of_its_length_and_swing():
     holds("pendulum: energy", np.ptp(made.energy, axis=1) / np.abs(made.energy).max(1), 2e-3)
 
 
+@pytest.mark.full
 def test_a_double_pendulum_keeps_its_energy_and_its_joints():
     made = film("pendulum", 8, 4.0, 30, "scene.links=2", energy=True)
     scale = np.abs(made.energy).max(1) + made.scene.objects.mass[:, 3:].sum(1) * GRAVITY
@@ -177,6 +179,7 @@ def test_a_double_pendulum_keeps_its_energy_and_its_joints():
 # Chains -------------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.full
 def test_a_chain_at_rest_is_a_catenary():
     links = 16
     made = film("chain", 4, 24.0, 10, f"scene.links={links}", "scene.slope=0", "physics.damping=1")

@@ -246,6 +246,7 @@ def test_contact_is_within_8_to_24_frames_wherever_there_is_room():
     holds("collision: contact frame by places, frames", frame[moves] - FPS * gap[moves] / closing[moves], 2e-3)
 
 
+@pytest.mark.full
 def test_balls_part_as_they_must_down_to_a_centimetre_a_second():
     n = 64
     made = played(phyworld("collision", "annotations.contacts=4"), n, pairs(n))
@@ -346,6 +347,7 @@ def test_ball_rolls_or_slides_as_its_friction_says():
     assert (x[..., 0] < 10 - r + 0.02).all()  # before the wall
 
 
+@pytest.mark.full
 def test_capsule_slides_or_stays_as_its_friction_says():
     slope = np.array([0.3, 0.3, 0.5, 0.5])
     part = np.array([0.5, 1.05, 0.5, 1.05])
@@ -362,6 +364,7 @@ def test_capsule_slides_or_stays_as_its_friction_says():
 # Spinning -----------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.full
 def test_ball_ends_with_the_speed_that_its_angular_momentum_gives_it():
     n, draws = 32, np.random.default_rng(9)
     given = {name: draws.uniform(low, high, (n, 1)) for name, low, high in

@@ -109,6 +109,7 @@ def test_what_cannot_be_is_told_in_one_sentence(name, wrong):
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.full
 def test_galton_s_balls_end_in_bins_as_often_left_as_right():
     columns, options = made("galton"), rollout_of("galton").config.scene.options
     there, last = columns["objects/present"][:, runs("galton")[0]] > 0, columns["states/position"][:, -1]
@@ -125,6 +126,7 @@ def test_galton_s_balls_end_in_bins_as_often_left_as_right():
     assert 0.7 < spread < 2.5
 
 
+@pytest.mark.full
 def test_funnel_lets_pass_what_fits_through_its_gap_and_gains_no_energy():
     columns, options = made("funnel"), rollout_of("funnel").config.scene.options
     ours = runs("funnel")[0]
@@ -144,6 +146,7 @@ def test_funnel_lets_pass_what_fits_through_its_gap_and_gains_no_energy():
     holds("funnel: energy gained in a frame, of the first", gained, 2e-3)
 
 
+@pytest.mark.full
 def test_marble_run_is_run_from_ramp_to_ramp():
     columns = made("marble_run")
     ball, ramps, box = runs("marble_run")
@@ -173,6 +176,7 @@ def test_cradle_hands_its_speed_to_as_many_as_came():
     assert not elastic.all()
 
 
+@pytest.mark.full
 def test_pile_comes_to_rest_in_its_bin():
     columns, options = made("pile"), rollout_of("pile").config.scene.options
     there = columns["objects/present"] * (columns["objects/kind"] == 0) > 0
@@ -188,6 +192,7 @@ def test_pile_comes_to_rest_in_its_bin():
     assert (inside > 0)[np.broadcast_to(there[:, None], inside.shape)].all()
 
 
+@pytest.mark.full
 def test_occluder_hides_balls_and_does_nothing_else():
     columns, options = made("occluder"), rollout_of("occluder").config.scene.options
     ours = runs("occluder")[0]

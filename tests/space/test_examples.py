@@ -82,6 +82,7 @@ def red(image: np.ndarray) -> np.ndarray:
 # The article --------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.full
 def test_three_falling_balls(tmp_path):
     rate = -math.log(0.95) / 0.1
     space = Space(gravity=(0, -GRAVITY), damping=rate)
@@ -118,6 +119,7 @@ def test_five_balls_that_overlap(tmp_path):
     assert not red(overlay(poses, view=(-10, -10, 10, 10))).any()
 
 
+@pytest.mark.full
 def test_five_balls_that_collide(tmp_path):
     space = five_balls(damping=-math.log(0.95) / 0.04)
     video = space.simulate(1.2, fps=25)
@@ -130,6 +132,7 @@ def test_five_balls_that_collide(tmp_path):
     assert video.contacts.count
 
 
+@pytest.mark.full
 def test_five_balls_in_a_bowl(tmp_path):
     space = Space(gravity=(0, -GRAVITY), mixing="mean")
     for a, b in (((-4, 4), (0, 0)), ((0, 0), (4, 0)), ((4, 0), (8, 4))):
@@ -159,6 +162,7 @@ def test_five_balls_in_a_bowl(tmp_path):
 # Joints -------------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.full
 def test_pendulum(tmp_path):
     space, swing = Space(gravity=(0, -GRAVITY)), 0.1
     rod = space.add_segment((0, 0), (math.sin(swing), -math.cos(swing)), kind="dynamic", mass=2)
@@ -177,6 +181,7 @@ def test_pendulum(tmp_path):
     total(video)
 
 
+@pytest.mark.full
 def test_chain():
     space, links = Space(gravity=(0, -GRAVITY)), 6
     x, y = 0.5 * math.sin(0.5), -0.5 * math.cos(0.5)
@@ -272,6 +277,7 @@ def test_tower():
     total(video)
 
 
+@pytest.mark.full
 def test_piston():
     space = Space(gravity=(0, 0))
     for y in (-1, 1):
