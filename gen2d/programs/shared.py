@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
+from jax.core import Tracer
 from jax.sharding import SingleDeviceSharding
 
 from gen2d.config.config import Config
@@ -138,7 +139,7 @@ def cached_jit(function: Callable[..., Any], key: Hashable | None, own_code: boo
 
     def call(*args: Any) -> Any:
         leaves, tree = jax.tree.flatten(args)
-        if key is None or any(isinstance(leaf, jax.core.Tracer) for leaf in leaves):
+        if key is None or any(isinstance(leaf, Tracer) for leaf in leaves):
             return jitted(*args)
         leaves = jax.device_put(leaves, device)
         args = tree.unflatten(leaves)
