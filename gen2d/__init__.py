@@ -14,6 +14,7 @@ it.
 import os
 from typing import TYPE_CHECKING
 
+from gen2d import engines as engines
 from gen2d._version import __version__ as __version__
 from gen2d.core.lazy import attach
 

@@ -25,7 +25,7 @@ LAYERS = (
     ("renderers", "physics", "loading"),
     ("sampling", "annotations", "captions"),
     ("scenes",),
-    ("programs",),
+    ("programs", "engines"),
     ("space",),
     ("generation",),
     ("tools", "exports"),

@@ -3,7 +3,17 @@
 import argparse
 from pathlib import Path
 
-from gen2d.cli.parser import Parser, add_dataset, add_network, add_overrides, add_trust, limits, whole_number
+from gen2d.cli.parser import (
+    Parser,
+    add_dataset,
+    add_engine,
+    add_network,
+    add_overrides,
+    add_trust,
+    engine_of,
+    limits,
+    whole_number,
+)
 from gen2d.config.plugins import names
 from gen2d.core.humanize import in_bytes, in_time
 
@@ -31,6 +41,7 @@ def add_arguments(parser: Parser) -> None:
     parser.add_argument("--look", metavar="NAME", help="look of the frames, which are rendered again")
     add_overrides(parser)
     add_trust(parser)
+    add_engine(parser)
     add_network(parser)
 
 
@@ -50,6 +61,7 @@ def run(options: argparse.Namespace) -> int:
         overwrite=options.overwrite,
         log=to_stderr,
         trust=options.trust,
+        engine=engine_of(options),
         render=render or None,
         **limits(options),
     )

@@ -1,11 +1,12 @@
 """Make a dataset, or add videos to one (the verb if none is named)."""
 
 import argparse
+import dataclasses
 import os
 import shlex
 from typing import TYPE_CHECKING
 
-from gen2d.cli.parser import PROG, Parser, add_network, add_overrides, limits, whole_number
+from gen2d.cli.parser import PROG, Parser, add_engine, add_network, add_overrides, engine_of, limits, whole_number
 from gen2d.core.errors import UserError
 from gen2d.core.humanize import in_bytes, in_time
 
@@ -48,6 +49,10 @@ def add_arguments(parser: Parser) -> None:
         help="share the work: worker R of W, counted from 0, makes every W-th shard (default: 0/1)",
     )
     parser.add_argument("--overwrite", action="store_true", help="replace a dataset of another config or seed")
+    parser.add_argument(
+        "--json", action="store_true", help="print progress, lost workers and the result as JSON, an object per line"
+    )
+    add_engine(parser)
     add_network(parser)
 
 
@@ -59,9 +64,10 @@ def _worker(text: str) -> tuple[int, int]:
 
 
 def run(options: argparse.Namespace) -> int:
-    from gen2d.core.progress import to_stderr, waiting
+    from gen2d.core.progress import Event, to_json, to_stderr, waiting
 
-    with waiting("Importing jax"):
+    log, engine = to_json if options.json else to_stderr, engine_of(options)
+    with waiting("Importing jax", log):
         from gen2d.generation.run import generate
         from gen2d.storage.filesystems import redact_url
 
@@ -75,15 +81,19 @@ def run(options: argparse.Namespace) -> int:
             overrides=options.overrides,
             device=options.device,
             worker=options.worker,
+            engine=engine,
             overwrite=options.overwrite,
-            log=to_stderr,
+            log=log,
             **limits(options),
         )
     except KeyboardInterrupt:
         again = [shlex.quote(redact_url(word)) for word in options.arguments if word != "--overwrite"]
         to_stderr(f"gen2d: stopped; complete shards are kept. To go on: {' '.join([PROG, *again])}")
         os._exit(130)  # all files are closed; jax may still compute in the background, and would crash a normal exit
-    print(_report(summary))
+    if options.json:
+        log(Event.of(_report(summary), "end", **dataclasses.asdict(summary) | {"out": str(summary.out)}))
+    else:
+        print(_report(summary))
     return 0
 
 

@@ -9,6 +9,7 @@ from gen2d.cli import clean, export, generate, info, listing, preview, verify
 from gen2d.cli.parser import parse
 from gen2d.core.errors import Error
 from gen2d.core.progress import logged_to_stderr
+from gen2d.engines.protocol import HeadLostError
 from gen2d.storage.explain import reading_error
 
 VERBS = {
@@ -39,6 +40,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return code
     except Error as error:
         sentence, code = str(error), error.exit_code
+        if isinstance(error, HeadLostError):
+            print(f"gen2d: {sentence}", file=sys.stderr, flush=True)
+            os._exit(code)
     except KeyboardInterrupt:
         sentence, code = "stopped", 130
     except BrokenPipeError:  # the reader of the output has ended, as `head` does

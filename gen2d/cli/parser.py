@@ -4,11 +4,14 @@ import argparse
 import itertools
 from collections.abc import Mapping, Sequence
 from types import ModuleType
-from typing import Any, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn
 
 from gen2d._version import __version__
 from gen2d.config.plugins import nearest
 from gen2d.core.errors import UserError
+
+if TYPE_CHECKING:
+    from gen2d.engines.ray import Ray
 
 PROG = "python -m gen2d"
 USAGE = """\
@@ -134,6 +137,71 @@ def add_trust(parser: Parser) -> None:
         metavar="SHA256",
         help="allow the Python file with this hash, which came with the dataset, to run (may be repeated)",
     )
+
+
+ENGINE_OPTIONS = ("address", "workers", "gpus_per_worker", "cpus_per_worker", "device_kind", "retries")
+
+
+def add_engine(parser: Parser) -> None:
+    """Adds where the work runs."""
+    group = parser.add_argument_group("clusters", "see gen2d/engines/README.md")
+    group.add_argument(
+        "--engine",
+        default="local",
+        choices=("local", "ray"),
+        help="where to run: local, in this process, or ray, on a Ray cluster (default: local)",
+    )
+    group.add_argument(
+        "--address",
+        metavar="A",
+        help="the cluster: auto, HOST:PORT or ray://HOST:PORT (default: $RAY_ADDRESS, or this machine alone)",
+    )
+    group.add_argument(
+        "--workers",
+        type=_worker_limits,
+        metavar="MIN:MAX",
+        help="the least and the largest number of workers (default: 1 and as many as the cluster holds)",
+    )
+    group.add_argument("--gpus-per-worker", type=_number, metavar="N", help="GPUs of a worker (default: 1)")
+    group.add_argument(
+        "--cpus-per-worker",
+        type=whole_number,
+        metavar="N",
+        help="cores of a worker (default: all of its machine, or an equal share)",
+    )
+    group.add_argument(
+        "--device-kind", metavar="K", help="use only devices with this in their names, such as H100 or avx512f"
+    )
+    group.add_argument(
+        "--retries", type=whole_number, metavar="N", help="how often a shard that fails is tried again (default: 3)"
+    )
+
+
+def engine_of(options: argparse.Namespace) -> "Ray | None":
+    """The engine that the arguments of `add_engine` name; None for this process."""
+    given = {name: value for name in ENGINE_OPTIONS if (value := getattr(options, name)) is not None}
+    if options.engine == "local":
+        if given:
+            raise UserError(f"--{next(iter(given)).replace('_', '-')} needs --engine ray")
+        return None
+    from gen2d.engines.ray import Ray
+
+    return Ray(**given)
+
+
+def _worker_limits(text: str) -> tuple[int, int | None]:
+    low, colon, high = text.partition(":")
+    try:
+        return int(low or 1), (int(high) if high else None) if colon else int(low)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is not MIN:MAX, such as 1:8") from None
+
+
+def _number(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number, such as 1") from None
 
 
 def whole_number(text: str) -> int:

@@ -5,7 +5,7 @@ import dataclasses
 import json
 import secrets
 
-from gen2d.cli.parser import Parser, add_dataset, add_network, add_trust, limits, whole_number
+from gen2d.cli.parser import Parser, add_dataset, add_engine, add_network, add_trust, engine_of, limits, whole_number
 from gen2d.core.errors import UserError
 
 
@@ -30,6 +30,7 @@ def add_arguments(parser: Parser) -> None:
     parser.add_argument("--repair", action="store_true", help="make damaged files again, from the dataset's recipe")
     parser.add_argument("--json", action="store_true", help="print the result as JSON")
     add_trust(parser)
+    add_engine(parser)
     add_network(parser)
 
 
@@ -40,6 +41,7 @@ def run(options: argparse.Namespace) -> int:
     from gen2d.storage.retries import Network
     from gen2d.tools.verify import verify_and_repair
 
+    engine = engine_of(options)
     root = place(options.dataset, Network(**limits(options)))
     with reading(root):
         if not is_begun(root) and not (root / MANIFEST).exists():
@@ -51,11 +53,11 @@ def run(options: argparse.Namespace) -> int:
         with waiting("Importing jax"):
             from gen2d.generation import regenerate
 
-        return regenerate.repair(root, shards, to_stderr, trust=options.trust, **limits(options))
+        return regenerate.repair(root, shards, to_stderr, trust=options.trust, engine=engine, **limits(options))
 
     seed = secrets.randbelow(2**32) if options.seed is None else options.seed
     repair_with = repair if options.repair else None
-    outcome = verify_and_repair(root, options.level, repair_with, options.videos, seed, options.trust)
+    outcome = verify_and_repair(root, options.level, repair_with, options.videos, seed, options.trust, engine)
     if options.json:
         result = {"dataset": f"{root}", "level": options.level, **dataclasses.asdict(outcome)}
         print(json.dumps(result | ({"videos": options.videos, "seed": seed} if options.level == "regen" else {})))

@@ -129,6 +129,8 @@ class Export(_Contract):
     check(source): raises ConfigError, before anything is written, if the format cannot hold these videos.
     fixed: whether the format holds these fields only.
     suffix: suffix of the single file written; "" for a folder.
+    separate: whether the files of a video depend on nothing but the video, as with `source.each`, so that several
+        machines may each write some of the videos.
     loss: description of the information that the format drops; "" if it drops none.
     """
 
@@ -137,4 +139,5 @@ class Export(_Contract):
     check: Callable[[Any], None] = _nothing
     fixed: bool = False
     suffix: str = ""
+    separate: bool = False
     loss: str = ""

@@ -4,6 +4,7 @@ Lines go to a caller's `log` or, by default, to the logger "gen2d" at level INFO
 a terminal and a notebook in which no handler of logging is set.
 """
 
+import json
 import logging
 import signal
 import sys
@@ -20,9 +21,31 @@ LOGGER = logging.getLogger("gen2d")
 Log = Callable[[str], None]
 
 
+class Event(str):
+    """A line for people, with the same as `values` for machines."""
+
+    values: dict[str, Any]
+
+    @classmethod
+    def of(cls, line: str, name: str, **values: Any) -> "Event":
+        event = cls(line)
+        event.values = {"event": name, **values}
+        return event
+
+
 def to_stderr(line: str) -> None:
-    """Print a line to standard error and flush."""
-    print(line, file=sys.stderr, flush=True)
+    """Print a line to standard error, above a progress bar if there is one, and flush."""
+    bars = sys.modules.get("tqdm")
+    if bars is not None and sys.stderr.isatty():
+        bars.tqdm.write(line, file=sys.stderr)
+    else:
+        print(line, file=sys.stderr, flush=True)
+
+
+def to_json(line: str) -> None:
+    """Print a line to standard output as a JSON object, with the values of an `Event`, and flush."""
+    values = line.values if isinstance(line, Event) else {"event": "log"}
+    print(json.dumps({"time": round(time.time(), 3), **values, "message": str(line)}), flush=True)
 
 
 def is_interactive() -> bool:
@@ -82,28 +105,43 @@ def waiting(what: str, log: Log | None = None, status: Callable[[float], str] | 
 
 
 @contextmanager
-def progress(what: str, count: int, log: Log | None = None, unit: str = "videos") -> Iterator[Callable[[int], None]]:
+def progress(
+    what: str,
+    count: int,
+    log: Log | None = None,
+    unit: str = "videos",
+    workers: Callable[[], int] | None = None,
+) -> Iterator[Callable[[int], None]]:
     """Progress bar for a person; elsewhere `what` after two seconds, and then one line every ten seconds.
 
-    Yields a function that advances the progress by a number of units.
+    `workers` gives the present number of workers, if there are any. Yields a function that advances the progress by a
+    number of units.
     """
-    if is_interactive():
+    if is_interactive() and log is not to_json:
         from tqdm import tqdm
 
         with tqdm(desc=what, total=count, unit=f" {unit}", smoothing=0.1, dynamic_ncols=True) as bar:
 
             def update(number: int) -> None:
+                if workers is not None:
+                    bar.set_postfix_str(_plural(workers(), "worker"), refresh=not number)
                 bar.update(number)
 
             yield update
         return
     done = 0
 
-    def status(seconds: float) -> str:
+    def status(seconds: float) -> Event:
+        at_work = () if workers is None else (_plural(workers(), "worker"),)
+        values = {"done": done, "of": count, "unit": unit, "seconds": round(seconds, 3)}
+        values |= {} if workers is None else {"workers": workers()}
         if not done:
-            return f"{what}: 0 of {count:,} {unit} after {in_time(seconds)}"
-        left = in_time((count - done) * seconds / done)
-        return f"{what}: {done:,} of {count:,} {unit}, {done / seconds:,.0f} {unit}/s, {left} left"
+            line = ", ".join([f"{what}: 0 of {count:,} {unit} after {in_time(seconds)}", *at_work])
+            return Event.of(line, "progress", **values)
+        seconds_left = (count - done) * seconds / done
+        rate = f"{done / seconds:,.0f} {unit}/s"
+        line = ", ".join([f"{what}: {done:,} of {count:,} {unit}", rate, *at_work, f"{in_time(seconds_left)} left"])
+        return Event.of(line, "progress", **values, rate=round(done / seconds, 3), seconds_left=round(seconds_left, 3))
 
     def advance(number: int) -> None:
         nonlocal done
@@ -111,6 +149,10 @@ def progress(what: str, count: int, log: Log | None = None, unit: str = "videos"
 
     with waiting(what, log, status):
         yield advance
+
+
+def _plural(number: int, noun: str) -> str:
+    return f"{number:,} {noun}{'' if number == 1 else 's'}"
 
 
 @contextmanager

@@ -149,9 +149,12 @@ def free_bytes(root: Place) -> float:
     return shutil.disk_usage(next(place for place in (path, *path.parents) if place.exists())).free
 
 
-def log(root: Place, entry: Mapping[str, Any]) -> None:
-    """Append a line to the folder's run log, the only file that contains times and hosts."""
-    path, line = root / MARK / "run.jsonl", json.dumps(dict(entry), sort_keys=True) + "\n"
+def log(root: Place, *entries: Mapping[str, Any]) -> None:
+    """Append lines to the folder's run log, the only file that contains times and hosts."""
+    path = root / MARK / "run.jsonl"
+    line = "".join(json.dumps(dict(entry), sort_keys=True) + "\n" for entry in entries)
+    if not line:
+        return
     with translate_errors(root):
         if isinstance(path, Path):
             with path.open("a") as file:

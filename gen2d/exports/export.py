@@ -11,9 +11,11 @@ from gen2d.config import plugins
 from gen2d.config.contracts import Export
 from gen2d.core.errors import ConfigError, FolderError
 from gen2d.core.progress import inform, progress, stopping_on_sigterm
+from gen2d.engines.protocol import Engine, results
+from gen2d.exports.parts import PART, ExportJob, export_format
 from gen2d.exports.source import Source, source_of
 from gen2d.loading.dataset import RenderOptions
-from gen2d.storage.atomic import publishing, publishing_folder, sweep_beside
+from gen2d.storage.atomic import publishing, publishing_folder, remove_tree, sweep_beside
 from gen2d.storage.explain import writing_error
 from gen2d.storage.paths import Place, Url, place
 from gen2d.storage.retries import Network
@@ -44,6 +46,7 @@ def export(
     overwrite: bool = False,
     log: Callable[[str], None] | None = None,
     trust: Sequence[str] = (),
+    engine: Engine | None = None,
     render: RenderOptions | None = None,
     timeout: float = 30.0,
     deadline: float = 300.0,
@@ -74,6 +77,9 @@ def export(
         Function that is called with each line of progress.
     trust : sequence of str
         sha256 of code that came with the dataset and may run to render frames, as in `gen2d.render`.
+    engine : gen2d.engines.Ray, optional
+        Where the videos are written, in formats that have files for each video; by default in this process. All
+        machines must see the dataset and the folder of `out`.
     render : RenderOptions, optional
         Size, look and other options of the frames, such as `{"height": 256, "width": 256}`, as in `open`.
     timeout : float
@@ -104,7 +110,7 @@ def export(
     >>> exported = gen2d.export("datasets/bouncing", "h264", "films", split="train")
     >>> print(exported.videos, exported.bytes, exported.loss)
     """
-    start, format_, name = time.perf_counter(), _format(to), Path(to).name
+    start, format_, name = time.perf_counter(), export_format(to), Path(to).name
     folder = place(root, Network(timeout, deadline))
     source = source_of(folder, split, _patterns(to, format_, fields), trust, render)
     out = Path(out) if out is not None else _default_out(folder, f"{name.removesuffix('.py')}{format_.suffix}")
@@ -112,18 +118,25 @@ def export(
     format_.check(source)
     _check_out(out, format_, description, overwrite)
     log = log or inform
-    with _translate_errors(out), stopping_on_sigterm(log), progress("Exporting", len(source), log) as advance:
-        size = _write_output(out, format_, dataclasses.replace(source, advance=advance), description)
+    if engine is not None and not format_.separate:
+        names = ", ".join(each for each in plugins.names("export") if plugins.load("export", each).separate)
+        raise ConfigError(f"--to is {to}, whose files hold many videos: leave out --engine, or choose one of {names}")
+
+    def write(target: Path) -> None:
+        if engine is not None:
+            there = folder.absolute() if isinstance(folder, Path) else folder
+            fields = tuple(source.fields)
+            job = ExportJob(there, source.ds.options.split, fields, trust, render, to, target.absolute())
+            parts = [source.numbers[first : first + PART] for first in range(0, len(source), PART)]
+            for _ in results(engine, job, parts, log):
+                pass
+            return
+        with stopping_on_sigterm(log), progress("Exporting", len(source), log) as advance:
+            format_.write(target, dataclasses.replace(source, advance=advance))
+
+    with _translate_errors(out):
+        size = _write_output(out, format_, write, description)
     return Exported(out, len(source), size, time.perf_counter() - start, format_.loss)
-
-
-def _format(to: str) -> Export:
-    """Format with this name, or from this Python file."""
-    known = plugins.names("export")
-    if not plugins.is_user_file(to) and to not in known:
-        raise ConfigError(f"--to is {to!r}, but must be one of {', '.join(known)}, or a Python file")
-    content = plugins.content_of(to, "--to") if plugins.is_user_file(to) else b""
-    return plugins.load("export", to, "--to", content)
 
 
 def _patterns(to: str, format_: Export, fields: Sequence[str] | None) -> Sequence[str]:
@@ -194,16 +207,18 @@ def _read_description(out: Path) -> dict[str, Any]:
     return description if description.get("schema") == SCHEMA and isinstance(description.get("files"), dict) else {}
 
 
-def _write_output(out: Path, format_: Export, source: Source, description: Mapping[str, Any]) -> int:
+def _write_output(out: Path, format_: Export, write: Callable[[Path], None], description: Mapping[str, Any]) -> int:
     """Write `out` completely and return its size in bytes; also remove temporary files of killed exports."""
     out.parent.mkdir(parents=True, exist_ok=True)
     sweep_beside(out)
     if format_.suffix:
         with publishing(out) as temporary:
-            format_.write(temporary, source)
+            write(temporary)
         return out.stat().st_size
     with publishing_folder(out) as temporary:
-        format_.write(temporary, source)
+        write(temporary)
+        for path in temporary.glob(".part-*"):  # of workers that were killed
+            remove_tree(path)
         files = {path.name: path.stat().st_size for path in sorted(temporary.iterdir())}
         (temporary / DESCRIPTION).write_bytes(as_json({**description, "files": files}))
     return sum(files.values())

@@ -24,9 +24,15 @@ class Source:
 
     ds: Dataset
     advance: Callable[[int], None]  # to be called with the number of videos just written
+    part: range | None = None  # numbers of the videos, if these are not all of the split
+
+    @property
+    def numbers(self) -> range:
+        """Numbers of the videos in the dataset."""
+        return range(len(self.ds)) if self.part is None else self.part
 
     def __len__(self) -> int:
-        return len(self.ds)
+        return len(self.numbers)
 
     @property
     def fields(self) -> dict[str, Field]:
@@ -56,14 +62,14 @@ class Source:
         """Videos one at a time, as dictionaries of arrays by field name."""
         count = max(1, BATCH_BYTES // max(1, self.video_bytes))
         for first in range(0, len(self), count):
-            yield from unbatch(self.ds.batch(range(first, min(first + count, len(self)))))
+            yield from unbatch(self.ds.batch(self.numbers[first : first + count]))
 
     def each(self, write: Callable[[str, Batch], None]) -> None:
         """Call `write(key, video)` for every video in several threads, and report the progress to `advance`."""
         threads = min(os.cpu_count() or 1, 8)
         running: deque[Future[None]] = deque()
         with ThreadPoolExecutor(threads) as pool:
-            for number, video in enumerate(self.videos()):
+            for number, video in zip(self.numbers, self.videos(), strict=True):
                 running.append(pool.submit(write, self.key(number), video))
                 if len(running) > threads:
                     running.popleft().result()

@@ -5,7 +5,7 @@ The number of slices in flight is limited, so memory is bounded by a batch and n
 
 import os
 from collections import deque
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any
 
@@ -35,8 +35,13 @@ class Encoder:
         _check_finite(block, int(videos.part.numbers[0]))
         return block
 
-    def blocks(self, ranges: Sequence[VideoRange]) -> Iterator[tuple[Any, Block]]:
-        """Blocks of these ranges in the order of the videos, each with the tag of its range."""
+    def blocks(
+        self, ranges: Sequence[VideoRange], rendered: Callable[[], None] = lambda: None
+    ) -> Iterator[tuple[Any, Block]]:
+        """Blocks of these ranges in the order of the videos, each with the tag of its range.
+
+        `rendered` is called when all videos are rendered; the last of them are still being compressed.
+        """
         waiting: dict[int, tuple[Any, Future[Block]]] = {}
         next_order = 0
         for videos in self.source.slices(ranges):
@@ -45,6 +50,7 @@ class Encoder:
                 tag, future = waiting.pop(next_order)
                 next_order += 1
                 yield tag, future.result()
+        rendered()
         for order in sorted(waiting):
             tag, future = waiting.pop(order)
             yield tag, future.result()

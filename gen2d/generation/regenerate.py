@@ -12,7 +12,7 @@ import numpy as np
 
 from gen2d.config.config import Config
 from gen2d.core.errors import DamagedError, FolderError
-from gen2d.core.progress import inform, waiting
+from gen2d.core.progress import Log, inform, waiting
 from gen2d.dataset import folder, hdf5
 from gen2d.dataset.hdf5_check import faults
 from gen2d.dataset.manifest import Manifest, identity_of, read_manifest
@@ -32,8 +32,9 @@ from gen2d.dataset.spec import (
     shard_of,
     shard_path,
 )
+from gen2d.engines.protocol import Engine
 from gen2d.generation.complete import publication
-from gen2d.generation.run import dataset_of, generate_shards
+from gen2d.generation.worker import GenerationJob, dataset_of, generate_shards
 from gen2d.loading import dataset as loader
 from gen2d.programs import devices
 from gen2d.programs.environment import sources
@@ -51,12 +52,12 @@ Identity = Mapping[str, Any]  # of a dataset; its manifest has the same keys
 CODECS = ("h5py", "hdf5", "isal", "zstandard", "numpy")
 
 
-def source_of(root: Place, identity: Identity, trust: Trust = ()) -> VideoSource:
-    """Source of the videos of the dataset in this folder.
+def source_of(root: Place, identity: Identity, trust: Trust = (), on_cpu: bool = False) -> VideoSource:
+    """Source of the videos of the dataset in this folder, on the kind of device that made it unless `on_cpu`.
 
     Raises ConfigError if its config cannot be used here, and UntrustedError if it needs code that is not trusted.
     """
-    on_cpu = str(identity["fingerprint"].get("device", "")).startswith("cpu")
+    on_cpu = on_cpu or str(identity["fingerprint"].get("device", "")).startswith("cpu")
     return _source(config_from(root, identity, trust), on_cpu)
 
 
@@ -133,6 +134,7 @@ def repair(
     log: Callable[[str], None] | None = None,
     *,
     trust: Trust = (),
+    engine: Engine | None = None,
     timeout: float = 30.0,
     deadline: float = 300.0,
 ) -> list[str]:
@@ -153,6 +155,8 @@ def repair(
         Receives lines of progress for a person.
     trust : str or sequence of str
         sha256 of code in the dataset that may run.
+    engine : gen2d.engines.Ray, optional
+        Where shards are generated, if the dataset is on a disk that all machines share; by default in this process.
     timeout, deadline : float
         Limits in s of a server's silence and of a whole request, as in `open`.
 
@@ -171,7 +175,7 @@ def repair(
     root = place(root, Network(timeout, deadline))
     folder.check_links(root)
     manifest, identity = _manifest_and_identity(root)
-    source = source_of(root, identity, trust)
+    source = source_of(root, identity, trust, on_cpu=engine is not None)  # a worker may need this machine's GPU
     spec = _original_spec(source, root, identity, manifest)
     counts, tables = (manifest.splits, read_tables(root, manifest)) if manifest else _tables_by_name(root, spec)
     spec = dataclasses.replace(spec, splits=counts)
@@ -181,8 +185,10 @@ def repair(
     staged = Records(spec.videos_per_shard, {})
     with folder.translate_errors(root), _staging(root) as stage:
         if todo:
-            check_fingerprint(root, source, identity)
-            staged = _regenerate_shards(source, spec, stage, todo, records, manifest, log or inform)
+            if engine is None:
+                check_fingerprint(root, source, identity)
+            generate = functools.partial(_generate, source, root, identity, engine)
+            staged = _regenerate_shards(generate, spec, stage, todo, records, manifest, log or inform)
         try:
             with folder.folder_lock(root):
                 check_current(root, manifest)
@@ -270,8 +276,38 @@ def _staging(root: Place) -> Iterator[Path]:
         yield stage
 
 
-def _regenerate_shards(
+def _generate(
     source: VideoSource,
+    root: Place,
+    identity: Identity,
+    engine: Engine | None,
+    dataset: DatasetSpec,
+    todo: list[Shard],
+    log: Log,
+) -> None:
+    """Generate these shards in this process or by an engine whose workers make the same bits."""
+    if engine is None:
+        generate_shards(source, dataset, todo, log)
+        return
+    if isinstance(root, Url):
+        raise FolderError(f"{root} is repaired on one machine, as the new shards are checked there: leave out --engine")
+    job = GenerationJob(source.config, dataset.root, dataset.splits, "auto", identity)
+    workers = engine.start(job, log)
+    try:
+        if job.dataset is None or job.dataset.identity != identity:
+            actual = job.dataset.identity["fingerprint"] if job.dataset else {}
+            _check_equal(root, identity["fingerprint"], actual)
+        folder.open_folder(dataset)
+        for shard in todo:
+            workers.submit(shard)
+        for _ in workers.done():
+            pass
+    finally:
+        workers.stop()
+
+
+def _regenerate_shards(
+    generate: Callable[[DatasetSpec, list[Shard], Log], None],
     spec: DatasetSpec,
     stage: Path,
     todo: Sequence[Shard],
@@ -283,7 +319,7 @@ def _regenerate_shards(
     for name in ("shards", f"{RECORDS}"):
         (stage / name).mkdir(parents=True)
     staged_spec = dataclasses.replace(spec, root=stage)
-    generate_shards(source, staged_spec, list(todo), log)
+    generate(staged_spec, list(todo), log)
     staged = read_records(staged_spec, stage)
     versions = devices.versions()
     same_codecs = manifest is None or all(manifest.producer.get(key) == versions[key] for key in CODECS)

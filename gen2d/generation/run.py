@@ -4,32 +4,27 @@ import dataclasses
 import numbers
 import os
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from gen2d.config.config import Config, checked_seed, load_config, user_plugin_files
+from gen2d.config.config import Config, checked_seed, load_config
 from gen2d.config.trust import remember
-from gen2d.core.errors import ConfigError
-from gen2d.core.progress import inform, progress, stopping_on_sigterm, waiting
+from gen2d.core.errors import ConfigError, DamagedError
+from gen2d.core.humanize import in_bytes, in_time
+from gen2d.core.progress import Log, inform, waiting
 from gen2d.dataset import folder as shards
-from gen2d.dataset.spec import SPLIT, DatasetSpec, Shard, shards_of_worker
+from gen2d.dataset.manifest import identity_of
+from gen2d.dataset.spec import SPLIT, Shard, shards_of_worker
+from gen2d.engines.local import Local
+from gen2d.engines.protocol import Engine, Workers
 from gen2d.generation.complete import complete
-from gen2d.generation.encoder import Encoder, shard_ranges, threads_for
-from gen2d.generation.warm_up import warm_up
-from gen2d.generation.writers import ShardWriters
-from gen2d.programs import devices
-from gen2d.programs.environment import sources
-from gen2d.programs.fingerprint import fingerprint
-from gen2d.programs.source import VideoSource
+from gen2d.generation.warm_up import check_disk
+from gen2d.generation.worker import GenerationJob
 from gen2d.records.keys import MAX_VIDEOS
+from gen2d.storage.atomic import sweep
 from gen2d.storage.paths import Place, place
 from gen2d.storage.retries import Network
-
-CONVENTIONS = (
-    "World: metres, y up, radians counter-clockwise, seconds. Pixels: (row, column) from the top left, pixel centres "
-    "at j + 0.5. Frame 0 is the initial state, frame t the state at t / fps. An empty slot is zero everywhere."
-)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -60,8 +55,9 @@ def generate(
     overrides: Sequence[str] = (),
     device: str = "auto",
     worker: tuple[int, int] = (0, 1),
+    engine: Engine | None = None,
     overwrite: bool = False,
-    log: Callable[[str], None] | None = None,
+    log: Log | None = None,
     timeout: float = 30.0,
     deadline: float = 300.0,
 ) -> Summary:
@@ -89,6 +85,9 @@ def generate(
         "auto", "cpu" or "gpu".
     worker : (int, int)
         (r, W) for worker r of W, from 0; each generates its share of the shards.
+    engine : gen2d.engines.Local or gen2d.engines.Ray, optional
+        Where the shards are generated; by default in this process. A `Ray` divides them among the machines of a
+        cluster, which must all see the folder `out`.
     overwrite : bool
         Whether to delete a dataset in the folder first; only with a single worker.
     log : callable, optional
@@ -125,30 +124,87 @@ def generate(
     config = load_config(config, overrides)
     if seed is not None:
         config = dataclasses.replace(config, seed=checked_seed(seed))
+    if engine is not None and worker != (0, 1):
+        raise ConfigError("--worker and --engine cannot go together: the engine divides the work")
     counts = _counts(config, _check_run(n, split, worker, overwrite), split)
     network = Network(timeout, deadline)
     out = place(out, network) if out is not None else Path("datasets") / config.name
     remember(config.copies.values())
-    with waiting("Starting the devices", log):
-        on = devices.prepare(device)
-    with waiting("Tracing the programs (kept for later runs)", log):
-        source = VideoSource(config, on)
-        if sum(counts.values()) <= source.rollout.batch_size:  # a single batch: one device, whose programs compile once
-            on = on[:1]
-            source = VideoSource(config, on)
-        dataset = dataset_of(source, out, counts, fingerprint(source.rollout))
-    with waiting(f"Reading {out}", log):
-        remaining = [shard for shard in shards.open_folder(dataset, overwrite) if shard.split in counts]
-    todo = shards_of_worker(remaining, *worker)
-    began, video_count = time.perf_counter(), sum(shard.count for shard in todo)
-    size, compile_seconds = generate_shards(source, dataset, todo, log)
+    identity = _begun(out) if engine is not None and not overwrite else None
+    job = GenerationJob(config, out, counts, device, identity)
+    workers = (engine or Local()).start(job, log)
+    try:
+        dataset = job.dataset
+        assert dataset is not None
+        with waiting(f"Reading {out}", log):
+            remaining = [shard for shard in shards.open_folder(dataset, overwrite) if shard.split in counts]
+        todo = shards_of_worker(remaining, *worker)
+        began, video_count = time.perf_counter(), sum(shard.count for shard in todo)
+        size, compile_seconds = _run_shards(workers, todo, ClusterRun(out, todo, log) if engine is not None else None)
+    finally:
+        workers.stop()
+    if engine is not None:
+        sweep(out, shards.FOLDERS)  # of workers that were killed
     with waiting("Writing tables, cards and the manifest", log):
         is_complete = complete(dataset)
     seconds = time.perf_counter() - began
     if todo:
         entry = {"time": time.time(), "host": os.uname().nodename, "videos": video_count, "seconds": seconds}
-        shards.log(out, entry | {"bytes": size, "devices": len(on), "platform": on[0].platform})
+        shards.log(out, entry | {"bytes": size, **job.hardware})
     return Summary(out, video_count, sum(counts.values()), seconds, compile_seconds, size, is_complete)
+
+
+def _begun(out: Place) -> Any:
+    """Identity of the dataset in the folder, which its workers must share; None if there is none that can be read."""
+    try:
+        return identity_of(out)
+    except (DamagedError, OSError):
+        return None
+
+
+def _run_shards(workers: Workers, todo: Sequence[Shard], run: "ClusterRun | None") -> tuple[int, float]:
+    """Have the workers make these shards; return the number of bytes written, and the seconds of compiling."""
+    size, compile_seconds = 0, dict[str, float]()
+    for shard in todo:
+        workers.submit(shard)
+    try:
+        for shard, written, name in workers.done():
+            size += written.bytes
+            compile_seconds[name] = compile_seconds.get(name, 0.0) + written.compile_seconds
+            if run is not None:
+                run.add(name, shard, written.bytes)
+    finally:
+        if run is not None:
+            run.flush()
+    return size, max(compile_seconds.values(), default=0.0)
+
+
+class ClusterRun:
+    """Record of a run on a cluster: its estimated size, and which worker made which shards, in the run log."""
+
+    PERIOD = 60.0  # s between entries; at a URL, where each is a request, there is one at the end
+
+    def __init__(self, root: Place, todo: Sequence[Shard], log: Log) -> None:
+        self.root, self.log, self.videos = root, log, sum(shard.count for shard in todo)
+        self.began = self.flushed = time.monotonic()
+        self.estimated = False
+        self.shards: dict[str, dict[str, list[int]]] = {}  # places of the shards by worker and split
+
+    def add(self, worker: str, shard: Shard, size: int) -> None:
+        """Record that the worker made a shard; after the first, raise FolderError if the disk cannot hold all."""
+        self.shards.setdefault(worker, {}).setdefault(shard.split, []).append(shard.place)
+        if not self.estimated:
+            self.estimated, total = True, size / shard.count * self.videos
+            seconds = in_time(time.monotonic() - self.began)
+            self.log(f"First shard after {seconds}. {self.videos:,} videos will take about {in_bytes(total)}.")
+            check_disk(self.root, total - size)
+        if isinstance(self.root, Path) and time.monotonic() - self.flushed > self.PERIOD:
+            self.flush()
+
+    def flush(self) -> None:
+        """Append an entry for each worker to the run log."""
+        now, made, self.shards, self.flushed = time.time(), self.shards, {}, time.monotonic()
+        shards.log(self.root, *({"time": now, "worker": name, "shards": made[name]} for name in sorted(made)))
 
 
 def _counts(config: Config, n: int, split: str | None) -> dict[str, int]:
@@ -170,64 +226,3 @@ def _check_run(n: Any, split: str | None, worker: tuple[int, int], overwrite: bo
     if not 0 <= worker[0] < worker[1]:
         raise ConfigError(f"--worker is {worker[0]}/{worker[1]}, but must be r/W with r from 0 to W - 1")
     return int(n)
-
-
-def dataset_of(
-    source: VideoSource, out: Place, counts: Mapping[str, int], fingerprint: Mapping[str, Any]
-) -> DatasetSpec:
-    """Spec of a dataset in the folder `out` of videos from programs with this fingerprint."""
-    config, schema = source.config, source.schema
-    return DatasetSpec(
-        root=out,
-        name=config.name,
-        fields=schema.fields,
-        sizes=schema.sizes,
-        seed=config.seed,
-        config=config.recipe(),
-        config_text=config.recipe_text(),
-        producer={**devices.versions(), "sources": sources(), "fingerprint": fingerprint},
-        splits=counts,
-        videos_per_shard=source.rollout.videos_per_shard,
-        codec=config.storage.codec,
-        chunk_frames=config.storage.chunk_frames,
-        fps=config.video.fps,
-        constants=schema.constants,
-        conventions=CONVENTIONS,
-        command="python -m gen2d --config config.yaml",
-        copies={path: config.copies[name] for path, name in user_plugin_files(config.plain()).items()},
-    )
-
-
-def generate_shards(
-    source: VideoSource, dataset: DatasetSpec, todo: list[Shard], log: Callable[[str], None]
-) -> tuple[int, float]:
-    """Generate and write these shards; return the number of bytes written, and the seconds of compiling."""
-    size, seconds = 0, 0.0
-    for split_source, splits in source.of_splits(shard.split for shard in todo):
-        own = [shard for shard in todo if shard.split in splits]
-        own_size, own_seconds = _generate_from(split_source, dataset, own, log)
-        size, seconds = size + own_size, seconds + own_seconds
-    return size, seconds
-
-
-def _generate_from(
-    source: VideoSource, dataset: DatasetSpec, todo: list[Shard], log: Callable[[str], None]
-) -> tuple[int, float]:
-    encoder, writers = Encoder(source, dataset, threads_for(devices.cores())), ShardWriters(dataset)
-    ranges, size = shard_ranges(todo), 0
-    with stopping_on_sigterm(log):  # also during clean-up, when a second signal ends the process
-        try:
-            count = sum(shard.count for shard in todo)
-            seconds = warm_up(source, encoder, ranges, count, log)
-            with progress("Generating", count, log) as advance:
-                for shard, block in encoder.blocks(ranges):
-                    writers.put(shard, block)
-                    size += block.nbytes
-                    advance(len(block))
-            writers.finish()
-        except BaseException:
-            writers.abort()
-            raise
-        finally:
-            encoder.close()
-    return size, seconds

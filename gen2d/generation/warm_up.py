@@ -16,6 +16,7 @@ from gen2d.generation.encoder import Encoder, threads_for
 from gen2d.programs import devices
 from gen2d.programs.rollout import DeviceBatch, Rollout, divisor
 from gen2d.programs.source import Request, VideoRange, VideoSlice, VideoSource
+from gen2d.storage.paths import Place
 
 
 class DeviceMemoryError(UserError):
@@ -30,9 +31,28 @@ def warm_up(
     The source keeps the first batch, so that a run of a single one simulates no more. Raises FolderError if the disk
     is too small, and DeviceMemoryError if a batch does not fit the device.
     """
+    began = time.perf_counter()
+    request, batches = compile_for(source, ranges, log)
+    compiled = time.perf_counter() - began
+    single = count <= len(request.numbers)
+    with waiting("Measuring the speed", log):
+        block, seconds = _measure(source, encoder, batches, next(source.requests(ranges[:1])), single)
+    size, duration = block.nbytes / len(block) * count, "" if single else f" and {in_time(seconds * count)}"
+    log(f"Compiled in {compiled:.1f} s. {count:,} videos will take about {in_bytes(size)}{duration}.")
+    _warn_of_low_compression(encoder.dataset, block, log)
+    check_disk(encoder.dataset.root, size)
+    return compiled
+
+
+def compile_for(
+    source: VideoSource, ranges: Sequence[VideoRange], log: Callable[[str], None]
+) -> tuple[Request, list[DeviceBatch]]:
+    """Compile the programs of these videos; return the first request and its batches, which the source keeps.
+
+    Raises DeviceMemoryError if a batch does not fit the device.
+    """
     rollout = source.rollout
     name = f"{len(rollout.devices)} {rollout.devices[0].platform} device{'s' if len(rollout.devices) > 1 else ''}"
-    began = time.perf_counter()
     request = next(source.requests(ranges[:1]))
     try:
         with waiting(f"Compiling for {name} (seconds; up to a minute for dozens of objects; kept for later runs)", log):
@@ -44,20 +64,17 @@ def warm_up(
     with waiting("Rendering its first videos", log):
         _fit_slice(rollout, batches)
     source.keep(request, batches)
-    compiled = time.perf_counter() - began
-    single = count <= len(request.numbers)
-    with waiting("Measuring the speed", log):
-        block, seconds = _measure(source, encoder, batches, next(source.requests(ranges[:1])), single)
-    size, duration = block.nbytes / len(block) * count, "" if single else f" and {in_time(seconds * count)}"
-    log(f"Compiled in {compiled:.1f} s. {count:,} videos will take about {in_bytes(size)}{duration}.")
-    _warn_of_low_compression(encoder.dataset, block, log)
-    free = shards.free_bytes(encoder.dataset.root)
+    return request, batches
+
+
+def check_disk(root: Place, size: float) -> None:
+    """Raise FolderError if the disk of the dataset has less space than these bytes."""
+    free = shards.free_bytes(root)
     if size > free:
         raise FolderError(
-            f"{encoder.dataset.root} would need about {in_bytes(size)}, but its disk has {in_bytes(free)} free; "
+            f"{root} would need about {in_bytes(size)}, but its disk has {in_bytes(free)} free; "
             "ask for fewer videos, or name another disk with --out"
         )
-    return compiled
 
 
 def _fit_slice(rollout: Rollout, batches: list[DeviceBatch]) -> None:

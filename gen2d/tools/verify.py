@@ -6,6 +6,7 @@ compares them to the bit.
 
 import contextlib
 import dataclasses
+import functools
 import os
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -14,8 +15,9 @@ from pathlib import Path
 
 import numpy as np
 
+from gen2d._version import __version__
 from gen2d.core.errors import ConfigError, DamagedError, Error, IncompleteError, UnreachableError, UserError, one_line
-from gen2d.core.progress import waiting
+from gen2d.core.progress import Log, inform, progress, waiting
 from gen2d.dataset.croissant import croissant
 from gen2d.dataset.folder import is_foreign
 from gen2d.dataset.hdf5_check import faults
@@ -24,6 +26,7 @@ from gen2d.dataset.manifest_parser import FILE_BYTES
 from gen2d.dataset.rows import check_shard, intact, npy, npy_header, npy_size, origin
 from gen2d.dataset.snapshots import next_manifest
 from gen2d.dataset.spec import MANIFEST, MARK, PLUGIN, Shard, mark_path, plan, shard_name, shard_path
+from gen2d.engines.protocol import Engine, EngineError, Report, other_version, results
 from gen2d.loading import dataset as loader
 from gen2d.loading.epochs import order
 from gen2d.storage.atomic import size_of
@@ -70,6 +73,7 @@ def verify(
     seed: int = 0,
     *,
     trust: Sequence[str] = (),
+    engine: Engine | None = None,
     timeout: float = 30.0,
     deadline: float = 300.0,
 ) -> list[str]:
@@ -91,6 +95,8 @@ def verify(
         Seed of their random choice.
     trust : sequence of str
         sha256 of code in the dataset that may run, as in `render`; only for "regen".
+    engine : gen2d.engines.Ray, optional
+        Where the shards are read and checked; by default in this process. "regen" regenerates in this process.
     timeout, deadline : float
         Limits in s of a server's silence and of a whole request, as in `open`.
 
@@ -116,7 +122,7 @@ def verify(
     []
     """
     root = place(root, Network(timeout, deadline))
-    return verify_and_repair(root, level, repair_with, videos, seed, trust).problems
+    return verify_and_repair(root, level, repair_with, videos, seed, trust, engine).problems
 
 
 def verify_and_repair(
@@ -126,13 +132,14 @@ def verify_and_repair(
     videos: int = VIDEOS,
     seed: int = 0,
     trust: Sequence[str] = (),
+    engine: Engine | None = None,
 ) -> Outcome:
     """Result of `verify`, with the repaired problems and the regenerated shards."""
-    before = find_problems(root, level, videos, seed, trust)
+    before = find_problems(root, level, videos, seed, trust, engine)
     if not before or repair_with is None:
         return Outcome([problem.sentence for problem in before], [], [])
     remade = repair_with(sorted({problem.shard for problem in before if problem.shard}))
-    remaining = [problem.sentence for problem in find_problems(root, level, videos, seed, trust)]
+    remaining = [problem.sentence for problem in find_problems(root, level, videos, seed, trust, engine)]
     repaired = [problem.sentence for problem in before if problem.sentence not in remaining]
     return Outcome(remaining, repaired, list(remade or ()))
 
@@ -143,7 +150,12 @@ def damaged_shards(root: str | Place, level: str = "full") -> list[str]:
 
 
 def find_problems(
-    root: Place, level: str = "full", videos: int = VIDEOS, seed: int = 0, trust: Sequence[str] = ()
+    root: Place,
+    level: str = "full",
+    videos: int = VIDEOS,
+    seed: int = 0,
+    trust: Sequence[str] = (),
+    engine: Engine | None = None,
 ) -> list[Problem]:
     """All problems of the folder, then of the shards in their order, then of regenerated videos.
 
@@ -159,7 +171,7 @@ def find_problems(
         except (IncompleteError, DamagedError) as error:
             return [Problem(str(error))]
         try:
-            problems = list(_problems_of(root, manifest, level, videos, seed, trust))
+            problems = list(_problems_of(root, manifest, level, videos, seed, trust, engine))
         except Error:
             if _has_manifest(root, manifest):
                 raise
@@ -177,7 +189,13 @@ def _has_manifest(root: Place, manifest: Manifest) -> bool:
 
 
 def _problems_of(
-    root: Place, manifest: Manifest, level: str, videos: int, seed: int, trust: Sequence[str]
+    root: Place,
+    manifest: Manifest,
+    level: str,
+    videos: int,
+    seed: int,
+    trust: Sequence[str],
+    engine: Engine | None,
 ) -> Iterator[Problem]:
     changed = _changed_videos(root, manifest, videos, seed, trust) if level == "regen" else iter(())
     with reading(root):
@@ -194,6 +212,9 @@ def _problems_of(
         def status(_: float) -> str:
             return f"Checked {checked:,} of {len(unreported):,} shards"
 
+        if engine is not None:
+            yield from _check_on(engine, root, manifest, unreported)
+            unreported = []
         with _ShardChecker(root, manifest, rows) as checker, waiting("Checking every byte of the shards", None, status):
             for problems in checker.check(unreported):
                 yield from problems
@@ -436,3 +457,70 @@ class _ShardChecker:
                     yield f"{name} of video {number} has infinite values"
             if "index" in values and values["index"][0] != number:
                 yield f"index of video {number} is {values['index'][0]}"
+
+
+# ---- On a cluster
+
+
+def _check_on(engine: Engine, root: Place, manifest: Manifest, shards: Sequence[Shard]) -> Iterator[Problem]:
+    """Problems of these shards, in their order, found by the workers of an engine."""
+    found: dict[Shard, list[Problem]] = {}
+    there = root.absolute() if isinstance(root, Path) else root
+    for shard, sentences, _ in results(engine, _CheckJob(there, manifest.sha256), shards, inform):
+        found[shard] = [Problem(sentence.replace(str(there), str(root)), shard.name) for sentence in sentences]
+    for shard in shards:
+        yield from found[shard]
+
+
+class _CheckJob:
+    """Shards to check, for an engine."""
+
+    title, unit, noun, device = "Checking", "shards", "shard", "cpu"
+
+    def __init__(self, root: Place, manifest_sha256: str) -> None:
+        self.open = functools.partial(_CheckWorker, root, manifest_sha256)
+
+    def size(self, item: Shard) -> int:
+        return 1
+
+    def refusals(self, reports: Sequence[Report]) -> list[str]:
+        return [other_version(report) for report in reports]
+
+
+class _CheckWorker:
+    """Worker that checks shards of the dataset with this manifest."""
+
+    def __init__(self, root: Place, manifest_sha256: str, device: str, log: Log) -> None:
+        self.root, self.manifest_sha256, self.stack = root, manifest_sha256, contextlib.ExitStack()
+
+    def report(self) -> Report:
+        return Report("cpu", versions={"gen2d": __version__}, group=min(os.cpu_count() or 1, 8))
+
+    def check(self) -> str:
+        try:
+            with reading(self.root):
+                manifest = read_manifest(self.root)
+                rows = _check_tables(self.root, manifest)[1]
+        except Error as error:
+            return str(error)
+        if manifest.sha256 != self.manifest_sha256:
+            return f"it sees another dataset in {self.root}"
+        self.checker = self.stack.enter_context(_ShardChecker(self.root, manifest, rows))
+        return ""
+
+    def run(self, items: Sequence[Shard]) -> list[list[str]]:
+        return [[problem.sentence for problem in problems] for problems in self.checker.check(items)]
+
+    def run_all(self, items: Sequence[Shard], log: Log) -> list[list[str]]:
+        refusal = self.check()
+        if refusal:
+            raise EngineError(refusal)
+        with progress("Checking", len(items), log, "shards") as advance:
+            found = []
+            for problems in self.checker.check(items):
+                found.append([problem.sentence for problem in problems])
+                advance(1)
+        return found
+
+    def close(self) -> None:
+        self.stack.close()

@@ -78,7 +78,7 @@ def _stages(folder: Path, overrides: Sequence[str], config: str = CONFIG) -> dic
     import jax
 
     from gen2d.generation import encoder as encoder_module
-    from gen2d.generation.run import dataset_of
+    from gen2d.generation.worker import dataset_of
     from gen2d.programs import devices
     from gen2d.programs.source import VideoRange
 
@@ -190,7 +190,7 @@ def make(source: Any, videos: int, out: Path) -> None:
     """Generate a dataset as `gen2d.generate` does, with programs that are already compiled."""
     from gen2d.generation import encoder as encoder_module
     from gen2d.generation import writers as writers_module
-    from gen2d.generation.run import dataset_of
+    from gen2d.generation.worker import dataset_of
     from gen2d.programs import devices
 
     dataset = dataset_of(source, out, {"train": videos}, {})

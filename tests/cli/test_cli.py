@@ -51,6 +51,8 @@ def test_generate_is_the_verb_of_a_line_without_one() -> None:
 
 @pytest.mark.parametrize(("verb", "name"), OPTIONS)
 def test_an_option_cut_short_is_an_error_that_names_it(verb: str, name: str) -> None:
+    if (verb, name[:-1]) in OPTIONS:
+        return  # --workers and --worker
     done = run_main(verb, f"{name[:-1]}=1")
     assert (done.returncode, done.stdout) == (2, "")
     assert done.stderr == f"gen2d: {name[:-1]} is not an option; did you mean {name}?\n"

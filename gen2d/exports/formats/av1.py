@@ -24,4 +24,4 @@ def write(target: Path, source: Source) -> None:
     source.each(write_film)
 
 
-EXPORT = Export(fields=("frames",), write=write, check=check, fixed=True, loss=films.LOSS)
+EXPORT = Export(fields=("frames",), write=write, separate=True, check=check, fixed=True, loss=films.LOSS)

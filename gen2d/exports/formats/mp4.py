@@ -16,4 +16,4 @@ def write(target: Path, source: Source) -> None:
     source.each(lambda key, video: films.mp4v(target / f"{key}.mp4", video["frames"], source.fps))
 
 
-EXPORT = Export(fields=("frames",), write=write, check=check, fixed=True, loss=films.LOSS)
+EXPORT = Export(fields=("frames",), write=write, separate=True, check=check, fixed=True, loss=films.LOSS)

@@ -20,4 +20,4 @@ def write(target: Path, source: Source) -> None:
     source.each(write_archive)
 
 
-EXPORT = Export(fields=("frames", "*"), write=write)
+EXPORT = Export(fields=("frames", "*"), write=write, separate=True)
