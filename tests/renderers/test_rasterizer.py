@@ -485,8 +485,8 @@ def test_batches_share_one_program():
         for start in (0, 2):
             (made,) = rollout.draw([batch], start, 2)
             assert made["frames"].shape[0] == 2
-    loaded = [key[0] for key, program in shared._programs if program._loaded]
-    assert sum("draw" in name for name in loaded) == 1
+    loaded = [key for key, program in shared._programs if program._loaded]
+    assert sum("draw_program" in key for key in loaded) == 1
 
 
 # ---- Derivatives
