@@ -17,7 +17,6 @@ import logging
 import math
 import os
 import re
-import shutil
 import socket
 import statistics
 import sys
@@ -32,13 +31,15 @@ from typing import Any, NamedTuple
 from gen2d.core.errors import Error, FolderError, UserError, one_line
 from gen2d.core.progress import Event, Log, progress, stopping_on_sigterm, waiting
 from gen2d.engines.protocol import Done, EngineError, HeadLostError, Job, Report, Worker
-from gen2d.storage.leases import try_lock
+from gen2d.storage.atomic import remove_tree
+from gen2d.storage.leases import LOCK, lease, remove_abandoned, temporary_files, temporary_name, try_lock
 
 DEPTH = 2  # groups of items that a worker has at once: one in work, one that follows without a pause
 SCALE_PERIOD = 2.0  # s between two looks at the machines of the cluster
 GRACE = 30.0  # s that a first worker waits for the reports of the others
 STRAGGLER, STRAGGLER_SECONDS = 3.0, 10.0  # an item is late after this many medians, and at least these seconds
 UNREACHABLE = 20.0  # s; Ray starts nothing anywhere while it tries a machine that it does not know to be dead
+LONGEST_FOLDER = 45  # characters; the path of a socket has 107 at most
 HEADLESS = 20.0  # s without a head before the run ends
 CLOSING = 20.0  # s that workers have to close their files
 CONNECTING = 10.0  # s
@@ -653,7 +654,8 @@ class _Connection:
                 import ray
         except ImportError:
             raise EngineError("Ray is not installed: pip install 'gen2d[ray]', or '.[ray]' in a checkout") from None
-        self.ray, self.folder, self.dashboard, self.is_own = ray, None, "", False
+        self.ray, self.dashboard, self.is_own = ray, "", False
+        self.leases = contextlib.ExitStack()  # on the folder
         self.head: str | None = None  # its address, if it can be reached from here
         self.answered, self.is_lost = time.monotonic(), False
         self.was_connected = ray.is_initialized()
@@ -663,10 +665,9 @@ class _Connection:
         self.is_own = address == "local"
         options: dict[str, Any] = {"log_to_driver": False, "logging_level": logging.CRITICAL}
         if self.is_own:
-            self.folder = tempfile.mkdtemp(prefix="gen2d-ray-")
             cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
             options |= {"num_cpus": cores, "include_dashboard": False, "object_store_memory": 10**8}
-            options |= {"_temp_dir": self.folder}
+            options |= {"_temp_dir": str(self._own_folder())}
         else:
             _check_reachable(address)
         try:
@@ -714,9 +715,20 @@ class _Connection:
                 self.ray.shutdown()
             self._remove_folder()
 
+    def _own_folder(self) -> Path:
+        """Folder of the files of Ray on this machine alone; those that killed runs left are removed."""
+        folder = Path(tempfile.gettempdir()) / temporary_name("gen2d-ray")
+        if len(str(folder)) > LONGEST_FOLDER:
+            folder = Path("/tmp") / folder.name
+        remove_abandoned(temporary_files(folder.parent, "gen2d-ray."))
+        lock = folder.with_name(folder.name + LOCK)
+        self.leases.enter_context(lease(lock))
+        self.leases.callback(lock.unlink, missing_ok=True)
+        self.leases.callback(remove_tree, folder)
+        return folder
+
     def _remove_folder(self) -> None:
-        if self.folder is not None:
-            shutil.rmtree(self.folder, ignore_errors=True)
+        self.leases.close()
 
 
 def _check_reachable(address: str) -> None:

@@ -20,7 +20,7 @@ from gen2d.engines.local import Local
 from gen2d.engines.protocol import Engine, Workers
 from gen2d.generation.complete import complete
 from gen2d.generation.warm_up import check_disk
-from gen2d.generation.worker import GenerationJob
+from gen2d.generation.worker import SEEN, GenerationJob
 from gen2d.records.keys import MAX_VIDEOS
 from gen2d.storage.atomic import sweep
 from gen2d.storage.paths import Place, place
@@ -143,10 +143,14 @@ def generate(
         size, compile_seconds = _run_shards(workers, todo, ClusterRun(out, todo, log) if engine is not None else None)
     finally:
         workers.stop()
-    if engine is not None:
-        sweep(out, shards.FOLDERS)  # of workers that were killed
     with waiting("Writing tables, cards and the manifest", log):
         is_complete = complete(dataset)
+        if engine is not None:
+            sweep(out, shards.FOLDERS)  # what killed workers left
+            end = time.monotonic() + SEEN
+            while not is_complete and time.monotonic() < end:
+                time.sleep(1)
+                is_complete = complete(dataset)
     seconds = time.perf_counter() - began
     if todo:
         entry = {"time": time.time(), "host": os.uname().nodename, "videos": video_count, "seconds": seconds}

@@ -123,7 +123,7 @@ def repaired(monkeypatch: pytest.MonkeyPatch) -> None:
     def made(rollout: object, root: Path, counts: Mapping[str, int], fingerprint: object) -> DatasetSpec:
         return small(root, dict(counts))
 
-    monkeypatch.setattr(regenerate, "source_of", lambda *_: None)
+    monkeypatch.setattr(regenerate, "source_of", lambda *_, **__: None)
     monkeypatch.setattr(regenerate, "check_fingerprint", lambda *_: None)
     monkeypatch.setattr(regenerate.devices, "versions", lambda: dict.fromkeys(regenerate.CODECS))
     monkeypatch.setattr(regenerate, "dataset_of", made)

@@ -66,18 +66,22 @@ def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cluster]:
                 os.environ[name] = value
 
 
-def actors() -> list[int]:
-    """Process numbers of the workers on this file's machines."""
+def processes(name: str, token: str) -> list[int]:
+    """Numbers of the processes whose command line contains this name, on machines with this token."""
     found = []
     for path in Path("/proc").glob("[0-9]*"):
         try:
-            if (path / "cmdline").read_bytes().startswith(b"ray::Actor"):
-                environment = (path / "environ").read_bytes()
-                if f"{TOKEN}={os.environ[TOKEN]}".encode() in environment:
-                    found.append(int(path.name))
+            is_named = name.encode() in (path / "cmdline").read_bytes()
+            if is_named and f"{TOKEN}={token}".encode() in (path / "environ").read_bytes():
+                found.append(int(path.name))
         except OSError:
             continue
     return found
+
+
+def actors() -> list[int]:
+    """Process numbers of the workers on this file's machines."""
+    return processes("ray::Actor", os.environ[TOKEN])
 
 
 def kill(processes: list[int], number: int = signal.SIGKILL) -> int:
@@ -246,6 +250,25 @@ def test_a_killed_driver_starts_again(plain: dict[str, bytes], tmp_path: Path):
     assert done.returncode == 0, done.stderr
     assert all(" ..." in line or "worker (" in line or "First shard" in line for line in done.stderr.splitlines())
     assert {n: d for n, d in files(tmp_path / "data").items() if ".tmp." not in n} == plain
+
+
+@pytest.mark.full
+def test_a_lost_head_is_one_sentence(tmp_path: Path):
+    """And what is made stays; Ray itself would wait for a minute and end the process with its own words."""
+    (tmp_path / "tiny.yaml").write_text(json.dumps(CONFIG))
+    arguments = ["--config", tmp_path / "tiny.yaml", "--n", 200_000, "--out", tmp_path / "data", "--engine", "ray"]
+    argv, environment = command(*arguments, **{TOKEN: str(tmp_path)})
+    with subprocess.Popen(argv, env=environment, stdout=-1, stderr=-1, text=True) as process:
+        assert process.stderr is not None
+        lines = []
+        for line in process.stderr:
+            lines.append(line)
+            if "First shard" in line:
+                assert kill(processes("gcs_server", str(tmp_path))) == 1
+    assert process.returncode == 2
+    assert lines[-1].startswith("gen2d: the head of the cluster, ")
+    assert lines[-1].endswith(", is lost; what is made stays\n")
+    assert len(list((tmp_path / "data/shards").glob("*.h5"))) > 1
 
 
 @pytest.mark.full
