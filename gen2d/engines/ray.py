@@ -225,7 +225,7 @@ class _Member:
         self.calls: dict[Any, _Call] = {}  # in work, by the reference to their results
 
     @property
-    def has_suspect(self) -> bool:
+    def has_retry(self) -> bool:
         return any(call.alone for call in self.calls.values())
 
 
@@ -252,15 +252,15 @@ class RayWorkers:
         self.members: dict[Hashable, _Member] = {}
         self.calls: dict[Any, _Call] = {}
         self.todo: deque[Any] = deque()
-        self.suspects: deque[Sequence[Any]] = deque()  # items that failed, or whose worker was lost, to be run alone
+        self.retry_queue: deque[Sequence[Any]] = deque()  # items that failed, or whose worker was lost, to be run alone
         self.missing: dict[Any, None] = {}  # submitted and not done, in order
         self.failures: dict[Any, int] = {}
         self.failed_on: dict[Any, str] = {}  # name of the last worker
         self.seconds: deque[float] = deque(maxlen=1000)  # of the last calls
         self.refused: dict[Hashable, str] = {}  # why, by the key of the slot
         self.refused_nodes: set[str] = set()
-        self.resting: dict[Hashable, float] = {}  # until when, slots whose workers die early
-        self.barren = 0  # workers lost since the last item was done
+        self.blocked_until: dict[Hashable, float] = {}  # until when, slots whose workers die early
+        self.losses = 0  # workers lost since the last item was done
         self.seen: set[Hashable] = set()  # slots that have had a worker
         self.scaled, self.opened = 0.0, False
         self.device = ""
@@ -319,11 +319,11 @@ class RayWorkers:
                 first = first or (time.monotonic() if reported else 0.0)
                 is_late = first and time.monotonic() > first + GRACE and len(reported) >= low
                 if reported and (is_late or len(reported) + len(self.refused) >= self._capacity()):
-                    self._judge(reported)
+                    self._admit(reported)
                     if self._reported_count() >= low:
                         break
                     first = 0.0
-                if self._is_hopeless(time.monotonic() - began):
+                if self._is_timed_out(time.monotonic() - began):
                     raise EngineError(self._too_few())
         names = ", ".join(sorted({member.report.device for member in self.members.values() if member.report}))
         ready = self._reported_count()
@@ -342,7 +342,7 @@ class RayWorkers:
         parts = _plural(len(nodes), "machine"), _plural(total["CPU"], "core"), _plural(total["GPU"], "GPU")
         return f"the cluster has {', '.join(parts)}"
 
-    def _is_hopeless(self, seconds: float) -> bool:
+    def _is_timed_out(self, seconds: float) -> bool:
         """Whether to wait no longer for the smallest number of workers."""
         low, _ = self.engine.limits
         slots = self._slots()
@@ -408,7 +408,7 @@ class RayWorkers:
         if not self.connection.has_head():
             return
         for key, slot in self._slots().items():
-            if key in self.members or key in self.refused or time.monotonic() < self.resting.get(key, 0):
+            if key in self.members or key in self.refused or time.monotonic() < self.blocked_until.get(key, 0):
                 continue
             options: dict[str, Any] = {"num_cpus": slot.cpus, "num_gpus": slot.gpus, "max_concurrency": DEPTH + 2}
             options |= {"max_restarts": 0, "max_task_retries": 0}
@@ -422,7 +422,7 @@ class RayWorkers:
             self.members[key] = member
             self._call(member, "open")
 
-    def _judge(self, members: Sequence[_Member]) -> None:
+    def _admit(self, members: Sequence[_Member]) -> None:
         """Release the workers that cannot take part; the first call decides what all must agree on."""
         kind = (self.engine.device_kind or "").lower()
         able = []
@@ -475,21 +475,21 @@ class RayWorkers:
         """Give items to the workers that have room for them."""
         ready = [member for member in self.members.values() if member.ready]
         for member in ready:
-            if self.suspects and not member.calls:
-                for items in self.suspects:
+            if self.retry_queue and not member.calls:
+                for items in self.retry_queue:
                     if len(ready) == 1 or self.failed_on.get(items[0]) != member.name:
-                        self.suspects.remove(items)
+                        self.retry_queue.remove(items)
                         self._call(member, "run", items, alone=True)
                         break
         for member in sorted(ready, key=lambda member: len(member.calls)):
             assert member.report is not None
-            while self.todo and len(member.calls) < DEPTH and not member.has_suspect:
+            while self.todo and len(member.calls) < DEPTH and not member.has_retry:
                 # The last items are shared, also by workers that are still starting.
                 share = -(-len(self.todo) // (DEPTH * max(len(ready), min(self._expected, len(self.members)))))
                 count = min(member.report.group, share)
                 items = [self.todo.popleft() for _ in range(count)]
                 self._call(member, "run", items)
-        if not self.todo and not self.suspects:
+        if not self.todo and not self.retry_queue:
             self._repeat_late(member for member in ready if not member.calls)
 
     @property
@@ -538,8 +538,8 @@ class RayWorkers:
             if isinstance(answer, Failure):
                 return self._failed(call, answer.error)
             self.seconds.append(time.monotonic() - call.began)
-            self.barren = 0
-            self.resting.pop(member.key, None)
+            self.losses = 0
+            self.blocked_until.pop(member.key, None)
             for item, result in zip(call.items, answer, strict=True):
                 if item in self.missing:
                     del self.missing[item]
@@ -549,7 +549,7 @@ class RayWorkers:
         elif call.kind == "open":
             member.name, member.node, member.report = answer
             if self.opened:
-                self._judge([member])
+                self._admit([member])
                 if member.key in self.members:
                     if member.key not in self.seen:  # otherwise it replaces one that was lost
                         self.log(Event.of(f"{member.name} joins", "joined", worker=member.name))
@@ -585,7 +585,7 @@ class RayWorkers:
                 sentence = f"{name} failed {times}, the last on {call.member.name}: {error}; what is made stays"
                 raise type(error)(sentence) if isinstance(error, Error) else EngineError(sentence)
         if items:
-            self.suspects.extend([[item] for item in items] if call.alone else [items])
+            self.retry_queue.extend([[item] for item in items] if call.alone else [items])
 
     def _lose(self, call: _Call, error: Exception) -> None:
         """Replace a worker that died, and have its items run again."""
@@ -606,14 +606,14 @@ class RayWorkers:
             self.log(Event.of(line, "lost", worker=member.name, cause=cause, items=names))
         for each in calls:
             self._again(each, cause)
-        self.barren += 1
-        pause = min(0.5 * 2 ** min(self.barren, 6), 30.0) if self.barren > 2 else 0.0
+        self.losses += 1
+        pause = min(0.5 * 2 ** min(self.losses, 6), 30.0) if self.losses > 2 else 0.0
         if cause != DIED:
             pause = max(pause, UNREACHABLE)
-        self.resting[member.key] = time.monotonic() + pause
-        if self.barren > (self.engine.retries + 1) * (len(self._slots()) + 1):
+        self.blocked_until[member.key] = time.monotonic() + pause
+        if self.losses > (self.engine.retries + 1) * (len(self._slots()) + 1):
             raise EngineError(
-                f"{self.barren} workers died one after the other before any finished a {self.job.noun}, the last as "
+                f"{self.losses} workers died one after the other before any finished a {self.job.noun}, the last as "
                 f"{cause}; what is made stays"
             )
 
