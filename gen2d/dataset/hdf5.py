@@ -10,6 +10,8 @@ other threads and chunks pass through h5py unchanged.
 import contextlib
 import dataclasses
 import errno
+import math
+import os
 import re
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
@@ -62,7 +64,10 @@ def write(
         }
         table = {name: np.zeros(shapes[name], _stored_type(fields[name])) for name in rows}
         index = np.zeros(count, video_type(fields, sizes["T"] // chunk_frames if chunk_frames else 1))
+        # More than HDF5 adds to the values: headers and attributes, and the places of the chunks.
+        metadata = 4096 * (len(fields) + 4) + 64 * len(images) * math.prod(index[images[0]].shape if images else ())
         for first, block in _number_blocks(blocks, count, path):
+            _reserve(file, block.nbytes + metadata)
             _write_chunks(chunked, block, first, chunk_frames)
             own = index[first : first + len(block)]
             for name in rows:
@@ -72,7 +77,9 @@ def write(
                 own[name]["crc32"] = block.crc[name].reshape(len(block), -1)
         for name, dataset in chunked.items():
             _fill_offsets(dataset, index[name])
-        for name, values in sorted((table | dict(constants)).items()):
+        tables = table | dict(constants)
+        _reserve(file, metadata + index.nbytes + sum(np.asarray(values).nbytes for values in tables.values()))
+        for name, values in sorted(tables.items()):
             file.create_dataset(name, data=np.asarray(values, _stored_type(fields[name])))
         for name, field in sorted(fields.items()):
             file[name].attrs.update(axes=field.axes, unit=field.unit, meaning=field.meaning)
@@ -103,6 +110,7 @@ def _create(path: Path) -> Iterator[h5py.File]:
     file = h5py.File(path, "w", libver=("v110", "v110"), locking=False)
     try:
         yield file
+        file.flush()
     except BaseException as error:
         with contextlib.suppress(RuntimeError, OSError):
             file.close()
@@ -111,8 +119,20 @@ def _create(path: Path) -> Iterator[h5py.File]:
         raise
     try:
         file.close()
-    except RuntimeError as error:  # HDF5 writes much only now, and h5py turns its OSErrors into RuntimeErrors
+    except RuntimeError as error:  # h5py turns its OSErrors into RuntimeErrors
         raise _as_oserror(error) from error
+    with path.open("r+b") as written:  # what is reserved and unused is removed
+        written.truncate(int.from_bytes(written.read(36)[28:], "little"))  # end of the file, as its superblock says
+
+
+def _reserve(file: h5py.File, size: int) -> None:
+    """Reserve room on the disk for so many more bytes. Raises OSError: where HDF5 meets a full disk, it may crash."""
+    if hasattr(os, "posix_fallocate"):
+        try:
+            os.posix_fallocate(file.id.get_vfd_handle(), 0, file.id.get_filesize() + size)
+        except OSError as error:
+            if error.errno not in (errno.EOPNOTSUPP, errno.EINVAL, errno.ENOSYS):
+                raise
 
 
 def _as_oserror(error: RuntimeError) -> OSError:

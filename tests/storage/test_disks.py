@@ -156,6 +156,42 @@ def test_a_full_disk_is_said_and_gone_on_from(small_disk: Path) -> None:
     assert verify(small_disk / "data") == []
 
 
+# Fills the disk to every level at which a shard may meet its end.
+LEVELS = """
+import errno, sys
+from pathlib import Path
+import numpy as np
+from gen2d.core.schema import Field
+from gen2d.dataset import hdf5
+from gen2d.dataset.block import encode
+disk, sizes, noise = Path(sys.argv[1]), {"T": 4, "H": 16, "W": 16, "K": 8}, np.random.default_rng(0)
+fields = {f"states/{k}": Field("float32", "n T K 2", "m", "noise") for k in range(12)}
+fields["frames"] = Field("uint8", "n T H W 3", "sRGB", "noise")
+columns = {name: (255 * noise.random((4, *field.shape(sizes)))).astype(field.dtype) for name, field in fields.items()}
+blocks, outcomes = [encode(columns, fields, "gzip")] * 6, []
+for fill in range(0, 400_000, 4096):
+    (disk / "fill").write_bytes(bytes(fill))
+    try:
+        hdf5.write(disk / "shard.h5", fields, sizes, range(24), blocks, "gzip", None, {"a": 1}, {}, 0)
+        outcomes.append("whole")
+    except OSError as error:
+        assert error.errno == errno.ENOSPC, error
+        outcomes.append("full")
+    (disk / "shard.h5").unlink(missing_ok=True)
+print(outcomes.count("whole"), outcomes.count("full"))
+"""
+
+
+def test_a_disk_that_fills_at_any_moment_is_an_error(small_disk: Path) -> None:
+    """HDF5 itself crashes where it finds the disk full while it closes a dataset."""
+    done = subprocess.run([sys.executable, "-c", LEVELS, str(small_disk)], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    whole, full = map(int, done.stdout.split())
+    assert whole > 5
+    assert full > 50
+    assert done.stderr == ""
+
+
 def test_a_disk_without_inodes_is_said(small_disk: Path) -> None:
     for number in range(28):
         (small_disk / f"{number}").touch()
