@@ -2,9 +2,9 @@
 
 import argparse
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from types import ModuleType
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
 from gen2d._version import __version__
 from gen2d.config.plugins import nearest
@@ -13,6 +13,7 @@ from gen2d.core.errors import UserError
 if TYPE_CHECKING:
     from gen2d.engines.ray import Ray
 
+T = TypeVar("T")
 PROG = "python -m gen2d"
 USAGE = """\
 python -m gen2d --config YAML --n N [options]
@@ -97,14 +98,14 @@ def add_network(parser: Parser) -> None:
     """Adds how long to wait for a server."""
     parser.add_argument(
         "--timeout",
-        type=seconds,
+        type=_seconds,
         default=30.0,
         metavar="S",
         help="for a URL: seconds to wait for a server that sends nothing (default: 30)",
     )
     parser.add_argument(
         "--deadline",
-        type=seconds,
+        type=_seconds,
         default=300.0,
         metavar="S",
         help="for a URL: seconds that a request and its retries may take together (default: 300)",
@@ -158,11 +159,16 @@ def add_engine(parser: Parser) -> None:
     )
     group.add_argument(
         "--workers",
-        type=_worker_limits,
+        type=argument(_worker_limits, "MIN:MAX, such as 1:8"),
         metavar="MIN:MAX",
         help="the least and the largest number of workers (default: 1 and as many as the cluster holds)",
     )
-    group.add_argument("--gpus-per-worker", type=_number, metavar="N", help="GPUs of a worker (default: 1)")
+    group.add_argument(
+        "--gpus-per-worker",
+        type=argument(float, "a number, such as 1"),
+        metavar="N",
+        help="GPUs of a worker (default: 1)",
+    )
     group.add_argument(
         "--cpus-per-worker",
         type=whole_number,
@@ -189,32 +195,22 @@ def engine_of(options: argparse.Namespace) -> "Ray | None":
     return Ray(**given)
 
 
+def argument(parse: Callable[[str], T], what: str) -> Callable[[str], T]:
+    """Parser of an argument's text, whose ValueError becomes the sentence that the text is not `what`."""
+
+    def parsed(text: str) -> T:
+        try:
+            return parse(text)
+        except ValueError:
+            raise argparse.ArgumentTypeError(f"{text!r} is not {what}") from None
+
+    return parsed
+
+
 def _worker_limits(text: str) -> tuple[int, int | None]:
     low, colon, high = text.partition(":")
-    try:
-        return int(low or 1), (int(high) if high else None) if colon else int(low)
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"{text!r} is not MIN:MAX, such as 1:8") from None
+    return int(low or 1), (int(high) if high else None) if colon else int(low)
 
 
-def _number(text: str) -> float:
-    try:
-        return float(text)
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a number, such as 1") from None
-
-
-def whole_number(text: str) -> int:
-    """The value of an argument that is a whole number."""
-    try:
-        return int(text)
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number, such as 100") from None
-
-
-def seconds(text: str) -> float:
-    """The value of an argument that is a duration."""
-    try:
-        return float(text)
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a number of seconds, such as 30") from None
+whole_number = argument(int, "a whole number, such as 100")
+_seconds = argument(float, "a number of seconds, such as 30")

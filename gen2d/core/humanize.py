@@ -1,4 +1,4 @@
-"""Sizes and durations as text."""
+"""Sizes, durations and counts as text."""
 
 
 def in_bytes(size: float) -> str:
@@ -17,3 +17,8 @@ def in_time(seconds: float) -> str:
     minutes, seconds = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)
     return f"{hours} h {minutes} min" if hours else f"{minutes} min {seconds} s"
+
+
+def with_noun(number: float, noun: str) -> str:
+    """Number of things as text, such as '2 workers'."""
+    return f"{number:,g} {noun}{'' if number == 1 else 's'}"

@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from gen2d.core.humanize import in_time
+from gen2d.core.humanize import in_time, with_noun
 
 PATIENCE, PERIOD = 2.0, 10.0  # seconds after which a wait is announced, and between two lines about it
 LOGGER = logging.getLogger("gen2d")
@@ -124,7 +124,7 @@ def progress(
 
             def update(number: int) -> None:
                 if workers is not None:
-                    bar.set_postfix_str(_plural(workers(), "worker"), refresh=not number)
+                    bar.set_postfix_str(with_noun(workers(), "worker"), refresh=not number)
                 bar.update(number)
 
             yield update
@@ -132,16 +132,16 @@ def progress(
     done = 0
 
     def status(seconds: float) -> Event:
-        at_work = () if workers is None else (_plural(workers(), "worker"),)
-        values = {"done": done, "of": count, "unit": unit, "seconds": round(seconds, 3)}
-        values |= {} if workers is None else {"workers": workers()}
+        values: dict[str, Any] = {"done": done, "of": count, "unit": unit, "seconds": round(seconds, 3)}
+        at_work, head = [], f"{what}: {done:,} of {count:,} {unit}"
+        if workers is not None:
+            values["workers"] = workers()
+            at_work = [with_noun(values["workers"], "worker")]
         if not done:
-            line = ", ".join([f"{what}: 0 of {count:,} {unit} after {in_time(seconds)}", *at_work])
-            return Event.of(line, "progress", **values)
-        seconds_left = (count - done) * seconds / done
-        rate = f"{done / seconds:,.0f} {unit}/s"
-        line = ", ".join([f"{what}: {done:,} of {count:,} {unit}", rate, *at_work, f"{in_time(seconds_left)} left"])
-        return Event.of(line, "progress", **values, rate=round(done / seconds, 3), seconds_left=round(seconds_left, 3))
+            return Event.of(", ".join([f"{head} after {in_time(seconds)}", *at_work]), "progress", **values)
+        rate, left = done / seconds, (count - done) * seconds / done
+        line = ", ".join([head, f"{rate:,.0f} {unit}/s", *at_work, f"{in_time(left)} left"])
+        return Event.of(line, "progress", **values, rate=round(rate, 3), seconds_left=round(left, 3))
 
     def advance(number: int) -> None:
         nonlocal done
@@ -149,10 +149,6 @@ def progress(
 
     with waiting(what, log, status):
         yield advance
-
-
-def _plural(number: int, noun: str) -> str:
-    return f"{number:,} {noun}{'' if number == 1 else 's'}"
 
 
 @contextmanager

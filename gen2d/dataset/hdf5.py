@@ -10,7 +10,6 @@ other threads and chunks pass through h5py unchanged.
 import contextlib
 import dataclasses
 import errno
-import math
 import os
 import re
 from collections.abc import Iterable, Iterator, Mapping
@@ -65,7 +64,7 @@ def write(
         table = {name: np.zeros(shapes[name], _stored_type(fields[name])) for name in rows}
         index = np.zeros(count, video_type(fields, sizes["T"] // chunk_frames if chunk_frames else 1))
         # More than HDF5 adds to the values: headers and attributes, and the places of the chunks.
-        metadata = 4096 * (len(fields) + 4) + 64 * len(images) * math.prod(index[images[0]].shape if images else ())
+        metadata = 4096 * (len(fields) + 4) + 64 * sum(index[name].size for name in images)
         for first, block in _number_blocks(blocks, count, path):
             _reserve(file, block.nbytes + metadata)
             _write_chunks(chunked, block, first, chunk_frames)

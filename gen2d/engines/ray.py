@@ -9,40 +9,29 @@ bytes pass through it. What is run twice is harmless (engines/protocol.py), so t
 - when nothing is left to hand out, idle workers also run items that take far longer than the others
 """
 
-import atexit
 import contextlib
 import dataclasses
-import importlib
-import logging
 import math
-import os
 import re
-import socket
 import statistics
-import sys
-import tempfile
 import time
-import warnings
 from collections import deque
 from collections.abc import Hashable, Iterator, Sequence
-from pathlib import Path
 from typing import Any, NamedTuple
 
-from gen2d.core.errors import Error, FolderError, UserError, one_line
+from gen2d.core.errors import Error, FolderError, UserError
+from gen2d.core.humanize import with_noun
 from gen2d.core.progress import Event, Log, progress, stopping_on_sigterm, waiting
-from gen2d.engines.protocol import Done, EngineError, HeadLostError, Job, Report, Worker
-from gen2d.storage.atomic import remove_tree
-from gen2d.storage.leases import LOCK, lease, remove_abandoned, temporary_files, temporary_name, try_lock
+from gen2d.engines.protocol import Done, EngineError, Job, Report
+from gen2d.engines.ray_actor import Actor, Failure
+from gen2d.engines.ray_connection import Connection
 
 DEPTH = 2  # groups of items that a worker has at once: one in work, one that follows without a pause
 SCALE_PERIOD = 2.0  # s between two looks at the machines of the cluster
 GRACE = 30.0  # s that a first worker waits for the reports of the others
 STRAGGLER, STRAGGLER_SECONDS = 3.0, 10.0  # an item is late after this many medians, and at least these seconds
 UNREACHABLE = 20.0  # s; Ray starts nothing anywhere while it tries a machine that it does not know to be dead
-LONGEST_FOLDER = 45  # characters; the path of a socket has 107 at most
-HEADLESS = 20.0  # s without a head before the run ends
 CLOSING = 20.0  # s that workers have to close their files
-CONNECTING = 10.0  # s
 DIED = "its process died"
 
 
@@ -106,7 +95,7 @@ class Ray:
 
         Raises EngineError if Ray is not installed or not reachable, or if there are too few workers.
         """
-        workers = RayWorkers(self, job, log, _Connection(self.address, log))
+        workers = RayWorkers(self, job, log, Connection(self.address, log))
         try:
             workers.assemble()
         except BaseException:
@@ -117,92 +106,6 @@ class Ray:
 
 def _is_whole(value: Any, low: int) -> bool:
     return isinstance(value, int) and not isinstance(value, bool) and value >= low
-
-
-# ---- In the workers
-
-
-class Failure(NamedTuple):
-    """What a worker answers if a call fails."""
-
-    error: Exception
-
-
-class Actor:
-    """A process of the cluster with one worker. Its calls return a Failure instead of raising."""
-
-    def __init__(self) -> None:
-        self.worker: Worker | None = None
-
-    def open(self, job: Any, device: str, cores: int | None, gpus: float) -> tuple[str, str, Report] | Failure:
-        """Name of the process, id of its machine, and report of its worker.
-
-        Without a number of cores, it takes the same share of its machine's as of its GPUs.
-        """
-        import ray
-
-        name, node = f"{socket.gethostname()}:{os.getpid()}", ray.get_runtime_context().get_node_id()
-        try:
-            if cores is None:
-                has = next(each["Resources"] for each in ray.nodes() if each["NodeID"] == node)
-                cores = max(1, int(has["CPU"] * gpus / has["GPU"]))
-            self.locks = take_cores(cores)
-            self.worker = worker = job(device, lambda line: None)
-            return name, node, worker.report()
-        except Exception as error:
-            return _failure(error)
-
-    def check(self) -> str | Failure:
-        assert self.worker is not None
-        try:
-            return self.worker.check()
-        except Exception as error:
-            return _failure(error)
-
-    def run(self, items: Sequence[Any]) -> list[Any] | Failure:
-        assert self.worker is not None
-        try:
-            return list(self.worker.run(items))
-        except Exception as error:
-            return _failure(error)
-
-    def close(self) -> None:
-        if self.worker is not None:
-            self.worker.close()
-
-
-def _failure(error: Exception) -> Failure:
-    """The error, if it is one of ours, or a sentence that says what it is."""
-    return Failure(error if isinstance(error, Error) else RuntimeError(f"{type(error).__name__}: {error}"))
-
-
-def take_cores(count: int) -> list[int]:
-    """Restrict this process to this many of its cores, none of which another worker has taken.
-
-    Returns the descriptors of the locks on the cores, which the system frees when the process dies.
-    """
-    if not hasattr(os, "sched_getaffinity"):
-        return []
-    allowed, taken, locks = sorted(os.sched_getaffinity(0)), [], []
-    folder = Path(tempfile.gettempdir()) / f"gen2d-cores-{os.getuid()}"
-    with contextlib.suppress(OSError):
-        folder.mkdir(mode=0o700, exist_ok=True)
-        for core in allowed:
-            if len(taken) < count < len(allowed):
-                lock = os.open(folder / f"{core}", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
-                if try_lock(lock):
-                    taken.append(core)
-                    locks.append(lock)
-                else:
-                    os.close(lock)
-    chosen = taken if len(taken) == count else allowed[:count]
-    for thread in Path("/proc/self/task").iterdir():
-        with contextlib.suppress(OSError):  # a thread that has ended
-            os.sched_setaffinity(int(thread.name), chosen)
-    return locks
-
-
-# ---- In the driver
 
 
 class _Slot(NamedTuple):
@@ -244,7 +147,7 @@ class _Call:
 class RayWorkers:
     """The workers of a run, and the items that are in work or left."""
 
-    def __init__(self, engine: Ray, job: Job, log: Log, connection: "_Connection") -> None:
+    def __init__(self, engine: Ray, job: Job, log: Log, connection: Connection) -> None:
         self.engine, self.job, self.log, self.connection = engine, job, log, connection
         self.ray = connection.ray
         self.actor_type = self.ray.remote(Actor)
@@ -327,7 +230,8 @@ class RayWorkers:
                     raise EngineError(self._too_few())
         names = ", ".join(sorted({member.report.device for member in self.members.values() if member.report}))
         ready = self._reported_count()
-        self.log(Event.of(f"{_plural(ready, 'worker')} ({names}){self.connection.dashboard}", "started", workers=ready))
+        line = f"{with_noun(ready, 'worker')} ({names}){self.connection.dashboard}"
+        self.log(Event.of(line, "started", workers=ready))
 
     def _status(self) -> str:
         wanted = self.engine.limits[0]
@@ -339,7 +243,7 @@ class RayWorkers:
     def _resources(self) -> str:
         nodes = self._nodes()
         total = {kind: sum(node["Resources"].get(kind, 0) for node in nodes) for kind in ("CPU", "GPU")}
-        parts = _plural(len(nodes), "machine"), _plural(total["CPU"], "core"), _plural(total["GPU"], "GPU")
+        parts = with_noun(len(nodes), "machine"), with_noun(total["CPU"], "core"), with_noun(total["GPU"], "GPU")
         return f"the cluster has {', '.join(parts)}"
 
     def _is_timed_out(self, seconds: float) -> bool:
@@ -361,11 +265,11 @@ class RayWorkers:
                 else (f"--workers asks for {low} or more, but fewer can take part: {reasons[-1]}")
             )
         device, slot = self.device or "cpu", next(iter(self._slots().values()), None)
-        need = f"{_plural(slot.gpus, 'GPU')} and " if slot and slot.gpus else "1 GPU and " if device == "gpu" else ""
+        need = f"{with_noun(slot.gpus, 'GPU')} and " if slot and slot.gpus else "1 GPU and " if device == "gpu" else ""
         cores = slot.cpus if slot else self.engine.cpus_per_worker or 1
         return (
-            f"there is no room for {_plural(low, 'worker')} of {need}{_plural(cores, 'core')}: {self._resources()}; "
-            "lower --workers, --gpus-per-worker or --cpus-per-worker, or add machines"
+            f"there is no room for {with_noun(low, 'worker')} of {need}{with_noun(cores, 'core')}: "
+            f"{self._resources()}; lower --workers, --gpus-per-worker or --cpus-per-worker, or add machines"
         )
 
     def _nodes(self) -> list[dict[str, Any]]:
@@ -581,7 +485,7 @@ class RayWorkers:
             item = items[0]
             self.failures[item] = self.failures.get(item, 0) + 1
             if self.failures[item] >= self.engine.retries:
-                name, times = getattr(item, "name", item), _plural(self.failures[item] + 1, "time")
+                name, times = getattr(item, "name", item), with_noun(self.failures[item] + 1, "time")
                 sentence = f"{name} failed {times}, the last on {call.member.name}: {error}; what is made stays"
                 raise type(error)(sentence) if isinstance(error, Error) else EngineError(sentence)
         if items:
@@ -598,7 +502,7 @@ class RayWorkers:
             reason = f"it has no module {missing_module[1]}: install gen2d there, as it is here"
             return self._refuse_or_raise(member, reason)
         items = [item for each in calls for item in each.items if item in self.missing]
-        again = f"; {_plural(len(items), self.job.noun)} will be run again" if items else ""
+        again = f"; {with_noun(len(items), self.job.noun)} will be run again" if items else ""
         node_is_known = member.node and member.node in {node["NodeID"] for node in self._nodes()}
         cause = cause if node_is_known or not member.node else "its machine is gone"
         line, names = f"{member.name} is lost ({cause}){again}", [f"{getattr(item, 'name', item)}" for item in items]
@@ -637,133 +541,3 @@ def _cause(error: Exception) -> str:
     if "memory" in text.lower() and "running low" in text:
         return "its machine ran out of memory"
     return DIED if "Unavailable" not in type(error).__name__ else "it cannot be reached"
-
-
-def _plural(number: float, noun: str) -> str:
-    return f"{number:,g} {noun}{'' if number == 1 else 's'}"
-
-
-class _Connection:
-    """Ray, connected to a cluster, without its own output."""
-
-    def __init__(self, address: str | None, log: Log) -> None:
-        os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-        os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
-        try:
-            with waiting("Importing Ray", log):
-                import ray
-        except ImportError:
-            raise EngineError("Ray is not installed: pip install 'gen2d[ray]', or '.[ray]' in a checkout") from None
-        self.ray, self.dashboard, self.is_own = ray, "", False
-        self.leases = contextlib.ExitStack()  # on the folder
-        self.head: str | None = None  # its address, if it can be reached from here
-        self.answered, self.is_lost = time.monotonic(), False
-        self.was_connected = ray.is_initialized()
-        if self.was_connected:
-            return
-        address = address or os.environ.get("RAY_ADDRESS") or "local"
-        self.is_own = address == "local"
-        options: dict[str, Any] = {"log_to_driver": False, "logging_level": logging.CRITICAL}
-        if self.is_own:
-            cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-            options |= {"num_cpus": cores, "include_dashboard": False, "object_store_memory": 10**8}
-            options |= {"_temp_dir": str(self._own_folder())}
-        else:
-            _check_reachable(address)
-        try:
-            with waiting("Starting Ray" if self.is_own else f"Connecting to {address}", log), _quiet():
-                context = ray.init(address, **options)
-        except Exception as error:
-            self._remove_folder()
-            raise EngineError(f"--address is {address}, but Ray cannot be used there ({_reason(error)})") from None
-        with contextlib.suppress(ImportError):  # it would print every death again, on standard output
-            worker: Any = importlib.import_module("ray._private.worker")
-            worker.print_to_stdstream = lambda *_, **__: None
-        dashboard = getattr(context, "dashboard_url", "")
-        self.dashboard = f"; dashboard at http://{dashboard}" if dashboard and not self.is_own else ""
-
-        with contextlib.suppress(Exception):  # unknown where a proxy stands between, at ray://
-            self.head = None if "://" in address else ray.get_runtime_context().gcs_address
-
-    def has_head(self) -> bool:
-        """Whether the head of the cluster answers. Raises EngineError if it has not for a while.
-
-        Ray's own calls would wait for it, and end this process.
-        """
-        if self.head is None:
-            return True
-        host, _, port = self.head.rpartition(":")
-        try:
-            socket.create_connection((host, int(port)), 1.0).close()
-        except OSError:
-            if time.monotonic() > self.answered + HEADLESS:
-                self.is_lost = True
-                raise HeadLostError(f"the head of the cluster, {self.head}, is lost; what is made stays") from None
-            return False
-        self.answered = time.monotonic()
-        return True
-
-    def abandon(self) -> None:
-        """Leave a cluster without a head; its workers end by themselves."""
-        with contextlib.suppress(ImportError):
-            atexit.unregister(importlib.import_module("ray._private.worker").shutdown)
-        self._remove_folder()
-
-    def close(self) -> None:
-        if not self.was_connected:
-            with _quiet():
-                self.ray.shutdown()
-            self._remove_folder()
-
-    def _own_folder(self) -> Path:
-        """Folder of the files of Ray on this machine alone; those that killed runs left are removed."""
-        folder = Path(tempfile.gettempdir()) / temporary_name("gen2d-ray")
-        if len(str(folder)) > LONGEST_FOLDER:
-            folder = Path("/tmp") / folder.name
-        remove_abandoned(temporary_files(folder.parent, "gen2d-ray."))
-        lock = folder.with_name(folder.name + LOCK)
-        self.leases.enter_context(lease(lock))
-        self.leases.callback(lock.unlink, missing_ok=True)
-        self.leases.callback(remove_tree, folder)
-        return folder
-
-    def _remove_folder(self) -> None:
-        self.leases.close()
-
-
-def _check_reachable(address: str) -> None:
-    """Raise EngineError if nothing answers at HOST:PORT or ray://HOST:PORT; Ray itself would try for minutes."""
-    match = re.fullmatch(r"(?:ray://)?([^:/\s]+|\[[0-9a-fA-F:]+\]):(\d{1,5})", address)
-    if address == "auto":
-        return
-    if not match:
-        raise EngineError(f"--address is {address!r}, but must be auto, HOST:PORT or ray://HOST:PORT")
-    try:
-        socket.create_connection((match[1].strip("[]"), int(match[2])), CONNECTING).close()
-    except (OSError, OverflowError) as error:
-        reason = getattr(error, "strerror", None) or str(error)
-        raise EngineError(f"--address is {address}, where nothing answers ({reason})") from None
-
-
-def _reason(error: Exception) -> str:
-    """The first sentence of an error of Ray."""
-    text = one_line(str(error)).strip()
-    if "Could not find any running Ray instance" in text:
-        return "no cluster runs on this machine: ray start --head starts one"
-    return re.split(r"(?<=[.!?]) ", text)[0].rstrip(".") or type(error).__name__
-
-
-@contextlib.contextmanager
-def _quiet() -> Iterator[None]:
-    """Context in which Ray's C++ code prints nothing, and nobody warns of starting processes where jax runs."""
-    with warnings.catch_warnings(), contextlib.ExitStack() as stack:
-        warnings.simplefilter("ignore")
-        ours = sys.stderr
-        with contextlib.suppress(OSError, ValueError, AttributeError):  # it may be no file
-            if ours.fileno() == 2:
-                copy = os.dup(2)
-                sys.stderr = stack.enter_context(os.fdopen(copy, "w", buffering=1))
-                stack.callback(setattr, sys, "stderr", ours)
-                stack.callback(os.dup2, copy, 2)
-                os.dup2(os.open(os.devnull, os.O_WRONLY), 2)
-        yield

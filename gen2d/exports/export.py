@@ -12,7 +12,7 @@ from gen2d.config.contracts import Export
 from gen2d.core.errors import ConfigError, FolderError
 from gen2d.core.progress import inform, progress, stopping_on_sigterm
 from gen2d.engines.protocol import Engine, results
-from gen2d.exports.parts import PART, ExportJob, export_format
+from gen2d.exports.parts import PART, ExportJob, ExportTask, load_format
 from gen2d.exports.source import Source, source_of
 from gen2d.loading.dataset import RenderOptions
 from gen2d.storage.atomic import publishing, publishing_folder, remove_tree, sweep_beside
@@ -110,7 +110,8 @@ def export(
     >>> exported = gen2d.export("datasets/bouncing", "h264", "films", split="train")
     >>> print(exported.videos, exported.bytes, exported.loss)
     """
-    start, format_, name = time.perf_counter(), export_format(to), Path(to).name
+    start, name = time.perf_counter(), Path(to).name
+    format_, content = load_format(to)
     folder = place(root, Network(timeout, deadline))
     source = source_of(folder, split, _patterns(to, format_, fields), trust, render)
     out = Path(out) if out is not None else _default_out(folder, f"{name.removesuffix('.py')}{format_.suffix}")
@@ -126,7 +127,8 @@ def export(
         if engine is not None:
             there = folder.absolute() if isinstance(folder, Path) else folder
             fields = tuple(source.fields)
-            job = ExportJob(there, source.ds.options.split, fields, trust, render, to, target.absolute())
+            options = source.ds.options.split, fields, trust, render, to, content
+            job = ExportJob(ExportTask(there, *options, target.absolute()))
             parts = [source.numbers[first : first + PART] for first in range(0, len(source), PART)]
             for _ in results(engine, job, parts, log):
                 pass

@@ -20,13 +20,27 @@ from gen2d.storage.paths import Place
 PART = 64  # videos that are written together
 
 
-def export_format(to: str) -> Export:
-    """Format with this name, or from this Python file."""
-    known = plugins.names("export")
-    if not plugins.is_user_file(to) and to not in known:
+def load_format(to: str) -> tuple[Export, bytes]:
+    """Format with this name, or from this Python file, and the file's content."""
+    known, is_file = plugins.names("export"), plugins.is_user_file(to)
+    if not is_file and to not in known:
         raise ConfigError(f"--to is {to!r}, but must be one of {', '.join(known)}, or a Python file")
-    content = plugins.content_of(to, "--to") if plugins.is_user_file(to) else b""
-    return plugins.load("export", to, "--to", content)
+    content = plugins.content_of(to, "--to") if is_file else b""
+    return plugins.load("export", to, "--to", content), content
+
+
+@dataclasses.dataclass(frozen=True)
+class ExportTask:
+    """What workers export, and to where."""
+
+    root: Place
+    split: str
+    fields: Sequence[str]
+    trust: Sequence[str]
+    render: RenderOptions | None
+    to: str
+    content: bytes  # of the format's file, if it is the user's
+    target: Path
 
 
 class ExportJob:
@@ -34,19 +48,9 @@ class ExportJob:
 
     title, unit, noun = "Exporting", "videos", "part"
 
-    def __init__(
-        self,
-        root: Place,
-        split: str,
-        fields: Sequence[str],
-        trust: Sequence[str],
-        render: RenderOptions | None,
-        to: str,
-        target: Path,
-    ) -> None:
-        content = plugins.content_of(to, "--to") if plugins.is_user_file(to) else b""
-        self.open = functools.partial(_ExportWorker, root, split, fields, trust, render, to, content, target)
-        self.device = "cpu" if render is None else "auto"
+    def __init__(self, task: ExportTask) -> None:
+        self.open = functools.partial(_ExportWorker, task)
+        self.device = "cpu" if task.render is None else "auto"
 
     def size(self, item: range) -> int:
         return len(item)
@@ -58,24 +62,12 @@ class ExportJob:
 class _ExportWorker:
     """Worker that writes the files of some videos."""
 
-    def __init__(
-        self,
-        root: Place,
-        split: str,
-        fields: Sequence[str],
-        trust: Sequence[str],
-        render: RenderOptions | None,
-        to: str,
-        content: bytes,
-        target: Path,
-        device: str,
-        log: Log,
-    ) -> None:
+    def __init__(self, task: ExportTask, device: str, log: Log) -> None:
         if device == "cpu":
             os.environ["JAX_PLATFORMS"] = "cpu"
-        self.source = source_of(root, split, fields, trust, render)
-        self.format: Export = plugins.load("export", to, "--to", content)
-        self.target = target
+        self.source = source_of(task.root, task.split, task.fields, task.trust, task.render)
+        self.format: Export = plugins.load("export", task.to, "--to", task.content)
+        self.target = task.target
 
     def report(self) -> Report:
         return Report("cpu", versions={"gen2d": __version__})

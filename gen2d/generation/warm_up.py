@@ -7,7 +7,7 @@ import jax
 import numpy as np
 
 from gen2d.core.errors import FolderError, UserError
-from gen2d.core.humanize import in_bytes, in_time
+from gen2d.core.humanize import in_bytes, in_time, with_noun
 from gen2d.core.progress import waiting
 from gen2d.dataset import folder as shards
 from gen2d.dataset.block import Block
@@ -52,7 +52,7 @@ def compile_for(
     Raises DeviceMemoryError if a batch does not fit the device.
     """
     rollout = source.rollout
-    name = f"{len(rollout.devices)} {rollout.devices[0].platform} device{'s' if len(rollout.devices) > 1 else ''}"
+    name = with_noun(len(rollout.devices), f"{rollout.devices[0].platform} device")
     request = next(source.requests(ranges[:1]))
     try:
         with waiting(f"Compiling for {name} (seconds; up to a minute for dozens of objects; kept for later runs)", log):

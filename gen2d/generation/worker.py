@@ -82,9 +82,10 @@ def generate_shards(source: VideoSource, dataset: DatasetSpec, todo: Sequence[Sh
 
 
 def _generate_from(source: VideoSource, dataset: DatasetSpec, todo: Sequence[Shard], log: Log) -> dict[Shard, Written]:
-    encoder, writers = Encoder(source, dataset, threads_for(devices.cores())), ShardWriters(dataset)
-    ranges, sizes = shard_ranges(todo), dict.fromkeys(todo, 0)
-    with stopping_on_sigterm(log):  # also during clean-up, when a second signal ends the process
+    encoder, ranges, sizes = _encoder(source, dataset), shard_ranges(todo), dict.fromkeys(todo, 0)
+    # Also during clean-up, when a second signal ends the process.
+    with stopping_on_sigterm(log), ShardWriter(dataset) as writer:
+        writers = ShardWriters(writer)
         try:
             count = sum(shard.count for shard in todo)
             seconds = warm_up(source, encoder, ranges, count, log)
@@ -100,6 +101,10 @@ def _generate_from(source: VideoSource, dataset: DatasetSpec, todo: Sequence[Sha
         finally:
             encoder.close()
     return {shard: Written(size, 0.0 if k else seconds) for k, (shard, size) in enumerate(sizes.items())}
+
+
+def _encoder(source: VideoSource, dataset: DatasetSpec) -> Encoder:
+    return Encoder(source, dataset, threads_for(devices.cores()))
 
 
 class ShardWorker:
@@ -162,7 +167,7 @@ class ShardWorker:
             with contextlib.ExitStack() as lock:
                 lock.enter_context(self._rendering)
                 encoder, seconds = self._encoder(source, own)
-                writers = ShardWriters(self.dataset, self._shard_writer())
+                writers = ShardWriters(self._shard_writer())
                 try:
                     for shard, block in encoder.blocks(shard_ranges(own), rendered=lock.close):
                         writers.put(shard, block)
@@ -182,7 +187,7 @@ class ShardWorker:
         began = time.perf_counter()
         with one_compiles():
             compile_for(source, shard_ranges(shards), lambda _: None)
-        self._encoders[source.config] = Encoder(source, self.dataset, threads_for(devices.cores()))
+        self._encoders[source.config] = _encoder(source, self.dataset)
         return self._encoders[source.config], time.perf_counter() - began
 
     def _shard_writer(self) -> ShardWriter:

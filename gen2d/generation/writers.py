@@ -9,7 +9,7 @@ import numpy as np
 
 from gen2d.dataset.block import Block
 from gen2d.dataset.shard_writer import ShardWriter
-from gen2d.dataset.spec import DatasetSpec, Shard
+from gen2d.dataset.spec import Shard
 
 
 class _Aborted(BaseException):
@@ -19,9 +19,8 @@ class _Aborted(BaseException):
 class ShardWriters:
     """Write blocks into shards, each in a thread, so that one is hashed and synced while the next is filled."""
 
-    def __init__(self, dataset: DatasetSpec, writer: ShardWriter | None = None) -> None:
-        """`writer` is one that stays open for other shards; by default, one is opened and closed."""
-        self.writer, self.close_writer = writer or ShardWriter(dataset), writer is None
+    def __init__(self, writer: ShardWriter) -> None:
+        self.writer = writer
         self.pool = ThreadPoolExecutor(2, "write")
         self.shard: Shard | None = None
         self.blocks: queue.Queue[Block | _Aborted | None] = queue.Queue()
@@ -57,16 +56,12 @@ class ShardWriters:
         for future in self.futures:
             future.result()
         self.pool.shutdown()
-        if self.close_writer:
-            self.writer.close()
 
     def abort(self) -> None:
         """Abandon the current shard and finish those before it."""
         if self.shard is not None:
             self._send(_Aborted())
         self.pool.shutdown(wait=True, cancel_futures=True)
-        if self.close_writer:
-            self.writer.close()
 
 
 def _drain(blocks: queue.Queue) -> Iterator[Block]:

@@ -135,18 +135,13 @@ def cached_jit(function: Callable[..., Any], key: Hashable | None, own_code: boo
     """
     device, name = devices.default(), f"{function.__module__}.{function.__qualname__}"
     jitted = jax.jit(function)
-    programs: dict[Hashable, BoundProgram] = {}  # by structure, shapes and types of the arguments
 
     def call(*args: Any) -> Any:
         leaves, tree = jax.tree.flatten(args)
         if key is None or any(isinstance(leaf, Tracer) for leaf in leaves):
             return jitted(*args)
-        leaves = jax.device_put(leaves, device)
-        args = tree.unflatten(leaves)
-        like = tree, *((leaf.shape, leaf.dtype) for leaf in leaves)
-        if like not in programs:
-            programs[like] = _bound(_Request(name, key, [], lambda tape: function, args, device, own_code))
-        return programs[like](device, *args)
+        args = tree.unflatten(jax.device_put(leaves, device))
+        return _bound(_Request(name, key, [], lambda tape: function, args, device, own_code))(device, *args)
 
     return call
 

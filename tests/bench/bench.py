@@ -195,10 +195,11 @@ def make(source: Any, videos: int, out: Path) -> None:
 
     dataset = dataset_of(source, out, {"train": videos}, {})
     encoder = encoder_module.Encoder(source, dataset, encoder_module.threads_for(devices.cores()))
-    writers = writers_module.ShardWriters(dataset)
-    for shard, block in encoder.blocks(encoder_module.shard_ranges(open_folder(dataset))):
-        writers.put(shard, block)
-    writers.finish()
+    with ShardWriter(dataset) as writer:
+        writers = writers_module.ShardWriters(writer)
+        for shard, block in encoder.blocks(encoder_module.shard_ranges(open_folder(dataset))):
+            writers.put(shard, block)
+        writers.finish()
     encoder.close()
     assert complete(dataset)
 

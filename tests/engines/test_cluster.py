@@ -12,7 +12,6 @@ from pathlib import Path
 
 import buckets
 import pytest
-from test_engines import SUPPORT, add_node
 from tiny import CONFIG, command, run_command, tiny_config
 
 import gen2d
@@ -24,6 +23,7 @@ from gen2d.generation.run import generate
 from gen2d.generation.worker import GenerationJob, ShardWorker
 
 ray = pytest.importorskip("ray")
+from clusters import add_node, two_cores  # noqa: E402
 from ray.cluster_utils import Cluster  # noqa: E402
 
 pytestmark = pytest.mark.filterwarnings("ignore")  # Ray's own
@@ -48,22 +48,8 @@ def plain(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
 @pytest.fixture(scope="module")
 def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cluster]:
     """A head without cores and a machine with two."""
-    before = {name: os.environ.get(name) for name in ("PYTHONPATH", TOKEN)}
-    os.environ["PYTHONPATH"] = f"{SUPPORT}{os.pathsep}{before['PYTHONPATH'] or ''}"
-    os.environ[TOKEN] = str(tmp_path_factory.mktemp("token"))
-    cluster = Cluster(
-        initialize_head=True, head_node_args={"num_cpus": 0, "object_store_memory": 10**8, "include_dashboard": False}
-    )
-    try:
-        add_node(cluster, 2)
+    with two_cores(**{TOKEN: str(tmp_path_factory.mktemp("token"))}) as cluster:
         yield cluster
-    finally:
-        ray.shutdown()
-        cluster.shutdown()
-        for name, value in before.items():
-            os.environ.pop(name)
-            if value is not None:
-                os.environ[name] = value
 
 
 def processes(name: str, token: str) -> list[int]:

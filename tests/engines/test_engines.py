@@ -18,33 +18,19 @@ from gen2d.engines import Local, Ray
 from gen2d.engines.protocol import Engine, EngineError
 
 ray = pytest.importorskip("ray")
+from clusters import add_node, two_cores  # noqa: E402
 from ray.cluster_utils import Cluster  # noqa: E402
 
 import gen2d.engines.ray as module  # noqa: E402
 
 pytestmark = pytest.mark.filterwarnings("ignore")  # Ray's own
-SUPPORT = Path(__file__).parent.parent / "support"
-
-
-def add_node(cluster: Cluster, cores: int = 1, **environment: str):
-    return cluster.add_node(num_cpus=cores, object_store_memory=10**8, env_vars=environment, include_dashboard=False)
 
 
 @pytest.fixture(scope="module")
 def cluster() -> Iterator[Cluster]:
     """A head without cores and a machine with two."""
-    before = os.environ.get("PYTHONPATH", "")
-    os.environ["PYTHONPATH"] = f"{SUPPORT}{os.pathsep}{before}"
-    cluster = Cluster(
-        initialize_head=True, head_node_args={"num_cpus": 0, "object_store_memory": 10**8, "include_dashboard": False}
-    )
-    try:
-        add_node(cluster, 2)
+    with two_cores() as cluster:
         yield cluster
-    finally:
-        ray.shutdown()
-        cluster.shutdown()
-        os.environ["PYTHONPATH"] = before
 
 
 def squares(engine: Engine, job: SquareJob, count: int, lines: list[str] | None = None) -> dict[int, int]:
@@ -209,7 +195,7 @@ def test_without_ray_one_sentence_says_how_to_install_it(tmp_path: Path, monkeyp
 
 @pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="needs affinities")
 def test_workers_of_a_machine_take_different_cores(tmp_path: Path):
-    code = "import os; os.sched_setaffinity(0, range(os.cpu_count())); from gen2d.engines.ray import take_cores; "
+    code = "import os; os.sched_setaffinity(0, range(os.cpu_count())); from gen2d.engines.ray_actor import take_cores; "
     code += "locks = take_cores(1); print(*os.sched_getaffinity(0), flush=True); input()"
     environment = {**os.environ, "TMPDIR": str(tmp_path)}
     processes = [
