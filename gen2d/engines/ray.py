@@ -261,7 +261,7 @@ class RayWorkers:
         if reasons:
             return (
                 f"no worker can take part: {reasons[-1]}"
-                if not self._ready_count()
+                if not self._reported_count()
                 else (f"--workers asks for {low} or more, but fewer can take part: {reasons[-1]}")
             )
         device, slot = self.device or "cpu", next(iter(self._slots().values()), None)

@@ -127,6 +127,16 @@ def test_a_cluster_may_lose_and_gain_machines(cluster: Cluster, tmp_path: Path):
 
 
 @pytest.mark.full
+def test_fewer_workers_than_asked_for_is_one_sentence(cluster: Cluster, tmp_path: Path):
+    foreign = add_node(cluster, FAKE_IDENTITY="other")
+    try:
+        with pytest.raises(EngineError, match=r"^--workers asks for 3 or more, but fewer can take part: .*makes "):
+            squares(Ray(cluster.address, workers=3, cpus_per_worker=1, patience=20), SquareJob(tmp_path), 4)
+    finally:
+        cluster.remove_node(foreign)
+
+
+@pytest.mark.full
 def test_workers_without_a_machine_of_their_own_avoid_those_that_were_refused(cluster: Cluster, tmp_path: Path):
     """More are asked for than there is room for, so the room of a released worker would be taken at once."""
     foreign, lines = add_node(cluster, FAKE_IDENTITY="other"), []
