@@ -90,6 +90,7 @@ def momentum_scales(worlds: list[tuple]) -> tuple[np.ndarray, np.ndarray]:
 # Conservation -------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.asked
 @settings(max_examples=8, deadline=None, derandomize=True)
 @given(SEEDS, st.floats(0, 1), st.floats(0, 1))
 def test_i1_i2_momentum_is_conserved_without_fixed_objects(seed, elasticity, friction):
@@ -107,6 +108,7 @@ def energy_gains(worlds: list[tuple]) -> np.ndarray:
     return np.diff(energy).max(1) / energy[:, 0]
 
 
+@pytest.mark.asked
 @settings(max_examples=8, deadline=None, derandomize=True)
 @given(SEEDS, st.floats(0, 1), st.floats(0, 1))
 def test_i3_energy_never_grows_among_free_discs(seed, elasticity, friction):
@@ -114,6 +116,7 @@ def test_i3_energy_never_grows_among_free_discs(seed, elasticity, friction):
     holds("I3 energy gained in a step, free discs, relative", energy_gains(worlds), 5e-4, asked=1e-4)
 
 
+@pytest.mark.asked
 @settings(max_examples=8, deadline=None, derandomize=True)
 @given(SEEDS, st.floats(0, 1), st.floats(0, 1))
 def test_i3_energy_never_grows_in_a_box(seed, elasticity, friction):
@@ -121,6 +124,7 @@ def test_i3_energy_never_grows_in_a_box(seed, elasticity, friction):
     holds("I3 energy gained in a step, box, relative", energy_gains(worlds), 4e-3, asked=1e-4)
 
 
+@pytest.mark.asked
 @settings(max_examples=8, deadline=None, derandomize=True)
 @given(SEEDS, st.floats(0, 1), st.floats(0, 1))
 def test_i3_energy_never_grows_in_a_wedge(seed, elasticity, friction):
@@ -158,6 +162,7 @@ def test_i3_elastic_gas_keeps_its_energy_for_a_minute():
     holds("I3 elastic gas of 16, 60 s, relative", energy / energy[:, :1] - 1, 1e-3)
 
 
+@pytest.mark.asked
 @pytest.mark.full
 def test_elastic_gas_in_double_precision_conserves_to_the_ninth_digit():
     with jax.enable_x64(True):

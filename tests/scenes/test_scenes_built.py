@@ -127,6 +127,7 @@ def when(angle: np.ndarray, time: np.ndarray) -> np.ndarray:
 # Seesaws ------------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.asked
 @pytest.mark.full
 def test_a_seesaw_tips_to_the_side_of_the_larger_torque():
     made = film("seesaw", 32, 1.5, 20, "scene.drop_height=0", "scene.plank_density=0.2", energy=True)
@@ -168,6 +169,7 @@ def test_a_pendulum_has_the_period_of_its_length_and_swing():
     holds("pendulum: energy", np.ptp(made.energy, axis=1) / np.abs(made.energy).max(1), 2e-3)
 
 
+@pytest.mark.asked
 @pytest.mark.full
 def test_a_double_pendulum_keeps_its_energy_and_its_joints():
     made = film("pendulum", 8, 4.0, 30, "scene.links=2", energy=True)

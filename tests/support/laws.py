@@ -88,15 +88,29 @@ def times(frames: int, step: float = STEP) -> np.ndarray:
     return np.arange(frames) * step
 
 
-def holds(law: str, measured: Any, bound: float, asked: float | None = None) -> None:
-    """Assert that the largest magnitude in `measured` is within the bound; `pytest -rP` prints it.
+class Owed(NamedTuple):
+    """A law that holds at a weaker bound than was asked for."""
 
-    Where the solver does not satisfy a law yet, `asked` is the law's bound, and `bound` prevents regressions.
+    measured: float
+    asked: float
+
+
+owed: dict[str, Owed] = {}
+"""Laws of the running test that are owed; conftest.py reports and clears them."""
+
+
+def holds(law: str, measured: Any, bound: float, asked: float | None = None) -> None:
+    """Check that the largest magnitude in `measured` is within the bound; `pytest -rP` prints it.
+
+    Where the solver does not satisfy a law yet, `asked` is the law's bound, and `bound` prevents regressions. Such a
+    test is marked `asked`, is reported as an expected failure, and fails once the law holds at `asked`.
     """
     worst = float(np.max(np.abs(measured)))
     print(f"{law}: {worst:.2g}, bound {bound:.2g}" + (f", asked {asked:.2g}" if asked is not None else ""))
     assert math.isfinite(worst), law
     assert worst <= bound, f"{law}: {worst:.4g}, but at most {bound:g}"
+    if asked is not None:
+        owed[law] = Owed(max(worst, owed[law].measured) if law in owed else worst, asked)
 
 
 def to_double(worlds: Sequence[tuple]) -> list[tuple]:
