@@ -2,6 +2,7 @@
 
 import ast
 import importlib
+import importlib.metadata
 import inspect
 import pkgutil
 import re
@@ -171,6 +172,13 @@ def test_reading_data_never_imports_jax() -> None:
     code = f"import gen2d, {', '.join(names)}, sys; gen2d.open, gen2d.DataLoader, gen2d.export, gen2d.verify; "
     code += "assert 'jax' not in sys.modules"
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_a_plain_installation_needs_no_display_engine_or_codec() -> None:
+    required = [each for each in importlib.metadata.requires("gen2d") or [] if "extra ==" not in each]
+    names = {re.split(r"[^\w-]", each)[0].lower() for each in required}
+    assert "opencv-python-headless" in names
+    assert not names & {"opencv-python", "matplotlib", "pymunk", "box2d", "mujoco", "av", "imageio", "moviepy"}
 
 
 def test_data_folders_hold_no_code():

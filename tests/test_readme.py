@@ -7,10 +7,12 @@ import subprocess
 import sys
 from pathlib import Path
 
+import jax
 import pytest
 from tiny import run_command
 
 from gen2d.config.config import load_config
+from gen2d.programs.rollout import Rollout
 
 README = Path(__file__).parent.parent / "README.md"
 BLOCKS = re.findall(r"```(\w+)\n(.*?)```", README.read_text(encoding="utf-8"), re.S)
@@ -85,3 +87,35 @@ def test_pages_name_only_files_that_are_there(page: Path):
     for name in re.findall(r"`([\w./]+\.(?:py|yaml))`", page.read_text(encoding="utf-8")):
         found = [page.parent / name, page.parent.parent / name, *page.parent.glob(f"*/{name}")]
         assert any(path.exists() for path in found), f"{page} names {name}"
+
+
+EVERY = ("energy", "masks", "amodal", "boxes", "visibility", "flow", "captions", "lyapunov")
+DESCRIBED = {
+    "scene": "bouncing",
+    "annotations": {"contacts": 4, "tracks": 8, **dict.fromkeys(EVERY, True)},
+    "quality": {"min_contacts": 1},
+    "splits": {"train": {}, "large": {"factors": {"radius": [1.0, 1.1]}}},
+}
+
+
+def test_the_table_of_fields_is_that_of_the_schema():
+    """Names, axes and units; each group of fields has a row."""
+    fields = Rollout(load_config(DESCRIBED), jax.devices()[:1]).schema.fields
+    rows = re.findall(r"^\| (`.*) \| (n.*|T, n) \| (.*) \|$", README.read_text(encoding="utf-8"), re.M)
+    described: set[str] = set()
+    for cells in rows:
+        group, names = "", []
+        for name in re.findall(r"`([^`]+)`", cells[0]):
+            group = name.rpartition("/")[0] or group
+            own = name if name in fields or "/" in name else f"{group}/{name}"
+            names += [each for each in fields if each.startswith(own[:-3])] if own.endswith("...") else [own]
+        assert names, cells
+        axes = cells[1].split(", ")
+        axes = axes if len(axes) == len(names) else [axes[0]] * len(names)
+        for name, written in zip(names, axes, strict=True):
+            field = fields[name]
+            assert field.axes.startswith("n") if written.endswith("...") else field.axes == written, (name, field.axes)
+            about = cells[2].startswith(("with ", "each ", "distance "))  # in place of units
+            assert about or not cells[2] or field.unit in ("1", "", "id", "object") or field.unit in cells[2], name
+        described.update(names)
+    assert {name.partition("/")[0] for name in fields} == {name.partition("/")[0] for name in described} | {"split"}

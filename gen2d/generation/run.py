@@ -117,7 +117,7 @@ def generate(
 
     Examples
     --------
-    >>> summary = gen2d.generate("bouncing.yaml", 10_000, "datasets/bouncing", overrides=["video.height=128"])
+    >>> summary = gen2d.generate("bouncing.yaml", 10_000, "datasets/films", overrides=["video.fps=25"])
     >>> print(summary.videos_per_second, "videos/s")
     """
     log = log or inform

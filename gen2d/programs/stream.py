@@ -124,8 +124,10 @@ def stream(
 
     Examples
     --------
-    >>> for batch in gen2d.stream("bouncing.yaml", seed=0, batch_size=32, window=16):
-    ...     step(batch["frames"])
+    >>> videos = gen2d.stream("bouncing.yaml", seed=0, batch_size=32, window=16)  # without an end
+    >>> batch = next(iter(videos))
+    >>> batch["frames"].shape  # a jax array
+    (32, 16, 64, 64, 3)
     """
     config = load_config(config, overrides)
     if seed is not None:

@@ -263,6 +263,7 @@ def test_a_caption_fits_is_ascii_and_follows_from_the_video_alone(seed: int) -> 
     for name, field in caption.fields(BALLS + 4, VIDEO.frames).items():
         assert one[name].dtype == two[name].dtype == np.dtype(field.dtype)
         assert one[name][0] == two[name][1]
+    assert one["text/events"].dtype.itemsize == 2 + 128 * (BALLS + 4) * (VIDEO.frames // 16)
     text = one["text/caption"][0].decode("ascii")
     assert len(text) < events_module.CAPTION_BYTES
     assert text.startswith("Three balls in a box under gravity.")

@@ -8,6 +8,7 @@ import jax
 import pytest
 from tiny import CONFIG, run_command, run_main, sentences
 
+import gen2d
 from gen2d.cli.main import VERBS
 from gen2d.cli.parser import Parser, parse
 from gen2d.config.reading import yaml_text
@@ -116,6 +117,7 @@ def test_the_command_line_tells_what_it_did(tmp_path: Path):
     sheet = run_main("info", "datasets/tiny", cwd=tmp_path)
     assert "train: 9 videos" in sheet.stdout
     assert "m/s^2" in sheet.stdout
+    assert [name for name in gen2d.open(tmp_path / "datasets/tiny").manifest.fields if name not in sheet.stdout] == []
     assert run_main("verify", "datasets/tiny", cwd=tmp_path).returncode == 0
     path = tmp_path / "datasets/tiny/shards/train-00001-n1.h5"
     content = bytearray(path.read_bytes())

@@ -7,11 +7,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tiny import CONFIG, tiny_config
 
-from gen2d.config import plugins
+from gen2d.cli.report import plugins as listing
+from gen2d.config import plugins, sections
 from gen2d.config.config import MAX_SEED, load_config
 from gen2d.config.distribution_syntax import parse
 from gen2d.config.reading import parse_yaml, yaml_text
 from gen2d.core.errors import ConfigError
+from gen2d.engines import Ray
 
 BAD = {
     "scene: {balls: 0}": ("scene.balls is 0", "1 or more"),
@@ -137,19 +139,57 @@ def test_every_seed_is_kept(seed):
     assert load_config({**CONFIG, "seed": seed}).seed == seed
 
 
-def test_every_option_says_its_unit_and_meaning():
-    config = load_config(CONFIG)
-    for options in (
-        config.video,
-        config.physics,
-        config.camera,
-        config.storage,
-        config.scene.options,
-        config.look.options,
-    ):
-        for field in dataclasses.fields(options):
-            assert field.metadata["option"].meaning
-            assert field.metadata["option"].allowed
+def test_every_option_says_its_default_unit_and_meaning_and_is_listed():
+    declared = [kind for kind in vars(sections).values() if getattr(kind, "__module__", "") == sections.__name__]
+    for kind in ("scene", "look", "annotation"):
+        declared += [plugins.load(kind, name).options for name in plugins.names(kind)]
+    single = [field for field in declared if isinstance(field, dataclasses.Field)]
+    fields = single + [f for kind in declared if dataclasses.is_dataclass(kind) for f in dataclasses.fields(kind)]
+    assert len(fields) > 300
+    listed = listing()
+    for field in fields:
+        option = field.metadata["option"]
+        assert field.default is not dataclasses.MISSING, field.name
+        assert option.meaning in listed, field.name
+        assert option.allowed, field.name
+        assert option.unit or option.kind in (bool, str, int), field.name
+
+
+def test_each_family_has_a_config_of_its_name():
+    for name in plugins.names("scene"):
+        assert load_config(f"{name}.yaml").scene.name == name
+
+
+def test_configs_hold_the_numbers_of_their_page():
+    def balls(name: str) -> tuple[float, float]:
+        return load_config(name).scene.options.balls.support
+
+    def shape(name: str) -> tuple[int, int, int]:
+        video = load_config(name).video
+        return video.frames, video.height, video.width
+
+    assert balls("bouncing.yaml") == (3, 8)
+    assert balls("benchmark.yaml") == (8, 8)
+    assert shape("bouncing.yaml") == shape("benchmark.yaml") == (64, 64, 64)
+    for name in ("uniform_motion", "collision", "parabola"):
+        config = load_config(f"phyworld_{name}.yaml")
+        assert shape(f"phyworld_{name}.yaml") == (32, 256, 256)
+        assert len(config.splits) > 1
+    low, high = load_config("billiards.yaml").scene.options.rows.support
+    assert (low * (low + 1) / 2, high * (high + 1) / 2) == (6, 15)
+    pile = load_config("pile.yaml").scene.options
+    supports = [getattr(pile, name).support for name in ("discs", "boxes", "capsules")]
+    assert (sum(low for low, _ in supports), sum(high for _, high in supports)) == (6, 20)
+
+
+def test_defaults_are_those_of_the_pages():
+    physics = load_config({}).physics
+    assert physics.max_step == 1 / 240
+    assert (physics.contact_hertz, physics.contact_damping_ratio, physics.push_speed) == (30, 10, 3)
+    look = load_config({}).look.options
+    assert (look.wall_width, look.contrast) == (1.5, 120)
+    engine = Ray()
+    assert (engine.workers, engine.gpus_per_worker, engine.cpus_per_worker, engine.retries) == (None, 1, None, 3)
 
 
 @pytest.mark.parametrize("quantity", ["density", "elasticity", "color", "gravity"])

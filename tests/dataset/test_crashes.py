@@ -200,3 +200,23 @@ def test_a_repair_that_makes_other_bytes_changes_nothing(
         regenerate.repair(root)
     assert contents(root) == before
     assert read_manifest(root).splits == {"train": 12, "test": 3}
+
+
+def test_a_repair_of_a_dataset_that_grows_meanwhile_changes_nothing(
+    grown: dict[int, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    repaired(monkeypatch)
+    root = Path(shutil.copytree(grown[12], tmp_path / "data"))
+    (root / "shards" / "train-00000.h5").write_bytes(b"")
+    make, after = regenerate.generate_shards, {}
+
+    def grow(*arguments: Any) -> None:
+        make(*arguments)
+        synthetic.make(small(root, SPLITS[30]))
+        after.update({name: own for name, own in contents(root).items() if ".tmp." not in name})
+
+    monkeypatch.setattr(regenerate, "generate_shards", grow)
+    with pytest.raises(FolderError, match="has changed during the repair: run it again"):
+        regenerate.repair(root, ["train-00000"])
+    assert contents(root) == after
+    assert read_manifest(root).splits == SPLITS[30]

@@ -159,6 +159,8 @@ def test_one_process_at_a_time_publishes(tmp_path: Path, monkeypatch: pytest.Mon
             with pytest.raises(FolderError, match="is being changed by another process: try again"):
                 action()
     assert completion.complete(made)
+    with folder.folder_lock(root), pytest.raises(FolderError, match="is being changed by another process: try again"):
+        clean(root)
 
 
 @pytest.mark.parametrize("harm", ["a row", "a table", "the manifest"])

@@ -113,6 +113,7 @@ def test_what_others_can_write_is_not_read(
 
 
 def test_the_least_recently_used_entries_are_removed(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert executables.MAX_BYTES == 2 * 2**30
     files = entry_files(cache)
     for age, path in enumerate(files):
         os.utime(path, (1000 - age, 1000 - age))

@@ -193,3 +193,4 @@ def test_limits_are_numbers_above_zero() -> None:
         with pytest.raises(ConfigError, match="must be a number of seconds above 0"):
             gen2d.open("http://127.0.0.1:9/x", **limits)
     assert place("memory://a/b", Network(1, 2)) == Url("memory://a/b")
+    assert Network() == Network(timeout=30, deadline=300)
