@@ -195,6 +195,32 @@ def test_c9b_touching_cradle_keeps_momentum_and_energy():
 # Rolling and sliding ------------------------------------------------------------------------------------------------
 
 
+def speed_after_impacts_in_sequence(elasticity: float) -> float:
+    """Speed at which a disc leaves an equal one at rest on a floor, of that at which it arrives.
+
+    The lower one hits the floor, and the upper one again, until the upper one is faster.
+    """
+    upper, lower = -1.0, 0.0
+    while upper < lower - 1e-9:
+        push = (1 + elasticity) / 2 * (lower - upper)
+        upper, lower = upper + push, lower - push
+        lower = abs(elasticity * lower)
+    return upper
+
+
+def test_disc_bounces_off_a_resting_one_by_impacts_in_sequence():
+    """Newton's law for one impact after the other, not for all at once, which would be e times the speed of arrival."""
+    ratios, fall = (0.5, 0.8, 0.9, 1.0), 1.0
+    discs = [[{"x": (0, RADIUS + k * (2 * RADIUS + fall)), "elasticity": np.sqrt(e)} for k in (0, 1)] for e in ratios]
+    floors = [{**FLOOR, "elasticity": np.sqrt(e)} for e in ratios]
+    made = watch([Case(pair, [floor], DOWN) for pair, floor in zip(discs, floors, strict=True)])
+    arrival, frame = np.sqrt(2 * GRAVITY * fall), 120
+    since = frame * STEP - arrival / GRAVITY  # the impacts take a step each, in which gravity acts
+    speeds = (made.v[:, :, frame, 1, 1] + GRAVITY * since) / arrival
+    exact = np.array([speed_after_impacts_in_sequence(e) for e in ratios])
+    holds("impacts in sequence: speed of the upper disc, of its arrival", speeds - exact[:, None], 2e-3)
+
+
 @pytest.mark.asked
 def test_c10_disc_rolls_down_without_slip():
     made, t = watch([on_slope(friction=0.8)]), times(721)[120:]

@@ -3,7 +3,7 @@
 import jax
 import numpy as np
 import pytest
-from laws import DOWN, GRAVITY, holds, to_double
+from laws import DOWN, GRAVITY, POSES, Case, holds, pose_world, to_double
 from test_invariants import gas
 from worlds import STEP, energies, momenta, run, world
 
@@ -72,3 +72,25 @@ def test_falling_disc_tells_its_bounces():
     lost = mass * GRAVITY * 2 * 0.75
     at = round((times[1] + times[0]) / 2 / (2 * STEP))
     holds("drop: lost in the first bounce, J", found.energy.lost_in_contact[0, at] - lost, 1e-6)
+
+
+@pytest.mark.full
+def test_c16_contacts_carry_the_weight_in_a_zigzag_channel():
+    """Eight smooth discs lean on each other and on the walls of a channel 1.6 diameters wide; statics is a sum."""
+    count, width, radius, steps, share = 8, 1.6, 0.5, 4, 60  # number, m, m, steps a frame, frames that are averaged
+    side, rise = width / 2 - radius, np.sqrt(1 - (width - 1) ** 2)  # sine of the angle of two neighbours' line
+    discs = [{"x": ((-1) ** k * side, radius + k * rise), "elasticity": 0} for k in range(count)]
+    walls = [{"a": (s * width / 2, -1), "b": (s * width / 2, 20), "elasticity": 0} for s in (-1, 1)]
+    case = Case(discs, [{"a": (-5, 0), "b": (5, 0), "elasticity": 0}, *walls], DOWN)
+    rows = run([pose_world(case, pose, 8, 4) for pose in POSES], FRAMES, steps, keep=EVERYTHING).contacts
+    assert (rows.count <= EVERYTHING.contacts).all()
+    weight = np.pi * radius**2 * GRAVITY
+    late = rows.frame >= FRAMES - share
+
+    def force(one: int, other: int) -> np.ndarray:
+        pair = ((rows.a == one) & (rows.b == other)) | ((rows.a == other) & (rows.b == one))
+        return np.where(late & pair, rows.normal_impulse, 0.0).sum(1) / (share * steps * STEP)
+
+    between = np.array([force(k, k + 1) * rise / (weight * (count - 1 - k)) for k in range(count - 1)])
+    holds("C16 zigzag channel: forces between discs, relative", between - 1, 1e-2)
+    holds("C16 zigzag channel: force on the floor, relative", force(0, count) / (count * weight) - 1, 1e-4)

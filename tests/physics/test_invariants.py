@@ -4,9 +4,11 @@ Steps are of 1/240 s. Random scenes are eight to an example of hypothesis, all o
 """
 
 import dataclasses
+import hashlib
 import os
 import subprocess
 import sys
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +23,7 @@ from numpy.testing import assert_array_equal
 from worlds import STEP, box, energies, momenta, rotate, rules, run, world
 
 from gen2d.physics.simulate import substeps
+from gen2d.programs.devices import instruction_set
 
 SEEDS = st.integers(0, 2**31)
 
@@ -381,6 +384,22 @@ def test_a_video_does_not_depend_on_its_place_or_its_neighbours():
     assert_array_equal(one.states.position, again.states.position)
     assert_array_equal(one.states.position, turned_round.states.position[::-1])
     assert_array_equal(one.states.position[0], elsewhere.states.position[7])
+
+
+# Hash of a simulation by version of jaxlib and instruction set. A change of the solver that is meant to change results
+# replaces it; one that is not, such as a move or a new name, must not.
+KNOWN_BITS = {("0.10.2", "avx512f"): "52174ed2de10420f"}
+
+
+def test_a_simulation_has_the_bits_that_are_known_for_this_platform():
+    platform = version("jaxlib"), instruction_set()
+    states = run([gas(seed, 0.9, 0.3, DOWN) for seed in range(8)], 61, 8).states
+    found = hashlib.sha256(b"".join(np.ascontiguousarray(x).tobytes() for x in jax.tree.leaves(states))).hexdigest()[
+        :16
+    ]
+    if platform not in KNOWN_BITS:
+        pytest.skip(f"no bits are known for jaxlib {platform[0]} with {platform[1]}: here they are {found!r}")
+    assert found == KNOWN_BITS[platform], "the solver's results have changed: if that is meant, replace KNOWN_BITS"
 
 
 PRINT = """

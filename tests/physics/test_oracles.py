@@ -11,18 +11,17 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 import pytest
+from billiard import Impact, impacts
 from laws import holds
 from oracles import (
     SKIN,
     Event,
-    Impact,
     Path,
     Setting,
     Thing,
     box2d_path,
     chipmunk_path,
     deepest,
-    exact_path,
     gen2d_paths,
     gen2d_world,
 )
@@ -73,7 +72,18 @@ def flights(elasticity: float) -> tuple[list[Setting], list[list[Impact]], list[
     settings = [Setting(discs(seed, 4), box(SIDE), elasticity=elasticity) for seed in range(SCENES)]
     made = run([gen2d_world(s, 8) for s in settings], SECONDS * 60 + 1, 4, keep=SaveAt(contacts=256))
     paths = [p._replace(events=firsts(p.events, elasticity)) for p in gen2d_paths(made, settings)]
-    return settings, [firsts(exact_path(s, 8), elasticity) for s in settings], paths
+    return settings, [firsts(exact_path(s), elasticity) for s in settings], paths
+
+
+def exact_path(setting: Setting) -> list[Impact]:
+    """The exact path until 8 pairs have collided."""
+    path, pairs = [], set()
+    for impact in impacts(setting):
+        path.append(impact)
+        pairs.add(impact.pair)
+        if len(pairs) == 8:
+            break
+    return path
 
 
 def is_clear(exact: Events) -> bool:
@@ -226,9 +236,15 @@ def figures(setting: Setting, path: Path, settle: int, skin: float = 0.0) -> tup
 
 
 def rests_as_box2d(
-    settings: Mapping[str, tuple[Setting, float | None, float]], slots: int | None, settle: int, watch: int
+    settings: Mapping[str, tuple[Setting, float | None, float]],
+    slots: int | None,
+    settle: int,
+    watch: int,
+    asked: float | None = None,
 ) -> None:
     """Asserts that scenes, each with the bounds of its overlap (None: Box2D's at 60 Hz) and speed, come to rest.
+
+    `asked` is the bound that is asked of the overlaps, where they miss it.
 
     Box2D 2.3 leaves 5 mm of overlap (its slop) and takes out what is more, whatever the load; gen2d's grows with it.
     """
@@ -243,7 +259,7 @@ def rests_as_box2d(
         )
     for name, (_, depth, fast) in settings.items():
         overlap, way, speed = found[name]
-        holds(f"{name}: overlap, m", overlap, theirs[name][0] if depth is None else depth)
+        holds(f"{name}: overlap, m", overlap, theirs[name][0] if depth is None else depth, asked)
         holds(f"{name}: way in {watch} s, m", way, 1e-3)
         holds(f"{name}: speed, m/s", speed, fast)
 
@@ -251,7 +267,7 @@ def rests_as_box2d(
 @pytest.mark.full
 def test_discs_rest_as_well_as_in_box2d():
     piles = {f"pyramid, e = {e:g}": (pyramid(e), 0.005, 1e-3) for e in (0.0, 0.5)}
-    piles |= {f"column of 10, e = {e:g}": (column(e), 0.011, 1e-3) for e in (0.0, 0.5)}
+    piles |= {f"column of 10, e = {e:g}": (column(e), 0.0055, 1e-3) for e in (0.0, 0.5)}
     rests_as_box2d(piles, 22, settle=3, watch=3)
 
 
@@ -264,10 +280,16 @@ def test_boxes_rest_as_well_as_in_box2d():
 @pytest.mark.slow
 def test_discs_rest_as_well_as_in_box2d_for_ten_seconds():
     piles = {f"pyramid, e = {e:g}": (pyramid(e), 0.005, 1e-3) for e in (0.0, 0.5)}
-    piles |= {f"column of 10, e = {e:g}": (column(e), 0.011, 1e-3) for e in (0.0, 0.5)}
-    # An overlap of .01 m was asked for the bin, and a way of 1e-3; the physics page says so.
-    piles |= {f"bin of 32, e = {e:g}": (bin_of_32(e), 0.012, 2e-2) for e in (0.0, 0.5)}
+    piles |= {f"column of 10, e = {e:g}": (column(e), 0.0055, 1e-3) for e in (0.0, 0.5)}
+    piles |= {"bin of 32, e = 0.5": (bin_of_32(0.5), 0.01, 2e-2)}
     rests_as_box2d(piles, 32, settle=10, watch=10)
+
+
+@pytest.mark.slow
+@pytest.mark.asked
+def test_full_bin_without_bounces_rests_for_ten_seconds():
+    piles = {"bin of 32, e = 0": (bin_of_32(0.0), 0.012, 2e-2)}
+    rests_as_box2d(piles, 32, settle=10, watch=10, asked=0.01)
 
 
 @pytest.mark.slow
@@ -298,15 +320,26 @@ def settling_figures(setting: Setting, path: Path) -> dict[str, float]:
     return left | {"mean height at the end": float(heights.mean()), "top at the end": float(heights.max())}
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("elasticity", [0.0, 0.5, 0.8])
-def test_many_hits_are_distributed_as_in_chipmunk(elasticity):
+SETTLING = ("kinetic energy after 2 s", "kinetic energy after 3 s")
+
+
+@functools.cache
+def settled(elasticity: float) -> tuple[list[dict[str, float]], list[dict[str, float]]]:
+    """Settling figures of 500 scenes in gen2d and in Chipmunk."""
     settings = [Setting(discs(seed, 8), box(SIDE), GRAVITY, elasticity, FRICTION) for seed in range(500)]
     paths = gen2d_paths(run([gen2d_world(s, 8) for s in settings], 6 * 60 + 1, 4), settings)
     ours, theirs = (
         [settling_figures(s, p) for s, p in zip(settings, of, strict=True)]
         for of in (paths, [chipmunk_path(s, 6) for s in settings])
     )
+    return ours, theirs
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("elasticity", [0.0, 0.5, 0.8])
+def test_many_hits_are_distributed_as_in_chipmunk(elasticity):
+    """With e = .5 but for the energy while piles settle: see the next test."""
+    ours, theirs = settled(elasticity)
     chances = {}
     for name in ours[0]:
         one, two = (np.array([figures[name] for figures in of]) for of in (ours, theirs))
@@ -314,7 +347,21 @@ def test_many_hits_are_distributed_as_in_chipmunk(elasticity):
         print(
             f"e = {elasticity:g}, {name}: median {np.median(one):.4f} and {np.median(two):.4f}, p = {chances[name]:.3f}"
         )
-    assert min(chances.values()) > 0.01, chances
+    compared = {name: p for name, p in chances.items() if elasticity != 0.5 or name not in SETTLING}
+    assert min(compared.values()) > 0.01, compared
+
+
+@pytest.mark.slow
+def test_piles_settle_sooner_than_in_chipmunk_as_impacts_come_in_sequence():
+    """A disc that hits a resting one loses more than in Chipmunk, which solves both contacts of the latter at once.
+
+    The test of a disc that bounces off a resting one (test_closed_forms.py) has the closed form of this choice.
+    """
+    ours, theirs = settled(0.5)
+    for name in SETTLING:
+        one, two = (np.median([figures[name] for figures in of]) for of in (ours, theirs))
+        print(f"e = 0.5, {name}: median {one:.4f} and {two:.4f}")
+        assert 0.4 * two < one < 0.9 * two
 
 
 # Newton's cradle ----------------------------------------------------------------------------------------------------

@@ -1,4 +1,4 @@
-"""One scene in four engines: gen2d, Box2D 2.3, Chipmunk (pymunk) and, for free discs, an exact event-driven simulation.
+"""One scene in three engines: gen2d, Box2D 2.3 and Chipmunk (pymunk); billiard.py has the exact path of smooth discs.
 
 The bodies of a scene have the numbers 0, 1, ..., its walls, which are segments, -1, -2, ... All pairs of a scene have
 the same elasticity and friction. The engines mix the values of two bodies differently, so the bodies have different
@@ -25,7 +25,6 @@ with warnings.catch_warnings():  # raised by types of SWIG
     import Box2D
 
 SKIN = Box2D.b2_polygonRadius  # m: Box2D's rounding of boxes and segments, which touch at this distance
-STILL = 1e-9  # m/s: slower approaches are rounding errors
 Pair = tuple[float, float]
 
 
@@ -70,15 +69,6 @@ class Event(NamedTuple):
 
     time: float  # s
     pair: tuple[int, int]  # in ascending order
-
-
-class Impact(NamedTuple):
-    """An impact of the exact simulation."""
-
-    time: float  # s
-    pair: tuple[int, int]
-    approach: float  # m/s, along the normal
-    after: np.ndarray  # [K, 2] m/s: velocities of all discs after it
 
 
 class Path(NamedTuple):
@@ -217,46 +207,6 @@ def _path(
             break
     trajectory = np.array(states)
     return Path(trajectory[..., :3], trajectory[..., 3:], events)
-
-
-# The exact path -----------------------------------------------------------------------------------------------------
-
-
-def exact_path(setting: Setting, count: int) -> list[Impact]:
-    """Impacts of smooth discs without gravity, within counter-clockwise walls, until `count` pairs have collided.
-
-    Closed forms: discs move in straight lines between impacts, so two of them touch at a root of |d + u t| = r + s, and
-    a disc touches a wall after gap / approach speed. An impact changes the normal speed v by -(1 + e) v.
-    """
-    x, v, r, mass = (np.array([getattr(t, n) for t in setting.things], float) for n in ("x", "v", "radius", "mass"))
-    first, second = np.triu_indices(len(x), 1)
-    start, end = np.array(setting.walls, float).transpose(1, 0, 2)
-    along = (end - start) / np.linalg.norm(end - start, axis=1)[:, None]
-    inward = np.stack([-along[:, 1], along[:, 0]], axis=1)
-    now, impacts = 0.0, []
-    while len({impact.pair for impact in impacts}) < count:
-        offset, relative, reach = x[second] - x[first], v[second] - v[first], r[first] + r[second]
-        a, b, c = (relative**2).sum(1), (offset * relative).sum(1), (offset**2).sum(1) - reach**2
-        root = np.sqrt(np.maximum(b**2 - a * c, 0))
-        discs = np.where((b < -STILL) & (root > 0), c / np.maximum(root - b, STILL), np.inf)
-        approach, gap = -v @ inward.T, ((x[:, None] - start) * inward).sum(2) - r[:, None]
-        walls = np.where(approach > STILL, gap / np.maximum(approach, STILL), np.inf)
-        wait = min(discs.min(), walls.min())
-        if wait == np.inf:
-            break
-        now, x = now + max(wait, 0.0), x + max(wait, 0.0) * v
-        if discs.min() < walls.min():
-            k = int(discs.argmin())
-            i, j, normal = int(first[k]), int(second[k]), (x[second[k]] - x[first[k]]) / reach[k]
-            speed, pair = float(-relative[k] @ normal), (i, j)
-            push = (1 + setting.elasticity) * speed / (1 / mass[i] + 1 / mass[j]) * normal
-            v[i], v[j] = v[i] - push / mass[i], v[j] + push / mass[j]
-        else:
-            i, wall = divmod(int(walls.argmin()), len(along))
-            speed, pair = float(approach[i, wall]), (-1 - wall, i)
-            v[i] += (1 + setting.elasticity) * speed * inward[wall]
-        impacts.append(Impact(now, pair, speed, v.copy()))
-    return impacts
 
 
 # Overlaps -----------------------------------------------------------------------------------------------------------

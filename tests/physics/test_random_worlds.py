@@ -1,0 +1,156 @@
+"""Laws of random closed worlds: nobody leaves, energy never rises, friction keeps to Coulomb's bound, nothing is NaN.
+
+Each class of worlds is a recipe (random_worlds.py). A law is about every world of a class, so the share of the worlds,
+or of the rows of contacts, that break it is measured, and none is asked; the tables hold what breaks today. The fast
+tier simulates a few worlds of most classes in one batch; the slow tier, thousands of all classes, with capsules, fixed
+boxes and joints, and under other options of the solver.
+"""
+
+import functools
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from laws import holds
+from random_worlds import LARGE, SMALL, Arena, Measures, Recipe, measure
+from worlds import STEP, rules
+
+FEW = 14  # worlds of a class in the fast tier
+MANY, BATCHES = 128, 8  # worlds in a batch and batches of a class in the slow tier
+FULL = Recipe(discs=(6, 6), capsules=(2, 2), polygons=(3, 3))
+DISCS = Recipe(discs=(6, 6), capsules=(0, 0), polygons=(0, 0))
+ONE, NONE = (1.0, 1.0), (0.0, 0.0)
+SMOOTH = replace(FULL, elasticity=ONE, friction=NONE, gravity=0.0, fixed=0.0, boxes=True)
+RECIPES = {
+    "discs": DISCS,
+    "elastic discs": replace(DISCS, elasticity=ONE),
+    "discs, mass ratios up to 1e6": replace(DISCS, density=3, gravity=1, radius=(0.6, 0.8)),
+    "all shapes": FULL,
+    "elastic shapes": replace(FULL, elasticity=ONE),
+    "mass ratios up to 1e6": replace(FULL, density=3, speed=10),
+    "smooth elastic boxes": replace(SMOOTH, discs=(0, 0), spin=15, speed=20, radius=(0.6, 1.0)),
+    "smooth elastic boxes and fast small discs": replace(SMOOTH, fast=60),
+    "joints, with gravity": Recipe(joints=True, gravity=1),
+    "joints, without": Recipe(joints=True, gravity=0),
+}
+NO_STATICS = replace(FULL, closed=False, gravity=0.0)
+NOT_FINITE, LEFT, RISING, GAINING, PULLING, SLIPPING, IDLE = LAWS = (
+    "worlds that are not finite",
+    "worlds that lose a body",
+    "worlds that gain 1e-4 of their energy in a step",
+    "worlds that gain 1 % of their energy",
+    "rows of contacts that pull",
+    "rows of contacts over Coulomb's bound",
+    "rows without a contact that have an impulse",
+)
+# Largest share that breaks a law today; None: a few worlds of a thousand do, so that a sample may have none (RARELY).
+# Laws that are not there hold.
+Bounds = Mapping[str, float | None]
+RARELY, RARELY_OF_FEW = 0.01, 0.3
+RARE = dict.fromkeys((LEFT, GAINING, PULLING, IDLE))
+FEW_BOUNDS: dict[str, Bounds] = {
+    "discs": {RISING: None},
+    "elastic discs": {},
+    "discs, mass ratios up to 1e6": {RISING: 0.7},
+    "all shapes": {PULLING: None, IDLE: None, RISING: None, SLIPPING: None},
+    "elastic shapes": {PULLING: None, IDLE: None, RISING: None, SLIPPING: None},
+    "mass ratios up to 1e6": {**RARE, RISING: None, SLIPPING: None},
+    "smooth elastic boxes": {RISING: 0.6, GAINING: 0.6},
+    "smooth elastic boxes and fast small discs": {RISING: None, GAINING: None},
+}
+MANY_BOUNDS: dict[str, Bounds] = {
+    "discs": {RISING: 0.05},
+    "elastic discs": {},
+    "discs, mass ratios up to 1e6": {RISING: 0.4},
+    "all shapes": {**RARE, RISING: 0.3, SLIPPING: 5e-4},
+    "elastic shapes": {**RARE, RISING: 0.12, SLIPPING: 5e-3},
+    "mass ratios up to 1e6": {**RARE, LEFT: 0.05, RISING: 0.3, SLIPPING: 1e-3},
+    "smooth elastic boxes": {RISING: 0.85, GAINING: 0.7},
+    "smooth elastic boxes and fast small discs": {LEFT: None, RISING: 0.4, GAINING: 0.25},
+    "joints, with gravity": {**RARE, NOT_FINITE: 0.03, LEFT: 0.07, RISING: 1.0, GAINING: 0.2, SLIPPING: 1e-3},
+    "joints, without": {**RARE, NOT_FINITE: None, RISING: 0.8, GAINING: 0.08, SLIPPING: 3e-3},
+}
+
+
+def classes(table: Mapping[str, Bounds]) -> list:
+    """Parameters of a test: the names of the classes, those with bounds marked as owed."""
+    return [pytest.param(name, marks=pytest.mark.asked if any(of.values()) else ()) for name, of in table.items()]
+
+
+def check_laws(name: str, batches: list[Measures], bounds: Bounds, rarely: float) -> None:
+    """Checks the laws of closed worlds, those that fail today against their bounds, rare failures against `rarely`."""
+    broken = (
+        [~m.finite for m in batches],
+        [m.outside > 0 for m in batches],
+        [m.gain_in_step > 1e-4 for m in batches],
+        [m.gain > 0.01 for m in batches],
+        [m.normal_impulse[m.rows] < 0 for m in batches],
+        [m.slipping[m.rows] for m in batches],
+        [m.idle_impulses for m in batches],
+    )
+    for law, parts in zip(LAWS, broken, strict=True):
+        of, bound = np.concatenate(parts), bounds.get(law, 0.0)
+        asked = 0.0 if bound else None
+        holds(f"{name}: share of {len(of)} {law}", of.mean(), rarely if bound is None else bound, asked)
+    assert all((m.contacts.count <= m.rows.shape[1]).all() for m in batches), "there was no room for all rows"
+
+
+@functools.cache
+def few_worlds() -> dict[str, Measures]:
+    """Some worlds of each class, all in one batch."""
+    recipes = [*(RECIPES[name] for name in FEW_BOUNDS), NO_STATICS]
+    return dict(zip([*FEW_BOUNDS, "no statics"], measure(SMALL, recipes, FEW), strict=True))
+
+
+@pytest.mark.parametrize("name", classes(FEW_BOUNDS))
+def test_few_worlds_keep_the_laws(name):
+    check_laws(name, [few_worlds()[name]], FEW_BOUNDS[name], RARELY_OF_FEW)
+
+
+def momentum_drift(measures: Measures) -> tuple[np.ndarray, np.ndarray]:
+    """Relative drift of the momentum, per s, and of the angular momentum, of each world."""
+    seconds = (measures.energy.shape[1] - 1) * STEP
+    linear = np.linalg.norm(measures.momentum - measures.momentum[:, :1], axis=-1).max(1)
+    angular = np.abs(measures.angular - measures.angular[:, :1]).max(1)
+    return linear / measures.momentum_scale / seconds, angular / measures.angular_scale
+
+
+def test_momentum_is_conserved_among_all_shapes():
+    measures = few_worlds()["no statics"]
+    assert (measures.rows.sum(1) > 0).mean() > 0.5
+    holds("no statics: momentum, of the sum of |m v|, per s", momentum_drift(measures)[0], 1e-5)
+
+
+@pytest.mark.asked
+def test_angular_momentum_is_conserved_among_all_shapes():
+    holds("no statics: angular momentum, relative", momentum_drift(few_worlds()["no statics"])[1], 1e-2, asked=1e-4)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", classes(MANY_BOUNDS))
+def test_many_worlds_keep_the_laws(name):
+    batches = [measure(LARGE, [RECIPES[name]], MANY, first=k * MANY)[0] for k in range(BATCHES)]
+    check_laws(name, batches, MANY_BOUNDS[name], RARELY)
+
+
+OPTIONS = {
+    "long steps, damping, means": rules(1 / 60, damping=0.5, mixing="mean"),
+    "stiff contacts, high threshold, maxima": rules(
+        hertz=60.0, damping_ratio=1.0, push_speed=30.0, bounce_threshold=1.0, mixing="max"
+    ),
+    "short steps, soft contacts, geometric means": rules(1 / 960, hertz=5.0, push_speed=0.1, mixing="geometric"),
+}
+OPTION_BOUNDS: dict[str, Bounds] = {
+    "long steps, damping, means": {PULLING: None, IDLE: None, RISING: 0.15, SLIPPING: None},
+    "stiff contacts, high threshold, maxima": {PULLING: None, IDLE: None, RISING: 0.2, SLIPPING: None},
+    "short steps, soft contacts, geometric means": {PULLING: None, IDLE: None, RISING: None, SLIPPING: None},
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", classes(OPTION_BOUNDS))
+def test_worlds_keep_the_laws_with_other_options(name):
+    arena = Arena(discs=4, capsules=0, polygons=2, corners=4)
+    recipe = Recipe(discs=(4, 4), polygons=(2, 2), fixed=0)
+    check_laws(name, measure(arena, [recipe], 2 * MANY, params=OPTIONS[name]), OPTION_BOUNDS[name], RARELY)
