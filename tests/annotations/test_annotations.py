@@ -1,7 +1,9 @@
 """Annotations: each obeys its law on random scenes, in several looks, with cameras that stand and that move."""
 
 import functools
+import types
 import zlib
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -9,12 +11,17 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
+from gen2d.annotations import tracks
+from gen2d.annotations.boxes import visible_boxes
+from gen2d.annotations.visibility import pixel_counts
 from gen2d.config import plugins
 from gen2d.config.config import load_config
 from gen2d.programs import redraw, render
 from gen2d.programs.rollout import Rollout
 from gen2d.records import keys as keys_module
 from gen2d.records import scene as scene_module
+from gen2d.records.layout import SlotGroup
+from gen2d.renderers.primitives import BodyGeometry
 
 ALL = [f"annotations.{name}={plugins.load('annotation', name).usual}" for name in plugins.names("annotation")]
 SMALL = [
@@ -28,6 +35,7 @@ SMALL = [
 CASES = {
     "still": ["look.palette=random"],
     "moving": ["camera.pan=[[-2,2],1]", "camera.turn=0.4", "camera.zoom=0.2", "look=textured"],
+    "covered": ["camera.pan=[3,1]", "camera.turn=-0.5", "image.occluders=3"],
     "marked": ["look=marked", "image.occluders=2", "image.occluder_front=[0,1]"],
 }
 
@@ -63,7 +71,10 @@ class Made:
         self.stages, self.options = stages, config.annotations
 
 
-@pytest.fixture(scope="module", params=["still", "moving", pytest.param("marked", marks=pytest.mark.full)])
+FULL = [pytest.param(case, marks=pytest.mark.full) for case in ("covered", "marked")]
+
+
+@pytest.fixture(scope="module", params=["still", "moving", *FULL])
 def made(request):
     return drawn_as(request.param)
 
@@ -101,6 +112,21 @@ def test_visible_boxes_and_counts_are_those_of_the_mask(made):
         assert_array_equal(made.of["boxes/visible"][v, t, k], box)
 
 
+@pytest.mark.parametrize(("height", "width"), [(256, 5), (257, 4)])
+def test_boxes_and_counts_hold_beyond_the_bits_of_a_word_and_what_a_byte_counts(height, width):
+    rng, slots = np.random.default_rng(height), 70
+    masks = np.zeros((3, height, width), np.uint8)
+    masks[0], masks[1] = 70, rng.integers(0, slots + 1, (height, width))
+    masks[1, 100:], masks[2, 2:9, 1:3], masks[2, 0] = 0, 33, 255
+    boxes = np.asarray(visible_boxes(jnp.asarray(masks), slots))
+    counts = np.asarray(pixel_counts(jnp.asarray(masks), slots))
+    for t, k in np.ndindex(3, slots):
+        rows, columns = np.nonzero(masks[t] == k + 1)
+        assert counts[t, k] == len(rows)
+        box = [0] * 4 if not len(rows) else [columns.min(), rows.min(), columns.max() + 1, rows.max() + 1]
+        assert_array_equal(boxes[t, k], box)
+
+
 def test_what_is_seen_lies_in_what_is_there(made):
     boxes, amodal = (made.of[f"boxes/{kind}"] for kind in ("visible", "amodal"))
     seen = made.of["visibility/pixels"] > 0
@@ -131,6 +157,23 @@ def test_amodal_masks_are_instance_masks_where_one_object_is_alone_and_have_its_
     assert_allclose(discs[whole], areas[whole], atol=6)
 
 
+@pytest.mark.full
+def test_pixels_inside_an_occluder_in_front_of_all_show_it():
+    made = drawn_as("marked")
+    boxes, ranks = (np.asarray(part) for part in made.stages.occluders[::2])
+    rows, columns = np.mgrid[: made.mask.shape[2], : made.mask.shape[3]]
+    checked = 0
+    for (left, top, right, bottom), rank, mask in zip(
+        boxes.reshape(-1, 4), ranks.ravel(), made.mask.repeat(2, 0), strict=True
+    ):
+        if rank == made.rollout.plan.moving:
+            inside = (columns >= left) & (columns + 1 <= right) & (rows >= top) & (rows + 1 <= bottom)
+            assert (mask[:, inside] == 255).all()
+            checked += inside.sum()
+    assert checked > 10
+    assert made.of["flow/forward"][made.mask == 255].any() == 0
+
+
 def test_flow_carries_each_object_and_the_background_to_the_next_frame(made):
     height, width = made.mask.shape[2:]
     y, x = np.mgrid[:height, :width] + 0.5
@@ -148,6 +191,51 @@ def test_flow_carries_each_object_and_the_background_to_the_next_frame(made):
             checked += len(to_x)
         assert missed <= 1e-3 * checked  # stored with 11 bits, a flow may end just beyond a pixel's edge
         assert checked > 0.7 * valid[:, 1:-1].size
+
+
+def turned(points: np.ndarray, angle: np.ndarray) -> np.ndarray:
+    """Points [..., 2] rotated counter-clockwise by angles [...]."""
+    cos, sin = np.cos(angle), np.sin(angle)
+    return np.stack([cos * points[..., 0] - sin * points[..., 1], sin * points[..., 0] + cos * points[..., 1]], -1)
+
+
+def carried(made: Made, v: int, t: int, step: int) -> np.ndarray:
+    """Where the points that the pixels of a frame show lie `step` frames later [H, W, 2], columns and rows."""
+    mask, size = made.mask[v, t], np.array(made.mask.shape[:1:-1])
+    rows, columns = np.mgrid[: mask.shape[0], : mask.shape[1]]
+    pixels = np.stack([columns, rows], -1) + 0.5
+    center, scale, lean = (made.of[f"camera/{name}"].astype(float)[v] for name in ("center", "scale", "angle"))
+    place, angle = (made.of[f"states/{name}"].astype(float)[v] for name in ("position", "angle"))
+    points = center[t] + turned((pixels - size / 2) * [1, -1] / scale[t], lean[t])
+    slot, owned = np.clip(mask.astype(int) - 1, 0, made.slots - 1), ((mask > 0) & (mask < 255))[..., None]
+    moved = place[t + step, slot] + turned(points - place[t, slot], (angle[t + step] - angle[t])[slot])
+    points = np.where(owned, moved, points)
+    ends = size / 2 + turned(points - center[t + step], -lean[t + step]) * scale[t + step] * [1, -1]
+    return np.where((mask == 255)[..., None], pixels, ends)
+
+
+def test_flow_is_the_way_of_the_point_that_each_pixel_shows_and_valid_where_it_is_seen_again(made):
+    height, width = made.mask.shape[2:]
+    rows, columns = np.mgrid[:height, :width]
+    for name, step in (("forward", 1), ("backward", -1)):
+        seen = {True: 0, False: 0}
+        for v, t in np.ndindex(*made.mask.shape[:2]):
+            flow, valid = (made.of[f"flow/{field}"][v, t] for field in (name, f"{name}_valid"))
+            if not 0 <= t + step < made.mask.shape[1]:
+                assert not flow.any()
+                assert not valid.any()
+                continue
+            ends = carried(made, v, t, step)
+            assert_allclose(flow, ends - np.stack([columns, rows], -1) - 0.5, rtol=2e-3, atol=5e-3)
+            column, row = np.moveaxis(np.floor(ends).astype(int), -1, 0)
+            inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+            there = made.mask[v, t + step][row.clip(0, height - 1), column.clip(0, width - 1)]
+            expected, clear = inside & (there == made.mask[v, t]), (np.abs(ends - np.rint(ends)) > 1e-3).all(-1)
+            clear |= made.mask[v, t] == 255
+            assert_array_equal(valid.astype(bool)[clear], expected[clear])
+            for value in (True, False):
+                seen[value] += (expected[clear] == value).sum()
+        assert min(seen.values()) > 100
 
 
 def test_flow_at_a_discs_centre_is_the_way_of_its_centre(made):
@@ -205,3 +293,39 @@ def test_tracks_follow_their_objects_and_know_when_they_are_seen(made):
     one = points[:, :, :5] / made.of["camera/scale"][:, :, None, None]
     apart = np.linalg.norm(one[:, :, 1:] - one[:, :, :1], axis=-1)
     assert_allclose(apart, np.broadcast_to(apart[:, :1], apart.shape), atol=2e-4)
+
+
+def test_tracked_points_stay_at_their_places_in_their_bodies(made):
+    points, owner = (made.of[f"tracks/{name}"] for name in ("points", "object"))
+    size = np.array(made.mask.shape[:1:-1])
+    for v, p in zip(*np.nonzero(owner >= 0), strict=True):
+        center, scale, lean = (made.of[f"camera/{name}"].astype(float)[v] for name in ("center", "scale", "angle"))
+        place, angle = (made.of[f"states/{name}"].astype(float)[v, :, owner[v, p]] for name in ("position", "angle"))
+        world = center + turned((points[v, :, p] - size / 2) * [1, -1] / scale[:, None], lean)
+        local = turned(world - place, -angle)
+        assert_allclose(local, np.broadcast_to(local[0], local.shape), atol=2e-4)
+
+
+def shares_of_cells(points: np.ndarray, reach: float) -> np.ndarray:
+    """Share of the points [P, 2] in each cell of a grid [6, 6] over the square of half a side `reach`."""
+    counts, *_ = np.histogram2d(*points.T, bins=6, range=[[-reach, reach]] * 2)
+    return counts / len(points)
+
+
+def test_tracked_points_are_uniform_in_the_area_of_their_shape():
+    corners = np.array([[-1.0, -0.6], [1.2, -0.4], [0.9, 0.8], [-0.2, 1.1], [-0.2, 1.1]])
+    bodies = BodyGeometry(jnp.float32([1.3, 0.5, 0]), jnp.float32([0, 0.9, 0]), jnp.float32([corners] * 3))
+    scene: Any = types.SimpleNamespace(seed=jnp.uint32(5), bodies=bodies)
+    x, y = (a.ravel() for a in np.meshgrid(*[(np.arange(600) + 0.5) / 200 - 1.5] * 2))
+    sides = np.roll(corners, -1, axis=0) - corners
+    inside = {
+        "circle": np.hypot(x, y) < 1.3,
+        "capsule": np.hypot(x - np.clip(x, -0.9, 0.9), y) < 0.5,
+        "polygon": (sides[:, :1] * (y - corners[:, 1:]) - sides[:, 1:] * (x - corners[:, :1]) >= 0).all(0),
+    }
+    for first, (shape, there) in enumerate(inside.items()):
+        run = SlotGroup(shape, 1, vertices=5 if shape == "polygon" else 0)
+        (points,) = np.asarray(tracks._random_points(scene, run, first, 20_000))
+        exact = shares_of_cells(np.stack([x, y], -1)[there], 1.5)
+        assert exact.max() < 0.2
+        assert_allclose(shares_of_cells(points, 1.5), exact, atol=0.012, err_msg=shape)

@@ -37,12 +37,15 @@ def test_c1_projectile_is_on_its_parabola():
 
 
 def test_c2_constant_force_and_torque():
-    """v = F t / m and w = tau t / I."""
+    """v = F t / m and w = tau t / I; place and angle are their integrals."""
     # Needs the keys `force` (N) and `torque` (N m) of a disc in worlds.world.
     force, torque, t = np.array([2.0, -1.0]), 0.3, times(721)[1:]
     made = watch([Case([{"force": force, "torque": torque}])])
-    holds("C2 force, relative", made.v[:, :, 1:, 0] / (force * t[:, None] / MASS) - 1, 1e-4)
-    holds("C2 torque, relative", made.spin[:, :, 1:, 0] / (torque * t / (MASS * RADIUS**2 / 2)) - 1, 1e-4)
+    v, w = force * t[:, None] / MASS, torque * t / (MASS * RADIUS**2 / 2)
+    holds("C2 force, relative", made.v[:, :, 1:, 0] / v - 1, 1e-4)
+    holds("C2 torque, relative", made.spin[:, :, 1:, 0] / w - 1, 1e-4)
+    holds("C2 way under a force, relative", made.x[:, :, 1:, 0] / (v * t[:, None] / 2) - 1, 1e-4)
+    holds("C2 angle under a torque, relative", made.angle[:, :, 1:, 0] / (w * t / 2) - 1, 1e-4)
 
 
 @pytest.mark.full
@@ -95,6 +98,15 @@ def test_c4_oblique_smooth_collision_exchanges_the_normal_components():
     holds("C4 oblique: angle of the striking disc, rad", glancing, 1e-3)
     holds("C4 oblique: speeds, of u", (last - exact[:, None]) / u, 1e-3)
     holds("C4 oblique: momentum, relative", (last.sum(2) - [u, 0]) / u, 1e-5)
+
+
+def test_a_disc_that_only_just_misses_another_is_not_deflected():
+    cases = [Case([{"x": (-3, 0), "v": (u, 0)}, {"x": (0, -2 * RADIUS - 1e-3)}]) for u in (4, 40, 200)]
+    made = watch(cases)
+    speeds = np.array([4, 40, 200])[:, None]
+    holds("Near miss: speed, relative", made.v[:, :, -1, 0, 0] / speeds - 1, 1e-6)
+    holds("Near miss: sideways speed, m/s", made.v[:, :, -1, 0, 1], 1e-6)
+    holds("Near miss: speed of the other, m/s", made.v[:, :, -1, 1], 1e-6)
 
 
 def test_c5_friction_at_a_wall_is_coulombs():

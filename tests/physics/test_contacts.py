@@ -26,6 +26,7 @@ from gen2d.physics.collision import (
     hull_at,
     manifold,
 )
+from gen2d.physics.constraint import mix_materials
 
 MANY = 2000
 V = 5  # corners of a hull, some of them repeated
@@ -401,6 +402,12 @@ def test_a_gap_opens_along_its_normal(kind_a: type, kind_b: type):
     assert_allclose(by_b["position"].T, normal[0], atol=0.03)  # corners hardly apart in float32
     assert_allclose(by_a["position"].T, -normal[0], atol=0.03)
     assert np.quantile(np.abs(by_b["position"].T - normal[0]), 0.99) < 1e-5
+
+
+def test_coefficients_of_a_pair_mix_as_named():
+    exact = {"product": 0.16, "mean": 0.5, "max": 0.8, "geometric": 0.4}
+    for name, coefficient in exact.items():
+        assert_allclose(mix_materials(jnp.float32(0.2), jnp.float32(0.8), name), coefficient, rtol=1e-6)
 
 
 def test_the_table_has_every_pair_once():

@@ -5,8 +5,9 @@ import numpy as np
 import pytest
 from laws import DOWN, GRAVITY, POSES, Case, holds, pose_world, to_double
 from test_invariants import gas
-from worlds import STEP, energies, momenta, run, world
+from worlds import STEP, energies, momenta, rules, run, world
 
+from gen2d.core.enums import END, IMPACT, PERSIST
 from gen2d.physics.simulate import SaveAt
 
 FRAMES = 241
@@ -94,3 +95,56 @@ def test_c16_contacts_carry_the_weight_in_a_zigzag_channel():
     between = np.array([force(k, k + 1) * rise / (weight * (count - 1 - k)) for k in range(count - 1)])
     holds("C16 zigzag channel: forces between discs, relative", between - 1, 1e-2)
     holds("C16 zigzag channel: force on the floor, relative", force(0, count) / (count * weight) - 1, 1e-4)
+
+
+@pytest.mark.full
+def test_a_contact_is_an_impact_then_persists_then_ends_and_bears_the_weight():
+    """A disc lands on a ledge, rolls to its end and falls off."""
+    disc = {"x": (-0.5, 0.7), "v": (1, 0), "spin": -2, "elasticity": 0, "friction": 1}
+    found = run([world([disc], [{"a": (-1, 0), "b": (1, 0), "friction": 1}], DOWN)], 181, 4, keep=EVERYTHING)
+    rows, n = found.contacts, int(found.contacts.count[0])
+    kinds, frames = rows.kind[0, :n], rows.frame[0, :n]
+    end = list(kinds).index(END)
+    assert kinds[0] == IMPACT
+    assert (kinds[1:end] == PERSIST).all()
+    assert list(np.diff(frames[: end + 1])) == [1] * end
+    assert (rows.b[0, :n] == 0).all()
+    assert (rows.a[0, :n] == 1).all()
+    fall = np.sqrt(2 * 0.2 / GRAVITY)
+    holds("landing: time, s", rows.time[0, 0] - fall, 1e-4)
+    holds("landing: separation, m/s", rows.separation_speed[0, 0], 0)
+    holds(
+        "rolling: impulse a frame, relative", rows.normal_impulse[0, 2 : n // 2] * 60 / (np.pi / 4 * GRAVITY) - 1, 1e-3
+    )
+    assert 1 < found.states.position[0, frames[end], 0, 0] < 1.5  # it turns about the end before it leaves
+    assert found.quality.contacts[0] < 10
+    holds(
+        "quality: deepest overlap, m",
+        found.quality.max_penetration[0] - (0.5 - found.states.position[0, :, 0, 1])[:90].max(),
+        1e-4,
+    )
+
+
+@pytest.mark.full
+def test_forces_and_damping_do_the_work_of_their_closed_forms():
+    """A disc under gravity, a force and a torque, with damping; another that is only damped."""
+    rate, mass, force, torque = 0.5, np.pi / 4, np.array([2.0, 1.0]), 0.3
+    moment, start, spin = mass / 8, np.array([3.0, 4.0]), 5.0
+    pushed = world([{"v": start, "spin": spin, "force": force, "torque": torque}], (), DOWN)
+    damped = world([{"v": start, "spin": spin, "force": (0, 0), "torque": 0.0}], (), (0, 0))
+    found = run([pushed, damped], 181, 4, rules(damping=rate), EVERYTHING)
+    t = np.linspace(0, 3, 18001)
+    slowed = np.exp(-rate * t)
+    for k, (pull, twist) in enumerate(((np.add(DOWN, force / mass), torque / moment), ((0, 0), 0.0))):
+        late = (1 - slowed) / rate
+        v, w = slowed[:, None] * start + late[:, None] * pull, slowed * spin + late * twist
+        way = late[:, None] * start + ((t - late) / rate)[:, None] * pull
+        turn = late * spin + (t - late) / rate * twist
+        holds("damped flight under forces: place, m", found.states.position[k, :, 0] - way[::100], 2e-4)
+        holds("damped flight under forces: angle, rad", found.states.angle[k, :, 0] - turn[::100], 2e-4)
+        power = rate * (mass * (v**2).sum(1) + moment * w**2)
+        lost = np.concatenate([[0], np.cumsum((power[1:] + power[:-1]) / 2)]) * (t[1] - t[0])
+        put_in = (way @ force + torque * turn) * (k == 0)
+        holds("damped flight under forces: lost to damping, J", found.energy.lost_to_damping[k] - lost[::100], 2e-3)
+        holds("damped flight under forces: put in, J", found.energy.work_in[k] - put_in[::100], 2e-3)
+        holds("damped flight under forces: residual, J", found.energy.residual[k], 1e-3)

@@ -22,8 +22,9 @@ from laws import DOWN, FLOOR, GRAVITY, QUARTERS, Case, holds, pose_world, to_dou
 from numpy.testing import assert_array_equal
 from worlds import STEP, box, energies, momenta, rotate, rules, run, world
 
-from gen2d.physics.simulate import substeps
+from gen2d.physics.simulate import SaveAt, simulate, substeps
 from gen2d.programs.devices import instruction_set
+from gen2d.records import axes
 
 SEEDS = st.integers(0, 2**31)
 
@@ -256,6 +257,29 @@ def test_i6_resting_overlapping_discs_on_a_floor_do_not_fly_apart():
     holds("I6 overlapping discs on a floor: speed at the end, m/s", made.v[:, :, -1], 1e-3)
 
 
+def test_an_overlap_ends_like_a_soft_spring_which_is_stiffer_against_static_bodies():
+    """Each step of a damped spring without warm start takes the same part of what is left (Catto, 'Solver2D', 2024)."""
+    cases = [
+        Case([{"x": (0, 0.45)}], [FLOOR]),
+        Case([{"x": (-0.475, 0)}, {"x": (0.475, 0)}]),
+    ]
+    made, k = watch(cases), np.arange(121)
+    for name, hertz, left in (
+        ("a floor", 60, 0.5 - made.x[0, :, :121, 0, 1]),
+        ("a disc", 30, 1 - np.linalg.norm(made.x[1, :, :121, 1] - made.x[1, :, :121, 0], axis=-1)),
+    ):
+        turn, ratio = STEP * 2 * np.pi * hertz, 10
+        part = turn**2 / (1 + 2 * ratio * turn + turn**2)
+        holds(f"Overlap with {name}, of that at the start", left / 0.05 - (1 - part) ** k, 1e-3)
+
+
+def test_a_slow_disc_far_from_the_origin_moves():
+    """Its way in a step is a hundredth of the distance of two neighbouring numbers in single precision."""
+    v, spin = np.array([2e-3, -1e-3]), 1e-3
+    made = watch([Case([{"x": (900, 900), "v": v, "spin": spin}])])
+    holds("Slow disc far away, 3 s, m", made.x[:, :, -1, 0] - ([900, 900] + 720 * STEP * v), 1e-4)
+
+
 def test_angle_is_not_wrapped():
     made = watch([Case([{"spin": s}]) for s in (10.0, -10.0)])
     exact = np.array([10.0, -10.0])[:, None, None] * np.arange(721) * STEP
@@ -460,6 +484,17 @@ def test_order_of_convergence_in_double_precision():
             assert least <= slope(np.array(errors)) <= most, (name, errors)
     print(f"Order of the sliding stop: {slope(np.array(stop)):.3f}")
     assert 0.9 <= slope(np.array(stop)) <= 1.1, stop
+
+
+@pytest.mark.full
+def test_states_between_frames_lead_to_those_of_the_frames():
+    scene, state, layout = world([{"v": (3, 4), "spin": 2.0}], gravity=DOWN)
+    device = [axes.to_device(jax.tree.map(lambda x: x[None], record)) for record in (scene, state)]
+    program = jax.jit(lambda scene, state: simulate(scene, state, layout, rules(), 6, 5, SaveAt(between=True)))
+    made = program(device[0], device[1])
+    jax.tree.map(lambda steps, frames: assert_array_equal(steps[:, -1], frames[1:]), made.between, made.states)
+    t = (1 + np.arange(25)) * STEP
+    holds("States between frames: place, m", made.between.position[:, :, 0, 0, 0].ravel() - 3 * t, 1e-5)
 
 
 @given(st.floats(0.5, 1000), st.integers(1, 64))

@@ -16,7 +16,7 @@ from gen2d.physics.broad_phase import (
     signed_distance,
 )
 from gen2d.physics.collision import Disc, Hull, Stadium, edge_normals, hull_at
-from gen2d.physics.schedule import Match, pairings
+from gen2d.physics.schedule import Match, matches, pairings
 from gen2d.physics.simulate import SaveAt, simulate
 from gen2d.records import axes, trajectory
 from gen2d.records import scene as scene_module
@@ -100,6 +100,24 @@ def _visited(words: np.ndarray, chunk: int) -> list[tuple[int, int, int]]:
             (int(spot.round), int(w), int(b)) for w, b in zip(spot.word[spot.there], spot.bit[spot.there], strict=True)
         ]
     return found
+
+
+def test_the_schedule_has_every_pair_once_and_no_body_twice_in_a_round():
+    sizes = [4, 1, 6, 2]
+    met = []
+    for match in matches(sizes, 2):
+        if match.static:
+            met.append(("static", match.first, match.second))
+            continue
+        a, b = pairings(sizes[match.first], sizes[match.second], match)
+        assert len(a) == match.rounds
+        for one, other in zip(a.tolist(), b.tolist(), strict=True):
+            bodies = [(match.first, i) for i in one] + [(match.second, j) for j in other]
+            assert len(set(bodies)) == len(bodies)
+            met += [tuple(sorted(((match.first, i), (match.second, j)))) for i, j in zip(one, other, strict=True)]
+    bodies = [(g, i) for g, size in enumerate(sizes) for i in range(size)]
+    pairs = [(x, y) for k, y in enumerate(bodies) for x in bodies[:k]]
+    assert sorted(map(str, met)) == sorted(map(str, [*pairs, *[("static", f, g) for f in range(2) for g in range(4)]]))
 
 
 @pytest.mark.parametrize("density", [0.0, 0.01, 0.3, 1.0])

@@ -43,6 +43,11 @@ def test_one_disc_rests():
     holds("Rest: one disc, speed, m/s", made.v[..., 0, :], 1e-3)
 
 
+def test_a_disc_a_hair_above_a_floor_comes_to_rest_on_it():
+    made = watch([Case([{"x": (0, RADIUS + gap), "elasticity": 0}], [FLOOR], DOWN) for gap in (1e-4, 1e-3)])
+    holds("Rest: a hair above the floor, height in the end, m", made.x[:, :, -1, 0, 1] - RADIUS, 1e-4)
+
+
 def test_column_of_ten_in_a_channel_rests():
     discs = [{"x": (0, RADIUS * (1 + 2 * k)), "elasticity": 0.5, "friction": 0.5} for k in range(10)]
     case = Case(discs, [FLOOR, wall(-RADIUS), wall(RADIUS)], DOWN)
@@ -268,6 +273,21 @@ def test_no_disc_passes_a_disc(mass):
     ]  # fmt: skip
     x = shot_positions(shots)
     assert_none((x[..., 1, 0] <= x[..., 0, 0]).any(2))
+
+
+def test_a_disc_that_is_hit_meets_the_wall_that_it_reaches_in_the_same_step():
+    """Neither the disc nor the wall is near when the step begins, as seen from the disc alone, which is at rest."""
+    shots = [
+        Case(
+            [{"x": (-1.01 - v * STEP / 8, 0), "v": (v, 0)}, {"x": (0, 0)}],
+            [{"a": (0.5 + room, -5), "b": (0.5 + room, 5)}],
+        )
+        for v in (20.0, 60.0)
+        for room in (0.01, 0.03)
+    ]
+    made = watch(shots)
+    room = np.array([0.01, 0.03] * 2)[:, None, None]
+    holds("Disc hit towards a wall: overlap with it, m", np.maximum(made.x[:, :, :, 1, 0] - room, 0), 1e-3)
 
 
 def test_far_things_are_far():

@@ -172,3 +172,19 @@ def test_a_moving_camera_shows_what_a_moved_world_does():
     other = np.asarray(draw(stages._replace(instants=moved), plan)[0])[..., 0].astype(float)
     assert light.std() > 20
     assert np.abs(light - other).max() <= 1
+
+
+@pytest.mark.full
+def test_an_exposure_ends_at_its_frame_and_its_camera_moves_on_meanwhile():
+    """Samples are the middles of equal parts of the exposure, in the world and of the camera alike."""
+    image = {"exposure": 0.6, "exposure_samples": 4}
+    stages, *_ = straight_motion({**BALLS, "image": image, "camera": {"scale": 7, "pan": [3, -1], "turn": 0.5}}, 2)
+    late = -0.6 * (1 - (np.arange(4) + 0.5) / 4) / FPS  # s
+    at, exposed = stages.instants, stages.exposed
+    pan, turn = np.array([3, -1]), 0.5
+    assert_allclose(exposed.view.center, at.view.center[:, :, None] + late[:, None] * pan, atol=1e-4)
+    assert_allclose(exposed.view.angle, at.view.angle[:, :, None] + late * turn, atol=1e-5)
+    velocity = (at.position[:, 1:2] - at.position[:, :1]) * FPS
+    assert np.abs(velocity).max() > 1
+    path = at.position[:, :, None] + late[:, None, None] * velocity[:, :, None]
+    assert_allclose(exposed.position, path, atol=1e-4)

@@ -19,6 +19,8 @@ from worlds import disc_areas, outline, polygon_areas
 
 from gen2d.renderers.coverage import disc as disc_module
 from gen2d.renderers.coverage import polygon
+from gen2d.renderers.extents import area_of
+from gen2d.renderers.primitives import Primitive
 
 SIZE, COUNT, CORNERS = 72, 64, 6  # px, shapes at once, corners of each
 EDGES = np.arange(SIZE + 1)
@@ -187,6 +189,19 @@ def test_a_capsule_without_length_and_a_rounded_point_are_discs():
     disc = discs(centre, radius)
     assert_allclose(rounded(np.repeat(centre[:, None], 2, 1), radius), disc, atol=3e-4)
     assert_allclose(rounded(np.repeat(centre[:, None], CORNERS, 1), radius), disc, atol=3e-4)
+
+
+def test_areas_of_primitives_are_those_of_their_outlines():
+    rng = np.random.default_rng(14)
+    for corners, radius in (
+        capsules(rng),
+        (polygons(rng), None),
+        (polygons(rng), np.float32(rng.uniform(0.3, 12, COUNT))),
+    ):
+        found = area_of(Primitive(jnp.asarray(corners), None if radius is None else jnp.asarray(radius)), disc=False)
+        assert_allclose(found, exact_areas(corners, radius).sum((1, 2)), rtol=1e-4)
+    radius = np.float32([0.5, 3])
+    assert_allclose(area_of(Primitive(jnp.zeros((2, 2)), jnp.asarray(radius)), disc=True), np.pi * radius**2, rtol=1e-6)
 
 
 # ---- Derivatives

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from numpy.testing import assert_array_equal
+from numpy.testing import assert_allclose, assert_array_equal
 from worlds import world
 
 from gen2d.config import plugins
@@ -21,6 +21,8 @@ from gen2d.programs import render
 from gen2d.records.layout import Layout, SlotGroup
 from gen2d.renderers import color as color_module
 from gen2d.renderers import look, rasterizer
+from gen2d.renderers.compositing import background_image
+from gen2d.renderers.noise import noise
 
 LOOKS = plugins.names("look")
 RANDOM = [name for name in LOOKS if issubclass(plugins.load("look", name).options, look.PlainOptions)]
@@ -150,9 +152,10 @@ def test_one_key_paints_the_same_and_another_key_what_is_random(name):
 def test_random_colours_can_be_told_apart(name):
     made = painted(name, 4, **FREE)
     colors = np.asarray(made.color)[:, :3]
-    behind = np.asarray(jax.vmap(look.background_colors)(made.background))
-    for shade in range(behind.shape[1]):
-        assert least(np.concatenate([behind[:, shade : shade + 1], colors], 1)).min() >= 150
+    one, other = made.background.color, made.background.to_color
+    other = other if made.background.texture is None else made.background.texture.color
+    for behind in (one,) if other is None else (one, other, (one + other) / 2):
+        assert least(np.concatenate([np.asarray(behind)[:, None], colors], 1)).min() >= 150
 
 
 def test_random_colours_are_the_same_in_all_looks_on_one_background():
@@ -164,6 +167,115 @@ def test_random_colours_are_the_same_in_all_looks_on_one_background():
     assert len(names) > 3
     for name in names:
         assert_array_equal(painted(name, 4, **FREE).color, painted("flat", 4, **FREE).color)
+
+
+# ---- Marks, spots, shade, gradients
+
+
+@functools.cache
+def turned(name):
+    """Frames [2, 40, 40, 3] of one disc in the middle, without a turn and after a quarter of one; and its paint."""
+    config = load_config(
+        {"video": {"frames": 2, "height": 40, "width": 40}, "look": {"name": name, "background_kind": "plain"}}
+    )
+    scene, state = scene_of(DISCS)
+    position = jnp.full_like(state.position, 100).at[:, 0].set(5.0)
+    two = jax.tree.map(lambda a: jnp.concatenate([a, a]), dataclasses.replace(state, position=position))
+    two = dataclasses.replace(two, angle=two.angle.at[1].add(np.pi / 2))
+    plan = render.plan_of(config, DISCS)
+    stages = jax.vmap(lambda key: render.render_scene(key, config, plan, scene, two))(keys(1))
+    return np.asarray(PATCHES(stages, plan)[0])[0].astype(float), jax.tree.map(lambda a: np.asarray(a[0]), stages.paint)
+
+
+@pytest.mark.parametrize("name", ["marked", "textured"])
+def test_what_is_painted_on_an_object_turns_with_it(name):
+    (first, later), _ = turned(name)
+    assert np.abs(later - first).max() > 30
+    assert_allclose(later, np.rot90(first), atol=2)
+
+
+def test_a_mark_points_along_the_x_axis_of_its_object():
+    (frame, _), paint = turned("marked")
+    assert_allclose(frame[19:21, 21:26], np.broadcast_to(paint.mark_color[0], (2, 5, 3)), atol=12)  # it is 1.92 px wide
+    assert_allclose(frame[19:21, 14:19], np.broadcast_to(paint.color[0], (2, 5, 3)), atol=1)
+    assert_allclose(frame[[16, 23], 21:24], np.broadcast_to(paint.color[0], (2, 3, 3)), atol=1)
+
+
+def test_light_comes_from_the_upper_left_however_an_object_turns():
+    (frame, later), paint = turned("shaded")
+    assert_allclose(later, frame, atol=1)
+    light = frame.sum(-1) / paint.color[0].sum()
+    upper_left, upper_right, lower_left, lower_right = (
+        light[a : a + 4, b : b + 4].mean() for a in (16, 20) for b in (16, 20)
+    )
+    assert_allclose(upper_right, lower_left, atol=0.01)
+    assert upper_left > upper_right + 0.05 > lower_right + 0.1
+    rim = light[23:25, 23:25].mean()  # towards the darkest point of the rim
+    assert 1 - paint.shade[0] - 0.05 < rim < 0.75
+
+
+@pytest.mark.full
+def test_spots_are_metres_large_and_scale_with_the_picture():
+    """Frames of twice as many rows and columns, four pixels averaged into one, are the smaller frames."""
+    frames = []
+    for size in (40, 80):
+        video = {"frames": 1, "height": size, "width": size}
+        config, (scene, states) = (
+            load_config({"video": video, "look": {"name": "textured", "cell_size": 1}}),
+            scene_of(DISCS),
+        )
+        plan = render.plan_of(config, DISCS)
+        staged = functools.partial(render.render_scene, config=config, plan=plan, scene=scene, states=states)
+        stages = jax.vmap(staged)(keys(2))
+        frames.append(np.asarray(PATCHES(stages, plan)[0])[:, 0].astype(float))
+    small, large = frames
+    averaged = large.reshape(2, 40, 2, 40, 2, 3).mean((2, 4))
+    assert small.std() > 20
+    assert np.abs(averaged - small).mean() < 2
+
+
+def test_phyworlds_objects_are_red_and_blue_in_turn_on_white():
+    made = painted("phyworld", 1)
+    red, blue = (255, 0, 0), (0, 0, 255)
+    assert_array_equal(made.color[0], [red, blue, red, blue])
+    assert_array_equal(made.background.color[0], (255, 255, 255))
+
+
+def test_an_outlined_object_is_filled_with_as_much_of_its_colour_as_asked():
+    for part in (0.0, 0.25, 1.0):
+        made = painted("outline", 1, fill=part)
+        mixed = (1 - part) * np.asarray(made.background.color[0]) + part * np.asarray(made.color[0])
+        assert_allclose(made.fill[0], mixed, atol=1e-3)
+        assert_array_equal(made.rim_color[0], made.color[0])
+
+
+def test_a_gradient_spans_the_view_in_its_direction():
+    config = config_of("flat", background_kind="gradient", background=[0, 0, 0], background_to=[255, 255, 255])
+    plan, (scene, states) = render.plan_of(config, DISCS), scene_of(DISCS)
+    right, up = np.meshgrid(np.arange(WIDTH) + 0.5 - WIDTH / 2, HEIGHT / 2 - np.arange(HEIGHT) - 0.5)
+    for key in keys(6):
+        stage = render.render_scene(key, config, plan, scene, states)
+        cos, sin = (float(part(stage.paint.background.direction)) for part in (jnp.cos, jnp.sin))
+        along = (right * cos + up * sin) / (abs(cos) * WIDTH / 2 + abs(sin) * HEIGHT / 2)  # -1 to 1 at the corners
+        (image,) = np.asarray(background_image(stage, stage.instants, plan))
+        assert_allclose(image, np.repeat(255 * (along[..., None] + 1) / 2, 3, -1), atol=0.1)
+
+
+def test_noise_is_a_number_from_0_to_1_that_changes_over_a_cell_and_is_continuous():
+    x, y = np.float32(np.random.default_rng(6).uniform(-50, 50, (2, 20_000)))
+
+    def at(dx, dy):
+        return np.asarray(noise(jnp.asarray(x + dx), jnp.asarray(y + dy), jnp.uint32(3)), float)
+
+    here = at(0, 0)
+    assert here.min() >= 0
+    assert here.max() <= 1
+    assert abs(here.mean() - 0.5) < 0.02
+    assert 0.12 < here.std() < 0.3
+    for dx, dy in ((1, 0), (0, 1)):
+        assert np.abs(at(1e-3 * dx, 1e-3 * dy) - here).max() < 5e-3
+        assert np.corrcoef(at(0.2 * dx, 0.2 * dy), here)[0, 1] > 0.7
+        assert abs(np.corrcoef(at(2 * dx, 2 * dy), here)[0, 1]) < 0.1
 
 
 # ---- Palettes
@@ -212,3 +324,34 @@ def test_contrast_is_a_distance_of_765_at_most():
     assert_array_equal(color_module.contrast(a, a), 0)
     assert np.max(one) < 765
     assert 764 < color_module.contrast(np.zeros(3, np.float32), np.full(3, 255, np.float32)) < 765
+
+
+def test_contrast_weighs_green_most_and_red_more_than_blue_among_bright_reds():
+    """T. Riemersma, 'Colour metric'."""
+    for red, order in ((250.0, "brg"), (5.0, "rbg")):
+        base = np.float32([red, 100, 100])
+        apart = {
+            name: float(color_module.contrast(base, base + np.float32(step)))
+            for name, step in zip("rgb", 4 * np.eye(3), strict=True)
+        }
+        assert sorted(apart, key=lambda name: apart[name]) == list(order), apart
+
+
+def test_a_mark_is_light_or_dark_whichever_has_the_higher_contrast_ratio():
+    """WCAG 2.2, 'contrast ratio' and 'relative luminance'."""
+
+    def luminance(colors):
+        share = np.asarray(colors, float) / 255
+        linear = np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)
+        return linear @ [0.2126, 0.7152, 0.0722]
+
+    colors = np.random.default_rng(4).integers(0, 256, (500, 3)).astype(np.float32)
+    chosen = np.asarray(look.contrasting(jnp.asarray(colors)))
+    other = 256 - chosen  # 16 or 240
+
+    def ratio(marks):
+        low, high = np.sort([luminance(marks), luminance(colors)], axis=0)
+        return (high + 0.05) / (low + 0.05)
+
+    assert set(np.unique(chosen)) == {16, 240}
+    assert (ratio(chosen) >= 0.9 * ratio(other)).all()

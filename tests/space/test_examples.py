@@ -254,6 +254,19 @@ def test_box_on_a_ramp(friction, tmp_path):
     total(video)
 
 
+def test_a_box_that_lands_flat_bounces_without_a_turn():
+    space, e = Space(gravity=(0, -GRAVITY), mixing="geometric"), 0.8
+    space.add_segment((-5, 0), (5, 0), elasticity=e, friction=0.5)
+    box = space.add_box((0.3, 1.25), 1, 0.5, elasticity=e, friction=0.5)
+    video = space.simulate(2)
+    assert np.abs(video.angle[:, box]).max() < 1e-4
+    fall = math.sqrt(2 / GRAVITY)
+    once = (video.time > fall) & (video.time < fall * (1 + 2 * e))
+    since = video.time[once] - fall
+    rise = e * math.sqrt(2 * GRAVITY) * since - GRAVITY * since**2 / 2
+    assert_allclose(video.position[once, box, 1], 0.25 + rise, atol=2e-3)
+
+
 @pytest.mark.full
 def test_tower():
     space = Space(gravity=(0, -GRAVITY))

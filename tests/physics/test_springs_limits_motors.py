@@ -1,0 +1,103 @@
+"""Springs, limits and motors: closed forms of bodies that joints tie to the world and to each other."""
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from laws import holds
+
+from gen2d import Space
+
+pytestmark = pytest.mark.full  # one program, compiled once
+
+
+@pytest.fixture(scope="module")
+def moved() -> tuple:
+    """Space in which each row, 10 m from the next, holds one mechanism, its video, and its bodies by name."""
+    space, bodies = Space(gravity=(0, 0)), {}
+
+    def disc(name: str, x: float, row: int, **options: Any) -> int:
+        bodies[name] = space.add_circle((x, 10.0 * row), 0.1, **options)
+        return bodies[name]
+
+    def hinged(name: str, row: int, spin: float = 0.0, **joint: Any) -> None:
+        space.add_joint("revolute", disc(name, 0, row, mass=1, moment=1, spin=spin), anchor_a=(0, 10 * row), **joint)
+
+    for name, row, damping in (("spring", 0, 0.0), ("damped", 1, 0.8)):
+        space.add_joint(
+            "distance", disc(name, 1.5, row, mass=2), anchor_b=(0, 10 * row), length=1, stiffness=8, damping=damping
+        )
+    light, heavy = disc("light", 0, 2, mass=1), disc("heavy", 1.4, 2, mass=3)
+    space.add_joint("distance", light, heavy, length=1, stiffness=12)
+    # A spring across the end of a bar that is hinged in its middle.
+    bodies["bar"] = bar = space.add_capsule((-1, 30), (1, 30), 0.05, mass=1, moment=2, spin=0.02)
+    space.add_joint("revolute", bar, anchor_a=(0, 30))
+    space.add_joint("distance", bar, anchor_a=(1, 30), anchor_b=(1, 34), stiffness=8)
+    hinged("motor", 4, motor_speed=3, motor_torque=2)
+    hinged("upper", 5, spin=2, limits=(-0.5, 1))
+    hinged("lower", 6, spin=-2, limits=(-0.5, 1))
+    slow, fast = disc("slow", 0, 7, mass=1, moment=3), disc("fast", 0, 7, mass=1, moment=1)
+    space.add_joint("revolute", slow, fast, anchor_a=(0, 70), motor_speed=100, motor_torque=2)
+    both = disc("both", 0.5, 8, mass=2)
+    for side in (-2, 2):
+        space.add_joint("distance", both, anchor_b=(side, 80), length=1, stiffness=4)
+    return space, space.simulate(3, fps=60, contacts=0), bodies
+
+
+def test_a_spring_swings_with_the_period_of_its_stiffness_and_mass(moved):
+    _, video, bodies = moved
+    t = video.time
+    holds("spring: place, m", video.position[:, bodies["spring"], 0] - 1 - 0.5 * np.cos(2 * t), 1e-4)
+    holds("two springs: place, m", video.position[:, bodies["both"], 0] - 0.5 * np.cos(2 * t), 1e-4)
+    x = {name: video.position[:, bodies[name], 0] for name in ("light", "heavy")}
+    holds("spring between two: length, m", x["heavy"] - x["light"] - 1 - 0.4 * np.cos(4 * t), 5e-4)
+    holds("spring between two: centre of mass, m", (x["light"] + 3 * x["heavy"]) / 4 - 1.05, 1e-5)
+
+
+def test_a_damper_slows_a_spring_exponentially(moved):
+    _, video, bodies = moved
+    rate, t = 0.8 / (2 * 2), video.time
+    omega = math.sqrt(4 - rate**2)
+    exact = 0.5 * np.exp(-rate * t) * (np.cos(omega * t) + rate / omega * np.sin(omega * t))
+    holds("damped spring: place, m", video.position[:, bodies["damped"], 0] - 1 - exact, 1e-4)
+
+
+def test_a_spring_at_an_arm_turns_its_body(moved):
+    _, video, bodies = moved
+    exact = 0.01 * np.sin(2 * video.time)  # I angle" = -k arm^2 angle
+    holds("spring at an arm: angle, rad", video.angle[:, bodies["bar"]] - exact, 1e-5)
+
+
+def test_a_motor_reaches_its_speed_with_its_torque_and_turns_both_bodies(moved):
+    _, video, bodies = moved
+    t = video.time
+    spins = {name: video.angular_velocity[:, bodies[name]] for name in bodies}
+    holds("motor: spin, rad/s", spins["motor"] - np.minimum(2 * t, 3), 1e-3)
+    slower, faster = spins["slow"], spins["fast"]
+    holds("motor between two: angular momentum, kg m^2/s", 3 * slower + faster, 1e-4)
+    holds("motor between two: relative spin, rad/s", np.abs(slower - faster) - 2 * (1 + 1 / 3) * t, 1e-3)
+
+
+def test_a_limit_stops_a_hinge_there(moved):
+    _, video, bodies = moved
+    for name, stop in (("upper", 1.0), ("lower", -0.5)):
+        angle, side = video.angle[:, bodies[name]], math.copysign(1, stop)
+        exact = side * np.minimum(2 * video.time, abs(stop))
+        holds(f"{name} limit: angle, rad", angle - exact, 1e-3)
+        holds(f"{name} limit: angle beyond it, rad", np.maximum(side * (angle - stop), 0), 1e-3)
+        holds(f"{name} limit: spin after it, rad/s", video.angular_velocity[-60:, bodies[name]], 1e-3)
+
+
+def test_the_books_tell_what_motors_dampers_and_limits_do(moved):
+    _, video, _ = moved
+    t, energy = video.time, video.energy
+    exact = np.minimum(2 * t, 3) ** 2 / 2 + (2 * t) ** 2 / 2 * (1 + 1 / 3)
+    holds("motors: put in, J", energy.work_in - exact, 1e-3)
+    holds("limits: lost, J", energy.lost_in_contact[-1] - 2 * 2**2 / 2, 5e-3)
+    rate = 0.2
+    v = -0.5 * 4 / math.sqrt(4 - rate**2) * np.exp(-rate * t) * np.sin(math.sqrt(4 - rate**2) * t)
+    power = 0.8 * v**2
+    lost = np.concatenate([[0], np.cumsum((power[1:] + power[:-1]) / 2)]) * (t[1] - t[0])
+    holds("damper: lost, J", energy.lost_to_damping - lost, 5e-4)
+    holds("springs, limits and motors: residual, J", energy.residual, 1e-3)
