@@ -195,6 +195,17 @@ def test_every_impact_is_told_once_unless_the_pair_was_in_touch(seed: int) -> No
     assert sorted(told) == sorted(impacts)
 
 
+@pytest.mark.parametrize(("seconds", "hits"), [(0.09, 1), (0.11, 2)])
+def test_impacts_of_a_pair_in_successive_frames_are_two_hits_if_they_are_a_tenth_of_a_second_apart(
+    seconds: float, hits: int
+) -> None:
+    made = still()
+    for row, time in enumerate((0.5, 0.5 + seconds)):
+        for name, value in (("kind", 1), ("frame", 4 + row), ("a", 0), ("b", 3), ("time", time)):
+            made[f"contacts/{name}"][row] = value
+    assert len(events_module.hit_events(made)) == hits
+
+
 @pytest.mark.parametrize("seed", range(20))
 def test_events_are_in_times_order_and_each_lies_in_the_interval_before_its_frame(seed: int) -> None:
     events = json.loads(events_module.events_json(events_module.video_events(seen(seed), VIDEO), 10**6))
@@ -307,6 +318,65 @@ def test_colours_of_the_table_have_their_own_names_and_so_have_slightly_others()
     for name, color in caption.COLORS.items():
         for _ in range(20):
             assert caption.color_name(np.clip(np.array(color) + rng.integers(-9, 10, 3), 0, 255)) == name
+
+
+def test_the_name_of_a_colour_is_that_of_the_nearest_and_green_counts_most() -> None:
+    for color in np.random.default_rng(0).integers(0, 256, (2000, 3)):
+        red, green, blue = (np.array(list(caption.COLORS.values())) - color).T
+        distances = dict(zip(caption.COLORS, 3 * red**2 + 4 * green**2 + 2 * blue**2, strict=True))
+        assert distances[caption.color_name(color.astype(np.uint8))] == min(distances.values())
+
+
+@pytest.mark.parametrize("frame", [1, 2, 9])
+def test_the_one_that_was_faster_a_frame_before_the_hit_hits_the_other(frame: int) -> None:
+    made = still()
+    made["objects/color"][:BALLS] = [[230, 30, 30], [30, 60, 230], [128, 128, 128]]
+    speeds = np.where(np.arange(VIDEO.frames) == frame - 1, 3, 1)
+    made["states/velocity"][:, :2] = 2
+    made["states/velocity"][:, 1] *= speeds[:, None] / 2  # blue: 3 to red's 2 in that frame, 1 in all others
+    for name, value in (("kind", 1), ("frame", frame), ("a", 0), ("b", 1), ("time", 0.1)):
+        made[f"contacts/{name}"][0] = value
+    text = caption.caption(made, events_module.hit_events(made), VIDEO.fps)
+    assert text.endswith("The blue ball hits the red ball at 0.10 s.")
+
+
+def test_what_is_static_never_hits() -> None:
+    made = still()
+    made["objects/color"][:BALLS] = [[230, 30, 30], [30, 60, 230], [128, 128, 128]]
+    made["states/velocity"][:] = 0
+    for name, value in (("kind", 1), ("frame", 2), ("a", 3), ("b", 0), ("time", 0.1)):
+        made[f"contacts/{name}"][0] = value
+    text = caption.caption(made, events_module.hit_events(made), VIDEO.fps)
+    assert text.endswith("The red ball hits the floor at 0.10 s.")
+
+
+@pytest.mark.parametrize(
+    ("gravity", "phrase"),
+    [
+        ((0, 0), ""),
+        ((0, -9.8), " under gravity"),
+        ((0, 3), " under gravity upwards"),
+        ((2, -2), " under gravity"),
+        ((2, 1), " under gravity to the right"),
+        ((-2, -1), " under gravity to the left"),
+    ],
+)
+def test_gravity_has_its_direction(gravity: tuple[float, float], phrase: str) -> None:
+    assert caption.caption(still(**{"world/gravity": np.array(gravity)}), [], VIDEO.fps) == (
+        f"Three balls in a box{phrase}."
+    )
+
+
+@pytest.mark.parametrize(("count", "phrase"), [(ROWS, "And 56 more events."), (ROWS + 1, "At least 56 more events.")])
+def test_more_contacts_than_are_stored_are_at_least_so_many(count: int, phrase: str) -> None:
+    made = still() | {"contacts/count": np.array(count, np.int32), "contacts/kind": np.ones(ROWS, np.uint8)}
+    made["states/velocity"][:, :BALLS] = 1
+    rows = np.arange(ROWS)
+    made |= {"contacts/a": rows % 3, "contacts/b": 3 + rows % 4, "contacts/frame": 1 + rows // 2}
+    made["contacts/time"] = 0.2 * rows
+    texts = caption.caption_fields({name: values[None] for name, values in made.items()}, VIDEO)
+    assert texts["text/event_count"].tolist() == [ROWS]
+    assert texts["text/caption"][0].decode().endswith(phrase)
 
 
 def test_shapes_have_their_nouns() -> None:

@@ -1,6 +1,7 @@
 """A crash at any change to the disk costs nothing: readers keep what they have, and the next run leaves what one run
 would have left."""
 
+import os
 import shutil
 from collections.abc import Mapping
 from pathlib import Path
@@ -202,21 +203,59 @@ def test_a_repair_that_makes_other_bytes_changes_nothing(
     assert read_manifest(root).splits == {"train": 12, "test": 3}
 
 
+def test_a_repair_finds_what_is_missing_by_itself(
+    grown: dict[int, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A file that is gone or shorter, by its row; without a manifest every byte is compared."""
+    repaired(monkeypatch)
+    pristine, names = contents(grown[12]), ("train-00000", "train-00001-n4")
+    for damage in ("gone", "shorter", "other bytes, and no manifest"):
+        root = Path(shutil.copytree(grown[12], tmp_path / damage))
+        for name in names:
+            path = root / "shards" / f"{name}.h5"
+            content = path.read_bytes()
+            path.write_bytes(content[:-1] + (b"" if damage == "shorter" else bytes([content[-1] ^ 1])))
+            if damage == "gone":
+                path.unlink()
+        if damage.endswith("no manifest"):
+            synthetic.flip(root / "manifest.json", 3000)
+        assert regenerate.repair(root) == [*names]
+        assert contents(root) == pristine
+
+
 def test_a_repair_of_a_dataset_that_grows_meanwhile_changes_nothing(
     grown: dict[int, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     repaired(monkeypatch)
-    root = Path(shutil.copytree(grown[12], tmp_path / "data"))
-    (root / "shards" / "train-00000.h5").write_bytes(b"")
-    make, after = regenerate.generate_shards, {}
+    root, make = Path(shutil.copytree(grown[12], tmp_path / "data")), regenerate.generate_shards
 
-    def grow(*arguments: Any) -> None:
+    def growing(*arguments: Any) -> None:
         make(*arguments)
         synthetic.make(small(root, SPLITS[30]))
-        after.update({name: own for name, own in contents(root).items() if ".tmp." not in name})
 
-    monkeypatch.setattr(regenerate, "generate_shards", grow)
+    monkeypatch.setattr(regenerate, "generate_shards", growing)
     with pytest.raises(FolderError, match="has changed during the repair: run it again"):
         regenerate.repair(root, ["train-00000"])
-    assert contents(root) == after
+    assert verify(root, "full") == []
     assert read_manifest(root).splits == SPLITS[30]
+
+
+def test_a_repaired_shard_is_on_the_disk_before_its_manifest(
+    grown: dict[int, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    repaired(monkeypatch)
+    root, done, sync, replace = Path(shutil.copytree(grown[12], tmp_path / "data")), list[str](), os.fsync, os.replace
+
+    def fsync(descriptor: int) -> None:
+        sync(descriptor)
+        done.append(f"flushed {Path(f'/proc/self/fd/{descriptor}').resolve().name}")
+
+    def renamed(source: Any, target: Any) -> None:
+        replace(source, target)
+        done.append(f"renamed {target}")
+
+    monkeypatch.setattr(os, "fsync", fsync)
+    monkeypatch.setattr(os, "replace", renamed)
+    regenerate.repair(root, ["train-00000"])
+    place = done.index(f"renamed {root / 'shards' / 'train-00000.h5'}")
+    assert done[place + 1] == "flushed shards"

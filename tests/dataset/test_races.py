@@ -119,6 +119,29 @@ def test_splits_that_end_at_once_are_all_there(tmp_path: Path, between: Between,
     assert verify(root) == []
 
 
+@pytest.mark.usefixtures("without_locks")
+def test_a_split_that_the_other_did_not_see_is_published_after_it(tmp_path: Path, between: Between) -> None:
+    root = tmp_path / "data"
+    first, second = small(root, {"train": 20}), small(root, {"val": 5})
+    for made in (first, second):
+        open_folder(made)
+    work(first)
+
+    def publish() -> None:
+        """As if the other had looked at the records before these were there."""
+        logs = {path: path.read_bytes() for path in (root / ".gen2d" / "records").iterdir()}
+        for path in logs:
+            path.unlink()
+        run(second)
+        for path, content in logs.items():
+            path.write_bytes(content)
+
+    between(completion, "read_records", publish, after=True)
+    assert completion.complete(first)
+    assert splits(root) == {"train": 20, "val": 5}
+    assert verify(root) == []
+
+
 def _forked(action: Callable[[], Any]) -> int:
     """The number of a process that does this, and ends with 0, or with 2 where it is refused."""
     process = os.fork()

@@ -1,7 +1,9 @@
 """A folder holds whole shards of one dataset or nothing, and its bytes follow from what is stored."""
 
+import contextlib
 import dataclasses
 import errno
+import io
 import json
 import os
 import re
@@ -23,12 +25,14 @@ from numpy.testing import assert_allclose, assert_array_equal
 from gen2d.core.errors import DamagedError, FolderError
 from gen2d.dataset import hdf5
 from gen2d.dataset.block import Block, encode, head
-from gen2d.dataset.folder import free_bytes, log, open_folder
+from gen2d.dataset.folder import clean, free_bytes, log, open_folder
 from gen2d.dataset.manifest import read_manifest
+from gen2d.dataset.records import read_records, remove_logs
 from gen2d.dataset.spec import plan, shards_of_worker
 from gen2d.generation.complete import complete
 from gen2d.storage import codecs
 from gen2d.storage.leases import lease
+from gen2d.storage.sealed import as_json, seal
 
 CODECS = pytest.mark.parametrize("codec", codecs.CODECS)
 
@@ -45,7 +49,7 @@ def test_a_plan_covers_each_video_once(count: int, size: int) -> None:
 
 def test_workers_share_the_plan_whatever_is_done() -> None:
     planned = plan({"train": 50}, 4)
-    remaining = planned[3:]
+    remaining = planned[4:]
     shares = [shards_of_worker(remaining, worker, 3) for worker in range(3)]
     assert sorted(s.place for share in shares for s in share) == [s.place for s in remaining]
     assert shares[1] == [s for s in shards_of_worker(planned, 1, 3) if s in remaining]
@@ -104,6 +108,34 @@ def test_the_index_says_where_the_bytes_are(tmp_path: Path, codec: str) -> None:
             assert codecs.crc32(data) == crc
 
 
+@pytest.mark.parametrize("frames", [1, 2, 3, 6])
+def test_a_chunk_holds_its_frames_and_the_index_says_where_it_is(tmp_path: Path, frames: int) -> None:
+    sizes = {"T": 6, "H": 8, "W": 8, "K": 3}
+    made = synthetic.make(synthetic.dataset(tmp_path, train=3, sizes=sizes, chunk_frames=frames))
+    content = (tmp_path / "shards" / "train-00000-n3.h5").read_bytes()
+    with h5py.File(io.BytesIO(content)) as file:
+        index = np.asarray(file["chunk_index"])
+        assert_array_equal(file["frames"], [synthetic.video(made, "train", number)["frames"] for number in range(3)])
+    for number, video in enumerate(index):
+        assert len(video["frames"]) == 6 // frames
+        for piece, (offset, size, crc) in enumerate(video["frames"].tolist()):
+            data, found = content[offset : offset + size], np.empty((frames, 8, 8, 3), np.uint8)
+            codecs.decode_into("gzip", data, found)
+            expected = synthetic.video(made, "train", number)["frames"][piece * frames : (piece + 1) * frames]
+            assert_array_equal(found, expected)
+            assert codecs.crc32(data) == crc
+
+
+@CODECS
+def test_a_file_ends_where_its_superblock_says(tmp_path: Path, codec: str) -> None:
+    """Room is reserved while it is written (HDF5 file format specification, superblock version 3: bytes 28 to 35)."""
+    for made in (synthetic.dataset(tmp_path / "a", codec=codec), synthetic.small(tmp_path / "b", {"train": 20})):
+        for path in (synthetic.folder(synthetic.make(made)) / "shards").iterdir():
+            content = path.read_bytes()
+            assert content[8] == 3
+            assert int.from_bytes(content[28:36], "little") == len(content)
+
+
 @CODECS
 def test_bytes_depend_on_content_only(tmp_path: Path, codec: str) -> None:
     synthetic.make(synthetic.dataset(tmp_path / "a", codec=codec), size=1)
@@ -141,6 +173,15 @@ def test_a_column_of_another_type_is_refused(tmp_path: Path) -> None:
     columns = synthetic.columns(made, plan(made.splits, 8)[0])
     with pytest.raises(ValueError, match="states/angle is float64, but must be float32"):
         encode(columns | {"states/angle": columns["states/angle"].astype(float)}, made.fields, "gzip")
+
+
+def test_a_column_of_another_shape_is_refused(tmp_path: Path) -> None:
+    made = synthetic.dataset(tmp_path)
+    shard = open_folder(made)[0]
+    columns = synthetic.columns(made, shard)
+    block = encode(columns | {"objects/mass": columns["objects/mass"][:, :1]}, made.fields, "gzip")
+    with pytest.raises(ValueError, match=r"objects/mass has shape \(1,\) a video, but must have \(3,\)"):
+        synthetic.write(made, shard, [block])
 
 
 @pytest.mark.parametrize("videos", [7, 9])
@@ -243,6 +284,23 @@ def test_another_dataset_is_refused(tmp_path: Path, change: dict[str, Any], told
     assert synthetic.tree(tmp_path) == before
 
 
+@pytest.mark.parametrize("schema", ["gen2d.dataset/2", "gen2d.dataset/4", None, 3])
+def test_another_schema_is_neither_read_nor_added_to(tmp_path: Path, schema: Any) -> None:
+    made = synthetic.make(synthetic.dataset(tmp_path, train=3))
+    manifest = json.loads((tmp_path / "manifest.json").read_text()) | {"schema": schema}
+    (tmp_path / "manifest.json").write_bytes(as_json(seal(manifest, "manifest_sha256")))
+    before = synthetic.tree(tmp_path)
+    named = f"the schema {schema}" if isinstance(schema, str) else "an unknown schema"
+    with pytest.raises(FolderError, match=f"has {named}, but this gen2d reads gen2d.dataset/3: make the dataset anew"):
+        read_manifest(tmp_path)
+    if isinstance(schema, str):
+        with pytest.raises(FolderError, match=f"a dataset with {named}, but this gen2d writes gen2d.dataset/3"):
+            open_folder(synthetic.dataset(tmp_path, train=20))
+        assert synthetic.tree(tmp_path) == before
+    synthetic.make(made, overwrite=True)
+    assert read_manifest(tmp_path).splits == made.splits
+
+
 def test_overwrite_replaces_a_dataset(tmp_path: Path) -> None:
     synthetic.make(synthetic.dataset(tmp_path / "a", train=20))
     synthetic.make(synthetic.dataset(tmp_path / "a", train=3, codec="zstd", seed=8), overwrite=True)
@@ -284,6 +342,62 @@ def test_leftovers_of_the_dead_go_and_others_stay(tmp_path: Path) -> None:
         assert [(tmp_path / "shards" / name).exists() for name in names] == [False, True, True]
     open_folder(synthetic.dataset(tmp_path, train=3))
     assert [(tmp_path / "shards" / name).exists() for name in names] == [False, False, True]
+
+
+def test_what_is_complete_is_not_written_again(tmp_path: Path) -> None:
+    made = synthetic.make(synthetic.dataset(tmp_path, train=12))
+
+    def files() -> dict[str, int]:
+        return {name: (tmp_path / name).stat().st_ino for name in synthetic.contents(tmp_path) if "lock" not in name}
+
+    before = files()
+    assert open_folder(made) == []
+    assert complete(made)
+    assert files() == before
+
+
+def test_a_folder_that_is_a_link_is_not_written_into(tmp_path: Path) -> None:
+    made = synthetic.make(synthetic.dataset(tmp_path / "data", train=3))
+    (tmp_path / "data" / "shards").rename(tmp_path / "elsewhere")
+    (tmp_path / "data" / "shards").symlink_to(tmp_path / "elsewhere")
+    for action in (lambda: open_folder(made), lambda: clean(tmp_path / "data")):
+        with pytest.raises(FolderError, match="shards is a link, but gen2d writes only into the dataset's own folders"):
+            action()
+
+
+def test_a_row_of_a_log_is_whole_or_gone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A write may take a part of a row; if the disk is full then, the part is removed, so that others can follow."""
+    made = synthetic.dataset(tmp_path)
+    todo, write, full = open_folder(made), os.write, False
+
+    def partial(descriptor: int, content: bytes) -> int:
+        if full and len(content) < 20:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        return write(descriptor, content[:7])
+
+    monkeypatch.setattr(os, "write", partial)
+    with synthetic.ShardWriter(made) as writer:
+        for number, shard in enumerate(todo):
+            full = number == 1
+            with pytest.raises(FolderError, match="no space left") if full else contextlib.nullcontext():
+                writer.write(shard, synthetic.blocks(made, shard))
+    assert open_folder(made) == [todo[1]]
+
+
+def test_a_log_stays_while_a_worker_writes_it_or_a_row_of_it_is_nowhere_else(tmp_path: Path) -> None:
+    made = synthetic.dataset(tmp_path, splits={"train": 20})
+    todo = open_folder(made)
+    with synthetic.ShardWriter(made) as other:
+        other.write(todo[0], synthetic.blocks(made, todo[0]))
+        known = read_records(made, tmp_path)
+        with synthetic.ShardWriter(made) as writer:
+            writer.write(todo[1], synthetic.blocks(made, todo[1]))
+        remove_logs(made, known)
+        assert open_folder(made) == todo[2:]
+    remove_logs(made, known)
+    assert open_folder(made) == [todo[0], *todo[2:]]
+    remove_logs(made, read_records(made, tmp_path))
+    assert open_folder(made) == todo
 
 
 @pytest.mark.parametrize("raised", [ValueError, KeyboardInterrupt, SystemExit])

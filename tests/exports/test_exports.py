@@ -1,10 +1,12 @@
 """What is exported, read back by programs that know nothing of gen2d, is what the dataset holds."""
 
+import dataclasses
 import io
 import json
 import subprocess
 import sys
 import tarfile
+import zipfile
 from collections.abc import Iterator
 from fractions import Fraction
 from pathlib import Path
@@ -106,6 +108,8 @@ def same(found: dict[str, np.ndarray], stored: dict[str, np.ndarray], number: in
 def test_an_archive_per_video_has_every_field_bit_by_bit(toy: Path, tmp_path: Path) -> None:
     out, expected = gen2d.export(toy, "npz", tmp_path / "npz").out, synthetic.stored(toy)
     for number in range(TRAIN):
+        with zipfile.ZipFile(out / f"train-{number:09d}.npz") as archive:
+            assert {entry.date_time for entry in archive.infolist()} == {(1980, 1, 1, 0, 0, 0)}
         with np.load(out / f"train-{number:09d}.npz") as archive:
             found = dict(archive)
         assert_array_equal(found.pop("time"), np.arange(6) / 10)
@@ -150,6 +154,17 @@ def test_fields_and_split_can_be_chosen(toy: Path, tmp_path: Path) -> None:
     assert sorted(path.name for path in out.glob("*.npz")) == [f"test-{number:09d}.npz" for number in range(3)]
     with np.load(out / "test-000000002.npz") as archive:
         assert set(archive) == {"states/position", "states/angle", "time"}
+
+
+def test_a_part_of_an_export_is_of_its_own_videos(toy: Path, tmp_path: Path) -> None:
+    source = source_module.source_of(toy, "train", ["index"])
+    part = dataclasses.replace(source, part=range(6, 9))
+    assert [int(video["index"]) for video in part.videos()] == [6, 7, 8]
+    plugins.load("export", "npz").write(tmp_path, part)
+    for number in (6, 7, 8):
+        with np.load(tmp_path / f"train-{number:09d}.npz") as archive:
+            assert archive["index"] == number
+    assert len(list(tmp_path.iterdir())) == 3
 
 
 # ---- phyworld
@@ -358,6 +373,27 @@ def test_its_own_is_replaced_and_what_others_made_is_not(toy: Path, tmp_path: Pa
             gen2d.export(toy, "mp4", out, overwrite=overwrite)
     assert (out / "mine.txt").read_text() == "keep me"
     assert list(tmp_path.iterdir()) == [out]
+
+
+def test_an_export_of_another_dataset_stays(toy: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    other = synthetic.make(synthetic.dataset(tmp_path / "toy", train=TRAIN, sizes=SIZES, seed=8))
+    before = tree(gen2d.export(synthetic.folder(other), "npz", out).out)
+    with pytest.raises(FolderError, match="holds another export: choose another --out, or --overwrite"):
+        gen2d.export(toy, "npz", out)
+    with pytest.raises(FolderError, match="holds another export"):
+        gen2d.export(synthetic.folder(other), "npz", out, split="test")
+    assert tree(out) == before
+
+
+def test_a_file_of_ones_own_is_replaced_only_when_asked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    root, out = two_balls(tmp_path / "balls", monkeypatch), tmp_path / "out.hdf5"
+    out.write_text("mine")
+    with pytest.raises(FolderError, match="is there already: choose another --out, or --overwrite"):
+        gen2d.export(root, "phyworld", out)
+    assert out.read_text() == "mine"
+    gen2d.export(root, "phyworld", out, overwrite=True)
+    assert h5py.is_hdf5(out)
 
 
 def test_a_file_is_replaced_only_when_asked(balls: Path, tmp_path: Path) -> None:

@@ -18,7 +18,9 @@ from numpy.testing import assert_array_equal
 from tiny import run_on
 
 from gen2d.core.errors import ConfigError
+from gen2d.core.permutation import hashed
 from gen2d.loading import dataset as loader
+from gen2d.loading import epochs
 from gen2d.loading.dataloader import DataLoader
 from gen2d.loading.epochs import order
 
@@ -53,6 +55,12 @@ def test_orders_differ_and_look_random() -> None:
     assert abs(np.corrcoef(orders)[np.triu_indices(100, 1)]).max() < 0.2
 
 
+def test_streams_of_random_numbers_share_nothing() -> None:
+    positions = np.arange(8)
+    streams = [hashed(use, 3, 1, positions) for use in (epochs.ORDER, epochs.WINDOWS, epochs.SOURCES)]
+    assert len(np.unique(streams)) == 24
+
+
 def test_a_huge_dataset_needs_no_memory() -> None:
     actual = order(0, 0, np.arange(10**12 - 5, 10**12), 10**12)
     assert len(set(actual.tolist())) == 5
@@ -72,6 +80,14 @@ def test_an_epoch_gives_each_video_once(toy: Path) -> None:
     dropped = DataLoader(dataset, 6, epochs=1)
     assert [len(batch) for batch in numbers(list(dropped))] == [6, 6, 6]
     assert len(dropped) == 3
+
+
+@pytest.mark.parametrize("drop_last", [True, False])
+def test_the_length_is_the_number_of_batches(toy: Path, drop_last: bool) -> None:
+    dataset = loader.open(toy, fields="index")
+    for size in (1, 3, 5, 6, 19, 20):
+        batches = DataLoader(dataset, size, epochs=1, drop_last=drop_last)
+        assert len(batches) == len(list(batches))
 
 
 def test_each_iteration_goes_on_with_the_next_epoch(toy: Path) -> None:
@@ -115,15 +131,19 @@ def test_a_state_resumes_at_the_very_batch_on_any_world_size(toy: Path, drop_las
 def test_random_windows_follow_from_seed_epoch_and_position(toy: Path) -> None:
     dataset, whole = loader.open(toy, fields=("index", "states/angle"), window=2), synthetic.stored(toy)["states/angle"]
 
-    def starts(**options: Any) -> list[int]:
+    def starts(size: int = 4, **options: Any) -> list[int]:
         frames = []
-        for batch in DataLoader(dataset, 4, epochs=3, **options):
+        for batch in DataLoader(dataset, size, epochs=3, **options):
             for index, angle in zip(batch["index"], batch["states/angle"], strict=True):
                 frames += [start for start in range(4) if np.array_equal(whole[index, start : start + 2], angle)]
         return frames
 
     assert starts() == starts(num_threads=1, prefetch=1)
+    assert starts() == starts(size=5) == starts(size=20)
     assert starts() != starts(seed=1)
+    one, two, three = np.array(starts(shuffle=False)).reshape(3, TRAIN)
+    assert (one != two).any()
+    assert (two != three).any()
     assert set(starts()) == {0, 1, 2, 3}
     assert len(starts()) == 3 * TRAIN
 
@@ -147,6 +167,9 @@ def test_a_state_of_another_order_is_refused(toy: Path) -> None:
     state = DataLoader(dataset, 4, seed=1).state_dict()
     with pytest.raises(ConfigError, match="the state has seed 1, but this loader has 0"):
         DataLoader(dataset, 4).load_state_dict(state)
+    sampler = DataLoader(dataset, 4).epoch_sampler
+    with pytest.raises(ConfigError, match="the state has videos 20, but this loader has 19"):
+        sampler.with_videos(19).load_state_dict(sampler.state_dict())
 
 
 def test_break_and_go_on(toy: Path) -> None:
@@ -156,6 +179,18 @@ def test_break_and_go_on(toy: Path) -> None:
         actual = [next(iter(batches))["index"].tolist()]
         actual += numbers(list(batches))
     assert actual == expected
+
+
+def test_a_closed_loader_has_no_threads(toy: Path) -> None:
+    def slow(batch: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+        time.sleep(0.3)
+        return batch
+
+    before = set(threading.enumerate())
+    with DataLoader(loader.open(toy, fields="index"), 4, transform=slow, num_threads=2) as batches:
+        next(iter(batches))
+        assert set(threading.enumerate()) - before
+    assert not set(threading.enumerate()) - before
 
 
 def test_an_error_in_a_thread_reaches_the_caller(toy: Path) -> None:

@@ -1,11 +1,14 @@
 """The loader gives what h5py gives, in whatever window and layout is asked for."""
 
+import os
 import pickle
+import shutil
 import subprocess
 import sys
 from pathlib import Path
 from typing import Any, cast
 
+import forged
 import numpy as np
 import pytest
 import synthetic
@@ -13,7 +16,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_array_equal
 
-from gen2d.core.errors import ConfigError, FolderError
+from gen2d.core.errors import ConfigError, DamagedError, FolderError
 from gen2d.loading import chunks
 from gen2d.loading import dataset as loader
 
@@ -88,6 +91,12 @@ def test_an_integer_start_begins_there(toy: Path) -> None:
     assert_array_equal(actual, synthetic.stored(toy)["states/angle"][4, 3:5])
 
 
+@pytest.mark.parametrize("start", [-1, 4])
+def test_a_window_beyond_the_video_is_refused(toy: Path, start: int) -> None:
+    with pytest.raises(ConfigError, match=rf"must be a frame from 0 to 3 for each video, but are \[3, {start}\]"):
+        loader.open(toy, window=2).batch([0, 1], starts=[3, start])
+
+
 def test_a_batch_can_be_filled_in_place(root: Path) -> None:
     dataset = loader.open(root)
     out = dataset.empty(2)
@@ -142,6 +151,67 @@ def test_a_folder_that_is_no_complete_dataset_is_told(tmp_path: Path) -> None:
     (tmp_path / ".gen2d").mkdir()
     with pytest.raises(FolderError, match="incomplete: run the command"):
         loader.open(tmp_path)
+
+
+# ---- Damage
+
+
+def test_a_damaged_row_of_an_index_is_named(toy: Path, tmp_path: Path) -> None:
+    root, manifest = shutil.copytree(toy, tmp_path / "toy"), loader.open(toy).manifest
+    row = np.load(root / "index" / "train-20.npy")[1]
+    check = int(row["index"]) + 4 * manifest.video_type.itemsize - 1  # the last byte of the row of video 11
+    synthetic.flip(root / "shards" / "train-00001.h5", 8 * check)
+    dataset = loader.open(root)
+    for numbers in ([11], range(20)):
+        with pytest.raises(DamagedError, match="the index of train video 11 is not what was written"):
+            dataset.batch(numbers)
+    assert_same(dataset[10], loader.open(toy)[10])
+
+
+def test_a_chunk_that_lies_outside_its_file_is_refused(toy: Path, tmp_path: Path) -> None:
+    root = shutil.copytree(toy, tmp_path / "toy")
+
+    def beyond(content: bytearray, index: np.ndarray, row: np.void) -> None:
+        index["frames"]["offset"][3, 0] = len(content) - 1
+
+    forged.change_shard(root, "train", 0, beyond)
+    with pytest.raises(DamagedError, match="frames lies outside the file, by its index"):
+        loader.open(root)[3]
+
+
+# ---- Files and blocks in memory
+
+
+def test_a_file_that_is_replaced_is_opened_anew(tmp_path: Path) -> None:
+    path = tmp_path / "a"
+    path.write_bytes(b"one")
+    first = chunks.open_file(path)
+    assert chunks.open_file(path) is first
+    (tmp_path / "b").write_bytes(b"two")
+    (tmp_path / "b").replace(path)
+    assert chunks.open_file(path).read(0, 3) == b"two"
+    assert first.read(0, 3) == b"one"
+
+
+def test_a_forked_process_opens_its_own_files(tmp_path: Path) -> None:
+    (tmp_path / "a").write_bytes(b"one")
+    descriptor = chunks.open_file(tmp_path / "a").descriptor
+    process = os.fork()
+    if not process:
+        os._exit(chunks.open_file(tmp_path / "a").descriptor == descriptor)
+    assert os.waitstatus_to_exitcode(os.waitpid(process, 0)[1]) == 0
+
+
+def test_blocks_of_tables_are_dropped_when_many_are_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    synthetic.make(synthetic.dataset(tmp_path, train=20, videos_per_shard=1), size=1)
+    monkeypatch.setattr(chunks, "BLOCK", 4)
+    monkeypatch.setattr(chunks, "CACHED_BLOCKS", 2)
+    monkeypatch.setattr(chunks, "CACHED_SHARDS", 3)
+    dataset = loader.open(tmp_path, fields="index")
+    for number in (*range(20), 0, 19, 7):
+        assert dataset[number]["index"] == number
+        assert len(dataset._files._blocks) <= 2
+        assert len(dataset._files._shards) <= 3
 
 
 # ---- Processes

@@ -81,6 +81,14 @@ def test_shuffling_leaves_the_proportions_of_each_batch(sources: dict) -> None:
         assert Counter(name for name, _ in one[first : first + 10]) == {"a": 5, "b": 3, "c": 2}
 
 
+def test_each_dataset_has_an_order_of_its_own(sources: dict) -> None:
+    mixture = gen2d.mix({"a": sources["c"], "b": sources["c"]})
+    actual = videos(mixture, gen2d.DataLoader(mixture, 2, epochs=1))
+    one, other = ([number for name, number in actual if name == source] for source in "ab")
+    assert sorted(one) == sorted(other) == list(range(31))
+    assert sum(a == b for a, b in zip(one, other, strict=True)) < 10
+
+
 def test_a_mixture_resumes_at_the_very_batch_on_any_world_size(sources: dict) -> None:
     roots = {name: loader.open(source.root, "train", ("index", "states/angle"), 2) for name, source in sources.items()}
     mixture = gen2d.mix(roots, WEIGHTS)

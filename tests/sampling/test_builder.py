@@ -23,3 +23,41 @@ def test_a_floor_is_level_and_reaches_beyond_the_view():
     np.testing.assert_array_equal(floor.state.angle, [0])
     np.testing.assert_array_equal(floor.objects["half_length"], [6])
     np.testing.assert_array_equal(floor.objects["friction"], [0.5])
+
+
+def test_an_absent_body_is_zero_in_every_field():
+    places, present = jnp.ones((3, 2)), jnp.array([True, False, True])
+    numbers = {"velocity": (1, 2), "spin": 3, "friction": 0.5, "force": (1, 1), "torque": 2, "rolling_resistance": 0.1}
+    groups = [
+        builder.discs(places, 0.5, present, angle=1.0, **numbers),
+        builder.boxes(places, 1.0, 2.0, 1.0, present, **numbers),
+        builder.segments(places, 2 * places, present),
+    ]
+    for group in groups:
+        for name, values in group.objects.items():
+            assert not np.asarray(values)[1].any(), name
+        for values in (group.state.position, group.state.angle, group.state.velocity, group.state.angular_velocity):
+            assert not np.asarray(values)[1].any()
+        assert np.asarray(group.objects["mass"])[[0, 2]].all()
+
+
+def test_a_given_mass_takes_the_place_of_that_of_the_density():
+    places = jnp.zeros((1, 2))
+    for make in (
+        lambda **of: builder.discs(places, 0.5, **of),
+        lambda **of: builder.capsules(places, 0.0, 1.0, 0.5, **of),
+        lambda **of: builder.boxes(places, 0.0, 2.0, 1.0, **of),
+    ):
+        dense, given = (make(density=3.0).objects, make(mass=7.0).objects)
+        assert given["mass"] == 7
+        np.testing.assert_allclose(given["moment"] / given["mass"], dense["moment"] / dense["mass"], rtol=1e-6)
+
+
+def test_walls_of_a_box_face_inwards():
+    """The middle of the box is on the left of each wall."""
+    walls = builder.box_walls(4.0, 3.0)
+    angle, position = np.asarray(walls.state.angle), np.asarray(walls.state.position)
+    np.testing.assert_allclose(position, [[2, 0], [4, 1.5], [2, 3], [0, 1.5]])
+    np.testing.assert_allclose(walls.objects["half_length"], [2, 1.5, 2, 1.5])
+    inwards = np.stack([-np.sin(angle), np.cos(angle)], -1)
+    assert (((np.array([2, 1.5]) - position) * inwards).sum(-1) > 0).all()

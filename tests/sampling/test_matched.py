@@ -200,6 +200,20 @@ def test_a_factor_is_another_one_for_one_or_for_all_drawn_anew_or_scaled(objects
         assert_allclose(others["density"], np.where(changed, one["density"] / 2, one["density"]), rtol=1e-6)
 
 
+def test_the_object_whose_factor_is_changed_is_there():
+    """Also where few of the objects are: of five at most, one or two."""
+    config = load_config(CONFIG, ["scene.balls=[1, 5]", "matched.change=density", "matched.objects=one"])
+    sampler = Sampler(config)
+
+    def factors(key: jax.Array, number: int) -> dict[str, jax.Array]:
+        member = sets_module.member_of(key, jnp.asarray(number), config.matched, 8)
+        return sampler.sample_factors(key, change=lambda *found: counterfactuals.change_factors(member, config, *found))
+
+    program = jax.jit(jax.vmap(factors, (0, None)))
+    one, other = (program(jax.random.split(jax.random.key(0), 200), number) for number in (0, 1))
+    assert_array_equal((np.asarray(one["density"]) != np.asarray(other["density"])).sum(1), 1)
+
+
 def test_a_scaled_factor_stays_within_what_it_may_be():
     assert drawn("change=elasticity", "scale=9")[1]["elasticity"].max() == 1
 

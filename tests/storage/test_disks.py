@@ -20,8 +20,10 @@ import tiny
 import gen2d
 from gen2d.core.errors import DamagedError, Error, FolderError, UnreachableError, UserError
 from gen2d.dataset.folder import open_folder
+from gen2d.generation.complete import complete
 from gen2d.loading import chunks
 from gen2d.storage import explain, leases
+from gen2d.storage.atomic import publishing_folder
 from gen2d.storage.leases import lease, temporary_name
 from gen2d.tools.verify import verify
 
@@ -129,6 +131,73 @@ def test_what_cannot_be_written_is_said_and_leaves_nothing(
     assert not [path for path in tmp_path.rglob("*") if ".tmp." in path.name]
     synthetic.make(made)
     assert verify(tmp_path / "data") == []
+
+
+def test_what_has_a_name_is_on_the_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Bytes are flushed before a file is renamed, and names before a record says that the file is there."""
+    flush, rename = os.fsync, os.replace
+    flushed: dict[int, bytes] = {}  # content by inode
+    renamed, recorded = set[Path](), list[bytes]()  # folders with names that are not flushed; logs of records
+
+    def fsync(descriptor: int) -> None:
+        path = Path(f"/proc/self/fd/{descriptor}").resolve()
+        flush(descriptor)
+        if path.is_dir():
+            renamed.discard(path)
+            return
+        flushed[os.fstat(descriptor).st_ino] = path.read_bytes()
+        if path.parent.name == "records":
+            assert not renamed
+            recorded.append(path.read_bytes())
+
+    def replace(source: Any, target: Any) -> None:
+        assert flushed[Path(source).stat().st_ino] == Path(source).read_bytes()
+        rename(source, target)
+        renamed.add(Path(target).parent)
+
+    monkeypatch.setattr(os, "fsync", fsync)
+    monkeypatch.setattr(os, "replace", replace)
+    made = synthetic.dataset(tmp_path / "data", train=12)
+    todo = open_folder(made)
+    with synthetic.ShardWriter(made) as writer:
+        for number, shard in enumerate(todo, 1):
+            row = writer.write(shard, synthetic.blocks(made, shard))
+            assert len(recorded) == number
+            assert recorded[-1].endswith(row.tobytes())
+    assert complete(made)
+    assert not renamed
+
+
+def test_what_is_in_a_folder_is_on_the_disk_before_the_folder_has_its_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    done, flush, flush_all, rename = list[str](), os.fsync, os.sync, os.rename
+    monkeypatch.setattr(os, "sync", lambda: (flush_all(), done.append("flushed all")))
+    monkeypatch.setattr(os, "rename", lambda *names: (rename(*names), done.append(f"renamed to {Path(names[1]).name}")))
+    monkeypatch.setattr(
+        os, "fsync", lambda file: (flush(file), done.append(f"flushed {Path(f'/proc/self/fd/{file}').resolve().name}"))
+    )
+    with publishing_folder(tmp_path / "films") as temporary:
+        (temporary / "a").touch()
+        done.clear()
+    assert done == ["flushed all", "renamed to films", f"flushed {tmp_path.name}"]
+
+
+def test_a_folder_that_cannot_be_replaced_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    rename = os.rename
+
+    def failing(source: Any, target: Any) -> None:
+        if ".old." not in f"{source}{target}":
+            raise OSError(errno.EIO, os.strerror(errno.EIO))
+        rename(source, target)
+
+    (tmp_path / "films").mkdir()
+    (tmp_path / "films" / "a").write_text("before")
+    monkeypatch.setattr(os, "rename", failing)
+    with pytest.raises(OSError, match="Input/output"), publishing_folder(tmp_path / "films") as temporary:
+        (temporary / "a").write_text("after")
+    assert [path.relative_to(tmp_path).as_posix() for path in sorted(tmp_path.rglob("*"))] == ["films", "films/a"]
+    assert (tmp_path / "films" / "a").read_text() == "before"
 
 
 @pytest.fixture
@@ -272,13 +341,17 @@ def test_containers_with_one_name_do_not_touch_each_others_files(tmp_path: Path)
     assert not path.exists()
 
 
-def test_without_locks_only_clean_removes_what_is_left(toy: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("reason", ["locking fails", "other machines do not see locks"])
+def test_without_locks_only_clean_removes_what_is_left(toy: Path, monkeypatch: pytest.MonkeyPatch, reason: str) -> None:
     def no_locks(*_: object) -> None:
         raise OSError(errno.ENOLCK, "No locks available")
 
     left = toy / "shards" / temporary_name("train-00000.h5")
     left.touch()
-    monkeypatch.setattr(leases.fcntl, "flock", no_locks)
+    if reason == "locking fails":
+        monkeypatch.setattr(leases.fcntl, "flock", no_locks)
+    else:
+        monkeypatch.setattr(leases, "has_locks", lambda folder: False)
     synthetic.make(synthetic.dataset(toy, train=11))
     assert left.exists()
     done = tiny.run_main("clean", toy)
@@ -323,6 +396,22 @@ def test_a_lease_is_the_owner_s_alone(tmp_path: Path) -> None:
         assert leases.remove_abandoned(list(leases.temporary_files(tmp_path))) == []
     assert leases.remove_abandoned(list(leases.temporary_files(tmp_path))) == [folder]
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_lease_is_of_the_file_that_has_the_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Another process may remove the file as abandoned between its making and its locking."""
+    path, lock, removed = tmp_path / temporary_name("x"), leases.try_lock, list[bool]()
+
+    def late(descriptor: int) -> bool | None:
+        if not removed:
+            path.unlink()
+            removed.append(True)
+        return lock(descriptor)
+
+    monkeypatch.setattr(leases, "try_lock", late)
+    with lease(path) as descriptor:
+        assert os.path.samestat(os.fstat(descriptor), path.stat())
+    assert removed
 
 
 # ---- Time

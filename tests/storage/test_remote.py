@@ -21,6 +21,7 @@ import s3fs
 import synthetic
 import tiny
 from buckets import Request, Server
+from fsspec.implementations.memory import MemoryFileSystem
 from numpy.testing import assert_array_equal
 
 import gen2d
@@ -38,7 +39,7 @@ from gen2d.storage import filesystems, ranges, retries
 from gen2d.storage.atomic import publish, sweep
 from gen2d.storage.paths import Url, place, upload
 from gen2d.storage.ranges import Range
-from gen2d.storage.sealed import read_bytes
+from gen2d.storage.sealed import file_sha256, read_bytes
 
 TOY = "s3://bucket/toy"
 
@@ -297,6 +298,14 @@ def test_what_is_changed_in_a_cache_is_fetched_again(server: Server, toy: Path, 
     same(gen2d.open(TOY, cache_dir=tmp_path)[:], gen2d.open(toy)[:])
 
 
+def test_what_is_damaged_does_not_enter_the_cache(toy: Path, tmp_path: Path) -> None:
+    url, name = "s3://bucket/uncached", "shards/train-00001.h5"
+    damaged(toy, url, name, flip)
+    with pytest.raises(DamagedError, match=rf"^{url}/{name} is not what was written: its sha256 differs"):
+        gen2d.open(url, cache_dir=tmp_path)[8]
+    assert all(path.name == file_sha256(path) for path in tmp_path.iterdir())
+
+
 def read_slowly(folder: Path, numbers: list[int]) -> list[int]:
     return [int(gen2d.open(TOY, fields="index", cache_dir=folder)[number]["index"]) for number in numbers]
 
@@ -430,6 +439,22 @@ def test_uploads_are_tried_again(server: Server, toy: Path, kind: str) -> None:
     synthetic.make(at(f"s3://bucket/again-{kind}"))
     server.reset()
     assert buckets.tree(f"s3://bucket/again-{kind}") == synthetic.tree(toy)
+
+
+def test_an_upload_of_which_a_part_arrives_is_tried_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    put, calls = MemoryFileSystem.put_file, list[str]()
+
+    def partial(system: Any, source: str, target: str, **options: Any) -> None:
+        put(system, source, target, **options)
+        calls.append(target)
+        if len(calls) == 1:
+            system.pipe(target, b"part")
+
+    monkeypatch.setattr(MemoryFileSystem, "put_file", partial)
+    (tmp_path / "a").write_bytes(b"all of it")
+    upload(tmp_path / "a", Url("memory://uploads/a"))
+    assert len(calls) == 2
+    assert Url("memory://uploads/a").read_bytes(100) == b"all of it"
 
 
 @pytest.mark.parametrize("part", ["/shards/train-00001.h5", "/records/train."])

@@ -181,6 +181,32 @@ def test_what_is_secret_is_never_shown(server: Server, what: str) -> None:
     assert any("***" in text for text in shown)
 
 
+def test_a_deadline_is_for_all_attempts_together() -> None:
+    waits = iter((0.8, 30.0))
+
+    def call(system: Any, path: str) -> None:
+        time.sleep(next(waits))
+        raise ConnectionResetError
+
+    began = time.monotonic()
+    with pytest.raises(UnreachableError, match="no answer within the deadline"):
+        retries.attempt(Url("memory://x", network=Network(TIMEOUT, DEADLINE)), call)
+    assert time.monotonic() - began < 1.5
+
+
+@pytest.mark.parametrize("error", [TypeError, ValueError, AttributeError, NotImplementedError])
+def test_an_error_of_the_program_is_not_tried_again(error: type[Exception]) -> None:
+    calls = []
+
+    def call(system: Any, path: str) -> None:
+        calls.append(path)
+        raise error("a bug")
+
+    with pytest.raises((OSError, error), match="a bug"):
+        retries.attempt(Url("memory://x"), call)
+    assert len(calls) == 1
+
+
 def test_limits_are_numbers_above_zero() -> None:
     cases: list[dict[str, Any]] = [
         {"timeout": 0},

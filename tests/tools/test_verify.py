@@ -3,6 +3,7 @@
 import shutil
 from pathlib import Path
 
+import forged
 import h5py
 import numpy as np
 import pytest
@@ -192,6 +193,13 @@ def test_a_shard_that_lies_is_found_although_its_checksums_fit(tmp_path: Path) -
     )
     assert all(any(part in sentence for sentence in found) for part in wrong)
     assert damaged_shards(tmp_path, "full") == ["train-00000"]
+
+
+@pytest.mark.parametrize("key", ["bytes", "largest"])
+def test_a_manifest_whose_sums_are_wrong_is_found(root: Path, key: str) -> None:
+    forged.seal(root, lambda plain: plain["tables"]["train"].update({key: plain["tables"]["train"][key] + 1}))
+    (sentence,) = [each for each in verify(root, "quick") if "dataset.json" not in each]
+    assert "train-10.npy has shards of other sizes than manifest.json says" in sentence
 
 
 def test_a_repair_makes_the_bad_shards_again(root: Path) -> None:
