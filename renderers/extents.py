@@ -32,7 +32,9 @@ def area_of(primitive: Primitive, disc: bool) -> Array:
     round_part = jnp.pi * radius**2
     if disc:
         return round_part
-    corners, following = primitive.corners, jnp.roll(primitive.corners, -1, axis=-2)
+    # From the first corner: far from the origin, rounding gives an area to a point, and a wrong one to a small shape.
+    corners = primitive.corners - primitive.corners[..., :1, :]
+    following = jnp.roll(corners, -1, axis=-2)
     core = (corners[..., 0] * following[..., 1] - corners[..., 1] * following[..., 0]).sum(-1) / 2
     return core + radius * jnp.sqrt(((following - corners) ** 2).sum(-1)).sum(-1) + round_part
 

@@ -33,7 +33,7 @@ from gen2d.renderers.compositing import (
     static_layer,
 )
 from gen2d.renderers.plan import FramePlan, RenderScene
-from gen2d.renderers.postprocessing import add_noise, exposure_average
+from gen2d.renderers.postprocessing import add_noise, expose, exposure_average, exposure_start
 from gen2d.renderers.primitives import Instants, PixelWindow
 from gen2d.renderers.shading import covered_color, fills_of
 from gen2d.renderers.tiles import draw_tiles
@@ -63,11 +63,11 @@ def _draw_video(scene: RenderScene, plan: FramePlan) -> tuple[Array | None, Arra
         def add(total: Array, at: Instants) -> tuple[Array, None]:
             image = _paint_instants(scene, alone, at).image
             assert image is not None
-            return total + image.astype(jnp.uint16), None
+            return expose(total, image, plan.linear), None
 
         exposed = jax.tree.map(lambda a: jnp.moveaxis(a, 1, 0), scene.exposed)
-        zero = jnp.zeros((scene.instants.angle.shape[0], plan.height, plan.width, 3), jnp.uint16)
-        frames = exposure_average(jax.lax.scan(add, zero, exposed)[0], plan.exposed)
+        start = exposure_start((scene.instants.angle.shape[0], plan.height, plan.width, 3), plan.linear)
+        frames = exposure_average(jax.lax.scan(add, start, exposed)[0], plan.exposed, plan.linear)
     if frames is not None and scene.noise is not None:
         frames = add_noise(frames, scene.noise, scene.seed, jnp.arange(frames.shape[0]))
     return frames, None if owners is None else (owners & 255).astype(jnp.uint8)

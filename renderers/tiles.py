@@ -24,7 +24,7 @@ from gen2d.renderers.compositing import (
     static_layer,
 )
 from gen2d.renderers.plan import FramePlan, RenderScene, TileGroup, tile_windows
-from gen2d.renderers.postprocessing import add_noise, exposure_average
+from gen2d.renderers.postprocessing import add_noise, expose, exposure_average, exposure_start
 from gen2d.renderers.primitives import Instants, PixelWindow
 from gen2d.renderers.shading import EdgeTerms, covered_color, fills_of
 
@@ -119,10 +119,10 @@ class _VideoRenderer:
 
         def average_exposure(t: Array) -> Array:
             def add(s: Array, total: Array) -> Array:
-                return total + render_instant(t * samples + s).astype(jnp.uint16)
+                return expose(total, render_instant(t * samples + s), plan.linear)
 
-            total = jnp.zeros((1, plan.height, plan.width, 3), jnp.uint16)
-            return exposure_average(jax.lax.fori_loop(0, samples, add, total), samples)
+            start = exposure_start((1, plan.height, plan.width, 3), plan.linear)
+            return exposure_average(jax.lax.fori_loop(0, samples, add, start), samples, plan.linear)
 
         def frame(t: Array, canvas: LayerCanvas) -> LayerCanvas:
             image = average_exposure(t) if plan.exposed else render_instant(t)
