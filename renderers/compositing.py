@@ -166,7 +166,7 @@ def paint_runs(
         def paint_run(
             canvas: Any, run: SlotGroup = run, first: int = first, slots: slice = slots, rank: int = rank
         ) -> Any:
-            def paint_slot(canvas: Any, entry: tuple) -> tuple[Any, None]:
+            def paint_slot(canvas: Any, entry: tuple[Any, ...]) -> tuple[Any, None]:
                 edges, fills, slot, rank = entry
                 canvas = paint_occluders(canvas, scene, plan, lambda of: of == rank, paint)
                 return paint(canvas, *covered_color(edges, fills, window, plan.largest(run)), slot + 1), None
@@ -223,7 +223,7 @@ def run_edge_terms(
     varied = scene.paint.shade is not None or scene.paint.texture is not None
     corners = [jnp.broadcast_to(jnp.asarray(edge), parts.pose.column.shape) for edge in (window.top, window.left)]
 
-    def sample(entry: tuple) -> EdgeTerms:
+    def sample(entry: tuple[Any, ...]) -> EdgeTerms:
         part, top, left = entry
         return edge_terms(part, PixelWindow(top, left, window.rows, window.columns), run.shape == "circle", varied)
 

@@ -27,8 +27,10 @@ class PlainOptions(LineOptions):
     """Options of the background, colours and lines of plain shapes."""
 
     background_kind: str = option("plain", str, "", "kind of the background", choices=("plain", "gradient", "noise"))
-    background: tuple = option([20, 20, 20], int, "sRGB", "first color of the background", parts=3, low=0, high=255)
-    background_to: tuple = option(
+    background: tuple[int, ...] = option(
+        [20, 20, 20], int, "sRGB", "first color of the background", parts=3, low=0, high=255
+    )
+    background_to: tuple[int, ...] = option(
         [80, 80, 110], int, "sRGB", "second color of the background", parts=3, low=0, high=255
     )
     background_cell: float = option(

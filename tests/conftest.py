@@ -5,8 +5,11 @@ import os
 import pathlib
 import sys
 import tempfile
+import warnings
 from collections.abc import Generator
+from typing import Any
 
+import packages
 import pytest
 
 Reports = Generator[None, pytest.TestReport, pytest.TestReport]
@@ -21,6 +24,7 @@ os.environ["XDG_CONFIG_HOME"] = _CONFIG.name  # the user's list of trusted code 
 
 def pytest_configure() -> None:
     """Empty a cache that has grown too large, and give each of several test processes a core of its own."""
+    warnings.simplefilter("error", ResourceWarning)  # also between tests, where the filters of pytest do not hold
     worker = os.environ.get("PYTEST_XDIST_WORKER")
     if not worker:
         files = [(path.stat(), path) for path in _CACHE.rglob("*") if path.is_file()]
@@ -38,7 +42,7 @@ def _compiled_programs_end_with_their_file():
     yield
     if "jax" in sys.modules:
         sys.modules["jax"].clear_caches()
-        gc.collect()
+    gc.collect()  # a file that is open in a cycle of references is an error too
 
 
 @pytest.hookimpl(wrapper=True)
@@ -64,3 +68,10 @@ def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo[None]) ->
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """The file that takes longest comes first, so that no process works at it alone in the end."""
     items.sort(key=lambda item: item.path.name != "test_readme.py")
+
+
+def pytest_terminal_summary(terminalreporter: Any) -> None:
+    """Name everything that was not run, such as tests of a package that is not installed."""
+    reports = [report for kind in ("passed", "failed") for report in terminalreporter.stats.get(kind, [])]
+    for line in packages.summary(terminalreporter.stats.get("skipped", []), reports):
+        terminalreporter.write_line(line)

@@ -102,6 +102,44 @@ def definitions(tree: ast.Module) -> set[str]:
     return found
 
 
+# Containers of a whole process, and the constants that bound them.
+CONTAINERS = {"gen2d.loading.chunks._files": "OPEN_FILES", "gen2d.programs.shared._programs": "MAX_PROGRAMS"}
+
+
+def unbounded_caches(tree: ast.Module) -> list[str]:
+    """Functions with parameters whose results are all kept."""
+    found = []
+    for node in ast.walk(tree):
+        if isinstance(node, ast.FunctionDef):
+            calls = [ast.unparse(decorator).removeprefix("functools.") for decorator in node.decorator_list]
+            has_parameters = any((node.args.args, node.args.vararg, node.args.kwonlyargs, node.args.kwarg))
+            if has_parameters and {"cache", "cache()", "lru_cache(maxsize=None)", "lru_cache(None)"} & {*calls}:
+                found.append(node.name)
+    return found
+
+
+def containers(tree: ast.Module) -> set[str]:
+    """Empty containers of the module, which its functions fill."""
+    empty = {"{}", "[]", "dict()", "list()", "set()", "OrderedDict()", "deque()", "Counter()", "defaultdict(list)"}
+    found = set()
+    for node in tree.body:
+        if isinstance(node, ast.Assign | ast.AnnAssign) and node.value is not None and ast.unparse(node.value) in empty:
+            targets = node.targets if isinstance(node, ast.Assign) else [node.target]
+            found |= {target.id for target in targets if isinstance(target, ast.Name)}
+    return found
+
+
+def test_no_cache_grows_without_bound() -> None:
+    trees = {name: ast.parse(path.read_text()) for name, path in MODULES.items()}
+    assert {name: caches for name, tree in trees.items() if (caches := unbounded_caches(tree))} == {}
+    assert {f"{name}.{container}" for name, tree in trees.items() for container in containers(tree)} == {*CONTAINERS}
+    for container, bound in CONTAINERS.items():
+        module, _, name = container.rpartition(".")
+        assert f"while len({name}) > {bound}:" in MODULES[module].read_text()
+    example = ast.parse("@functools.cache\ndef f(x): ...\n@cache\ndef g(): ...\nkept: dict[str, int] = {}\nnames = 3")
+    assert (unbounded_caches(example), containers(example)) == (["f"], {"kept"})
+
+
 def test_a_class_has_one_name_and_a_name_one_class() -> None:
     owners: dict[str, list[str]] = {}
     for module, path in MODULES.items():

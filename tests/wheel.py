@@ -1,4 +1,4 @@
-"""Checks an installed wheel: its top level, and that looks and configs came along. `.ci/run` runs it elsewhere."""
+"""Checks an installed wheel: its top level, and that looks and configs came along. `versions.sh` runs it elsewhere."""
 
 import importlib
 import sys

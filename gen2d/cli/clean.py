@@ -7,11 +7,13 @@ from gen2d.core.errors import one_line
 
 
 def add_arguments(parser: Parser) -> None:
+    """Add the arguments of the verb."""
     add_dataset(parser)
     add_network(parser)
 
 
 def run(options: argparse.Namespace) -> int:
+    """Remove the files of old snapshots; the exit code of the verb."""
     from gen2d.dataset import folder
     from gen2d.storage.paths import place
     from gen2d.storage.retries import Network

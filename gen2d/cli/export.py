@@ -19,6 +19,7 @@ from gen2d.core.humanize import in_bytes, in_time
 
 
 def add_arguments(parser: Parser) -> None:
+    """Add the arguments of the verb."""
     add_dataset(parser)
     parser.add_argument(
         "--to", required=True, metavar="FORMAT", help=f"one of {', '.join(names('export'))}, or a Python file"
@@ -46,6 +47,7 @@ def add_arguments(parser: Parser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
+    """Export the videos; the exit code of the verb."""
     from gen2d.core.progress import to_stderr
     from gen2d.exports.export import export
     from gen2d.loading.dataset import RenderOptions

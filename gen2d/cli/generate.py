@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 
 
 def add_arguments(parser: Parser) -> None:
+    """Add the arguments of the verb."""
     parser.add_argument(
         "--config", required=True, metavar="YAML", help="a config file, or the name of one that comes with gen2d"
     )
@@ -64,6 +65,7 @@ def _worker(text: str) -> tuple[int, int]:
 
 
 def run(options: argparse.Namespace) -> int:
+    """Generate the dataset, or this worker's share of it; the exit code of the verb."""
     from gen2d.core.progress import Event, to_json, to_stderr, waiting
 
     log, engine = to_json if options.json else to_stderr, engine_of(options)

@@ -7,6 +7,7 @@ from gen2d.cli.parser import Parser, add_network, add_overrides, add_trust, limi
 
 
 def add_arguments(parser: Parser) -> None:
+    """Add the arguments of the verb."""
     parser.add_argument(
         "source",
         metavar="DIR|CONFIG",
@@ -31,6 +32,7 @@ def add_arguments(parser: Parser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
+    """Write pictures of a dataset or config; the exit code of the verb."""
     keywords = {"seed": options.seed, "overrides": options.overrides, "trust": options.trust, **limits(options)}
     if options.videos is not None:
         keywords["videos"] = options.videos

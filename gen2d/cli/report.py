@@ -119,7 +119,7 @@ def plugins(name: str | None = None) -> str:
     return "\n".join(lines).rstrip()
 
 
-def _plugin_options(kind: str, name: str, contract: Any) -> dict[str, dataclasses.Field]:
+def _plugin_options(kind: str, name: str, contract: Any) -> dict[str, dataclasses.Field[Any]]:
     """The options of a plug-in, by where they stand in a config."""
     if kind == "export":
         return {}
@@ -129,11 +129,11 @@ def _plugin_options(kind: str, name: str, contract: Any) -> dict[str, dataclasse
     return {where: options} if isinstance(options, dataclasses.Field) else _options_of(where, options)
 
 
-def _options_of(where: str, options: type) -> dict[str, dataclasses.Field]:
+def _options_of(where: str, options: type) -> dict[str, dataclasses.Field[Any]]:
     return {f"{where}.{field.name}": field for field in dataclasses.fields(options)}
 
 
-def _option_table(fields: Mapping[str, dataclasses.Field]) -> list[str]:
+def _option_table(fields: Mapping[str, dataclasses.Field[Any]]) -> list[str]:
     rows = []
     for name, field in fields.items():
         spec = field.metadata["option"]

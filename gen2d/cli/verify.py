@@ -10,6 +10,7 @@ from gen2d.core.errors import UserError
 
 
 def add_arguments(parser: Parser) -> None:
+    """Add the arguments of the verb."""
     add_dataset(parser)
     parser.add_argument(
         "--level",
@@ -35,6 +36,7 @@ def add_arguments(parser: Parser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
+    """Check, and repair if asked to; the exit code of the verb."""
     from gen2d.dataset.manifest import is_begun
     from gen2d.dataset.spec import MANIFEST
     from gen2d.storage.paths import place, reading

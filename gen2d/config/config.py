@@ -256,7 +256,9 @@ def _check_grids(config: Config, source: str) -> None:
 
 
 def load_config(
-    config: "Config | Mapping | str | pathlib.Path", overrides: Sequence[str] = (), copies: Copies = NO_COPIES
+    config: "Config | Mapping[str, object] | str | pathlib.Path",
+    overrides: Sequence[str] = (),
+    copies: Copies = NO_COPIES,
 ) -> Config:
     """The Config of a file's name or path, of a mapping, or of a Config, with `overrides` such as 'physics.substeps=8'.
 

@@ -28,7 +28,7 @@ class _Contract:
             raise TypeError(f"{type(self).__name__}.options is {options!r}, of which not every field is an option(...)")
 
 
-def option_fields(options: Any) -> tuple[dataclasses.Field, ...]:
+def option_fields(options: Any) -> tuple[dataclasses.Field[Any], ...]:
     """Fields of a dataclass of options; a single option is its own field."""
     return (options,) if isinstance(options, dataclasses.Field) else dataclasses.fields(options)
 
@@ -67,7 +67,7 @@ class Family(_Contract):
     sample: Callable[[Any, Any, Any], Any]
     check: Callable[[Any], None] = _nothing
     sizes: Callable[[Any], Mapping[str, int]] = _no_sizes
-    derived: Mapping[str, Field] = dataclasses.field(default_factory=dict)
+    derived: Mapping[str, Field] = dataclasses.field(default_factory=dict[str, Field])
     crowded_by: tuple[str, ...] = ()
     begins_outside: bool = False
 

@@ -27,7 +27,7 @@ def nearest(name: str, names: list[str]) -> str:
     return f"did you mean {close[0]}?" if close else "there are: " + ", ".join(sorted(names))
 
 
-@functools.cache  # the folders do not change
+@functools.lru_cache(maxsize=8)  # of the few kinds; the folders do not change
 def names(kind: str) -> list[str]:
     """Sorted names of the built-in plug-ins of a kind."""
     return sorted(module.name for module in pkgutil.iter_modules(importlib.import_module(KINDS[kind][0]).__path__))

@@ -11,7 +11,7 @@ from gen2d.engines.protocol import Done, EngineError, Job
 
 @dataclasses.dataclass(frozen=True)
 class Local:
-    """This process as the only worker, on all its devices: the default engine."""
+    """The calling process as the only worker, on all its devices: the default engine."""
 
     def start(self, job: Job, log: Log) -> "LocalWorkers":
         """The worker in this process, when its programs are traced."""

@@ -3,7 +3,7 @@
 import contextlib
 import dataclasses
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -189,7 +189,7 @@ def _check_out(out: Path, format_: Export, description: Mapping[str, Any], overw
 
 def _check_folder(out: Path, description: Mapping[str, Any], overwrite: bool) -> None:
     previous = _read_description(out)
-    known = {DESCRIPTION, *previous["files"]} if previous else set()
+    known: set[str] = {DESCRIPTION, *previous["files"]} if previous else set()
     foreign = {path.name for path in out.iterdir()} - known
     if foreign:
         raise FolderError(f"{out} holds {min(foreign)}, which no export made: choose another --out")
@@ -227,7 +227,7 @@ def _write_output(out: Path, format_: Export, write: Callable[[Path], None], des
 
 
 @contextlib.contextmanager
-def _translate_errors(out: Path) -> Iterator[None]:
+def _translate_errors(out: Path) -> Generator[None]:
     """Context that turns an OSError into a UserError with one sentence."""
     try:
         yield

@@ -46,7 +46,7 @@ class Summary:
 
 
 def generate(
-    config: Config | Mapping | str | Path,
+    config: Config | Mapping[str, object] | str | Path,
     n: int,
     out: str | Place | None = None,
     *,

@@ -9,7 +9,7 @@ import dataclasses
 import difflib
 import fnmatch
 import math
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Generator, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypedDict, TypeVar, overload
 
@@ -436,7 +436,7 @@ class Dataset:
         return first
 
     @contextlib.contextmanager
-    def _lookup_errors(self, numbers: np.ndarray) -> Iterator[None]:
+    def _lookup_errors(self, numbers: np.ndarray) -> Generator[None]:
         """Context that adds the indices of the videos that are looked up to the message of a DamagedError."""
         try:
             yield

@@ -134,7 +134,7 @@ def _rank_and_world_size(rank: int | None, world_size: int | None) -> tuple[int,
     return 0 if rank is None else rank, 1 if world_size is None else world_size
 
 
-def check_one_of(name: str, value: Any, allowed: tuple) -> None:
+def check_one_of(name: str, value: Any, allowed: tuple[object, ...]) -> None:
     """Raise ConfigError unless the value is one of the allowed ones."""
     if value not in allowed:
         raise ConfigError(f"{name} is {value!r}, but must be one of {', '.join(map(str, allowed))}")

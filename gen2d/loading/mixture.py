@@ -185,7 +185,8 @@ def tijdeman_schedule(shares: Sequence[int], sizes: Sequence[int]) -> np.ndarray
     each of K datasets within 1 - 1 / (2K - 2) of its share. Integer arithmetic makes the result the same everywhere.
     """
     period, scale, unit = sum(shares), max(2 * len(shares) - 2, 1), math.lcm(*shares)
-    counts, schedule = [0] * len(shares), []
+    counts = [0] * len(shares)
+    schedule: list[int] = []
     for length in range(1, period + 1):
         due = [k for k, share in enumerate(shares) if scale * (share * length - period * counts[k]) >= period]
         owner = min(due, key=lambda k: (scale - 1 + scale * counts[k]) * (unit // shares[k]))
@@ -199,7 +200,7 @@ def tijdeman_schedule(shares: Sequence[int], sizes: Sequence[int]) -> np.ndarray
 def _shares(names: list[str], weights: Weights | None) -> list[int]:
     """Smallest integers in the same proportions as the weights."""
     if isinstance(weights, Mapping):
-        if weights.keys() != set(names):
+        if set(weights) != set(names):
             raise ConfigError(f"weights has the names {', '.join(weights)}, but must have {', '.join(names)}")
         weights = [weights[name] for name in names]
     values = [1.0] * len(names) if weights is None else list(weights)

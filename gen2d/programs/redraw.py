@@ -411,7 +411,7 @@ def _simulate_columns(
 
 
 @functools.lru_cache(maxsize=16)
-def _compile(program: Callable, settings: RenderSettings, *more: float) -> Callable:
+def _compile(program: Callable[..., Any], settings: RenderSettings, *more: float) -> Callable[..., Any]:
     """One of the functions above, compiled for these settings with the options of a run, so that they round alike."""
 
     def run(*arrays: Any) -> Any:

@@ -39,7 +39,7 @@ UINT8_TO_FLOAT = np.arange(256, dtype=np.float32) / np.float32(255)
 
 
 def stream(
-    config: Config | Mapping | str | Path,
+    config: Config | Mapping[str, object] | str | Path,
     seed: int | None = None,
     batch_size: int = 32,
     *,

@@ -31,7 +31,7 @@ class Tape:
     """Operations on the numbers of one config, the guards among them, and the arguments of its programs."""
 
     def __init__(self) -> None:
-        self._nodes: list[tuple[Callable, tuple]] = []  # operation and operands, in order of evaluation
+        self._nodes: list[tuple[Callable[..., Any], tuple[Any, ...]]] = []  # operation and operands, in order
         self._parameters: dict[Hashable, Parameter] = {}
         self.guards: dict[int, Any] = {}  # value that each of these nodes must have
         self._arguments: dict[int, tuple[int, Parameter]] = {}  # first place, by node
@@ -45,7 +45,7 @@ class Tape:
         self.__init__()
         self._nodes, self.guards, self._arguments, self._used = state
 
-    def apply(self, operation: Callable, *operands: Any) -> "Parameter":
+    def apply(self, operation: Callable[..., Any], *operands: Any) -> "Parameter":
         """Result of an operation on parameters and constants; the same object for the same operands."""
         known = operation, *(x.node if isinstance(x, Parameter) else _identity(x) for x in operands)
         if known not in self._parameters:
@@ -164,7 +164,7 @@ class Parameter:
 
     # ---- Concrete values, each of them a guard
 
-    def _concrete(self, operation: Callable) -> Any:
+    def _concrete(self, operation: Callable[..., Any]) -> Any:
         return self.tape.guard(self.tape.apply(operation, self))
 
     def __bool__(self) -> bool:
@@ -192,7 +192,7 @@ class Parameter:
         return format(self.value, spec)
 
 
-def _operator(operation: Callable, swapped: bool = False) -> Callable:
+def _operator(operation: Callable[..., Any], swapped: bool = False) -> Callable[..., Any]:
     def method(self: Parameter, *others: Any) -> Any:
         if any(isinstance(other, jax.Array) for other in others):
             array = self.__jax_array__()
@@ -202,7 +202,7 @@ def _operator(operation: Callable, swapped: bool = False) -> Callable:
     return method
 
 
-def _comparison(operation: Callable) -> Callable:
+def _comparison(operation: Callable[..., Any]) -> Callable[..., Any]:
     compared = _operator(operation)
 
     def method(self: Parameter, other: Any) -> Any:
@@ -228,7 +228,7 @@ for _name in ("lt", "le", "gt", "ge", "eq", "ne"):
 jax.tree_util.register_pytree_node(Parameter, lambda x: ((jnp.asarray(x),), None), lambda _, leaves: leaves[0])  # pyright: ignore[reportArgumentType]
 
 
-def apply(operation: Callable, *operands: Any) -> Any:
+def apply(operation: Callable[..., Any], *operands: Any) -> Any:
     """Result of a host function of numbers; recorded if one of them is a parameter."""
     tape = next((x.tape for x in operands if isinstance(x, Parameter)), None)
     return operation(*operands) if tape is None else tape.apply(operation, *operands)

@@ -36,11 +36,11 @@ def place(key: Array, radius: Array, present: Array, low: Array, high: Array) ->
     """
     slots = jnp.arange(radius.shape[0])
 
-    def unfinished(carry: tuple) -> Array:
+    def unfinished(carry: tuple[Any, ...]) -> Array:
         slot, _, restarts, *_ = carry
         return (slot < radius.shape[0]) & (restarts < RESTARTS)
 
-    def draw(carry: tuple) -> tuple:
+    def draw(carry: tuple[Any, ...]) -> tuple[Any, ...]:
         slot, tries, restarts, rejected, draws, positions = carry
         reach = radius[slot]
         unit = jax.random.uniform(jax.random.fold_in(key, draws), (2,))

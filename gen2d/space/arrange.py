@@ -26,6 +26,7 @@ from gen2d.xla import on_cpu
 
 
 def slots_of_span(span: tuple[SlotGroup, int]) -> range:
+    """Slots of a group that starts at a slot."""
     return range(span[1], span[1] + span[0].count)
 
 
@@ -51,6 +52,7 @@ def pad_vertices(vertices: np.ndarray, corners: int) -> np.ndarray:
 
 
 def world_anchor(shape: str) -> Body:
+    """Body without extent at the origin, to which joints with the world are attached."""
     zero, none = np.zeros(2), np.zeros((0, 2))
     return Body(
         shape=shape, kind=DYNAMIC, position=zero, angle=0.0, velocity=zero, spin=0.0, radius=0.0, half_length=0.0,

@@ -42,6 +42,7 @@ def _floats(value: Any) -> np.ndarray:
 
 
 def checked_pair(name: str, value: Any) -> np.ndarray:
+    """Two finite numbers."""
     pair = _floats(value)
     if pair.shape != (2,) or not np.isfinite(pair).all():
         raise ConfigError(f"{name} is {value!r}, but must be two numbers, x and y")
@@ -66,6 +67,7 @@ def checked_corners(name: str, value: Any) -> np.ndarray:
 
 
 def checked_color(name: str, value: Any, number: int, kind: int) -> tuple[int, int, int]:
+    """Red, green and blue; without a value, grey or a hue by the number of the body."""
     if value is None:
         hue = 0.03 + 0.618034 * number  # golden ratio: consecutive hues differ, and none repeats
         red, green, blue = (round(255 * part) for part in colorsys.hls_to_rgb(hue % 1, 0.55, 0.6))
@@ -77,5 +79,6 @@ def checked_color(name: str, value: Any, number: int, kind: int) -> tuple[int, i
 
 
 def rotate(vector: np.ndarray, angle: float) -> np.ndarray:
+    """The vector, turned counter-clockwise."""
     cos, sin = math.cos(angle), math.sin(angle)
     return np.array([cos * vector[0] - sin * vector[1], sin * vector[0] + cos * vector[1]])

@@ -9,6 +9,8 @@ Each zstd frame contains its size and a checksum, because HDF5's zstd filter che
 """
 
 import threading
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import zstandard
@@ -24,7 +26,7 @@ HDF5_FILTERS: dict[str, tuple[int, tuple[int, ...]]] = {"gzip": (1, (1,)), "zstd
 
 _ISAL_LEVEL = 0
 
-crc32 = isal_zlib.crc32
+crc32: Callable[[Any], int] = isal_zlib.crc32
 
 # isal's stub declares its exception class as an instance.
 _ERRORS: tuple[type[Exception], ...] = (isal_zlib.error, zstandard.ZstdError, MemoryError)  # pyright: ignore

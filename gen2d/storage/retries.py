@@ -1,8 +1,8 @@
 """Requests to servers: timeouts, deadlines, retries, and the errors of a request that failed in the end.
 
-Reads, uploads and downloads all pass through `attempt`. Each request has a timeout and a deadline. Failures that may be
-temporary are retried until the deadline and then raise UnreachableError; FileNotFoundError and PermissionError are
-raised where the server says so.
+Reads, uploads and downloads all pass through `attempt`. Each request has a timeout and a deadline. Failures of servers
+that may be temporary are retried until the deadline and then raise UnreachableError; FileNotFoundError and
+PermissionError are raised where the server says so. Errors of the program, such as TypeError, are raised as they are.
 """
 
 import dataclasses
@@ -95,12 +95,24 @@ def _within(seconds: float, call: Callable[[], T]) -> T:
 
 # Errors that another attempt would not solve.
 _FINAL = (FileNotFoundError, PermissionError, IsADirectoryError, NotADirectoryError)
+# Errors of the program itself. Their subclass NotImplementedError is not one: the protocol cannot do what is asked.
+_BUGS = (
+    ArithmeticError,
+    AssertionError,
+    AttributeError,
+    ImportError,
+    LookupError,
+    MemoryError,
+    NameError,
+    RuntimeError,
+)
+_BUGS += (SystemError, TypeError)
 _FINAL_NUMBERS = (errno.EFBIG, errno.EOPNOTSUPP, errno.ENOSPC, errno.EMFILE, errno.ENFILE)
 
 
 def request_error(error: BaseException, url: Address) -> Exception:
     """The error to raise for a library's error: OSError if another attempt would not solve it, DamagedError for a file
-    of another length, otherwise UnreachableError."""
+    of another length, the same error for one of the program, otherwise UnreachableError."""
     status = http_status(error)
     if status in (401, 403) or "Credentials" in type(error).__name__:
         error = PermissionError()
@@ -108,7 +120,7 @@ def request_error(error: BaseException, url: Address) -> Exception:
         error = FileNotFoundError()
     elif status == 416:  # range not satisfiable
         return DamagedError(f"{url} ends too early")
-    if isinstance(error, DamagedError):
+    if isinstance(error, DamagedError) or (isinstance(error, _BUGS) and not isinstance(error, NotImplementedError)):
         return error
     for kind in _FINAL:
         if isinstance(error, kind):
@@ -118,7 +130,7 @@ def request_error(error: BaseException, url: Address) -> Exception:
     text = getattr(error, "strerror", None) or str(error)
     text = text or ("no answer in time" if isinstance(error, TimeoutError) else type(error).__name__)
     text = " ".join(redact(text, url.text, url.query).split()).rstrip(".")
-    final = number in _FINAL_NUMBERS or isinstance(error, TypeError | ValueError | NotImplementedError | AttributeError)
+    final = number in _FINAL_NUMBERS or isinstance(error, ValueError | NotImplementedError)
     if final or (status is not None and 400 <= status < 500 and status not in (408, 425, 429)):
         return OSError(number or errno.EIO, text, str(url))
     return UnreachableError(f"{url} cannot be reached ({text})")
@@ -131,6 +143,8 @@ def http_status(error: BaseException | None) -> int | None:
         response = getattr(error, "response", None)
         if status is None and isinstance(response, dict):
             status = response.get("ResponseMetadata", {}).get("HTTPStatusCode")
+            if response.get("Error", {}).get("Code") == "RequestTimeout":  # for which S3 answers with 400
+                status = 408
         if isinstance(status, int):
             return status
         error = error.__cause__

@@ -7,7 +7,7 @@ import os
 import stat
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, NoReturn, cast
 
 from gen2d.storage.paths import Place, Url
 
@@ -25,7 +25,7 @@ def parse_json(content: bytes) -> dict[str, Any] | None:
         value = json.loads(content, parse_constant=_refuse)
     except (ValueError, RecursionError):
         return None
-    return value if isinstance(value, dict) else None
+    return cast(dict[str, Any], value) if isinstance(value, dict) else None
 
 
 def _refuse(name: str) -> NoReturn:

@@ -247,8 +247,8 @@ def chosen_videos(splits: Mapping[str, int], videos: int, seed: int) -> list[tup
     ends = np.cumsum(list(splits.values()))
     split_index = np.searchsorted(ends, positions, side="right")
     return [
-        (list(splits)[k], int(position - ends[k] + list(splits.values())[k]))
-        for k, position in zip(split_index, positions, strict=True)
+        (list(splits)[k], int(position - ends[k]) + list(splits.values())[k])
+        for k, position in zip(split_index.tolist(), positions.tolist(), strict=True)
     ]
 
 
@@ -285,7 +285,8 @@ def _check_hash(path: Place, *expected: str | None) -> Iterator[str]:
 
 def _check_tables(root: Place, manifest: Manifest) -> tuple[list[Problem], dict[str, np.ndarray]]:
     """Problems of the splits' tables, and the rows of the intact tables by split."""
-    problems, rows_of = [], {}
+    problems: list[Problem] = []
+    rows_of: dict[str, np.ndarray] = {}
     dtype, per_shard = manifest.shard_type, manifest.videos_per_shard
     sizes = manifest.video_type.itemsize, manifest.row_bytes, manifest.raw_bytes
     for split, table in manifest.tables.items():
@@ -516,7 +517,7 @@ class _CheckWorker:
         if refusal:
             raise EngineError(refusal)
         with progress("Checking", len(items), log, "shards") as advance:
-            found = []
+            found: list[list[str]] = []
             for problems in self.checker.check(items):
                 found.append([problem.sentence for problem in problems])
                 advance(1)

@@ -16,6 +16,7 @@ import tiny
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
+from packages import package
 
 import gen2d
 from gen2d.captions import caption
@@ -80,7 +81,7 @@ def test_a_damaged_letter_is_found(toy: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize("to", ["numpy", "torch", "jax"])
 def test_text_stays_bytes_in_batches_of_any_kind(toy: Path, to: Any) -> None:
     if to == "torch":
-        pytest.importorskip("torch")
+        package("torch")
     ds = gen2d.open(toy, "train", ["text/name", "states/angle"])
     for number, batch in enumerate(gen2d.DataLoader(ds, 5, shuffle=False, epochs=1, to=to)):
         assert_array_equal(batch["text/name"], expected("text/name")[5 * number : 5 * number + 5])
@@ -89,7 +90,7 @@ def test_text_stays_bytes_in_batches_of_any_kind(toy: Path, to: Any) -> None:
 
 
 def test_torchs_own_loader_lists_it(toy: Path) -> None:
-    torch = pytest.importorskip("torch")
+    torch = package("torch")
     batch = next(iter(torch.utils.data.DataLoader(gen2d.open(toy, "train", ["text/name", "index"]), batch_size=6)))
     assert batch["text/name"] == expected("text/name", 6).tolist()
 
@@ -432,7 +433,7 @@ def test_growth_is_a_number_that_each_video_has_for_itself(tmp_path: Path) -> No
 @pytest.mark.parametrize("to", ["jax", "torch"])
 def test_a_stream_tells_the_same(made: Path, to: str) -> None:
     if to == "torch":
-        pytest.importorskip("torch")
+        package("torch")
     names = ["text/*", "index", "quality/*"]
     stream = gen2d.stream(WORDY, 5, 3, n=8, fields=names, epochs=1, to=to)
     loader = gen2d.DataLoader(gen2d.open(made, fields=names), 3, shuffle=False, epochs=1)

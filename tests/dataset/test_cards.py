@@ -1,6 +1,5 @@
 """What a dataset says about itself is true, and its examples run."""
 
-import importlib.util
 import json
 import re
 import subprocess
@@ -12,6 +11,7 @@ import numpy as np
 import pytest
 import synthetic
 from numpy.testing import assert_array_equal
+from packages import package, require
 
 from gen2d.dataset.manifest import read_manifest
 from gen2d.media import contact_sheet
@@ -72,7 +72,7 @@ def test_the_readme_tells_the_statistics(tmp_path: Path) -> None:
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")  # the validator's own
 def test_croissant_is_valid_and_lists_the_tables(tmp_path: Path) -> None:
-    mlcroissant = pytest.importorskip("mlcroissant")
+    mlcroissant = package("mlcroissant")
     synthetic.make(synthetic.dataset(tmp_path))
     described = mlcroissant.Dataset(jsonld=str(tmp_path / "croissant.json"))
     assert not described.metadata.ctx.issues.errors
@@ -91,9 +91,7 @@ def test_the_examples_of_the_card_run(tmp_path: Path, example: str, codec: str) 
     blocks = re.findall(r"```python\n(.*?)```", (root / "README.md").read_text(), re.S)
     plugin = ", hdf5plugin" if codec == "zstd" and example == "h5py" else ""
     (code,) = (block for block in blocks if f"import {example}{plugin}\n" in block)
-    for module in re.findall(r"import (.*)", code)[0].split(", "):
-        if not importlib.util.find_spec(module):
-            pytest.skip(f"{module} is not installed")
+    require(*re.findall(r"import (.*)", code)[0].split(", "))
     batch = "numpy.asarray(batch['frames'])"
     shown = {"gen2d, torch": batch, "gen2d, jax": batch, "gen2d": 'video["frames"]', "h5py": "video"}[example]
     code += f"\nimport numpy\nnumpy.save('shown.npy', {shown})"

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import buckets
 import pytest
+from clusters import Cluster, add_node, two_cores
 from tiny import CONFIG, command, run_command, tiny_config
 
 import gen2d
@@ -21,10 +22,6 @@ from gen2d.engines.protocol import EngineError, Report
 from gen2d.generation.regenerate import repair
 from gen2d.generation.run import generate
 from gen2d.generation.worker import GenerationJob, ShardWorker
-
-ray = pytest.importorskip("ray")
-from clusters import add_node, two_cores  # noqa: E402
-from ray.cluster_utils import Cluster  # noqa: E402
 
 pytestmark = pytest.mark.filterwarnings("ignore")  # Ray's own
 N = 90  # videos: eleven shards of 8 and one of 2

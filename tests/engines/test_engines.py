@@ -9,19 +9,15 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from clusters import Cluster, add_node, two_cores
 from fake_jobs import SquareJob
 from tiny import run_main, sentences
 
+import gen2d.engines.ray as module
 from gen2d.core.errors import ConfigError, FolderError, UserError
 from gen2d.core.progress import Event
 from gen2d.engines import Local, Ray
 from gen2d.engines.protocol import Engine, EngineError
-
-ray = pytest.importorskip("ray")
-from clusters import add_node, two_cores  # noqa: E402
-from ray.cluster_utils import Cluster  # noqa: E402
-
-import gen2d.engines.ray as module  # noqa: E402
 
 pytestmark = pytest.mark.filterwarnings("ignore")  # Ray's own
 

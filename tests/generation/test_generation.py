@@ -2,6 +2,7 @@
 
 import json
 import random
+import shutil
 import signal
 import subprocess
 import time
@@ -13,11 +14,13 @@ import jax
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
+from synthetic import contents
 from tiny import CONFIG, CROWDED, command, everything, run_command, run_on, same, tiny_config
 
 import gen2d
 from gen2d.config.reading import yaml_text
 from gen2d.core.errors import ConfigError, FolderError, UserError
+from gen2d.dataset.folder import clean
 from gen2d.generation.run import generate
 from gen2d.programs import shared
 from gen2d.programs.rollout import Rollout
@@ -168,34 +171,38 @@ def test_another_config_or_seed_is_refused_unless_overwritten(tmp_path: Path):
     assert not np.array_equal(before["frames"], everything(out)["frames"])
 
 
-def test_killed_at_random_moments_it_completes_to_the_same_bits(tiny: Path, tmp_path: Path):
+@pytest.mark.parametrize("kills", [3, pytest.param(40, marks=pytest.mark.slow)])
+def test_killed_at_random_moments_it_completes_to_the_same_bytes(tiny: Path, tmp_path: Path, kills: int):
+    """Killed while it starts, or after some more shards; a dataset that is complete makes room for another."""
     config, out = tmp_path / "tiny.yaml", tmp_path / "data"
     config.write_text(yaml_text(tiny_config(storage={"videos_per_shard": 4})))
-    clean = tmp_path / "clean"
-    generate(str(config), 160, clean)
-    words, environment = command("--config", config, "--n", 160, "--out", out)
-    chance, killed = random.Random(0), 0
-    for attempt in range(7):
-        process = subprocess.Popen(words, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-        shards = out / "shards"
-        shard_count = chance.randint(1, 8) + 5 * attempt
-        while process.poll() is None and len(list(shards.glob("*.h5"))) < shard_count:
+    generate(str(config), 160, tmp_path / "clean")
+    expected, words = contents(tmp_path / "clean"), ("--config", config, "--n", 160, "--out", out)
+    argv, environment = command(*words)
+    chance, killed, shards = random.Random(0), 0, out / "shards"
+    while killed < kills:
+        process = subprocess.Popen(argv, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        more = chance.randint(0, 8)
+        enough, moment = len(list(shards.glob("*.h5"))) + more, chance.random() * (0.02 if more else 4)
+        while process.poll() is None and len(list(shards.glob("*.h5"))) < enough:
             time.sleep(0.001)
-        time.sleep(chance.random() * 0.02)
-        if process.poll() is None:
-            process.send_signal(signal.SIGKILL)
-            killed += 1
-        process.wait()
+        time.sleep(moment)
+        process.kill()
+        assert process.wait() in (0, -signal.SIGKILL)
+        killed += process.returncode != 0
         for path in shards.glob("*.h5"):
             with h5py.File(path) as file:  # what has its final name is whole
                 frames: Any = file["frames"]
                 assert len(frames) == 4
-    assert killed >= 3
-    assert run_command("--config", config, "--n", 160, "--out", out).returncode == 0
-    same(everything(clean), everything(out))
+        if process.returncode == 0:
+            clean(out)
+            assert contents(out) == expected
+            shutil.rmtree(out)
+    assert run_command(*words).returncode == 0
     same(everything(tiny), everything(out), N)
-    assert not list((out / "shards").glob("*.tmp*"))
     assert gen2d.verify(out, "full") == []
+    clean(out)
+    assert contents(out) == expected
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

@@ -10,6 +10,7 @@ import synthetic
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
+from packages import package
 
 import gen2d
 from gen2d.core.errors import ConfigError, FolderError, UserError
@@ -95,7 +96,7 @@ def test_a_list_of_one_is_that_one(roots: list[Path]) -> None:
 
 
 def test_a_pickled_list_is_the_same_and_a_url_may_stand_in_it(roots: list[Path]) -> None:
-    fsspec = pytest.importorskip("fsspec")
+    fsspec = package("fsspec")
     files = fsspec.filesystem("memory")
     for name, content in synthetic.tree(roots[1]).items():
         files.pipe_file(f"/joined/{name}", content)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import synthetic
 from numpy.testing import assert_array_equal
+from packages import package
 
 import gen2d
 from gen2d.loading import dataset as loader
@@ -37,7 +38,7 @@ def check(batches: Sequence[dict[str, Any]], source: Any, order: Sequence[int]) 
 @pytest.mark.filterwarnings("ignore:This DataLoader will create:UserWarning")  # more than this process has cores
 @pytest.mark.parametrize("method", [None, "fork", "spawn"])
 def test_torch_reads_the_same_in_any_number_of_processes(source: Any, method: str | None) -> None:
-    torch = pytest.importorskip("torch")
+    torch = package("torch")
     workers = {"num_workers": 2, "multiprocessing_context": method} if method else {"num_workers": 0}
     batches = list(torch.utils.data.DataLoader(source, batch_size=6, **workers))
     assert [len(batch["index"]) for batch in batches] == [6] * (len(source) // 6) + [len(source) % 6]
@@ -46,7 +47,7 @@ def test_torch_reads_the_same_in_any_number_of_processes(source: Any, method: st
 
 
 def test_torch_asks_for_whole_batches(source: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    torch = pytest.importorskip("torch")
+    torch = package("torch")
     requests: list[list[int]] = []
     whole = type(source).__getitems__
     monkeypatch.setattr(
@@ -64,7 +65,7 @@ def test_torch_asks_for_whole_batches(source: Any, monkeypatch: pytest.MonkeyPat
 
 
 def test_grain_shuffles_and_batches(source: Any) -> None:
-    pytest.importorskip("grain")
+    package("grain")
     grain = importlib.import_module("grain.python")
     plain = grain.MapDataset.source(source)
     assert len(plain) == len(source)
@@ -77,7 +78,7 @@ def test_grain_shuffles_and_batches(source: Any) -> None:
 
 @pytest.mark.parametrize("workers", [0, 2])
 def test_grains_own_loader_reads_the_same(source: Any, workers: int) -> None:
-    pytest.importorskip("grain")
+    package("grain")
     grain = importlib.import_module("grain.python")
     importlib.import_module("absl.flags").FLAGS.mark_as_parsed()  # as absl.app does; Grain asks them for its workers
     sampler = grain.IndexSampler(len(source), shuffle=False, num_epochs=1, seed=0)

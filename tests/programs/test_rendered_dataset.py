@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import tiny
 from numpy.testing import assert_array_equal
+from packages import package
 
 import gen2d
 from gen2d.core.errors import ConfigError, UserError
@@ -143,12 +144,12 @@ def test_bad_input_gets_one_sentence(roots: tuple[Path, Path], arguments: Any, s
 
 
 def test_torch_and_jax(roots: tuple[Path, Path], frames: np.ndarray) -> None:
-    jax = pytest.importorskip("jax")
+    jax = package("jax")
     ds = gen2d.open(roots[1], fields=["frames", "index"])
     for batch in gen2d.DataLoader(ds, 5, epochs=1, to="jax"):
         assert isinstance(batch["frames"], jax.Array)
         assert_array_equal(np.asarray(batch["frames"]), frames[np.asarray(batch["index"])])
-    torch = pytest.importorskip("torch")
+    torch = package("torch")
     for batch in gen2d.DataLoader(ds, 5, epochs=1, to="torch"):
         assert_array_equal(batch["frames"].numpy(), frames[batch["index"].numpy()])
     for batch in torch.utils.data.DataLoader(ds, 5, shuffle=True):
@@ -187,7 +188,7 @@ def test_a_loader_s_state_opens_the_snapshot_again(tmp_path: Path) -> None:
 
 
 def test_workers_that_are_forked_say_so_and_spawned_ones_work(roots: tuple[Path, Path], frames: np.ndarray) -> None:
-    torch = pytest.importorskip("torch")
+    torch = package("torch")
     ds = gen2d.open(roots[1], fields=["frames", "index"])
 
     def loader(method: str) -> Any:

@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_array_equal
+from packages import package
 from tiny import CONFIG, CROWDED, tiny_config
 
 import gen2d
@@ -89,7 +90,7 @@ def test_without_an_end_it_begins_like_the_dataset_and_goes_on(root: Path):
 
 def test_arrays_are_on_the_device_and_torch_takes_them(root: Path):
     assert isinstance(next(iter(open_stream()))["frames"], jax.Array)
-    torch = pytest.importorskip("torch")
+    torch = package("torch")
     batch = next(iter(open_stream(to="torch")))
     assert batch["frames"].dtype == torch.uint8
     assert_array_equal(batch["frames"].numpy(), gen2d.open(root).batch(range(4))["frames"])

@@ -44,7 +44,6 @@ class Played(NamedTuple):
 
 def begun(config: Config, n: int, given: dict[str, Any] | None = None) -> Played:
     """The starts of n videos, with the given factors [n, ...] in place of those drawn."""
-
     sampler = Sampler(config)
 
     def made(key: jax.Array, given: dict) -> tuple:

@@ -16,6 +16,7 @@ from typing import Any
 import pytest
 import synthetic
 import tiny
+from packages import not_run
 
 import gen2d
 from gen2d.core.errors import DamagedError, Error, FolderError, UnreachableError, UserError
@@ -207,7 +208,7 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
     disk.mkdir()
     words = ["mount", "-t", "tmpfs", "-o", "size=400k,nr_inodes=40", "tmpfs", str(disk)]
     if subprocess.run(words, capture_output=True, check=False).returncode:
-        pytest.skip("this user may not mount a disk")
+        not_run("a full disk, as this user may not mount one")
     yield disk
     subprocess.run(["umount", "-l", str(disk)], check=True)
 
@@ -325,7 +326,7 @@ def in_a_container(*words: str) -> list[str]:
 
 def test_containers_with_one_name_do_not_touch_each_others_files(tmp_path: Path) -> None:
     if subprocess.run(in_a_container("true"), capture_output=True, check=False).returncode:
-        pytest.skip("this user may not make namespaces")
+        not_run("containers, as this user may not make namespaces")
     synthetic.make(synthetic.dataset(tmp_path, train=3))
     path = tmp_path / "shards" / temporary_name("train-00000.h5")
     sweeping = f"import sys; sys.path.insert(0, {str(TESTS)!r}); import synthetic; from pathlib import Path; "

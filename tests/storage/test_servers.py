@@ -1,6 +1,7 @@
 """Servers that hang, drip, reset, lie or say no: each ends in time, as what it is, and says nothing that is secret."""
 
 import contextlib
+import errno
 import re
 import socket
 import threading
@@ -9,8 +10,10 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import aiohttp
 import pytest
 import synthetic
+from botocore.exceptions import ClientError
 from tiny import run_main
 
 import gen2d
@@ -194,17 +197,38 @@ def test_a_deadline_is_for_all_attempts_together() -> None:
     assert time.monotonic() - began < 1.5
 
 
-@pytest.mark.parametrize("error", [TypeError, ValueError, AttributeError, NotImplementedError])
-def test_an_error_of_the_program_is_not_tried_again(error: type[Exception]) -> None:
+def answer(status: int, code: str = "") -> Exception:
+    """The error of botocore for an answer of S3."""
+    return ClientError({"Error": {"Code": code}, "ResponseMetadata": {"HTTPStatusCode": status}}, "GetObject")
+
+
+@pytest.mark.parametrize(
+    ("error", "expected"),
+    [
+        *((error, UnreachableError) for error in (ConnectionResetError(), TimeoutError(), OSError(errno.EPIPE, "x"))),
+        *((error, UnreachableError) for error in (aiohttp.ServerDisconnectedError(), aiohttp.ClientPayloadError())),
+        *((answer(status), UnreachableError) for status in (408, 429, 500, 502, 503)),
+        (answer(400, "RequestTimeout"), UnreachableError),
+        (answer(400, "InvalidRequest"), OSError),
+        (answer(403), PermissionError),
+        (answer(404), FileNotFoundError),
+        *((kind("x"), kind) for kind in (TypeError, AttributeError, KeyError, IndexError, NameError, AssertionError)),
+        *((kind("x"), kind) for kind in (ZeroDivisionError, RuntimeError, RecursionError, ImportError, MemoryError)),
+        *((kind("x"), OSError) for kind in (ValueError, NotImplementedError)),
+    ],
+    ids=lambda value: value.__name__ if isinstance(value, type) else " ".join(f"{value!r}".split())[:60],
+)
+def test_only_failures_of_servers_are_tried_again(error: Exception, expected: type[Exception]) -> None:
     calls = []
 
-    def call(system: Any, path: str) -> None:
+    def request(system: object, path: str) -> None:
         calls.append(path)
-        raise error("a bug")
+        raise error
 
-    with pytest.raises((OSError, error), match="a bug"):
-        retries.attempt(Url("memory://x"), call)
-    assert len(calls) == 1
+    with pytest.raises(expected) as caught:
+        retries.attempt(Url("memory://a/b"), request)
+    assert len(calls) == (retries.ATTEMPTS if expected is UnreachableError else 1)
+    assert (caught.value is error) == (isinstance(error, expected) and not isinstance(error, OSError))
 
 
 def test_limits_are_numbers_above_zero() -> None:

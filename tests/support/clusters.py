@@ -6,8 +6,10 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import ray
-from ray.cluster_utils import Cluster
+from packages import package
+
+ray = package("ray")
+from ray.cluster_utils import Cluster as Cluster  # noqa: E402  tests without Ray are not run
 
 SUPPORT = Path(__file__).parent
 

@@ -152,7 +152,7 @@ def mass_and_moment(shape: int, radius: float, half: float, corners: np.ndarray,
     return ends + middle, moment + ends * (radius**2 / 2 + half**2 + 2 * half * centroid)
 
 
-def random_world(arena: Arena, recipe: Recipe, seed: int) -> tuple[Scene, State, Layout]:
+def random_world(arena: Arena, recipe: Recipe, seed: int) -> tuple[Scene, State, Layout]:  # noqa: PLR0915  one story
     """One world; bodies start apart from each other and from what is fixed."""
     rng, slots, shape = np.random.default_rng([seed, 19]), arena.layout.slots, arena.shapes
     o: dict[str, Any] = {name: np.zeros(slots) for name in ("radius", "half_length", "elasticity", "friction")}

@@ -1,0 +1,33 @@
+"""Every version that pyproject.toml promises works, in environments of its own (`versions.sh`)."""
+
+import os
+import subprocess
+import tomllib
+from collections.abc import Callable
+from pathlib import Path
+
+import floors
+import pytest
+
+SCRIPT = Path(__file__).parent / "versions.sh"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("section", ["lowest", "newest", "sdist"])
+def test_the_versions_that_are_promised_work(section: str, record_property: Callable[[str, object], None]) -> None:
+    """`pytest -rP` prints the tables."""
+    environment = {name: value for name, value in os.environ.items() if name not in ("PYTHONPATH", "VIRTUAL_ENV")}
+    done = subprocess.run([str(SCRIPT), section], env=environment, capture_output=True, text=True, check=False)
+    print(done.stdout)
+    for line in done.stdout.splitlines():
+        if line.startswith("not run: "):
+            record_property("not run", line.removeprefix("not run: "))
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_every_requirement_has_a_lowest_version() -> None:
+    project = tomllib.loads(floors.PROJECT.read_text())["project"]
+    extras = project["optional-dependencies"]
+    assert all("==" in floors.floor(requirement) for requirement in floors.requirements(extras))
+    of_users = {line for name, lines in extras.items() if name not in ("cuda", "dev", "torch") for line in lines}
+    assert of_users <= set(extras["dev"]), "the extras are tested at their lowest versions with those of dev"
