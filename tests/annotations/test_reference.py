@@ -420,7 +420,7 @@ def test_tracks_are_points_fixed_to_objects_and_are_seen_where_the_mask_shows_th
                 assert not seen[:, p].any()
                 continue
             fixed = reference.to_body(
-                one.video, 0, slot, reference.to_world(one.video, 0, np.float64(points[0, p]), one.view)
+                one.video, 0, slot, reference.to_world(one.video, 0, reference.double(points[0, p]), one.view)
             )
             for frame in one.frames:
                 world = reference.from_body(one.video, frame.number, slot, fixed)
@@ -436,7 +436,7 @@ def test_tracks_are_points_fixed_to_objects_and_are_seen_where_the_mask_shows_th
 def test_tracked_points_are_uniform_in_their_objects(made):
     within = []
     for one in made:
-        owner, points = one.video["tracks/object"], np.float64(one.video["tracks/points"][0])
+        owner, points = one.video["tracks/object"], reference.double(one.video["tracks/points"][0])
         for slot in drawn(one):
             world = reference.to_world(one.video, 0, points[owner == slot], one.view)
             core, radius = reference.body_core(one.video, slot), float(one.video["objects/radius"][slot])

@@ -10,7 +10,7 @@ Outlines are polygons whose sides are at most 1e-5 px from the true outline, so 
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -59,6 +59,11 @@ class Layer(NamedTuple):
     radius: float  # px
 
 
+def double(values: Any) -> Array:
+    """Values in float64."""
+    return np.asarray(values, np.float64)
+
+
 # ---- Geometry
 
 
@@ -70,34 +75,34 @@ def rotate(points: Array, angle: float | Array) -> Array:
 
 def to_pixels(video: Video, t: int, points: Array, view: View) -> Array:
     """Pixel positions [..., 2] (x right, y down) of world points [..., 2] in frame t."""
-    center, scale, angle = (np.float64(video[f"camera/{name}"][t]) for name in ("center", "scale", "angle"))
+    center, scale, angle = (double(video[f"camera/{name}"][t]) for name in ("center", "scale", "angle"))
     x, y = np.moveaxis(scale * rotate(points - center, -angle), -1, 0)
     return np.stack([view.width / 2 + x, view.height / 2 - y], -1)
 
 
 def to_world(video: Video, t: int, pixels: Array, view: View) -> Array:
     """World points of pixel positions, the inverse of `to_pixels`."""
-    center, scale, angle = (np.float64(video[f"camera/{name}"][t]) for name in ("center", "scale", "angle"))
+    center, scale, angle = (double(video[f"camera/{name}"][t]) for name in ("center", "scale", "angle"))
     up = np.stack([pixels[..., 0] - view.width / 2, view.height / 2 - pixels[..., 1]], -1)
     return center + rotate(up / scale, angle)
 
 
 def from_body(video: Video, t: int, slot: int, points: Array) -> Array:
     """World points of points that are fixed to an object."""
-    position, angle = (np.float64(video[f"states/{name}"][t, slot]) for name in ("position", "angle"))
+    position, angle = (double(video[f"states/{name}"][t, slot]) for name in ("position", "angle"))
     return position + rotate(points, angle)
 
 
 def to_body(video: Video, t: int, slot: int, points: Array) -> Array:
     """Points in an object's frame, the inverse of `from_body`."""
-    position, angle = (np.float64(video[f"states/{name}"][t, slot]) for name in ("position", "angle"))
+    position, angle = (double(video[f"states/{name}"][t, slot]) for name in ("position", "angle"))
     return rotate(points - position, -angle)
 
 
 def body_core(video: Video, slot: int) -> Array:
     """Corners [V, 2] in m of an object's core, in the object's frame: its points within the radius form the shape."""
     if video["objects/shape"][slot] == POLYGON:
-        return np.float64(video["objects/vertices"][slot, : video["objects/vertex_count"][slot]])
+        return double(video["objects/vertices"][slot, : video["objects/vertex_count"][slot]])
     half = float(video["objects/half_length"][slot])
     return np.array([[-half, 0.0], [half, 0.0]]) if half else np.zeros((1, 2))
 
@@ -209,7 +214,7 @@ def outlined(shape: Outline, covered: Array, color: Array, view: View) -> Array:
     assert len(shape.core) <= 2, "only of discs and capsules"
     inner = Outline(shape.core, max(shape.radius - view.line, 0.0))
     share = coverage(inner, view.height, view.width) / np.maximum(covered, 1e-12) if inner.radius else 0 * covered
-    fill = view.background + view.fill * (color - np.float64(view.background))
+    fill = double(view.background) + view.fill * (color - double(view.background))
     return color + np.minimum(share, 1.0)[..., None] * (fill - color)
 
 
@@ -221,14 +226,14 @@ def layers(video: Video, t: int, view: View) -> list[Layer]:
         while occluders and occluders[0].behind <= rank:
             (x0, y0, x1, y1), color, _ = occluders.pop(0)
             corners = Outline(np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]], float), 0.0)
-            found.append(Layer(OCCLUDER, coverage(corners, view.height, view.width), np.float64(color), 0.0))
+            found.append(Layer(OCCLUDER, coverage(corners, view.height, view.width), double(color), 0.0))
 
     slots = [slot for slot in range(len(video["objects/depth"])) if rendered(video, slot, view)]
     for slot in sorted(slots, key=lambda slot: int(video["objects/depth"][slot])):
         add_occluders(int(video["objects/depth"][slot]))
         shape = outline(video, t, slot, view)
         covered = coverage(shape, view.height, view.width)
-        color = np.float64(video["objects/color"][slot])
+        color = double(video["objects/color"][slot])
         if view.line and video["objects/shape"][slot] != SEGMENT:
             color = outlined(shape, covered, color, view)
         found.append(Layer(slot + 1, covered, color, shape.radius))
@@ -267,7 +272,7 @@ def mix(under: Array, color: Array, coverage: Array, linear: bool) -> Array:
 
 def background(view: View) -> Array:
     """A frame [H, W, 3] that shows nothing."""
-    return np.broadcast_to(np.float64(view.background), (view.height, view.width, 3))
+    return np.broadcast_to(double(view.background), (view.height, view.width, 3))
 
 
 def frame(found: Sequence[Layer], view: View) -> Array:
@@ -295,12 +300,12 @@ def exposed(video: Video, steps: Video, t: int, before: float, per_frame: int, f
     step = max(0, math.floor(time))
     states = {}
     for name, rate in (("position", "velocity"), ("angle", "angular_velocity")):
-        values, rates = np.float64(steps[f"states/{name}"]), np.float64(steps[f"states/{rate}"])
+        values, rates = double(steps[f"states/{name}"]), double(steps[f"states/{rate}"])
         slope = values[step + 1] - values[step] if time > 0 else rates[0] / (fps * per_frame)
         states[f"states/{name}"] = (values[step] + (time - step) * slope)[None]
     cameras = {}
     for name in ("center", "scale", "angle"):
-        values = np.float64(video[f"camera/{name}"])
+        values = double(video[f"camera/{name}"])
         last = values[t - 1] if t else 2 * values[0] - values[1]
         cameras[f"camera/{name}"] = (values[t] + before * (last - values[t]))[None]
     return {**video, **states, **cameras}
