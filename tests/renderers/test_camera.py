@@ -1,10 +1,9 @@
 """Cameras: where points of the world are in the picture, and that each moves as its options say."""
 
-# Records of jax arrays are filled with NumPy's here.
-# pyright: reportArgumentType=false, reportIndexIssue=false, reportOptionalMemberAccess=false, reportOptionalSubscript=false, reportCallIssue=false
-# pyright: reportOperatorIssue=false, reportOptionalOperand=false, reportGeneralTypeIssues=false, reportAttributeAccessIssue=false
+from typing import NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
@@ -27,19 +26,27 @@ BALLS = {
 draw = jax.jit(rasterizer.draw_tiles, static_argnums=1)
 
 
+class Watched(NamedTuple):
+    """A `CameraView` in NumPy, in float64."""
+
+    center: np.ndarray
+    scale: np.ndarray
+    angle: np.ndarray
+
+
 def views(rng, count):
     """Random ones."""
     center, scale = rng.uniform(-5, 5, (count, 2)), np.exp(rng.uniform(0, 4, count))
-    return CameraView(*map(np.float32, (center, scale, rng.uniform(-7, 7, count))))
+    return CameraView(*map(jnp.float32, (center, scale, rng.uniform(-7, 7, count))))
 
 
 def watched(seed=0, states=None, **options):
     """The view of one video with these options of its camera; a distribution is written as in a config."""
     config = load_config({"camera": options})
     if states is None:
-        states = State(*(np.zeros((FRAMES, 3, *shape), np.float32) for shape in ((2,), (), (2,), ())))
+        states = State(*(jnp.zeros((FRAMES, 3, *shape)) for shape in ((2,), (), (2,), ())))
     view = sample_view(jax.random.key(seed), config.camera, LAYOUT, states, FPS, HEIGHT, WIDTH)
-    return CameraView(*(np.asarray(part, float) for part in view))
+    return Watched(*(np.asarray(part, float) for part in view))
 
 
 # ---- Pixels and metres
@@ -47,7 +54,7 @@ def watched(seed=0, states=None, **options):
 
 def test_from_the_world_to_pixels_and_back():
     rng = np.random.default_rng(0)
-    view, points = views(rng, 50), np.float32(rng.uniform(-9, 9, (50, 20, 2)))
+    view, points = views(rng, 50), jnp.float32(rng.uniform(-9, 9, (50, 20, 2)))
     pixels = to_pixels(view, points, HEIGHT, WIDTH)
     again = np.stack(to_world(view, pixels[..., 0], pixels[..., 1], HEIGHT, WIDTH), -1)
     assert_allclose(again, points, atol=2e-4)
@@ -55,8 +62,8 @@ def test_from_the_world_to_pixels_and_back():
 
 def test_up_is_up_and_the_picture_turns_against_the_camera():
     def at(angle, x, y):
-        view = CameraView(*(np.float32(part) for part in ([[2, 1]], [10], [angle])))
-        return np.asarray(to_pixels(view, np.float32([[[x, y]]]), HEIGHT, WIDTH))[0, 0]
+        view = CameraView(*(jnp.float32(part) for part in ([[2, 1]], [10], [angle])))
+        return np.asarray(to_pixels(view, jnp.float32([[[x, y]]]), HEIGHT, WIDTH))[0, 0]
 
     assert_allclose(at(0, 2, 1), [32, 24])
     assert_allclose(at(0, 3, 1), [42, 24])
@@ -69,8 +76,8 @@ def test_up_is_up_and_the_picture_turns_against_the_camera():
 @pytest.mark.parametrize("margin", [0, 0.7])
 def test_a_fitted_camera_just_shows_the_bounds(bounds, height, width, margin):
     center, scale = fit_bounds(bounds, height, width, margin)
-    view = CameraView(*(np.float32(part) for part in ([center], [scale], [0])))
-    corners = np.float32([[bounds[:2], bounds[2:]]])
+    view = CameraView(*(jnp.float32(part) for part in ([center], [scale], [0])))
+    corners = jnp.float32([[bounds[:2], bounds[2:]]])
     (left, bottom), (right, top) = np.asarray(to_pixels(view, corners, height, width), float)[0]
     room = np.array([left, top, width - right, height - bottom])
     assert_allclose(room.min(), margin * scale, atol=1e-3)
@@ -111,15 +118,15 @@ def test_a_hand_shakes_by_as_much_as_asked():
     way = np.concatenate([watched(seed, shake=0.4).center - [5, 3] for seed in range(60)])
     assert_allclose(np.sqrt((way**2).mean(0)), 0.4, rtol=0.1)  # along each axis
     assert_allclose(way.mean(0), 0, atol=0.06)
-    assert abs(np.corrcoef(way.T)[0, 1]) < 0.2
+    assert abs(np.corrcoef(way[:, 0], way[:, 1])[0, 1]) < 0.2
 
 
 def test_a_followed_object_stays_in_the_middle():
     rng = np.random.default_rng(1)
-    places = np.float32(np.cumsum(rng.normal(0, 0.2, (FRAMES, 3, 2)), 0))
-    states = State(places, *(np.zeros((FRAMES, 3, *shape), np.float32) for shape in ((), (2,), ())))
+    places = np.cumsum(rng.normal(0, 0.2, (FRAMES, 3, 2)), 0).astype(np.float32)
+    states = State(jnp.asarray(places), *(jnp.zeros((FRAMES, 3, *shape)) for shape in ((), (2,), ())))
     view = watched(states=states, follow=1, zoom=0.5, angle=1)
-    pixels = to_pixels(view, places, HEIGHT, WIDTH)[:, 1]
+    pixels = to_pixels(CameraView(*map(jnp.float32, view)), jnp.asarray(places), HEIGHT, WIDTH)[:, 1]
     assert_allclose(pixels, np.broadcast_to([WIDTH / 2, HEIGHT / 2], (FRAMES, 2)), atol=1e-3)
     away = watched(states=states, follow=1, pan=[1, 0])
     assert_allclose(away.center - places[:, 1], np.arange(FRAMES)[:, None] / FPS * [1, 0], atol=1e-5)
@@ -181,6 +188,7 @@ def test_an_exposure_ends_at_its_frame_and_its_camera_moves_on_meanwhile():
     stages, *_ = straight_motion({**BALLS, "image": image, "camera": {"scale": 7, "pan": [3, -1], "turn": 0.5}}, 2)
     late = -0.6 * (1 - (np.arange(4) + 0.5) / 4) / FPS  # s
     at, exposed = stages.instants, stages.exposed
+    assert exposed is not None
     pan, turn = np.array([3, -1]), 0.5
     assert_allclose(exposed.view.center, at.view.center[:, :, None] + late[:, None] * pan, atol=1e-4)
     assert_allclose(exposed.view.angle, at.view.angle[:, :, None] + late * turn, atol=1e-5)

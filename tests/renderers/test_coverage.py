@@ -4,10 +4,6 @@ Errors are in grey levels of 255 before rounding; `pytest -rP` prints those reac
 are not compiled as a whole, which would take longer than it saves.
 """
 
-# Records of jax arrays are filled with NumPy's here.
-# pyright: reportArgumentType=false, reportIndexIssue=false, reportOptionalMemberAccess=false, reportOptionalSubscript=false, reportCallIssue=false
-# pyright: reportOperatorIssue=false, reportOptionalOperand=false, reportGeneralTypeIssues=false, reportAttributeAccessIssue=false
-
 import functools
 
 import jax
@@ -58,7 +54,8 @@ def rims(rng, radii):
     angle[:16] = np.arange(16) * (np.pi / 2)
     middle = SIZE / 2 + rng.uniform(-0.5, 0.5, (len(radii), 2))
     middle[:8], radii[:8] = SIZE / 2, np.ceil(radii[:8])
-    return np.float32(middle - radii[:, None] * np.stack([np.cos(angle), np.sin(angle)], -1)), np.float32(radii)
+    centre = middle - radii[:, None] * np.stack([np.cos(angle), np.sin(angle)], -1)
+    return centre.astype(np.float32), radii.astype(np.float32)
 
 
 # ---- Discs
@@ -72,16 +69,16 @@ def rims(rng, radii):
 def test_a_disc_covers_its_area_of_every_pixel(low, high, mean, most):
     rng = np.random.default_rng(int(high))
     centre, radius = rims(rng, np.exp(rng.uniform(np.log(low), np.log(high), COUNT)))
-    exact = [disc_areas(EDGES - c[0], EDGES - c[1], r) for c, r in zip(np.float64(centre), radius, strict=True)]
+    exact = [disc_areas(EDGES - c[0], EDGES - c[1], r) for c, r in zip(centre.astype(float), radius, strict=True)]
     compared(f"discs of {low} to {high} px", discs(centre, radius), np.array(exact), mean, most)
 
 
 @pytest.mark.parametrize(("low", "high", "size"), [(0.2, 30, SIZE), (30, 300, 608)])
 def test_the_pixels_of_a_disc_add_up_to_its_area(low, high, size):
     rng = np.random.default_rng(1)
-    radius = np.float32(np.geomspace(low, high, COUNT if size == SIZE else 12))
-    centre = np.float32(size / 2 + rng.uniform(-0.5, 0.5, (len(radius), 2)))
-    share = np.asarray(discs(centre, radius, size), float).sum((1, 2)) / (np.pi * np.float64(radius) ** 2)
+    radius = np.geomspace(low, high, COUNT if size == SIZE else 12).astype(np.float32)
+    centre = (size / 2 + rng.uniform(-0.5, 0.5, (len(radius), 2))).astype(np.float32)
+    share = np.asarray(discs(centre, radius, size), float).sum((1, 2)) / (np.pi * radius.astype(float) ** 2)
     print(f"discs of {low} to {high} px: {np.abs(share - 1).max():.1e} of the area")
     assert_allclose(share, 1, atol=1e-3)
     assert_allclose(share, 1, atol=3e-5)
@@ -96,9 +93,9 @@ def centroids(cover):
 def centroid_offset(radius):
     """Largest distance, px along an axis, of the centroid of the coverage of a disc from its centre; fails if the
     centroid is not that of exact areas."""
-    centre = np.float32(SIZE / 2 + np.random.default_rng(2).uniform(-0.5, 0.5, (COUNT, 2)))
+    centre = (SIZE / 2 + np.random.default_rng(2).uniform(-0.5, 0.5, (COUNT, 2))).astype(np.float32)
     found = centroids(discs(centre, np.full(COUNT, radius, np.float32)))
-    exact = [disc_areas(EDGES - c[0], EDGES - c[1], radius) for c in np.float64(centre)]
+    exact = [disc_areas(EDGES - c[0], EDGES - c[1], radius) for c in centre.astype(float)]
     assert_allclose(found, centroids(exact), atol=1e-4)
     return np.abs(found - centre).max()
 
@@ -129,7 +126,7 @@ def capsules(rng, special=True):
     radius = np.exp(rng.uniform(np.log(0.3), np.log(16), COUNT))
     if special:
         centre[::4], radius[::4] = SIZE / 2, np.ceil(radius[::4])
-    return np.float32(np.stack([centre - along, centre + along], 1)), np.float32(radius)
+    return np.stack([centre - along, centre + along], 1).astype(np.float32), radius.astype(np.float32)
 
 
 def polygons(rng, special=True):
@@ -147,13 +144,13 @@ def polygons(rng, special=True):
         if i % 8 == 0 and special:
             corners, centre = np.ceil(corners), 0
         found.append(np.concatenate([corners, np.repeat(corners[-1:], CORNERS - len(corners), 0)]) + centre + SIZE / 2)
-    return np.float32(found)
+    return np.asarray(found, np.float32)
 
 
 def exact_areas(corners, radius=None):
     radius = np.zeros(len(corners)) if radius is None else np.asarray(radius, float)
     return np.array(
-        [polygon_areas(outline(np.float64(c), r), SIZE, SIZE) for c, r in zip(corners, radius, strict=True)]
+        [polygon_areas(outline(np.asarray(c, float), r), SIZE, SIZE) for c, r in zip(corners, radius, strict=True)]
     )
 
 
@@ -169,14 +166,14 @@ def test_a_polygon_covers_its_area_of_every_pixel():
 
 def test_a_rounded_polygon_covers_its_area_of_every_pixel():
     rng = np.random.default_rng(5)
-    corners, radius = polygons(rng), np.float32(np.exp(rng.uniform(np.log(0.3), np.log(12), COUNT)))
+    corners, radius = polygons(rng), np.exp(rng.uniform(np.log(0.3), np.log(12), COUNT)).astype(np.float32)
     compared("rounded polygons", rounded(corners, radius), exact_areas(corners, radius), 0.005, 0.05)
 
 
 def test_what_has_no_area_covers_nothing():
     rng = np.random.default_rng(6)
-    points = np.float32(np.repeat(rng.uniform(0, SIZE, (COUNT, 1, 2)), CORNERS, 1))
-    lines = np.float32(rng.uniform(0, SIZE, (COUNT, 2, 2)))
+    points = np.repeat(rng.uniform(0, SIZE, (COUNT, 1, 2)), CORNERS, 1).astype(np.float32)
+    lines = rng.uniform(0, SIZE, (COUNT, 2, 2)).astype(np.float32)
     for cover in (
         discs(points[:, 0], np.zeros(COUNT, np.float32)),
         rounded(points, None),
@@ -196,7 +193,8 @@ def test_two_parts_make_a_whole():
 
 def test_a_capsule_without_length_and_a_rounded_point_are_discs():
     rng = np.random.default_rng(8)
-    centre, radius = np.float32(rng.uniform(30, 42, (COUNT, 2))), np.float32(rng.uniform(0.3, 20, COUNT))
+    centre = rng.uniform(30, 42, (COUNT, 2)).astype(np.float32)
+    radius = rng.uniform(0.3, 20, COUNT).astype(np.float32)
     disc = discs(centre, radius)
     assert_allclose(rounded(np.repeat(centre[:, None], 2, 1), radius), disc, atol=3e-4)
     assert_allclose(rounded(np.repeat(centre[:, None], CORNERS, 1), radius), disc, atol=3e-4)
@@ -207,11 +205,11 @@ def test_areas_of_primitives_are_those_of_their_outlines():
     for corners, radius in (
         capsules(rng),
         (polygons(rng), None),
-        (polygons(rng), np.float32(rng.uniform(0.3, 12, COUNT))),
+        (polygons(rng), rng.uniform(0.3, 12, COUNT).astype(np.float32)),
     ):
         found = area_of(Primitive(jnp.asarray(corners), None if radius is None else jnp.asarray(radius)), disc=False)
         assert_allclose(found, exact_areas(corners, radius).sum((1, 2)), rtol=1e-4)
-    radius = np.float32([0.5, 3])
+    radius = np.asarray([0.5, 3], np.float32)
     assert_allclose(area_of(Primitive(jnp.zeros((2, 2)), jnp.asarray(radius)), disc=True), np.pi * radius**2, rtol=1e-6)
 
 
@@ -220,7 +218,7 @@ def test_areas_of_primitives_are_those_of_their_outlines():
 
 def weights():
     """A picture that each coverage is weighted with: derivatives of each pixel's share count."""
-    return np.float32(np.random.default_rng(9).uniform(-1, 1, (SIZE, SIZE)))
+    return np.random.default_rng(9).uniform(-1, 1, (SIZE, SIZE)).astype(np.float32)
 
 
 def differences(value, shape, step):
@@ -261,7 +259,7 @@ def test_a_disc_moves_and_grows_as_its_slopes_say(low, high, mean, most):
         areas = [disc_areas(EDGES - c[0], EDGES - c[1], c[2]) for c in of]
         return (weight * np.array(areas)).sum((1, 2))
 
-    exact = differences(total, np.concatenate([np.float64(centre), radius[:, None]], 1)[some], 1e-4)
+    exact = differences(total, np.concatenate([centre.astype(float), radius[:, None]], 1)[some], 1e-4)
     slope = [np.asarray(slope)[some] for slope in disc_slopes(centre, radius)]
     alike(f"discs of {low} to {high} px, centre", slope[0], exact[:, :2], mean, most)
     alike(f"discs of {low} to {high} px, radius", slope[1], exact[:, 2], mean, most)
@@ -273,7 +271,7 @@ def test_a_shape_changes_as_its_slopes_say(kind):
     corners, radius = capsules(rng, special=False)
     if kind != "capsule":
         corners = polygons(rng, special=False)[:, :4]
-        radius = None if kind == "polygon" else np.float32(rng.uniform(1, 9, COUNT))
+        radius = None if kind == "polygon" else rng.uniform(1, 9, COUNT).astype(np.float32)
     if radius is not None:  # with a level side, the slopes of round shapes are off by a few hundredths
         rise = np.abs(corners - np.roll(corners, 1, 1))[..., 1]
         length = np.linalg.norm(corners - np.roll(corners, 1, 1), axis=-1)
@@ -286,7 +284,7 @@ def test_a_shape_changes_as_its_slopes_say(kind):
     def grown(by):
         return (weight * exact_areas(corners, radius + by)).sum((1, 2))
 
-    alike(f"{kind}, corners", of_corners, differences(total, np.float64(corners), 1e-3), 1e-3, 2e-2)
+    alike(f"{kind}, corners", of_corners, differences(total, corners.astype(float), 1e-3), 1e-3, 2e-2)
     if radius is not None:
         alike(f"{kind}, radius", of_radius, differences(grown, np.zeros(COUNT), 1e-3), 1e-3, 2e-2)
 
@@ -300,7 +298,7 @@ def test_slopes_are_finite_where_shapes_touch_edges_or_have_no_area():
     on_edges[1::5, 2:] = on_edges[1::5, 1:2]  # a line
     slopes = [*disc_slopes(centre, radius)]
     for corners in (on_edges, np.round(capsules(rng)[0])):
-        for grown in (np.zeros(COUNT, np.float32), np.float32(np.arange(COUNT) % 9)):
+        for grown in (np.zeros(COUNT, np.float32), (np.arange(COUNT) % 9).astype(np.float32)):
             slopes += rounded_slopes(corners, grown)
     slopes.append(rounded_slopes(on_edges, None)[0])
     for slope in slopes:

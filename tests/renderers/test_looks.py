@@ -1,9 +1,5 @@
 """Looks: each in the folder paints, in both forms alike, what it says that it paints; and colours can be told apart."""
 
-# Records of jax arrays are filled with NumPy's here.
-# pyright: reportArgumentType=false, reportIndexIssue=false, reportOptionalMemberAccess=false, reportOptionalSubscript=false, reportCallIssue=false
-# pyright: reportOperatorIssue=false, reportOptionalOperand=false, reportGeneralTypeIssues=false, reportAttributeAccessIssue=false
-
 import dataclasses
 import functools
 
@@ -255,14 +251,16 @@ def test_a_gradient_spans_the_view_in_its_direction():
     right, up = np.meshgrid(np.arange(WIDTH) + 0.5 - WIDTH / 2, HEIGHT / 2 - np.arange(HEIGHT) - 0.5)
     for key in keys(6):
         stage = render.render_scene(key, config, plan, scene, states)
-        cos, sin = (float(part(stage.paint.background.direction)) for part in (jnp.cos, jnp.sin))
+        direction = stage.paint.background.direction
+        assert direction is not None
+        cos, sin = (float(part(direction)) for part in (jnp.cos, jnp.sin))
         along = (right * cos + up * sin) / (abs(cos) * WIDTH / 2 + abs(sin) * HEIGHT / 2)  # -1 to 1 at the corners
         (image,) = np.asarray(background_image(stage, stage.instants, plan))
         assert_allclose(image, np.repeat(255 * (along[..., None] + 1) / 2, 3, -1), atol=0.1)
 
 
 def test_noise_is_a_number_from_0_to_1_that_changes_over_a_cell_and_is_continuous():
-    x, y = np.float32(np.random.default_rng(6).uniform(-50, 50, (2, 20_000)))
+    x, y = np.random.default_rng(6).uniform(-50, 50, (2, 20_000)).astype(np.float32)
 
     def at(dx, dy):
         return np.asarray(noise(jnp.asarray(x + dx), jnp.asarray(y + dy), jnp.uint32(3)), float)
@@ -318,20 +316,20 @@ def test_a_palette_that_is_asked_for_too_much_gives_colours_far_apart():
 
 def test_contrast_is_a_distance_of_765_at_most():
     rng = np.random.default_rng(3)
-    a, b = np.float32(rng.uniform(0, 255, (2, 1000, 3)))
+    a, b = jnp.float32(rng.uniform(0, 255, (2, 1000, 3)))
     one, other = color_module.contrast(a, b), color_module.contrast(b, a)
     assert_array_equal(one, other)
     assert_array_equal(color_module.contrast(a, a), 0)
     assert np.max(one) < 765
-    assert 764 < color_module.contrast(np.zeros(3, np.float32), np.full(3, 255, np.float32)) < 765
+    assert 764 < color_module.contrast(jnp.zeros(3), jnp.full(3, 255.0)) < 765
 
 
 def test_contrast_weighs_green_most_and_red_more_than_blue_among_bright_reds():
     """T. Riemersma, 'Colour metric'."""
     for red, order in ((250.0, "brg"), (5.0, "rbg")):
-        base = np.float32([red, 100, 100])
+        base = jnp.float32([red, 100, 100])
         apart = {
-            name: float(color_module.contrast(base, base + np.float32(step)))
+            name: float(color_module.contrast(base, base + jnp.float32(step)))
             for name, step in zip("rgb", 4 * np.eye(3), strict=True)
         }
         assert sorted(apart, key=lambda name: apart[name]) == list(order), apart

@@ -1,9 +1,5 @@
 """Frames: both forms the same image, which is the one that exact areas give, painted in NumPy in float64."""
 
-# Records of jax arrays are filled with NumPy's here.
-# pyright: reportArgumentType=false, reportIndexIssue=false, reportOptionalMemberAccess=false, reportOptionalSubscript=false, reportCallIssue=false
-# pyright: reportOperatorIssue=false, reportOptionalOperand=false, reportGeneralTypeIssues=false, reportAttributeAccessIssue=false
-
 import dataclasses
 import functools
 import itertools
@@ -53,7 +49,7 @@ def shapes(rng, layout):
                 half[slot], radius[slot] = 4.0, (0.0 if run.shape == "segment" else 150.0)
         if run.shape == "polygon" and not run.rounded:
             radius[first : first + run.count] = 0
-    return BodyGeometry(radius, half, vertices)
+    return BodyGeometry(*map(jnp.asarray, (radius, half, vertices)))
 
 
 def painted(rng, layout, plan, features):
@@ -63,24 +59,26 @@ def painted(rng, layout, plan, features):
         line[first : first + run.count] = plan.grow * (run.shape == "segment")
 
     def colors(*shape):
-        return rng.integers(0, 256, (*shape, 3)).astype(float)
+        return jnp.asarray(rng.integers(0, 256, (*shape, 3)), float)
 
     def seeds(*shape):
-        return rng.integers(2**32, size=shape, dtype=np.uint32)
+        return jnp.asarray(rng.integers(2**32, size=shape, dtype=np.uint32))
 
-    background = {"color": colors()}
+    background = Background(colors())
     if "gradient" in features:
-        background |= {"to_color": colors(), "direction": rng.uniform(0, 6)}
+        background = background._replace(to_color=colors(), direction=rng.uniform(0, 6))
     if "noise" in features:
-        background |= {"texture": Texture(seeds(), 1.3, colors())}
+        background = background._replace(texture=Texture(seeds(), jnp.asarray(1.3), colors()))
     known = {
         "rim": {"rim": rng.uniform(0, 3, slots), "rim_color": colors(slots), "fill": colors(slots)},
         "mark": {"mark": rng.uniform(0, 0.5, slots), "mark_color": colors(slots)},
         "shade": {"shade": rng.uniform(0, 1, slots)},
-        "texture": {"texture": Texture(seeds(slots), np.full(slots, 0.7), colors(slots))},
+        "texture": {"texture": Texture(seeds(slots), jnp.full(slots, 0.7), colors(slots))},
     }
-    some = {key: value for name in features if name in known for key, value in known[name].items()}
-    return Paint(Background(**background), colors(slots), rng.random(slots) < 0.9, grow=line, **some)
+    paint = Paint(background, colors(slots), rng.random(slots) < 0.9, grow=jnp.asarray(line))
+    for name in features:
+        paint = paint._replace(**known.get(name, {}))
+    return paint
 
 
 def instants(rng, layout, plan, shape):
@@ -94,9 +92,9 @@ def instants(rng, layout, plan, shape):
             places[..., slots, :] = [0, -150]
         elif run.kind == STATIC and plan.still:
             places[..., slots, :], angles[..., slots] = [0.6, 0.3], np.arange(run.count) * np.pi / 2
-    still = np.zeros(shape)
+    still = jnp.zeros(shape)
     if plan.still:
-        return Instants(places, angles, CameraView(np.zeros((*shape, 2)), still + plan.scale, still))
+        return Instants(places, angles, CameraView(jnp.zeros((*shape, 2)), still + plan.scale, still))
     view = CameraView(
         rng.uniform(-1, 1, (*shape, 2)), rng.uniform(0.6, 1, shape) * plan.scale, rng.uniform(-3, 3, shape)
     )
@@ -111,9 +109,8 @@ def stages(plan, videos, frames, features=(), occluders=0, noise=None, seed=0):
         low = rng.uniform(0, 0.8, (occluders, 2)) * [plan.width, plan.height]
         box = np.concatenate([low, low + rng.uniform(1, 9, (occluders, 2))], -1)
         moving = plan.moving
-        some = Occluders(
-            box, rng.integers(0, 256, (occluders, 3)) * 1.0, np.sort(rng.integers(0, moving + 1, occluders))
-        )
+        color, rank = rng.integers(0, 256, (occluders, 3)) * 1.0, np.sort(rng.integers(0, moving + 1, occluders))
+        some = Occluders(*map(jnp.asarray, (box, color, rank)))
         exposed = instants(rng, plan.layout, plan, (frames, plan.exposed)) if plan.exposed else None
         made.append(
             RenderScene(
@@ -123,7 +120,7 @@ def stages(plan, videos, frames, features=(), occluders=0, noise=None, seed=0):
                 painted(rng, plan.layout, plan, features),
                 some if occluders else None,
                 noise,
-                np.uint32(video),
+                jnp.uint32(video),
             )
         )
     return jax.tree.map(lambda *a: _single(np.stack(a)), *made)
@@ -151,9 +148,9 @@ def layers(stage, plan, t):
     def stand(until):
         while standing and standing[0][2] <= until:
             box, color, _ = standing.pop(0)
-            left, top, right, bottom = np.float64(box)
+            left, top, right, bottom = np.asarray(box, float)
             corners = np.array([[left, top], [right, top], [right, bottom], [left, bottom]])
-            found.append((OCCLUDER, polygon_areas(corners, plan.height, plan.width), np.float64(color)))
+            found.append((OCCLUDER, polygon_areas(corners, plan.height, plan.width), np.asarray(color, float)))
 
     for number, (run, first) in enumerate(order):
         for slot in range(first, first + run.count):
@@ -246,12 +243,18 @@ TIERS = {"everything": pytest.mark.slow, "painted": pytest.mark.full}
 TIERED = [pytest.param(case, marks=TIERS.get(case, ())) for case in CASES]
 
 
+def drawn_as(form, some, plan):
+    """The frames in one form, and the owners if they are wanted."""
+    frames, owners = form(some, plan)
+    return np.asarray(frames), None if owners is None else np.asarray(owners)
+
+
 @functools.cache
 def drawn(case, seed=0):
     """A case's stages, and its frames and owners in both forms."""
     plan, options = CASES[case]
     some = stages(plan, frames=2, seed=seed, **options)
-    return some, *(tuple(None if a is None else np.asarray(a) for a in form(some, plan)) for form in (PATCHES, DENSE))
+    return some, drawn_as(PATCHES, some, plan), drawn_as(DENSE, some, plan)
 
 
 def difference_of_forms(case, seed):
@@ -259,6 +262,7 @@ def difference_of_forms(case, seed):
     some, (frames, owners), (dense_frames, dense_owners) = drawn(case, seed)
     assert frames.std() > 20
     if owners is not None:
+        assert dense_owners is not None
         plan = CASES[case][0]
         for v, t, row, column in np.argwhere(owners != dense_owners):
             share = shares(video(some, v), plan, t)[:, row, column]
@@ -305,6 +309,7 @@ def test_frames_are_those_of_exact_areas():
 def test_a_pixel_is_owned_by_what_is_seen_most_of(case):
     plan, options = CASES[case]
     some, (_, owners), _ = drawn(case)
+    assert owners is not None
     ties = 0
     for v, t in np.ndindex(options["videos"], 2):
         share = shares(video(some, v), plan, t)
@@ -367,7 +372,9 @@ def test_a_rim_is_what_lies_within_a_width_of_the_edge(shape):
             inner, wide = inset(core, rim - radius)
         error = np.abs(found[v] - (whole - polygon_areas(inner, size, size))).max()
         worst[wide] = max(worst[wide], error)
-    print(f"{shape}: a rim is off by {255 * worst[0]:.3f} of 255 at most, by {255 * worst[1]:.0f} where it is wide")
+    print(
+        f"{shape}: a rim is off by {255 * worst[False]:.3f} of 255 at most, by {255 * worst[True]:.0f} where it is wide"
+    )
     assert worst[False] < 1e-3
     assert worst[True] < 0.3  # a polygon's centre, or a short side, lies in its rim: less exact
 
@@ -382,11 +389,11 @@ def test_a_pixel_half_of_white_is_half_of_its_values_or_half_of_its_light(form, 
     corners = np.array([[-1, -1], [0.5, -1], [0.5, 1], [-1, 1]]) / plan.scale  # its right side in the middle of a pixel
     some = video(stages(plan, 1, 1), 0)
     some = some._replace(
-        bodies=some.bodies._replace(vertices=np.float32(corners)[None]),
+        bodies=some.bodies._replace(vertices=corners.astype(np.float32)[None]),
         instants=some.instants._replace(position=np.zeros((1, 1, 2), np.float32), angle=np.zeros((1, 1), np.float32)),
         paint=some.paint._replace(
             color=np.full((1, 3), 255, np.float32),
-            background=Background(np.zeros(3, np.float32)),
+            background=Background(jnp.zeros(3)),
             drawn=np.ones(1, bool),
         ),
     )
@@ -401,11 +408,9 @@ def test_noise_is_as_strong_as_asked_and_another_in_each_frame():
     plan = plan_for((SlotGroup("circle", 1),), 48, 64)
     some = stages(plan, 4, 3, noise=6.0)
     some = some._replace(
-        paint=some.paint._replace(
-            drawn=np.zeros((4, 1), bool), background=Background(np.full((4, 3), 100, np.float32))
-        ),
-        noise=np.float32([6, 6, 6, 0.8]),
-        seed=np.uint32([1, 1, 2, 3]),
+        paint=some.paint._replace(drawn=np.zeros((4, 1), bool), background=Background(jnp.full((4, 3), 100.0))),
+        noise=np.asarray([6, 6, 6, 0.8], np.float32),
+        seed=np.asarray([1, 1, 2, 3], np.uint32),
     )
     noise = np.asarray(PATCHES(some, plan)[0]).astype(float) - 100
     values = noise[0].size
@@ -459,6 +464,7 @@ def test_a_moving_ball_is_blurred_along_its_path():
     print(f"a blurred ball is off by {off:.4f} px from the middle of its path, {inside.sum()} videos")
     assert off < 0.02
     # The mean of sharp frames at the instants of its exposures.
+    assert blurred.exposed is not None
     shape = blurred.exposed.angle.shape
     sharp = blurred._replace(
         instants=jax.tree.map(lambda a: a.reshape(len(a), -1, *a.shape[3:]), blurred.exposed), exposed=None
@@ -498,6 +504,7 @@ def test_batches_share_one_program():
     shared.clear()
     rollout = Rollout(config, jax.devices()[:1])
     count = config.storage.batch_size
+    assert count is not None
     every, *_ = straight_motion(config, 3 * count)
     for first in range(0, 3 * count, count):
         batch = DeviceBatch(
