@@ -190,6 +190,6 @@ def test_a_forgotten_file_fails_its_test(tmp_path: Path) -> None:
     words = [*map(str, words), "-p", "no:cacheprovider", "-n", "0", str(tmp_path)]
     environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parent)}
     done = subprocess.run(words, env=environment, capture_output=True, text=True, check=False)
-    results = {line.split()[0] + " " + line.rpartition("::")[2] for line in done.stdout.splitlines() if "::" in line}
-    assert {"FAILED test_a_forgotten_file", "FAILED test_an_error_in_a_thread"} <= results, done.stdout
-    assert len({result for result in results if result.startswith(("FAILED", "ERROR"))}) == 3, done.stdout
+    failures = re.findall(r"^(FAILED|ERROR) .*?::(test_\w+)", done.stdout, re.MULTILINE)
+    assert {("FAILED", "test_a_forgotten_file"), ("FAILED", "test_an_error_in_a_thread")} <= set(failures), done.stdout
+    assert len(set(failures)) == 3, done.stdout
