@@ -9,6 +9,7 @@ from typing import Any
 import jax
 import numpy as np
 import pytest
+from packages import require
 
 import gen2d
 
@@ -58,7 +59,7 @@ def test_examples_show_what_they_say(name: str, folder: Path, tmp_path: Path, mo
     shutil.copytree(folder, tmp_path, dirs_exist_ok=True)
     test = EXAMPLES[name]
     if any('to="torch"' in example.source for example in test.examples):
-        pytest.importorskip("torch")
+        require("torch")
     for example in test.examples:
         for long, short in SHORTER.items():
             example.source = example.source.replace(long, short)

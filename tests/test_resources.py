@@ -44,8 +44,8 @@ def held() -> Counter[str]:
 
 
 def read(toy: Path, _: Path) -> None:
-    for codec in (None, "first"):
-        gen2d.open(toy, fields="*", window=codec and 2)[:]
+    for window in (None, 2):
+        gen2d.open(toy, fields="*", window=window)[:]
 
 
 def read_url(toy: Path, folder: Path) -> None:

@@ -105,8 +105,9 @@ _BUGS = (
     MemoryError,
     NameError,
     RuntimeError,
+    SystemError,
+    TypeError,
 )
-_BUGS += (SystemError, TypeError)
 _FINAL_NUMBERS = (errno.EFBIG, errno.EOPNOTSUPP, errno.ENOSPC, errno.EMFILE, errno.ENFILE)
 
 

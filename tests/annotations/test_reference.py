@@ -80,7 +80,7 @@ class Frame:
 
 
 @dataclasses.dataclass(frozen=True)
-class Made:
+class RenderedVideo:
     """A video's stored fields, how it was rendered, and the reference's frames."""
 
     video: dict[str, np.ndarray]
@@ -114,7 +114,7 @@ def fields(case: Case) -> tuple[list[tuple[dict[str, np.ndarray], View]], list[d
     else:
         (drawn,) = rollout.draw([batch], 0, case.videos)
     columns = rollout.host_columns([batch])[0] | {name: np.asarray(array) for name, array in drawn.items()}
-    look, made = config.look.options, []
+    look, rendered = config.look.options, []
     for v in range(case.videos):
         occluders = ()
         if batch.render_scenes.occluders is not None:  # a dataset does not store them
@@ -125,19 +125,19 @@ def fields(case: Case) -> tuple[list[tuple[dict[str, np.ndarray], View]], list[d
         view = View(height, width, background, look.wall_width, linear, occluders)
         if config.look.name == "outline":
             view = view._replace(line=look.width, fill=look.fill)
-        made.append(({name: array[v] for name, array in columns.items()}, view))
+        rendered.append(({name: array[v] for name, array in columns.items()}, view))
     if not case.exposure:
-        return made, []
+        return rendered, []
     every = [f"video.fps={FPS * STEPS}", f"video.frames={(case.frames - 1) * STEPS + 1}"]
     fine = Rollout(load_config(f"{case.config}.yaml", [*common, *every, "physics.substeps=1"]), jax.devices()[:1])
     (columns,) = fine.host_columns(fine.start("train", np.arange(case.videos)))
-    return made, [{name: array[v] for name, array in columns.items()} for v in range(case.videos)]
+    return rendered, [{name: array[v] for name, array in columns.items()} for v in range(case.videos)]
 
 
-def videos(case: Case) -> Iterator[Made]:
+def videos(case: Case) -> Iterator[RenderedVideo]:
     """The videos of a case with the reference's frames."""
-    made, steps = fields(case)
-    for v, (video, view) in enumerate(made):
+    rendered, steps = fields(case)
+    for v, (video, view) in enumerate(rendered):
         exposures = None
         if case.exposure:
             length, samples = case.exposure
@@ -147,7 +147,7 @@ def videos(case: Case) -> Iterator[Made]:
                 [reference.layers(reference.exposed(video, steps[v], t, b, STEPS, rate), 0, view) for b in before]
                 for t in range(case.frames)
             ]
-        yield Made(video, view, [frame_of(video, t, view) for t in range(case.frames)], exposures)
+        yield RenderedVideo(video, view, [frame_of(video, t, view) for t in range(case.frames)], exposures)
 
 
 def accuracy(layer: Layer, size: float) -> float:
@@ -244,16 +244,16 @@ TIERED = [
 
 
 @pytest.fixture(scope="module", params=TIERED)
-def made(request) -> list[Made]:
+def rendered(request) -> list[RenderedVideo]:
     """The videos of a case."""
     return list(videos(request.param))
 
 
-def each_frame(made: list[Made]) -> Iterator[tuple[Made, Frame]]:
-    return ((one, frame) for one in made for frame in one.frames)
+def each_frame(rendered: list[RenderedVideo]) -> Iterator[tuple[RenderedVideo, Frame]]:
+    return ((one, frame) for one in rendered for frame in one.frames)
 
 
-def drawn(one: Made) -> list[int]:
+def drawn(one: RenderedVideo) -> list[int]:
     """Slots that are rendered."""
     return [slot for slot in range(one.slots) if reference.rendered(one.video, slot, one.view)]
 
@@ -286,9 +286,9 @@ def test_the_reference_covers_the_points_within_its_radius(corners, radius):
     np.testing.assert_allclose(covered.sum(), reference.area(shape), rtol=1e-5)
 
 
-def test_a_frame_shows_the_exact_areas_of_its_objects(made):
+def test_a_frame_shows_the_exact_areas_of_its_objects(rendered):
     beyond, errors = [], []
-    for one, frame in each_frame(made):
+    for one, frame in each_frame(rendered):
         stored = one.video["frames"][frame.number].astype(float)
         exposures = one.exposures[frame.number] if one.exposures else [frame.layers]
         low, high = (
@@ -304,17 +304,17 @@ def test_a_frame_shows_the_exact_areas_of_its_objects(made):
     assert np.mean(errors) <= 0.3
 
 
-def test_a_pixel_shows_the_object_with_the_largest_share_of_it(made):
-    for one, frame in each_frame(made):
+def test_a_pixel_shows_the_object_with_the_largest_share_of_it(rendered):
+    for one, frame in each_frame(rendered):
         assert_array_equal(one.video["masks/instance"][frame.number], frame.mask)
-    ties, rim = (sum(getattr(frame, name) for _, frame in each_frame(made)) for name in ("ties", "rim"))
+    ties, rim = (sum(getattr(frame, name) for _, frame in each_frame(rendered)) for name in ("ties", "rim"))
     print(f"masks: {ties} ties of {rim} shared pixels")
     assert ties <= 1e-3 * rim
 
 
-def test_amodal_masks_are_the_pixels_that_an_object_covers_by_half(made):
+def test_amodal_masks_are_the_pixels_that_an_object_covers_by_half(rendered):
     ties, rim = 0, 0
-    for one, frame in each_frame(made):
+    for one, frame in each_frame(rendered):
         bits = np.unpackbits(one.video["masks/amodal"][frame.number], axis=-1)[:, : one.view.height * one.view.width]
         stored = bits.reshape(-1, one.view.height, one.view.width).astype(bool)
         covered = {layer.id - 1: layer for layer in frame.layers if layer.id != OCCLUDER}
@@ -331,9 +331,9 @@ def test_amodal_masks_are_the_pixels_that_an_object_covers_by_half(made):
     assert ties <= 1e-3 * rim
 
 
-def test_boxes_are_those_of_the_mask_and_of_the_whole_object(made):
+def test_boxes_are_those_of_the_mask_and_of_the_whole_object(rendered):
     worst = 0.0
-    for one, frame in each_frame(made):
+    for one, frame in each_frame(rendered):
         seen = reference.visible_boxes(frame.mask, one.slots)
         assert_array_equal(one.video["boxes/visible"][frame.number], seen)
         whole = np.zeros((one.slots, 4))
@@ -345,9 +345,9 @@ def test_boxes_are_those_of_the_mask_and_of_the_whole_object(made):
     assert worst <= 2e-6
 
 
-def test_visibility_is_the_share_of_the_area_that_is_seen(made):
+def test_visibility_is_the_share_of_the_area_that_is_seen(rendered):
     largest = 0
-    for one in made:
+    for one in rendered:
         least = 1.0
         for frame in one.frames:
             pixels, fraction = (one.video[f"visibility/{name}"][frame.number] for name in ("pixels", "fraction"))
@@ -360,16 +360,16 @@ def test_visibility_is_the_share_of_the_area_that_is_seen(made):
                 least = min(least, expected[slot]) if one.video["objects/kind"][slot] != STATIC else least
             np.testing.assert_allclose(fraction, expected, rtol=1e-5)
         np.testing.assert_allclose(one.video["quality/min_visibility"], least, rtol=1e-5)
-    assert largest > 255 or made[0].view.width < WIDE.size[1]
+    assert largest > 255 or rendered[0].view.width < WIDE.size[1]
 
 
 DIRECTIONS = {"forward": 1, "backward": -1}
 
 
 @pytest.mark.parametrize("direction", DIRECTIONS)
-def test_flow_is_how_the_content_of_a_pixel_moves(made, direction):
+def test_flow_is_how_the_content_of_a_pixel_moves(rendered, direction):
     worst, largest = 0.0, 0.0
-    for one, frame in each_frame(made):
+    for one, frame in each_frame(rendered):
         stored = one.video[f"flow/{direction}"][frame.number].astype(float)
         to = frame.number + DIRECTIONS[direction]
         if not 0 <= to < len(one.frames):
@@ -381,13 +381,13 @@ def test_flow_is_how_the_content_of_a_pixel_moves(made, direction):
         worst, largest = max(worst, error.max()), max(largest, np.abs(expected).max())
     print(f"flow {direction}: {worst:.1e} px beyond rounding; at most {largest:.0f} px")
     assert worst <= 2e-4
-    assert largest > 255 or made[0].view.width < WIDE.size[1]
+    assert largest > 255 or rendered[0].view.width < WIDE.size[1]
 
 
 @pytest.mark.parametrize("direction", DIRECTIONS)
-def test_flow_is_valid_where_it_ends_at_the_same_object(made, direction):
+def test_flow_is_valid_where_it_ends_at_the_same_object(rendered, direction):
     open_, pixels = 0, 0
-    for one, frame in each_frame(made):
+    for one, frame in each_frame(rendered):
         stored = one.video[f"flow/{direction}_valid"][frame.number]
         to = frame.number + DIRECTIONS[direction]
         if not 0 <= to < len(one.frames):
@@ -406,9 +406,9 @@ def test_flow_is_valid_where_it_ends_at_the_same_object(made, direction):
     assert open_ <= 0.01 * pixels
 
 
-def test_tracks_are_points_fixed_to_objects_and_are_seen_where_the_mask_shows_the_object(made):
+def test_tracks_are_points_fixed_to_objects_and_are_seen_where_the_mask_shows_the_object(rendered):
     worst = 0.0
-    for one in made:
+    for one in rendered:
         owner, points, seen = (one.video[f"tracks/{name}"] for name in ("object", "points", "visible"))
         slots = drawn(one)
         assert_array_equal(
@@ -433,9 +433,9 @@ def test_tracks_are_points_fixed_to_objects_and_are_seen_where_the_mask_shows_th
     assert worst <= 2e-4
 
 
-def test_tracked_points_are_uniform_in_their_objects(made):
+def test_tracked_points_are_uniform_in_their_objects(rendered):
     within = []
-    for one in made:
+    for one in rendered:
         owner, points = one.video["tracks/object"], reference.double(one.video["tracks/points"][0])
         for slot in drawn(one):
             world = reference.to_world(one.video, 0, points[owner == slot], one.view)

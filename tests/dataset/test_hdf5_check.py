@@ -21,7 +21,7 @@ def root(tmp_path: Path) -> Path:
     return synthetic.folder(synthetic.make(synthetic.dataset(tmp_path / "data", train=3)))
 
 
-def found(root: Path) -> list[str]:
+def faults_of(root: Path) -> list[str]:
     """Faults of the first shard."""
     manifest = read_manifest(root)
     shard = plan({"train": 3}, manifest.videos_per_shard)[0]
@@ -68,23 +68,23 @@ CHANGES: dict[str, tuple[Callable[[h5py.File], object], str]] = {
 
 @pytest.mark.parametrize("change", CHANGES)
 def test_a_file_that_hdf5_reads_otherwise_is_found(root: Path, change: str) -> None:
-    assert found(root) == []
+    assert faults_of(root) == []
     changed, sentence = CHANGES[change]
     with h5py.File(root / "shards" / "train-00000-n3.h5", "r+") as file:
         changed(file)
-    assert found(root) == [sentence]
+    assert faults_of(root) == [sentence]
 
 
 def test_a_file_that_keeps_hdf5_busy_or_crashes_it_is_found(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert found(root) == []
+    assert faults_of(root) == []
     busy = hdf5_check._checker_process()
     busy.send_signal(signal.SIGSTOP)
     with monkeypatch.context() as patch:
         patch.setattr(hdf5_check, "SECONDS", 0.2)
-        assert found(root) == ["HDF5 has not finished reading it after 0 s"]
+        assert faults_of(root) == ["HDF5 has not finished reading it after 0 s"]
     assert busy.wait(10) == -signal.SIGKILL
     crashing = hdf5_check._checker_process()
     crashing.send_signal(signal.SIGSTOP)
     threading.Timer(0.2, os.kill, (crashing.pid, signal.SIGKILL)).start()
-    assert found(root) == ["HDF5 crashed while reading it"]
-    assert found(root) == []
+    assert faults_of(root) == ["HDF5 crashed while reading it"]
+    assert faults_of(root) == []

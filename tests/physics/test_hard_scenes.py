@@ -7,22 +7,11 @@ import math
 
 import numpy as np
 import pytest
-from laws import holds
+from laws import deepest_overlap, holds, total_energy
 
 from gen2d.space.space import Space
-from gen2d.space.video import Video
 
 GRAVITY = 9.81  # m/s^2
-
-
-def overlap(space: Space, video: Video) -> float:
-    """Deepest overlap at any frame, m."""
-    return float(np.max(space.poses(video.position, video.angle).contacts.depth, initial=0.0))
-
-
-def energy(video: Video) -> np.ndarray:
-    """Energy at every frame, J [T]."""
-    return np.asarray(video.energy.kinetic + video.energy.rotational + video.energy.potential, float)
 
 
 # Ghost collisions ---------------------------------------------------------------------------------------------------
@@ -84,7 +73,7 @@ def test_stack_of_ten_boxes_stands():
     video = space.simulate(10, fps=60)
     last = video.position[300:, boxes]
     way = np.linalg.norm(last - last[:1], axis=-1)
-    holds("stack of 10 boxes: overlap, m", overlap(space, video), 8e-3, asked=1e-3)
+    holds("stack of 10 boxes: overlap, m", deepest_overlap(space, video), 8e-3, asked=1e-3)
     holds("stack of 10 boxes: way in the last 5 of 10 s, m", way, 2e-3, asked=1e-4)
 
 
@@ -117,7 +106,7 @@ def test_spinning_elastic_box_keeps_its_energy(spin):
         space.add_segment(a, b, elasticity=1.0, friction=0.0)
     space.add_box((0.1, 0.05), 1.0, 0.6, velocity=(5, 3), spin=spin, elasticity=1.0, friction=0.0)
     video = space.simulate(5, fps=60)
-    now = energy(video)
+    now = total_energy(video)
     holds(f"elastic box with a spin of {spin:g} rad/s in a box: energy in 5 s, relative", now / now[0] - 1, 1e-4)
 
 

@@ -9,7 +9,7 @@ from laws import holds
 
 from gen2d import Space
 
-pytestmark = pytest.mark.full  # one program, compiled once
+pytestmark = pytest.mark.full  # two programs, compiled once
 
 
 @pytest.fixture(scope="module")
@@ -89,7 +89,7 @@ def test_a_limit_stops_a_hinge_there(moved):
         holds(f"{name} limit: spin after it, rad/s", video.angular_velocity[-60:, bodies[name]], 1e-3)
 
 
-def test_the_books_tell_what_motors_dampers_and_limits_do(moved):
+def test_the_energy_budget_accounts_for_motors_dampers_and_limits(moved):
     _, video, _ = moved
     t, energy = video.time, video.energy
     exact = np.minimum(2 * t, 3) ** 2 / 2 + (2 * t) ** 2 / 2 * (1 + 1 / 3)
@@ -101,3 +101,18 @@ def test_the_books_tell_what_motors_dampers_and_limits_do(moved):
     lost = np.concatenate([[0], np.cumsum((power[1:] + power[:-1]) / 2)]) * (t[1] - t[0])
     holds("damper: lost, J", energy.lost_to_damping - lost, 5e-4)
     holds("springs, limits and motors: residual, J", energy.residual, 1e-3)
+
+
+@pytest.mark.parametrize(("stiffness", "bound"), [(1.0, 1e-5), (1e3, 1e-4), (1e6, 1e-3), (1e9, 1e-2)])
+def test_a_spring_keeps_its_energy_at_any_stiffness(stiffness: float, bound: float):
+    """From 2 m between two bodies of 1 and 3 kg in space, pulled apart by a tenth of that."""
+    space = Space(gravity=(0, 0))
+    masses = np.array([1.0, 3.0])
+    bodies = [space.add_circle((x, 0), 0.2, mass=mass) for x, mass in zip((-1.1, 1.1), masses, strict=True)]
+    space.add_joint("distance", *bodies, length=2.0, stiffness=stiffness)
+    video = space.simulate(seconds=4, fps=60, contacts=0)
+    stretch = np.linalg.norm(video.position[:, 1].astype(float) - video.position[:, 0], axis=-1) - 2.0
+    energy = 0.5 * (masses * (video.velocity**2).sum(-1)).sum(1) + 0.5 * stiffness * stretch**2
+    holds(f"spring of {stiffness:g} N/m: energy, relative", energy / energy[0] - 1, bound)  # of rounded positions
+    momentum = (video.velocity * masses[:, None]).sum(1)
+    holds(f"spring of {stiffness:g} N/m: momentum, relative", momentum / np.sqrt(energy[0]), 1e-4)

@@ -10,6 +10,7 @@ import math
 import cv2
 import numpy as np
 import pytest
+from laws import deepest_overlap, total_energy
 from numpy.testing import assert_allclose
 
 from gen2d.space.plot import RED, overlay, picture
@@ -32,8 +33,7 @@ def five_balls(**physics) -> Space:
 
 def total(video: Video) -> np.ndarray:
     """Energy at every frame, J [T]; its books add up."""
-    energy = video.energy
-    found = energy.kinetic + energy.rotational + energy.potential
+    energy, found = video.energy, total_energy(video)
     scale = max(np.abs(found).max(), np.abs(energy.potential).max(), energy.kinetic.max())
     assert np.abs(energy.residual).max() < 1e-4 * scale
     return found
@@ -55,11 +55,6 @@ def apart(video: Video) -> np.ndarray:
     """How far the anchors of each joint are apart, m [J, T]."""
     ends = (worlds(video, joint) for joint in range(len(video.joints)))
     return np.array([np.hypot(*(b - a).T) for a, b in ends])
-
-
-def depth(space: Space, video: Video) -> float:
-    """The deepest overlap at any frame, m."""
-    return max(space.poses(video.position, video.angle).contacts.depth, default=0.0)
 
 
 def opened(path) -> list[np.ndarray]:
@@ -127,7 +122,7 @@ def test_five_balls_that_collide(tmp_path):
 
     assert len(frames) == 31
     assert frames[0].shape[:2] == (404, 404)  # white around it
-    assert depth(space, video) < 1e-3
+    assert deepest_overlap(space, video) < 1e-3
     assert (np.diff(total(video)) < 1e-4).all()
     assert video.contacts.count
 
@@ -148,7 +143,7 @@ def test_five_balls_in_a_bowl(tmp_path):
     x, y = video.position[:, 3:].transpose(2, 0, 1)
     inside = np.minimum(y, np.minimum(x + y, y - x + 4) / math.sqrt(2))
     assert inside.min() > 1 - 0.01  # nothing leaves the bowl, or sinks in
-    assert depth(space, video) < 0.01
+    assert deepest_overlap(space, video) < 0.01
     assert (np.diff(total(video)) < 1e-3).all()
     # An arrow at every touch of the last frame.
     last = video.contacts.frame == 50
@@ -211,7 +206,7 @@ def test_bridge():
     assert apart(video)[:, -30:].max() < 2e-3  # and so far under its weight
     low = min(end[-1, 1] for joint in range(5) for end in worlds(video, joint))
     assert video.position[-1, ball, 1] > low  # the bridge holds it
-    assert depth(space, video) < 5e-3
+    assert deepest_overlap(space, video) < 5e-3
     total(video)
 
 

@@ -14,6 +14,9 @@ import jax.numpy as jnp
 import numpy as np
 from worlds import STEP, run, world
 
+from gen2d.space.space import Space
+from gen2d.space.video import Video
+
 GRAVITY = 9.81  # m/s^2
 DOWN = (0.0, -GRAVITY)
 FLOOR = {"a": (-50.0, 0.0), "b": (50.0, 0.0), "elasticity": 1.0, "friction": 1.0}
@@ -139,3 +142,13 @@ def overlaps(one: tuple, position: np.ndarray) -> np.ndarray:
         depth = radius[:n] + radius[k] - np.linalg.norm(x - nearest, axis=-1)
         depths = np.maximum(depths, np.where(present[:n] & present[k], depth, -np.inf).max(1))
     return depths
+
+
+def deepest_overlap(space: Space, video: Video) -> float:
+    """Deepest overlap of two bodies at any frame, m."""
+    return float(np.max(space.poses(video.position, video.angle).contacts.depth, initial=0.0))
+
+
+def total_energy(video: Video) -> np.ndarray:
+    """Kinetic and potential energy at every frame, J [T]."""
+    return np.asarray(video.energy.kinetic + video.energy.rotational + video.energy.potential, float)
