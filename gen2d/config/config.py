@@ -201,6 +201,10 @@ def _with_splits(config: Config, written: Any, source: str, copies: Copies) -> C
                 split_sections[name] = _parse_section(name, values, "config", copies)
         except ConfigError as error:
             raise ConfigError(f"{source}: splits.{split.name}: {str(error).removeprefix('config: ')}") from None
+        precision = split_sections.get("physics", config.physics).precision
+        if precision != config.physics.precision:
+            message = f"{source}: splits.{split.name}.physics.precision is {precision!r}, but must be that of all"
+            raise ConfigError(f"{message} splits, {config.physics.precision}")
         if "look" in split_sections and split_sections["look"].sha256:
             changes["look"] = named(changes["look"]) | {"sha256": split_sections["look"].sha256}
         resolved.append(dataclasses.replace(split, written=json.dumps(changes), sections=split_sections))

@@ -35,6 +35,7 @@ class Option:
     each: str = ""
     optional: bool = False  # may be null: gen2d decides
     several: bool = False  # may also be a list of values
+    later: bool = False  # younger than stored configs, which lack it: plain values have it only where it is changed
 
     @property
     def allowed(self) -> str:
@@ -73,8 +74,13 @@ def plain_value(value: Any) -> Any:
 
 
 def plain_of(options: Any) -> dict[str, Any]:
-    """Options as plain YAML and JSON values, by name."""
-    return {field.name: plain_value(getattr(options, field.name)) for field in dataclasses.fields(options)}
+    """Options as plain YAML and JSON values, by name; a later option is left out at its default."""
+    plain = {}
+    for field in dataclasses.fields(options):
+        value = getattr(options, field.name)
+        if not field.metadata["option"].later or value != field.default:
+            plain[field.name] = plain_value(value)
+    return plain
 
 
 def _in_range(spec: Option, low: float, high: float) -> bool:

@@ -85,19 +85,19 @@ def split(key: Array, shape: tuple[int, ...]) -> Array:
 
 def uniform(key: Array, shape: tuple[int, ...], low: Any, high: Any) -> Array:
     """Samples from low to high, without high."""
-    return jax.random.uniform(key, shape, minval=low, maxval=high)
+    return jax.random.uniform(key, shape, jnp.float32, low, high)
 
 
 def integers(key: Array, shape: tuple[int, ...], low: Any, stop: Any) -> Array:
     """Whole samples from low to stop, without stop, int32."""
-    return jax.random.randint(key, shape, low, stop)
+    return jax.random.randint(key, shape, low, stop, jnp.int32)
 
 
 def normal(key: Array, shape: tuple[int, ...]) -> Array:
     """Samples of mean 0 and standard deviation 1."""
-    return jax.random.normal(key, shape)
+    return jax.random.normal(key, shape, jnp.float32)
 
 
 def truncated_normal(key: Array, shape: tuple[int, ...], low: Any, high: Any) -> Array:
     """Samples of mean 0 and standard deviation 1 before truncation from low to high."""
-    return jax.random.truncated_normal(key, low, high, shape)
+    return jax.random.truncated_normal(key, low, high, shape, jnp.float32)

@@ -38,6 +38,19 @@ class PhysicsOptions:
     )
     contact_damping_ratio: float = option(10.0, float, "1", "damping ratio of a contact", above=0)
     push_speed: float = option(3.0, float, "m/s", "largest speed at which an overlap is resolved", above=0)
+    precision: str = option(
+        "float32",
+        str,
+        "",
+        "type of the simulation's numbers, in which states, contacts and energy are stored",
+        choices=("float32", "float64"),
+        later=True,
+    )
+
+    @property
+    def x64(self) -> bool:
+        """Whether the simulation runs in jax's 64-bit mode."""
+        return self.precision == "float64"
 
 
 @dataclasses.dataclass(frozen=True)

@@ -61,7 +61,8 @@ class DataLoader(Generic[A]):
         Function from a NumPy batch to a batch of new arrays. It runs in the reading threads, so several calls may run
         at once.
     to : "numpy", "torch" or "jax"
-        Type of the arrays. jax has no 64-bit types by default. Text fields stay NumPy bytes.
+        Type of the arrays. With "jax", numbers of 64 bits are rounded to 32, unless jax is in its 64-bit mode. Text
+        fields stay NumPy bytes.
     device : torch.device, str or jax.Device, optional
         Device of the batches, with `to="torch"` or `to="jax"`. The default is the CPU for torch, jax's default device
         for jax.

@@ -34,7 +34,7 @@ def lyapunov_exponent(
     """
     change = perturbation(keys, scene, state)
     _, after = jax.jvp(lambda start: last_state(run(scene, start).states), (state,), (change,))
-    most = jnp.finfo(jnp.float32).max  # an overflow counts as the largest growth
+    most = jnp.finfo(state.angle.dtype).max  # an overflow counts as the largest growth
     size = jnp.clip(jnp.nan_to_num(perturbation_size(after), nan=most, posinf=most), SMALL * SMALL)
     moves = perturbation_size((change.position, change.velocity)) > 0
     return jnp.where(moves, jnp.log10(size) - jnp.log10(SMALL), 0.0) / (seconds or 1.0)
@@ -43,8 +43,9 @@ def lyapunov_exponent(
 def perturbation(keys: Array, scene: Scene, state: State) -> State:
     """Random perturbation of the size SMALL."""
     dynamic = scene.objects.present & (scene.objects.kind == DYNAMIC)
-    normal = jax.vmap(lambda key: jax.random.normal(key_for(key, "lyapunov"), (2, *state.position.shape[:2])))(keys)
-    position, velocity = jnp.where(dynamic, jnp.moveaxis(normal, 0, -1), 0.0)
+    shape = 2, *state.position.shape[:2]
+    normal = jax.vmap(lambda key: jax.random.normal(key_for(key, "lyapunov"), shape, jnp.float32))(keys)
+    position, velocity = jnp.where(dynamic, jnp.moveaxis(normal, 0, -1), 0.0).astype(state.angle.dtype)
     zero = jnp.zeros_like(state.angle)
     change = State(position, zero, velocity, zero)
     size = perturbation_size((position, velocity))

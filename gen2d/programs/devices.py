@@ -58,7 +58,8 @@ def prepare(device: str = "auto") -> list[Device]:
     jax.config.update("jax_threefry_partitionable", True)  # sampled values depend on it
     if jax.config.values["jax_enable_x64"]:
         raise DeviceError(
-            "jax is in 64-bit mode (JAX_ENABLE_X64), but gen2d stores and computes in 32 bits: switch it off"
+            "jax is in 64-bit mode (JAX_ENABLE_X64), but gen2d samples and renders in 32 bits: switch it off, and say "
+            "physics.precision=float64 for a simulation in 64 bits"
         )
     if jax.config.values["jax_compilation_cache_dir"] is None:
         jax.config.update("jax_compilation_cache_dir", str(default_cache()))

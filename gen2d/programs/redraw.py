@@ -240,7 +240,8 @@ def simulate_again(
     -------
     dict of jax.Array
         Fields by stored name: "states/position" [n, T, K, 2] in m and the other states, "time" [T] in s, and the
-        camera's fields; contacts and energy if the config enables them.
+        camera's fields; contacts and energy if the config enables them. With physics.precision=float64, what is
+        simulated is float64.
 
     Raises
     ------
@@ -267,9 +268,10 @@ def simulate_again(
     config = load_config(base, changes)
     if not set(matched.VIOLATIONS).isdisjoint(config.matched.change or ()):
         raise ConfigError(f"{ds.root}: matched.change has violations, which cannot be simulated again from a scene")
-    simulated = _compile(_simulate_columns, RenderSettings(base, config))
+    simulated = _compile(_simulate_columns, RenderSettings(base, config), x64=config.physics.x64)
     columns = simulated(_with_all_fields(ds).batch(numbers), seed_words_of(ds), jnp.asarray(numbers, jnp.uint32))
-    return columns | {"time": jnp.arange(config.video.frames) / config.video.fps}
+    with jax.enable_x64(config.physics.x64):
+        return columns | {"time": jnp.arange(config.video.frames) / config.video.fps}
 
 
 # ---- Configs
@@ -398,27 +400,31 @@ def _simulate_columns(
     columns: FieldColumns, words: Array, numbers: Array, settings: RenderSettings
 ) -> dict[str, Array]:
     config, layout = settings.config, settings.layout
-    scene = scene_of(columns)
     first = jax.tree.map(lambda a: a[:, 0], from_columns(State, columns))
+    scene, first = axes.to_precision((scene_of(columns), first), config.physics.precision)
     steps = steps_of(config)
     rules = solver_params(config.physics, config.video.fps, steps)
     saved = dataclasses.replace(save_at(config, layout), between=False)
     start = axes.to_device(scene), axes.to_device(first)
     trajectory = axes.to_stored(simulate(*start, layout, rules, config.video.frames, steps, saved, sparse=on_cpu()))
     keys = sets_module.keys_of(words, numbers, settings.base.matched)
-    view = jax.vmap(lambda key, states: render_module.view_of(key, config, layout, states))(keys, trajectory.states)
+    states = axes.to_precision(trajectory.states, "float32")
+    with jax.enable_x64(False):
+        view = jax.vmap(lambda key, states: render_module.view_of(key, config, layout, states))(keys, states)
     return axes.columns(trajectory) | render_module.camera_columns(view)
 
 
 @functools.lru_cache(maxsize=16)
-def _compile(program: Callable[..., Any], settings: RenderSettings, *more: float) -> Callable[..., Any]:
+def _compile(
+    program: Callable[..., Any], settings: RenderSettings, *more: float, x64: bool = False
+) -> Callable[..., Any]:
     """One of the functions above, compiled for these settings with the options of a run, so that they round alike."""
 
     def run(*arrays: Any) -> Any:
         return program(*arrays, settings, *more)
 
     key = program.__name__, *settings.texts, more
-    return cached_jit(run, key, own_code=bool(settings.config.copies))
+    return cached_jit(run, key, bool(settings.config.copies), x64)
 
 
 def regenerate(ds: Dataset, config: Config, numbers: np.ndarray) -> dict[str, Array]:

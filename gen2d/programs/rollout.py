@@ -174,7 +174,7 @@ class Rollout:
         """Programs from video numbers to render scenes, by name."""
         config, size, programs = self.config, self.batch_size, {}
         numbers, grid = np.zeros(size, np.uint32), np.zeros((size, len(self.sampler.gridded)), np.float32)
-        args = np.zeros(3, np.uint32), np.int32(0), grid, numbers, numbers
+        args, x64 = (np.zeros(3, np.uint32), np.int32(0), grid, numbers, numbers), config.physics.x64
         keep, sparse, physical = self.save_at, self.sparse, Layout(self.layout.groups, joints=self.layout.joints)
 
         def members(config: Config, layout: Layout) -> Members:
@@ -192,7 +192,7 @@ class Rollout:
         if config.matched.change:
             sections = "scene", "splits", "quality", "matched", "video", "physics"
             members_config = only_sections(config, *sections, simulated=True)
-            programs["members"] = self._program(members_config, self.layout, keep, members, args)
+            programs["members"] = self._program(members_config, self.layout, keep, members, args, x64)
             sampled, simulated = programs["members"].results
         else:
             sample_config = only_sections(config, "scene", "splits", "quality", "matched")
@@ -200,7 +200,7 @@ class Rollout:
             sampled = programs["sample"].results
             args = sampled.keys, sampled.scene, sampled.state
             simulate_config = only_sections(config, "video", "physics", simulated=True)
-            programs["simulate"] = self._program(simulate_config, physical, keep, simulate, args)
+            programs["simulate"] = self._program(simulate_config, physical, keep, simulate, args, x64)
             simulated = programs["simulate"].results
         args = sampled.keys, sampled.scene, simulated.trajectory.states, simulated.trajectory.between
         stage_config = only_sections(config, "video", "camera", "image", "look")
@@ -225,8 +225,10 @@ class Rollout:
             self._draws[count] = self._program(config, self.layout, count, draw, args)
         return self._draws[count]
 
-    def _program(self, config: Config, layout: Layout, key: Hashable, build: Build, args: tuple) -> BoundProgram:
-        return program_for(config, layout, key, build, args, self.devices[0])
+    def _program(
+        self, config: Config, layout: Layout, key: Hashable, build: Build, args: tuple, x64: bool = False
+    ) -> BoundProgram:
+        return program_for(config, layout, key, build, args, self.devices[0], x64)
 
     def host_columns(self, batches: Sequence[DeviceBatch]) -> list[dict[str, np.ndarray]]:
         """Each device's columns as NumPy arrays; waits for the devices."""

@@ -56,7 +56,10 @@ class VideoSchema:
         config = self.config
         records = [scene.State, trajectory.Quality, *([trajectory.Contacts] if self.save_at.contacts else [])]
         records += [trajectory.Energy] if self.save_at.energy else []
-        fields = {name: field for record in records for name, (_, field) in axes.stored_fields(record).items()}
+        simulated = {name: field for record in records for name, (_, field) in axes.stored_fields(record).items()}
+        if config.annotations.simulated.lyapunov:
+            simulated |= lyapunov.FIELDS
+        fields = {name: self._in_precision(field) for name, field in simulated.items()}
         fields |= axes.fields_of(jax.eval_shape(self._scene, jax.eval_shape(lambda: jax.random.key(0))))
         if not self.save_at.energy:
             del fields["quality/energy_residual"]
@@ -65,8 +68,6 @@ class VideoSchema:
         if self.plan.frames:
             fields["frames"] = FRAMES
         fields |= self.host_fields
-        if config.annotations.simulated.lyapunov:
-            fields |= lyapunov.FIELDS
         fields["index"] = Field("int64", "n", "1", "number of the video in its split")
         fields["time"] = Field("float64", "T", "s", "time of each frame; frame 0 is the initial state")
         if self.layout.joints:
@@ -78,6 +79,10 @@ class VideoSchema:
             fields[f"camera/{name}"] = Field("float32", axis_names, unit, meaning)
         fields |= sampler.fields(config) | sets.fields(config.matched)
         return dict(sorted(annotations.fields(config.annotations, fields).items()))
+
+    def _in_precision(self, field: Field) -> Field:
+        """A field of the simulation, whose floating-point numbers are stored as they are computed."""
+        return dataclasses.replace(field, dtype=self.config.physics.precision) if field.dtype == "float32" else field
 
     def _scene(self, key: jax.Array) -> scene.Scene:
         return self.sampler.sample(key, given=jnp.zeros(len(self.sampler.gridded)))[1].scene

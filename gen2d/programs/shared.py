@@ -35,19 +35,23 @@ class Program:
     ----------
     trace : Trace
         Its parameters, the hash of its text without names and source locations, and the shapes of its results.
+    x64 : bool
+        Whether it is traced, compiled and called in jax's 64-bit mode.
     executable : bytes or None
         Its executable, for all devices of its kind; None until it is compiled, and where XLA cannot give the bytes.
     """
 
-    def __init__(self, trace: Trace, device: Device, lowered: Any = None, executable: bytes | None = None) -> None:
-        self.trace, self.executable = trace, executable
+    def __init__(
+        self, trace: Trace, device: Device, x64: bool, lowered: Any = None, executable: bytes | None = None
+    ) -> None:
+        self.trace, self.x64, self.executable = trace, x64, executable
         self._device, self._lowered = device, lowered  # lowered for this device, where there is no executable yet
         self._loaded: dict[Device, Callable[..., Any]] = {}
         self._lock = threading.Lock()
 
     def load(self, device: Device) -> Callable[..., Any]:
         """The program on a device, as a function of leaves; compiled on the first call for any device."""
-        with self._lock:
+        with self._lock, jax.enable_x64(self.x64):
             if device not in self._loaded:
                 if self.executable is None:
                     self._loaded[self._device], self.executable = executables.compiled(self._lowered, self._device)
@@ -72,8 +76,10 @@ class BoundProgram(NamedTuple):
     numbers: np.ndarray  # uint32 [SIZE]
 
     def __call__(self, device: Device, *args: Any) -> Any:
-        """Result of the program on a device."""
-        leaves = self.program.load(device)(self.numbers, *jax.tree.leaves(args))
+        """Result of the program on a device; without the 64-bit mode it takes float64 as float32."""
+        program, x64 = self.program.load(device), self.program.x64
+        with jax.enable_x64(x64):
+            leaves = program(self.numbers, *(_taken(leaf, x64) for leaf in jax.tree.leaves(args)))
         return jax.tree.unflatten(jax.tree.structure(self.program.trace.results), leaves)
 
     @property
@@ -92,7 +98,7 @@ _lock = threading.Lock()
 
 
 def program_for(
-    config: Config, layout: Layout, key: Hashable, build: Build, args: tuple, device: Device
+    config: Config, layout: Layout, key: Hashable, build: Build, args: tuple, device: Device, x64: bool = False
 ) -> BoundProgram:
     """The program of a config: one that is already there if it serves the config, else a new one, traced for `args`.
 
@@ -110,6 +116,8 @@ def program_for(
         Arguments of the function, or their shapes.
     device : jax.Device
         Any device of the kind that the program shall run on.
+    x64 : bool
+        Whether the program runs in jax's 64-bit mode.
     """
     structure, leaves = split_numbers(config, layout)
 
@@ -117,10 +125,12 @@ def program_for(
         return build(*parametrized(config, tape, layout))
 
     own_code = bool(config.copies)
-    return _bound(_Request(build.__qualname__, (key, structure), leaves, function, args, device, own_code))
+    return _bound(_Request(build.__qualname__, (key, structure), leaves, function, args, device, own_code, x64))
 
 
-def cached_jit(function: Callable[..., Any], key: Hashable | None, own_code: bool = False) -> Callable[..., Any]:
+def cached_jit(
+    function: Callable[..., Any], key: Hashable | None, own_code: bool = False, x64: bool = False
+) -> Callable[..., Any]:
     """A function whose compiled programs are kept in memory and on disk, as those of configs are.
 
     Parameters
@@ -132,16 +142,21 @@ def cached_jit(function: Callable[..., Any], key: Hashable | None, own_code: boo
         Equal keys have the same `repr`. None where nobody can say; the function is then only jitted.
     own_code : bool
         Whether a user's file can reach the function.
+    x64 : bool
+        Whether the function runs in jax's 64-bit mode; otherwise it takes float64 as float32.
     """
     device, name = devices.default(), f"{function.__module__}.{function.__qualname__}"
     jitted = jax.jit(function)
 
     def call(*args: Any) -> Any:
         leaves, tree = jax.tree.flatten(args)
-        if key is None or any(isinstance(leaf, Tracer) for leaf in leaves):
+        if any(isinstance(leaf, Tracer) for leaf in leaves):
             return jitted(*args)
-        args = tree.unflatten(jax.device_put(leaves, device))
-        return _bound(_Request(name, key, [], lambda tape: function, args, device, own_code))(device, *args)
+        with jax.enable_x64(x64):
+            if key is None:
+                return jitted(*args)
+            args = tree.unflatten(jax.device_put(leaves, device))
+        return _bound(_Request(name, key, [], lambda tape: function, args, device, own_code, x64))(device, *args)
 
     return call
 
@@ -156,15 +171,33 @@ class _Request(NamedTuple):
     args: tuple
     device: Device
     own_code: bool
+    x64: bool
+
+    @property
+    def types(self) -> list[jax.ShapeDtypeStruct]:
+        """Shapes and types of the leaves of the arguments."""
+        return [jax.ShapeDtypeStruct(np.shape(x), _type(x, self.x64)) for x in jax.tree.leaves(self.args)]
+
+
+def _type(leaf: Any, x64: bool) -> np.dtype:
+    """Type as which a program takes a leaf of its arguments."""
+    return np.dtype(np.float32) if leaf.dtype == np.float64 and not x64 else leaf.dtype
+
+
+def _taken(leaf: Any, x64: bool) -> Any:
+    """A leaf as a program takes it."""
+    dtype = _type(leaf, x64)
+    return leaf if leaf.dtype == dtype else leaf.astype(dtype)
 
 
 def _bound(request: _Request) -> BoundProgram:
     """The program that serves a request: one that is in memory or on disk, else a new one."""
-    name, key, leaves, _, args, device, own_code = request
-    shapes = [(np.shape(x), str(x.dtype)) for x in jax.tree.leaves(args)]
+    name, key, leaves, _, args, device, own_code, x64 = request
+    types = [(x.shape, str(x.dtype)) for x in request.types]
+    parts = name, key, str(jax.tree.structure(args)), types, device.device_kind, x64
     # Addresses of functions differ between processes; their sources are part of the key on disk.
-    text = re.sub(r" at 0x[0-9a-f]+", "", repr((name, key, str(jax.tree.structure(args)), shapes, device.device_kind)))
-    with _lock:
+    text = re.sub(r" at 0x[0-9a-f]+", "", repr(parts))
+    with _lock, jax.enable_x64(x64):
         for entry in _programs:
             numbers = entry[1].trace.tape.arguments(leaves) if entry[0] == text else None
             if numbers is not None:
@@ -172,7 +205,7 @@ def _bound(request: _Request) -> BoundProgram:
                 break
         else:
             disk = text, device, own_code
-            program = _stored(disk, leaves)
+            program = _stored(disk, x64, leaves)
             if program is None:
                 program = _traced(request)
                 executables.store_trace(*disk, program.trace)
@@ -192,20 +225,20 @@ def clear() -> None:
             _programs.pop()[1].unload()
 
 
-def _stored(disk: tuple[str, Device, bool], leaves: Sequence[Any]) -> Program | None:
+def _stored(disk: tuple[str, Device, bool], x64: bool, leaves: Sequence[Any]) -> Program | None:
     """The program on disk that serves these numbers; None if there is none."""
     device = disk[1]
     for trace in executables.find_traces(*disk):
         if trace.tape.arguments(leaves) is not None:
-            return _loadable(trace, device)
+            return _loadable(trace, device, x64)
     return None
 
 
-def _loadable(trace: Trace, device: Device) -> Program | None:
+def _loadable(trace: Trace, device: Device, x64: bool) -> Program | None:
     """The program with this trace, if its executable is on disk and can be loaded."""
     executable = executables.find_executable(trace.digest, device)
     try:
-        program = None if executable is None else Program(trace, device, executable=executable)
+        program = None if executable is None else Program(trace, device, x64, executable=executable)
         if program is not None:
             program.load(device)
         return program
@@ -215,7 +248,7 @@ def _loadable(trace: Trace, device: Device) -> Program | None:
 
 def _traced(request: _Request) -> Program:
     device, tape, one = request.device, Tape(), SingleDeviceSharding(request.device)
-    function, (leaves, tree) = request.function(tape), jax.tree.flatten(request.args)
+    function, tree = request.function(tape), jax.tree.structure(request.args)
     results: Any = None
 
     def run(numbers: jax.Array, *leaves: Any) -> list[jax.Array]:
@@ -226,12 +259,12 @@ def _traced(request: _Request) -> Program:
 
     run.__name__ = request.name.rpartition(".")[2]
     numbers = jax.ShapeDtypeStruct((SIZE,), np.uint32)
-    shapes = [jax.ShapeDtypeStruct(np.shape(x), x.dtype, sharding=one) for x in (numbers, *leaves)]
+    shapes = [jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=one) for x in (numbers, *request.types)]
     lowered = jax.jit(run).lower(*shapes)
     results = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), results)
     inputs = [f"{x.dtype}{x.shape}" for x in shapes]  # jax leaves those out of the text that are not used
     trace = Trace(tape, sha256(as_json([canonical(lowered.as_text()), inputs])), results)
-    return _loadable(trace, device) or Program(trace, device, lowered)
+    return _loadable(trace, device, request.x64) or Program(trace, device, request.x64, lowered)
 
 
 def canonical(text: str) -> str:

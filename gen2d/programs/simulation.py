@@ -103,7 +103,7 @@ class Simulation:
 
     def trajectory(self, scene: Scene, state: State) -> Trajectory:
         """Trajectories with the videos first."""
-        trajectory = self._device_trajectory(axes.to_device(scene), axes.to_device(state), self.keep)
+        trajectory = self._device_trajectory(*self._start(scene, state), self.keep)
         between = trajectory.between
         if between is not None:  # from [T - 1, steps, (2,) K, n] to [n, T - 1, steps, K(, 2)]
             between = jax.tree.map(lambda x: jnp.moveaxis(jnp.moveaxis(x, -1, 0), -1, 3), between)
@@ -115,8 +115,13 @@ class Simulation:
         if not self.config.annotations.simulated.lyapunov:
             return None
         video, rerun = self.config.video, functools.partial(self._device_trajectory, keep=SaveAt())
-        start, seconds = (axes.to_device(scene), axes.to_device(state)), (video.frames - 1) / video.fps
-        return lyapunov.lyapunov_exponent(wrapped(keys), *start, rerun, seconds)
+        seconds = (video.frames - 1) / video.fps
+        return lyapunov.lyapunov_exponent(wrapped(keys), *self._start(scene, state), rerun, seconds)
+
+    def _start(self, scene: Scene, state: State) -> tuple[Scene, State]:
+        """Scene and initial state in the precision of the simulation, in the device's layout."""
+        scene, state = axes.to_precision((scene, state), self.config.physics.precision)
+        return axes.to_device(scene), axes.to_device(state)
 
     def _device_trajectory(self, scene: Scene, state: State, keep: SaveAt) -> Trajectory:
         """Trajectories from these initial states, in the device's layout."""
@@ -134,7 +139,7 @@ class Members:
     def __call__(
         self, root: Array, row: Array, grid: Array, numbers: Array, attempts: Array
     ) -> tuple[SampledBatch, SimulatedBatch]:
-        """Videos with these numbers [n]."""
+        """Videos with these numbers [n]; sampled in 32 bits, whatever the precision of the simulation."""
         keys = sets.keys_of(root, numbers, self.config.matched)
 
         def member(key: Array, change: FactorChange | None = None) -> tuple[SampledFactors, SampledScene]:
@@ -143,7 +148,8 @@ class Members:
         factors, sampled, trajectory, record = simulate_module.simulate_members(
             keys, numbers, self.config, self.layout, member, self.simulation.trajectory
         )
-        batch = self.sampling.batch(keys, factors, sampled)
+        with jax.enable_x64(False):
+            batch = self.sampling.batch(keys, factors, sampled)
         exponents = self.simulation.exponents(batch.keys, batch.scene, batch.state)
         return batch._replace(columns=batch.columns | record), SimulatedBatch(trajectory, exponents)
 

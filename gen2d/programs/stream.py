@@ -104,7 +104,8 @@ def stream(
     drop_last : bool
         Whether to drop the last videos of an epoch that fill no batch of all ranks.
     to : str
-        "jax", or "torch" for tensors that share the same memory by DLPack. Text is an array of bytes in NumPy.
+        "jax", or "torch" for tensors that share the same memory by DLPack. With "jax", numbers of 64 bits are rounded
+        to 32, unless jax is in its 64-bit mode. Text is an array of bytes in NumPy.
     device : str
         "auto", "cpu" or "gpu".
 
@@ -241,7 +242,8 @@ class Stream:
         if self.fields.keys() - batch.columns.keys() - host_fields - {"index"}:
             columns |= self._render_cell(batch, row)
         numbers, starts = jnp.asarray(cell.numbers.astype(np.int32)), jnp.asarray(cell.starts, jnp.int32)
-        fields = self._jitted_cell_views(columns, numbers, starts, np.int32(row))
+        with jax.enable_x64(self.source.config.physics.x64):
+            fields = self._jitted_cell_views(columns, numbers, starts, np.int32(row))
         fields |= self._host_fields(batch, row, host_fields) if host_fields else {}
         return fields if cell.videos == self.cell else {name: array[: cell.videos] for name, array in fields.items()}
 
@@ -295,6 +297,12 @@ def _apply_view(name: str, field: Field, values: Array, starts: Array, options: 
     return values
 
 
+def _to_jax(batch: Arrays) -> Arrays:
+    """The batch in the types that jax has in its present mode, as from a `DataLoader`."""
+    numbers, text = without_text(batch)
+    return {name: values.astype(jax.dtypes.canonicalize_dtype(values.dtype)) for name, values in numbers.items()} | text
+
+
 def _to_torch(batch: Arrays) -> Arrays:
     torch = importlib.import_module("torch")
     numbers, text = without_text(batch)
@@ -302,4 +310,4 @@ def _to_torch(batch: Arrays) -> Arrays:
 
 
 # Conversions of a batch, by the value of `to`.
-_CONVERTERS = {"jax": lambda batch: batch, "torch": _to_torch}
+_CONVERTERS = {"jax": _to_jax, "torch": _to_torch}

@@ -91,6 +91,15 @@ def _transpose(value: Any, back: bool) -> Any:
     return dataclasses.replace(value, **changes)
 
 
+def to_precision(value: Record, dtype: str) -> Record:
+    """The record, or tree of records, with its floating-point numbers of this type."""
+
+    def convert(x: Array) -> Array:
+        return x.astype(dtype) if jnp.issubdtype(x.dtype, jnp.floating) else x
+
+    return jax.tree.map(convert, value)
+
+
 def to_device(value: Record) -> Record:
     """The record in device layout (videos last), from stored layout (videos first)."""
     return _transpose(value, back=False)

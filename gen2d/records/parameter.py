@@ -34,7 +34,7 @@ class Tape:
         self._nodes: list[tuple[Callable[..., Any], tuple[Any, ...]]] = []  # operation and operands, in order
         self._parameters: dict[Hashable, Parameter] = {}
         self.guards: dict[int, Any] = {}  # value that each of these nodes must have
-        self._arguments: dict[int, tuple[int, Parameter]] = {}  # first place, by node
+        self._arguments: dict[tuple[int, np.dtype], tuple[int, Parameter]] = {}  # first place, by node and type
         self._used = 0
         self._trace = threading.local()  # its `arguments`: those of the program that this thread traces
 
@@ -79,24 +79,25 @@ class Tape:
             self._trace.arguments = outer
 
     def traced(self, parameter: "Parameter") -> jax.Array:
-        """A parameter as a float32 or int32 array of the program that is being traced.
+        """A parameter as an array of the program that is being traced, of the type `Parameter.dtype`.
 
         Raises ConfigError if the program has too many.
         """
         arguments = getattr(self._trace, "arguments", None)
         if arguments is None:
             raise RuntimeError("a parameter is an array only while its program is traced")
-        if parameter.node not in self._arguments:
-            self._arguments[parameter.node] = self._used, parameter
-            self._used += parameter.size
+        dtype, key = parameter.dtype, (parameter.node, parameter.dtype)
+        words = [2] if dtype.itemsize == 8 else []
+        if key not in self._arguments:
+            self._arguments[key] = self._used, parameter
+            self._used += math.prod([parameter.size, *words])
             if self._used > SIZE:
                 raise ConfigError(
                     f"config: one of its programs takes {self._used:,} numbers or more, but at most {SIZE:,} are "
                     "possible: shorten its longest choice, grid or palette"
                 )
-        start, _ = self._arguments[parameter.node]
-        words = arguments[start : start + parameter.size].reshape(parameter.shape)
-        return jax.lax.bitcast_convert_type(words, parameter.dtype)
+        start, shape = self._arguments[key][0], (*parameter.shape, *words)
+        return jax.lax.bitcast_convert_type(arguments[start : start + math.prod(shape)].reshape(shape), dtype)
 
     def arguments(self, leaves: Sequence[Any]) -> np.ndarray | None:
         """Arguments of the programs, uint32 [SIZE], for other leaves; None if the programs do not serve these."""
@@ -111,11 +112,11 @@ class Tape:
         if not all(_identity(values[node]) == _identity(value) for node, value in self.guards.items()):
             return None
         words = np.zeros(SIZE, np.uint32)
-        for node, (start, parameter) in self._arguments.items():
-            argument = _as_argument(values[node])
-            if (argument.dtype, argument.shape) != (parameter.dtype, parameter.shape):
+        for (node, dtype), (start, parameter) in self._arguments.items():
+            argument = _as_argument(values[node], wide=dtype.itemsize == 8)
+            if (argument.dtype, argument.shape) != (dtype, parameter.shape):
                 return None  # `maximum` of a whole number and a fraction may be either
-            words[start : start + argument.size] = argument.ravel().view(np.uint32)
+            words[start : start + argument.nbytes // 4] = argument.ravel().view(np.uint32)
         return words
 
 
@@ -131,13 +132,17 @@ def _identity(value: Any) -> Hashable:
     return type(value), repr(value) if value != value else value
 
 
-def _as_argument(value: Any) -> np.ndarray:
-    array = np.asarray(value)
-    return array.astype(np.float32 if array.dtype.kind == "f" else np.int32)
+def _as_argument(value: Any, wide: bool) -> np.ndarray:
+    """A number as int32 or float32; with `wide`, a fraction is float64."""
+    array, real = np.asarray(value), np.float64 if wide else np.float32
+    return array.astype(real if array.dtype.kind == "f" else np.int32)
 
 
 class Parameter:
-    """A number, or an array of numbers, that a tape computes from the leaves of a config."""
+    """A number, or an array of numbers, that a tape computes from the leaves of a config.
+
+    As an array it is int32 or float32; in jax's 64-bit mode, a fraction is float64.
+    """
 
     __slots__ = ("node", "tape", "value")
 
@@ -146,7 +151,7 @@ class Parameter:
 
     # ---- As an array
 
-    dtype = property(lambda self: _as_argument(self.value).dtype)
+    dtype = property(lambda self: _as_argument(self.value, wide=jax.config.values["jax_enable_x64"]).dtype)
     shape = property(lambda self: np.shape(self.value))
     ndim = property(lambda self: np.ndim(self.value))
     size = property(lambda self: np.size(self.value))

@@ -76,7 +76,7 @@ def closest_points(
 
 @functools.lru_cache(maxsize=8)  # a program takes up to thousands of memory maps, of which a process has some 60,000
 def compiled_program(
-    layout: Layout, params: SolverParams, frames: int, steps: int, keep: SaveAt, forces: Any
+    layout: Layout, params: SolverParams, frames: int, steps: int, keep: SaveAt, forces: Any, x64: bool
 ) -> Callable:
     """Compiled simulation of a layout; scenes, states and trajectories have the videos first.
 
@@ -88,7 +88,7 @@ def compiled_program(
         device = to_device(scene), to_device(state)
         return to_stored(simulate(*device, layout, params, frames, steps, keep, hook, on_cpu()))
 
-    return cached_jit(run, None if forces else (layout, params, frames, steps, keep))
+    return cached_jit(run, None if forces else (layout, params, frames, steps, keep), x64=x64)
 
 
 def _slot_forces(forces: Callable, slots: tuple[int, ...]) -> Forces:

@@ -61,7 +61,7 @@ class Space:
     **physics
         Options of a config's section `physics`, with the same defaults: damping (1/s), mixing ("product", "mean",
         "max", "geometric"), bounce_threshold (m/s), max_step (s), substeps, contact_hertz (Hz), contact_damping_ratio,
-        push_speed (m/s).
+        push_speed (m/s), precision ("float32", "float64").
 
     Raises
     ------
@@ -385,8 +385,12 @@ class Space:
         ConfigError
             If no body is dynamic.
         """
+        with jax.enable_x64(self.physics.x64):
+            return self._scene()
+
+    def _scene(self) -> tuple[Scene, State, Layout]:
         groups, slots, bodies = self._arrange()
-        real = np.dtype(jnp.result_type(float))
+        real = np.dtype(self.physics.precision)
 
         def column(name: str, dtype: Any = real) -> jax.Array:
             return jnp.asarray(np.array([getattr(body, name) for body in bodies]).astype(dtype))
@@ -503,8 +507,9 @@ class Space:
         params, steps = self._solver_params(fps, substeps)
         slots = self.slots
         slot_forces = None if forces is None else (forces, tuple(int(s) for s in slots))
-        program = compiled_program(layout, params, frames, steps, SaveAt(rows, energy), slot_forces)
-        trajectory = jax.tree.map(lambda x: np.asarray(x[0]), program(*jax.tree.map(lambda x: x[None], (scene, state))))
+        program = compiled_program(layout, params, frames, steps, SaveAt(rows, energy), slot_forces, self.physics.x64)
+        trajectory = program(*jax.tree.map(lambda x: x[None], (scene, state)))
+        trajectory = jax.tree.map(lambda x: np.asarray(x)[0], trajectory)
         states = trajectory.states
         return Video(
             bodies=tuple(self.bodies),
@@ -558,7 +563,9 @@ class Space:
         if angle is not None and angles.shape != positions.shape[:2]:
             raise ConfigError(f"poses: angle has shape {list(angles.shape)}, but must have {list(positions.shape[:2])}")
         angles = np.broadcast_to(angles, positions.shape[:2])
-        return Poses(tuple(self.bodies), tuple(self.joints), positions, angles, self._overlaps(positions, angles))
+        with jax.enable_x64(self.physics.x64):
+            overlaps = self._overlaps(positions, angles)
+        return Poses(tuple(self.bodies), tuple(self.joints), positions, angles, overlaps)
 
     def overlaps(self) -> Overlaps:
         """Overlaps in the initial state, as in `poses`."""

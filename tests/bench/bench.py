@@ -234,6 +234,21 @@ def physics(folder: Path, scene: str, turns: int) -> Turns:
     return in_turns(works, turns) | {name: [seconds] for name, seconds in compiled.items()}
 
 
+def precisions(folder: Path, turns: int, overrides: Sequence[str] = ()) -> Turns:
+    """CPU seconds per video of the simulation of bouncing.yaml, by its precision."""
+    import jax
+
+    def simulation(precision: str) -> Callable[[], float]:
+        rollout = source_of([f"physics.precision={precision}", *overrides], "bouncing.yaml").rollout
+        programs, device, numbers = rollout.programs, rollout.devices[0], np.arange(rollout.batch_size, dtype=np.uint32)
+        grid, words = np.zeros((len(numbers), 0), np.float32), np.zeros(3, np.uint32)
+        sampled = programs["sample"](device, words, np.int32(0), grid, numbers, np.zeros_like(numbers))
+        start = sampled.keys, sampled.scene, sampled.state
+        return timed(lambda: jax.block_until_ready(programs["simulate"](device, *start)), len(numbers))
+
+    return in_turns({precision: simulation(precision) for precision in ("float32", "float64")}, turns)
+
+
 def render(folder: Path, case: str, turns: int) -> Turns:
     """CPU seconds per frame of gen2d, OpenCV and a copy."""
     bench_case = bench_render.CASES[case]
@@ -290,7 +305,7 @@ def states(folder: Path, videos: int = 512, turns: int = 7, window: int = 16, ov
     return in_turns(works, turns) | sizes
 
 
-MEASURED = (stages, steady, bounds, physics, render, annotated, family, storage, states)
+MEASURED = (stages, steady, bounds, physics, precisions, render, annotated, family, storage, states)
 MEASUREMENTS = {work.__name__: work for work in MEASURED}
 
 
@@ -512,6 +527,8 @@ def physics_section(folder: Path, quick: bool) -> Results:
                 ratio = _ratio(turns[other], turns["all"])
                 yield Promise(f"physics, {case.name}, against {other}", ratio, target=target, note=note)
         yield Promise("  compiled", cost.compile["all"], "s", 30, most=True)
+    turns = measure(precisions, folder, CORES[:1], turns=3 if quick else 9)
+    yield Promise("physics, float64 against float32", _ratio(turns["float32"], turns["float64"]), target=0.5)
 
 
 def render_section(folder: Path, quick: bool) -> Results:

@@ -55,6 +55,13 @@ def test_states_are_made_and_loaded(tmp_path: Path) -> None:
     assert turns["bytes states"][0] < turns["bytes frames"][0]
 
 
+@pytest.mark.slow
+def test_both_precisions_are_timed(tmp_path: Path) -> None:
+    turns = bench.precisions(tmp_path, turns=1, overrides=TINY)
+    assert turns.keys() == {"float32", "float64"}
+    assert all(seconds > 0 for (seconds,) in turns.values())
+
+
 def test_every_way_to_store_is_timed(tmp_path: Path) -> None:
     case = bench_storage.Case(16, 4, 8, 1, 1, 1, 1)
     code = f"""

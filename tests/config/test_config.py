@@ -39,6 +39,10 @@ BAD = {
     "vidoe: {frames: 3}": ("vidoe is not a section", "did you mean video?"),
     "physics: {substeps: .nan}": ("physics.substeps is nan", "whole number"),
     "physics: {mixing: average}": ("physics.mixing is 'average'", "one of product"),
+    "physics: {precision: 64}": ("physics.precision is 64", "one of float32, float64"),
+    "splits: {train: {}, test: {physics: {precision: float64}}}": (
+        "splits.test.physics.precision is 'float64', but must be that of all splits, float32",
+    ),
     "storage: {codec: mp4}": ("storage.codec is 'mp4'", "one of gzip"),
     "camera: {center: [1]}": ("camera.center is [1]", "a list of 2 numbers"),
     "seed: -1": ("seed is -1", "0 to 2**63 - 1"),
@@ -180,6 +184,15 @@ def test_configs_hold_the_numbers_of_their_page():
     pile = load_config("pile.yaml").scene.options
     supports = [getattr(pile, name).support for name in ("discs", "boxes", "capsules")]
     assert (sum(low for low, _ in supports), sum(high for _, high in supports)) == (6, 20)
+
+
+def test_a_later_option_is_written_only_where_it_is_changed():
+    """So that datasets of configs that lack it keep their identity."""
+    config, wide = load_config({}), load_config({"physics": {"precision": "float64"}})
+    assert "precision" not in config.text()
+    assert load_config({"physics": {"precision": "float32"}}) == config
+    assert load_config(wide.plain()) == wide != config
+    assert wide.sha256() != config.sha256()
 
 
 def test_defaults_are_those_of_the_pages():

@@ -81,9 +81,9 @@ def test_damaged_entries_are_replaced(stock: tuple[Path, dict[str, np.ndarray]],
 
 def test_entries_that_cannot_be_used_are_left_out(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     trace, executable = (next((cache / "programs" / name).rglob("*[0-9a-f]")) for name in ("traces", "executables"))
-    assert shared._loadable(executables.Trace(None, "", None), jax.devices()[0]) is None  # type: ignore[arg-type]
+    assert shared._loadable(executables.Trace(None, "", None), jax.devices()[0], False) is None  # type: ignore[arg-type]
     monkeypatch.setattr(executables, "find_executable", lambda *_: b"no executable")
-    assert shared._loadable(executables.Trace(None, "", None), jax.devices()[0]) is None  # type: ignore[arg-type]
+    assert shared._loadable(executables.Trace(None, "", None), jax.devices()[0], False) is None  # type: ignore[arg-type]
     folder = trace if trace.is_dir() else trace.parent
     monkeypatch.setattr(executables, "_trace_folder", lambda *_: folder)
     assert len(list(executables.find_traces("", jax.devices()[0], False))) == 1
@@ -174,6 +174,19 @@ def test_a_cached_function_is_traced_once(cache: Path, monkeypatch: pytest.Monke
     before = len(entry_files(cache))
     power(5, None)({"x": x}, one)
     assert len(entry_files(cache)) == before
+
+
+def test_a_function_in_float64_is_another_program_in_memory_and_on_disk(cache: Path) -> None:
+    def thirds(x: jax.Array) -> jax.Array:
+        return jax.numpy.arange(3.0) / 3 * x
+
+    functions = {x64: shared.cached_jit(thirds, "thirds", x64=x64) for x64 in (True, False)}
+    for _ in range(2):
+        for x64, function in functions.items():
+            result = np.asarray(function(np.float32(1)))
+            assert result.dtype == (np.float64 if x64 else np.float32)
+            np.testing.assert_array_equal(result, np.arange(3, dtype=result.dtype) / 3)
+        shared.clear()  # then from disk
 
 
 def test_a_space_is_not_traced_again(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:

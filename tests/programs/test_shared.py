@@ -227,6 +227,16 @@ def test_the_fingerprint_does_not_depend_on_what_was_traced_first(name: str) -> 
     assert [bound.sha256 for bound in trace(changed).values()] == shared_hashes
 
 
+def test_programs_in_float32_are_the_same_after_some_in_float64() -> None:
+    """Alone, and beside the programs of the same config in float64, which trace the same functions."""
+    config = load_config("bouncing.yaml", ["storage.batch_size=4"])
+    trace(load_config(config, ["physics.precision=float64"]))
+    after = [bound.sha256 for bound in trace(config).values()]
+    shared.clear()
+    jax.clear_caches()
+    assert [bound.sha256 for bound in trace(config).values()] == after
+
+
 NEEDS = {
     "annotations.masks=true": {"draw"},
     "storage.frames=none": {"draw"},
@@ -236,6 +246,7 @@ NEEDS = {
     "scene.radius={normal: [0.6, 0.1, 0.5, 0.9]}": {"sample"},
     "physics.substeps=3": {"simulate"},
     "physics.damping=0.1": {"simulate"},
+    "physics.precision=float64": {"simulate"},
     "annotations.energy=true": {"simulate"},
 }
 

@@ -58,6 +58,22 @@ def test_one_trace_serves_other_numbers(name: str) -> None:
     assert len(traces) == 1
 
 
+def test_in_the_64_bit_mode_fractions_are_float64_and_may_be_float32_too() -> None:
+    def both(a: Any, b: Any, c: Any, n: Any) -> Any:
+        with jax.enable_x64(False):
+            narrow = [jnp.asarray(x) for x in (a / 3, n)]
+        return narrow, [jnp.asarray(x) for x in (a / 3, np.array([1.0, 3.0]) / b, n)]
+
+    with jax.enable_x64(True):
+        tape, run, _ = program(both)
+        for a, b, c, n in OTHERS:
+            narrow, wide = run(tape.arguments((a, b, c, n)))
+            assert [x.dtype for x in (*narrow, *wide)] == ["float32", "int32", "float64", "float64", "int32"]
+            expected = np.float32(a / 3), n, a / 3, np.array([1, 3]) / b, n
+            for x, number in zip((*narrow, *wide), expected, strict=True):
+                np.testing.assert_array_equal(x, number)
+
+
 @pytest.mark.parametrize(
     ("use", "served", "refused"),
     [

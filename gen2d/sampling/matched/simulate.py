@@ -10,7 +10,7 @@ import jax.numpy as jnp
 
 from gen2d.config.matched import INTERVENTIONS, VIOLATIONS, free_slots
 from gen2d.config.options import factor_options
-from gen2d.records.axes import Array
+from gen2d.records.axes import Array, to_precision
 from gen2d.records.layout import Layout
 from gen2d.records.scene import Scene, State
 from gen2d.records.trajectory import Trajectory
@@ -18,6 +18,8 @@ from gen2d.sampling.builder import SampledScene
 from gen2d.sampling.matched.counterfactuals import change_factors, changed_slot
 from gen2d.sampling.matched.sets import SetMember, along_slots, change_codes, fields, member_of
 from gen2d.sampling.matched.violations import INTERVENTION_FUNCTIONS, Intervention, SceneInstant, inside_view
+
+RECORD = {"object": "int32", "partner": "int32", "onset": "int32", "size": "float32"}  # of a change, by name
 
 
 class MemberVideos(NamedTuple):
@@ -36,24 +38,28 @@ def simulate_members(
 
     `sample(key, change)` returns a video's factors and its sampled scene (sampler.py), `run(scenes, states)` the
     trajectories. The original and the member are two iterations of one loop, and thus of one compiled program, because
-    two programs would round differently.
+    two programs would round differently. Whatever the precision of the simulation, videos are sampled in 32 bits.
     """
     options, run = config.matched, jax.jit(run)  # traced once
     membership = functools.partial(member_of, options=options, frames=config.video.frames)
-    members = jax.vmap(membership)(keys, numbers % options.members)
+    with jax.enable_x64(False):
+        members = jax.vmap(membership)(keys, numbers % options.members)
 
     def sampled_member(key: Array, member: SetMember) -> tuple[dict[str, Array], SampledScene]:
         return sample(key, functools.partial(change_factors, member, config))
 
     def simulate_once(iteration: Array, before: MemberVideos) -> MemberVideos:
         now = members._replace(changed=members.changed & (iteration > 0))
-        factors, sampled = jax.vmap(sampled_member)(keys, now)
+        with jax.enable_x64(False):
+            factors, sampled = jax.vmap(sampled_member)(keys, now)
         intervene = jax.vmap(functools.partial(_intervene, options=options, layout=layout))
-        stored, scene, start, frame, record = intervene(now, sampled.scene, sampled.state, before.trajectory.states)
+        start = to_precision((sampled.scene, sampled.state), config.physics.precision)
+        stored, scene, start, frame, record = intervene(now, *start, before.trajectory.states)
         trajectory = run(scene, start)
         names = ["states"] if trajectory.between is None else ["states", "between"]
         spliced = {name: _splice(frame, getattr(before.trajectory, name), getattr(trajectory, name)) for name in names}
         trajectory = dataclasses.replace(trajectory, **spliced)
+        stored = to_precision(stored, "float32")
         after = MemberVideos(factors, sampled._replace(scene=stored), trajectory, record)
         return after._replace(record=jax.vmap(functools.partial(_record_change, config=config))(now, before, after))
 
@@ -70,11 +76,10 @@ def _zeros(keys: Array, sample: Callable, run: Callable) -> MemberVideos:
     """Zero-filled videos, the initial value of the loop."""
 
     def videos(keys: Array) -> MemberVideos:
-        factors, sampled = jax.vmap(sample)(keys)
-        counts = {name: jnp.zeros(len(keys), jnp.int32) for name in ("object", "partner", "onset")}
-        return MemberVideos(
-            factors, sampled, run(sampled.scene, sampled.state), counts | {"size": jnp.zeros(len(keys))}
-        )
+        with jax.enable_x64(False):
+            factors, sampled = jax.vmap(sample)(keys)
+        record = {name: jnp.zeros(len(keys), dtype) for name, dtype in RECORD.items()}
+        return MemberVideos(factors, sampled, run(sampled.scene, sampled.state), record)
 
     return jax.tree.map(lambda like: jnp.zeros(like.shape, like.dtype), jax.eval_shape(videos, keys))
 
@@ -127,4 +132,5 @@ def _record_change(member: SetMember, before: MemberVideos, after: MemberVideos,
     differ = jnp.zeros(len(after.trajectory.states.angle), bool)
     for a, b in zip(jax.tree.leaves(before.trajectory.states), jax.tree.leaves(after.trajectory.states), strict=True):
         differ |= ((a != b).reshape(*a.shape[:2], -1).any(axis=-1) & present).any(axis=-1)
-    return record | {"onset": jnp.where(differ.any(), jnp.argmax(differ), -1).astype(jnp.int32)}
+    record |= {"onset": jnp.where(differ.any(), jnp.argmax(differ), -1)}
+    return {name: jnp.asarray(record[name], dtype) for name, dtype in RECORD.items()}

@@ -54,7 +54,7 @@ def _teleport(member: SetMember, now: SceneInstant, options: Any, layout: Layout
     state = now.state
     slot, possible = _random_slot(key_for(member.set_key, "object"), now.free)
     distance = options.distance.sample(key_for(member.own_key, "distance"), ())
-    turn, priority = (jax.random.uniform(key_for(member.own_key, name), (DIRECTIONS,)) for name in ("turn", "luck"))
+    turn, priority = (_uniform(key_for(member.own_key, name), (DIRECTIONS,)) for name in ("turn", "luck"))
     angle = 2 * jnp.pi * (jnp.arange(DIRECTIONS) + turn[0]) / DIRECTIONS
     jump = distance * jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=-1)
     clear = jax.vmap(lambda position: _is_free(position, slot, now, layout))(state.position[slot] + jump)
@@ -73,7 +73,7 @@ def _swap(member: SetMember, now: SceneInstant, options: Any, layout: Layout) ->
     pair = free[:, None] & free & (objects.shape[:, None] == objects.shape) & (slots[:, None] < slots)
     pair &= differ <= MAX_SIZE_DIFFERENCE * jnp.minimum(size[:, None], size)
     nearest = pair & (differ <= jnp.min(jnp.where(pair, differ, jnp.inf)) + 1e-6)  # m
-    priority = jax.random.uniform(key_for(member.set_key, "object"), pair.shape)
+    priority = _uniform(key_for(member.set_key, "object"), pair.shape)
     a, b = jnp.divmod(jnp.argmax(jnp.where(nearest, priority, -1)), len(free))
     permutation = slots.at[a].set(b).at[b].set(a)
     distance = jnp.linalg.norm(now.state.position[a] - now.state.position[b])
@@ -93,7 +93,7 @@ def _ghost_contact(member: SetMember, now: SceneInstant, options: Any, layout: L
     state = now.state
     slot, possible = _random_slot(key_for(member.set_key, "object"), _fast_objects(now))
     velocity = state.velocity[slot]
-    skew = MAX_INCIDENCE * jax.random.uniform(key_for(member.own_key, "skew"), (), minval=-1)
+    skew = MAX_INCIDENCE * _uniform(key_for(member.own_key, "skew"), (), -1.0)
     normal = _rotate(velocity, jnp.pi + skew)
     square = jnp.maximum((normal**2).sum(), 1e-12)
     mirrored = velocity - 2 * (velocity @ normal) / square * normal
@@ -123,9 +123,14 @@ INTERVENTION_FUNCTIONS = {
 }
 
 
+def _uniform(key: Array, shape: tuple[int, ...], low: float = 0.0) -> Array:
+    """Samples from low to 1, the same in any precision of the simulation."""
+    return jax.random.uniform(key, shape, jnp.float32, low)
+
+
 def _random_slot(key: Array, eligible: Array, index: Any = 0) -> tuple[Array, Array]:
     """Slot at `index`, modulo their number, in a random order of the eligible slots, and whether there are any."""
-    order = jnp.argsort(jnp.where(eligible, jax.random.uniform(key, eligible.shape), 2))
+    order = jnp.argsort(jnp.where(eligible, _uniform(key, eligible.shape), 2))
     return order[index % jnp.maximum(eligible.sum(), 1)], eligible.any()
 
 
