@@ -11,7 +11,6 @@ import jax.numpy as jnp
 
 from gen2d.physics.collision import FAR, ManifoldPoint, dot, perpendicular
 from gen2d.physics.params import SolverParams
-from gen2d.physics.time_of_impact import MISSES
 from gen2d.records.axes import Array
 
 
@@ -93,7 +92,7 @@ class ActiveContact(NamedTuple):
     gap: Array
     tau: Array  # s: time of impact; negative without a bounce (time_of_impact.py)
     arrival: Array  # m/s: approach speed at tau
-    target: Array  # m/s: normal speed at the end of the step after a bounce
+    fall: Array | float  # m/s: approach speed that the acceleration adds after tau
     position: Array | None  # [2, ...] m: of the point; None: not logged
 
 
@@ -183,42 +182,3 @@ def impulse_change(new: Impulse, old: Impulse) -> Impulse:
 def softness(constraint: ContactConstraint, params: SolverParams) -> tuple[float, float, float]:
     """`SolverParams.softness` of an overlapping contact."""
     return params.softness(2 * params.hertz if constraint.static else params.hertz, params.damping_ratio)
-
-
-def biased_impulse(
-    constraint: ContactConstraint, contact: ActiveContact, speed: Array, old: Impulse, params: SolverParams
-) -> Array:
-    """Accumulated normal impulse after the biased solve.
-
-    A separated contact may close its gap, an overlapping one is pushed apart softly, and a bounce reaches its target
-    speed exactly. A fast approach that misses in this step gets no impulse, as the straight line of a soft contact
-    would stop a body that only grazes the other or arrives a step later.
-    """
-    rate, mass_scale, impulse_scale = softness(constraint, params)
-    apart, mass = contact.gap > 0, contact.frame.normal_mass
-    bias = jnp.where(apart, contact.gap / params.step, jnp.maximum(rate * contact.gap, -params.push_speed))
-    soft = old.normal - jnp.where(apart, 1.0, mass_scale) * mass * (speed + bias)
-    soft = jnp.maximum(soft - jnp.where(apart, 0.0, impulse_scale) * old.normal, 0.0)
-    soft = jnp.where(contact.tau == MISSES, 0.0, soft)
-    hard = old.normal + mass * (contact.target - speed)
-    return jnp.where(mass > 0, jnp.where(contact.tau >= 0, hard, soft), 0.0)
-
-
-def bounces_again(contact: ActiveContact, speed: Array, threshold: Array) -> Array:
-    """Whether a touching contact bounces in the relaxing pass, as a neighbour's bounce closes it."""
-    return (speed < -threshold) & (contact.gap <= 0) & (contact.frame.normal_mass > 0)
-
-
-def relaxed_impulse(
-    constraint: ContactConstraint, contact: ActiveContact, speed: Array, old: Impulse, threshold: Array
-) -> Array:
-    """Accumulated normal impulse after the relaxing solve, without bias.
-
-    Leave unchanged: contacts that bounced and are separating; separated contacts that carried no impulse, which would
-    brake a body one step before its impact; and gaps that a neighbour is closing, which bounce in a later step.
-    """
-    mass = contact.frame.normal_mass
-    active = (contact.tau < 0) & ((old.normal > 0) | (contact.gap <= 0)) & (speed >= -threshold) & (mass > 0)
-    soft = jnp.where(active, jnp.maximum(old.normal - mass * speed, 0.0), old.normal)
-    hard = old.normal - (1 + constraint.elasticity) * mass * speed
-    return jnp.where(bounces_again(contact, speed, threshold), hard, soft)

@@ -4,7 +4,6 @@ A batch holds any number of pairs: all pairs of a round (all_pairs.py) or a chun
 """
 
 import functools
-from collections.abc import Callable
 
 import jax.numpy as jnp
 
@@ -15,54 +14,54 @@ from gen2d.physics.constraint import (
     Impulse,
     Motion,
     apply_impulse,
-    biased_impulse,
-    bounces_again,
     impulse_change,
     relative_speed,
-    relaxed_impulse,
     softness,
 )
-from gen2d.physics.contact_points import bounce_threshold, contact_points, impact_of, two_point_impulses
+from gen2d.physics.contact_points import bounce_threshold, contact_points, impact_of
 from gen2d.physics.contact_state import BodySide, PassSetup, SolvedPair, WarmStart
 from gen2d.physics.energy import add_disc_dissipation, add_dissipation
 from gen2d.physics.friction import apply_angular_impulse, friction_impulse, rolling_impulse
+from gen2d.physics.normal_impulse import (
+    NormalTarget,
+    TargetOf,
+    biased_target,
+    bounces_again,
+    relaxed_target,
+    solve_normals,
+)
 from gen2d.physics.params import SolverParams
 from gen2d.records.axes import Array
 from gen2d.xla import materialize
 
 
 def _apply_pass(
-    constraint: ContactConstraint, pair: SolvedPair, normal_impulse: Callable, a: BodySide, b: BodySide
+    constraint: ContactConstraint, pair: SolvedPair, target_of: TargetOf, a: BodySide, b: BodySide
 ) -> tuple[BodySide, BodySide, SolvedPair]:
-    """Both sides and the pair after normal impulses, friction and rolling resistance.
-
-    `normal_impulse(i, contact, speed, old)` returns the accumulated normal impulse at point i.
-    """
+    """Both sides and the pair after normal impulses, friction and rolling resistance."""
     assert b.motion is not None, "only static bodies lack a motion"
-    before, roll = (a.motion, b.motion), pair.roll
-    motions, impulses = before, []
+    before, roll, impulses = (a.motion, b.motion), pair.roll, []
+    speeds, slips = zip(*(relative_speed(c.frame, c.normal, *before) for c in pair.contacts), strict=True)
+    targets = [target_of(*of) for of in zip(pair.contacts, speeds, pair.impulses, strict=True)]
+    normals = materialize(solve_normals(constraint, pair.contacts, speeds, pair.impulses, targets))
     if constraint.frame is not None and roll is None:
         # The normal impulse between two discs adds no slip, so both impulses follow from the same velocities.
-        (contact,), (old,) = pair.contacts, pair.impulses
-        speed, slip = relative_speed(contact.frame, contact.normal, *before)
-        normal = materialize(normal_impulse(0, contact, speed, old))
+        (contact,), (old,), (normal,), (speed,), (slip,) = pair.contacts, pair.impulses, normals, speeds, slips
         impulses.append(Impulse(normal, materialize(friction_impulse(constraint, contact, normal, slip, old))))
         change = impulse_change(impulses[0], old)
         motions = apply_impulse(constraint, contact, change, *before)
         work = add_disc_dissipation(b.work, constraint.frame, change, speed, slip)
     else:
-        normals = []
-        for i, (contact, old) in enumerate(zip(pair.contacts, pair.impulses, strict=True)):
-            speed, _ = relative_speed(contact.frame, contact.normal, *motions)
-            normals.append(materialize(normal_impulse(i, contact, speed, old)))
-            motions = apply_impulse(constraint, contact, (normals[-1] - old.normal, None), *motions)
+        motions = before
+        for contact, old, normal in zip(pair.contacts, pair.impulses, normals, strict=True):
+            motions = apply_impulse(constraint, contact, (normal - old.normal, None), *motions)
         for contact, old, normal in zip(pair.contacts, pair.impulses, normals, strict=True):
             _, slip = relative_speed(contact.frame, contact.normal, *motions)
             tangent = materialize(friction_impulse(constraint, contact, normal, slip, old))
             impulses.append(Impulse(normal, tangent))
             motions = apply_impulse(constraint, contact, (None, tangent - old.tangent), *motions)
         if pair.roll is not None:
-            roll = materialize(rolling_impulse(constraint, sum(normals[1:], normals[0]), *motions, pair.roll))
+            roll = materialize(rolling_impulse(constraint, functools.reduce(jnp.add, normals), *motions, pair.roll))
             motions = apply_angular_impulse(constraint, roll - pair.roll, *motions)
         changes = [impulse_change(new, old) for new, old in zip(impulses, pair.impulses, strict=True)]
         twist = None if roll is None or pair.roll is None else roll - pair.roll
@@ -140,18 +139,13 @@ def solve(
     params: SolverParams,
 ) -> tuple[BodySide, BodySide, SolvedPair]:
     """Both sides and the pair after the biased solve, bounces included."""
-    motion_a, motion_b = a.motion, b.motion
-    assert motion_b is not None, "only static bodies lack a motion"
     contacts = [impact_of(constraint, point, a, b, setup, params.step) for point in points]
-    speeds = [relative_speed(c.frame, c.normal, motion_a, motion_b)[0] for c in contacts]
-    both = two_point_impulses(constraint, contacts, speeds)
 
-    def normal_impulse(i: int, contact: ActiveContact, speed: Array, old: Impulse) -> Array:
-        alone, together = biased_impulse(constraint, contact, speed, old, params), both[i]
-        return alone if together is None else jnp.where(together >= 0, old.normal + together, alone)
+    def target_of(contact: ActiveContact, speed: Array, old: Impulse) -> NormalTarget:
+        return biased_target(constraint, contact, speed, old, params)
 
     pair = SolvedPair(contacts, warm_start_impulses(memory.impulses), memory.roll)
-    new_a, new_b, solved = _apply_pass(constraint, pair, normal_impulse, a, b)
+    new_a, new_b, solved = _apply_pass(constraint, pair, target_of, a, b)
     push = _push_bound(constraint, solved, a, b, params)
     new_b = _update_drift(b, new_b, contacts, push)
     if constraint.a is not None and a.drift is not None:
@@ -187,13 +181,13 @@ def relax(
     """Both sides and the pair after the relaxing solve, and the impulses for the next step."""
     bounced = []
 
-    def normal_impulse(_: int, contact: ActiveContact, speed: Array, old: Impulse) -> Array:
+    def target_of(contact: ActiveContact, speed: Array, old: Impulse) -> NormalTarget:
         resting = jnp.where(contact.tau < 0, old.normal, 0.0)
         threshold = bounce_threshold(contact, resting, a, b, setup)
         bounced.append(bounces_again(contact, speed, threshold))
-        return relaxed_impulse(constraint, contact, speed, old, threshold)
+        return relaxed_target(constraint, contact, speed, old, threshold)
 
-    a, new_b, last = _apply_pass(constraint, solved, normal_impulse, a, b)
+    a, new_b, last = _apply_pass(constraint, solved, target_of, a, b)
     of = zip(last.contacts, bounced, last.impulses, strict=True)
     impulses = materialize([_next_impulse(c, (c.tau >= 0) | again, impulse) for c, again, impulse in of])
     if constraint.static:

@@ -11,7 +11,6 @@ from gen2d.physics.constraint import (
     ContactFrame,
     ContactPoint,
     CoreOffset,
-    Inertia,
     Motion,
     frame_at,
     relative_speed,
@@ -20,10 +19,8 @@ from gen2d.physics.contact_state import BodySide, PassSetup
 from gen2d.physics.time_of_impact import (
     SLOWEST,
     ApproachPath,
-    approach_speed,
     plane_approach_speed,
     plane_path,
-    post_impact_speed,
     round_path,
     select_path,
     time_of_impact,
@@ -103,14 +100,13 @@ def impact_of(
         tau, normal = _round_impact(point, point.core, a.motion, b.motion, shift, approach, pull, threshold, h)
         speed, pull = _speed_and_pull(point, normal, a.motion, b.motion)
         frame = _frame_of_discs(constraint, point, tau)
-    arrival = approach_speed(speed, pull, tau, h)
-    target = post_impact_speed(arrival, pull, constraint.elasticity, tau, h)
+    fall = pull * (h - tau)
     position = point.position
     if position is not None:
         position = position + jnp.maximum(tau, 0.0) * b.motion.velocity
         # A disc's lever is minus its radius.
         position = position if constraint.frame is None else position + frame.tangent_b * normal
-    return ActiveContact(frame, normal, point.gap, tau, arrival, target, position)
+    return ActiveContact(frame, normal, point.gap, tau, -speed - fall, fall, position)
 
 
 def _speed_and_pull(point: ContactPoint, normal: Array, a: Motion | None, b: Motion) -> tuple[Array, Array | float]:
@@ -180,31 +176,3 @@ def _frame_of_discs(constraint: ContactConstraint, point: ContactPoint, tau: Arr
     k = frame.k_tangent + constraint.b.moment * (tangent_b**2 - frame.tangent_b**2)
     k = k + constraint.a.moment * (tangent_a**2 - frame.tangent_a**2)
     return frame._replace(tangent_a=tangent_a, tangent_b=tangent_b, k_tangent=k)
-
-
-def _cross_term(inertia: Inertia, lever: Array | None, other: Array | None) -> Array | float:
-    """Speed at one lever that a unit impulse at another causes by the spin."""
-    return 0.0 if lever is None or other is None else inertia.moment * lever * other
-
-
-def two_point_impulses(
-    constraint: ContactConstraint, contacts: list[ActiveContact], speeds: list[Array]
-) -> list[Array | None]:
-    """Normal impulses that bounce both points at once, as one after the other would turn a box that lands flat.
-
-    They solve a 2 x 2 system. Points are solved alone, marked by -1, where it is singular or a point would be pulled.
-    """
-    if len(contacts) == 1:
-        return [None]
-    (p, q), changes = contacts, [c.target - s for c, s in zip(contacts, speeds, strict=True)]
-    k = constraint.b.mass + _cross_term(constraint.b, p.frame.normal_b, q.frame.normal_b)
-    if constraint.a is not None:
-        k = k + constraint.a.mass + _cross_term(constraint.a, p.frame.normal_a, q.frame.normal_a)
-    det = p.frame.k_normal * q.frame.k_normal - k * k
-    regular = det > 1e-4 * p.frame.k_normal * q.frame.k_normal
-    inverse = 1 / jnp.where(regular, det, 1.0)
-    first = (q.frame.k_normal * changes[0] - k * changes[1]) * inverse
-    second = (p.frame.k_normal * changes[1] - k * changes[0]) * inverse
-    both = regular & (p.tau >= 0) & (q.tau >= 0) & (first >= 0) & (second >= 0)
-    both = both & (p.frame.normal_mass > 0) & (q.frame.normal_mass > 0)
-    return [jnp.where(both, x, -1.0) for x in (first, second)]

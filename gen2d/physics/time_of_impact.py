@@ -64,16 +64,3 @@ def plane_approach_speed(gap: Array, approach: Array, pull: Array | float) -> Ar
     """Speed with which a point arrives at a plane from `gap`; the signed approach speed if it does not approach."""
     squared = approach**2 + 2 * pull * gap
     return jnp.where((approach > 0) & (squared > 0), _root(squared), approach)
-
-
-def approach_speed(speed: Array, pull: Array | float, tau: Array, h: float) -> Array:
-    """Approach speed at time tau, from a normal speed that includes the acceleration of the whole step."""
-    return -speed - pull * (h - tau)
-
-
-def post_impact_speed(arrival: Array, pull: Array | float, elasticity: Array, tau: Array, h: float) -> Array:
-    """Normal speed at the end of the step after an arrival at tau.
-
-    It is e times the arrival speed less what the acceleration takes in h - tau, and zero if that is more.
-    """
-    return jnp.maximum(elasticity * arrival - pull * (h - tau), 0.0)
