@@ -47,9 +47,9 @@ LOOK = "paint = plain(scene, layout, options, key)\n    return paint._replace(co
 EDITS = {
     "scene": ("gen2d/scenes/bouncing.py", "jnp.zeros(2), box", "jnp.zeros(2) + 0.25, box", "samples scenes"),
     "solver": (
-        "gen2d/physics/time_of_impact.py",
-        "elasticity * arrival",
-        "0.99 * elasticity * arrival",
+        "gen2d/physics/normal_impulse.py",
+        "constraint.elasticity * arrival",
+        "0.99 * constraint.elasticity * arrival",
         "simulates",
     ),
     "look": ("renderers/looks/flat.py", "return plain(scene, layout, options, key)", LOOK, "prepares rendering"),
