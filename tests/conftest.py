@@ -16,6 +16,7 @@ Reports = Generator[None, pytest.TestReport, pytest.TestReport]
 
 _CACHE = pathlib.Path(os.environ.get("XDG_CACHE_HOME") or pathlib.Path.home() / ".cache") / "gen2d-tests"
 _CACHE_BYTES = 2**32
+_LONGEST = ("test_readme.py", "test_recovery.py", "test_versions.py", "test_families.py", "test_random_worlds.py")
 _CONFIG = tempfile.TemporaryDirectory(prefix="gen2d-test-config-")
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(_CACHE))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.2")
@@ -66,8 +67,8 @@ def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo[None]) ->
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """The file that takes longest comes first, so that no process works at it alone in the end."""
-    items.sort(key=lambda item: item.path.name != "test_readme.py")
+    """The files that take longest come first, so that no process works at one alone in the end."""
+    items.sort(key=lambda item: _LONGEST.index(item.path.name) if item.path.name in _LONGEST else len(_LONGEST))
 
 
 def pytest_terminal_summary(terminalreporter: Any) -> None:
