@@ -45,6 +45,13 @@ class AllPairsCarry(NamedTuple):
     events: list[ContactEvent] | None
 
 
+class SolvedRounds(NamedTuple):
+    """Pairs of each round after the biased pass, and their contact points at the start of the step."""
+
+    points: list[list[ContactPoint]]
+    pairs: list[SolvedPair]
+
+
 @dataclasses.dataclass(frozen=True)
 class AllPairs(ContactSolver):
     """Contact solver over the constraints of all rounds, in their order."""
@@ -86,30 +93,31 @@ class AllPairs(ContactSolver):
 
     def solve(
         self, carry: AllPairsCarry, contacts: list[list[ContactPoint]], sides: list[BodySide], statics: list[BodySide]
-    ) -> tuple[list[BodySide], list[SolvedPair]]:
+    ) -> tuple[list[BodySide], SolvedRounds]:
         def play(k: int, a: BodySide, b: BodySide) -> tuple[BodySide, BodySide, SolvedPair]:
             warm = carry.warm[k]
             return contact_passes.solve(self.constraints[k], warm, contacts[k], a, b, self.setup, self.params)
 
-        return run_schedule(sides, statics, self.order, play)
+        sides, pairs = run_schedule(sides, statics, self.order, play)
+        return sides, SolvedRounds(contacts, pairs)
 
     def relax(
         self,
         carry: AllPairsCarry,
-        solved: list[SolvedPair],
+        solved: SolvedRounds,
         sides: list[BodySide],
         statics: list[BodySide],
         time: Array,
     ) -> tuple[list[BodySide], AllPairsCarry]:
         def play(k: int, a: BodySide, b: BodySide) -> tuple[BodySide, BodySide, tuple[SolvedPair, WarmStart]]:
-            return contact_passes.relax(self.constraints[k], solved[k], a, b, self.setup)
+            return contact_passes.relax(self.constraints[k], solved.points[k], solved.pairs[k], a, b, self.setup)
 
         sides, relaxed = run_schedule(sides, statics, self.order, play)
         events, observed = carry.events, dict(carry.observed)
         if events is not None:
-            of = zip(events, solved, relaxed, strict=True)
+            of = zip(events, solved.pairs, relaxed, strict=True)
             events = [record_event(event, pair, last, time) for event, pair, (last, _) in of]
-        for pair, warm in zip(solved, carry.warm, strict=True):
+        for pair, warm in zip(solved.pairs, carry.warm, strict=True):
             depth, began = contact_passes.observe(pair, warm)
             old = observed[size := depth.shape[0]]
             observed[size] = Observed(jnp.maximum(old.depth, depth), old.begins + began)

@@ -211,10 +211,15 @@ def hull_disc(a: Hull, b: Disc) -> tuple[ManifoldPoint]:
     return (manifold_point(normal, nearest, b.centre, a, b),)
 
 
-def hull_hull(a: Hull, b: Hull) -> tuple[ManifoldPoint, ManifoldPoint]:
-    """Contact points of two hulls, in order along the tangent; the second is FAR where two corners are nearest."""
+def hull_hull(a: Hull, b: Hull, admits: Callable[[Array], Array] | None = None) -> tuple[ManifoldPoint, ManifoldPoint]:
+    """Contact points of two hulls, in order along the tangent; the second is FAR where two corners are nearest.
+
+    Where `admits` refuses a normal that is not of a face of a, the nearest face of a gives the normal, and both points
+    are FAR if b is beyond its ends.
+    """
     (gap_a, face_a), (gap_b, face_b) = materialize((largest_separation(a, b), largest_separation(b, a)))
-    other = gap_b > gap_a + SLOP
+    better = gap_b > gap_a + SLOP
+    other = better if admits is None else better & admits(-face_b)
     face = jnp.where(other, -face_b, face_a)
     tangent = perpendicular(face)
     (low_a, high_a), (high_b, low_b) = materialize((facing_edge(a, face), facing_edge(b, -face)))
@@ -223,13 +228,19 @@ def hull_hull(a: Hull, b: Hull) -> tuple[ManifoldPoint, ManifoldPoint]:
     # The edges of overlapping hulls may be nearest at corners; lines do not overlap.
     apart = True if len(a.vertices) == len(b.vertices) == 2 else jnp.maximum(gap_a, gap_b) > 0
     at_corners = nearest & apart & (jnp.abs(dot(end_b - end_a, tangent)) > SLOP)
-    normal = jnp.where(at_corners, direction(end_b - end_a, face), face)
+    normal, missing = jnp.where(at_corners, direction(end_b - end_a, face), face), False
+    if admits is not None:
+        refused = at_corners & ~admits(normal)
+        normal, at_corners = jnp.where(refused, face, normal), at_corners & ~refused
+        beyond = (dot(low_b - high_a, tangent) > 0) | (dot(low_a - high_b, tangent) > 0)
+        missing = beyond & (refused | (better & ~other))
 
     left_a, right_a = clip_edge(low_a, high_a, low_b, high_b, tangent)
     left_b, right_b = clip_edge(low_b, high_b, low_a, high_a, tangent)
     first = manifold_point(normal, jnp.where(at_corners, end_a, left_a), jnp.where(at_corners, end_b, left_b), a, b)
     second = manifold_point(normal, right_a, right_b, a, b)
-    return first, second._replace(gap=jnp.where(at_corners, FAR, second.gap))
+    first = first._replace(gap=jnp.where(missing, FAR, first.gap))
+    return first, second._replace(gap=jnp.where(at_corners | missing, FAR, second.gap))
 
 
 def hull_stadium(a: Hull, b: Stadium) -> tuple[ManifoldPoint, ManifoldPoint]:
@@ -240,6 +251,13 @@ def hull_stadium(a: Hull, b: Stadium) -> tuple[ManifoldPoint, ManifoldPoint]:
 def stadium_stadium(a: Stadium, b: Stadium) -> tuple[ManifoldPoint, ManifoldPoint]:
     """Contact points of two stadiums, as `hull_hull`."""
     return hull_hull(core_hull(a), core_hull(b))
+
+
+def segment_contacts(
+    segment: Stadium, b: Hull | Stadium, admits: Callable[[Array], Array]
+) -> tuple[ManifoldPoint, ManifoldPoint]:
+    """Contact points of a segment and another shape with corners; see `hull_hull` for normals that `admits` refuses."""
+    return hull_hull(core_hull(segment), core_hull(b) if isinstance(b, Stadium) else b, admits)
 
 
 PAIRS: dict[tuple[type, type], Callable[..., tuple[ManifoldPoint, ...]]] = {

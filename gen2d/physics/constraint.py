@@ -11,6 +11,7 @@ import jax.numpy as jnp
 
 from gen2d.physics.collision import FAR, ManifoldPoint, dot, perpendicular
 from gen2d.physics.params import SolverParams
+from gen2d.physics.segment_lines import Neighbours
 from gen2d.records.axes import Array
 
 
@@ -59,9 +60,7 @@ class ContactConstraint(NamedTuple):
     rolling: Array | None  # m: torque over normal force
     frame: ContactFrame | None  # of two discs, or a disc on a static body at rest; else it changes from step to step
     static: bool  # against a static or kinematic body: twice as stiff
-    # Where other segments continue a static segment at its ends: two directions [2, 1, ...], zero without one.
-    left: tuple[Array, Array] | None = None
-    right: tuple[Array, Array] | None = None
+    neighbours: Neighbours | None = None  # of a static segment
 
 
 class CoreOffset(NamedTuple):
@@ -82,6 +81,7 @@ class ContactPoint(NamedTuple):
     acceleration: Array | None  # [2, ...] m/s^2: of b relative to a; None: equal
     position: Array | None  # [2, ...] m: of the point, or of b's centre if b is a disc; None: not logged
     core: CoreOffset | None = None  # None: shapes with corners
+    moves_with_a: bool = False  # a is a disc, and the point moves with it; else with b
 
 
 class ActiveContact(NamedTuple):

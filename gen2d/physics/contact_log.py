@@ -6,6 +6,8 @@ import jax
 import jax.numpy as jnp
 
 from gen2d.core.enums import BEGIN, END, IMPACT, NO_CONTACT, PERSIST
+from gen2d.physics.collision import dot, perpendicular
+from gen2d.physics.constraint import reciprocal
 from gen2d.physics.contact_state import SolvedPair
 from gen2d.records.axes import Array
 from gen2d.records.trajectory import Contacts
@@ -33,6 +35,29 @@ def empty_events(shape: tuple[int, ...], dtype: jnp.dtype) -> ContactEvent:
     return ContactEvent(zero - 1, vector, vector, zero, zero, zero, jnp.zeros(shape, jnp.int32))
 
 
+MOST_OF_IT = 0.5  # a smaller share of the impulse is a difference of two large ones, without a direction
+
+
+def _impulse_of_step(solved: SolvedPair, relaxed: SolvedPair) -> tuple[Array, Array, Array]:
+    """Normal [2, ...], and normal and tangential impulse in N s, of a pair with one point in both passes.
+
+    Discs move on between the passes, so the impulses act along two normals, and are added as vectors.
+    """
+    begin, end = solved.contacts[0].normal, relaxed.contacts[0].normal
+    (first, slid), (last, slides) = solved.impulses[0], relaxed.impulses[0]
+    pressed = first * begin + (last - first) * end
+    squared = dot(pressed, pressed)
+    has_direction = squared > (MOST_OF_IT * last) ** 2
+    length = jnp.sqrt(jnp.where(has_direction, squared, 1.0))
+    normal = jnp.where(has_direction, pressed / length, begin)
+    length, across = jnp.where(has_direction, length, last), perpendicular(normal)
+    # After two bounces, friction has also acted along two tangents.
+    twice = (solved.contacts[0].tau >= 0) & (last > first) & has_direction
+    friction = slid * perpendicular(begin) + (slides - slid) * perpendicular(end)
+    tangent = jnp.where(twice, dot(across, friction), slides * length * reciprocal(last, last > 0))
+    return normal, jnp.where(twice, length + dot(normal, friction), length), tangent
+
+
 def record_event(event: ContactEvent, solved: SolvedPair, relaxed: SolvedPair, start: Array) -> ContactEvent:
     """Event after one more step, which began at `start`, from the pair after the biased and the relaxing solve."""
     points = list(zip(solved.contacts, solved.impulses, relaxed.impulses, strict=True))
@@ -43,6 +68,11 @@ def record_event(event: ContactEvent, solved: SolvedPair, relaxed: SolvedPair, s
         second, other = touching[1] & ~on, points[1][0]._replace(frame=None)
         bounced = bounced | (touching[1] & (other.tau >= 0))
         contact, on = jax.tree.map(lambda x, y: jnp.where(second, y, x), contact, other), on | second
+    if len(points) == 1:
+        normal, *impulses = _impulse_of_step(solved, relaxed)
+        contact = contact._replace(normal=normal)
+    else:
+        impulses = [sum(x[1:], x[0]) for x in zip(*relaxed.impulses, strict=True)]
     first = materialize(jnp.where(on & (event.time < 0), 1.0, 0.0)) > 0.5
     assert contact.position is not None, "logged contacts have positions"
     news = (start + jnp.maximum(contact.tau, 0.0), contact.position, contact.normal, contact.arrival)
@@ -52,8 +82,8 @@ def record_event(event: ContactEvent, solved: SolvedPair, relaxed: SolvedPair, s
         position,
         normal,
         approach,
-        event.normal_impulse + sum(last.normal for *_, last in points),
-        event.tangent_impulse + sum(last.tangent for *_, last in points),
+        event.normal_impulse + impulses[0],
+        event.tangent_impulse + impulses[1],
         (event.flags & (BOUNCED | BEFORE)) | jnp.where(bounced, BOUNCED, jnp.where(on, ON, 0)).astype(jnp.int32),
     )
 

@@ -18,7 +18,7 @@ from gen2d.physics.constraint import (
     relative_speed,
     softness,
 )
-from gen2d.physics.contact_points import bounce_threshold, contact_points, impact_of
+from gen2d.physics.contact_points import bounce_threshold, contact_points, displaced_points, impacts_of
 from gen2d.physics.contact_state import BodySide, PassSetup, SolvedPair, WarmStart
 from gen2d.physics.energy import add_disc_dissipation, add_dissipation
 from gen2d.physics.friction import apply_angular_impulse, friction_impulse, rolling_impulse
@@ -47,17 +47,18 @@ def _apply_pass(
     if constraint.frame is not None and roll is None:
         # The normal impulse between two discs adds no slip, so both impulses follow from the same velocities.
         (contact,), (old,), (normal,), (speed,), (slip,) = pair.contacts, pair.impulses, normals, speeds, slips
-        impulses.append(Impulse(normal, materialize(friction_impulse(constraint, contact, normal, slip, old))))
+        tangent = materialize(friction_impulse(constraint, contact, normal, slip, old, targets[0].apart))
+        impulses.append(Impulse(normal, tangent))
         change = impulse_change(impulses[0], old)
         motions = apply_impulse(constraint, contact, change, *before)
-        work = add_disc_dissipation(b.work, constraint.frame, change, speed, slip)
+        work = add_disc_dissipation(b.work, contact.frame, change, speed, slip)
     else:
         motions = before
         for contact, old, normal in zip(pair.contacts, pair.impulses, normals, strict=True):
             motions = apply_impulse(constraint, contact, (normal - old.normal, None), *motions)
-        for contact, old, normal in zip(pair.contacts, pair.impulses, normals, strict=True):
+        for contact, old, normal, target in zip(pair.contacts, pair.impulses, normals, targets, strict=True):
             _, slip = relative_speed(contact.frame, contact.normal, *motions)
-            tangent = materialize(friction_impulse(constraint, contact, normal, slip, old))
+            tangent = materialize(friction_impulse(constraint, contact, normal, slip, old, target.apart))
             impulses.append(Impulse(normal, tangent))
             motions = apply_impulse(constraint, contact, (None, tangent - old.tangent), *motions)
         if pair.roll is not None:
@@ -73,23 +74,26 @@ def _apply_pass(
 def warm_start(
     constraint: ContactConstraint, memory: WarmStart, a: BodySide, b: BodySide, setup: PassSetup
 ) -> tuple[BodySide, BodySide, list[ContactPoint]]:
-    """Both sides with the impulses of the last step, and the contact points."""
+    """Both sides with the impulses of the last step, which act at `displacement`, and the contact points."""
     assert b.motion is not None, "only static bodies lack a motion"
-    olds, roll, before = warm_start_impulses(memory.impulses), memory.roll, (a.motion, b.motion)
+    roll, before = memory.roll, (a.motion, b.motion)
     acceleration = setup.gravity if constraint.static else None
     if b.acceleration is not None:
         acceleration = b.acceleration if a.acceleration is None else b.acceleration - a.acceleration
     normals = [jnp.abs(old.normal) for old in memory.impulses]
     points, motions = contact_points(constraint, a.shape, b.shape, normals, acceleration, setup), before
-    for point, old in zip(points, olds, strict=True):
+    assert b.displacement is not None, "only static bodies lack a displacement"
+    olds = warm_start_impulses(constraint, points, memory.impulses)
+    moved = displaced_points(constraint, points, a.displacement, b.displacement)
+    for point, old in zip(moved, olds, strict=True):
         motions = apply_impulse(constraint, point, old, *motions)
     if roll is not None:
         motions = apply_angular_impulse(constraint, roll, *motions)
     if constraint.frame is not None and roll is None:
-        speeds = relative_speed(constraint.frame, points[0].normal, *before)
-        work = add_disc_dissipation(b.work, constraint.frame, olds[0], *speeds)
+        speeds = relative_speed(moved[0].frame, moved[0].normal, *before)
+        work = add_disc_dissipation(b.work, moved[0].frame, olds[0], *speeds)
     else:
-        work = add_dissipation(b.work, constraint, points, olds, roll, before, motions)
+        work = add_dissipation(b.work, constraint, moved, olds, roll, before, motions)
     motion_b = materialize(motions[1]) if constraint.static else motions[1]
     return a._replace(motion=motions[0]), b._replace(motion=motion_b, work=work), points
 
@@ -111,21 +115,13 @@ def _push_bound(
     return push
 
 
-def _update_drift(old: BodySide, new: BodySide, contacts: list[ActiveContact], push: Array) -> BodySide:
-    """The side with its drift reduced by tau times the change of velocity.
-
-    If two points bounce in the same step, the mean of their times counts.
-    """
+def _update_drift(old: BodySide, new: BodySide, time: Array, push: Array) -> BodySide:
+    """The side with its drift reduced by the time of the impulses times the change of velocity."""
     assert old.motion, "only moving bodies drift"
     assert new.motion, "only moving bodies drift"
     assert old.drift, "only moving bodies drift"
-    tau = jnp.maximum(contacts[0].tau, 0.0)
-    if len(contacts) == 2:
-        second = jnp.maximum(contacts[1].tau, 0.0)
-        both = (contacts[0].tau >= 0) & (contacts[1].tau >= 0)
-        tau = jnp.where(both, 0.5 * (tau + second), tau + second)
-    velocity = old.drift.velocity - tau * (new.motion.velocity - old.motion.velocity)
-    spin = old.drift.spin - tau * (new.motion.spin - old.motion.spin)
+    velocity = old.drift.velocity - time * (new.motion.velocity - old.motion.velocity)
+    spin = old.drift.spin - time * (new.motion.spin - old.motion.spin)
     return new._replace(drift=Motion(velocity, spin), push=jnp.maximum(old.push, push))
 
 
@@ -139,17 +135,17 @@ def solve(
     params: SolverParams,
 ) -> tuple[BodySide, BodySide, SolvedPair]:
     """Both sides and the pair after the biased solve, bounces included."""
-    contacts = [impact_of(constraint, point, a, b, setup, params.step) for point in points]
+    contacts, time = impacts_of(constraint, points, a, b, setup, params.step)
 
     def target_of(contact: ActiveContact, speed: Array, old: Impulse) -> NormalTarget:
         return biased_target(constraint, contact, speed, old, params)
 
-    pair = SolvedPair(contacts, warm_start_impulses(memory.impulses), memory.roll)
+    pair = SolvedPair(contacts, warm_start_impulses(constraint, points, memory.impulses), memory.roll)
     new_a, new_b, solved = _apply_pass(constraint, pair, target_of, a, b)
     push = _push_bound(constraint, solved, a, b, params)
-    new_b = _update_drift(b, new_b, contacts, push)
+    new_b = _update_drift(b, new_b, time, push)
     if constraint.a is not None and a.drift is not None:
-        new_a = _update_drift(a, new_a, contacts, push)
+        new_a = _update_drift(a, new_a, time, push)
     if constraint.static:
         new_b = materialize(new_b._replace(work=None))._replace(work=new_b.work)
     return new_a, new_b, solved
@@ -170,15 +166,32 @@ def _next_impulse(contact: ActiveContact, bounced: Array, impulse: Impulse) -> I
     return Impulse(normal, jnp.where(bounced, 0.0, impulse.tangent))
 
 
-def warm_start_impulses(impulses: list[Impulse]) -> list[Impulse]:
-    """Impulses of the last step without those of impacts, which are stored as negative normal impulses."""
-    return [Impulse(jnp.maximum(i.normal, 0.0), i.tangent) for i in impulses]
+def warm_start_impulses(
+    constraint: ContactConstraint, points: list[ContactPoint], impulses: list[Impulse]
+) -> list[Impulse]:
+    """Impulses of the last step without those of impacts, which are stored as negative normal impulses.
+
+    Those of a segment end when the next segment of its line takes over.
+    """
+    impulses = [Impulse(jnp.maximum(i.normal, 0.0), i.tangent) for i in impulses]
+    if constraint.neighbours is None or constraint.neighbours.line is None:
+        return impulses
+    held = [point.frame.normal_mass > 0 for point in points]
+    return [Impulse(*(jnp.where(of, x, 0.0) for x in i)) for of, i in zip(held, impulses, strict=True)]
 
 
 def relax(
-    constraint: ContactConstraint, solved: SolvedPair, a: BodySide, b: BodySide, setup: PassSetup
+    constraint: ContactConstraint,
+    points: list[ContactPoint],
+    solved: SolvedPair,
+    a: BodySide,
+    b: BodySide,
+    setup: PassSetup,
 ) -> tuple[BodySide, BodySide, tuple[SolvedPair, WarmStart]]:
-    """Both sides and the pair after the relaxing solve, and the impulses for the next step."""
+    """Both sides and the pair after the relaxing solve at the end of the step, and the impulses for the next step."""
+    assert b.displacement is not None, "only static bodies lack a displacement"
+    moved = zip(solved.contacts, displaced_points(constraint, points, a.displacement, b.displacement), strict=True)
+    contacts = [contact._replace(frame=end.frame, normal=end.normal) for contact, end in moved]
     bounced = []
 
     def target_of(contact: ActiveContact, speed: Array, old: Impulse) -> NormalTarget:
@@ -187,7 +200,7 @@ def relax(
         bounced.append(bounces_again(contact, speed, threshold))
         return relaxed_target(constraint, contact, speed, old, threshold)
 
-    a, new_b, last = _apply_pass(constraint, solved, target_of, a, b)
+    a, new_b, last = _apply_pass(constraint, solved._replace(contacts=contacts), target_of, a, b)
     of = zip(last.contacts, bounced, last.impulses, strict=True)
     impulses = materialize([_next_impulse(c, (c.tau >= 0) | again, impulse) for c, again, impulse in of])
     if constraint.static:

@@ -4,7 +4,17 @@ from typing import Any
 
 import jax.numpy as jnp
 
-from gen2d.physics.collision import FAR, NEAREST, Disc, dot, inverse_length, manifold, offset_from_core
+from gen2d.physics.collision import (
+    FAR,
+    NEAREST,
+    Disc,
+    ManifoldPoint,
+    dot,
+    inverse_length,
+    manifold,
+    offset_from_core,
+    segment_contacts,
+)
 from gen2d.physics.constraint import (
     ActiveContact,
     ContactConstraint,
@@ -13,11 +23,13 @@ from gen2d.physics.constraint import (
     CoreOffset,
     Motion,
     frame_at,
+    frame_of,
+    reciprocal,
     relative_speed,
 )
 from gen2d.physics.contact_state import BodySide, PassSetup
+from gen2d.physics.segment_lines import admissible, whole_line
 from gen2d.physics.time_of_impact import (
-    SLOWEST,
     ApproachPath,
     plane_approach_speed,
     plane_path,
@@ -47,11 +59,21 @@ def _core_offset(constraint: ContactConstraint, a: Any, b: Disc) -> tuple[Array,
         return _nonzero_offset(b.centre - a.centre), None
     offset, along, inside = offset_from_core(a, b.centre)
     offset, part = _nonzero_offset(offset), jnp.where(along == inside, MIDDLE, END)
-    if constraint.left is None or constraint.right is None:
+    if constraint.neighbours is None:
         return offset, part
-    sides = zip(constraint.left, constraint.right, strict=True)
+    sides = zip(constraint.neighbours.left, constraint.neighbours.right, strict=True)
     onward = [dot(offset, jnp.where(along > 0, right, left)) for left, right in sides]
     return offset, jnp.where((part == END) & (jnp.maximum(*onward) > 0), NEIGHBOUR, part)
+
+
+def _manifold(constraint: ContactConstraint, a: Any, b: Any) -> tuple[ManifoldPoint, ...]:
+    """Contact points of two shapes of which one has corners; a segment acts with its whole line."""
+    neighbours = constraint.neighbours
+    if neighbours is None or neighbours.line is None:
+        return manifold(a, b)
+    line, acts = whole_line(a, neighbours.line, b.centre)
+    points = segment_contacts(line, b, admissible(line, neighbours))
+    return tuple(point._replace(gap=jnp.where(acts, point.gap, FAR)) for point in points)
 
 
 def contact_points(
@@ -72,47 +94,121 @@ def contact_points(
         position = b.centre if setup.log else None
         normal, core = offset * inverse, CoreOffset(offset, a.radius + b.radius, flat)
         return [ContactPoint(constraint.frame, normal, gap, last_normals[0], acceleration, position, core)]
-    points = materialize(manifold(a, b))
+    points = materialize(_manifold(constraint, a, b))
     positions = [b.centre + p.arm_b if setup.log else None for p in points]
     return [
-        ContactPoint(materialize(frame_at(constraint, p)), p.normal, p.gap, last, acceleration, position)
+        ContactPoint(
+            materialize(frame_at(constraint, p)),
+            p.normal,
+            p.gap,
+            last,
+            acceleration,
+            position,
+            None,
+            isinstance(a, Disc),
+        )
         for p, last, position in zip(points, last_normals, positions, strict=True)
     ]
 
 
-def impact_of(
-    constraint: ContactConstraint, point: ContactPoint, a: BodySide, b: BodySide, setup: PassSetup, h: float
-) -> ActiveContact:
-    """Contact point with its impact in this step, if there is one.
+def displaced_points(
+    constraint: ContactConstraint, points: list[ContactPoint], a: Motion | None, b: Motion
+) -> list[ContactPoint]:
+    """Contact points after displacements of both bodies, in which an impulse and its reaction act at one point."""
+    shift = b.velocity if a is None else b.velocity - a.velocity
+    return [_displaced_point(constraint, point, shift) for point in points]
 
-    Earlier impacts in this step have shifted the bodies' paths; the impact is computed on the shifted paths.
+
+def _displaced_point(constraint: ContactConstraint, point: ContactPoint, shift: Array) -> ContactPoint:
+    if point.core is not None:
+        offset = point.core.offset + shift
+        inverse = inverse_length(offset)
+        normal = offset * inverse
+        if point.core.flat is not None:
+            normal = jnp.where(point.core.flat, point.normal, normal)
+        frame = _frame_of_discs(constraint, point.frame, 1 / inverse - point.core.reach)
+        return point._replace(frame=frame, normal=normal)
+    if constraint.static or constraint.a is None:
+        return point
+    frame, (nx, ny), (x, y) = point.frame, point.normal, shift
+    assert frame.normal_a is not None, "a body with corners has levers"
+    assert frame.tangent_a is not None, "a body with corners has levers"
+    assert frame.normal_b is not None, "a body with corners has levers"
+    across, along = x * ny - y * nx, x * nx + y * ny
+    if point.moves_with_a:
+        levers = frame.normal_a, frame.normal_b - across, frame.tangent_a, frame.tangent_b - along
+    else:
+        levers = frame.normal_a + across, frame.normal_b, frame.tangent_a + along, frame.tangent_b
+    return point._replace(frame=frame_of(constraint, levers, frame.normal_mass > 0))
+
+
+def impacts_of(
+    constraint: ContactConstraint, points: list[ContactPoint], a: BodySide, b: BodySide, setup: PassSetup, h: float
+) -> tuple[list[ActiveContact], Array]:
+    """Contact points with their impacts in this step, if there are any, and the time in s at which impulses act.
+
+    Earlier impulses in this step have shifted the bodies' paths; an impact is computed on the shifted paths. If two
+    points bounce in the same step, the impulses act at the mean of their times, and at half of the step if none does.
     """
     assert b.motion, "only static bodies lack a motion"
     assert b.drift, "only static bodies lack a drift"
-    speed, pull = _speed_and_pull(point, point.normal, a.motion, b.motion)
     shift = b.drift.velocity if a.drift is None else b.drift.velocity - a.drift.velocity
-    threshold = bounce_threshold(point, point.last_normal, a, b, setup)
-    approach, frame, normal = -speed - pull * h, point.frame, point.normal
-    if point.core is None:
-        path, approach = _plane_approach(point, shift, approach, pull)
-        tau = materialize(time_of_impact(path, approach, h, threshold))
+    taus = [_time_of_impact(point, a, b, shift, setup, h) for point in points]
+    if len(taus) == 1:
+        time = jnp.where(taus[0] >= 0, taus[0], 0.5 * h)
     else:
-        tau, normal = _round_impact(point, point.core, a.motion, b.motion, shift, approach, pull, threshold, h)
-        speed, pull = _speed_and_pull(point, normal, a.motion, b.motion)
-        frame = _frame_of_discs(constraint, point, tau)
-    fall = pull * (h - tau)
-    position = point.position
-    if position is not None:
-        position = position + jnp.maximum(tau, 0.0) * b.motion.velocity
-        # A disc's lever is minus its radius.
-        position = position if constraint.frame is None else position + frame.tangent_b * normal
-    return ActiveContact(frame, normal, point.gap, tau, -speed - fall, fall, position)
+        first, second = taus
+        both, total = (first >= 0) & (second >= 0), jnp.maximum(first, 0.0) + jnp.maximum(second, 0.0)
+        time = jnp.where(both, 0.5 * total, jnp.where((first >= 0) | (second >= 0), total, 0.5 * h))
+    taus, time = materialize((taus, time))
+    velocity = _mean_velocity(points[0], a.motion, b.motion, h)
+    contacts = []
+    for point, tau in zip(points, taus, strict=True):
+        frame, normal = materialize(_displaced_point(constraint, point, shift + time * velocity)[:2])
+        speed, _ = relative_speed(frame, normal, a.motion, b.motion)
+        fall = _pull(point, normal) * (h - tau)
+        position = point.position
+        if position is not None:
+            position = position + _path(a if point.moves_with_a else b, time)
+            # A disc's lever is minus its radius.
+            position = position if constraint.frame is None else position + frame.tangent_b * normal
+        contacts.append(ActiveContact(frame, normal, point.gap, tau, -speed - fall, fall, position))
+    return contacts, time
 
 
-def _speed_and_pull(point: ContactPoint, normal: Array, a: Motion | None, b: Motion) -> tuple[Array, Array | float]:
-    """Speed of b relative to a along a normal, m/s, and acceleration of b towards a, m/s^2."""
-    speed, _ = relative_speed(point.frame, normal, a, b)
-    return speed, 0.0 if point.acceleration is None else -dot(normal, point.acceleration)
+def _path(side: BodySide, time: Array) -> Array:
+    """Displacement [2, ...] in m of a body until a time in the step; zero at rest."""
+    velocity = 0.0 if side.motion is None else time * side.motion.velocity
+    return velocity if side.drift is None else velocity + side.drift.velocity
+
+
+def _mean_velocity(point: ContactPoint, a: Motion | None, b: Motion, h: float) -> Array:
+    """Velocity [2, ...] of b relative to a in the step, at the end of which they have these motions."""
+    velocity = b.velocity if a is None else b.velocity - a.velocity
+    return velocity if point.acceleration is None else velocity - 0.5 * h * point.acceleration
+
+
+def _pull(point: ContactPoint, normal: Array) -> Array | float:
+    """Acceleration of b towards a along a normal, m/s^2."""
+    return 0.0 if point.acceleration is None else -dot(normal, point.acceleration)
+
+
+def _time_of_impact(point: ContactPoint, a: BodySide, b: BodySide, shift: Array, setup: PassSetup, h: float) -> Array:
+    """Time of impact in s, or NONE or MISSES."""
+    assert b.motion, "only static bodies lack a motion"
+    speed, _ = relative_speed(point.frame, point.normal, a.motion, b.motion)
+    pull, threshold = _pull(point, point.normal), bounce_threshold(point, point.last_normal, a, b, setup)
+    path, approach = _plane_approach(point, shift, -speed - pull * h, pull)
+    if point.core is not None:
+        core, offset = point.core, point.core.offset + shift
+        gap = jnp.maximum(1 / inverse_length(offset) - core.reach, 0.0)
+        round_one = round_path(offset, gap, core.reach, _mean_velocity(point, a.motion, b.motion, h))
+        if core.flat is None:
+            path, approach = round_one, -speed - pull * h
+        else:  # a contact that belongs to a neighbouring segment has no impact
+            round_one = round_one._replace(c=jnp.where(point.gap < FAR / 2, round_one.c, FAR**2))
+            path = select_path(core.flat, path, round_one)
+    return time_of_impact(path, approach, h, threshold)
 
 
 def _plane_approach(
@@ -121,36 +217,6 @@ def _plane_approach(
     """Path to a plane and the speed of arrival there."""
     gap = jnp.maximum(point.gap + dot(point.normal, shift), 0.0)
     return plane_path(gap, approach, pull), plane_approach_speed(gap, approach, pull)
-
-
-def _round_impact(
-    point: ContactPoint,
-    core: CoreOffset,
-    a: Motion | None,
-    b: Motion,
-    shift: Array,
-    approach: Array,
-    pull: Array | float,
-    threshold: Array,
-    h: float,
-) -> tuple[Array, Array]:
-    """Time of impact and normal of two round shapes, or of a disc and a core line."""
-    plane = None if core.flat is None else (core.flat, *_plane_approach(point, shift, approach, pull))
-    velocity = b.velocity if a is None else b.velocity - a.velocity
-    mean = velocity if point.acceleration is None else velocity - 0.5 * h * point.acceleration
-    offset = core.offset + shift
-    inverse = inverse_length(offset)
-    gap = jnp.maximum(1 / inverse - core.reach, 0.0)
-    path = round_path(offset, gap, core.reach, mean)
-    if plane is not None:  # a contact that belongs to a neighbouring segment has no impact
-        flat, straight, approach = plane
-        path = select_path(flat, straight, path._replace(c=jnp.where(point.gap < FAR / 2, path.c, FAR**2)))
-    tau = time_of_impact(path, approach, h, threshold)
-    # The normal is that at the time of impact, when the distance equals the sum of the radii.
-    scale = jnp.where((tau >= 0) & (gap > 0), 1 / jnp.maximum(core.reach, SLOWEST), inverse)
-    tau, scale = materialize((tau, scale))
-    normal = jnp.where(tau >= 0, (offset + jnp.maximum(tau, 0.0) * mean) * scale, point.normal)
-    return tau, materialize(normal) if core.flat is None else jnp.where(core.flat, point.normal, normal)
 
 
 def bounce_threshold(
@@ -165,14 +231,13 @@ def bounce_threshold(
     return setup.threshold + push + point.frame.k_normal * normal
 
 
-def _frame_of_discs(constraint: ContactConstraint, point: ContactPoint, tau: Array) -> ContactFrame:
+def _frame_of_discs(constraint: ContactConstraint, frame: ContactFrame, gap: Array) -> ContactFrame:
     """Frame of two discs whose levers add up to the distance of their centres, also where they do not just touch."""
-    frame = point.frame
     if constraint.a is None or frame.tangent_a is None:
         return frame
-    half_gap = jnp.where(tau >= 0, 0.0, 0.5 * point.gap)
-    tangent_b = frame.tangent_b - half_gap
-    tangent_a = frame.tangent_a + half_gap
+    tangent_b = frame.tangent_b - 0.5 * gap
+    tangent_a = frame.tangent_a + 0.5 * gap
     k = frame.k_tangent + constraint.b.moment * (tangent_b**2 - frame.tangent_b**2)
     k = k + constraint.a.moment * (tangent_a**2 - frame.tangent_a**2)
-    return frame._replace(tangent_a=tangent_a, tangent_b=tangent_b, k_tangent=k)
+    mass = reciprocal(k, frame.normal_mass > 0)
+    return frame._replace(tangent_a=tangent_a, tangent_b=tangent_b, k_tangent=k, tangent_mass=mass)

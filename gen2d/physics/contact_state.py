@@ -22,7 +22,8 @@ class BodySide(NamedTuple):
     shape: Shape | None = None  # in the world
     motion: Motion | None = None  # None: static bodies at rest
     acceleration: Array | None = None  # [2, N, ...] m/s^2; None: gravity's
-    drift: Motion | None = None  # m, rad: displacement beyond h times the new velocity, as impacts act at their time
+    drift: Motion | None = None  # m, rad: displacement beyond h times the new velocity, as impulses act at their time
+    displacement: Motion | None = None  # m, rad: where the impulses of a pass act; None: of static bodies
     push: Any = None  # [N, ...] m/s: bound on the speed from pushing overlaps apart; 0: no contact; None: static
     work: Work | None = None
 

@@ -10,12 +10,23 @@ from gen2d.records.axes import Array
 
 
 def friction_impulse(
-    constraint: ContactConstraint, contact: ActiveContact, normal_impulse: Array, slip: Array, old: Impulse
+    constraint: ContactConstraint,
+    contact: ActiveContact,
+    normal_impulse: Array,
+    slip: Array,
+    old: Impulse,
+    apart: Array | None = None,
 ) -> Array:
-    """Accumulated tangential impulse that stops the slip, within Coulomb's bound."""
+    """Accumulated tangential impulse that stops the slip, within Coulomb's bound.
+
+    Where an impact is `apart` from what has acted before, the bound holds for its own impulses.
+    """
+    if apart is not None:
+        normal_impulse = normal_impulse - jnp.where(apart, old.normal, 0.0)
+    kept = 0.0 if apart is None else jnp.where(apart, old.tangent, 0.0)
     bound = constraint.friction * normal_impulse
-    tangent = jnp.clip(old.tangent - contact.frame.tangent_mass * slip, -bound, bound)
-    return jnp.where(bound > 0, tangent, 0.0)  # the gradient of a clip between two zeros is not zero
+    tangent = kept + jnp.clip(old.tangent - kept - contact.frame.tangent_mass * slip, -bound, bound)
+    return jnp.where(bound > 0, tangent, kept)  # the gradient of a clip between two zeros is not zero
 
 
 def apply_angular_impulse(

@@ -47,6 +47,7 @@ from gen2d.physics.contact_state import BodySide, PassSetup, WarmStart
 from gen2d.physics.packing import SAFE, PackedTable, TableSpec, make_table, pack, repeat_rows, table_of_rows, unpack
 from gen2d.physics.params import SolverParams
 from gen2d.physics.schedule import bipartite_rounds
+from gen2d.physics.segment_lines import Neighbours
 from gen2d.physics.solver_protocol import ContactSolver
 from gen2d.records.axes import Array
 from gen2d.records.trajectory import Contacts
@@ -59,8 +60,7 @@ class StaticSide(NamedTuple):
     """Constants of a static or kinematic body; leaves [..., 1, n]."""
 
     material: Any
-    left: tuple[Array, Array] | None  # see `ContactConstraint`
-    right: tuple[Array, Array] | None
+    neighbours: Neighbours | None
     present: Array
 
 
@@ -318,7 +318,12 @@ class NearbyPairs(ContactSolver):
         None has no buffer yet; one chunk is then played to find its shape.
         """
         carries = list(carries)
-        tables = [self._table(side, self._size(g)) for g, side in enumerate(sides)]
+        changing, constant = zip(*(_split(side) for side in sides), strict=True)
+        tables, inputs = ([self._table(x, self._size(g)) for g, x in enumerate(of)] for of in (changing, constant))
+
+        def bodies(now: PackedTable, group: int, where: Array) -> BodySide:
+            return _joined(now.at(where), inputs[group].at(where))
+
         for i, batch in enumerate(self.batches):
             fixed = self._static_table([statics[j] for j in batch.statics]) if batch.first is None else None
 
@@ -328,11 +333,15 @@ class NearbyPairs(ContactSolver):
                 rows, carry = state
                 now = {g: tables[g]._replace(rows=x) for g, x in rows.items()}
                 indices = GatherIndices(*listed.indices[i][k])
-                a = now[batch.first].at(indices.a) if fixed is None else fixed.at(indices.a)
-                a, b, carry = play(i, k, indices, a, now[batch.second].at(indices.b), carry)
-                if fixed is None:
-                    now[batch.first] = now[batch.first].put(indices.a, a)
-                now[batch.second] = now[batch.second].put(indices.b, b)
+                if batch.first is not None:
+                    a = bodies(now[batch.first], batch.first, indices.a)
+                else:
+                    assert fixed is not None, "a batch without a first group has static bodies"
+                    a = fixed.at(indices.a)
+                a, b, carry = play(i, k, indices, a, bodies(now[batch.second], batch.second, indices.b), carry)
+                if batch.first is not None:
+                    now[batch.first] = now[batch.first].put(indices.a, _split(a)[0])
+                now[batch.second] = now[batch.second].put(indices.b, _split(b)[0])
                 return {g: x.rows for g, x in now.items()}, carry
 
             start = {g: tables[g].rows for g in batch.groups}, carries[i]
@@ -342,7 +351,8 @@ class NearbyPairs(ContactSolver):
                 rows, carries[i] = jax.lax.fori_loop(0, listed.chunks[i], chunk, start)
             for g, x in rows.items():
                 tables[g] = tables[g]._replace(rows=x)
-        return [t.unpack((self._size(g), self._scenes)) for g, t in enumerate(tables)], carries
+        shapes = [(self._size(g), self._scenes) for g in range(len(tables))]
+        return [_joined(t.unpack(shape), x) for t, shape, x in zip(tables, shapes, constant, strict=True)], carries
 
     def _store(self, batch: PairBatch, buffer: Array | None, k: Array, values: list[Array]) -> Array:
         """Buffer with the values of chunk k; a new one if there is none."""
@@ -372,7 +382,7 @@ class NearbyPairs(ContactSolver):
             warm = jax.tree.map(lambda x: jnp.where(fresh, x, 0.0), cached.warm)
             constraint = batch.constraint(first.material, second.material)
             if isinstance(first, StaticSide):
-                constraint = constraint._replace(left=first.left, right=first.right)
+                constraint = constraint._replace(neighbours=first.neighbours)
             setup = self.setup._replace(gravity=second.gravity, threshold=second.threshold)
             a, b, points = contact_passes.warm_start(constraint, warm, a, b, setup)
             packed = (constraint, warm, points, second.threshold)
@@ -418,9 +428,9 @@ class NearbyPairs(ContactSolver):
 
         def play(i: int, k: Array, indices: GatherIndices, a: BodySide, b: BodySide, carried: tuple) -> tuple:
             cache, touch = caches[i]._replace(rows=carried[0]), carried[1]
-            constraint, _, _, setup = self._unpack_contacts(listed, i, k)
+            constraint, _, points, setup = self._unpack_contacts(listed, i, k)
             pair = unpack(list(solved.packed[i][k]), solved.specs[i])
-            a, b, (last, warm) = contact_passes.relax(constraint, pair, a, b, setup)
+            a, b, (last, warm) = contact_passes.relax(constraint, points, pair, a, b, setup)
             new = CachedConstraint(warm, jnp.full(self.chunk, carry.step, self._dtype), None, None)
             if self.setup.log:
                 event = record_event(self._event_so_far(carry, cache.at(indices.pair)), pair, last, time)
@@ -516,6 +526,20 @@ class NearbyPairs(ContactSolver):
             return jnp.take_along_axis(x, jnp.broadcast_to(order, x.shape), axis=-2)
 
         return depth, begins, contacts_of(*jax.tree.map(in_order, log), count=count)
+
+
+def _split(side: BodySide) -> tuple[BodySide, BodySide]:
+    """What a pass changes of a side, and the rest."""
+    shape, acceleration, displacement = side.shape, side.acceleration, side.displacement
+    constant = BodySide(shape, acceleration=acceleration, displacement=displacement)
+    return side._replace(shape=None, acceleration=None, displacement=None), constant
+
+
+def _joined(changing: BodySide, constant: BodySide) -> BodySide:
+    """A side from its two parts."""
+    return changing._replace(
+        shape=constant.shape, acceleration=constant.acceleration, displacement=constant.displacement
+    )
 
 
 def _empty_row(dtype: Any) -> ContactRow:

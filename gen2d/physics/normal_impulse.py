@@ -11,7 +11,15 @@ from typing import NamedTuple, TypeAlias
 
 import jax.numpy as jnp
 
-from gen2d.physics.constraint import ActiveContact, ContactConstraint, ContactFrame, Impulse, Inertia, softness
+from gen2d.physics.constraint import (
+    ActiveContact,
+    ContactConstraint,
+    ContactFrame,
+    Impulse,
+    Inertia,
+    reciprocal,
+    softness,
+)
 from gen2d.physics.params import SolverParams
 from gen2d.physics.time_of_impact import MISSES
 from gen2d.records.axes import Array
@@ -25,8 +33,10 @@ class NormalTarget(NamedTuple):
     active: Array
     speed: Array  # m/s
     compliance: Array | float  # of the impulse, relative to k_normal
+    leak: Array | float  # share of what a spring with this compliance would take from the impulse of the last step
     idle: Array  # N s: the impulse where not active
     bounces: Array
+    apart: Array | None = None  # whether it is an impact of its own, whose friction is bounded by its own impulse
 
 
 TargetOf: TypeAlias = Callable[[ActiveContact, Array, Impulse], NormalTarget]
@@ -39,6 +49,22 @@ def bounce_speed(constraint: ContactConstraint, contact: ActiveContact, speed: A
     """
     arrival = -speed - contact.fall
     return jnp.where(arrival > 0, jnp.maximum(constraint.elasticity * arrival - contact.fall, 0.0), speed)
+
+
+LEAK, LEAK_BY_RATIO = 0.3, 0.01
+
+
+def _leak(constraint: ContactConstraint) -> Array | float:
+    """Share of the leak of a spring, between LEAK and 1.
+
+    A contact that leaks like a spring sinks under its load by Hooke's law. One that does not leak at all would make
+    heavy bodies on light ones unstable, whose loads take as many steps to arrive as the ratio of the masses.
+    """
+    if constraint.a is None or constraint.static:
+        return LEAK
+    a, b = constraint.a.mass, constraint.b.mass
+    ratio = jnp.maximum(a, b) * reciprocal(jnp.minimum(a, b), jnp.minimum(a, b) > 0)
+    return jnp.clip(LEAK_BY_RATIO * ratio, LEAK, 1.0)
 
 
 def biased_target(
@@ -60,6 +86,7 @@ def biased_target(
         active=active,
         speed=jnp.where(bounces, bounce, -bias),
         compliance=jnp.where(apart | bounces, 0.0, impulse_scale / mass_scale),
+        leak=_leak(constraint),
         idle=jnp.where(touches & bounces, old.normal, 0.0),
         bounces=bounces,
     )
@@ -81,7 +108,8 @@ def relaxed_target(
     rests = (contact.tau < 0) & ((old.normal > 0) | (contact.gap <= 0)) & (speed >= -threshold)
     again = bounces_again(contact, speed, threshold)
     active = again | (rests & (contact.frame.normal_mass > 0))
-    return NormalTarget(active, jnp.where(again, -constraint.elasticity * speed, 0.0), 0.0, old.normal, again)
+    target, apart = jnp.where(again, -constraint.elasticity * speed, 0.0), again | (contact.tau >= 0)
+    return NormalTarget(active, target, 0.0, 0.0, old.normal, again, apart)
 
 
 class _Row:
@@ -92,7 +120,7 @@ class _Row:
         stiff = 1 + target.compliance
         self.active, self.bounces = target.active, target.active & target.bounces
         self.old, self.k = old.normal, stiff * k_normal
-        self.missing = target.speed - speed - target.compliance * k_normal * old.normal
+        self.missing = target.speed - speed - target.leak * target.compliance * k_normal * old.normal
         self.least = jnp.where(target.active, 0.0, target.idle)
         self._mass = mass / stiff
 

@@ -15,12 +15,13 @@ from gen2d.core.enums import DYNAMIC, KINEMATIC
 from gen2d.physics import rigid_joints, springs_limits_motors
 from gen2d.physics.all_pairs import AllPairs
 from gen2d.physics.broad_phase import round_robin_of
-from gen2d.physics.collision import FAR, Stadium, dot, offset_from_core
+from gen2d.physics.collision import FAR, Stadium
 from gen2d.physics.constraint import ContactConstraint, Inertia, Motion, frame_of, mix_materials, reciprocal
 from gen2d.physics.contact_state import PassSetup
 from gen2d.physics.nearby_pairs import DynamicSide, NearbyPairs, PairBatch, StaticSide, chunk_size
 from gen2d.physics.params import SolverParams
 from gen2d.physics.schedule import matches, pairings, run_schedule
+from gen2d.physics.segment_lines import Neighbours, neighbours_of
 from gen2d.physics.shapes import BodyShape, CapsuleShape, DiscShape, body_shape_of, to_world
 from gen2d.physics.state import BodyGroupState, Model, StaticBody
 from gen2d.records.axes import Array, Record
@@ -151,44 +152,10 @@ def _constraint(
     return constraint._replace(frame=frame_of(constraint, levers, present))
 
 
-ENDS_MEET = 1e-4  # m: ends that are so near to another segment lie on it
-
-
-def _continuing_directions(ends: Array, own: np.ndarray, shapes: Stadium) -> tuple[Array, Array]:
-    """Two directions in which other segments continue at the ends [2, E, n] of segments `own` [E]; zero without one.
-
-    Segments [S, ..., 1, n] are visited in a loop, so that its body is compiled once.
-    """
-
-    def visit(directions: tuple[Array, Array], other: tuple[Stadium, Array]) -> tuple[tuple[Array, Array], None]:
-        (first, second), (shape, number) = directions, other
-        offset, along, _ = offset_from_core(shape, ends)
-        meets = (dot(offset, offset) < ENDS_MEET**2) & (shape.half_length > ENDS_MEET) & (number != own)[:, None]
-        for sign, goes in ((1, along < shape.half_length - ENDS_MEET), (-1, along > ENDS_MEET - shape.half_length)):
-            new, empty = meets & goes, dot(first, first) == 0
-            first, second = (
-                jnp.where(new & empty, sign * shape.direction, first),
-                jnp.where(new & ~empty, sign * shape.direction, second),
-            )
-        return (first, second), None
-
-    zero = jnp.zeros_like(ends)
-    return jax.lax.scan(visit, (zero, zero), (shapes, jnp.arange(len(shapes.radius))))[0]
-
-
-def _neighbours(statics: list[StaticBody]) -> dict[int, list]:
-    """Directions of the continuing segments at both ends of each static segment; empty for a single segment."""
+def _neighbours(statics: list[StaticBody]) -> tuple[dict[int, Neighbours], dict[int, Neighbours]]:
+    """Neighbours of each static segment at rest, for discs and for other shapes."""
     segments = {i: f.shape for i, f in enumerate(statics) if isinstance(f.shape, Stadium) and f.motion is None}
-    if len(segments) < 2:
-        return {}
-    shapes: Stadium = jax.tree.map(lambda *x: jnp.stack(jnp.broadcast_arrays(*x)), *segments.values())
-    reach = shapes.half_length[:, None] * shapes.direction
-    ends = jnp.stack([shapes.centre - reach, shapes.centre + reach], axis=1)  # [S, 2 ends, 2, 1, n]
-    numbers = np.arange(2 * len(segments))
-    ends = jnp.moveaxis(ends[..., 0, :], 2, 0).reshape(2, len(numbers), -1)
-    directions = _continuing_directions(ends, numbers // 2, shapes)
-    each = [tuple(x[:, k : k + 1] for x in directions) for k in numbers]
-    return {i: each[2 * k : 2 * k + 2] for k, i in enumerate(segments)}
+    return neighbours_of(segments)
 
 
 def _all_pairs(
@@ -200,15 +167,15 @@ def _all_pairs(
     params: SolverParams,
 ) -> AllPairs:
     order = matches([padded_size(group.count) for group, _ in dynamic_groups(layout)], len(statics))
-    neighbours, rounds = _neighbours(statics), [match for match in order for _ in range(match.rounds)]
+    (of_discs, of_others), rounds = _neighbours(statics), [match for match in order for _ in range(match.rounds)]
     pairs = [((statics if m.static else groups)[m.first].body_shape, groups[m.second].body_shape) for m in rounds]
 
     def play(k: int, a: Material, b: Material) -> tuple[Material, Material, tuple[ContactConstraint, Array, Array]]:
         match = rounds[k]
         constraint = _constraint(a, b, pairs[k], match.static, layout, params.mixing)
-        if constraint.frame is not None and match.static and match.first in neighbours:
-            left, right = neighbours[match.first]
-            constraint = constraint._replace(left=left, right=right)
+        if match.static:
+            neighbours = of_discs if isinstance(pairs[k][1], DiscShape) else of_others
+            constraint = constraint._replace(neighbours=neighbours.get(match.first))
         return a, b, (constraint, jnp.broadcast_to(a.slot, b.slot.shape), b.slot)
 
     _, played = run_schedule(*_materials(objects, layout, groups), order, play)
@@ -233,7 +200,8 @@ def _nearby_pairs(
     dynamic, static = _materials(objects, layout, groups)
     sizes, firsts = [material.slot.shape[0] for material in dynamic], [first for _, first in dynamic_groups(layout)]
     solid, solid_static = ([group.collides for group, _ in of] for of in (dynamic_groups(layout), static_slots(layout)))
-    slots_of_statics, neighbours, batches = [slot for _, slot in static_slots(layout)], _neighbours(statics), []
+    slots_of_statics, (of_discs, of_others) = [slot for _, slot in static_slots(layout)], _neighbours(statics)
+    batches: list[PairBatch] = []
 
     def add(shapes: tuple[BodyShape, BodyShape], slots_a: np.ndarray, b: np.ndarray, **more: Any) -> None:
         def constraint(a: Material, b: Material) -> ContactConstraint:
@@ -250,19 +218,18 @@ def _nearby_pairs(
         shapes = groups[m.first].body_shape, groups[m.second].body_shape
         add(shapes, a + firsts[m.first], b, first=m.first, second=m.second, a=a, statics={}, round_robin=ring)
     for g, group in enumerate(groups):
-        disc = isinstance(group.body_shape, DiscShape)
+        neighbours = of_discs if isinstance(group.body_shape, DiscShape) else of_others
 
-        def operations(i: int, disc: bool = disc) -> tuple:
+        def operations(i: int, neighbours: dict[int, Neighbours] = neighbours) -> tuple:
             """Key of the static bodies that are solved by the same operations."""
             body = statics[i]
             leaves = len(jax.tree.leaves(body.body_shape))
-            return type(body.body_shape), leaves, body.motion is None, i in neighbours and disc
+            return type(body.body_shape), leaves, body.motion is None, i in neighbours
 
         touching = [i for i in range(len(statics)) if solid[g] and solid_static[i]]
-        for key, numbers in itertools.groupby(touching, key=operations):
+        for _, numbers in itertools.groupby(touching, key=operations):
             alike = list(numbers)
-            ends = {i: neighbours[i] if key[-1] else (None, None) for i in alike}
-            sides = {i: StaticSide(static[i], left, right, static[i].present) for i, (left, right) in ends.items()}
+            sides = {i: StaticSide(static[i], neighbours.get(i), static[i].present) for i in alike}
             a, b = np.indices((len(alike), sizes[g]))
             slots = np.array([slots_of_statics[i] for i in alike])[a]
             shapes = statics[alike[0]].body_shape, group.body_shape

@@ -3,7 +3,7 @@
 A step of h seconds:
 
 1. Gravity, forces and damping change the velocities.
-2. The impulses of the last step are applied again (warm starting).
+2. The impulses of the last step are applied again (warm starting), at half of the step.
 3. Every pair is solved once with its soft bias, bounces at the exact time of impact, then all rigid joints at once.
 4. The bodies move.
 5. Every pair and all joints are solved once more without the bias, so that pushing apart leaves no speed behind.
@@ -15,7 +15,11 @@ Pairs are solved in rounds of disjoint pairs (schedule.py), all of them (all_pai
 Restitution. A contact that closes within the step bounces: Newton's law is applied to the velocities that it finds, so
 impacts follow one another and never add energy. The impulse P acts at the time of impact tau, not at the start of the
 step, so it moves its body by (h - tau) P / m: the drift subtracts tau P / m from the displacement of the new velocity.
-The path is exact, and so is its derivative; without tau even its sign is wrong.
+The path is exact, and so is its derivative; without tau even its sign is wrong. All other impulses act at h / 2, like
+forces that are constant in the step.
+
+Impulse and reaction act at one point, where the bodies are when they act, which conserves angular momentum: the passes
+move the contact points by the displacement until then, the last one to the end of the step.
 
 Sources: E. Catto, 'Iterative dynamics with temporal coherence' (GDC 2005) for accumulated impulses and warm starting;
 'Solver2D' (2024) for small steps with soft contacts and a relaxing pass; Y. Hu et al., DiffTaichi (arXiv 1910.00935)
@@ -72,11 +76,8 @@ def _free_motion(
     return motion, Motion(velocity, spin)
 
 
-def _total_drift(side: BodySide, free: Motion) -> Motion:
-    """Displacement beyond h times the motion: the drift of impacts, and that of free flight for bodies that no contact
-    holds."""
-    unheld = jnp.where(side.push > 0, 0.0, 1.0)
-    return jax.tree.map(lambda x, y: x + unheld * y, side.drift, free)
+def _scaled(motion: Motion, time: float) -> Motion:
+    return jax.tree.map(lambda x: time * x, motion)
 
 
 def _displace(body: BodyState, displacement: Motion, motion: Motion) -> BodyState:
@@ -140,15 +141,19 @@ def step(world: WorldState, model: Model, params: SolverParams) -> WorldState:
     different = accelerations if angular else [None] * len(groups)
     works = [None] * len(groups) if ledger is None else ledger.groups
     of_groups = zip(shapes, before, different, works, strict=True)
-    sides = [BodySide(shape, motion, acceleration, work=work) for shape, motion, acceleration, work in of_groups]
+    sides = [
+        BodySide(shape, motion, acceleration, displacement=_scaled(motion, 0.5 * h), work=work)
+        for shape, motion, acceleration, work in of_groups
+    ]
     sides, contacts = solver.warm_start(carry, sides, statics)
     motions = _motions(sides)
-    pushes = []  # bounds on the speeds that warm starting added
+    pushes, drifts = [], []  # bounds on the speeds that warm starting added, and the drift of its impulses
     for after, old in zip(motions, before, strict=True):
-        x, y = jnp.abs(after.velocity - old.velocity)
+        change = jax.tree.map(jnp.subtract, after, old)
+        x, y = jnp.abs(change.velocity)
         pushes.append(x + y)
+        drifts.append(_scaled(change, -0.5 * h))
 
-    drifts = jax.tree.map(jnp.zeros_like, motions)
     joints, motions, drifts, work_solve = springs_limits_motors.solve(
         joints, motions, drifts, accelerations, fixed, params, biased=True
     )
@@ -156,7 +161,7 @@ def step(world: WorldState, model: Model, params: SolverParams) -> WorldState:
     sides = [BodySide(motion=m, drift=drift, push=push, work=s.work) for s, m, drift, push in of_groups]
     statics = [BodySide(motion=side.motion) for side in statics]
     sides, solved = solver.solve(carry, contacts, sides, statics)
-    drifts = [_total_drift(*of) for of in zip(sides, free_drifts, strict=True)]
+    drifts = [jax.tree.map(jnp.add, side.drift, free) for side, free in zip(sides, free_drifts, strict=True)]
     motions = rigid.run(rigid_joints.solve, _motions(sides), drifts)
 
     displacements = [jax.tree.map(lambda x, y: h * x + y, *of) for of in zip(motions, drifts, strict=True)]
@@ -167,7 +172,8 @@ def step(world: WorldState, model: Model, params: SolverParams) -> WorldState:
     joints, motions, _, work_relax = springs_limits_motors.solve(
         joints, motions, displacements, accelerations, fixed, params, biased=False
     )
-    sides = [side._replace(motion=motion, drift=None) for side, motion in zip(sides, motions, strict=True)]
+    of_groups = zip(sides, motions, displacements, strict=True)
+    sides = [side._replace(motion=m, drift=None, displacement=moved) for side, m, moved in of_groups]
     sides, carry = solver.relax(carry, solved, sides, statics, world.time)
     motions = rigid.run(rigid_joints.relax, _motions(sides), displacements)
     if ledger is not None:

@@ -115,6 +115,15 @@ def segments(a: Any, b: Any, present: Any = True, **material: Any) -> BodyGroup:
     )  # fmt: skip
 
 
+def segment_chain(points: Any, present: Any = True, *, closed: bool = False, **material: Any) -> BodyGroup:
+    """Segments from each of `points` [P, 2] m to the next, and from the last to the first if `closed`; static by
+    default. Bodies do not feel their joints."""
+    points = jnp.asarray(points, jnp.float32)
+    nexts = jnp.roll(points, -1, axis=0)
+    count = len(points) if closed else len(points) - 1
+    return segments(points[:count], nexts[:count], present, **material)
+
+
 def boxes(position: Array, angle: Any, width: Any, height: Any, present: Any = True, **material: Any) -> BodyGroup:
     """Rectangles at centres [K, 2] m, with sides in m."""
     count = position.shape[0]
@@ -145,7 +154,7 @@ def polygons(
 def box_walls(width: float, height: float, **material: Any) -> BodyGroup:
     """Floor, right wall, ceiling and left wall of a box from (0, 0) to (width, height) m; each faces inwards."""
     corners = jnp.asarray([[0, 0], [width, 0], [width, height], [0, height]], jnp.float32)
-    return segments(corners, jnp.roll(corners, -1, axis=0), **material)
+    return segment_chain(corners, closed=True, **material)
 
 
 def floor(layout: Layout, widths: float = 4.0, **material: Any) -> BodyGroup:

@@ -134,7 +134,61 @@ class Space:
             If an argument is invalid.
         """
         radius = checked_number("add_segment: radius", radius, low=0)
-        return self._add_line("add_segment", a, b, radius, **{"kind": "static", **options})
+        return self._add_line("add_segment", "segment", a, b, radius, **{"kind": "static", **options})
+
+    def add_chain(
+        self,
+        points: Sequence[Pair] | np.ndarray,
+        *,
+        closed: bool = False,
+        radius: float = 0.0,
+        **options: Unpack[BodyOptions],
+    ) -> list[int]:
+        """Add a chain of segments from point to point, such as hilly ground; bodies do not feel its joints.
+
+        Parameters
+        ----------
+        points : array_like, [P, 2]
+            At least 2 points in m.
+        closed : bool
+            Whether a last segment leads back to the first point, which takes 3 points.
+        radius : float
+            Half the thickness of the segments in m.
+        **options
+            Options of each segment; see `BodyOptions`. The kind is "static".
+
+        Returns
+        -------
+        list of int
+            Numbers of the segments, in the order of their points.
+
+        Raises
+        ------
+        ConfigError
+            If an argument is invalid.
+
+        Examples
+        --------
+        >>> space = gen2d.Space()
+        >>> ground = space.add_chain([(-4, 1), (0, 0), (4, 1)], friction=0.2)
+        >>> box = space.add_box((-3, 1.5), 0.4, 0.4)
+        """
+        least, number = 3 if closed else 2, len(points)
+        if number < least:
+            raise ConfigError(f"add_chain: points has {number} points, but must have at least {least}")
+        if (kind := options.get("kind", "static")) != "static":
+            raise ConfigError(f"add_chain: kind is {kind!r}, but must be 'static'")
+        radius = checked_number("add_chain: radius", radius, low=0)
+        ends = [checked_pair(f"add_chain: points[{i}]", point) for i, point in enumerate(points)]
+        starts = ends if closed else ends[:-1]
+        for i, start in enumerate(starts):
+            if (start == ends[(i + 1) % number]).all():
+                raise ConfigError(f"add_chain: points[{i}] and the next are both {start.tolist()}, but must differ")
+        chain: Any = {**options, "kind": "static"}
+        return [
+            self._add_line("add_chain", "segment", start, ends[(i + 1) % number], radius, **chain)
+            for i, start in enumerate(starts)
+        ]
 
     def add_capsule(self, a: Pair, b: Pair, radius: float, **options: Unpack[BodyOptions]) -> int:
         """Add a capsule: all points within `radius` of the line segment from a to b.
@@ -158,7 +212,9 @@ class Space:
         ConfigError
             If an argument is invalid.
         """
-        return self._add_line("add_capsule", a, b, checked_number("add_capsule: radius", radius, above=0), **options)
+        return self._add_line(
+            "add_capsule", "capsule", a, b, checked_number("add_capsule: radius", radius, above=0), **options
+        )
 
     def add_box(
         self, position: Pair, width: float, height: float, *, angle: float = 0.0, **options: Unpack[BodyOptions]
@@ -311,13 +367,13 @@ class Space:
             return point
         return rotate(point - self.bodies[number].position, -self.bodies[number].angle)
 
-    def _add_line(self, name: str, a: Pair, b: Pair, radius: float, **options: Any) -> int:
+    def _add_line(self, name: str, shape: str, a: Pair, b: Pair, radius: float, **options: Any) -> int:
         first, last = checked_pair(f"{name}: a", a), checked_pair(f"{name}: b", b)
         x, y = last - first
         if x == 0 and y == 0:
             raise ConfigError(f"{name}: a and b are both {first.tolist()}, but must be two points")
-        shape, half = name.removeprefix("add_"), math.hypot(x, y) / 2
-        return self._add(name, shape, (first + last) / 2, math.atan2(y, x), radius=radius, half_length=half, **options)
+        length, angle = math.hypot(x, y), math.atan2(y, x)
+        return self._add(name, shape, (first + last) / 2, angle, radius=radius, half_length=length / 2, **options)
 
     def _add(
         self, name: str, shape: str, position: np.ndarray, angle: float, *,

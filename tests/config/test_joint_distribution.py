@@ -55,6 +55,21 @@ def test_what_is_cut_is_inside_or_outside_and_both_are_all(one, other):
             assert (np.any([span.contains(values) for span in region], axis=0) == expected).all()
 
 
+@pytest.mark.parametrize(
+    ("value", "cut", "share"),
+    [
+        ([0, 4], [1, 2], 0.25),
+        ({"log_uniform": [1, 100]}, [1, 10], 0.5),
+        ({"integer": [1, 8]}, [3, 5], 3 / 8),
+        ({"normal": [0, 1]}, [-1, 1], 0.6827),
+        ({"choice": [1, 2, 4]}, [1, 3], 2 / 3),
+    ],
+)
+def test_the_probability_of_a_piece_is_its_share(value, cut, share):
+    inside = truncation.inside(parse(value), parse(cut).spans)
+    assert_allclose(truncation.total(inside), share, rtol=1e-4)
+
+
 def test_ranges_that_meet_have_nothing_in_common():
     low, high = parse([0.7, 1.4]), parse([1.4, 2.0])
     assert low.spans[0].intersect(high.spans[0]) is None

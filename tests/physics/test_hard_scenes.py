@@ -27,20 +27,17 @@ def add_slider(space: Space, shape: str) -> int:
     return space.add_polygon([(-0.5, 0), (0.5, 0), (0, 0.8)], **options)
 
 
-@pytest.mark.asked
 @pytest.mark.full
-@pytest.mark.parametrize(
-    ("shape", "way_bound", "lean_bound"), [("box", 33, 0.6), ("capsule", 0.5, 2e-3), ("triangle", 33, 0.3)]
-)
-def test_sliding_body_does_not_feel_the_joints_of_a_floor(shape, way_bound, lean_bound):
+@pytest.mark.parametrize("shape", ["box", "capsule", "triangle"])
+def test_sliding_body_does_not_feel_the_joints_of_a_floor(shape):
     space = Space(gravity=(0, -GRAVITY))
     for k in range(24):
         space.add_segment((2 * k - 4, 0), (2 * k - 2, 0), friction=0.0)
     body = add_slider(space, shape)
     video = space.simulate(10, fps=60)
     way, lean = video.position[-1, body, 0] - video.position[0, body, 0], np.abs(video.angle[:, body]).max()
-    holds(f"{shape} over 24 collinear segments: way in 10 s less 30 m, m", way - 30, way_bound, asked=1e-3)
-    holds(f"{shape} over 24 collinear segments: angle, rad", lean, lean_bound, asked=1e-4)
+    holds(f"{shape} over 24 collinear segments: way in 10 s less 30 m, m", way - 30, 1e-3)
+    holds(f"{shape} over 24 collinear segments: angle, rad", lean, 1e-4)
 
 
 # Rest ---------------------------------------------------------------------------------------------------------------
@@ -50,7 +47,7 @@ def test_sliding_body_does_not_feel_the_joints_of_a_floor(shape, way_bound, lean
 @pytest.mark.full
 @pytest.mark.parametrize(
     ("ratio", "bound", "asked"),
-    [(10, 6e-3, 5e-4), (100, 5e-2, 1e-3), (1000, 1.1, 5e-3)],  # the last falls through
+    [(10, 2e-3, 5e-4), (100, 4e-2, 1e-3), (1000, 1.1, 5e-3)],  # the last falls through
 )
 def test_heavy_box_stands_on_a_light_one(ratio, bound, asked):
     space = Space(gravity=(0, -GRAVITY))
@@ -73,7 +70,7 @@ def test_stack_of_ten_boxes_stands():
     video = space.simulate(10, fps=60)
     last = video.position[300:, boxes]
     way = np.linalg.norm(last - last[:1], axis=-1)
-    holds("stack of 10 boxes: overlap, m", deepest_overlap(space, video), 8e-3, asked=1e-3)
+    holds("stack of 10 boxes: overlap, m", deepest_overlap(space, video), 3e-3, asked=1e-3)
     holds("stack of 10 boxes: way in the last 5 of 10 s, m", way, 1e-4)
 
 
@@ -113,7 +110,6 @@ def test_spinning_elastic_box_keeps_its_energy(spin):
 # Friction -----------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.asked
 @pytest.mark.full
 def test_sliding_from_rest_is_uniformly_accelerated():
     """A body that slides down a slope: g (sin - mu cos) t^2 / 2."""
@@ -125,5 +121,5 @@ def test_sliding_from_rest_is_uniformly_accelerated():
     space.add_segment((-10, 5), (200, 5), friction=math.sqrt(mu))
     video = space.simulate(seconds, fps=60)
     exact = GRAVITY * (math.sin(slope) - mu * math.cos(slope)) * seconds**2 / 2
-    holds("disc that slides from rest: way in 10 s, m", video.position[-1, disc, 0] - exact, 0.04, asked=5e-3)
-    holds("box that slides from rest: way in 10 s, m", video.position[-1, box, 0] - exact, 0.04, asked=5e-3)
+    holds("disc that slides from rest: way in 10 s, m", video.position[-1, disc, 0] - exact, 5e-3)
+    holds("box that slides from rest: way in 10 s, m", video.position[-1, box, 0] - exact, 5e-3)

@@ -94,7 +94,6 @@ def momentum_scales(worlds: list[tuple]) -> tuple[np.ndarray, np.ndarray]:
 # Conservation -------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.asked
 @settings(max_examples=8, deadline=None, derandomize=True)
 @given(SEEDS, st.floats(0, 1), st.floats(0, 1))
 def test_i1_i2_momentum_is_conserved_without_fixed_objects(seed, elasticity, friction):
@@ -103,7 +102,7 @@ def test_i1_i2_momentum_is_conserved_without_fixed_objects(seed, elasticity, fri
     sizes, angular_sizes = momentum_scales(worlds)
     drift = np.linalg.norm(linear - linear[:, :1], axis=-1).max(1) / sizes / 2  # in 2 s
     holds("I1 momentum, of the sum of |m v|, per s", drift, 1e-5)
-    holds("I2 angular momentum, relative", np.abs(angular - angular[:, :1]).max(1) / angular_sizes, 3e-4, asked=1e-4)
+    holds("I2 angular momentum, relative", np.abs(angular - angular[:, :1]).max(1) / angular_sizes, 1e-5)
 
 
 def energy_gains(worlds: list[tuple]) -> np.ndarray:
@@ -166,7 +165,6 @@ def test_i3_elastic_gas_keeps_its_energy_for_a_minute():
     holds("I3 elastic gas of 16, 60 s, relative", energy / energy[:, :1] - 1, 1e-3)
 
 
-@pytest.mark.asked
 @pytest.mark.full
 def test_elastic_gas_in_double_precision_conserves_to_the_ninth_digit():
     with jax.enable_x64(True):
@@ -181,7 +179,7 @@ def test_elastic_gas_in_double_precision_conserves_to_the_ninth_digit():
     energy = energies(boxed, bouncing)
     holds("f64: energy of an elastic gas, relative", energy / energy[:, :1] - 1, 1e-9)
     turned = np.abs(angular - angular[:, :1]).max(1) / angular_sizes
-    holds("f64: angular momentum, relative", turned, 1e-4, asked=1e-9)
+    holds("f64: angular momentum, relative", turned, 1e-12)
 
 
 # Odd scenes ---------------------------------------------------------------------------------------------------------
@@ -258,7 +256,8 @@ def test_i6_resting_overlapping_discs_on_a_floor_do_not_fly_apart():
 
 
 def test_an_overlap_ends_like_a_soft_spring_which_is_stiffer_against_static_bodies():
-    """Each step of a damped spring without warm start takes the same part of what is left (Catto, 'Solver2D', 2024)."""
+    """Each step of a damped spring without warm start takes the same part of what is left (Catto, 'Solver2D', 2024):
+    half of the spring's, as its impulse acts at half of the step."""
     cases = [
         Case([{"x": (0, 0.45)}], [FLOOR]),
         Case([{"x": (-0.475, 0)}, {"x": (0.475, 0)}]),
@@ -270,7 +269,7 @@ def test_an_overlap_ends_like_a_soft_spring_which_is_stiffer_against_static_bodi
     ):
         turn, ratio = STEP * 2 * np.pi * hertz, 10
         part = turn**2 / (1 + 2 * ratio * turn + turn**2)
-        holds(f"Overlap with {name}, of that at the start", left / 0.05 - (1 - part) ** k, 1e-3)
+        holds(f"Overlap with {name}, of that at the start", left / 0.05 - (1 - part / 2) ** k, 1e-3)
 
 
 def test_a_slow_disc_far_from_the_origin_moves():
@@ -412,7 +411,7 @@ def test_a_video_does_not_depend_on_its_place_or_its_neighbours():
 
 # Hash of a simulation by version of jaxlib and instruction set. A change of the solver that is meant to change results
 # replaces it; one that is not, such as a move or a new name, must not.
-KNOWN_BITS = {("0.10.2", "avx512f"): "52174ed2de10420f"}
+KNOWN_BITS = {("0.10.2", "avx512f"): "eacf54312d1fc231"}
 
 
 def test_a_simulation_has_the_bits_that_are_known_for_this_platform():
