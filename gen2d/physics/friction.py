@@ -23,7 +23,7 @@ def friction_impulse(
     """
     if apart is not None:
         normal_impulse = normal_impulse - jnp.where(apart, old.normal, 0.0)
-    kept = 0.0 if apart is None else jnp.where(apart, old.tangent, 0.0)
+    kept = jnp.zeros_like(slip) if apart is None else jnp.where(apart, old.tangent, 0.0)
     bound = constraint.friction * normal_impulse
     tangent = kept + jnp.clip(old.tangent - kept - contact.frame.tangent_mass * slip, -bound, bound)
     return jnp.where(bound > 0, tangent, kept)  # the gradient of a clip between two zeros is not zero
