@@ -176,7 +176,7 @@ def impacts_of(
     return contacts, time
 
 
-def _path(side: BodySide, time: Array) -> Array:
+def _path(side: BodySide, time: Array) -> Array | float:
     """Displacement [2, ...] in m of a body until a time in the step; zero at rest."""
     velocity = 0.0 if side.motion is None else time * side.motion.velocity
     return velocity if side.drift is None else velocity + side.drift.velocity
