@@ -60,7 +60,7 @@ def test_what_is_cut_is_inside_or_outside_and_both_are_all(one, other):
     [
         ([0, 4], [1, 2], 0.25),
         ({"log_uniform": [1, 100]}, [1, 10], 0.5),
-        ({"integer": [1, 8]}, [3, 5], 3 / 8),
+        ({"integer": [1, 8]}, [3, 5], 2 / 8),  # without 5
         ({"normal": [0, 1]}, [-1, 1], 0.6827),
         ({"choice": [1, 2, 4]}, [1, 3], 2 / 3),
     ],
