@@ -21,9 +21,11 @@ def friction_impulse(
 
     Where an impact is `apart` from what has acted before, the bound holds for its own impulses.
     """
+    kept = jnp.zeros_like(slip)
     if apart is not None:
+        limit = constraint.friction * normal_impulse
+        kept = jnp.where(apart, jnp.clip(old.tangent, -limit, limit), 0.0)
         normal_impulse = normal_impulse - jnp.where(apart, old.normal, 0.0)
-    kept = jnp.zeros_like(slip) if apart is None else jnp.where(apart, old.tangent, 0.0)
     bound = constraint.friction * normal_impulse
     tangent = kept + jnp.clip(old.tangent - kept - contact.frame.tangent_mass * slip, -bound, bound)
     return jnp.where(bound > 0, tangent, kept)  # the gradient of a clip between two zeros is not zero
