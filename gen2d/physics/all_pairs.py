@@ -115,8 +115,8 @@ class AllPairs(ContactSolver):
         sides, relaxed = run_schedule(sides, statics, self.order, play)
         events, observed = carry.events, dict(carry.observed)
         if events is not None:
-            of = zip(events, solved.pairs, relaxed, self.constraints, strict=True)
-            events = [record_event(event, pair, last, time, c.friction) for event, pair, (last, _), c in of]
+            of = zip(events, solved.pairs, relaxed, strict=True)
+            events = [record_event(event, pair, last, time) for event, pair, (last, _) in of]
         for pair, warm in zip(solved.pairs, carry.warm, strict=True):
             depth, began = contact_passes.observe(pair, warm)
             old = observed[size := depth.shape[0]]

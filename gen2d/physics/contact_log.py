@@ -38,7 +38,7 @@ def empty_events(shape: tuple[int, ...], dtype: jnp.dtype) -> ContactEvent:
 MOST_OF_IT = 0.5  # a smaller share of the impulse is a difference of two large ones, without a direction
 
 
-def _impulse_of_step(solved: SolvedPair, relaxed: SolvedPair, coefficient: Array) -> tuple[Array, Array, Array]:
+def _impulse_of_step(solved: SolvedPair, relaxed: SolvedPair) -> tuple[Array, Array, Array]:
     """Normal [2, ...], and normal and tangential impulse in N s, of a pair with one point in both passes.
 
     Discs move on between the passes, so the impulses act along two normals, and are added as vectors.
@@ -55,16 +55,11 @@ def _impulse_of_step(solved: SolvedPair, relaxed: SolvedPair, coefficient: Array
     twice = (solved.contacts[0].tau >= 0) & (last > first) & has_direction
     friction = slid * perpendicular(begin) + (slides - slid) * perpendicular(end)
     tangent = jnp.where(twice, dot(across, friction), slides * length * reciprocal(last, last > 0))
-    length = jnp.where(twice, length + dot(normal, friction), length)
-    bound = coefficient * length  # along one normal, the friction of two may exceed it a little
-    return normal, length, jnp.where(twice, jnp.clip(tangent, -bound, bound), tangent)
+    return normal, jnp.where(twice, length + dot(normal, friction), length), tangent
 
 
-def record_event(
-    event: ContactEvent, solved: SolvedPair, relaxed: SolvedPair, start: Array, coefficient: Array
-) -> ContactEvent:
-    """Event after one more step, which began at `start`, from the pair after the biased and the relaxing solve, and its
-    coefficient of friction."""
+def record_event(event: ContactEvent, solved: SolvedPair, relaxed: SolvedPair, start: Array) -> ContactEvent:
+    """Event after one more step, which began at `start`, from the pair after the biased and the relaxing solve."""
     points = list(zip(solved.contacts, solved.impulses, relaxed.impulses, strict=True))
     touching = [(biased.normal > 0) | (last.normal > 0) for _, biased, last in points]
     contact, on = points[0][0]._replace(frame=None), touching[0]
@@ -74,7 +69,7 @@ def record_event(
         bounced = bounced | (touching[1] & (other.tau >= 0))
         contact, on = jax.tree.map(lambda x, y: jnp.where(second, y, x), contact, other), on | second
     if len(points) == 1:
-        normal, *impulses = _impulse_of_step(solved, relaxed, coefficient)
+        normal, *impulses = _impulse_of_step(solved, relaxed)
         contact = contact._replace(normal=normal)
     else:
         impulses = [sum(x[1:], x[0]) for x in zip(*relaxed.impulses, strict=True)]

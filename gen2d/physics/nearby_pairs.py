@@ -433,9 +433,7 @@ class NearbyPairs(ContactSolver):
             a, b, (last, warm) = contact_passes.relax(constraint, points, pair, a, b, setup)
             new = CachedConstraint(warm, jnp.full(self.chunk, carry.step, self._dtype), None, None)
             if self.setup.log:
-                event = record_event(
-                    self._event_so_far(carry, cache.at(indices.pair)), pair, last, time, constraint.friction
-                )
+                event = record_event(self._event_so_far(carry, cache.at(indices.pair)), pair, last, time)
                 new = new._replace(event=event, elasticity=constraint.elasticity)
                 now = 2 * carry.step + jnp.where((event.flags & ON) > 0, 1, 0)
                 old = touch.at[indices.pair].get(mode=SAFE)
