@@ -47,14 +47,14 @@ def _impulse_of_step(solved: SolvedPair, relaxed: SolvedPair) -> tuple[Array, Ar
     (first, slid), (last, slides) = solved.impulses[0], relaxed.impulses[0]
     pressed = first * begin + (last - first) * end
     squared = dot(pressed, pressed)
-    has_direction = squared > (MOST_OF_IT * last) ** 2
+    has_direction = squared > (MOST_OF_IT * jnp.maximum(first, last)) ** 2
     length = jnp.sqrt(jnp.where(has_direction, squared, 1.0))
     normal = jnp.where(has_direction, pressed / length, begin)
     length, across = jnp.where(has_direction, length, last), perpendicular(normal)
     # After two bounces, friction has also acted along two tangents.
     twice = (solved.contacts[0].tau >= 0) & (last > first) & has_direction
     friction = slid * perpendicular(begin) + (slides - slid) * perpendicular(end)
-    tangent = jnp.where(twice, dot(across, friction), slides * length * reciprocal(last, last > 0))
+    tangent = jnp.where(twice, dot(across, friction), slides * (length * reciprocal(last, last > 0)))
     return normal, jnp.where(twice, length + dot(normal, friction), length), tangent
 
 
