@@ -131,9 +131,14 @@ def frame_at(constraint: ContactConstraint, point: ManifoldPoint) -> ContactFram
     return frame_of(constraint, levers, constraint.present & (point.gap < FAR / 2))
 
 
+def relative_velocity(a: Motion | None, b: Motion) -> Array:
+    """Velocity [2, ...] in m/s, or displacement in m, of b relative to a."""
+    return b.velocity if a is None else b.velocity - a.velocity
+
+
 def relative_speed(frame: ContactFrame, normal: Array, a: Motion | None, b: Motion) -> tuple[Array, Array]:
     """Normal and tangential speed of b relative to a at the point, m/s."""
-    velocity = b.velocity if a is None else b.velocity - a.velocity
+    velocity = relative_velocity(a, b)
     speed = dot(normal, velocity)
     slip = normal[0] * velocity[1] - normal[1] * velocity[0] + frame.tangent_b * b.spin
     if frame.normal_b is not None:

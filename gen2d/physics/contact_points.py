@@ -26,9 +26,10 @@ from gen2d.physics.constraint import (
     frame_of,
     reciprocal,
     relative_speed,
+    relative_velocity,
 )
 from gen2d.physics.contact_state import BodySide, PassSetup
-from gen2d.physics.segment_lines import admissible, whole_line
+from gen2d.physics.segment_lines import admissible, onward, whole_line
 from gen2d.physics.time_of_impact import (
     ApproachPath,
     plane_approach_speed,
@@ -61,9 +62,8 @@ def _core_offset(constraint: ContactConstraint, a: Any, b: Disc) -> tuple[Array,
     offset, part = _nonzero_offset(offset), jnp.where(along == inside, MIDDLE, END)
     if constraint.neighbours is None:
         return offset, part
-    sides = zip(constraint.neighbours.left, constraint.neighbours.right, strict=True)
-    onward = [dot(offset, jnp.where(along > 0, right, left)) for left, right in sides]
-    return offset, jnp.where((part == END) & (jnp.maximum(*onward) > 0), NEIGHBOUR, part)
+    continues = onward(constraint.neighbours, offset, along > 0) > 0
+    return offset, jnp.where((part == END) & continues, NEIGHBOUR, part)
 
 
 def _manifold(constraint: ContactConstraint, a: Any, b: Any) -> tuple[ManifoldPoint, ...]:
@@ -115,7 +115,7 @@ def displaced_points(
     constraint: ContactConstraint, points: list[ContactPoint], a: Motion | None, b: Motion
 ) -> list[ContactPoint]:
     """Contact points after displacements of both bodies, in which an impulse and its reaction act at one point."""
-    shift = b.velocity if a is None else b.velocity - a.velocity
+    shift = relative_velocity(a, b)
     return [_displaced_point(constraint, point, shift) for point in points]
 
 
@@ -152,7 +152,7 @@ def impacts_of(
     """
     assert b.motion, "only static bodies lack a motion"
     assert b.drift, "only static bodies lack a drift"
-    shift = b.drift.velocity if a.drift is None else b.drift.velocity - a.drift.velocity
+    shift = relative_velocity(a.drift, b.drift)
     taus = [_time_of_impact(point, a, b, shift, setup, h) for point in points]
     if len(taus) == 1:
         time = jnp.where(taus[0] >= 0, taus[0], 0.5 * h)
@@ -184,7 +184,7 @@ def _path(side: BodySide, time: Array) -> Array | float:
 
 def _mean_velocity(point: ContactPoint, a: Motion | None, b: Motion, h: float) -> Array:
     """Velocity [2, ...] of b relative to a in the step, at the end of which they have these motions."""
-    velocity = b.velocity if a is None else b.velocity - a.velocity
+    velocity = relative_velocity(a, b)
     return velocity if point.acceleration is None else velocity - 0.5 * h * point.acceleration
 
 
@@ -198,16 +198,16 @@ def _time_of_impact(point: ContactPoint, a: BodySide, b: BodySide, shift: Array,
     assert b.motion, "only static bodies lack a motion"
     speed, _ = relative_speed(point.frame, point.normal, a.motion, b.motion)
     pull, threshold = _pull(point, point.normal), bounce_threshold(point, point.last_normal, a, b, setup)
-    path, approach = _plane_approach(point, shift, -speed - pull * h, pull)
-    if point.core is not None:
-        core, offset = point.core, point.core.offset + shift
-        gap = jnp.maximum(1 / inverse_length(offset) - core.reach, 0.0)
-        round_one = round_path(offset, gap, core.reach, _mean_velocity(point, a.motion, b.motion, h))
-        if core.flat is None:
-            path, approach = round_one, -speed - pull * h
-        else:  # a contact that belongs to a neighbouring segment has no impact
-            round_one = round_one._replace(c=jnp.where(point.gap < FAR / 2, round_one.c, FAR**2))
-            path = select_path(core.flat, path, round_one)
+    approach, core = -speed - pull * h, point.core
+    if core is None:
+        return time_of_impact(*_plane_approach(point, shift, approach, pull), h, threshold)
+    offset = core.offset + shift
+    gap = jnp.maximum(1 / inverse_length(offset) - core.reach, 0.0)
+    path = round_path(offset, gap, core.reach, _mean_velocity(point, a.motion, b.motion, h))
+    if core.flat is not None:  # a contact that belongs to a neighbouring segment has no impact
+        path = path._replace(c=jnp.where(point.gap < FAR / 2, path.c, FAR**2))
+        straight, approach = _plane_approach(point, shift, approach, pull)
+        path = select_path(core.flat, straight, path)
     return time_of_impact(path, approach, h, threshold)
 
 

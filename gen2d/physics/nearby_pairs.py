@@ -53,6 +53,7 @@ from gen2d.records.axes import Array
 from gen2d.records.trajectory import Contacts
 from gen2d.xla import materialize, max_bodies
 
+CONSTANTS = ("shape", "acceleration", "displacement")  # of a `BodySide`: a pass does not change them
 NEVER = -2  # the step of an event that has not happened
 
 
@@ -322,7 +323,7 @@ class NearbyPairs(ContactSolver):
         tables, inputs = ([self._table(x, self._size(g)) for g, x in enumerate(of)] for of in (changing, constant))
 
         def bodies(now: PackedTable, group: int, where: Array) -> BodySide:
-            return _joined(now.at(where), inputs[group].at(where))
+            return _merge(now.at(where), inputs[group].at(where))
 
         for i, batch in enumerate(self.batches):
             fixed = self._static_table([statics[j] for j in batch.statics]) if batch.first is None else None
@@ -352,7 +353,7 @@ class NearbyPairs(ContactSolver):
             for g, x in rows.items():
                 tables[g] = tables[g]._replace(rows=x)
         shapes = [(self._size(g), self._scenes) for g in range(len(tables))]
-        return [_joined(t.unpack(shape), x) for t, shape, x in zip(tables, shapes, constant, strict=True)], carries
+        return [_merge(t.unpack(shape), x) for t, shape, x in zip(tables, shapes, constant, strict=True)], carries
 
     def _store(self, batch: PairBatch, buffer: Array | None, k: Array, values: list[Array]) -> Array:
         """Buffer with the values of chunk k; a new one if there is none."""
@@ -530,16 +531,13 @@ class NearbyPairs(ContactSolver):
 
 def _split(side: BodySide) -> tuple[BodySide, BodySide]:
     """What a pass changes of a side, and the rest."""
-    shape, acceleration, displacement = side.shape, side.acceleration, side.displacement
-    constant = BodySide(shape, acceleration=acceleration, displacement=displacement)
-    return side._replace(shape=None, acceleration=None, displacement=None), constant
+    constants = {name: getattr(side, name) for name in CONSTANTS}
+    return side._replace(**dict.fromkeys(CONSTANTS)), BodySide(**constants)
 
 
-def _joined(changing: BodySide, constant: BodySide) -> BodySide:
+def _merge(changing: BodySide, constant: BodySide) -> BodySide:
     """A side from its two parts."""
-    return changing._replace(
-        shape=constant.shape, acceleration=constant.acceleration, displacement=constant.displacement
-    )
+    return changing._replace(**{name: getattr(constant, name) for name in CONSTANTS})
 
 
 def _empty_row(dtype: Any) -> ContactRow:

@@ -116,13 +116,16 @@ def whole_line(segment: Stadium, line: SegmentLine, centre: Array) -> tuple[Stad
     return segment._replace(centre=segment.centre + middle * segment.direction, half_length=half), acts
 
 
+def onward(neighbours: Neighbours, vector: Array, at_right: Array) -> Array:
+    """How far a vector [2, ...] from the left or the right end leads along the neighbours there; 0 without any."""
+    pairs = zip(neighbours.left, neighbours.right, strict=True)
+    return jnp.maximum(*(dot(vector, jnp.where(at_right, right, left)) for left, right in pairs))
+
+
 def admissible(segment: Stadium, neighbours: Neighbours) -> Callable[[Array], Array]:
     """Function of a normal [2, ...] away from an end of a segment: whether no neighbour leads that way."""
 
     def admits(normal: Array) -> Array:
-        at_last = dot(normal, segment.direction) > 0
-        pairs = zip(neighbours.left, neighbours.right, strict=True)
-        onward = [dot(normal, jnp.where(at_last, right, left)) for left, right in pairs]
-        return jnp.maximum(*onward) < ONWARD
+        return onward(neighbours, normal, dot(normal, segment.direction) > 0) < ONWARD
 
     return admits
