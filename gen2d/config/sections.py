@@ -46,6 +46,14 @@ class PhysicsOptions:
         choices=("float32", "float64"),
         later=True,
     )
+    impact_order: str = option(
+        "pairs",
+        str,
+        "",
+        "order of impacts in a step: pairs (the solver's, faster) or time (exact where a disc is hit twice)",
+        choices=("pairs", "time"),
+        later=True,
+    )
 
     @property
     def x64(self) -> bool:

@@ -30,7 +30,7 @@ class HeadLostError(EngineError):
 class Report:
     """What a worker says of itself before it gets work."""
 
-    device: str  # kind, such as "cpu avx512f"
+    device: str  # kind, such as "cpu avx512f GenuineIntel"
     hardware: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # for logs
     versions: Mapping[str, str] = dataclasses.field(default_factory=dict)  # of gen2d and the libraries
     identity: Any = None  # workers with equal identities give equal results

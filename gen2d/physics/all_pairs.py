@@ -5,6 +5,7 @@ number of bodies.
 """
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -23,6 +24,7 @@ from gen2d.physics.contact_log import (
     record_event,
 )
 from gen2d.physics.contact_state import BodySide, PassSetup, SolvedPair, WarmStart
+from gen2d.physics.impact_order import TURNS, later_impact, not_hit, takes_part, with_first
 from gen2d.physics.params import SolverParams
 from gen2d.physics.schedule import Match, run_schedule
 from gen2d.physics.solver_protocol import ContactSolver
@@ -87,7 +89,7 @@ class AllPairs(ContactSolver):
         self, carry: AllPairsCarry, sides: list[BodySide], statics: list[BodySide]
     ) -> tuple[list[BodySide], list[list[ContactPoint]]]:
         def play(k: int, a: BodySide, b: BodySide) -> tuple[BodySide, BodySide, list[ContactPoint]]:
-            return contact_passes.warm_start(self.constraints[k], carry.warm[k], a, b, self.setup)
+            return contact_passes.warm_start(self.constraints[k], carry.warm[k], a, b, self.setup, self.params.step)
 
         return run_schedule(sides, statics, self.order, play)
 
@@ -99,7 +101,50 @@ class AllPairs(ContactSolver):
             return contact_passes.solve(self.constraints[k], warm, contacts[k], a, b, self.setup, self.params)
 
         sides, pairs = run_schedule(sides, statics, self.order, play)
+        sides, pairs = self._later_impacts(contacts, pairs, sides, statics)
         return sides, SolvedRounds(contacts, pairs)
+
+    def _later_impacts(
+        self,
+        points: list[list[ContactPoint]],
+        pairs: list[SolvedPair],
+        sides: list[BodySide],
+        statics: list[BodySide],
+    ) -> tuple[list[BodySide], list[SolvedPair]]:
+        """Sides and pairs after the impacts that follow others of their bodies in this step."""
+        if not self.params.by_time:
+            return sides, pairs
+        round_pairs = [takes_part(of, sides[0]) for of in points]
+        if not any(round_pairs):
+            return sides, pairs
+
+        def find(sides: list[BodySide], pairs: list[SolvedPair]) -> tuple[list[BodySide], Array]:
+            def play(k: int, a: BodySide, b: BodySide) -> tuple[BodySide, BodySide, Array | bool]:
+                if not round_pairs[k]:
+                    return a, b, False
+                tau = later_impact(*points[k], *pairs[k].contacts, a, b, self.setup, self.params.step)
+                return *with_first(a, b, tau), jnp.any(tau >= 0)
+
+            sides, follow = run_schedule(not_hit(sides), statics, self.order, play)
+            return sides, functools.reduce(jnp.logical_or, follow)
+
+        def impacts(state: tuple) -> tuple:
+            sides, follow = find(*state[:2])
+            pairs = state[1]
+
+            def play(k: int, a: BodySide, b: BodySide) -> tuple[BodySide, BodySide, SolvedPair]:
+                if not round_pairs[k]:
+                    return a, b, pairs[k]
+                of = self.constraints[k], *points[k], pairs[k], a, b, self.setup, self.params
+                return contact_passes.solve_impact(*of)
+
+            return *run_schedule(sides, statics, self.order, play), follow
+
+        def turn(state: tuple, _: None) -> tuple[tuple, None]:
+            return jax.lax.cond(state[-1], impacts, lambda x: x, state), None
+
+        (sides, pairs, _), _ = jax.lax.scan(turn, (sides, pairs, jnp.ones((), bool)), length=TURNS)
+        return sides, pairs
 
     def relax(
         self,

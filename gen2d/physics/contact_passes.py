@@ -5,6 +5,7 @@ A batch holds any number of pairs: all pairs of a round (all_pairs.py) or a chun
 
 import functools
 
+import jax
 import jax.numpy as jnp
 
 from gen2d.physics.constraint import (
@@ -18,14 +19,22 @@ from gen2d.physics.constraint import (
     relative_speed,
     softness,
 )
-from gen2d.physics.contact_points import bounce_threshold, contact_points, displaced_points, impacts_of
+from gen2d.physics.contact_points import (
+    active_contacts,
+    bounce_threshold,
+    contact_points,
+    displaced_points,
+    impact_times,
+)
 from gen2d.physics.contact_state import BodySide, PassSetup, SolvedPair, WarmStart
 from gen2d.physics.energy import add_disc_dissipation, add_dissipation
 from gen2d.physics.friction import apply_angular_impulse, friction_impulse, rolling_impulse
+from gen2d.physics.impact_order import after_impact, in_order, later_impact, takes_part, with_first
 from gen2d.physics.normal_impulse import (
     NormalTarget,
     TargetOf,
     biased_target,
+    bounce_speed,
     bounces_again,
     relaxed_target,
     solve_normals,
@@ -72,9 +81,12 @@ def _apply_pass(
 
 
 def warm_start(
-    constraint: ContactConstraint, memory: WarmStart, a: BodySide, b: BodySide, setup: PassSetup
+    constraint: ContactConstraint, memory: WarmStart, a: BodySide, b: BodySide, setup: PassSetup, h: float
 ) -> tuple[BodySide, BodySide, list[ContactPoint]]:
-    """Both sides with the impulses of the last step, which act at `displacement`, and the contact points."""
+    """Both sides with the impulses of the last step, which act at `displacement`, and the contact points.
+
+    The sides also have the time of the first impact of each body.
+    """
     assert b.motion is not None, "only static bodies lack a motion"
     roll, before = memory.roll, (a.motion, b.motion)
     acceleration = setup.gravity if constraint.static else None
@@ -95,7 +107,10 @@ def warm_start(
     else:
         work = add_dissipation(b.work, constraint, moved, olds, roll, before, motions)
     motion_b = materialize(motions[1]) if constraint.static else motions[1]
-    return a._replace(motion=motions[0]), b._replace(motion=motion_b, work=work), points
+    a, b = a._replace(motion=motions[0]), b._replace(motion=motion_b, work=work)
+    if takes_part(points, b):
+        a, b = with_first(a, b, *impact_times(points, a, b, setup, h))
+    return a, b, points
 
 
 MIN_PUSH = 1e-9  # m/s: marks a contact that holds its bodies without pushing them apart
@@ -135,7 +150,10 @@ def solve(
     params: SolverParams,
 ) -> tuple[BodySide, BodySide, SolvedPair]:
     """Both sides and the pair after the biased solve, bounces included."""
-    contacts, time = impacts_of(constraint, points, a, b, setup, params.step)
+    taus = impact_times(points, a, b, setup, params.step)
+    if takes_part(points, b):
+        taus = [in_order(*points, *taus, a, b)]
+    contacts, time = active_contacts(constraint, points, taus, a, b, params.step)
 
     def target_of(contact: ActiveContact, speed: Array, old: Impulse) -> NormalTarget:
         return biased_target(constraint, contact, speed, old, params)
@@ -146,9 +164,38 @@ def solve(
     new_b = _update_drift(b, new_b, time, push)
     if constraint.a is not None and a.drift is not None:
         new_a = _update_drift(a, new_a, time, push)
+    bounces = functools.reduce(jnp.logical_or, [tau >= 0 for tau in taus])
+    new_a, new_b = after_impact(new_a, new_b, bounces, time)
     if constraint.static:
         new_b = materialize(new_b._replace(work=None))._replace(work=new_b.work)
     return new_a, new_b, solved
+
+
+def solve_impact(
+    constraint: ContactConstraint,
+    point: ContactPoint,
+    solved: SolvedPair,
+    a: BodySide,
+    b: BodySide,
+    setup: PassSetup,
+    params: SolverParams,
+) -> tuple[BodySide, BodySide, SolvedPair]:
+    """Both sides and the pair after an impact that follows another one of their bodies, if it is their next."""
+    tau = in_order(point, later_impact(point, solved.contacts[0], a, b, setup, params.step), a, b)
+    contacts, time = active_contacts(constraint, [point], [tau], a, b, params.step)
+    happens = tau >= 0
+
+    def target_of(contact: ActiveContact, speed: Array, old: Impulse) -> NormalTarget:
+        bounce = bounce_speed(constraint, contact, speed)
+        active = happens & (bounce > speed) & (contact.frame.normal_mass > 0)
+        return NormalTarget(active, bounce, 0.0, 0.0, old.normal, happens, apart=happens)
+
+    new_a, new_b, new = _apply_pass(constraint, solved._replace(contacts=contacts), target_of, a, b)
+    new_b = _update_drift(b, new_b, time, new_b.push)
+    if constraint.a is not None and a.drift is not None:
+        new_a = _update_drift(a, new_a, time, new_a.push)
+    new_a, new_b = after_impact(new_a, new_b, happens, time)
+    return jax.tree.map(lambda x, y: jnp.where(happens, x, y), (new_a, new_b, new), (a, b, solved))
 
 
 MAX_STACK_IMPACT = 1.0  # m/s: faster contacts count as impacts even inside a stack

@@ -142,18 +142,30 @@ def _displaced_point(constraint: ContactConstraint, point: ContactPoint, shift: 
     return point._replace(frame=frame_of(constraint, levers, frame.normal_mass > 0))
 
 
-def impacts_of(
-    constraint: ContactConstraint, points: list[ContactPoint], a: BodySide, b: BodySide, setup: PassSetup, h: float
-) -> tuple[list[ActiveContact], Array]:
-    """Contact points with their impacts in this step, if there are any, and the time in s at which impulses act.
+def impact_times(points: list[ContactPoint], a: BodySide, b: BodySide, setup: PassSetup, h: float) -> list[Array]:
+    """Time of impact of each point in s, or NONE or MISSES.
 
-    Earlier impulses in this step have shifted the bodies' paths; an impact is computed on the shifted paths. If two
-    points bounce in the same step, the impulses act at the mean of their times, and at half of the step if none does.
+    Earlier impulses in this step have shifted the bodies' paths; an impact is computed on the shifted paths, from the
+    last impact of either body on.
+    """
+    return [_time_of_impact(point, a, b, pair_clock(a, b), setup, h) for point in points]
+
+
+def pair_clock(a: BodySide, b: BodySide) -> Array | None:
+    """Time of the last impact of either body in the step so far, s; None: of no body."""
+    return b.clock if a.clock is None or b.clock is None else jnp.maximum(a.clock, b.clock)
+
+
+def active_contacts(
+    constraint: ContactConstraint, points: list[ContactPoint], taus: list[Array], a: BodySide, b: BodySide, h: float
+) -> tuple[list[ActiveContact], Array]:
+    """Contact points with their times of impact, and the time in s at which impulses act.
+
+    If two points bounce in the same step, the impulses act at the mean of their times, and at half of the step if none
+    does.
     """
     assert b.motion, "only static bodies lack a motion"
     assert b.drift, "only static bodies lack a drift"
-    shift = relative_velocity(a.drift, b.drift)
-    taus = [_time_of_impact(point, a, b, shift, setup, h) for point in points]
     if len(taus) == 1:
         time = jnp.where(taus[0] >= 0, taus[0], 0.5 * h)
     else:
@@ -161,7 +173,7 @@ def impacts_of(
         both, total = (first >= 0) & (second >= 0), jnp.maximum(first, 0.0) + jnp.maximum(second, 0.0)
         time = jnp.where(both, 0.5 * total, jnp.where((first >= 0) | (second >= 0), total, 0.5 * h))
     taus, time = materialize((taus, time))
-    velocity = _mean_velocity(points[0], a.motion, b.motion, h)
+    shift, velocity = relative_velocity(a.drift, b.drift), _mean_velocity(points[0], a.motion, b.motion, h)
     contacts = []
     for point, tau in zip(points, taus, strict=True):
         frame, normal = materialize(_displaced_point(constraint, point, shift + time * velocity)[:2])
@@ -193,29 +205,37 @@ def _pull(point: ContactPoint, normal: Array) -> Array | float:
     return 0.0 if point.acceleration is None else -dot(normal, point.acceleration)
 
 
-def _time_of_impact(point: ContactPoint, a: BodySide, b: BodySide, shift: Array, setup: PassSetup, h: float) -> Array:
-    """Time of impact in s, or NONE or MISSES."""
+def _time_of_impact(
+    point: ContactPoint, a: BodySide, b: BodySide, clock: Array | None, setup: PassSetup, h: float
+) -> Array:
+    """Time of impact in s after the clock, or NONE or MISSES."""
     assert b.motion, "only static bodies lack a motion"
     speed, _ = relative_speed(point.frame, point.normal, a.motion, b.motion)
     pull, threshold = _pull(point, point.normal), bounce_threshold(point, point.last_normal, a, b, setup)
     approach, core = -speed - pull * h, point.core
-    if core is None:
+    shift = jnp.zeros_like(point.normal) if b.drift is None else relative_velocity(a.drift, b.drift)
+    if core is None:  # its corners turn within the step, so a path from a later time on is no better
         return time_of_impact(*_plane_approach(point, shift, approach, pull), h, threshold)
-    offset = core.offset + shift
+    offset, velocity = core.offset + shift, _mean_velocity(point, a.motion, b.motion, h)
+    if clock is not None:
+        offset = offset + clock * velocity
     gap = jnp.maximum(1 / inverse_length(offset) - core.reach, 0.0)
-    path = round_path(offset, gap, core.reach, _mean_velocity(point, a.motion, b.motion, h))
+    path = round_path(offset, gap, core.reach, velocity)
     if core.flat is not None:  # a contact that belongs to a neighbouring segment has no impact
         path = path._replace(c=jnp.where(point.gap < FAR / 2, path.c, FAR**2))
-        straight, approach = _plane_approach(point, shift, approach, pull)
+        straight, approach = _plane_approach(point, shift, approach, pull, clock)
         path = select_path(core.flat, straight, path)
-    return time_of_impact(path, approach, h, threshold)
+    return time_of_impact(path, approach, h, threshold, clock)
 
 
 def _plane_approach(
-    point: ContactPoint, shift: Array, approach: Array, pull: Array | float
+    point: ContactPoint, shift: Array, approach: Array, pull: Array | float, clock: Array | None = None
 ) -> tuple[ApproachPath, Array]:
-    """Path to a plane and the speed of arrival there."""
-    gap = jnp.maximum(point.gap + dot(point.normal, shift), 0.0)
+    """Path to a plane from the clock on, and the speed of arrival there; `approach` is the speed without a clock."""
+    gap = point.gap + dot(point.normal, shift)
+    if clock is not None:
+        gap, approach = gap - clock * (approach + 0.5 * clock * pull), approach + clock * pull
+    gap = jnp.maximum(gap, 0.0)
     return plane_path(gap, approach, pull), plane_approach_speed(gap, approach, pull)
 
 
@@ -227,7 +247,7 @@ def bounce_threshold(
     It exceeds what pushing overlaps apart may add and what the pair's last normal impulse causes in a step; otherwise
     a pile would bounce on itself.
     """
-    push = b.push if a.push is None else a.push + b.push
+    push = 0.0 if b.push is None else b.push if a.push is None else a.push + b.push
     return setup.threshold + push + point.frame.k_normal * normal
 
 

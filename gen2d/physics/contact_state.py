@@ -26,6 +26,8 @@ class BodySide(NamedTuple):
     displacement: Motion | None = None  # m, rad: where the impulses of a pass act; None: of static bodies
     push: Any = None  # [N, ...] m/s: bound on the speed from pushing overlaps apart; 0: no contact; None: static
     work: Work | None = None
+    first: Array | None = None  # [N, ...] s: least time of impact of a body in the step; infinite without one
+    clock: Array | None = None  # [N, ...] s: of a body's last impact in the step so far; 0 without one
 
 
 class WarmStart(NamedTuple):

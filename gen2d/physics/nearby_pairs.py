@@ -9,7 +9,8 @@ The loops end with the last near pair, so there is no reverse-mode gradient; all
 """
 
 import dataclasses
-from collections.abc import Callable
+import functools
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -44,6 +45,7 @@ from gen2d.physics.contact_log import (
     sort_order,
 )
 from gen2d.physics.contact_state import BodySide, PassSetup, WarmStart
+from gen2d.physics.impact_order import TURNS, later_impact, may_follow, takes_part, with_first
 from gen2d.physics.packing import SAFE, PackedTable, TableSpec, make_table, pack, repeat_rows, table_of_rows, unpack
 from gen2d.physics.params import SolverParams
 from gen2d.physics.schedule import bipartite_rounds
@@ -136,6 +138,20 @@ class SolvedChunk(NamedTuple):
     packed: list[Array]
     specs: dict[int, TableSpec]
     observed: list[tuple[Array, Array]]  # [n + 1] each: deepest overlap, m, and contacts that began
+
+
+class BodyTables(NamedTuple):
+    """Packed bodies of a pass."""
+
+    changing: list[PackedTable]  # by group: what a pass changes
+    constant: list[PackedTable]
+    fixed: list[PackedTable | None]  # static bodies of each batch that has any
+    sides: list[BodySide]  # with the constant part alone
+
+    @property
+    def rows(self) -> list[Array]:
+        """Rows of the changing tables."""
+        return [table.rows for table in self.changing]
 
 
 class CachedConstraint(NamedTuple):
@@ -318,42 +334,78 @@ class NearbyPairs(ContactSolver):
         `play(i, k, indices, a, b, carry)` returns both sides and the carry after chunk k of batch i. A carry with a
         None has no buffer yet; one chunk is then played to find its shape.
         """
-        carries = list(carries)
+        bodies = self._bodies(sides, statics)
+        rows, carries = self._play(bodies, bodies.rows, listed, carries, play, range(len(self.batches)))
+        return self._unpacked(bodies, rows), carries
+
+    def _bodies(self, sides: list[BodySide], statics: list[BodySide]) -> BodyTables:
+        """Tables of the bodies, and of the static bodies of each batch."""
         changing, constant = zip(*(_split(side) for side in sides), strict=True)
         tables, inputs = ([self._table(x, self._size(g)) for g, x in enumerate(of)] for of in (changing, constant))
+        fixed = [self._static_table([statics[j] for j in b.statics]) if b.first is None else None for b in self.batches]
+        return BodyTables(tables, inputs, fixed, list(constant))
 
-        def bodies(now: PackedTable, group: int, where: Array) -> BodySide:
-            return _merge(now.at(where), inputs[group].at(where))
+    def _unpacked(self, bodies: BodyTables, rows: list[Array]) -> list[BodySide]:
+        """Sides with the rows of tables in which a pass has changed them."""
+        shapes = [(self._size(g), self._scenes) for g in range(len(rows))]
+        of = zip(bodies.changing, rows, shapes, bodies.sides, strict=True)
+        return [_merge(table._replace(rows=x).unpack(shape), constant) for table, x, shape, constant in of]
 
-        for i, batch in enumerate(self.batches):
-            fixed = self._static_table([statics[j] for j in batch.statics]) if batch.first is None else None
+    def _play(
+        self,
+        bodies: BodyTables,
+        rows: list[Array],
+        listed: ListedPairs,
+        carries: list[Any],
+        play: Callable,
+        numbers: Sequence[int],
+        skip: Callable | None = None,
+    ) -> tuple[list[Array], list[Any]]:
+        """Rows of the bodies' tables and carries after `play` of all chunks of some batches.
 
-            def chunk(
-                k: Array, state: tuple, i: int = i, batch: PairBatch = batch, fixed: PackedTable | None = fixed
-            ) -> tuple:
+        `skip(i, k, indices, rows, carry)` returns whether a chunk is left out.
+        """
+        rows, carries = list(rows), list(carries)
+
+        def side(rows: dict[int, Array], group: int, where: Array) -> BodySide:
+            return _merge(bodies.changing[group]._replace(rows=rows[group]).at(where), bodies.constant[group].at(where))
+
+        for i in numbers:
+            batch = self.batches[i]
+
+            def chunk(k: Array, state: tuple, i: int = i, batch: PairBatch = batch) -> tuple:
                 rows, carry = state
-                now = {g: tables[g]._replace(rows=x) for g, x in rows.items()}
-                indices = GatherIndices(*listed.indices[i][k])
+                indices, fixed = GatherIndices(*listed.indices[i][k]), bodies.fixed[i]
                 if batch.first is not None:
-                    a = bodies(now[batch.first], batch.first, indices.a)
+                    a = side(rows, batch.first, indices.a)
                 else:
                     assert fixed is not None, "a batch without a first group has static bodies"
                     a = fixed.at(indices.a)
-                a, b, carry = play(i, k, indices, a, bodies(now[batch.second], batch.second, indices.b), carry)
+                a, b, carry = play(i, k, indices, a, side(rows, batch.second, indices.b), carry)
+                new = dict(rows)
                 if batch.first is not None:
-                    now[batch.first] = now[batch.first].put(indices.a, _split(a)[0])
-                now[batch.second] = now[batch.second].put(indices.b, _split(b)[0])
-                return {g: x.rows for g, x in now.items()}, carry
+                    new[batch.first] = self._put(bodies, new, batch.first, indices.a, a)
+                new[batch.second] = self._put(bodies, new, batch.second, indices.b, b)
+                return new, carry
 
-            start = {g: tables[g].rows for g in batch.groups}, carries[i]
+            def chunk_if_needed(k: Array, state: tuple, i: int = i, chunk: Callable = chunk) -> tuple:
+                assert skip is not None, "without it no chunk is skipped"
+                idle = skip(i, k, GatherIndices(*listed.indices[i][k]), *state)
+                # A loop of one turn, as XLA copies the tables that a branch changes.
+                return jax.lax.fori_loop(0, jnp.where(idle, 0, 1), lambda _, state: chunk(k, state), state)
+
+            start = {g: rows[g] for g in batch.groups}, carries[i]
             if any(x is None for x in jax.tree.leaves(carries[i], is_leaf=lambda x: x is None)):
-                rows, carries[i] = chunk(jnp.zeros((), jnp.int32), start)
+                new, carries[i] = chunk(jnp.zeros((), jnp.int32), start)
             else:
-                rows, carries[i] = jax.lax.fori_loop(0, listed.chunks[i], chunk, start)
-            for g, x in rows.items():
-                tables[g] = tables[g]._replace(rows=x)
-        shapes = [(self._size(g), self._scenes) for g in range(len(tables))]
-        return [_merge(t.unpack(shape), x) for t, shape, x in zip(tables, shapes, constant, strict=True)], carries
+                body = chunk if skip is None else chunk_if_needed
+                new, carries[i] = jax.lax.fori_loop(0, listed.chunks[i], body, start)
+            for g, x in new.items():
+                rows[g] = x
+        return rows, carries
+
+    def _put(self, bodies: BodyTables, rows: dict[int, Array], group: int, where: Array, side: BodySide) -> Array:
+        return bodies.changing[group]._replace(rows=rows[group]).put(where, _split(side)[0]).rows
 
     def _store(self, batch: PairBatch, buffer: Array | None, k: Array, values: list[Array]) -> Array:
         """Buffer with the values of chunk k; a new one if there is none."""
@@ -385,7 +437,7 @@ class NearbyPairs(ContactSolver):
             if isinstance(first, StaticSide):
                 constraint = constraint._replace(neighbours=first.neighbours)
             setup = self.setup._replace(gravity=second.gravity, threshold=second.threshold)
-            a, b, points = contact_passes.warm_start(constraint, warm, a, b, setup)
+            a, b, points = contact_passes.warm_start(constraint, warm, a, b, setup, self.params.step)
             packed = (constraint, warm, points, second.threshold)
             values, specs[i] = pack(packed, (self.chunk,), self._dtype, once=True)
             return a, b, self._store(batch, buffer, k, values)
@@ -419,7 +471,76 @@ class NearbyPairs(ContactSolver):
         zero = jnp.zeros_like(carry.depth), jnp.zeros_like(carry.begins)
         sides, carries = self._pass(sides, statics, contacts, [(buffer, *zero) for buffer in buffers], play)
         observed = [(depth, begins) for _, depth, begins in carries]
-        return sides, SolvedChunk(contacts, [packed for packed, *_ in carries], specs, observed)
+        solved = SolvedChunk(contacts, [packed for packed, *_ in carries], specs, observed)
+        return self._later_impacts(solved, sides, statics)
+
+    def _later_impacts(
+        self, solved: SolvedChunk, sides: list[BodySide], statics: list[BodySide]
+    ) -> tuple[list[BodySide], SolvedChunk]:
+        """Sides and contacts after the impacts that follow others of their bodies in this step."""
+        if not self.params.by_time:
+            return sides, solved
+        listed, zero = solved.listed, jnp.zeros((), jnp.int32)
+        points = [self._unpack_contacts(listed, i, zero)[2] for i in range(len(self.batches))]
+        batches = [i for i, of in enumerate(points) if takes_part(of, sides[0])]
+        if not batches:
+            return sides, solved
+        bodies = self._bodies(sides, statics)
+        clocks = [_column(table, "clock") for table in bodies.changing]
+
+        def idle(i: int, buffer: Array, k: Array, indices: GatherIndices, rows: dict[int, Array]) -> Array:
+            """Whether no impact may follow in a chunk."""
+
+            def clock_of(group: int, where: Array) -> Array:
+                return rows[group][:, clocks[group]].at[where].get(mode=SAFE)
+
+            batch, (contact,) = self.batches[i], unpack(list(buffer[k]), solved.specs[i]).contacts
+            clock = clock_of(batch.second, indices.b)
+            if batch.first is not None:
+                clock = jnp.maximum(clock, clock_of(batch.first, indices.a))
+            return ~jnp.any(may_follow(contact, clock))
+
+        def find(rows: list[Array], packed: list[Array]) -> tuple[list[Array], Array]:
+            def play(i: int, k: Array, indices: GatherIndices, a: BodySide, b: BodySide, follow: Array) -> tuple:
+                _, _, points, setup = self._unpack_contacts(listed, i, k)
+                pair = unpack(list(packed[i][k]), solved.specs[i])
+                tau = later_impact(*points, *pair.contacts, a, b, setup, self.params.step)
+                return *with_first(a, b, tau), follow | jnp.any(tau >= 0)
+
+            firsts = [_column(table, "first") for table in bodies.changing]
+            rows = [x.at[:, column].set(jnp.inf) for x, column in zip(rows, firsts, strict=True)]
+            none = [jnp.zeros((), bool)] * len(self.batches)
+            rows, follow = self._play(
+                bodies,
+                rows,
+                listed,
+                none,
+                play,
+                batches,
+                lambda i, k, indices, rows, _: idle(i, packed[i], k, indices, rows),
+            )
+            return rows, functools.reduce(jnp.logical_or, follow)
+
+        def turn(state: tuple) -> tuple:
+            rows, packed, _, count = state
+            rows, follow = find(rows, packed)
+
+            def play(i: int, k: Array, indices: GatherIndices, a: BodySide, b: BodySide, buffer: Array) -> tuple:
+                constraint, _, points, setup = self._unpack_contacts(listed, i, k)
+                pair = unpack(list(buffer[k]), solved.specs[i])
+                a, b, pair = contact_passes.solve_impact(constraint, *points, pair, a, b, setup, self.params)
+                values, _ = pack(pair, (self.chunk,), self._dtype, once=True)
+                return a, b, self._store(self.batches[i], buffer, k, values)
+
+            def skip(i: int, k: Array, indices: GatherIndices, rows: dict[int, Array], buffer: Array) -> Array:
+                return ~follow | idle(i, buffer, k, indices, rows)
+
+            rows, packed = self._play(bodies, rows, listed, packed, play, batches, skip)
+            return rows, packed, follow, count + 1
+
+        start = bodies.rows, solved.packed, jnp.ones((), bool), zero
+        rows, packed, *_ = jax.lax.while_loop(lambda state: state[2] & (state[3] < TURNS), turn, start)
+        return self._unpacked(bodies, rows), solved._replace(packed=packed)
 
     def relax(
         self, carry: NearbyCarry, solved: SolvedChunk, sides: list[BodySide], statics: list[BodySide], time: Array
@@ -533,6 +654,11 @@ def _split(side: BodySide) -> tuple[BodySide, BodySide]:
     """What a pass changes of a side, and the rest."""
     constants = {name: getattr(side, name) for name in CONSTANTS}
     return side._replace(**dict.fromkeys(CONSTANTS)), BodySide(**constants)
+
+
+def _column(table: PackedTable, name: str) -> int:
+    """Column of a scalar of the bodies in a table."""
+    return getattr(jax.tree.unflatten(table.spec.tree, [leaf.first for leaf in table.spec.leaves]), name)
 
 
 def _merge(changing: BodySide, constant: BodySide) -> BodySide:

@@ -81,7 +81,7 @@ def biased_target(
     bias = jnp.where(apart, contact.gap / params.step, jnp.maximum(rate * contact.gap, -params.push_speed))
     bounce = bounce_speed(constraint, contact, speed)
     touches = contact.frame.normal_mass > 0
-    active = touches & jnp.where(bounces, bounce > speed, contact.tau != MISSES)
+    active = touches & jnp.where(bounces, bounce > speed, contact.tau > MISSES)
     return NormalTarget(
         active=active,
         speed=jnp.where(bounces, bounce, -bias),

@@ -36,6 +36,7 @@ from gen2d.physics import rigid_joints, springs_limits_motors
 from gen2d.physics.constraint import Motion
 from gen2d.physics.contact_state import BodySide
 from gen2d.physics.energy import Ledger, accumulate, record_energy
+from gen2d.physics.impact_order import not_hit
 from gen2d.physics.params import SolverParams
 from gen2d.physics.shapes import to_world
 from gen2d.physics.state import BodyState, Model, WorldState
@@ -145,6 +146,8 @@ def step(world: WorldState, model: Model, params: SolverParams) -> WorldState:
         BodySide(shape, motion, acceleration, displacement=_scaled(motion, 0.5 * h), work=work)
         for shape, motion, acceleration, work in of_groups
     ]
+    if params.by_time:
+        sides = not_hit(sides)
     sides, contacts = solver.warm_start(carry, sides, statics)
     motions = _motions(sides)
     pushes, drifts = [], []  # bounds on the speeds that warm starting added, and the drift of its impulses
@@ -158,7 +161,9 @@ def step(world: WorldState, model: Model, params: SolverParams) -> WorldState:
         joints, motions, drifts, accelerations, fixed, params, biased=True
     )
     of_groups = zip(sides, motions, drifts, pushes, strict=True)
-    sides = [BodySide(motion=m, drift=drift, push=push, work=s.work) for s, m, drift, push in of_groups]
+    sides = [BodySide(motion=m, drift=drift, push=push, work=s.work, first=s.first) for s, m, drift, push in of_groups]
+    if params.by_time:
+        sides = [side._replace(clock=jnp.zeros_like(side.push)) for side in sides]
     statics = [BodySide(motion=side.motion) for side in statics]
     sides, solved = solver.solve(carry, contacts, sides, statics)
     drifts = [jax.tree.map(jnp.add, side.drift, free) for side, free in zip(sides, free_drifts, strict=True)]
@@ -173,7 +178,7 @@ def step(world: WorldState, model: Model, params: SolverParams) -> WorldState:
         joints, motions, displacements, accelerations, fixed, params, biased=False
     )
     of_groups = zip(sides, motions, displacements, strict=True)
-    sides = [side._replace(motion=m, drift=None, displacement=moved) for side, m, moved in of_groups]
+    sides = [BodySide(motion=m, displacement=moved, push=side.push, work=side.work) for side, m, moved in of_groups]
     sides, carry = solver.relax(carry, solved, sides, statics, world.time)
     motions = rigid.run(rigid_joints.relax, _motions(sides), displacements)
     if ledger is not None:

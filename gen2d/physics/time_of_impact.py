@@ -11,6 +11,7 @@ SLOWEST = 1e-12  # m/s or m: keeps divisions finite where nothing moves or has a
 # Values that stand for a time of impact, in s:
 NONE = -1.0  # no fast approach: a soft contact
 MISSES = -2.0  # a fast approach without an impact in this step: no impulse yet
+WAITS = -3.0  # an impact after another one of the same bodies, which has not acted yet: no impulse yet
 
 
 def _root(x: Array) -> Array:
@@ -47,14 +48,17 @@ def select_path(which: Array, x: ApproachPath, y: ApproachPath) -> ApproachPath:
     return ApproachPath(*(jnp.where(which, *of) for of in zip(x, y, strict=True)))
 
 
-def time_of_impact(path: ApproachPath, approach: Array, h: float, threshold: Array) -> Array:
+def time_of_impact(
+    path: ApproachPath, approach: Array, h: float, threshold: Array, clock: Array | None = None
+) -> Array:
     """Time of impact in s from the start of the step; NONE or MISSES without an impact in it.
 
-    It is the smaller root of the path, in the form without cancellation. `approach` is the speed that is compared with
-    the threshold.
+    It is the smaller root of the path, which begins at the clock, in the form without cancellation. `approach` is the
+    speed that is compared with the threshold.
     """
     inside = path.b**2 - path.a * path.c
     tau = path.c / jnp.maximum(_root(inside) - path.b, SLOWEST)
+    tau = tau if clock is None else clock + tau
     # An impact at the end of the step counts now: in the next its time would be clamped to zero, without a gradient.
     meet = (inside > 0) & (tau <= 1.001 * h)
     return jnp.where(approach > threshold, jnp.where(meet, tau, MISSES), NONE)

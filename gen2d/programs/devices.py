@@ -105,6 +105,19 @@ def instruction_set() -> str:
     return next((isa for isa in ("avx512f", "avx2", "avx") if isa in flags), platform.machine())
 
 
+def processor_kind() -> str:
+    """Widest vector instruction set and vendor of this CPU.
+
+    XLA computes reciprocal square roots from an instruction of which the last bits differ between vendors.
+    """
+    try:
+        lines = pathlib.Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        return instruction_set()
+    vendors = [line.split(":")[1].strip() for line in lines if line.startswith("vendor_id")]
+    return " ".join([instruction_set(), *vendors[:1]])
+
+
 def versions() -> dict[str, str]:
     """Versions of gen2d, Python and the libraries that generate a dataset."""
     return {

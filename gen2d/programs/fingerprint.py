@@ -15,7 +15,7 @@ from typing import Any
 from gen2d.captions import caption
 from gen2d.core import permutation
 from gen2d.loading import epochs
-from gen2d.programs.devices import instruction_set
+from gen2d.programs.devices import processor_kind
 from gen2d.programs.environment import compiler_options, flags
 from gen2d.programs.rollout import Rollout
 from gen2d.sampling.sampler import Sampler
@@ -29,7 +29,7 @@ def fingerprint(rollout: Rollout) -> dict[str, Any]:
 def machine(rollout: Rollout) -> dict[str, Any]:
     """Part of the fingerprint that is known before anything is traced."""
     device = rollout.devices[0]
-    kind = device.device_kind if device.platform != "cpu" else f"cpu {instruction_set()}"
+    kind = device.device_kind if device.platform != "cpu" else f"cpu {processor_kind()}"
     options = " ".join(f"{name}={value}" for name, value in compiler_options(device).items())
     own = {"batch_size": rollout.batch_size, "xla_flags": flags(), "xla_options": options}
     return {"jaxlib": version("jaxlib"), "device": kind, **own}

@@ -61,7 +61,7 @@ class Space:
     **physics
         Options of a config's section `physics`, with the same defaults: damping (1/s), mixing ("product", "mean",
         "max", "geometric"), bounce_threshold (m/s), max_step (s), substeps, contact_hertz (Hz), contact_damping_ratio,
-        push_speed (m/s), precision ("float32", "float64").
+        push_speed (m/s), precision ("float32", "float64"), impact_order ("pairs", "time").
 
     Raises
     ------

@@ -2,7 +2,7 @@
 
 An error of rounding grows with the path, so errors are divided by the growth of a small perturbation of the exact path.
 A path is followed to the first impact at less than SLOW, where the solver takes a contact for one at rest. Where a disc
-is hit for the second time in one step, the solver takes the impacts in the order of its pairs, not of time.
+is hit for the second time in one step, the impacts act in the order of their times only with `by_time`.
 """
 
 import dataclasses
@@ -16,13 +16,14 @@ import pytest
 from billiard import Impact, impacts, positions, start
 from laws import holds
 from oracles import Path, Setting, Thing, gen2d_paths, gen2d_world
-from worlds import STEP, run
+from worlds import STEP, rules, run
 
 from gen2d.physics.simulate import SaveAt
 
 SIDE, DISCS, FRAMES = 5.0, 5, 481  # m, number, number of steps of STEP
 SLOW = 0.5  # m/s
 NUDGE = 1e-9  # m and m/s
+LINEAR = 1e7  # growth up to which the perturbation stays small
 EARLY = 1.001e-3  # of a step: the solver may take an impact so much early, at the end of the step before
 SETTINGS = [(e, g) for e in (1.0, 0.8) for g in (0.0, 9.81)]
 EACH = 16  # scenes of each setting
@@ -89,13 +90,14 @@ def discs_of(impact: Impact) -> list[int]:
 
 
 @functools.cache
-def scenes() -> list[Scene]:
+def scenes(by_time: bool = False) -> list[Scene]:
     """All scenes, simulated at once in double precision, every step a frame."""
     settings = [random_setting(seed, *of) for of in SETTINGS for seed in range(EACH)]
+    numbers = rules(by_time=by_time)
     with jax.enable_x64(True):
-        paths = gen2d_paths(run([gen2d_world(s) for s in settings], FRAMES, 1, keep=SaveAt(contacts=400)), settings)
+        made = run([gen2d_world(s) for s in settings], FRAMES, 1, numbers, SaveAt(contacts=400))
     found = []
-    for setting, path in zip(settings, paths, strict=True):
+    for setting, path in zip(settings, gen2d_paths(made, settings), strict=True):
         exact, end = until(setting, (FRAMES - 1) * STEP), FRAMES
         frames = [frame_after(impact) for impact in exact]
         slow = next((f for f, impact in zip(frames, exact, strict=True) if impact.approach < SLOW), end)
@@ -103,6 +105,14 @@ def scenes() -> list[Scene]:
         twice = next((hit[0] for k, hit in enumerate(hits) if hit in hits[:k]), end)
         found.append(Scene(setting, exact, path, slow, twice))
     return found
+
+
+def test_path_is_exact_to_rounding_where_impacts_act_in_the_order_of_their_times():
+    ratios = [(scene.errors / scene.growth)[scene.growth < LINEAR].max() for scene in scenes(by_time=True)]
+    twice = sum(scene.twice < scene.slow for scene in scenes(by_time=True))
+    print(f"billiard: {twice} of {len(ratios)} scenes have a step in which a disc is hit twice")
+    assert twice > 10
+    holds("billiard by time: error over growth of a perturbation, m", ratios, 1e-13)
 
 
 def test_path_is_exact_to_rounding_while_no_disc_is_hit_twice_in_a_step():
@@ -134,3 +144,25 @@ def test_path_is_exact_to_rounding_where_a_disc_is_hit_twice_in_a_step():
     print(f"billiard: {len(twice)} of {len(scenes())} scenes have such a step, {np.sum(errors > 1e-13)} depart in it")
     assert len(twice) > 10
     holds("billiard: error over growth of a step with two impacts of a disc, m", errors, 0.02, asked=1e-13)
+
+
+AT_REST = 0.1  # m/s: contacts at rest are slower
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("gravity", [0.0, 9.81])
+@pytest.mark.parametrize("discs", [2, 3, 6])
+def test_no_elastic_billiard_departs_from_its_exact_path_in_ten_seconds(discs, gravity, monkeypatch):
+    monkeypatch.setitem(globals(), "DISCS", discs)
+    monkeypatch.setitem(globals(), "FRAMES", 2401)
+    monkeypatch.setitem(globals(), "SLOW", AT_REST)
+    monkeypatch.setitem(globals(), "NUDGE", NUDGE / 100)
+    monkeypatch.setitem(globals(), "SETTINGS", [(1.0, gravity)])
+    monkeypatch.setitem(globals(), "EACH", 40)
+    ratios, ends = [], []
+    for scene in scenes.__wrapped__(by_time=True):
+        small = scene.growth < 100 * LINEAR
+        ends.append(int(small.argmin()) or scene.slow)
+        ratios.append((scene.errors / scene.growth)[small].max())
+    print(f"{discs} discs: {len(ends)} paths of {np.mean(ends) * STEP:.1f} s on average, until they are chaotic")
+    holds(f"elastic billiard of {discs} discs, {gravity:g} m/s^2: error over growth, m", ratios, 1e-11)

@@ -54,6 +54,13 @@ def test_both_forms_give_the_same_discs():
     assert_alike(*made, within=2e-3)
 
 
+def test_both_forms_give_the_same_impacts_in_the_order_of_their_times():
+    worlds = [gas(seed, 5) for seed in range(3)]
+    made = [run(worlds, 41, 4, rules(by_time=True), EVERYTHING, sparse=sparse) for sparse in (True, False)]
+    assert made[0].contacts.count.min() > 0
+    assert_alike(*made, within=2e-3)
+
+
 @pytest.mark.slow
 def test_both_forms_give_the_same_of_more_discs_than_a_word_has_bits():
     worlds = [gas(seed, 19) for seed in range(3)]
