@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from gen2d.core.lazy import attach
 
 if TYPE_CHECKING:
+    from gen2d.captions import caption, facts, questions
     from gen2d.config import common
     from gen2d.config.contracts import Annotation, Export, Family, Look
     from gen2d.config.distributions import Distribution
@@ -49,6 +50,7 @@ if TYPE_CHECKING:
     from gen2d.xla import each_video, on_cpu, reduce_halves
 
 _HOMES = {
+    "gen2d.captions": "caption facts questions",
     "gen2d.config": "common",
     "gen2d.config.contracts": "Annotation Export Family Look",
     "gen2d.config.distributions": "Distribution",
@@ -118,11 +120,13 @@ __all__ = [
     "are_moving",
     "as_json",
     "builder",
+    "caption",
     "common",
     "contrasting",
     "dataset",
     "each_video",
     "extents",
+    "facts",
     "films",
     "fraction",
     "hashed",
@@ -136,6 +140,7 @@ __all__ = [
     "pixel_at",
     "place",
     "plain",
+    "questions",
     "reduce_halves",
     "start_position",
     "tile_windows",

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from gen2d.core.enums import END, IMPACT, STATIC
+from gen2d.core.enums import END, IMPACT, SEGMENT, STATIC
 
 EventColumns = Mapping[str, np.ndarray]
 
@@ -16,6 +16,17 @@ SAME_HIT_SECONDS = 0.1  # s; impacts of a pair in successive frames are one hit 
 REST_SPEED, REST_SECONDS = 0.02, 0.1  # rest: all points stay slower than 0.02 m/s until the end, for 0.1 s at least
 DIGITS = 6  # significant digits of numbers in events
 SIDES = ("left", "right", "top", "bottom")
+BOX_SIDES = ("floor", "ceiling", "left wall", "right wall")
+
+
+class Hit(NamedTuple):
+    """Impact that begins a contact of two objects."""
+
+    time: float  # s
+    frame: int  # the impact is in the interval before it
+    a: int  # slots
+    b: int
+    row: int  # of contacts
 
 
 class VideoEvent(NamedTuple):
@@ -58,24 +69,27 @@ def video_events(columns: EventColumns, video: Any) -> list[VideoEvent]:
     return sorted(events, key=lambda event: event.time)  # stable at equal times
 
 
-def hit_events(columns: EventColumns) -> list[VideoEvent]:
-    """Hits: the impacts that begin a contact."""
+def hits(columns: EventColumns) -> list[Hit]:
+    """Impacts that begin a contact, by time."""
     rows = zip(*(columns[f"contacts/{name}"].tolist() for name in ("kind", "frame", "time", "a", "b")), strict=True)
     last: dict[tuple[int, int], tuple[int, int, float]] = {}  # kind, frame and time of each pair's last row
-    events = []
+    impacts = []
     for row, (kind, frame, time, a, b) in enumerate(rows):
         if not kind:
             break
         if kind == IMPACT and not _in_contact_since(last.get((a, b)), frame, time):
-            point, speed = columns["contacts/point"][row].tolist(), float(columns["contacts/approach_speed"][row])
-            details = {
-                "a": a,
-                "b": b,
-                "point": [round_number(x) for x in point],
-                "speed": round_number(speed),
-            }
-            events.append(VideoEvent(time, "hit", frame, details))
+            impacts.append(Hit(time, frame, a, b, row))
         last[a, b] = kind, frame, time
+    return impacts
+
+
+def hit_events(columns: EventColumns) -> list[VideoEvent]:
+    """Hits as events."""
+    events = []
+    for hit in hits(columns):
+        point = [round_number(x) for x in columns["contacts/point"][hit.row].tolist()]
+        speed = round_number(float(columns["contacts/approach_speed"][hit.row]))
+        events.append(VideoEvent(hit.time, "hit", hit.frame, {"a": hit.a, "b": hit.b, "point": point, "speed": speed}))
     return events
 
 
@@ -149,3 +163,25 @@ def rest_events(columns: EventColumns, fps: float) -> list[VideoEvent]:
     if frame == 0 or len(speed) - 1 - frame < REST_SECONDS * fps:
         return []
     return [VideoEvent(frame / fps, "rest", frame, {})]
+
+
+def wall_names(columns: EventColumns) -> dict[int, str]:
+    """Names of static segments, by slot: slopes, and otherwise by their side of the bounding box of all of them."""
+    static = columns["objects/present"] & (columns["objects/kind"] == STATIC) & (columns["objects/shape"] == SEGMENT)
+    slots = np.flatnonzero(static)
+    if not len(slots):
+        return {}
+    ends = core_points(columns, slots)[0, :, :2]
+    low, high = ends.min((0, 1)), ends.max((0, 1))
+    margin, names = (high - low) / 10, {}
+    for slot, (a, b) in zip(slots.tolist(), ends, strict=True):
+        (width, height), (x, y) = abs(b - a), (a + b) / 2
+        if height <= width / 10:  # a single level segment is the floor
+            names[slot] = "floor" if y - low[1] <= margin[1] else "ceiling" if high[1] - y <= margin[1] else "shelf"
+        elif width <= height / 10:
+            names[slot] = (
+                "left wall" if x - low[0] <= margin[0] else "right wall" if high[0] - x <= margin[0] else "divider"
+            )
+        else:
+            names[slot] = "slope"
+    return names

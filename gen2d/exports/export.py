@@ -189,7 +189,7 @@ def _check_out(out: Path, format_: Export, description: Mapping[str, Any], overw
 
 def _check_folder(out: Path, description: Mapping[str, Any], overwrite: bool) -> None:
     previous = _read_description(out)
-    known: set[str] = {DESCRIPTION, *previous["files"]} if previous else set()
+    known = {DESCRIPTION, *(name.split("/")[0] for name in previous["files"])} if previous else set()
     foreign = {path.name for path in out.iterdir()} - known
     if foreign:
         raise FolderError(f"{out} holds {min(foreign)}, which no export made: choose another --out")
@@ -221,7 +221,8 @@ def _write_output(out: Path, format_: Export, write: Callable[[Path], None], des
         write(temporary)
         for path in temporary.glob(".part-*"):  # of workers that were killed
             remove_tree(path)
-        files = {path.name: path.stat().st_size for path in sorted(temporary.iterdir())}
+        paths = sorted(path for path in temporary.rglob("*") if path.is_file())
+        files = {path.relative_to(temporary).as_posix(): path.stat().st_size for path in paths}
         (temporary / DESCRIPTION).write_bytes(as_json({**description, "files": files}))
     return sum(files.values())
 

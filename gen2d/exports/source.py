@@ -15,6 +15,7 @@ from gen2d.loading.dataset import Dataset, RenderOptions
 from gen2d.loading.protocols import Batch, unbatch
 from gen2d.storage.paths import Place
 
+DRAWN = ("frames", "masks/", "boxes/", "visibility/", "flow/", "tracks/")  # what can be rendered from states
 BATCH_BYTES = 2**26  # of videos that are read, or rendered, at once
 
 
@@ -86,13 +87,16 @@ def source_of(
     trust: Sequence[str] = (),
     render: RenderOptions | None = None,
 ) -> Source:
-    """Videos of a split with the fields that match `patterns`; frames that match but are not stored are rendered.
+    """Videos of a split with the fields that match `patterns`.
+
+    Frames that match but are not stored are rendered, and so are annotations that are named beside frames.
 
     Raises the errors of `open`.
     """
     ds = loader.open(root, split, fields=())
     if any(fnmatch.fnmatch("frames", pattern) for pattern in patterns):
-        if render is not None or "frames" not in ds.manifest.fields:
+        missing = [name for name in ("frames", *patterns) if name.startswith(DRAWN) and name not in ds.manifest.fields]
+        if render is not None or missing:
             render, patterns = {"trust": trust, **(render or {})}, ["frames", *patterns]
     elif render is not None:
         raise ConfigError(f"render is {render!r}, but must be None where no frames are exported")

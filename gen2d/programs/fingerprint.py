@@ -12,7 +12,7 @@ import textwrap
 from importlib.metadata import version
 from typing import Any
 
-from gen2d.captions import caption
+from gen2d.captions import actions, caption, colors, events, facts, questions, references, sentences
 from gen2d.core import permutation
 from gen2d.loading import epochs
 from gen2d.programs.devices import processor_kind
@@ -56,7 +56,7 @@ def _hashes(rollout: Rollout) -> dict[str, str]:
     programs = rollout.programs | {"draw": rollout.draw_program(rollout.slice)}
     hashes = {name: program.sha256 for name, program in programs.items()}
     if rollout.config.annotations.simulated.captions:
-        hashes["captions"] = code_hash(caption)
+        hashes["captions"] = code_hash(actions, caption, colors, events, facts, questions, references, sentences)
     if rollout.sampler.gridded:
         hashes["grids"] = code_hash(
             Sampler.grid_values, epochs.order, permutation.hashed, permutation.feistel, permutation.splitmix64

@@ -117,5 +117,7 @@ class VideoSchema:
         if config.splits:
             host_columns["split"] = np.full(count, split.encode(), self.host_fields["split"].dtype)
         return host_columns | (
-            caption.caption_fields(columns, config.video) if config.annotations.simulated.captions else {}
+            caption.caption_fields(columns, config.video, self.constants)
+            if config.annotations.simulated.captions
+            else {}
         )

@@ -196,6 +196,7 @@ def balls(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFacto
         scene={"balls": request.param, "radius": [0.7, 0.8], "color": colors},
         look={"background": [255, 255, 255], "wall_width": 0},
         storage={"frames": {1: "video", 2: "none"}[request.param]},
+        annotations={"masks": True, "boxes": True, "visibility": True, "flow": True, "tracks": 2, "contacts": 4},
     )
     folder = tmp_path_factory.mktemp("balls") / "balls"
     gen2d.generate(config, 6, folder, device="cpu")
@@ -415,7 +416,10 @@ def test_every_format_keeps_the_contract(name: str, balls: Path, tmp_path: Path)
 @pytest.mark.parametrize(
     ("words", "told"),
     [
-        (["--to", "mp3"], "--to is 'mp3', but must be one of av1, ffv1, h264, mp4, npz, phyworld, webdataset"),
+        (
+            ["--to", "mp3"],
+            "--to is 'mp3', but must be one of av1, coco, ffv1, flo, h264, kitti_flow, mot, mp4, npz, objects",
+        ),
         ([], "required: --to"),
         (["--to", "npz", "--split", "tran"], "has no split 'tran': did you mean 'train'?"),
         (

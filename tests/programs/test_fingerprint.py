@@ -54,7 +54,12 @@ EDITS = {
     ),
     "look": ("renderers/looks/flat.py", "return plain(scene, layout, options, key)", LOOK, "prepares rendering"),
     "rasterizer": ("renderers/compositing.py", "((product + 16) >> 5)", "((product + 15) >> 5)", "draws"),
-    "captions": ("gen2d/captions/caption.py", '"ball", "rod"', '"sphere", "rod"', "writes captions"),
+    "captions": (
+        "gen2d/captions/sentences.py",
+        '"comes to rest", "stops"',
+        '"comes to rest", "halts"',
+        "writes captions",
+    ),
 }
 
 
@@ -96,7 +101,7 @@ def test_an_edited_program_is_refused_by_name(
 def test_other_names_and_comments_are_not_refused(package: Path, edit_source: Edit) -> None:
     for name in ("time_of_impact", "contact_points"):
         edit_source(f"gen2d/physics/{name}.py", "plane_approach_speed", "speed_at_a_plane")
-    edit_source("gen2d/captions/caption.py", "\nNOUNS =", "\n# What they are called\nNOUNS =")
+    edit_source("gen2d/captions/caption.py", "\nSHORT_BYTES =", "\n# In bytes\nSHORT_BYTES =")
     flags = "--xla_force_host_platform_device_count=2"
     done = run(package, "--config", "tiny.yaml", "--n", 3, "--out", "data", XLA_FLAGS=flags)
     assert "nothing to do" in done.stdout, done.stderr

@@ -13,8 +13,8 @@ MARK = "not run: "
 
 
 def package(name: str) -> Any:
-    """The imported package, if tests that need it can run."""
-    require(name)
+    """The imported package, or module of a package, if tests that need it can run."""
+    require(name.partition(".")[0])
     return importlib.import_module(name)
 
 

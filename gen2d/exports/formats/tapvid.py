@@ -1,0 +1,47 @@
+"""TAP-Vid: pickles SPLIT-000000.pkl, ... of dictionaries, as its readers load them.
+
+Each pickle maps the key of a video to `video` [T, H, W, 3] uint8, `points` [N, T, 2] float32 (x, y over the width and
+the height, from corner to corner) and `occluded` [N, T] bool. Points that are never seen are left out. A pickle runs
+code when it is loaded: load only those that you trust.
+"""
+
+import pickle
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+
+from gen2d.plugin import Batch, Export, Source
+
+FILE_BYTES, FILE_VIDEOS = 2**28, 100  # maximum of a pickle, which holds one video at least
+
+
+def write(target: Path, source: Source) -> None:
+    """Write the pickles to the folder."""
+    height, width = source.frame_size
+    videos = zip(source.numbers, source.videos(), strict=True)
+    per_file = max(1, min(FILE_VIDEOS, FILE_BYTES // source.video_bytes))
+    for number in range(-(-len(source) // per_file)):
+        content = {}
+        for index, video in islice(videos, per_file):
+            content[source.key(index)] = tracks(video, height, width)
+            source.advance(1)
+        data = pickle.dumps(content, protocol=4)
+        (target / f"{source.ds.options.split}-{number:06d}.pkl").write_bytes(data)
+
+
+def tracks(video: Batch, height: int, width: int) -> dict[str, np.ndarray]:
+    """TAP-Vid's arrays of a video."""
+    seen = (video["tracks/object"] >= 0) & video["tracks/visible"].any(0)
+    points = video["tracks/points"][:, seen] / np.array([width, height], np.float32)
+    occluded = ~video["tracks/visible"][:, seen]
+    by_point = np.ascontiguousarray(points.transpose(1, 0, 2)), np.ascontiguousarray(occluded.T)
+    return {"video": np.ascontiguousarray(video["frames"]), "points": by_point[0], "occluded": by_point[1]}
+
+
+EXPORT = Export(
+    fields=("frames", "tracks/points", "tracks/visible", "tracks/object"),
+    write=write,
+    fixed=True,
+    loss="frames and tracks alone",
+)
