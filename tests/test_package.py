@@ -24,7 +24,7 @@ LAYERS = (
     ("records", "xla", "storage"),
     ("config", "dataset", "media"),
     ("renderers", "physics", "loading"),
-    ("sampling", "annotations", "captions"),
+    ("sampling", "annotations", "captions", "page"),
     ("scenes",),
     ("programs", "engines"),
     ("space",),
@@ -36,7 +36,7 @@ RANKS = {room: rank for rank, layer in enumerate(LAYERS) for room in layer}
 # Imports inside functions that go up, so that frames that are not stored are rendered where they are asked for.
 UPWARD = {("gen2d.loading.dataset", "gen2d.programs.rendered_dataset")}
 # None of these imports jax when it is imported.
-WITHOUT_JAX = ("core", "storage", "dataset", "media", "loading", "captions", "exports", "tools.verify", "cli")
+WITHOUT_JAX = ("core", "storage", "dataset", "media", "loading", "captions", "page", "exports", "tools.verify", "cli")
 
 
 def sources() -> dict[str, Path]:

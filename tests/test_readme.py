@@ -26,7 +26,7 @@ def test_the_set_up_is_one_line_each():
     assert installing[1].endswith("&& pytest")
 
 
-@pytest.mark.parametrize("count", [8, pytest.param(len(BLOCKS), marks=pytest.mark.full)], ids=["first", "every"])
+@pytest.mark.parametrize("count", [9, pytest.param(len(BLOCKS), marks=pytest.mark.full)], ids=["first", "every"])
 def test_the_blocks_run(count: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """The first blocks install, generate, preview and read; the others take minutes."""
     monkeypatch.chdir(tmp_path)  # where the blocks' own files lie

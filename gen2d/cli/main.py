@@ -5,7 +5,7 @@ import os
 import sys
 from collections.abc import Sequence
 
-from gen2d.cli import clean, export, generate, info, listing, preview, verify
+from gen2d.cli import clean, export, generate, info, listing, plot, preview, verify, view
 from gen2d.cli.parser import parse
 from gen2d.core.errors import Error
 from gen2d.core.progress import logged_to_stderr
@@ -15,6 +15,8 @@ from gen2d.storage.explain import reading_error
 VERBS = {
     "generate": generate,
     "preview": preview,
+    "view": view,
+    "plot": plot,
     "info": info,
     "verify": verify,
     "export": export,

@@ -31,6 +31,7 @@ from gen2d.dataset.spec import (
     MANIFEST,
     MARK,
     NEXT,
+    PAGE,
     RECORDS,
     SCHEMA,
     SHEET,
@@ -182,7 +183,7 @@ def check_links(root: Place) -> None:
 
 def _clear(root: Place) -> None:
     """Remove the files that gen2d writes and no others; the mark, which claims the folder, goes last."""
-    for name in (MANIFEST, "croissant.json", "README.md", SHEET, CONFIG, NEXT):
+    for name in (MANIFEST, "croissant.json", "README.md", SHEET, PAGE, CONFIG, NEXT):
         (root / name).unlink(missing_ok=True)
     for name in ("shards", "index", "plugins", MARK / "done", RECORDS, SNAPSHOTS):
         remove_tree(root / name)

@@ -15,7 +15,7 @@ import numpy as np
 from gen2d.core.schema import Field
 from gen2d.dataset.block import image_names, stored_bytes
 from gen2d.dataset.rows import CHUNK
-from gen2d.dataset.spec import CONFIG, NAME, PLUGIN, SHEET, SPLIT, shard_count, table_name
+from gen2d.dataset.spec import CONFIG, NAME, PAGE, PLUGIN, SHEET, SPLIT, shard_count, table_name
 from gen2d.dataset.statistics import MOMENTS, Stats, component_counts
 from gen2d.storage.codecs import CODECS
 
@@ -308,7 +308,7 @@ class ManifestParser:
     def files(self) -> dict[str, str]:
         hashes = {}
         for name, digest in _mapping(self.part("files"), "files", 2 * SPLITS).items():
-            if name not in (CONFIG, SHEET) and not PLUGIN.fullmatch(name):
-                _refuse("a name in files", name, f"{CONFIG}, {SHEET} or plugins/KIND/NAME.py")
+            if name not in (CONFIG, SHEET, PAGE) and not PLUGIN.fullmatch(name):
+                _refuse("a name in files", name, f"{CONFIG}, {SHEET}, {PAGE} or plugins/KIND/NAME.py")
             hashes[name] = _text(digest, f"files.{name}", HASH)
         return hashes

@@ -1,7 +1,7 @@
 """The dataset card, README.md, from the manifest."""
 
 from gen2d.dataset.manifest import Manifest, statistics
-from gen2d.dataset.spec import SHEET, shard_name, shard_of
+from gen2d.dataset.spec import PAGE, SHEET, shard_name, shard_of
 
 
 def card_split(manifest: Manifest) -> str:
@@ -23,7 +23,8 @@ def readme(manifest: Manifest, command: str) -> str:
         conventions=manifest.conventions,
         split=first,
         shard=shard_name(shard.name),
-        sheet=f"\n![the first videos, time from left to right]({SHEET})\n" if SHEET in manifest.files else "",
+        sheet=f"\n![{_PICTURED}]({SHEET})\n" if SHEET in manifest.files else "",
+        page=f"\n{_PAGE}\n" if PAGE in manifest.files else "",
         statistics="\n".join(f"| {' | '.join(row)} |" for row in statistics(manifest)),
         sampled=manifest.stats_sampled,
         field="frames" if "frames" in fields else min(fields),
@@ -34,12 +35,17 @@ def readme(manifest: Manifest, command: str) -> str:
     )
 
 
+_PICTURED = "the first videos, time from left to right; below them annotations of the first"
+_PAGE = f"""[{PAGE}]({PAGE}) plays the first videos in any browser, without a network: outlines, velocities, contacts,
+trails, boxes and masks over the frames, the videos of a matched set side by side, energies and factors.
+`python -m gen2d view .` shows all videos."""
+
 # The folder is `.` in the examples, as a copy may have another name.
 _README = """# {name}
 
 Rendered videos of two-dimensional rigid bodies with everything that is true about them: {counts} videos,
 {fps:g} frames per second.
-{sheet}
+{sheet}{page}
 ## What it holds
 
 | field | dtype | axes | unit | meaning |

@@ -15,7 +15,7 @@ from gen2d.storage.paths import Place
 from gen2d.storage.sealed import as_json, sha256
 
 SCHEMA = "gen2d.dataset/3"
-MANIFEST, SHEET, CONFIG = "manifest.json", "sheet.png", "config.yaml"
+MANIFEST, SHEET, PAGE, CONFIG = "manifest.json", "sheet.png", "index.html", "config.yaml"
 MARK = Path(".gen2d")  # the subfolder of files that only gen2d needs
 RECORDS = MARK / "records"  # logs of the shards that are done and not in the manifest yet
 SNAPSHOTS = MARK / "snapshots"  # files that earlier manifests name and the present one does not

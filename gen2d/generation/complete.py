@@ -1,6 +1,4 @@
-"""Completion of a dataset: tables and cards of its finished shards and, last, the manifest that readers open."""
-
-import numpy as np
+"""Completion of a dataset: tables, cards and page of its finished shards and, last, the manifest that readers open."""
 
 from gen2d.core.errors import UnreachableError, UserError
 from gen2d.dataset.croissant import croissant
@@ -11,10 +9,11 @@ from gen2d.dataset.readme import card_split, readme
 from gen2d.dataset.records import Records, read_records
 from gen2d.dataset.rows import npy
 from gen2d.dataset.snapshots import Publication, SupersededError, publish_snapshot
-from gen2d.dataset.spec import SHEET, DatasetSpec, Shard, table_name
+from gen2d.dataset.spec import PAGE, SHEET, DatasetSpec, Shard, table_name
 from gen2d.dataset.statistics import summarize
-from gen2d.loading.dataset import Dataset, ViewOptions
-from gen2d.media import contact_sheet, images
+from gen2d.media import images
+from gen2d.page.page import index_page
+from gen2d.page.sheet import dataset_sheet, first_videos
 from gen2d.storage.atomic import publish_changed
 from gen2d.storage.explain import reading_error
 from gen2d.storage.paths import Place
@@ -65,10 +64,12 @@ def publication(spec: DatasetSpec, shards: list[Shard], records: Records, old: M
     files = spec.recipe_files
     hashes = {name: sha256(content) for name, content in files.items()}
     manifest = describe(spec, counts, tables, stats, hashes)
+    pictures = {PAGE: index_page(spec.root, manifest)}
     if "frames" in spec.fields:
-        files[SHEET] = sheet(spec.root, manifest)
-        manifest = describe(spec, counts, tables, stats, hashes | {SHEET: sha256(files[SHEET])})
-    return Publication(manifest, files | _cards(spec, manifest))
+        pictures[SHEET] = sheet(spec.root, manifest)
+    hashes |= {name: sha256(content) for name, content in pictures.items()}
+    manifest = describe(spec, counts, tables, stats, hashes)
+    return Publication(manifest, files | pictures | _cards(spec, manifest))
 
 
 def _cards(spec: DatasetSpec, manifest: Manifest) -> dict[str, bytes]:
@@ -77,7 +78,7 @@ def _cards(spec: DatasetSpec, manifest: Manifest) -> dict[str, bytes]:
 
 def _current_publication(spec: DatasetSpec, old: Manifest) -> Publication | None:
     """The current manifest and the damaged files to rewrite; None if the content of one of them would differ."""
-    recipe, files = spec.recipe_files, {}
+    recipe, files, pictures = spec.recipe_files, {}, {SHEET: sheet, PAGE: index_page}
     for name, digest in old.files.items():
         try:
             if has_sha256(spec.root / name, digest, FILE_BYTES):
@@ -86,7 +87,7 @@ def _current_publication(spec: DatasetSpec, old: Manifest) -> Publication | None
             failure = reading_error(spec.root / name, error)
             if isinstance(failure, UserError | UnreachableError):
                 raise failure from error
-        files[name] = sheet(spec.root, old) if name == SHEET else recipe.get(name, b"")
+        files[name] = pictures[name](spec.root, old) if name in pictures else recipe.get(name, b"")
         if sha256(files[name]) != digest:
             return None
     return Publication(old, files | _cards(spec, old))
@@ -94,8 +95,5 @@ def _current_publication(spec: DatasetSpec, old: Manifest) -> Publication | None
 
 def sheet(root: Place, manifest: Manifest) -> bytes:
     """Contact sheet of the first videos, as PNG; the manifest need not be in the folder yet."""
-    options = ViewOptions(card_split(manifest), ("frames",), None, 1, "first", "THWC", "uint8", "checksum")
-    ds = Dataset(root, manifest, options)
-    # One video in memory at a time: they may be long and large.
-    videos = (ds[number]["frames"] for number in range(min(ROWS, len(ds))))
-    return images.png(contact_sheet.contact_sheet(np.stack([contact_sheet.downsample(video) for video in videos])))
+    split = card_split(manifest)
+    return images.png(dataset_sheet(root, manifest, split, first_videos(manifest, split, ROWS)))

@@ -14,6 +14,7 @@ import h5py
 import isal
 import jax
 import numpy as np
+import PIL
 import zstandard
 
 from gen2d._version import __version__
@@ -131,4 +132,5 @@ def versions() -> dict[str, str]:
         "isal": isal.__version__,
         "zstandard": zstandard.__version__,
         "opencv": cv2.__version__,
+        "pillow": PIL.__version__,
     }

@@ -7,11 +7,13 @@ import numpy as np
 
 from gen2d.core.errors import UserError
 from gen2d.core.progress import waiting
+from gen2d.dataset.manifest import Manifest
 from gen2d.loading.dataset import Dataset
 from gen2d.loading.dataset import open as open_dataset
 from gen2d.media.contact_sheet import contact_sheet
 from gen2d.media.images import animate, check_folder, write, writing
-from gen2d.storage.paths import Url, place
+from gen2d.page.sheet import dataset_sheet, first_videos
+from gen2d.storage.paths import Place, Url, place
 
 
 def preview(
@@ -26,6 +28,9 @@ def preview(
     deadline: float = 300.0,
 ) -> list[Path]:
     """Write a contact sheet, NAME-sheet.png, and an animation, NAME.webp, of a dataset or a config.
+
+    A dataset's pictures have the name of its folder. The sheet of one with stored frames names its videos and what
+    differs in matched sets, and shows masks, boxes and flow of the first video where they are stored.
 
     Parameters
     ----------
@@ -67,13 +72,18 @@ def preview(
     check_folder(out)
     if is_dataset(source):
         ds = open_dataset(source, timeout=timeout, deadline=deadline)
-        numbers = range(min(videos, len(ds)))
-        name, frames, fps = ds.manifest.name, _dataset_frames(ds, numbers, trust), ds.manifest.fps
+        numbers = first_videos(ds.manifest, ds.options.split, videos)
+        name, frames, fps = folder_name(ds.root, ds.manifest), _dataset_frames(ds, numbers, trust), ds.manifest.fps
+        if "frames" in ds.manifest.fields:
+            picture = dataset_sheet(ds.root, ds.manifest, ds.options.split, numbers)
+        else:
+            picture = contact_sheet(frames)
     else:
         name, frames, fps = _config_frames(str(source), videos, seed, overrides)
+        picture = contact_sheet(frames)
     sheet, animation = out / f"{name}-sheet.png", out / f"{name}.webp"
     with writing(out), waiting(f"Writing {sheet.name} and {animation.name}"):
-        write(sheet, contact_sheet(frames))
+        write(sheet, picture)
         animate(animation, frames, fps)
     return [sheet, animation]
 
@@ -82,6 +92,12 @@ def is_dataset(source: str | Url) -> bool:
     """Whether the source is a dataset (a URL or a folder) rather than a config."""
     path = place(source)
     return isinstance(path, Url) or path.is_dir()
+
+
+def folder_name(root: Place, manifest: Manifest) -> str:
+    """Name of a dataset's folder, after which its pictures are named."""
+    name = str(root).rstrip("/").rpartition("/")[2] if isinstance(root, Url) else root.resolve().name
+    return name or manifest.name
 
 
 def check_videos(videos: int) -> None:

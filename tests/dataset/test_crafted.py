@@ -25,6 +25,9 @@ import gen2d
 from gen2d.cli.main import main
 from gen2d.core.errors import Error
 from gen2d.storage import retries
+from gen2d.storage.paths import place
+from gen2d.storage.retries import Network
+from gen2d.tools.view import Library, NotFoundError
 
 SECONDS = 10.0  # for one action
 MANY = int(os.environ.get("CRAFTED_DATASETS", "1000"))  # of the third tier: 10,000 take an hour and a half
@@ -46,6 +49,14 @@ def tried(root: str, folder: Path, writable: bool) -> Iterator[str]:
                 with contextlib.suppress(Error):
                     ds[number]
             ds[:]
+    yield "view"
+    with contextlib.suppress(Error):
+        library = Library(place(root, Network(2, 4)))
+        library.page()
+        for split in ("train", "test"):
+            with contextlib.suppress(Error, NotFoundError):
+                library.numbers(split, "0", '[["index", "0", "3"]]')
+                library.video(split, "0")
     for words in verbs:
         yield " ".join(words)
         out, told = io.StringIO(), io.StringIO()

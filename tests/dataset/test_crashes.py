@@ -109,7 +109,7 @@ def test_while_snapshots_are_cleaned_away(grown: dict[int, Path], tmp_path: Path
 DAMAGES = {
     "a shard": ("shards/train-00000.h5",),
     "the manifest and a shard": ("manifest.json", "shards/train-00001-n4.h5"),
-    "the table and the config": ("index/train-12.npy", "config.yaml", "sheet.png"),
+    "the table and the config": ("index/train-12.npy", "config.yaml", "sheet.png", "index.html"),
 }
 
 

@@ -63,7 +63,7 @@ DAMAGES = {
     "manifest and a shard": ["manifest.json", LAST],
     "manifest and a table": ["manifest.json", TABLE],
     "manifest, a table and a shard": ["manifest.json", TABLE, LAST],
-    "many": ["shards/train-00001.h5", TEST, "config.yaml", "croissant.json", "sheet.png"],
+    "many": ["shards/train-00001.h5", TEST, "config.yaml", "croissant.json", "sheet.png", "index.html"],
 }
 
 

@@ -203,10 +203,10 @@ def test_a_folder_that_cannot_be_replaced_stays(tmp_path: Path, monkeypatch: pyt
 
 @pytest.fixture
 def small_disk(tmp_path: Path) -> Iterator[Path]:
-    """A disk of 400 kB and 40 inodes, where this user may mount one."""
+    """A disk of 400 kB and 42 inodes, where this user may mount one."""
     disk = tmp_path / "disk"
     disk.mkdir()
-    words = ["mount", "-t", "tmpfs", "-o", "size=400k,nr_inodes=40", "tmpfs", str(disk)]
+    words = ["mount", "-t", "tmpfs", "-o", "size=400k,nr_inodes=42", "tmpfs", str(disk)]
     if subprocess.run(words, capture_output=True, check=False).returncode:
         not_run("a full disk, as this user may not mount one")
     yield disk

@@ -396,6 +396,7 @@ def a_file_that_is_none(root: Path, chance: random.Random) -> str:
         "README.md",
         "croissant.json",
         "sheet.png",
+        "index.html",
         ".gen2d/dataset.json",
         "shards/train-00000.h5",
     ]
@@ -436,6 +437,7 @@ def a_file_that_is_huge(root: Path, chance: random.Random) -> str:
         "manifest.json",
         "config.yaml",
         "sheet.png",
+        "index.html",
         "croissant.json",
         "index/train-10.npy",
         "shards/train-00000.h5",
@@ -490,7 +492,7 @@ def a_log_or_a_snapshot(root: Path, chance: random.Random) -> str:
 
 @kind
 def a_file_of_the_manifest(root: Path, chance: random.Random) -> str:
-    name = chance.choice(["config.yaml", "sheet.png"])
+    name = chance.choice(["config.yaml", "sheet.png", "index.html"])
     content = chance.choice(
         [
             b"",
@@ -533,7 +535,7 @@ def a_name_on_the_disk(root: Path, chance: random.Random) -> str:
 def a_picture_that_leads_away(root: Path, chance: random.Random) -> str:
     """Symbolic links with the names of preview files: a preview that follows them overwrites another file."""
     (root.parent / "victim").write_bytes(b"precious")
-    for name in ("toy-sheet.png", "toy.webp"):
+    for name in (f"{root.name}-sheet.png", f"{root.name}.webp"):
         if chance.random() < 0.2:
             os.mkfifo(root / name)
         else:

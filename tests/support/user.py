@@ -47,9 +47,10 @@ def train(root: Path) -> float:
     exported = gen2d.export(root, "npz", root / "npz", render={"height": 128})
     problems: list[str] = gen2d.verify(root)
     previews: list[Path] = gen2d.preview(root, out=root)
+    plots: list[Path] = gen2d.plot(root, root, video=3)
     try:
         gen2d.open("nothing")
     except gen2d.UserError as error:
         print(error)
-    print(exported.videos, problems, previews, gen2d.info(root))
+    print(exported.videos, problems, previews, plots, gen2d.info(root))
     return total

@@ -39,7 +39,7 @@ def test_what_was_written_passes(tmp_path: Path, codec: str, level: str) -> None
 
 
 KINDS = [
-    *("shards/*.h5", "index/*.npy", "manifest.json", "config.yaml", "croissant.json", "sheet.png"),
+    *("shards/*.h5", "index/*.npy", "manifest.json", "config.yaml", "croissant.json", "sheet.png", "index.html"),
     ".gen2d/dataset.json",
 ]
 
