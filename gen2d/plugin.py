@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from gen2d.config.contracts import Annotation, Export, Family, Look
     from gen2d.config.distributions import Distribution
     from gen2d.config.options import option
-    from gen2d.core.enums import CIRCLE, DYNAMIC, KINEMATIC, STATIC
+    from gen2d.core.enums import CIRCLE, DYNAMIC, KINEMATIC, POLYGON, STATIC
     from gen2d.core.errors import ConfigError
     from gen2d.core.schema import Field
     from gen2d.exports.source import Source
@@ -36,10 +36,11 @@ if TYPE_CHECKING:
         line_fields,
         line_margin,
         mean_color,
+        palette_option,
         plain,
     )
     from gen2d.renderers.noise import fraction, hashed
-    from gen2d.renderers.paint import Background, Paint, Texture
+    from gen2d.renderers.paint import Background, Light, Paint, Pattern, Shadow, Surface, Texture
     from gen2d.renderers.plan import FramePlan, RenderScene, tile_windows
     from gen2d.renderers.primitives import Instants, PixelWindow
     from gen2d.renderers.rasterizer import alone
@@ -55,7 +56,7 @@ _HOMES = {
     "gen2d.config.contracts": "Annotation Export Family Look",
     "gen2d.config.distributions": "Distribution",
     "gen2d.config.options": "option",
-    "gen2d.core.enums": "CIRCLE DYNAMIC KINEMATIC STATIC",
+    "gen2d.core.enums": "CIRCLE DYNAMIC KINEMATIC POLYGON STATIC",
     "gen2d.core.errors": "ConfigError",
     "gen2d.core.schema": "Field",
     "gen2d.exports.source": "Source",
@@ -70,10 +71,11 @@ _HOMES = {
     "gen2d.renderers.camera": "pixel_at to_pixels",
     "gen2d.renderers.compositing": "OCCLUDER",
     "gen2d.renderers.look": (
-        "LineOptions PlainOptions are_lines are_moving contrasting line_fields line_margin mean_color plain"
+        "LineOptions PlainOptions are_lines are_moving contrasting line_fields line_margin mean_color palette_option "
+        "plain"
     ),
     "gen2d.renderers.noise": "fraction hashed",
-    "gen2d.renderers.paint": "Background Paint Texture",
+    "gen2d.renderers.paint": "Background Light Paint Pattern Shadow Surface Texture",
     "gen2d.renderers.plan": "FramePlan RenderScene tile_windows",
     "gen2d.renderers.primitives": "Instants PixelWindow",
     "gen2d.renderers.rasterizer": "alone",
@@ -90,6 +92,7 @@ __all__ = [
     "DYNAMIC",
     "KINEMATIC",
     "OCCLUDER",
+    "POLYGON",
     "STATIC",
     "Annotation",
     "Array",
@@ -104,16 +107,20 @@ __all__ = [
     "Instants",
     "JointSpec",
     "Layout",
+    "Light",
     "LineOptions",
     "Look",
     "Paint",
+    "Pattern",
     "PixelWindow",
     "PlainOptions",
     "RenderScene",
     "SampledScene",
     "Scene",
+    "Shadow",
     "SlotGroup",
     "Source",
+    "Surface",
     "Texture",
     "alone",
     "are_lines",
@@ -137,6 +144,7 @@ __all__ = [
     "minimum",
     "on_cpu",
     "option",
+    "palette_option",
     "pixel_at",
     "place",
     "plain",

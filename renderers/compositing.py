@@ -1,8 +1,8 @@
 """Compositing: layers painted over full-size images, back to front.
 
 A `Painter` is a function `paint(canvas, cover, color, object_id)` that paints one layer: its coverage [I, H, W] from 0
-to 1, its sRGB colour, and its id. The canvas is a `LayerCanvas` of frames and owners, or a float image. The owner of
-a pixel is the object that the pixel shows most of.
+to 1, its sRGB colour, and its id; None for a shadow, which owns no pixel. The canvas is a `LayerCanvas` of frames and
+owners, or a float image. The owner of a pixel is the object that the pixel shows most of.
 """
 
 import math
@@ -17,16 +17,21 @@ from gen2d.records.axes import Array
 from gen2d.records.layout import SlotGroup
 from gen2d.renderers.camera import to_world
 from gen2d.renderers.color import LINEAR, to_linear, to_srgb
+from gen2d.renderers.lighting import ShadedColor, as_color
 from gen2d.renderers.noise import textured
 from gen2d.renderers.plan import FramePlan, RenderScene
 from gen2d.renderers.primitives import Instants, PixelWindow, object_parts
+from gen2d.renderers.relief import relief_of
 from gen2d.renderers.shading import EdgeTerms, covered_color, edge_terms, fills_of
+from gen2d.renderers.shadows import ShadowTerms, shadow_cover, shadow_terms
 
 FULL_COVER = 2**15 - 1  # a quantised coverage of 1
+SHARE_BITS, SHARE_WORD = 13, 16
+FULL_SHARE = 2**SHARE_BITS  # a quantised share of 1 of a `ShadedColor`, whose shares are from 0 to 4
 NO_OWNER = FULL_COVER << 8  # owner of a pixel that shows only background
 OCCLUDER = 255  # id of all occluders
 
-Painter = Callable[[Any, Array, Array, Any], Any]
+Painter = Callable[[Any, Array, Any, Any], Any]
 
 
 class LayerCanvas(NamedTuple):
@@ -44,14 +49,34 @@ def quantize_cover(cover: Array) -> Array:
     return (cover * FULL_COVER + 0.5).astype(jnp.int32).astype(jnp.int16)
 
 
-def quantize_color(color: Array) -> Array:
-    """Colour rounded to int16."""
+class PackedColor(NamedTuple):
+    """A quantised `ShadedColor`. Both shares are in one array, so that the compiler computes them together."""
+
+    color: Array  # [..., 1, 1, 3] int16
+    accent: Array  # [..., 1, 1, 3] int16
+    shares: Array  # [..., rows, columns] int32: of the color below, of the accent above SHARE_WORD bits
+
+
+def quantize_color(color: Array | ShadedColor) -> Any:
+    """Colour rounded to int16, or a `PackedColor`."""
+    if isinstance(color, ShadedColor):
+        share, accent_share = ((part * FULL_SHARE + 0.5).astype(jnp.int32) for part in color[2:])
+        shares = share | (accent_share << SHARE_WORD)
+        return PackedColor(quantize_color(color.color), quantize_color(color.accent), shares)
     return (color + 0.5).astype(jnp.int32).astype(jnp.int16)
 
 
-def over(under: Array, cover: Array, color: Array, linear: bool) -> Array:
+def _unpacked(packed: PackedColor) -> Array:
+    """Colours [..., rows, columns, 3] int16 of a `PackedColor`."""
+    color, accent, shares = packed.color.astype(jnp.int32), packed.accent.astype(jnp.int32), packed.shares[..., None]
+    share, accent_share = shares & (2**SHARE_WORD - 1), shares >> SHARE_WORD
+    value = (color * share + (accent * accent_share + FULL_SHARE // 2)) >> SHARE_BITS
+    return jnp.minimum(value, 255).astype(jnp.int16)
+
+
+def over(under: Array, cover: Array, color: Array | PackedColor, linear: bool) -> Array:
     """Composite of a layer over a uint8 image [..., 3], from its quantised coverage [...] and colour."""
-    cover = cover[..., None]
+    cover, color = cover[..., None], _unpacked(color) if isinstance(color, PackedColor) else color
     if linear:
         light = jnp.asarray(LINEAR)[under.astype(jnp.int32)]
         alpha = cover.astype(jnp.float32) * (1 / FULL_COVER)
@@ -80,11 +105,11 @@ def ownership(owner: Array, cover: Array, object_id: Array | int) -> Array:
 def quantized_painter(linear: bool) -> Painter:
     """Painter of a `LayerCanvas`, which rounds each layer to integers."""
 
-    def paint(canvas: LayerCanvas, cover: Array, color: Array, object_id: Any) -> LayerCanvas:
+    def paint(canvas: LayerCanvas, cover: Array, color: Array | ShadedColor, object_id: Any) -> LayerCanvas:
         image, owner = canvas
         return LayerCanvas(
             None if image is None else over(image, quantize_cover(cover), quantize_color(color), linear),
-            None if owner is None else ownership(owner, quantize_cover(cover), object_id),
+            owner if owner is None or object_id is None else ownership(owner, quantize_cover(cover), object_id),
         )
 
     return paint
@@ -93,8 +118,8 @@ def quantized_painter(linear: bool) -> Painter:
 def float_painter(linear: bool, sigma: float = 0.0) -> Painter:
     """Painter of a float image in sRGB or linear light, without rounding; `sigma` (px) blurs each layer's coverage."""
 
-    def paint(image: Array, cover: Array, color: Array, object_id: Any) -> Array:
-        cover = gaussian_blur(cover, sigma) if sigma else cover
+    def paint(image: Array, cover: Array, color: Array | ShadedColor, object_id: Any) -> Array:
+        cover, color = gaussian_blur(cover, sigma) if sigma else cover, as_color(color)
         return image + cover[..., None] * ((to_linear(color) if linear else color) - image)
 
     return paint
@@ -118,7 +143,7 @@ def background_image(scene: RenderScene, at: Instants, plan: FramePlan) -> Array
     """Background [I, H, W, 3] in floats at the instants `at`; [1, H, W, 3] if it is a plain colour."""
     background, first = scene.paint.background, scene.instants.view
     color, height, width = background.color, plan.height, plan.width
-    if background.to_color is None and background.texture is None:
+    if background.to_color is None and background.texture is None and background.corners is None:
         return jnp.broadcast_to(color, (1, height, width, 3))
     rows, columns = (jnp.arange(n, dtype=jnp.float32) + 0.5 for n in (height, width))
     rows, columns = (a.reshape(-1) for a in jnp.meshgrid(rows, columns, indexing="ij"))
@@ -131,7 +156,11 @@ def background_image(scene: RenderScene, at: Instants, plan: FramePlan) -> Array
         along = ((x - center[0]) * cos + (y - center[1]) * sin) / reach
         color = color + jnp.clip((along[..., None] + 1) / 2, 0, 1) * (background.to_color - color)
     if background.texture is not None:
-        color = textured(color, background.texture, x, y)
+        color = textured(color, background.texture, x, y, at.view.scale[:, None, None])
+    if background.corners is not None:
+        center, scale = first.center[0], first.scale[0]
+        square = ((x - center[0]) * 2 * scale / width) ** 2 + ((y - center[1]) * 2 * scale / height) ** 2
+        color = color + jnp.clip(square / 2, 0, 1)[..., None] * (background.corners - color)
     return jnp.broadcast_to(color, (*x.shape, 3))
 
 
@@ -147,7 +176,9 @@ def static_layer(scene: RenderScene, plan: FramePlan) -> LayerCanvas:
     """Canvas [1, ...] of the background and of static slots behind all moving ones, without occluders."""
     first = jax.tree.map(lambda a: a[:1], scene.instants)
     canvas, alone = background_layer(scene, first, plan), scene._replace(occluders=None)
-    return paint_runs(canvas, alone, plan, first, plan.static_runs, quantized_painter(plan.linear))
+    paint = quantized_painter(plan.linear)
+    canvas = paint_shadows(canvas, scene, plan, first, plan.static_runs, paint)
+    return paint_runs(canvas, alone, plan, first, plan.static_runs, paint)
 
 
 def paint_runs(
@@ -181,9 +212,28 @@ def paint_runs(
     return canvas
 
 
+def paint_shadows(
+    canvas: Any, scene: RenderScene, plan: FramePlan, at: Instants, runs: list[tuple[SlotGroup, int]], paint: Painter
+) -> Any:
+    """Canvas with the shadows of the slots of `runs` painted over its full size."""
+    shadow = scene.paint.shadow
+    if shadow is None:
+        return canvas
+    window = PixelWindow(0, 0, plan.height, plan.width)
+
+    def paint_shadow(canvas: Any, terms: ShadowTerms) -> tuple[Any, None]:
+        return paint(canvas, shadow_cover(terms, window), shadow.color, None), None
+
+    for run, first in runs:
+        canvas = jax.lax.scan(paint_shadow, canvas, shadow_terms(scene, plan, at, run, first, window))[0]
+    return canvas
+
+
 def paint_moving(canvas: Any, scene: RenderScene, plan: FramePlan, at: Instants, paint: Painter) -> Any:
     """Canvas with all moving slots and all occluders painted over its full size."""
-    canvas = paint_runs(canvas, scene, plan, at, [span for group in plan.groups for span in group.runs], paint)
+    runs = [span for group in plan.groups for span in group.runs]
+    canvas = paint_shadows(canvas, scene, plan, at, runs, paint)
+    canvas = paint_runs(canvas, scene, plan, at, runs, paint)
     return paint_occluders(canvas, scene, plan, lambda rank: rank >= plan.moving, paint)
 
 
@@ -220,11 +270,13 @@ def run_edge_terms(
     The loop over slots keeps the compiler from computing the parts again for each row and column.
     """
     parts = object_parts(run, first, scene.bodies, at, scene.paint, plan.height, plan.width)
-    varied = scene.paint.shade is not None or scene.paint.texture is not None
+    paint = scene.paint
+    varied = any(part is not None for part in (paint.shade, paint.texture, paint.surface))
     corners = [jnp.broadcast_to(jnp.asarray(edge), parts.pose.column.shape) for edge in (window.top, window.left)]
 
     def sample(entry: tuple[Any, ...]) -> EdgeTerms:
         part, top, left = entry
         return edge_terms(part, PixelWindow(top, left, window.rows, window.columns), run.shape == "circle", varied)
 
-    return jax.lax.map(sample, (parts, *corners))
+    edges = jax.lax.map(sample, (parts, *corners))
+    return edges if paint.surface is None else edges._replace(relief=relief_of(run, first, scene.bodies, at, paint))

@@ -1,6 +1,7 @@
 """Shared parts of looks: options of backgrounds, colours and lines, and the paint of plain shapes."""
 
 import dataclasses
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -8,11 +9,18 @@ import numpy as np
 
 from gen2d.config.options import option
 from gen2d.core.enums import SHAPES, STATIC
+from gen2d.core.palettes import PALETTES, Palette
 from gen2d.records.axes import Array
 from gen2d.records.layout import Layout
 from gen2d.records.scene import Scene
 from gen2d.renderers.color import palette, to_linear
 from gen2d.renderers.paint import Background, Paint, Texture
+
+
+def palette_option(default: str) -> str:
+    """The option `palette` with another default."""
+    meaning = "object colors: of the scene, random, or of a named palette, which also colors walls and background"
+    return option(default, str, "", meaning, choices=("scene", "random", *PALETTES))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -27,19 +35,46 @@ class PlainOptions(LineOptions):
     """Options of the background, colours and lines of plain shapes."""
 
     background_kind: str = option("plain", str, "", "kind of the background", choices=("plain", "gradient", "noise"))
-    background: tuple[int, ...] = option(
-        [20, 20, 20], int, "sRGB", "first color of the background", parts=3, low=0, high=255
+    background: tuple[int, ...] | None = option(
+        None,
+        int,
+        "sRGB",
+        "first color of the background; null: that of the palette, or [20, 20, 20]",
+        parts=3,
+        low=0,
+        high=255,
+        optional=True,
     )
-    background_to: tuple[int, ...] = option(
-        [80, 80, 110], int, "sRGB", "second color of the background", parts=3, low=0, high=255
+    background_to: tuple[int, ...] | None = option(
+        None,
+        int,
+        "sRGB",
+        "second color of the background; null: that of the palette, or one of the look",
+        parts=3,
+        low=0,
+        high=255,
+        optional=True,
     )
     background_cell: float = option(
         0.2, float, "1", "cell size of the noise, over the shorter side of the scene", above=0
     )
-    palette: str = option("scene", str, "", "source of the objects' colors", choices=("scene", "random"))
+    palette: str = palette_option("scene")
     contrast: float = option(
         120.0, float, "1", "smallest contrast of random colors and the background, 0 to 765", low=0, high=765
     )
+    dark: ClassVar[tuple[tuple[int, ...], tuple[int, ...]]] = (20, 20, 20), (80, 80, 110)  # backgrounds by default
+
+    @property
+    def named_palette(self) -> Palette | None:
+        """The palette of this name; None if the colours are those of the scene, or random."""
+        return PALETTES.get(self.palette)
+
+    @property
+    def grounds(self) -> tuple[tuple[int, ...], tuple[int, ...]]:
+        """First and second colour of the background: as asked for, else of the palette, else dark ones."""
+        named = self.named_palette
+        first, second = (named.ground[1], named.ground[2]) if named else self.dark
+        return self.background or first, self.background_to or second
 
 
 def line_margin(options: LineOptions) -> float:
@@ -56,7 +91,7 @@ def plain(scene: Scene, layout: Layout, options: PlainOptions, key: Array) -> Pa
 
 def sample_background(options: PlainOptions, layout: Layout, key: Array) -> Background:
     """Background by `background_kind`: plain, a gradient in a random direction, or noise."""
-    color, to_color = (jnp.asarray(c, jnp.float32) for c in (options.background, options.background_to))
+    color, to_color = (jnp.asarray(c, jnp.float32) for c in options.grounds)
     if options.background_kind == "plain":
         return Background(color)
     if options.background_kind == "gradient":
@@ -78,12 +113,25 @@ def mean_color(background: Background) -> Array:
 
 
 def slot_colors(scene: Scene, layout: Layout, options: PlainOptions, key: Array, background: Background) -> Array:
-    """Colours [K, 3] of the slots: those of the scene, or for moving slots a random palette that contrasts with itself
-    and with the background."""
-    colors, moving = scene.objects.color.astype(jnp.float32), np.flatnonzero(are_moving(layout))
-    if options.palette == "scene" or not len(moving):
+    """Colours [K, 3] of the slots: of the scene, of a named palette, or for moving slots random ones that contrast with
+    each other and with the background."""
+    colors, moving = scene.objects.color.astype(jnp.float32), are_moving(layout)
+    if options.named_palette is not None:
+        return palette_colors(scene, moving, options.named_palette, jax.random.fold_in(key, 3))
+    count = int(moving.sum())
+    if options.palette == "scene" or not count:
         return colors
-    return colors.at[moving].set(palette(key, len(moving), options.contrast, background_colors(background)))
+    return colors.at[np.flatnonzero(moving)].set(palette(key, count, options.contrast, background_colors(background)))
+
+
+def palette_colors(scene: Scene, moving: np.ndarray, named: Palette, key: Array) -> Array:
+    """Colours [K, 3] of a named palette in a random order: distinct for the moving objects that are present, or each as
+    often as any other, to one, if there are more objects than colours; static slots have the colour of walls."""
+    colors = jnp.asarray([*named.objects.values()], jnp.float32)
+    order = jax.random.permutation(key, len(colors))
+    place = jnp.cumsum(scene.objects.present & moving) - 1
+    wall = jnp.asarray(named.wall[1], jnp.float32)
+    return jnp.where(jnp.asarray(moving)[:, None], colors[order[place % len(colors)]], wall)
 
 
 def line_fields(scene: Scene, options: LineOptions) -> tuple[Array, Array]:

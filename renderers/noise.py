@@ -7,6 +7,8 @@ import jax.numpy as jnp
 from gen2d.records.axes import Array
 from gen2d.renderers.paint import Texture
 
+FADE = 0.25  # of an octave, over the square of a pixel's width in cells: fitted to averages over pixels
+
 
 def _hash_word(x: Array) -> Array:
     """Well-mixed 32-bit hash of a 32-bit word (the finalizer 'lowbias32' of C. Wellons, 2018)."""
@@ -28,10 +30,14 @@ def fraction(word: Array) -> Array:
     return (word >> 8).astype(jnp.float32) * (1 / 2**24)
 
 
-def noise(x: Array, y: Array, seed: Array) -> Array:
-    """Value noise in [0, 1] with a cell of 1: two octaves of random values on the integers, with cubic blending."""
+def noise(x: Array, y: Array, seed: Array, pixel: Array | float = 0.0) -> Array:
+    """Value noise in [0, 1] with a cell of 1: two octaves of random values on the integers, with cubic blending.
+
+    `pixel` is the width of a pixel, in cells: each octave is as faint as its average over a pixel, within a tenth.
+    """
     fine = _octave(2 * x + 0.37, 2 * y + 0.71, hashed(seed, 1))
-    return (2 * _octave(x, y, seed) + fine) / 3
+    coarse, wide = _octave(x, y, seed) - 0.5, pixel * pixel
+    return 0.5 + (2 * coarse / (1 + FADE * wide) + (fine - 0.5) / (1 + 4 * FADE * wide)) / 3
 
 
 def _octave(x: Array, y: Array, seed: Array) -> Array:
@@ -46,7 +52,9 @@ def _octave(x: Array, y: Array, seed: Array) -> Array:
     return upper * (1 - v) + lower * v
 
 
-def textured(color: Array, texture: Texture, x: Array, y: Array) -> Array:
-    """Colours [..., 3] of a texture at x and y [...] in m, on a base of `color` [..., 3] (broadcast)."""
-    share = noise(x / texture.cell, y / texture.cell, texture.seed)[..., None]
+def textured(color: Array, texture: Texture, x: Array, y: Array, scale: Array) -> Array:
+    """Colours [..., 3] of a texture at x and y [...] in m, on a base of `color` [..., 3] (broadcast), in pixels of
+    `scale` [...] px/m."""
+    pixel = 1 / (texture.cell * scale)
+    share = noise(x / texture.cell, y / texture.cell, texture.seed, pixel)[..., None]
     return color + share * (texture.color - color)

@@ -16,13 +16,53 @@ class Texture(NamedTuple):
     color: Array  # [..., 3] where the noise is 1; where it is 0 the base colour shows
 
 
+class Light(NamedTuple):
+    """Directional light, fixed to the world, and ambient light from above."""
+
+    direction: Array  # [..., 3] towards the light: x right, y up, z towards the viewer; of length 1
+    softness: Array  # [...] width of the transition from light to dark, as a cosine
+    ambient: Array  # [...] part of the light on a surface that faces the viewer
+    highlight: Array  # [..., 3] colour of highlights
+
+
+class Surface(NamedTuple):
+    """Relief and material of objects that are lit by a `Light`."""
+
+    slope: Array  # [K] sine of the steepest tilt, at the rim; 0: flat
+    bevel: Array  # [K] m, width of the sloping border of polygons; discs, capsules and segments are domes
+    gloss: Array  # [K] strength of the highlight
+    sharpness: Array  # [K] exponent of the highlight (J. Blinn, 1977)
+    stripe: Array | None = None  # [K] half width of a band along the x axis of discs, over the radius; 0: none
+    stripe_light: Array | None = None  # [K] 1: in the colour of highlights; -a: darker by the part a
+    pattern: "Pattern | None" = None
+
+
+class Pattern(NamedTuple):
+    """Noise on the surfaces of objects, stretched along their x axes: grain, fibres, brush strokes."""
+
+    seed: Array  # [K] uint32
+    cell: Array  # [K] m, size of the coarsest spots along the y axis
+    stretch: Array  # [K] size along the x axis, over that along the y axis
+    contrast: Array  # [K] relative change of the reflected light; 0: none
+
+
+class Shadow(NamedTuple):
+    """Shadows on the background of everything in front of it."""
+
+    offset: Array  # [2] m, of a shadow from its object
+    blur: Array  # [] m, half the width of its soft edge; at most `Look.blur` says
+    opacity: Array  # []
+    color: Array  # [3]
+
+
 class Background(NamedTuple):
-    """Background: a colour, a gradient, or noise."""
+    """Background: a colour, a gradient, or noise; with `corners` darker or lighter towards the corners of the view."""
 
     color: Array  # [3]
     to_color: Array | None = None  # [3] at the end of a gradient
     direction: Array | None = None  # rad, of a gradient, from `color` to `to_color`
     texture: Texture | None = None
+    corners: Array | None = None  # [3] at the corners of the view of the first frame
 
 
 class Paint(NamedTuple):
@@ -39,3 +79,6 @@ class Paint(NamedTuple):
     mark_color: Array | None = None  # [K, 3]
     shade: Array | None = None  # [K] relative darkening opposite the light, 0 to 1
     texture: Texture | None = None  # arrays [K, ...]
+    light: Light | None = None  # lights `surface`
+    surface: Surface | None = None
+    shadow: Shadow | None = None

@@ -46,6 +46,7 @@ class FramePlan:
     width: int
     scale: float  # px/m, upper bound
     grow: float = 0.0  # px, upper bound of what the look adds to an object's rim
+    blur: float = 0.0  # px, upper bound of half the width of the soft edges of shadows
     still: bool = True  # whether the camera never moves
     linear: bool = False  # whether colours mix in linear light
     frames: bool = True  # whether frames are wanted
@@ -103,11 +104,13 @@ class TileGroup(NamedTuple):
         return min(rows, height), min(-(-rows // LANES) * LANES, width)
 
 
-def tile_windows(plan: FramePlan, group: TileGroup, at: Instants, run: SlotGroup, first: int) -> PixelWindow:
-    """Tiles of a run's slots at the instants `at`, with top and left [k, I]."""
+def tile_windows(
+    plan: FramePlan, group: TileGroup, at: Instants, run: SlotGroup, first: int, offset: Array | float = 0.0
+) -> PixelWindow:
+    """Tiles of a run's slots, moved by `offset` [2] m, at the instants `at`, with top and left [k, I]."""
     height, width = plan.height, plan.width
     rows, columns = group.size(height, width)
-    centers = to_pixels(at.view, at.position[:, first : first + run.count], height, width)
+    centers = to_pixels(at.view, at.position[:, first : first + run.count] + offset, height, width)
 
     def begin(center: Array, size: int, whole: int) -> Array:
         if size == whole:

@@ -106,7 +106,7 @@ def _body_shape(
     return corners, half + radius, half + radius
 
 
-def _sides(corners: Array) -> tuple[Array, Array]:
+def side_normals(corners: Array) -> tuple[Array, Array]:
     """Outward normals [..., V, 2] of the sides, and their distances from the centre [..., V]; infinite for a side of
     length 0."""
     side = jnp.roll(corners, -1, axis=-2) - corners
@@ -117,21 +117,21 @@ def _sides(corners: Array) -> tuple[Array, Array]:
 
 def _rim_along_x(corners: Array) -> Array:
     """Distance of a polygon's rim from its centre along its own x axis."""
-    normal, distance = _sides(corners)
+    normal, distance = side_normals(corners)
     facing = normal[..., 0] > 1e-6
     return jnp.where(facing, distance / jnp.where(facing, normal[..., 0], 1.0), jnp.inf).min(-1)
 
 
 def _inradius(run: SlotGroup, corners: Array | None, radius: Array) -> Array:
     """Distance of the nearest point of the rim from the centre."""
-    return radius if run.shape != "polygon" or corners is None else _sides(corners)[1].min(-1) + radius
+    return radius if run.shape != "polygon" or corners is None else side_normals(corners)[1].min(-1) + radius
 
 
 def _inset_corners(run: SlotGroup, corners: Array | None, rim: Array, radius: Array) -> Array | None:
     """Corners of a polygon inset by the part of the rim line that exceeds the radius, at most to the centre."""
     if run.shape != "polygon" or corners is None:
         return corners
-    normal, distance = _sides(corners)
+    normal, distance = side_normals(corners)
     inset = jnp.clip(rim - radius, 0.0, 0.999 * distance.min(-1))[..., None, None]
     # Corners may be repeated: take the normals of the nearest sides that have a length.
     outgoing = normal

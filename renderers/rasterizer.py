@@ -28,6 +28,7 @@ from gen2d.renderers.compositing import (
     float_painter,
     paint_moving,
     paint_runs,
+    paint_shadows,
     quantized_painter,
     run_edge_terms,
     static_layer,
@@ -90,6 +91,7 @@ def draw_soft(scene: RenderScene, plan: FramePlan, sigma: float = 0.0) -> Array:
     at, paint = scene.instants, float_painter(plan.linear, sigma)
     image = background_image(scene, at, plan)
     image = jnp.broadcast_to(to_linear(image) if plan.linear else image, (len(at.angle), *image.shape[1:]))
+    image = paint_shadows(image, scene, plan, at, plan.static_runs, paint)
     image = paint_runs(image, scene._replace(occluders=None), plan, at, plan.static_runs, paint)
     image = paint_moving(image, scene, plan, at, paint)
     return to_srgb(image) if plan.linear else image

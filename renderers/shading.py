@@ -8,9 +8,11 @@ import jax.numpy as jnp
 from gen2d.records.axes import Array
 from gen2d.renderers.coverage import disc as disc_module
 from gen2d.renderers.coverage import polygon
+from gen2d.renderers.lighting import ShadedColor, as_color, lit_color
 from gen2d.renderers.noise import textured
-from gen2d.renderers.paint import Paint, Texture
+from gen2d.renderers.paint import Light, Paint, Surface, Texture
 from gen2d.renderers.primitives import ImagePose, ObjectParts, PixelWindow, Primitive
+from gen2d.renderers.relief import Relief
 
 
 class Fills(NamedTuple):
@@ -21,12 +23,15 @@ class Fills(NamedTuple):
     mark: Array | None
     shade: Array | None
     texture: Texture | None
+    light: Light | None
+    surface: Surface | None
 
 
 def fills_of(paint: Paint, slots: slice) -> Fills:
     """Fills of some slots; arrays [k, ...]."""
     color = paint.color if paint.fill is None else paint.fill
-    fills = Fills(color, paint.rim_color, paint.mark_color, paint.shade, paint.texture)
+    light = jax.tree.map(lambda a: jnp.broadcast_to(a, (len(color), *a.shape)), paint.light)
+    fills = Fills(color, paint.rim_color, paint.mark_color, paint.shade, paint.texture, light, paint.surface)
     return jax.tree.map(lambda a: a[slots], fills)
 
 
@@ -37,15 +42,18 @@ class EdgeTerms(NamedTuple):
     inner: Any
     mark: Any
     pose: ImagePose | None  # relative to the window, if the colour varies within it
+    relief: Relief | None  # of lit surfaces
 
 
-def edge_terms(parts: ObjectParts, window: PixelWindow, disc: bool, varied: bool) -> EdgeTerms:
-    """Edge terms of parts in a window; `disc` for discs, `varied` if shade or texture varies the colour."""
+def edge_terms(
+    parts: ObjectParts, window: PixelWindow, disc: bool, varied: bool, relief: Relief | None = None
+) -> EdgeTerms:
+    """Edge terms of parts in a window; `disc` for discs, `varied` if shade, texture or light varies the colour."""
     pose = parts.pose
     pose = pose._replace(column=pose.column - window.left, row=pose.row - window.top) if varied else None
     inner = None if parts.inner is None else _primitive_terms(parts.inner, window, disc)
     mark = None if parts.mark is None else _primitive_terms(parts.mark, window, disc=False)
-    return EdgeTerms(_primitive_terms(parts.whole, window, disc), inner, mark, pose)
+    return EdgeTerms(_primitive_terms(parts.whole, window, disc), inner, mark, pose, relief)
 
 
 def _primitive_terms(primitive: Primitive, window: PixelWindow, disc: bool) -> Any:
@@ -65,17 +73,20 @@ def _coverage(terms: Any, largest: float) -> Array:
     return jnp.clip(polygon.polygon_coverage(terms), 0.0, 1.0)
 
 
-def covered_color(edges: EdgeTerms, fills: Fills, window: PixelWindow, largest: float) -> tuple[Array, Array]:
+def covered_color(
+    edges: EdgeTerms, fills: Fills, window: PixelWindow, largest: float
+) -> tuple[Array, Array | ShadedColor]:
     """Coverage [..., rows, columns] and mean colour [..., rows, columns, 3] of the covered area.
 
     The colour is [..., 1, 1, 3] if it does not vary. `largest` (px) bounds the radius of discs.
     """
     whole = _coverage(edges.whole, largest)
-    color = fills.color[..., None, None, :]
+    color: Array | ShadedColor = fills.color[..., None, None, :]
     if edges.pose is not None:
-        color = _varied_color(color, fills, edges.pose, window)
+        color = _varied_color(color, fills, edges.pose, edges.relief, window, whole)
     if edges.mark is None and edges.inner is None:
         return whole, color
+    color = as_color(color)
     inner = whole if edges.inner is None else jnp.minimum(_coverage(edges.inner, largest), whole)
     mark = jnp.zeros_like(whole) if edges.mark is None else jnp.minimum(_coverage(edges.mark, largest), inner)
     total = (inner - mark)[..., None] * color
@@ -86,8 +97,10 @@ def covered_color(edges: EdgeTerms, fills: Fills, window: PixelWindow, largest: 
     return whole, total / jnp.maximum(whole, 1e-6)[..., None]
 
 
-def _varied_color(color: Array, fills: Fills, pose: ImagePose, window: PixelWindow) -> Array:
-    """Colours of textured or shaded slots at pixel centres."""
+def _varied_color(
+    color: Array, fills: Fills, pose: ImagePose, relief: Relief | None, window: PixelWindow, cover: Array
+) -> Array | ShadedColor:
+    """Colours of textured, shaded or lit slots at pixel centres."""
     x = jnp.arange(window.columns) + 0.5 - pose.column[..., None]
     y = (jnp.arange(window.rows) + 0.5 - pose.row[..., None])[..., :, None]
     x = x[..., None, :]
@@ -98,10 +111,12 @@ def _varied_color(color: Array, fills: Fills, pose: ImagePose, window: PixelWind
             cell=fills.texture.cell[..., None, None],
             color=fills.texture.color[..., None, None, :],
         )
-        color = textured(color, texture, (x * cos + y * sin) / scale, (y * cos - x * sin) / scale)
+        color = textured(color, texture, (x * cos + y * sin) / scale, (y * cos - x * sin) / scale, scale)
     if fills.shade is not None:
         reach = jnp.maximum(pose.reach, 1e-3)[..., None, None]
         # Lit from the upper left: darkest at the opposite rim.
         far = ((x / reach + 0.35) ** 2 + (y / reach + 0.35) ** 2) / 2.24
         color = color * (1 - fills.shade[..., None, None] * jnp.minimum(far, 1.0))[..., None]
+    if fills.surface is not None and fills.light is not None and relief is not None:
+        return lit_color(color, fills.light, fills.surface, relief, pose, x, y, cover)
     return color

@@ -5,7 +5,7 @@ Each step of the loops over videos, frames and objects touches little memory; `v
 
 import functools
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -14,6 +14,7 @@ from gen2d.records.axes import Array
 from gen2d.renderers.compositing import (
     OCCLUDER,
     LayerCanvas,
+    PackedColor,
     background_layer,
     occluder_layer,
     over,
@@ -27,6 +28,7 @@ from gen2d.renderers.plan import FramePlan, RenderScene, TileGroup, tile_windows
 from gen2d.renderers.postprocessing import add_noise, expose, exposure_average, exposure_start
 from gen2d.renderers.primitives import Instants, PixelWindow
 from gen2d.renderers.shading import EdgeTerms, covered_color, fills_of
+from gen2d.renderers.shadows import ShadowTerms, shadow_cover, shadow_terms
 
 
 def draw_tiles(scenes: RenderScene, plan: FramePlan) -> tuple[Array | None, Array | None]:
@@ -60,11 +62,19 @@ class TileEdges(NamedTuple):
     of_runs: list[EdgeTerms]
 
 
+class ShadowTiles(NamedTuple):
+    """Shadows of a group's slots in their tiles at all instants; arrays [k, I, ...]."""
+
+    group: TileGroup
+    window: PixelWindow
+    of_runs: list[ShadowTerms]
+
+
 class TileCoverage(NamedTuple):
     """Quantised tiles of a group's k slots at one instant."""
 
     cover: Array  # [k, rows, columns] int16
-    color: Array  # [k, rows or 1, columns or 1, 3] int16
+    color: Any  # [k, rows or 1, columns or 1, 3] int16, or a PackedColor
     object_id: Array  # [k] slot + 1
     top: Array  # [k] first row
     left: Array  # [k] first column
@@ -80,9 +90,11 @@ class _VideoRenderer:
     def paint_in_place(self, canvas: LayerCanvas) -> LayerCanvas:
         """Frames, and owners if wanted, painted in place: the canvas already holds the static layer of its frames."""
         edges = self._tile_edges(self.scene.instants)
+        shadows = self._shadow_tiles(self.scene.instants)
 
         def frame(t: Array, canvas: LayerCanvas) -> LayerCanvas:
-            image, owner = self._paint_instant(LayerCanvas(canvas.image, self.back.owner), self.first + t, edges, t)
+            image = self._paint_shadows(canvas.image, self.first + t, shadows, t)
+            image, owner = self._paint_instant(LayerCanvas(image, self.back.owner), self.first + t, edges, t)
             return LayerCanvas(image, self._store_owner(canvas.owner, owner, t))
 
         return jax.lax.fori_loop(0, self.frames, frame, canvas)
@@ -110,10 +122,11 @@ class _VideoRenderer:
         if scene.exposed is not None:
             instants = jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:]), scene.exposed)
         samples, edges = max(plan.exposed, 1), self._tile_edges(instants)
+        shadows = self._shadow_tiles(instants)
 
         def render_instant(i: Array) -> Array:
-            start = self._background(instants, i)._replace(owner=None)
-            image = self._paint_instant(start, jnp.int32(0), edges, i).image
+            start = self._paint_shadows(self._background(instants, i).image, jnp.int32(0), shadows, i)
+            image = self._paint_instant(LayerCanvas(start, None), jnp.int32(0), edges, i).image
             assert image is not None
             return image
 
@@ -154,6 +167,42 @@ class _VideoRenderer:
             edges.append(TileEdges(group, PixelWindow(top, left, windows[0].rows, windows[0].columns), samples))
         return edges
 
+    def _shadow_tiles(self, at: Instants) -> list[ShadowTiles]:
+        """Shadows of each group at all instants."""
+        tiles, shadow = [], self.scene.paint.shadow
+        for group in self.plan.groups if shadow is not None else []:
+            assert shadow is not None
+            wider = group._replace(reach=group.reach + self.plan.blur)
+            windows = [tile_windows(self.plan, wider, at, run, first, shadow.offset) for run, first in group.runs]
+            pairs = zip(group.runs, windows, strict=True)
+            terms = [shadow_terms(self.scene, self.plan, at, run, first, window) for (run, first), window in pairs]
+            top, left = (_concatenate([getattr(w, edge) for w in windows]) for edge in ("top", "left"))
+            tiles.append(ShadowTiles(wider, PixelWindow(top, left, windows[0].rows, windows[0].columns), terms))
+        return tiles
+
+    def _paint_shadows(self, image: Array | None, frame: Array, tiles: list[ShadowTiles], i: Array) -> Array | None:
+        """Image with all shadows of moving slots at instant i painted into image `frame`."""
+        shadow = self.scene.paint.shadow
+        if shadow is None or image is None:
+            return image
+        color = quantize_color(shadow.color)
+
+        def pick(a: Array) -> Array:
+            return jax.lax.dynamic_index_in_dim(a, i, 1, keepdims=False)
+
+        for group, window, of_runs in tiles:
+            covers = [quantize_cover(shadow_cover(jax.tree.map(pick, terms), window)) for terms in of_runs]
+            cover, top, left = _concatenate(covers), pick(window.top), pick(window.left)
+
+            def paint(
+                k: Array, canvas: LayerCanvas, cover: Array = cover, top: Array = top, left: Array = left
+            ) -> LayerCanvas:
+                corner = (frame, top[k], left[k])
+                return self._paint_layer(canvas, jax.lax.dynamic_index_in_dim(cover, k), color, 0, corner)
+
+            image = jax.lax.fori_loop(0, len(group.slots), paint, LayerCanvas(image, None)).image
+        return image
+
     def _paint_instant(self, canvas: LayerCanvas, frame: Array, edges: list[TileEdges], i: Array) -> LayerCanvas:
         """Canvas with all moving slots at instant i painted into image `frame`; owners hold a single frame."""
         rank = 0
@@ -174,19 +223,19 @@ class _VideoRenderer:
             cover, color = covered_color(jax.tree.map(pick, samples), fills, edges.window, self.plan.largest(run))
             covers.append(quantize_cover(cover))
             colors.append(quantize_color(color))
-        shape = jnp.broadcast_shapes(*(color.shape[1:] for color in colors))
-        colors = [jnp.broadcast_to(color, (color.shape[0], *shape)) for color in colors]
+        if not isinstance(colors[0], PackedColor):
+            shape = jnp.broadcast_shapes(*(color.shape[1:] for color in colors))
+            colors = [jnp.broadcast_to(color, (color.shape[0], *shape)) for color in colors]
+        color = jax.tree.map(lambda *parts: _concatenate(list(parts)), *colors)
         ids = jnp.asarray(edges.group.slots, jnp.int32) + 1
-        return TileCoverage(
-            _concatenate(covers), _concatenate(colors), ids, pick(edges.window.top), pick(edges.window.left)
-        )
+        return TileCoverage(_concatenate(covers), color, ids, pick(edges.window.top), pick(edges.window.left))
 
     def _paint_slot(self, k: Array, canvas: LayerCanvas, tiles: TileCoverage, frame: Array) -> LayerCanvas:
-        cover, color = (jax.lax.dynamic_index_in_dim(a, k) for a in (tiles.cover, tiles.color))
+        cover, color = jax.tree.map(lambda a: jax.lax.dynamic_index_in_dim(a, k), (tiles.cover, tiles.color))
         return self._paint_layer(canvas, cover, color, tiles.object_id[k], (frame, tiles.top[k], tiles.left[k]))
 
     def _paint_layer(
-        self, canvas: LayerCanvas, cover: Array, color: Array, object_id: Array | int, corner: tuple[Array, ...]
+        self, canvas: LayerCanvas, cover: Array, color: Any, object_id: Array | int, corner: tuple[Array, ...]
     ) -> LayerCanvas:
         """Canvas with a quantised layer [1, rows, columns] painted at a corner (frame, top, left)."""
         image, owner = canvas

@@ -182,6 +182,7 @@ def from_mapping(values: Any, source: str, name: str = "dataset", copies: Copies
     if values.get("splits"):
         config = _with_splits(config, values["splits"], source, copies)
     _check_matched(config, source)
+    _check_palettes(config, source)
     return config
 
 
@@ -227,11 +228,32 @@ def _mapping(value: Any) -> Mapping[Any, Any]:
     return value if isinstance(value, Mapping) else {}
 
 
+def _check_palettes(config: Config, source: str) -> None:
+    """Raise ConfigError if a split has other colours, but a palette replaces those of the scene."""
+    for split in config.splits:
+        look = config.of_split(split.name).look
+        hidden = [name for name in _keys(split.plain().get("factors")) if name.partition("[")[0].endswith("color")]
+        if hidden and getattr(look.options, "named_palette", None) is not None:
+            raise ConfigError(
+                f"{source}: splits.{split.name}.factors has {hidden[0]}, which look.palette={look.options.palette} "
+                "replaces: look.palette must be scene"
+            )
+
+
+def _keys(values: Any) -> list[str]:
+    """All keys of nested mappings and lists."""
+    if isinstance(values, Mapping):
+        return [name for key, value in values.items() for name in (key, *_keys(value))]
+    return [name for value in values for name in _keys(value)] if isinstance(values, list | tuple) else []
+
+
 def _check_matched(config: Config, source: str) -> None:
     """Raise ConfigError if the matched sets are impossible for this scene."""
     sections = config.scene, config.video, config.annotations.simulated, config.camera
     try:
         matched_module.check(config.matched, MatchedOptions(), *sections)
+        for look in (config.look, *(config.of_split(split.name).look for split in config.splits)):
+            matched_module.check_look(config.matched, config.scene, look)
         if config.matched.change and quality_module.ranges(config.quality):
             raise ValueError("change is given, but a set has one scene: quality must ask for nothing")
         if config.matched.change and any(joint.gridded for joint in config.joint_distributions):

@@ -37,6 +37,11 @@ def _nothing(options: Any) -> None:
     """Accept all options."""
 
 
+def _no_blur(*_: Any) -> float:
+    """No shadows."""
+    return 0.0
+
+
 def _no_sizes(*_: Any) -> dict[str, int]:
     """No further axes."""
     return {}
@@ -80,12 +85,14 @@ class Look(_Contract):
     paint(scene, layout, options, key): the `Paint` of one video, with one entry per slot (K), traced by jax.
     margin(options): largest distance, in px, to which an object is rendered beyond its outline; `line_margin` for
         `LineOptions`.
+    blur(options, layout): largest half width of the soft edges of shadows, in m; 0 for looks without shadows.
     check(options): raises ValueError if the options are invalid; the message begins with an option's name.
     """
 
     options: type
     paint: Callable[[Any, Any, Any, Any], Any]
     margin: Callable[[Any], float]
+    blur: Callable[[Any, Any], float] = _no_blur
     check: Callable[[Any], None] = _nothing
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from gen2d.config import plugins
 from gen2d.config.distributions import Distribution
 from gen2d.config.options import factor_options
-from gen2d.core.enums import DYNAMIC
+from gen2d.core.enums import DYNAMIC, STATIC
 from gen2d.records.layout import Layout
 
 INTERVENTIONS = ("remove", "teleport", "identity_swap", "gravity_flip", "ghost_contact", "energy_gain")
@@ -43,6 +43,24 @@ def check(options: Any, default: Any, scene: Any, video: Any, annotations: Any, 
         raise ValueError(
             f"change is {violations[0]}, which breaks the laws of motion: annotations.{annotated[0]} must be off"
         )
+
+
+def check_look(options: Any, scene: Any, look: Any) -> None:
+    """Raise ValueError, beginning with the option's name, if a palette's colours hide a change, or change with it."""
+    named = getattr(look.options, "named_palette", None)
+    if not options.change or named is None:
+        return
+    palette, specs, layout = look.options.palette, factor_options(scene.contract), scene.contract.layout(scene.options)
+    moving = sum(run.count for run in layout.groups if run.kind != STATIC)
+    for name in options.change:
+        if name.endswith("color"):
+            raise ValueError(f"change is {name}, which look.palette={palette} hides: look.palette must be scene")
+        counts = name == "remove" or (name in specs and specs[name].kind is int)
+        if counts and moving > len(named.objects):
+            raise ValueError(
+                f"change is {name}, but look.palette={palette} has {len(named.objects)} colors for up to {moving} "
+                "objects, whose colors would change too: look.palette must be scene or random"
+            )
 
 
 def _check_intervention(name: str, scene: Any, layout: Layout, video: Any, camera: Any) -> None:

@@ -27,12 +27,14 @@ def plan_of(config: Config, layout: Layout) -> FramePlan:
     """Frame plan of a config: everything static that rendering needs."""
     video, image, look = config.video, config.image, config.look
     seconds = video.frames / video.fps
+    scale = camera.largest_scale(config.camera, layout, video.height, video.width, seconds)
     return FramePlan(
         layout=layout,
         height=video.height,
         width=video.width,
-        scale=camera.largest_scale(config.camera, layout, video.height, video.width, seconds),
+        scale=scale,
         grow=look.contract.margin(look.options),
+        blur=look.contract.blur(look.options, layout) * scale,
         still=not camera.may_move(config.camera),
         linear=image.blending == "linear",
         frames=config.storage.frames != "none",

@@ -12,6 +12,7 @@ from gen2d.captions import caption
 from gen2d.config import quality
 from gen2d.config.config import Config
 from gen2d.core.enums import JOINT_KINDS
+from gen2d.core.palettes import NAME_BYTES, Palette
 from gen2d.core.schema import Field
 from gen2d.physics import lyapunov
 from gen2d.physics.simulate import SaveAt
@@ -104,11 +105,19 @@ class VideoSchema:
 
     @functools.cached_property
     def host_fields(self) -> dict[str, Field]:
-        """Fields that the host computes from the others: split and captions."""
+        """Fields that the host computes from the others: split, names of colours, and captions."""
         longest = max((len(split.name) for split in self.config.splits), default=0)
         fields = {"split": Field(f"S{longest}", "n", "", "split of the video")} if longest else {}
+        if any(_named_palette(config) for config in self._split_configs):
+            meaning = "name of the color in the look's palette; empty: none"
+            fields["objects/color_name"] = Field(f"S{NAME_BYTES}", "n K", "", meaning)
         captioned = self.config.annotations.simulated.captions
         return fields | (caption.fields(self.layout.slots, self.config.video.frames) if captioned else {})
+
+    @property
+    def _split_configs(self) -> list[Config]:
+        """The configs of all splits; the config itself if there are no splits."""
+        return [self.config.of_split(split.name) for split in self.config.splits] or [self.config]
 
     def host_columns(self, columns: dict[str, np.ndarray], split: str) -> dict[str, np.ndarray]:
         """Values of the host's fields for videos of one split, from their other fields [n, ...]."""
@@ -116,8 +125,26 @@ class VideoSchema:
         host_columns = {}
         if config.splits:
             host_columns["split"] = np.full(count, split.encode(), self.host_fields["split"].dtype)
+        if "objects/color_name" in self.host_fields:
+            palette = _named_palette(config.of_split(split))
+            host_columns["objects/color_name"] = _color_names(columns, palette)
         return host_columns | (
-            caption.caption_fields(columns, config.video, self.constants)
+            caption.caption_fields(columns | host_columns, config.video, self.constants)
             if config.annotations.simulated.captions
             else {}
         )
+
+
+def _named_palette(config: Config) -> Palette | None:
+    """The palette that a look's options name, if any."""
+    return getattr(config.look.options, "named_palette", None)
+
+
+def _color_names(columns: dict[str, np.ndarray], palette: Palette | None) -> np.ndarray:
+    """Names [n, K] of the objects' colours in a palette; empty for other colours, and where there is no object."""
+    colors, present = columns["objects/color"], columns["objects/present"]
+    names = np.zeros(present.shape, f"S{NAME_BYTES}")
+    if palette is not None:
+        for name, color in (palette.wall, *palette.objects.items()):
+            names[present & (colors == color).all(-1)] = name.encode()
+    return names

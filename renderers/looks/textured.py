@@ -1,6 +1,7 @@
 """Shapes with spots of random noise that turn with them, by default on a noise background."""
 
 import dataclasses
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -26,9 +27,9 @@ class Options(PlainOptions):
     """Options of the spots, in addition to those of plain shapes."""
 
     background_kind: str = option("noise", str, "", "kind of the background", choices=("plain", "gradient", "noise"))
-    background_to: tuple = option([64, 64, 84], int, "sRGB", "second color of the background", parts=3, low=0, high=255)
     texture_contrast: float = option(0.8, float, "1", "contrast of the spots; 1: black or white", low=0, high=1)
     cell_size: float = option(0.6, float, "1", "size of the spots, over the reach of the largest object", above=0)
+    dark: ClassVar[tuple[tuple[int, ...], tuple[int, ...]]] = (20, 20, 20), (64, 64, 84)
 
 
 def paint(scene: Scene, layout: Layout, options: Options, key: Array) -> Paint:

@@ -255,6 +255,13 @@ def render(folder: Path, case: str, turns: int) -> Turns:
     return in_turns(bench_render.works(bench_case, source_of(bench_case.overrides).rollout), turns)
 
 
+def looks(folder: Path, case: str, turns: int) -> Turns:
+    """CPU seconds per frame in each look, of discs between walls."""
+    overrides = bench_render.CASES[case].overrides
+    rollouts = {name: source_of((*overrides, option)).rollout for name, option in bench_render.LOOKS.items()}
+    return in_turns(bench_render.look_works(rollouts), turns)
+
+
 def annotated(folder: Path, turns: int) -> Turns:
     """CPU seconds per frame of rendering with each annotation, and the bytes per frame of the annotation."""
     options = {name: [f"annotations.{part}" for part in parts] for name, parts in bench_render.ANNOTATIONS.items()}
@@ -541,6 +548,9 @@ def render_section(folder: Path, quick: bool) -> Results:
         yield Promise(f"{name} OpenCV", _ratio(turns["opencv"], turns["gen2d"]), target=target)
         if case.name == bench_render.COPIED:
             yield Promise(f"{name} a copy", _ratio(turns["gen2d"], turns["copy"]), target=4, most=True)
+    for name, limit in zip(bench_render.LIT, (3, 4), strict=True):
+        turns = measure(looks, folder, CORES[:1], case=name, turns=repeats)
+        yield Promise(f"studio against flat, {name}", _ratio(turns["studio"], turns["flat"]), target=limit, most=True)
     yield from annotation_results(measure(annotated, folder, CORES[:1], turns=repeats))
 
 

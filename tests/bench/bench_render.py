@@ -54,6 +54,8 @@ class Case(NamedTuple):
 
 CASES = {case.name: case for case in (Case(px, n, videos) for px, videos in SIZES.items() for n in (2, 8, 32))}
 COPIED = "256 px, 8 discs"  # case that is compared with a copy
+LIT = [f"{pixels} px, 8 discs" for pixels in (64, 256)]  # cases in which looks are compared, and the looks
+LOOKS = {name: f"look={{name: {name}, wall_width: 3}}" for name in ("flat", "studio")}
 ANNOTATED = Case(64, 8, 64)  # case in which annotations are measured
 ANNOTATIONS = {
     "frames": (),
@@ -97,6 +99,12 @@ def annotation_works(rollouts: Mapping[str, Any]) -> tuple[dict[str, Callable[[]
         for name, arrays in rendered.items()
     }
     return works_by_name, sizes
+
+
+def look_works(rollouts: Mapping[str, Any]) -> dict[str, Callable[[], float]]:
+    """Functions by look that render all frames of a batch and return the CPU seconds per frame."""
+    each = {name: (rollout, rollout.batch_size * rollout.config.video.frames) for name, rollout in rollouts.items()}
+    return {name: timed(_render_all(rollout, first_batch(rollout)), frames) for name, (rollout, frames) in each.items()}
 
 
 def _render_all(rollout: Any, batch: Any) -> Callable[[], None]:

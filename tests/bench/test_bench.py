@@ -174,6 +174,14 @@ def test_every_way_of_drawing_is_timed(monkeypatch: pytest.MonkeyPatch, tmp_path
 
 
 @pytest.mark.full
+def test_every_look_is_timed(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setitem(bench_render.CASES, SMALL.name, SMALL)
+    turns = bench.looks(tmp_path, SMALL.name, turns=1)
+    assert turns.keys() == bench_render.LOOKS.keys()
+    assert all(seconds > 0 for (seconds,) in turns.values())
+
+
+@pytest.mark.full
 def test_what_annotations_add_is_timed_and_weighed(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(bench_render, "ANNOTATED", SMALL)
     monkeypatch.setattr(bench_render, "ANNOTATIONS", {"frames": (), "flow": ("flow=true",)})

@@ -102,6 +102,12 @@ def test_a_tower_does_what_statics_says():
 
 
 @pytest.mark.full
+def test_about_half_of_the_towers_stand():
+    sampler = Sampler(load_config("tower.yaml"))
+    factors, _ = jax.vmap(sampler.sample)(jax.random.split(jax.random.key(0), 1000))
+    assert 0.42 < factors["stable"].mean() < 0.58
+
+
 def test_dominoes_fall_in_order_in_a_steady_wave_unless_their_gap_is_too_wide():
     made = film("dominoes", 8, 3.0, 40, "scene.dominoes=10", "scene.height=1.5", "scene.gap={choice: [0.6, 1.7]}")
     fallen = made.states.angle[:, :, slots(made, 2)] < -0.3

@@ -1,0 +1,103 @@
+"""Named palettes: colours of objects, walls and background that go together, with an English name for each.
+
+The colours of a palette's objects and its ground are at least 20 apart in CIELAB (CIE 1976, D65).
+"""
+
+from typing import NamedTuple
+
+Color = tuple[int, int, int]  # sRGB
+
+
+class Palette(NamedTuple):
+    """Colours of a palette; names are unique within it."""
+
+    ground: tuple[Color, Color, Color]  # of the background: top, bottom, and corners
+    wall: tuple[str, Color]  # of static objects
+    objects: dict[str, Color]  # of all other objects, by name
+    light: Color = (255, 255, 255)
+
+
+def _color(digits: str) -> Color:
+    red, green, blue = bytes.fromhex(digits)
+    return red, green, blue
+
+
+def _palette(ground: str, wall: str, wall_color: str, objects: dict[str, str], light: str = "ffffff") -> Palette:
+    top, bottom, corners = map(_color, ground.split())
+    colors = {name: _color(digits) for name, digits in objects.items()}
+    return Palette((top, bottom, corners), (wall, _color(wall_color)), colors, _color(light))
+
+
+PALETTES = {
+    "paper": _palette(
+        "f7f1e3 efe4cf d8c7a5",
+        "brown",
+        "7a5c3e",
+        {
+            "red": "d1495b",
+            "yellow": "edae49",
+            "teal": "007f95",
+            "blue": "2f68ad",
+            "green": "6aa67e",
+            "purple": "9467a8",
+            "orange": "e8835a",
+            "navy": "33354f",
+        },
+        light="fffaf0",
+    ),
+    "dusk": _palette(
+        "80635c 4a3f63 2b2d42",
+        "lilac",
+        "9a87b8",
+        {
+            "red": "ff5d6c",
+            "yellow": "ffd166",
+            "emerald": "06d6a0",
+            "sky blue": "4cc9f0",
+            "orange": "f4923e",
+            "violet": "c77dff",
+            "olive": "8fb35a",
+            "cream": "f4f1de",
+        },
+        light="ffe8d0",
+    ),
+    "lab": _palette(
+        "dfe7ee c3d0db 9fb2c1",
+        "slate",
+        "66798a",
+        {
+            "red": "e63946",
+            "orange": "f2994a",
+            "teal": "2a9d8f",
+            "navy": "23404d",
+            "yellow": "efd35a",
+            "green": "8ab17d",
+            "blue": "3f78a8",
+            "pink": "b5838d",
+        },
+    ),
+    # Distinguishable with any colour vision (M. Okabe, K. Ito, 'Color Universal Design', 2008).
+    "okabe_ito": _palette(
+        "f6f6f6 ececec d4d4d4",
+        "grey",
+        "6a6a6a",
+        {
+            "black": "000000",
+            "orange": "e69f00",
+            "sky blue": "56b4e9",
+            "green": "009e73",
+            "yellow": "f0e442",
+            "blue": "0072b2",
+            "vermilion": "d55e00",
+            "pink": "cc79a7",
+        },
+    ),
+    "grey": _palette(
+        "fcfcfc f7f7f7 efefef",
+        "mid-grey",
+        "929292",
+        {"black": "101010", "dark grey": "424242", "grey": "787878", "light grey": "b2b2b2"},
+    ),
+}
+
+NAME_BYTES = max(len(name) for palette in PALETTES.values() for name in (*palette.objects, palette.wall[0]))

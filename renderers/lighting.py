@@ -1,0 +1,119 @@
+"""Light on surfaces, computed in linear light, and the display values of lit bodies.
+
+A surface with the normal n gets the light
+
+    E(n) = (1 - a) D(n) / D(z) + a (1 + 0.25 u),    D(n) = (c + sqrt(c^2 + s^2)) / 2,    c = n l
+
+from a source in the direction l of softness s, by Lambert's law without a kink at its end, and of ambient light a, a
+part of which comes from above, where u is the upward part of n. A surface that faces the viewer gets 1, and has its own
+colour. Display values are proportional to F = E^(1/2.2), so one factor serves all channels; where it exceeds 1, it is
+1 + (F - 1) / (1 + 12 (F - 1)), so that few colours reach 255. Highlights mix in their own colour: that of J. Blinn,
+'Models of light reflection' (1977), as the fourth power of a parabola instead of a power of the cosine, and a faint one
+at the rim.
+"""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+
+from gen2d.records.axes import Array
+from gen2d.renderers.noise import noise
+from gen2d.renderers.paint import Light, Pattern, Surface
+from gen2d.renderers.primitives import ImagePose
+from gen2d.renderers.relief import Relief, tilt
+
+FROM_ABOVE = 0.25  # part of the ambient light that comes from above
+SHOULDER = 12.0  # of display values above 1
+RIM = 0.25  # part of the light of the rim, seen at a grazing angle
+STEEPEST = 0.98  # largest square of the tilt; beyond the rim, surfaces are as at the rim
+
+
+class ShadedColor(NamedTuple):
+    """Colours color * share + accent * accent_share, at most 255, with shares of all channels of a pixel."""
+
+    color: Array  # [..., 1, 1, 3] sRGB
+    accent: Array  # [..., 1, 1, 3] sRGB
+    share: Array  # [..., rows, columns]
+    accent_share: Array
+
+
+def as_color(shaded: Array | ShadedColor) -> Array:
+    """Colours [..., rows, columns, 3] in floats."""
+    if not isinstance(shaded, ShadedColor):
+        return shaded
+    color = shaded.share[..., None] * shaded.color + shaded.accent_share[..., None] * shaded.accent
+    return jnp.minimum(color, 255.0)
+
+
+def lit_color(
+    color: Array, light: Light, surface: Surface, relief: Relief, pose: ImagePose, x: Array, y: Array, cover: Array
+) -> ShadedColor:
+    """Colours of lit bodies of `color` [..., 1, 1, 3], means of the covered part of each pixel.
+
+    `x` [..., 1, columns] and `y` [..., rows, 1] are pixel centres relative to the body's centre, in px; `cover`
+    [..., rows, columns] is the coverage.
+    """
+    slope, gloss, sharpness, soft, ambient = (
+        a[..., None, None] for a in (surface.slope, surface.gloss, surface.sharpness, light.softness, light.ambient)
+    )
+    tilt_x, tilt_y, shown = tilt(relief, pose, x, y, surface.bevel, cover)
+    nx, ny = slope * tilt_x, slope * tilt_y
+    nz = jnp.sqrt(1 - jnp.minimum(nx * nx + ny * ny, STEEPEST))
+    lx, ly, lz = (a[..., None, None] for a in (relief.light[..., 0], relief.light[..., 1], light.direction[..., 2]))
+    along, square = nx * lx + ny * ly, soft * soft
+    cosine = along + nz * lz
+    strength = (1 - ambient) / (lz + jnp.sqrt(lz * lz + square))
+    irradiance = strength * (cosine + jnp.sqrt(cosine * cosine + square)) + ambient * (1 - FROM_ABOVE * ny)
+    if surface.pattern is not None:
+        irradiance = irradiance * (1 + _pattern(surface.pattern, pose, x, y))
+    irradiance = jnp.clip(irradiance, 0.01, 2.0)  # beyond the rim, where the tilt is larger than any
+    # The half vector of the light and the viewer.
+    norm = 1 / jnp.sqrt(2 + 2 * lz)
+    half_cosine = (along + nz * (lz + 1)) * norm
+    # The average over a pixel widens the lobe, whose variance is 1 / sharpness in the plane of tilts, and lowers it: in
+    # two directions on a disc, across the core of a capsule, and across the bevel of a polygon.
+    radius = jnp.maximum(relief.radius if relief.normal is None else surface.bevel * pose.scale, 0.5)[..., None, None]
+    width = 1 / sharpness + (slope / radius) ** 2 * ((1 + 4 * norm * norm) / 24)
+    part = 1 / (sharpness * width)
+    shown = shown * (part if relief.is_disc else jnp.sqrt(part))
+    lobe = jnp.clip(1 - (1 - half_cosine) * (0.25 / width), 0.0, 1.0)
+    lobe, grazing = lobe * lobe, 1 - nz
+    shine = jnp.minimum(gloss * shown * (lobe * lobe) + RIM * (grazing * grazing * grazing), 1.0)
+    share = display(irradiance) * (1 - shine)
+    if surface.stripe is None or surface.stripe_light is None or not relief.is_disc:
+        return ShadedColor(color, light.highlight[..., None, None, :], share, shine)
+    half = surface.stripe[..., None, None] * radius
+    cos, sin = pose.cos[..., None, None], pose.sin[..., None, None]
+    band = jnp.where(half > 0, _beyond_edge(half - jnp.abs(y * cos - x * sin), cos, sin), 0.0) * share
+    # A stripe of 1 has the colour of highlights; one below 0 is a part of the object's own colour.
+    bright = surface.stripe_light[..., None, None]
+    return ShadedColor(
+        color,
+        light.highlight[..., None, None, :],
+        share - jnp.abs(bright) * band,
+        shine + jnp.maximum(bright, 0.0) * band,
+    )
+
+
+def _beyond_edge(depth: Array, cos: Array, sin: Array) -> Array:
+    """Part of a pixel within a straight edge at a distance `depth` from the pixel's centre, in this direction."""
+    a, b = (jnp.maximum(jnp.abs(part), 0.02) for part in (cos, sin))
+    reach = jnp.clip(depth + (a + b) / 2, 0.0, a + b)
+    return (reach**2 - jnp.maximum(reach - a, 0.0) ** 2 - jnp.maximum(reach - b, 0.0) ** 2) * (0.5 / (a * b))
+
+
+def display(light: Array) -> Array:
+    """Display values of light from 0.12 to 2, relative to those of 1: the power 1 / 2.2, with a shoulder above 1."""
+    root = jnp.sqrt(light)
+    value = 0.02592 + root * (1.06405 + root * (-0.11431 + root * 0.02434))  # within 4e-4 of the power
+    over = jnp.maximum(value - 1, 0.0)
+    return jnp.minimum(value, 1.0) + over / (1 + SHOULDER * over)
+
+
+def _pattern(pattern: Pattern, pose: ImagePose, x: Array, y: Array) -> Array:
+    """Relative change of the light [..., rows, columns] by a pattern."""
+    seed, cell, stretch, contrast = (a[..., None, None] for a in pattern)
+    cos, sin, scale = (a[..., None, None] for a in (pose.cos, pose.sin, pose.scale))
+    along, across = (x * cos + y * sin) / scale, (y * cos - x * sin) / scale
+    pixel = 1 / (cell * scale)
+    return contrast * (2 * noise(along / (cell * stretch), across / cell, seed, pixel) - 1)

@@ -1,0 +1,94 @@
+"""Relief of bodies in pixels: the tilt of their surfaces at each pixel.
+
+Discs, capsules and segments are domes: the surface tilts outwards in proportion to the distance from the core. Polygons
+are flat with a bevel, which tilts towards the nearest side.
+"""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+
+from gen2d.records.axes import Array
+from gen2d.records.layout import SlotGroup
+from gen2d.renderers.paint import Paint
+from gen2d.renderers.primitives import BodyGeometry, ImagePose, Instants, side_normals
+
+MITRE = 0.7  # of a pixel's width, over the difference of the distances of two perpendicular sides
+
+
+class Relief(NamedTuple):
+    """Shape of some slots, relative to their centres; px, y down."""
+
+    radius: Array  # [...] of a dome, or of a polygon's corners
+    half: Array | None  # [...] half the length of the core of a capsule or segment
+    normal: Array | None  # [..., V, 2] outward normals of a polygon's sides
+    distance: Array | None  # [..., V] of the sides of its core from the centre
+    light: Array  # [..., 2] direction towards the light
+
+    @property
+    def is_disc(self) -> bool:
+        """Whether the slots hold discs."""
+        return self.half is None and self.normal is None
+
+
+def relief_of(run: SlotGroup, first: int, bodies: BodyGeometry, at: Instants, paint: Paint) -> Relief:
+    """Relief of a run's slots at I instants; arrays [k, I, ...]."""
+    assert paint.light is not None, "surfaces need a light"
+    outline = outline_of(run, first, bodies, at, paint)
+    cos, sin = jnp.cos(at.view.angle), jnp.sin(at.view.angle)
+    right, up = paint.light.direction[0], paint.light.direction[1]
+    toward = jnp.stack([right * cos + up * sin, right * sin - up * cos], -1)  # as the camera sees it, y down
+    return Relief(*outline, jnp.broadcast_to(toward, (*outline[0].shape, 2)))
+
+
+def outline_of(
+    run: SlotGroup, first: int, bodies: BodyGeometry, at: Instants, paint: Paint
+) -> tuple[Array, Array | None, Array | None, Array | None]:
+    """Radius [k, I], half length [k, I], normals [k, I, V, 2] and distances [k, I, V] of the sides of a run's slots, as
+    in `Relief`."""
+    slots, scale = slice(first, first + run.count), at.view.scale
+    radius = bodies.radius[slots, None] * scale + (0.0 if paint.grow is None else paint.grow[slots, None])
+    if run.shape == "circle":
+        return radius, None, None, None
+    if run.shape != "polygon":
+        return radius, bodies.half_length[slots, None] * scale, None, None
+    assert bodies.vertices is not None, "a layout with polygons needs objects.vertices"
+    corners = bodies.vertices[slots, None, ::-1] * jnp.asarray([1.0, -1.0]) * scale[:, None, None]
+    normal, distance = side_normals(corners)
+    angle = at.view.angle - at.angle[:, slots].T
+    cos, sin = jnp.cos(angle)[..., None], jnp.sin(angle)[..., None]
+    turned = jnp.stack([normal[..., 0] * cos - normal[..., 1] * sin, normal[..., 0] * sin + normal[..., 1] * cos], -1)
+    return radius, None, turned, distance
+
+
+def tilt(
+    relief: Relief, pose: ImagePose, x: Array, y: Array, bevel: Array, cover: Array
+) -> tuple[Array, Array, Array | float]:
+    """Tilt towards x and towards y [..., rows, columns], from 0 to 1 at the rim, and the part [..., rows, columns] of a
+    highlight that shows: half of it where a pixel averages two sides of a polygon.
+
+    `x` [..., 1, columns] and `y` [..., rows, 1] are relative to the centre, in px; `bevel` [...] is in m. Where the
+    coverage is c, the tilt is that at the centroid of the covered part, (1 - c) / 2 from the pixel's centre.
+    """
+    inwards = (1 - cover) / 2
+    if relief.normal is not None and relief.distance is not None:
+        width = jnp.maximum(bevel * pose.scale, 1.0)[..., None, None]
+        nx, ny, even = jnp.zeros_like(cover), jnp.zeros_like(cover), jnp.ones_like(cover)
+        farthest = jnp.full_like(cover, -jnp.inf)
+        for side in range(relief.normal.shape[-2]):
+            a, b = (relief.normal[..., side, axis][..., None, None] for axis in (0, 1))
+            distance = jnp.minimum(relief.distance[..., side] + relief.radius, 1e6)  # infinite for a side of length 0
+            beyond = x * a + (y * b - distance[..., None, None])
+            nearer = jnp.clip((beyond - farthest) * MITRE + 0.5, 0.0, 1.0)  # an edge between sides, a pixel wide
+            nx, ny = nx + nearer * (a - nx), ny + nearer * (b - ny)
+            even = jnp.where(nearer < 0.5, even, 1.0) * (2 * nearer - 1) ** 2
+            farthest = jnp.maximum(farthest, beyond)
+        amount = jnp.clip(1 + (farthest - inwards) / width, 0.0, 1.0)
+        return nx * amount, ny * amount, (1 + even) / 2
+    radius = jnp.maximum(relief.radius, 0.5)[..., None, None]
+    if relief.half is not None:
+        cos, sin, half = (a[..., None, None] for a in (pose.cos, pose.sin, relief.half))
+        along = jnp.clip(x * cos + y * sin, -half, half)
+        x, y = x - along * cos, y - along * sin
+    part = (1 - inwards / radius) / radius
+    return x * part, y * part, 1.0

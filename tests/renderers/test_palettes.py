@@ -1,0 +1,110 @@
+"""Named palettes: their colours can be told apart, each object gets its own, and its name is stored."""
+
+import itertools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from tiny import CONFIG
+from worlds import world
+
+from gen2d.config.config import load_config
+from gen2d.core.errors import ConfigError
+from gen2d.core.palettes import NAME_BYTES, PALETTES
+from gen2d.programs import render
+from gen2d.programs.rollout import Rollout
+from gen2d.records.layout import Layout, SlotGroup
+from gen2d.renderers.color import to_linear
+
+# To XYZ relative to the white point D65 (IEC 61966-2-1).
+TO_XYZ = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]])
+
+
+def cielab(color):
+    """CIELAB (CIE 1976) coordinates [3] of an sRGB colour."""
+    ratio = TO_XYZ @ np.asarray(to_linear(jnp.asarray(color, float))) / TO_XYZ.sum(1)
+    x, y, z = np.where(ratio > (6 / 29) ** 3, np.cbrt(ratio), ratio / (3 * (6 / 29) ** 2) + 4 / 29)
+    return np.array([116 * y - 16, 500 * (x - y), 200 * (y - z)])
+
+
+@pytest.mark.parametrize("name", PALETTES)
+def test_colours_of_a_palette_are_far_apart(name):
+    palette = PALETTES[name]
+    objects, ground = [[cielab(c) for c in colors] for colors in (palette.objects.values(), palette.ground)]
+    apart = [np.linalg.norm(a - b) for a, b in itertools.combinations(objects, 2)]
+    behind = [np.linalg.norm(a - b) for a, b in itertools.product([*objects, cielab(palette.wall[1])], ground)]
+    print(f"{name}: objects {min(apart):.0f} apart at least, {min(behind):.0f} from the background")
+    assert min(apart) >= 20
+    assert min(behind) >= 20
+    assert palette.wall[0] not in palette.objects
+    assert all(0 < len(entry) <= NAME_BYTES for entry in palette.objects)
+
+
+def colors_of(palette, present, videos=50, look="flat"):
+    """Colours [videos, K, 3] that a look gives moving discs, some of which are present, and a static one."""
+    layout = Layout((SlotGroup("circle", len(present)), SlotGroup("circle", 1, 1)), (0.0, 0.0, 10.0, 10.0), 1.6)
+    scene = world([{"radius": 1.0 if there else 0.0} for there in (*present, True)])[0]
+    config = load_config({"look": {"name": look, "palette": palette}})
+    keys = jax.random.split(jax.random.key(0), videos)
+    return np.asarray(jax.vmap(lambda key: render.paint_of(key, config, scene, layout).color)(keys))
+
+
+@pytest.mark.parametrize("name", ["paper", "grey"])
+def test_objects_of_a_video_have_distinct_colours_of_the_palette_in_a_random_order(name):
+    entries = {tuple(map(float, color)) for color in PALETTES[name].objects.values()}
+    present = np.arange(20) % 3 == 1
+    for seen, count in ((present, len(entries)), (np.arange(20) < len(entries), len(entries))):
+        colors = colors_of(name, seen)[:, :-1][:, np.flatnonzero(seen)[:count]]
+        assert all(len({*map(tuple, video)}) == min(count, seen.sum()) for video in colors.tolist())
+        assert {tuple(c) for c in colors.reshape(-1, 3).tolist()} == entries
+    crowd = colors_of(name, np.ones(20, bool))
+    counts = [np.unique(video[:-1], axis=0, return_counts=True)[1] for video in crowd]
+    assert all(count.max() - count.min() <= 1 for count in counts)
+    assert (crowd[:, -1] == PALETTES[name].wall[1]).all()
+    assert len(np.unique(crowd[:, 0], axis=0)) == len(entries)
+
+
+def test_a_palette_colours_all_looks_alike():
+    one, other = (colors_of("lab", np.ones(5, bool), look=look) for look in ("flat", "studio"))
+    np.testing.assert_array_equal(one, other)
+
+
+def test_the_name_of_each_colour_is_stored():
+    config = load_config(CONFIG, ["look={name: flat, palette: dusk}"])
+    rollout = Rollout(config, jax.devices()[:1])
+    numbers = np.arange(rollout.batch_size)
+    columns = rollout.host_columns(rollout.start("train", numbers))[0]
+    assert rollout.schema.fields["objects/color_name"].axes == "n K"
+    names = rollout.schema.host_columns(columns, "train")["objects/color_name"]
+    colors, known = columns["objects/color"], PALETTES["dusk"].objects | dict([PALETTES["dusk"].wall])
+    present = columns["objects/present"]
+    assert not present.all()
+    assert not names[~present].any()
+    assert all(
+        known[name.decode()] == tuple(color) for name, color in zip(names[present], colors[present], strict=True)
+    )
+
+
+def test_without_a_palette_no_name_is_stored():
+    schema = Rollout(load_config(CONFIG), jax.devices()[:1]).schema
+    assert "objects/color_name" not in schema.fields
+
+
+@pytest.mark.parametrize(("change", "palette"), [("color", "paper"), ("remove", "grey"), ("balls", "grey")])
+def test_a_matched_change_that_a_palette_hides_or_spreads_is_refused(change, palette):
+    with pytest.raises(ConfigError, match=f"look.palette={palette}"):
+        load_config({"matched": {"change": change}, "look": {"name": "flat", "palette": palette}})
+    load_config({"matched": {"change": change}})
+
+
+RED = {"color": [[200, 250], [0, 20], [0, 20]]}
+
+
+@pytest.mark.parametrize("factors", [RED, {"mixture": [RED, {"radius": 0.5, **RED}]}])
+def test_a_split_by_a_colour_that_a_palette_replaces_is_refused(factors):
+    scene = {"name": "bouncing", "color": [[0, 90]] * 3, "radius": [0.6, 0.7]}
+    config = {"scene": scene, "splits": {"a": {}, "b": {"factors": factors}}}
+    load_config(config)
+    with pytest.raises(ConfigError, match="palette=lab replaces"):
+        load_config(config | {"look": {"name": "flat", "palette": "lab"}})

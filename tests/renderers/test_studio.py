@@ -1,0 +1,262 @@
+"""Studio: lit frames are those of a supersampled reference in float64, in both forms; shadows own no pixel."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+
+from gen2d.config.config import load_config
+from gen2d.core.enums import CIRCLE, POLYGON
+from gen2d.programs import render
+from gen2d.records.layout import Layout
+from gen2d.renderers import rasterizer
+from gen2d.sampling import builder
+
+TILES, DENSE = (jax.jit(form, static_argnums=1) for form in (rasterizer.draw_tiles, rasterizer.draw_dense))
+SOFT = jax.jit(rasterizer.draw_soft, static_argnums=1)
+SAMPLES = 10  # per side of a pixel
+
+
+def groups():
+    """Discs, capsules and boxes apart from each other, between two walls."""
+    discs = builder.discs(jnp.asarray([[2.2, 2.3], [7.6, 7.5], [5.3, 3.2]]), jnp.asarray([1.5, 1.1, 0.6]), angle=0.4)
+    capsules = builder.capsules(jnp.asarray([[2.5, 7.3]]), 0.7, 1.0, 0.5)
+    boxes = builder.boxes(jnp.asarray([[8.0, 2.6]]), 0.3, 1.6, 2.0)
+    walls = builder.segments([(1.1, 0.25), (0.25, 0.7)], [(9.7, 0.25), (0.25, 9.6)])
+    return discs, capsules, boxes, walls
+
+
+@functools.cache
+def staged(look, size, turn=0.0, masks=False):
+    """Scene, plan and render scene of one frame."""
+    video = {"frames": 1, "height": size, "width": size}
+    camera = {"angle": turn, "turn": 0.01} if turn else {}
+    config = load_config(
+        {"video": video, "look": {"name": "studio", **dict(look)}, "camera": camera, "annotations": {"masks": masks}}
+    )
+    made = groups()
+    layout = Layout(tuple(group.run for group in made), (0.0, 0.0, 10.0, 10.0), 1.6)
+    scene, state = builder.assemble(layout, made, jnp.zeros(2))
+    plan = render.plan_of(config, layout)
+    states = jax.tree.map(lambda a: a[None], state)
+    return scene, plan, render.render_scene(jax.random.key(3), config, plan, scene, states)
+
+
+def frames(form, stage, plan):
+    image, owners = form(jax.tree.map(lambda a: a[None], stage), plan)
+    return np.asarray(image)[0, 0], None if owners is None else np.asarray(owners)[0, 0]
+
+
+# ---- The reference
+
+
+class Body:
+    """A body in pixels, y up from the frame's lower left, and its surface at points [..., 2]."""
+
+    def __init__(self, scene, stage, plan, slot):
+        at, objects = stage.instants, scene.objects
+        self.scale, self.shape = float(at.view.scale[0]), int(objects.shape[slot])
+        cos, sin = np.cos(float(at.view.angle[0])), np.sin(float(at.view.angle[0]))
+        u, v = np.asarray(at.position[0, slot], float) - np.asarray(at.view.center[0], float)
+        self.center = np.array([plan.width, plan.height]) / 2 + self.scale * np.array(
+            [u * cos + v * sin, v * cos - u * sin]
+        )
+        angle = float(at.angle[0, slot]) - float(at.view.angle[0])
+        self.axes = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
+        grow = float(stage.paint.grow[slot])
+        self.radius = float(objects.radius[slot]) * self.scale + grow
+        self.half = float(objects.half_length[slot]) * self.scale
+        self.vertices = np.asarray(objects.vertices[slot], float) * self.scale
+        self.bevel = float(stage.paint.surface.bevel[slot]) * self.scale
+
+    def local(self, points, offset=(0.0, 0.0)):
+        return (points - self.center - offset) @ self.axes.T
+
+    def sides(self, local):
+        """Distance beyond each side, and the outward normals."""
+        corners = self.vertices
+        side = np.roll(corners, -1, 0) - corners
+        normal = np.stack([side[:, 1], -side[:, 0]], -1) / np.linalg.norm(side, axis=-1, keepdims=True)
+        return local @ normal.T - (normal * corners).sum(-1), normal
+
+    def surface(self, points):
+        """Whether the body covers each point, its tilt [..., 2] along its own axes, and local coordinates."""
+        local = self.local(points)
+        if self.shape == POLYGON:
+            beyond, normal = self.sides(local)
+            amount = np.clip(1 + beyond.max(-1) / self.bevel, 0, 1)
+            return beyond.max(-1) <= 0, normal[beyond.argmax(-1)] * amount[..., None], local
+        core = np.stack([np.clip(local[..., 0], -self.half, self.half), 0 * local[..., 0]], -1)
+        away = (local - core) / self.radius
+        return np.linalg.norm(away, axis=-1) <= 1, away, local
+
+    def shadow(self, points, offset, blur):
+        local = self.local(points, offset)
+        if self.shape == POLYGON:
+            beyond = self.sides(local)[0]
+            return np.maximum(1 - smooth((beyond + blur) / (2 * blur)).sum(-1), 0)
+        core = np.stack([np.clip(local[..., 0], -self.half, self.half), 0 * local[..., 0]], -1)
+        inner, outer, r = max(self.radius - blur, 0), self.radius + blur, self.radius
+        profile = smooth((outer**2 - ((local - core) ** 2).sum(-1)) / (outer**2 - inner**2))
+        if self.shape == CIRCLE:
+            return profile * (r**2 / (r**2 + blur**2) if r > blur else 2 * r**2 / outer**2)
+        return profile * min(r / (24 / 35 * outer), 1)
+
+
+def smooth(value):
+    value = np.clip(value, 0, 1)
+    return value**2 * (3 - 2 * value)
+
+
+def lit(stage, slot, body, points):
+    """Coverage [...] and colours [..., 3] of a body, by the formulas of the README."""
+    light, surface = (
+        jax.tree.map(lambda a: np.asarray(a, float), part) for part in (stage.paint.light, stage.paint.surface)
+    )
+    inside, tilt, local = body.surface(points)
+    angle = float(stage.instants.view.angle[0])
+    turn = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
+    toward = np.append(turn @ light.direction[:2], light.direction[2])
+    flat = np.where(inside[..., None], surface.slope[slot] * (tilt @ body.axes), 0)
+    normal = np.concatenate([flat, np.sqrt(1 - np.minimum((flat**2).sum(-1), 0.98))[..., None]], -1)
+
+    def source(cosine):
+        return (cosine + np.sqrt(cosine**2 + light.softness**2)) / 2
+
+    direct = source(normal @ toward) / source(toward[2])
+    ambient = 1 + 0.25 * normal[..., 1]
+    factor = ((1 - light.ambient) * direct + light.ambient * ambient) ** (1 / 2.2)
+    factor = np.where(factor > 1, 1 + (factor - 1) / (1 + 12 * np.maximum(factor - 1, 0)), factor)
+    half = toward + np.array([0, 0, 1])
+    half = half / np.linalg.norm(half)
+    lobe = np.maximum(1 - surface.sharpness[slot] / 4 * (1 - normal @ half), 0) ** 4
+    shine = surface.gloss[slot] * lobe + 0.25 * (1 - normal[..., 2]) ** 3
+    color = np.asarray(stage.paint.color[slot], float) * factor[..., None]
+    if surface.stripe is not None and surface.stripe[slot] and body.shape == CIRCLE:
+        band = (np.abs(local[..., 1]) < surface.stripe[slot] * body.radius)[..., None]
+        bright = surface.stripe_light[slot]
+        color = np.where(band, light.highlight * factor[..., None] if bright > 0 else color * (1 + bright), color)
+    return inside, np.minimum(color + shine[..., None] * (light.highlight - color), 255)
+
+
+def reference(scene, plan, stage):
+    """Frame [H, W, 3] in floats, the mean of SAMPLES^2 points in each pixel."""
+    height, width = plan.height, plan.width
+    x, y = ((np.arange(n * SAMPLES) + 0.5) / SAMPLES for n in (width, height))
+    points = np.stack(np.meshgrid(x, height - y), -1)
+    image = backdrop(stage, plan, points)
+    shadow, drawn = stage.paint.shadow, np.flatnonzero(stage.paint.drawn)
+    bodies = {slot: Body(scene, stage, plan, slot) for slot in drawn}
+    angle, scale = float(stage.instants.view.angle[0]), float(stage.instants.view.scale[0])
+    turn = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
+    offset, blur = scale * turn @ np.asarray(shadow.offset, float), max(scale * float(shadow.blur), 0.5)
+    order = sorted(drawn, key=lambda slot: int(scene.objects.depth[slot]))
+    still = [slot for slot in order if plan.still and not np.isfinite(scene.objects.mass[slot])]
+    for part in (still, [slot for slot in order if slot not in still]):
+        for slot in part:
+            opacity = float(shadow.opacity) * bodies[slot].shadow(points, offset, blur)
+            image = image + opacity[..., None] * (np.asarray(shadow.color, float) - image)
+        for slot in part:
+            inside, color = lit(stage, slot, bodies[slot], points)
+            image = np.where(inside[..., None], color, image)
+    return image.reshape(height, SAMPLES, width, SAMPLES, 3).mean((1, 3))
+
+
+def backdrop(stage, plan, points):
+    """Vertical gradient over the first view, and its corners."""
+    background = jax.tree.map(lambda a: np.asarray(a, float), stage.paint.background)
+    angle = float(stage.instants.view.angle[0])
+    centered = points - np.array([plan.width, plan.height]) / 2
+    world = centered @ np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
+    share = world / (np.array([plan.width, plan.height]) / 2)
+    image = background.color + np.clip((share[..., 1:] + 1) / 2, 0, 1) * (background.to_color - background.color)
+    return image + np.clip((share**2).sum(-1) / 2, 0, 1)[..., None] * (background.corners - image)
+
+
+# ---- Frames
+
+CASES = {
+    "paper, 88 px": ((), 88, 0.0),
+    "lab, 80 px, turned": ((("palette", "lab"), ("softness", 0.1), ("ambient", 0.2)), 80, 0.25),
+    "dusk, 128 px": ((("palette", "dusk"), ("azimuth", 0.5), ("elevation", 0.7), ("gloss", 0.6)), 128, 0.0),
+    "grey, 72 px": ((("palette", "grey"), ("stripe", 0)), 72, 0.0),
+}
+TIERED = [pytest.param(case, marks=pytest.mark.full if i > 1 else ()) for i, case in enumerate(CASES)]
+
+
+@pytest.mark.parametrize("case", TIERED)
+def test_lit_frames_are_those_of_a_supersampled_reference(case):
+    scene, plan, stage = staged(*CASES[case])
+    image, _ = frames(TILES, stage, plan)
+    apart = np.abs(image - reference(scene, plan, stage))
+    print(f"{case}: mean {apart.mean():.2f}, 99.9 % below {np.quantile(apart, 0.999):.1f}, at most {apart.max():.1f}")
+    assert apart.mean() < 0.7
+    assert np.quantile(apart, 0.999) < 6
+    assert apart.max() < 40
+
+
+@pytest.mark.parametrize("case", TIERED)
+def test_both_forms_render_the_same_lit_frames(case):
+    _, plan, stage = staged(*CASES[case])
+    tiles, dense = (frames(form, stage, plan)[0].astype(int) for form in (TILES, DENSE))
+    assert np.abs(tiles - dense).max() <= 1
+
+
+def test_soft_frames_are_the_lit_frames_before_rounding():
+    _, plan, stage = staged((), 88)
+    soft = np.asarray(SOFT(stage, plan))[0]
+    assert np.abs(soft - frames(TILES, stage, plan)[0]).max() < 4
+
+
+def test_a_surface_that_faces_the_viewer_has_its_own_colour():
+    """The flat top of a box."""
+    _, plan, stage = staged((("gloss", 0),), 96)
+    image, _ = frames(TILES, stage, plan)
+    column, row = (int(x) for x in (np.array([8.0, 10 - 2.6]) * plan.scale))
+    assert_allclose(image[row, column], stage.paint.color[4], atol=1)
+
+
+def test_shadows_own_no_pixel_and_fall_away_from_the_light():
+    _, plan, stage = staged((("azimuth", 0.0), ("elevation", 0.6)), 64, masks=True)
+    opaque = stage.paint.shadow
+    assert opaque is not None
+    bare = stage._replace(paint=stage.paint._replace(shadow=opaque._replace(opacity=jnp.zeros_like(opaque.opacity))))
+    (image, owners), (without, same) = (frames(TILES, some, plan) for some in (stage, bare))
+    assert_array_equal(owners, same)
+    assert_array_equal(frames(DENSE, stage, plan)[1], owners)
+    darker = without.astype(int).sum(-1) - image.astype(int).sum(-1)
+    row, left, right = (int(x * plan.scale) for x in (10 - 7.5, 7.6 - 1.3, 7.6 + 1.3))
+    assert darker[row, left] > 60
+    assert darker[row, right] == 0
+
+
+# ---- Options
+
+
+def test_defaults_are_those_of_the_page():
+    options = load_config({"look": "studio"}).look.options
+    drawn = [getattr(options, name).support[0] for name in ("azimuth", "elevation", "softness", "ambient")]
+    assert drawn == [2.1, 0.9, 0.3, 0.3]
+    assert [options.stripe, options.gloss.support[0], options.shadow.support[0]] == [0.22, 0.45, 0.4]
+    assert options.material == ("rubber",)
+
+
+def test_light_and_materials_are_drawn_from_distributions():
+    look = {"name": "studio", "azimuth": [0, 6], "elevation": [0.4, 1.2], "material": ["wood", "metal", "rubber"]}
+    config, (scene, plan, _) = load_config({"look": look}), staged((), 88)
+    keys = jax.random.split(jax.random.key(0), 100)
+    paint = jax.vmap(lambda key: render.paint_of(key, config, scene, plan.layout))(keys)
+    direction, surface = np.asarray(paint.light.direction), paint.surface
+    assert_allclose(np.linalg.norm(direction, axis=-1), 1, atol=1e-6)
+    elevation = np.arcsin(direction[:, 2])
+    assert 0.4 <= elevation.min() < 0.5
+    assert 1.1 < elevation.max() <= 1.2
+    assert np.ptp(np.arctan2(direction[:, 1], direction[:, 0])) > 5
+    moving = np.isfinite(np.asarray(scene.objects.mass))
+    assert len(np.unique(surface.sharpness[:, moving])) == 3
+    assert len(np.unique(surface.sharpness[:, ~moving])) == 1
+    one = render.paint_of(keys[0], config, scene, plan.layout)
+    jax.tree.map(lambda a, b: assert_array_equal(a, b[0]), one, paint)
