@@ -122,7 +122,7 @@ class AllPairs(ContactSolver):
             def play(k: int, a: BodySide, b: BodySide) -> tuple[BodySide, BodySide, Array | bool]:
                 if not round_pairs[k]:
                     return a, b, False
-                tau = later_impact(*points[k], *pairs[k].contacts, a, b, self.setup, self.params.step)
+                tau = later_impact(points[k][0], pairs[k].contacts[0], a, b, self.setup, self.params.step)
                 return *with_first(a, b, tau), jnp.any(tau >= 0)
 
             sides, follow = run_schedule(not_hit(sides), statics, self.order, play)
@@ -135,8 +135,8 @@ class AllPairs(ContactSolver):
             def play(k: int, a: BodySide, b: BodySide) -> tuple[BodySide, BodySide, SolvedPair]:
                 if not round_pairs[k]:
                     return a, b, pairs[k]
-                of = self.constraints[k], *points[k], pairs[k], a, b, self.setup, self.params
-                return contact_passes.solve_impact(*of)
+                point = points[k][0]
+                return contact_passes.solve_impact(self.constraints[k], point, pairs[k], a, b, self.setup, self.params)
 
             return *run_schedule(sides, statics, self.order, play), follow
 

@@ -152,7 +152,7 @@ def solve(
     """Both sides and the pair after the biased solve, bounces included."""
     taus = impact_times(points, a, b, setup, params.step)
     if takes_part(points, b):
-        taus = [in_order(*points, *taus, a, b)]
+        taus = [in_order(points[0], taus[0], a, b)]
     contacts, time = active_contacts(constraint, points, taus, a, b, params.step)
 
     def target_of(contact: ActiveContact, speed: Array, old: Impulse) -> NormalTarget:

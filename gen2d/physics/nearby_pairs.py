@@ -504,7 +504,7 @@ class NearbyPairs(ContactSolver):
             def play(i: int, k: Array, indices: GatherIndices, a: BodySide, b: BodySide, follow: Array) -> tuple:
                 _, _, points, setup = self._unpack_contacts(listed, i, k)
                 pair = unpack(list(packed[i][k]), solved.specs[i])
-                tau = later_impact(*points, *pair.contacts, a, b, setup, self.params.step)
+                tau = later_impact(points[0], pair.contacts[0], a, b, setup, self.params.step)
                 return *with_first(a, b, tau), follow | jnp.any(tau >= 0)
 
             firsts = [_column(table, "first") for table in bodies.changing]
@@ -528,7 +528,7 @@ class NearbyPairs(ContactSolver):
             def play(i: int, k: Array, indices: GatherIndices, a: BodySide, b: BodySide, buffer: Array) -> tuple:
                 constraint, _, points, setup = self._unpack_contacts(listed, i, k)
                 pair = unpack(list(buffer[k]), solved.specs[i])
-                a, b, pair = contact_passes.solve_impact(constraint, *points, pair, a, b, setup, self.params)
+                a, b, pair = contact_passes.solve_impact(constraint, points[0], pair, a, b, setup, self.params)
                 values, _ = pack(pair, (self.chunk,), self._dtype, once=True)
                 return a, b, self._store(self.batches[i], buffer, k, values)
 

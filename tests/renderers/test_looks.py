@@ -282,7 +282,8 @@ def test_noise_is_as_faint_as_its_average_over_a_pixel():
     for pixel in (0.25, 0.5, 1.0, 2.0):  # of the coarse octave's cell; twice as many of the fine one's
         inside = (np.arange(16, dtype=np.float32) + 0.5) / 16 - 0.5
         points = x[:, None, None] + pixel * inside[:, None], y[:, None, None] + pixel * inside
-        averaged = np.asarray(noise(*map(jnp.asarray, np.broadcast_arrays(*points)), jnp.uint32(3))).mean((1, 2))
+        u, v = (jnp.asarray(part) for part in np.broadcast_arrays(*points))
+        averaged = np.asarray(noise(u, v, jnp.uint32(3))).mean((1, 2))
         faded = np.asarray(noise(jnp.asarray(x), jnp.asarray(y), jnp.uint32(3), pixel))
         assert_allclose(faded.std(), averaged.std(), rtol=0.1)
         assert np.corrcoef(faded, averaged)[0, 1] > 0.7

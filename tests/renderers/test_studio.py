@@ -249,6 +249,8 @@ def test_light_and_materials_are_drawn_from_distributions():
     config, (scene, plan, _) = load_config({"look": look}), staged((), 88)
     keys = jax.random.split(jax.random.key(0), 100)
     paint = jax.vmap(lambda key: render.paint_of(key, config, scene, plan.layout))(keys)
+    assert paint.light is not None
+    assert paint.surface is not None
     direction, surface = np.asarray(paint.light.direction), paint.surface
     assert_allclose(np.linalg.norm(direction, axis=-1), 1, atol=1e-6)
     elevation = np.arcsin(direction[:, 2])
