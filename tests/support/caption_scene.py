@@ -163,9 +163,9 @@ class SceneReader:
 
     def _size(self, s: int) -> str:
         sizes = [self.reach[o] for o in self.moving if self.noun[o] == self.noun[s]]
-        if max(sizes) < 1.5 * min(sizes) - EPSILON:
+        if max(sizes) < 1.5 * min(sizes):
             return ""
-        small, large = self.reach[s] <= 1.2 * min(sizes) + EPSILON, self.reach[s] >= max(sizes) / 1.2 - EPSILON
+        small, large = self.reach[s] <= 1.2 * min(sizes), self.reach[s] >= max(sizes) / 1.2
         return "small" if small else "large" if large else ""
 
     def _pixels(self, frame: int) -> np.ndarray:
