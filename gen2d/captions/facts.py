@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from gen2d.captions.events import BOX_SIDES, Hit, core_points, hits, moving_slots, wall_names
+from gen2d.captions.events import BOX_SIDES, Hit, hits, moving_slots, wall_names
 from gen2d.core.enums import CAPSULE, CIRCLE, END, NO_CONTACT, POLYGON, STATIC
 
 CLASSES = (  # nouns of all objects; class names of annotations
@@ -62,9 +62,11 @@ class VideoFacts:
     @functools.cached_property
     def reach(self) -> np.ndarray:
         """Largest distance from each object's centre to its outline [K], m."""
-        slots = np.arange(len(self.columns["objects/present"]))
-        ends = core_points(self.columns, slots)[0] - self.position[0, :, None]
-        return np.linalg.norm(ends, axis=-1).max(-1) + self.columns["objects/radius"].astype(float)
+        core = self.columns["objects/half_length"].astype(float)
+        if "objects/vertices" in self.columns:
+            corners = np.linalg.norm(self.columns["objects/vertices"].astype(float), axis=-1).max(-1)
+            core = np.where(self.columns["objects/shape"] == POLYGON, corners, core)
+        return core + self.columns["objects/radius"].astype(float)
 
     @functools.cached_property
     def point_speed(self) -> np.ndarray:
