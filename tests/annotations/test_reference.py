@@ -121,7 +121,8 @@ def fields(case: Case) -> tuple[list[tuple[dict[str, np.ndarray], View]], list[d
             boxes, colors, ranks = (np.asarray(array)[v] for array in batch.render_scenes.occluders)
             behind = ranks + rollout.layout.slots - rollout.plan.moving  # of a still camera's static slots, all
             occluders = tuple(map(Occluder, boxes, colors, behind))
-        background, linear = getattr(look, "background", (255, 255, 255)), config.image.blending == "linear"
+        background = look.grounds[0] if hasattr(look, "grounds") else (255, 255, 255)
+        linear = config.image.blending == "linear"
         view = View(height, width, background, look.wall_width, linear, occluders)
         if config.look.name == "outline":
             view = view._replace(line=look.width, fill=look.fill)

@@ -54,7 +54,7 @@ FEW_BOUNDS: dict[str, Bounds] = {
     "elastic discs": {},
     "discs, mass ratios up to 1e6": {RISING: 0.7},
     "all shapes": {RISING: None},
-    "elastic shapes": {RISING: None},
+    "elastic shapes": {LEFT: None, RISING: None},
     "mass ratios up to 1e6": {**RARE, RISING: None},
     "smooth elastic boxes": {RISING: None, GAINING: None},
     "smooth elastic boxes and fast small discs": {},

@@ -9,7 +9,14 @@ from numpy.testing import assert_allclose, assert_array_equal
 import gen2d
 from gen2d.core.errors import ConfigError
 
-SMALL = ["storage.batch_size=4", "video.frames=8", "video.height=32", "video.width=48", "annotations.masks=true"]
+SMALL = [
+    "storage.batch_size=4",
+    "video.frames=8",
+    "video.height=32",
+    "video.width=48",
+    "annotations.masks=true",
+    "look=flat",
+]
 CASES = {
     "plain": [],
     "moving": [
