@@ -69,6 +69,7 @@ def test_the_blocks_run(count: int, tmp_path: Path, monkeypatch: pytest.MonkeyPa
         "told",
         "drop",
         "states",
+        "exact",
     }
 
 
