@@ -15,6 +15,7 @@ from gen2d.captions.facts import VideoFacts
 
 NUMBERS = ["no", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten", "eleven", "twelve"]
 ORDINALS = ["", "second ", "third ", "fourth ", "fifth ", "sixth ", "seventh ", "eighth ", "ninth ", "tenth "]
+EXTREMES = {"left": "leftmost", "right": "rightmost", "top": "highest", "bottom": "lowest"}  # by side
 SIZES_DIFFER, SIZES_AGREE = 1.5, 1.2  # ratios of sizes: of large to small objects, and within either kind
 SIDE, SIDE_GAP = 1 / 3, 0.08  # of the picture: what is on a side of it, and how far from there others must be
 RANK_GAP = 0.02  # of the picture, between successive ranks up to the one after an object's
@@ -142,8 +143,7 @@ class References:
                 continue  # a rank counts objects by their word
             for rank, side in self.ranks(slot, slots):
                 if rank == 0:
-                    extreme = {"left": "leftmost", "right": "rightmost", "top": "highest", "bottom": "lowest"}[side]
-                    yield f"{extreme} {text}", (*program, "0", side, "rank"), True
+                    yield f"{EXTREMES[side]} {text}", (*program, "0", side, "rank"), True
                 else:
                     yield f"{ORDINALS[rank]}{text} from the {side}", (*program, f"{rank}", side, "rank"), True
 
@@ -186,7 +186,6 @@ class References:
             return Reference(f"the {name}", (*program, "unique"), True)
         if name not in ("peg", "pin"):
             for rank, side in self.ranks(slot, same):
-                extreme = {"left": "leftmost", "right": "rightmost", "top": "highest", "bottom": "lowest"}[side]
-                text = f"{ORDINALS[rank]}{name} from the {side}" if rank else f"{extreme} {name}"
+                text = f"{ORDINALS[rank]}{name} from the {side}" if rank else f"{EXTREMES[side]} {name}"
                 return Reference(f"the {text}", (*program, f"{rank}", side, "rank"), True)
         return Reference(f"one of {number_word(len(same))} {plural(name)}", program, False)

@@ -29,6 +29,7 @@ from gen2d.config.sections import (
     VideoOptions,
 )
 from gen2d.config.splits import CHANGES, Split, distributions_of_splits, with_splits
+from gen2d.core import palettes
 from gen2d.core.errors import ConfigError
 from gen2d.storage.explain import reason
 from gen2d.storage.sealed import read_bytes
@@ -233,7 +234,7 @@ def _check_palettes(config: Config, source: str) -> None:
     for split in config.splits:
         look = config.of_split(split.name).look
         hidden = [name for name in _keys(split.plain().get("factors")) if name.partition("[")[0].endswith("color")]
-        if hidden and getattr(look.options, "named_palette", None) is not None:
+        if hidden and palettes.palette_of(look.options) is not None:
             raise ConfigError(
                 f"{source}: splits.{split.name}.factors has {hidden[0]}, which look.palette={look.options.palette} "
                 "replaces: look.palette must be scene"

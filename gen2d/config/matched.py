@@ -9,6 +9,7 @@ import numpy as np
 from gen2d.config import plugins
 from gen2d.config.distributions import Distribution
 from gen2d.config.options import factor_options
+from gen2d.core import palettes
 from gen2d.core.enums import DYNAMIC, STATIC
 from gen2d.records.layout import Layout
 
@@ -47,7 +48,7 @@ def check(options: Any, default: Any, scene: Any, video: Any, annotations: Any, 
 
 def check_look(options: Any, scene: Any, look: Any) -> None:
     """Raise ValueError, beginning with the option's name, if a palette's colours hide a change, or change with it."""
-    named = getattr(look.options, "named_palette", None)
+    named = palettes.palette_of(look.options)
     if not options.change or named is None:
         return
     palette, specs, layout = look.options.palette, factor_options(scene.contract), scene.contract.layout(scene.options)

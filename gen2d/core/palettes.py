@@ -3,7 +3,7 @@
 The colours of a palette's objects and its ground are at least 20 apart in CIELAB (CIE 1976, D65).
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 Color = tuple[int, int, int]  # sRGB
 
@@ -15,6 +15,11 @@ class Palette(NamedTuple):
     wall: tuple[str, Color]  # of static objects
     objects: dict[str, Color]  # of all other objects, by name
     light: Color = (255, 255, 255)
+
+
+def palette_of(options: Any) -> Palette | None:
+    """The palette that the options of a look name; None if they name none, or the look has no palettes."""
+    return getattr(options, "named_palette", None)
 
 
 def _color(digits: str) -> Color:

@@ -34,8 +34,8 @@ from gen2d.physics.normal_impulse import (
     NormalTarget,
     TargetOf,
     biased_target,
-    bounce_speed,
     bounces_again,
+    impact_target,
     relaxed_target,
     solve_normals,
 )
@@ -130,14 +130,30 @@ def _push_bound(
     return push
 
 
-def _update_drift(old: BodySide, new: BodySide, time: Array, push: Array) -> BodySide:
+def _update_drift(old: BodySide, new: BodySide, time: Array, push: Array | None) -> BodySide:
     """The side with its drift reduced by the time of the impulses times the change of velocity."""
     assert old.motion, "only moving bodies drift"
     assert new.motion, "only moving bodies drift"
     assert old.drift, "only moving bodies drift"
     velocity = old.drift.velocity - time * (new.motion.velocity - old.motion.velocity)
     spin = old.drift.spin - time * (new.motion.spin - old.motion.spin)
-    return new._replace(drift=Motion(velocity, spin), push=jnp.maximum(old.push, push))
+    return new._replace(drift=Motion(velocity, spin), push=old.push if push is None else jnp.maximum(old.push, push))
+
+
+def _after_impulses(
+    constraint: ContactConstraint,
+    old: tuple[BodySide, BodySide],
+    new: tuple[BodySide, BodySide],
+    bounces: Array,
+    time: Array,
+    push: Array | None,
+) -> tuple[BodySide, BodySide]:
+    """Both sides with the drift, the push and the clock after impulses at this time, s."""
+    (a, b), (new_a, new_b) = old, new
+    new_b = _update_drift(b, new_b, time, push)
+    if constraint.a is not None and a.drift is not None:
+        new_a = _update_drift(a, new_a, time, push)
+    return after_impact(new_a, new_b, bounces, time)
 
 
 def solve(
@@ -161,11 +177,8 @@ def solve(
     pair = SolvedPair(contacts, warm_start_impulses(constraint, points, memory.impulses), memory.roll)
     new_a, new_b, solved = _apply_pass(constraint, pair, target_of, a, b)
     push = _push_bound(constraint, solved, a, b, params)
-    new_b = _update_drift(b, new_b, time, push)
-    if constraint.a is not None and a.drift is not None:
-        new_a = _update_drift(a, new_a, time, push)
     bounces = functools.reduce(jnp.logical_or, [tau >= 0 for tau in taus])
-    new_a, new_b = after_impact(new_a, new_b, bounces, time)
+    new_a, new_b = _after_impulses(constraint, (a, b), (new_a, new_b), bounces, time, push)
     if constraint.static:
         new_b = materialize(new_b._replace(work=None))._replace(work=new_b.work)
     return new_a, new_b, solved
@@ -186,15 +199,10 @@ def solve_impact(
     happens = tau >= 0
 
     def target_of(contact: ActiveContact, speed: Array, old: Impulse) -> NormalTarget:
-        bounce = bounce_speed(constraint, contact, speed)
-        active = happens & (bounce > speed) & (contact.frame.normal_mass > 0)
-        return NormalTarget(active, bounce, 0.0, 0.0, old.normal, happens, apart=happens)
+        return impact_target(constraint, contact, speed, old, happens)
 
     new_a, new_b, new = _apply_pass(constraint, solved._replace(contacts=contacts), target_of, a, b)
-    new_b = _update_drift(b, new_b, time, new_b.push)
-    if constraint.a is not None and a.drift is not None:
-        new_a = _update_drift(a, new_a, time, new_a.push)
-    new_a, new_b = after_impact(new_a, new_b, happens, time)
+    new_a, new_b = _after_impulses(constraint, (a, b), (new_a, new_b), happens, time, None)
     return jax.tree.map(lambda x, y: jnp.where(happens, x, y), (new_a, new_b, new), (a, b, solved))
 
 

@@ -92,6 +92,15 @@ def biased_target(
     )
 
 
+def impact_target(
+    constraint: ContactConstraint, contact: ActiveContact, speed: Array, old: Impulse, happens: Array
+) -> NormalTarget:
+    """Target of an impact alone, where it happens: the speed of its bounce."""
+    bounce = bounce_speed(constraint, contact, speed)
+    active = happens & (bounce > speed) & (contact.frame.normal_mass > 0)
+    return NormalTarget(active, bounce, 0.0, 0.0, old.normal, happens, apart=happens)
+
+
 def bounces_again(contact: ActiveContact, speed: Array, threshold: Array) -> Array:
     """Whether a touching contact bounces in the relaxing pass, as a neighbour's bounce closes it."""
     return (speed < -threshold) & (contact.gap <= 0) & (contact.frame.normal_mass > 0)

@@ -12,6 +12,7 @@ SLOWEST = 1e-12  # m/s or m: keeps divisions finite where nothing moves or has a
 NONE = -1.0  # no fast approach: a soft contact
 MISSES = -2.0  # a fast approach without an impact in this step: no impulse yet
 WAITS = -3.0  # an impact after another one of the same bodies, which has not acted yet: no impulse yet
+# Contacts with tau > MISSES may get an impulse, so WAITS lies below it.
 
 
 def _root(x: Array) -> Array:

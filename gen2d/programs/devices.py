@@ -2,6 +2,7 @@
 
 import contextlib
 import ctypes
+import functools
 import os
 import pathlib
 import platform
@@ -97,12 +98,20 @@ def default_cache() -> pathlib.Path:
     )
 
 
+@functools.cache
+def processor_properties() -> dict[str, str]:
+    """Names and values that the system gives for this CPU's first core; empty if it gives none."""
+    try:
+        first_core, *_ = pathlib.Path("/proc/cpuinfo").read_text().split("\n\n")
+    except OSError:
+        return {}
+    lines = (line.partition(":") for line in first_core.splitlines())
+    return {name.strip(): value.strip() for name, _, value in lines}
+
+
 def instruction_set() -> str:
     """Widest vector instruction set of this CPU, which affects how sums are rounded."""
-    try:
-        flags = set(pathlib.Path("/proc/cpuinfo").read_text().split())
-    except OSError:
-        return platform.machine()
+    flags = processor_properties().get("flags", "").split()
     return next((isa for isa in ("avx512f", "avx2", "avx") if isa in flags), platform.machine())
 
 
@@ -111,12 +120,7 @@ def processor_kind() -> str:
 
     XLA computes reciprocal square roots from an instruction of which the last bits differ between vendors.
     """
-    try:
-        lines = pathlib.Path("/proc/cpuinfo").read_text().splitlines()
-    except OSError:
-        return instruction_set()
-    vendors = [line.split(":")[1].strip() for line in lines if line.startswith("vendor_id")]
-    return " ".join([instruction_set(), *vendors[:1]])
+    return f"{instruction_set()} {processor_properties().get('vendor_id', '')}".strip()
 
 
 def versions() -> dict[str, str]:

@@ -12,7 +12,7 @@ import jax
 import numpy as np
 
 import gen2d
-from gen2d.programs.devices import Device, instruction_set
+from gen2d.programs.devices import Device, instruction_set, processor_properties
 from gen2d.storage.sealed import sha256
 
 # Prefixes of XLA flags that leave all results unchanged to the bit; any other flag is assumed to change some.
@@ -66,11 +66,12 @@ def flags() -> str:
 @functools.cache
 def processor() -> str:
     """Hash of the processor's model and features, for which programs are compiled."""
-    try:
-        lines = pathlib.Path("/proc/cpuinfo").read_text().splitlines()
-    except OSError:
+    properties = processor_properties()
+    if not properties:
         return platform.processor()
-    return sha256("\n".join(sorted({line for line in lines if line.startswith(("model name", "flags"))})).encode())
+    return sha256(
+        "\n".join(properties.get(name, "") for name in ("model name", "CPU part", "flags", "Features")).encode()
+    )
 
 
 @functools.cache

@@ -12,7 +12,7 @@ from gen2d.captions import caption
 from gen2d.config import quality
 from gen2d.config.config import Config
 from gen2d.core.enums import JOINT_KINDS
-from gen2d.core.palettes import NAME_BYTES, Palette
+from gen2d.core.palettes import NAME_BYTES, Palette, palette_of
 from gen2d.core.schema import Field
 from gen2d.physics import lyapunov
 from gen2d.physics.simulate import SaveAt
@@ -108,7 +108,7 @@ class VideoSchema:
         """Fields that the host computes from the others: split, names of colours, and captions."""
         longest = max((len(split.name) for split in self.config.splits), default=0)
         fields = {"split": Field(f"S{longest}", "n", "", "split of the video")} if longest else {}
-        if any(_named_palette(config) for config in self._split_configs):
+        if any(palette_of(config.look.options) for config in self._split_configs):
             meaning = "name of the color in the look's palette; empty: none"
             fields["objects/color_name"] = Field(f"S{NAME_BYTES}", "n K", "", meaning)
         captioned = self.config.annotations.simulated.captions
@@ -126,18 +126,13 @@ class VideoSchema:
         if config.splits:
             host_columns["split"] = np.full(count, split.encode(), self.host_fields["split"].dtype)
         if "objects/color_name" in self.host_fields:
-            palette = _named_palette(config.of_split(split))
+            palette = palette_of(config.of_split(split).look.options)
             host_columns["objects/color_name"] = _color_names(columns, palette)
         return host_columns | (
             caption.caption_fields(columns | host_columns, config.video, self.constants)
             if config.annotations.simulated.captions
             else {}
         )
-
-
-def _named_palette(config: Config) -> Palette | None:
-    """The palette that a look's options name, if any."""
-    return getattr(config.look.options, "named_palette", None)
 
 
 def _color_names(columns: dict[str, np.ndarray], palette: Palette | None) -> np.ndarray:
