@@ -4,6 +4,7 @@ A batch holds any number of pairs: all pairs of a round (all_pairs.py) or a chun
 """
 
 import functools
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -40,8 +41,74 @@ from gen2d.physics.normal_impulse import (
     solve_normals,
 )
 from gen2d.physics.params import SolverParams
+from gen2d.physics.support import SupportedPair, add_support, supported_pair
 from gen2d.records.axes import Array
 from gen2d.xla import materialize
+
+
+class _SeenPair(NamedTuple):
+    """The contacts of a pair as its impulses see them: with what bears the lighter body, where they rest."""
+
+    supported: SupportedPair | None
+    rests: Array | None  # None: nothing bears them
+    contacts: list[ActiveContact]
+    speeds: list[Array]  # m/s
+    targets: list[NormalTarget]
+    taken: Array | float  # 1/kg, from the coupling of two points
+
+
+def _seen_pair(
+    constraint: ContactConstraint, pair: SolvedPair, target_of: TargetOf, a: BodySide, b: BodySide
+) -> _SeenPair:
+    assert b.motion is not None, "only static bodies lack a motion"
+    contacts, motions = pair.contacts, (a.motion, b.motion)
+    speeds = [relative_speed(contact.frame, contact.normal, *motions)[0] for contact in contacts]
+    supported = supported_pair(constraint, contacts[0].normal, (a.support, b.support))
+    if supported is None:
+        targets = [target_of(*of) for of in zip(contacts, speeds, pair.impulses, strict=True)]
+        return _SeenPair(None, None, contacts, speeds, targets, 0.0)
+    borne = [supported.speed(contact, motions) for contact in contacts]
+    borne = [jnp.where(c.tau < 0, x, y) for c, x, y in zip(contacts, borne, speeds, strict=True)]
+    targets = [target_of(*of) for of in zip(contacts, borne, pair.impulses, strict=True)]
+    rests = ~functools.reduce(jnp.logical_or, [target.bounces for target in targets])
+    speeds = [jnp.where(rests, x, y) for x, y in zip(borne, speeds, strict=True)]
+    taken = supported.coupling(contacts[0], contacts[1], rests) if len(contacts) == 2 else 0.0
+    contacts = [contact._replace(frame=supported.frame(contact, rests)) for contact in contacts]
+    return _SeenPair(supported, rests, contacts, speeds, targets, taken)
+
+
+def _with_pushes(
+    seen: _SeenPair, pair: SolvedPair, normals: list[Array], a: BodySide, b: BodySide
+) -> tuple[BodySide, BodySide]:
+    """Both sides with the push of these normal impulses, so that what bears the lighter body does not see an impact."""
+    assert seen.supported is not None, "the pair is supported"
+    assert seen.rests is not None, "the pair is supported"
+    changes = [jnp.abs(normal - old.normal) for normal, old in zip(normals, pair.impulses, strict=True)]
+    of_a, of_b = seen.supported.pushes(functools.reduce(jnp.add, changes), seen.rests)
+    return a._replace(push=jnp.maximum(a.push, of_a)), b._replace(push=jnp.maximum(b.push, of_b))
+
+
+def _press_again(
+    constraint: ContactConstraint,
+    contacts: list[ActiveContact],
+    impulses: list[Impulse],
+    targets: list[NormalTarget],
+    motions: tuple[Motion | None, Motion],
+) -> tuple[tuple[Motion | None, Motion], list[Impulse]]:
+    """Motions and impulses after another normal solve, as friction has turned the body between its two points.
+
+    Friction stays within Coulomb's bound.
+    """
+    rests = ~(targets[0].bounces | targets[1].bounces)
+    speeds = [relative_speed(contact.frame, contact.normal, *motions)[0] for contact in contacts]
+    normals = materialize(solve_normals(constraint, contacts, speeds, impulses, targets))
+    new = []
+    for contact, old, normal in zip(contacts, impulses, normals, strict=True):
+        bound = constraint.friction * normal
+        impulse = Impulse(normal, jnp.clip(old.tangent, -bound, bound))
+        new.append(Impulse(*(jnp.where(rests, x, y) for x, y in zip(impulse, old, strict=True))))
+        motions = apply_impulse(constraint, contact, impulse_change(new[-1], old), *motions)
+    return motions, new
 
 
 def _apply_pass(
@@ -50,13 +117,16 @@ def _apply_pass(
     """Both sides and the pair after normal impulses, friction and rolling resistance."""
     assert b.motion is not None, "only static bodies lack a motion"
     before, roll, impulses = (a.motion, b.motion), pair.roll, []
-    speeds, slips = zip(*(relative_speed(c.frame, c.normal, *before) for c in pair.contacts), strict=True)
-    targets = [target_of(*of) for of in zip(pair.contacts, speeds, pair.impulses, strict=True)]
-    normals = materialize(solve_normals(constraint, pair.contacts, speeds, pair.impulses, targets))
+    seen = _seen_pair(constraint, pair, target_of, a, b)
+    targets = seen.targets
+    normals = materialize(solve_normals(constraint, seen.contacts, seen.speeds, pair.impulses, targets, seen.taken))
+    if seen.supported is not None:
+        a, b = _with_pushes(seen, pair, normals, a, b)
     if constraint.frame is not None and roll is None:
         # The normal impulse between two discs adds no slip, so both impulses follow from the same velocities.
-        (contact,), (old,), (normal,), (speed,), (slip,) = pair.contacts, pair.impulses, normals, speeds, slips
-        tangent = materialize(friction_impulse(constraint, contact, normal, slip, old, targets[0].apart))
+        (contact,), (old,), (normal,), (target,) = pair.contacts, pair.impulses, normals, targets
+        speed, slip = relative_speed(contact.frame, contact.normal, *before)
+        tangent = materialize(friction_impulse(constraint, contact, normal, slip, old, target.apart))
         impulses.append(Impulse(normal, tangent))
         change = impulse_change(impulses[0], old)
         motions = apply_impulse(constraint, contact, change, *before)
@@ -70,6 +140,9 @@ def _apply_pass(
             tangent = materialize(friction_impulse(constraint, contact, normal, slip, old, target.apart))
             impulses.append(Impulse(normal, tangent))
             motions = apply_impulse(constraint, contact, (None, tangent - old.tangent), *motions)
+        if constraint.static and b.support is not None and len(impulses) == 2:
+            motions, impulses = _press_again(constraint, pair.contacts, impulses, targets, motions)
+            normals = [impulse.normal for impulse in impulses]
         if pair.roll is not None:
             roll = materialize(rolling_impulse(constraint, functools.reduce(jnp.add, normals), *motions, pair.roll))
             motions = apply_angular_impulse(constraint, roll - pair.roll, *motions)
@@ -108,6 +181,8 @@ def warm_start(
         work = add_dissipation(b.work, constraint, moved, olds, roll, before, motions)
     motion_b = materialize(motions[1]) if constraint.static else motions[1]
     a, b = a._replace(motion=motions[0]), b._replace(motion=motion_b, work=work)
+    if constraint.a is None and b.support is not None:
+        b = b._replace(support=add_support(b.support, constraint, points, olds))
     if takes_part(points, b):
         a, b = with_first(a, b, *impact_times(points, a, b, setup, h))
     return a, b, points
@@ -137,7 +212,7 @@ def _update_drift(old: BodySide, new: BodySide, time: Array, push: Array | None)
     assert old.drift, "only moving bodies drift"
     velocity = old.drift.velocity - time * (new.motion.velocity - old.motion.velocity)
     spin = old.drift.spin - time * (new.motion.spin - old.motion.spin)
-    return new._replace(drift=Motion(velocity, spin), push=old.push if push is None else jnp.maximum(old.push, push))
+    return new._replace(drift=Motion(velocity, spin), push=new.push if push is None else jnp.maximum(new.push, push))
 
 
 def _after_impulses(

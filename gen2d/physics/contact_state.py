@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 from gen2d.physics.collision import Shape
 from gen2d.physics.constraint import ActiveContact, Impulse, Motion
 from gen2d.physics.energy import Work
+from gen2d.physics.support import Support
 from gen2d.records.axes import Array
 
 
@@ -26,6 +27,7 @@ class BodySide(NamedTuple):
     displacement: Motion | None = None  # m, rad: where the impulses of a pass act; None: of static bodies
     push: Any = None  # [N, ...] m/s: bound on the speed from pushing overlaps apart; 0: no contact; None: static
     work: Work | None = None
+    support: Support | None = None  # None: static bodies, and without shock propagation
     first: Array | None = None  # [N, ...] s: least time of impact of a body in the step; infinite without one
     clock: Array | None = None  # [N, ...] s: of a body's last impact in the step so far; 0 without one
 

@@ -52,19 +52,21 @@ def bounce_speed(constraint: ContactConstraint, contact: ActiveContact, speed: A
 
 
 LEAK, LEAK_BY_RATIO = 0.3, 0.01
+SUPPORTED_LEAK = 0.15  # with shock propagation
 
 
-def _leak(constraint: ContactConstraint) -> Array | float:
-    """Share of the leak of a spring, between LEAK and 1.
+def _leak(constraint: ContactConstraint, params: SolverParams) -> Array | float:
+    """Share of the leak of a spring, between its least, LEAK or SUPPORTED_LEAK, and 1.
 
     A contact that leaks like a spring sinks under its load by Hooke's law. One that does not leak at all would make
     heavy bodies on light ones unstable, whose loads take as many steps to arrive as the ratio of the masses.
     """
+    least = SUPPORTED_LEAK if params.shock_propagation else LEAK
     if constraint.a is None or constraint.static:
-        return LEAK
+        return least
     a, b = constraint.a.mass, constraint.b.mass
     ratio = jnp.maximum(a, b) * reciprocal(jnp.minimum(a, b), jnp.minimum(a, b) > 0)
-    return jnp.clip(LEAK_BY_RATIO * ratio, LEAK, 1.0)
+    return jnp.clip(LEAK_BY_RATIO * ratio, least, 1.0)
 
 
 def biased_target(
@@ -74,19 +76,20 @@ def biased_target(
 
     A separated contact may close its gap, an overlapping one is pushed apart softly, and a bounce reaches its target
     speed exactly. A fast approach that misses in this step gets no impulse, as the straight line of a soft contact
-    would stop a body that only grazes the other or arrives a step later.
+    would stop a body that only grazes the other or arrives a step later. With shock propagation, a static body stops
+    another at once, whatever its load.
     """
     rate, mass_scale, impulse_scale = softness(constraint, params)
     apart, bounces = contact.gap > 0, contact.tau >= 0
     bias = jnp.where(apart, contact.gap / params.step, jnp.maximum(rate * contact.gap, -params.push_speed))
     bounce = bounce_speed(constraint, contact, speed)
-    touches = contact.frame.normal_mass > 0
+    touches, firm = contact.frame.normal_mass > 0, constraint.static and params.shock_propagation
     active = touches & jnp.where(bounces, bounce > speed, contact.tau > MISSES)
     return NormalTarget(
         active=active,
         speed=jnp.where(bounces, bounce, -bias),
-        compliance=jnp.where(apart | bounces, 0.0, impulse_scale / mass_scale),
-        leak=_leak(constraint),
+        compliance=jnp.where(apart | bounces, 0.0, 0.0 if firm else impulse_scale / mass_scale),
+        leak=_leak(constraint, params),
         idle=jnp.where(touches & bounces, old.normal, 0.0),
         bounces=bounces,
     )
@@ -145,13 +148,17 @@ def solve_normals(
     speeds: Sequence[Array],
     olds: Sequence[Impulse],
     targets: Sequence[NormalTarget],
+    taken: Array | float = 0.0,
 ) -> list[Array]:
-    """Accumulated normal impulses, N s, at the points of a contact with these speeds, m/s."""
+    """Accumulated normal impulses, N s, at the points of a contact with these speeds, m/s.
+
+    A support takes `taken`, 1/kg, from the coupling of two points.
+    """
     rows = [_Row(*of) for of in zip(contacts, speeds, olds, targets, strict=True)]
     if len(rows) == 1:
         return [rows[0].impulse(0.0)]
     p, q = rows
-    k = _coupling(constraint, *(contact.frame for contact in contacts))
+    k = _coupling(constraint, *(contact.frame for contact in contacts)) - taken
     det = p.k * q.k - k * k
     regular = det > REGULAR * p.k * q.k
     inverse = 1 / jnp.where(regular, det, 1.0)

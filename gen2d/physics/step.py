@@ -40,6 +40,7 @@ from gen2d.physics.impact_order import not_hit
 from gen2d.physics.params import SolverParams
 from gen2d.physics.shapes import to_world
 from gen2d.physics.state import BodyState, Model, WorldState
+from gen2d.physics.support import no_support
 from gen2d.physics.tunnelling import clamp_displacement
 from gen2d.records.axes import Array
 from gen2d.records.parameter import apply
@@ -143,7 +144,14 @@ def step(world: WorldState, model: Model, params: SolverParams) -> WorldState:
     works = [None] * len(groups) if ledger is None else ledger.groups
     of_groups = zip(shapes, before, different, works, strict=True)
     sides = [
-        BodySide(shape, motion, acceleration, displacement=_scaled(motion, 0.5 * h), work=work)
+        BodySide(
+            shape,
+            motion,
+            acceleration,
+            displacement=_scaled(motion, 0.5 * h),
+            work=work,
+            support=no_support(motion.velocity) if params.shock_propagation else None,
+        )
         for shape, motion, acceleration, work in of_groups
     ]
     if params.by_time:
@@ -161,7 +169,10 @@ def step(world: WorldState, model: Model, params: SolverParams) -> WorldState:
         joints, motions, drifts, accelerations, fixed, params, biased=True
     )
     of_groups = zip(sides, motions, drifts, pushes, strict=True)
-    sides = [BodySide(motion=m, drift=drift, push=push, work=s.work, first=s.first) for s, m, drift, push in of_groups]
+    sides = [
+        BodySide(motion=m, drift=drift, push=push, work=s.work, support=s.support, first=s.first)
+        for s, m, drift, push in of_groups
+    ]
     if params.by_time:
         sides = [side._replace(clock=jnp.zeros_like(side.push)) for side in sides]
     statics = [BodySide(motion=side.motion) for side in statics]
@@ -178,7 +189,10 @@ def step(world: WorldState, model: Model, params: SolverParams) -> WorldState:
         joints, motions, displacements, accelerations, fixed, params, biased=False
     )
     of_groups = zip(sides, motions, displacements, strict=True)
-    sides = [BodySide(motion=m, displacement=moved, push=side.push, work=side.work) for side, m, moved in of_groups]
+    sides = [
+        BodySide(motion=m, displacement=moved, push=side.push, work=side.work, support=side.support)
+        for side, m, moved in of_groups
+    ]
     sides, carry = solver.relax(carry, solved, sides, statics, world.time)
     motions = rigid.run(rigid_joints.relax, _motions(sides), displacements)
     if ledger is not None:

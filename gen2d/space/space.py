@@ -14,6 +14,7 @@ numbers to slots.
 
 import dataclasses
 import itertools
+import logging
 import math
 from collections.abc import Sequence
 from typing import Any, Unpack
@@ -30,6 +31,7 @@ from gen2d.core.progress import waiting
 from gen2d.physics import inertia
 from gen2d.physics.params import SolverParams, solver_params
 from gen2d.physics.simulate import Forces, SaveAt, substeps
+from gen2d.physics.support import LARGEST_RATIO
 from gen2d.records.axes import to_device
 from gen2d.records.layout import JointSpec, Layout, SlotGroup
 from gen2d.records.scene import Joints, Objects, Scene, State
@@ -48,6 +50,9 @@ from gen2d.space.bodies import KINDS, Body, BodyOptions, Joint, Overlaps, Pair, 
 from gen2d.space.checks import checked_color, checked_corners, checked_number, checked_pair, rotate
 from gen2d.space.video import Video
 
+_log = logging.getLogger(__name__)
+SAFE_RATIO = 10  # of two masses, without shock propagation: the heavier one sinks in by 2 mm
+
 
 class Space:
     """Scene of bodies and joints, which are added one by one, and the options of its physics.
@@ -61,7 +66,8 @@ class Space:
     **physics
         Options of a config's section `physics`, with the same defaults: damping (1/s), mixing ("product", "mean",
         "max", "geometric"), bounce_threshold (m/s), max_step (s), substeps, contact_hertz (Hz), contact_damping_ratio,
-        push_speed (m/s), precision ("float32", "float64"), impact_order ("pairs", "time").
+        push_speed (m/s), precision ("float32", "float64"), impact_order ("pairs", "time"),
+        shock_propagation (False, True).
 
     Raises
     ------
@@ -513,7 +519,8 @@ class Space:
         """Simulate the space from its initial state.
 
         The first call compiles a program, which takes seconds. Another space with as many bodies of each shape and the
-        same joints reuses it.
+        same joints reuses it. Logs a warning if masses differ more than contacts at rest bear: by a factor of 10, or of
+        3000 with `shock_propagation`.
 
         Parameters
         ----------
@@ -554,6 +561,7 @@ class Space:
             raise ConfigError(
                 f"simulate: seconds is {seconds:g}, but must be {0.5 / fps:g} or more at {fps:g} frames/s"
             )
+        self._warn_of_masses()
         scene, state, layout = self.scene()
         rows = (
             4 * layout.slots * (frames - 1)
@@ -579,6 +587,18 @@ class Space:
             energy=trajectory.energy,
             quality=trajectory.quality,
         )
+
+    def _warn_of_masses(self) -> None:
+        """Log a warning if the masses of dynamic bodies differ more than contacts at rest can bear."""
+        masses = [body.mass for body in self.bodies if body.kind == DYNAMIC and math.isfinite(body.mass)]
+        safe = LARGEST_RATIO if self.physics.shock_propagation else SAFE_RATIO
+        if masses and max(masses) > safe * min(masses):
+            _log.warning(
+                "Space: masses from %.3g to %.3g kg differ by a factor of %.3g: a body that rests on one of less than "
+                "1/%g of its mass sinks in%s",
+                *(min(masses), max(masses), max(masses) / min(masses), safe),
+                "" if self.physics.shock_propagation else f"; shock_propagation=True holds up to {LARGEST_RATIO:g}",
+            )
 
     def _solver_params(self, fps: float, asked: int | None) -> tuple[SolverParams, int]:
         physics = self.physics

@@ -4,6 +4,7 @@ Each asks for what an exact solver would give; what gen2d owes is marked `asked`
 """
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -50,28 +51,85 @@ def test_sliding_body_does_not_feel_the_joints_of_a_floor(shape):
     [(10, 2e-3, 5e-4), (100, 4e-2, 1e-3), (1000, 1.1, 5e-3)],  # the last falls through
 )
 def test_heavy_box_stands_on_a_light_one(ratio, bound, asked):
-    space = Space(gravity=(0, -GRAVITY))
+    heavy_on_light(ratio, bound, asked)
+
+
+@pytest.mark.full
+@pytest.mark.parametrize(("ratio", "bound"), [(10, 5e-4), (100, 1e-3), (1000, 1e-3), (3000, 1e-3)])
+def test_heavy_box_stands_on_a_light_one_with_shock_propagation(ratio, bound):
+    heavy_on_light(ratio, bound, shock_propagation=True)
+
+
+def heavy_on_light(ratio: float, bound: float, asked: float | None = None, **physics: Any) -> None:
+    """Check that a box of `ratio` times the density stands on another one."""
+    space = Space(gravity=(0, -GRAVITY), **physics)
     space.add_segment((-10, 0), (10, 0))
     light = space.add_box((0, 0.5), 1, 1)
     heavy = space.add_box((0, 1.5), 1, 1, density=ratio)
     video = space.simulate(10, fps=60)
     sinking = 1.5 - video.position[:, heavy, 1]
-    holds(f"heavy box on a light one, {ratio}:1, sinking in 10 s, m", sinking, bound, asked)
+    holds(f"heavy box on a light one, {ratio}:1, {physics}, sinking in 10 s, m", sinking, bound, asked)
     sideways = video.position[:, [light, heavy], 0]
-    holds(f"heavy box on a light one, {ratio}:1, sideways, m", sideways, 1e-3)
+    holds(f"heavy box on a light one, {ratio}:1, {physics}, sideways, m", sideways, 1e-3)
+
+
+def test_heavy_discs_stand_on_light_ones_with_shock_propagation():
+    """Light discs between walls, each under a heavy one."""
+    space = Space(gravity=(0, -GRAVITY), shock_propagation=True)
+    floor, ratios = space.add_segment((-10, 0), (30, 0)), (3, 30, 300)
+    heavy = []
+    for k, ratio in enumerate(ratios):
+        x = 3.0 * k
+        for side in (-0.5, 0.5):
+            space.add_segment((x + side, 0), (x + side, 4), friction=0.0)
+        space.add_circle((x, 0.5), 0.5)
+        heavy.append(space.add_circle((x, 1.5), 0.5, density=ratio))
+    video = space.simulate(2, fps=60)
+    holds("heavy discs on light ones: sinking in 2 s, m", video.position[:, heavy, 1] - 1.5, 1e-3)
+    rows = video.contacts
+    weight = sum(body.mass for body in video.bodies if np.isfinite(body.mass)) * GRAVITY
+    load = rows.normal_impulse[(rows.time > 0.99) & ((rows.a == floor) | (rows.b == floor))].sum()
+    holds("heavy discs on light ones: force on the floor, of their weight", load / weight - 1, 1e-2)
 
 
 @pytest.mark.asked
 @pytest.mark.full
 def test_stack_of_ten_boxes_stands():
-    space = Space(gravity=(0, -GRAVITY))
+    stack_of_ten(3e-3, asked=1e-3)
+
+
+@pytest.mark.full
+def test_stack_of_ten_boxes_stands_with_shock_propagation():
+    stack_of_ten(2e-3, after_a_second=1e-3, shock_propagation=True)
+
+
+def stack_of_ten(bound: float, asked: float | None = None, after_a_second: float | None = None, **physics: Any) -> None:
+    """Check that ten boxes stand on each other."""
+    space = Space(gravity=(0, -GRAVITY), **physics)
     space.add_segment((-10, 0), (10, 0))
     boxes = [space.add_box((0, 0.5 + k), 1, 1) for k in range(10)]
     video = space.simulate(10, fps=60)
     last = video.position[300:, boxes]
     way = np.linalg.norm(last - last[:1], axis=-1)
-    holds("stack of 10 boxes: overlap, m", deepest_overlap(space, video), 3e-3, asked=1e-3)
-    holds("stack of 10 boxes: way in the last 5 of 10 s, m", way, 1e-4)
+    holds(f"stack of 10 boxes, {physics}: overlap, m", deepest_overlap(space, video), bound, asked)
+    holds(f"stack of 10 boxes, {physics}: way in the last 5 of 10 s, m", way, 1e-4)
+    if after_a_second is not None:
+        overlap = np.maximum(1 - np.diff(video.position[60:, boxes, 1], axis=1), 0)
+        holds(f"stack of 10 boxes, {physics}: overlap after a second, m", overlap, after_a_second)
+
+
+@pytest.mark.full
+def test_shock_propagation_changes_nothing_where_nothing_is_static():
+    paths = []
+    for shock_propagation in (False, True):
+        rng = np.random.default_rng(1)
+        space = Space(gravity=(0, 0), shock_propagation=shock_propagation)
+        for k in range(8):
+            x = np.array([k % 4, k // 4]) - [1.5, 0.5]
+            density = 10 ** rng.uniform(-2, 2)
+            space.add_box(x, 0.5, 0.7, velocity=-2 * x, spin=rng.normal(), density=density, elasticity=rng.uniform())
+        paths.append(space.simulate(1, fps=60).position)
+    holds("shock propagation without static bodies: change of the paths, m", paths[0] - paths[1], 1e-4)
 
 
 @pytest.mark.full

@@ -70,7 +70,8 @@ def test_both_forms_give_the_same_of_more_discs_than_a_word_has_bits():
 
 
 @pytest.mark.slow
-def test_both_forms_give_the_same_mixture():
+@pytest.mark.parametrize("shock_propagation", [False, True])
+def test_both_forms_give_the_same_mixture(shock_propagation):
     """Pairs of several shapes, bodies that move as they like, a joint, and forces that depend on the state."""
     space = Space((0, -9.81))
     space.add_segment((-4, 0), (0, 0.5))
@@ -89,7 +90,8 @@ def test_both_forms_give_the_same_mixture():
         return jnp.stack([jnp.cos(time) - 0.1 * state.velocity[0], 0 * state.angle]), -0.1 * state.angular_velocity
 
     def made(sparse: bool) -> trajectory.Trajectory:
-        program = jax.jit(lambda a, b: simulate(a, b, layout, rules(), 31, 4, EVERYTHING, wind, sparse))
+        params = rules(shock_propagation=shock_propagation)
+        program = jax.jit(lambda a, b: simulate(a, b, layout, params, 31, 4, EVERYTHING, wind, sparse))
         return jax.tree.map(np.asarray, axes.to_stored(program(many[0], many[1])))
 
     ours, theirs = made(True), made(False)
