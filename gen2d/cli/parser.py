@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 PROG = "python -m gen2d"
 USAGE = """\
-python -m gen2d --config YAML --n N [options]
+python -m gen2d YAML --n N [options]
        python -m gen2d VERB [options]"""
 DESCRIPTION = "Make datasets of rendered videos of 2D rigid bodies, with every ground truth."
 EXAMPLES = """\
@@ -24,10 +24,10 @@ examples:
   draw a config before making a dataset:
     python -m gen2d preview bouncing.yaml
   make 1000 videos in datasets/bouncing, then 4000 more:
-    python -m gen2d --config bouncing.yaml --n 1000
-    python -m gen2d --config bouncing.yaml --n 5000
+    python -m gen2d bouncing.yaml --n 1000
+    python -m gen2d bouncing.yaml --n 5000
   make videos of another size, with another seed, in another folder:
-    python -m gen2d --config bouncing.yaml --n 100 --set video.height=128 \\
+    python -m gen2d bouncing.yaml --n 100 --set video.height=128 \\
       --set video.width=128 --seed 7 --out /data/larger
 """
 
@@ -55,7 +55,7 @@ def parse(arguments: Sequence[str], verbs: Mapping[str, ModuleType]) -> argparse
     """Options of a command line, with the function that runs its verb as `run`.
 
     A verb is a module with `add_arguments(parser)` and `run(options)`, described by its docstring. `generate` is the
-    verb of a line that starts with an option. Raises UserError; exits after --help and --version.
+    verb of a line that starts with an option or a config. Raises UserError; exits after --help and --version.
     """
     top = argparse.ArgumentParser(
         prog=PROG,
@@ -75,11 +75,11 @@ def parse(arguments: Sequence[str], verbs: Mapping[str, ModuleType]) -> argparse
     words = list(arguments) or ["--help"]
     if words[0] in ("--help", "-h", "--version"):
         top.parse_args(words)  # exits
+    if words[0].endswith((".yaml", ".yml")):
+        words.insert(0, "--config")
     verb, *words = ["generate", *words] if words[0].startswith("-") else words
     if verb not in verbs:
-        is_config = verb.endswith((".yaml", ".yml"))
-        hint = f"did you mean --config {verb}?" if is_config else nearest(verb, [*verbs])
-        raise UserError(f"{verb!r} is not a verb; {hint}")
+        raise UserError(f"{verb!r} is not a verb; {nearest(verb, [*verbs])}")
     parser = parser_of[verb]
     verbs[verb].add_arguments(parser)
     parser.check_names(words)
@@ -212,5 +212,16 @@ def _worker_limits(text: str) -> tuple[int, int | None]:
     return int(low or 1), (int(high) if high else None) if colon else int(low)
 
 
-whole_number = argument(int, "a whole number, such as 100")
+def _whole_number(text: str) -> int:
+    """A whole number such as 100, 10_000 or 1e5."""
+    try:
+        return int(text)
+    except ValueError:
+        number = float(text)
+        if not number.is_integer() or abs(number) >= 2**53:  # beyond, a float is not exact
+            raise
+        return int(number)
+
+
+whole_number = argument(_whole_number, "a whole number, such as 100")
 _seconds = argument(float, "a number of seconds, such as 30")

@@ -7,12 +7,12 @@ import sys
 from pathlib import Path
 
 import bench
+import bench_demos
 import bench_physics
 import bench_render
 import bench_storage
 import charts
 import cv2
-import demos
 import h5py
 import numpy as np
 import peer
@@ -42,13 +42,13 @@ def test_the_peer_makes_the_scene_of_the_config() -> None:
     assert peer.FRAMES * peer.SIZE**2 * 3 == bench.FRAMES_BYTES
 
 
-@pytest.mark.parametrize("demo", demos.DEMOS, ids=lambda demo: demo.build.__name__)
-def test_a_demonstration_begins_alike_in_all_engines(demo: demos.Demo) -> None:
-    space = demos.Space(gravity=(0, -demos.GRAVITY))
+@pytest.mark.parametrize("demo", bench_demos.DEMOS, ids=lambda demo: demo.build.__name__)
+def test_a_demonstration_begins_alike_in_all_engines(demo: bench_demos.Demo) -> None:
+    space = bench_demos.Space(gravity=(0, -bench_demos.GRAVITY))
     demo.build(space)
-    moving = [k for k, body in enumerate(space.bodies) if body.kind == demos.DYNAMIC]
+    moving = [k for k, body in enumerate(space.bodies) if body.kind == bench_demos.DYNAMIC]
     own = np.array([(*b.position, b.angle, *b.velocity, b.spin, b.mass) for b in space.bodies])[moving]
-    for engine in (demos.in_box2d, demos.in_chipmunk):
+    for engine in (bench_demos.in_box2d, bench_demos.in_chipmunk):
         world = engine(space)  # Box2D's bodies end with their world
         np.testing.assert_allclose(np.array(world.state())[moving], own, atol=1e-5, rtol=1e-5)
 

@@ -50,6 +50,12 @@ def test_generate_is_the_verb_of_a_line_without_one() -> None:
     assert bare["worker"] == (1, 4)
 
 
+@pytest.mark.parametrize(("text", "number"), [("7", 7), ("10_000", 10_000), ("1e5", 100_000), ("2.5e3", 2500)])
+def test_a_line_may_begin_with_a_config_and_numbers_have_any_form(text: str, number: int) -> None:
+    options = parse(["a.yaml", "--n", text], VERBS)
+    assert (options.config, options.n, options.run) == ("a.yaml", number, VERBS["generate"].run)
+
+
 @pytest.mark.parametrize(("verb", "name"), OPTIONS)
 def test_an_option_cut_short_is_an_error_that_names_it(verb: str, name: str) -> None:
     if (verb, name[:-1]) in OPTIONS:
@@ -71,7 +77,9 @@ def test_a_misspelt_verb_is_an_error_that_names_it(verb: str) -> None:
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
-        (("bouncing.yaml",), "'bouncing.yaml' is not a verb; did you mean --config bouncing.yaml?"),
+        (("a.yaml", "--n", "1e400"), "--n: '1e400' is not a whole number, such as 100; see "),
+        (("a.yaml", "--n", "0.5"), "--n: '0.5' is not a whole number, such as 100; see "),
+        (("bouncing",), "'bouncing' is not a verb; "),
         (("--config", "a.yaml", "--n", "many"), "--n: 'many' is not a whole number, such as 100; see "),
         (("--config", "a.yaml", "--n", "1", "extra"), "'extra' is one argument too many; see "),
         (("--config", "a.yaml"), "the following arguments are required: --n; see python -m gen2d generate --help"),

@@ -98,10 +98,13 @@ def bin_of(count: int, width: float) -> Case:
     return Case(discs, [{**FLOOR, "friction": np.sqrt(0.5)}, *sides], DOWN)
 
 
-@pytest.mark.parametrize(("count", "width"), [(32, 6.0), pytest.param(64, 8.0, marks=pytest.mark.slow)])
-def test_full_bin_rests(count, width):
+@pytest.mark.parametrize(
+    ("count", "width", "bound", "asked"),
+    [(32, 6.0, 3e-3, None), pytest.param(64, 8.0, 5e-3, 3e-3, marks=[pytest.mark.slow, pytest.mark.asked])],
+)
+def test_full_bin_rests(count, width, bound, asked):
     depth, way, speed = rest_measures(bin_of(count, width), count, settle=15)
-    holds(f"Rest: bin of {count}, overlap, m", np.maximum(depth, 0), 0.003)
+    holds(f"Rest: bin of {count}, overlap, m", np.maximum(depth, 0), bound, asked)
     holds(f"Rest: bin of {count}, speed, m/s", speed, 1e-3)
     holds(f"Rest: bin of {count}, way in 10 s, m", way, 1e-3)
 

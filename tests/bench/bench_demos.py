@@ -1,6 +1,6 @@
 """Demonstrations of other engines, rebuilt in gen2d, Box2D 2.3 and Chipmunk (pymunk), side by side.
 
-    python tests/bench/demos.py            # about 4 minutes; a table in Markdown
+    python tests/bench/bench_demos.py            # about 4 minutes; a table in Markdown
 
 Each is built once, as a `gen2d.Space`, and translated. All engines take steps of 1/240 s; Box2D has 8 iterations for
 velocities and 3 for positions, Chipmunk has 10. Bodies have no elasticity and friction .49 between them. Overlaps are
