@@ -162,7 +162,7 @@ def test_the_command_line_tells_what_it_did(tmp_path: Path):
         ["--config", "/dev/zero", "--n", "1"],
         ["--config", ".", "--n", "1"],
         ["--config", "bouncing.yaml", "--n", "99999999999999999999"],
-        ["--config", "bouncing.yaml", "--n", "1", "--seed", "1e3"],
+        ["--config", "bouncing.yaml", "--n", "1", "--seed", "1.5"],
         ["--config", "bouncing.yaml", "--n", "1", "--split", ""],
         ["--config", "bouncing.yaml", "--n", "1", "--set", "a"],
         ["--config", "bouncing.yaml", "--n", "1", "--set", "=1"],

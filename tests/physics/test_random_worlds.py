@@ -68,7 +68,7 @@ MANY_BOUNDS: dict[str, Bounds] = {
     "mass ratios up to 1e6": {**RARE, LEFT: 0.05, RISING: 0.3},
     "smooth elastic boxes": {RISING: None, GAINING: None},
     "smooth elastic boxes and fast small discs": {LEFT: None, RISING: None},
-    "joints, with gravity": {NOT_FINITE: 0.03, LEFT: 0.07, RISING: 1.0, GAINING: 0.2, SLIPPING: 1e-5},
+    "joints, with gravity": {NOT_FINITE: 0.03, LEFT: 0.07, RISING: 1.0, GAINING: 0.2, SLIPPING: 1e-5, IDLE: 1e-5},
     "joints, without": {**RARE, NOT_FINITE: None, RISING: 0.8, GAINING: 0.08},
 }
 
