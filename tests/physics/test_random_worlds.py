@@ -93,7 +93,9 @@ def check_laws(name: str, batches: list[Measures], bounds: Bounds, rarely: float
         of, bound = np.concatenate(parts), bounds.get(law, 0.0)
         asked = 0.0 if bound else None
         holds(f"{name}: share of {len(of)} {law}", of.mean(), rarely if bound is None else bound, asked)
-    assert all((m.contacts.count <= m.rows.shape[1]).all() for m in batches), "there was no room for all rows"
+    # A world that explodes may touch more often than there are rows.
+    crowded = np.concatenate([(m.contacts.count > m.rows.shape[1]) & m.finite & ~(m.gain > 1) for m in batches])
+    assert not crowded.any(), f"there was no room for all rows of {crowded.sum()} worlds"
 
 
 @functools.cache
