@@ -4,6 +4,7 @@ A batch holds any number of pairs: all pairs of a round (all_pairs.py) or a chun
 """
 
 import functools
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
@@ -57,20 +58,31 @@ class _SeenPair(NamedTuple):
     taken: Array | float  # 1/kg, from the coupling of two points
 
 
+def _rests(targets: Sequence[NormalTarget]) -> Array:
+    """Whether no point of a contact bounces."""
+    return ~functools.reduce(jnp.logical_or, [target.bounces for target in targets])
+
+
 def _seen_pair(
-    constraint: ContactConstraint, pair: SolvedPair, target_of: TargetOf, a: BodySide, b: BodySide
+    constraint: ContactConstraint,
+    pair: SolvedPair,
+    target_of: TargetOf,
+    speeds: list[Array],
+    a: BodySide,
+    b: BodySide,
 ) -> _SeenPair:
     assert b.motion is not None, "only static bodies lack a motion"
     contacts, motions = pair.contacts, (a.motion, b.motion)
-    speeds = [relative_speed(contact.frame, contact.normal, *motions)[0] for contact in contacts]
     supported = supported_pair(constraint, contacts[0].normal, (a.support, b.support))
     if supported is None:
         targets = [target_of(*of) for of in zip(contacts, speeds, pair.impulses, strict=True)]
         return _SeenPair(None, None, contacts, speeds, targets, 0.0)
-    borne = [supported.speed(contact, motions) for contact in contacts]
-    borne = [jnp.where(c.tau < 0, x, y) for c, x, y in zip(contacts, borne, speeds, strict=True)]
+    borne = [
+        jnp.where(contact.tau < 0, supported.speed(contact, speed, motions), speed)
+        for contact, speed in zip(contacts, speeds, strict=True)
+    ]
     targets = [target_of(*of) for of in zip(contacts, borne, pair.impulses, strict=True)]
-    rests = ~functools.reduce(jnp.logical_or, [target.bounces for target in targets])
+    rests = _rests(targets)
     speeds = [jnp.where(rests, x, y) for x, y in zip(borne, speeds, strict=True)]
     taken = supported.coupling(contacts[0], contacts[1], rests) if len(contacts) == 2 else 0.0
     contacts = [contact._replace(frame=supported.frame(contact, rests)) for contact in contacts]
@@ -99,7 +111,7 @@ def _press_again(
 
     Friction stays within Coulomb's bound.
     """
-    rests = ~(targets[0].bounces | targets[1].bounces)
+    rests = _rests(targets)
     speeds = [relative_speed(contact.frame, contact.normal, *motions)[0] for contact in contacts]
     normals = materialize(solve_normals(constraint, contacts, speeds, impulses, targets))
     new = []
@@ -117,7 +129,8 @@ def _apply_pass(
     """Both sides and the pair after normal impulses, friction and rolling resistance."""
     assert b.motion is not None, "only static bodies lack a motion"
     before, roll, impulses = (a.motion, b.motion), pair.roll, []
-    seen = _seen_pair(constraint, pair, target_of, a, b)
+    speeds, slips = zip(*(relative_speed(c.frame, c.normal, *before) for c in pair.contacts), strict=True)
+    seen = _seen_pair(constraint, pair, target_of, list(speeds), a, b)
     targets = seen.targets
     normals = materialize(solve_normals(constraint, seen.contacts, seen.speeds, pair.impulses, targets, seen.taken))
     if seen.supported is not None:
@@ -125,7 +138,7 @@ def _apply_pass(
     if constraint.frame is not None and roll is None:
         # The normal impulse between two discs adds no slip, so both impulses follow from the same velocities.
         (contact,), (old,), (normal,), (target,) = pair.contacts, pair.impulses, normals, targets
-        speed, slip = relative_speed(contact.frame, contact.normal, *before)
+        (speed,), (slip,) = speeds, slips
         tangent = materialize(friction_impulse(constraint, contact, normal, slip, old, target.apart))
         impulses.append(Impulse(normal, tangent))
         change = impulse_change(impulses[0], old)

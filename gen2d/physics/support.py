@@ -26,7 +26,6 @@ from gen2d.physics.constraint import (
     Inertia,
     Motion,
     reciprocal,
-    relative_speed,
 )
 from gen2d.records.axes import Array
 
@@ -97,9 +96,8 @@ class SupportedPair(NamedTuple):
     supports: tuple[Support, Support]
     pressed: tuple[Array, Array]  # whether the contact presses the body, which is the lighter, onto what bears it
 
-    def speed(self, contact: ActiveContact, motions: Motions) -> Array:
-        """Normal speed of b relative to a at a point after the support's impulses, m/s."""
-        speed, _ = relative_speed(contact.frame, contact.normal, *motions)
+    def speed(self, contact: ActiveContact, speed: Array, motions: Motions) -> Array:
+        """Normal speed of b relative to a at a point after the support's impulses, m/s; `speed` is that before."""
         taken, of = [], zip(self.inertia, self.supports, self.pressed, motions, _normals(contact), strict=True)
         for inertia, support, pressed, motion, direction in of:
             assert motion is not None, "both bodies move"

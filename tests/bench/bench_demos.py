@@ -1,6 +1,6 @@
 """Demonstrations of other engines, rebuilt in gen2d, Box2D 2.3 and Chipmunk (pymunk), side by side.
 
-    python tests/bench/bench_demos.py            # about 4 minutes; a table in Markdown
+    python tests/bench/bench_demos.py            # about 10 minutes; a table in Markdown
 
 Each is built once, as a `gen2d.Space`, and translated. All engines take steps of 1/240 s; Box2D has 8 iterations for
 velocities and 3 for positions, Chipmunk has 10. Bodies have no elasticity and friction .49 between them. Overlaps are
@@ -16,11 +16,17 @@ import warnings
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pymunk
 import pymunk.constraints
 
 from gen2d.core.enums import DYNAMIC, KINEMATIC, STATIC
+from gen2d.physics.inertia import polygon_mass
+from gen2d.physics.params import solver_params
+from gen2d.physics.simulate import SaveAt, simulate
+from gen2d.records import axes
 from gen2d.space.space import Space
 
 with warnings.catch_warnings():  # raised by types of SWIG
@@ -144,11 +150,6 @@ class Run(NamedTuple):
     cost: float
 
 
-def corners_of(body: Any) -> np.ndarray:
-    """Corners [V, 2] of a polygon in its own frame, m."""
-    return np.asarray(body.vertices, float)
-
-
 class World(NamedTuple):
     """A scene in another engine."""
 
@@ -182,7 +183,7 @@ def in_box2d(space: Space) -> World:
         body = create[own.kind](position=own.position, angle=own.angle, allowSleep=False)
         body.linearVelocity, body.angularVelocity = own.velocity.tolist(), own.spin
         if len(own.vertices):
-            shape = Box2D.b2PolygonShape(vertices=corners_of(own).tolist())
+            shape = Box2D.b2PolygonShape(vertices=own.vertices.tolist())
         elif own.half_length:
             shape = Box2D.b2EdgeShape(vertices=[(-own.half_length, 0), (own.half_length, 0)])
         else:
@@ -219,7 +220,7 @@ def in_chipmunk(space: Space) -> World:
         body.position, body.angle = own.position.tolist(), own.angle
         body.velocity, body.angular_velocity = own.velocity.tolist(), own.spin
         if len(own.vertices):
-            shape = pymunk.Poly(body, corners_of(own).tolist())
+            shape = pymunk.Poly(body, own.vertices.tolist())
         elif own.half_length:
             shape = pymunk.Segment(body, (-own.half_length, 0), (own.half_length, 0), own.radius)
         else:
@@ -244,13 +245,6 @@ def in_chipmunk(space: Space) -> World:
 
 def in_gen2d(space: Space) -> Run:
     """Run in gen2d, and its cost in a batch."""
-    import jax
-    import jax.numpy as jnp
-
-    from gen2d.physics.params import solver_params
-    from gen2d.physics.simulate import SaveAt, simulate
-    from gen2d.records import axes
-
     video = space.simulate(SECONDS, fps=FPS, contacts=0)
     scene, state, layout = space.scene()
     many = [
@@ -272,8 +266,7 @@ def density_of(body: Any) -> float:
         return 0.0
     if not len(body.vertices):
         return body.mass / (math.pi * body.radius**2)
-    (x, y), (u, v) = corners_of(body).T, np.roll(corners_of(body), -1, axis=0).T
-    return body.mass / (0.5 * float(np.sum(x * v - u * y)))
+    return body.mass / float(polygon_mass(jnp.asarray(body.vertices), jnp.ones(())))
 
 
 # ---- The table

@@ -120,6 +120,8 @@ def test_a_cluster_may_lose_and_gain_machines(cluster: Cluster, tmp_path: Path):
         for node in (foreign, late):
             if node:
                 cluster.remove_node(node)
+        # The process of a driver that is given a machine whose death Ray has not noticed ends without a word.
+        cluster.wait_for_nodes(timeout=60)
 
 
 @pytest.mark.full
