@@ -6,7 +6,6 @@ frames that must be rendered need jax, and a process that was not forked.
 
 import contextlib
 import dataclasses
-import difflib
 import fnmatch
 import math
 from collections.abc import Collection, Generator, Iterator, Mapping, Sequence
@@ -24,7 +23,9 @@ from gen2d.loading.chunks import Chunk, Reader, SplitFiles
 from gen2d.loading.column import LAYOUTS, Column
 from gen2d.loading.concat import ConcatDataset
 from gen2d.loading.epochs import check_one_of, epoch_indices
+from gen2d.loading.fields import suggestion
 from gen2d.loading.protocols import Batch, Key, Numbers, Snapshot, checked_numbers, item, read_batch, unbatch
+from gen2d.loading.selection import Selectable
 from gen2d.storage import codecs
 from gen2d.storage.cache import Cache
 from gen2d.storage.explain import reason
@@ -275,17 +276,25 @@ def window_fields(begins: np.ndarray, options: ViewOptions, frame_times: np.ndar
 _HINT = "gen2d verify finds all such damage"
 
 
-class Dataset:
+class Dataset(Selectable):
     """One split of a dataset, as `gen2d.open` returns it; also a map-style dataset for torch and grain.
 
     `ds[i]` is a video, a dictionary of NumPy arrays by field name; `ds[2:5]` and `ds[[2, 7]]` are batches, whose arrays
     have a leading axis of videos. `info` lists the axes and the unit of each field. A `Dataset` can be pickled, and can
-    be read from several threads at once.
+    be read from several threads at once. `select` and `filter` give datasets of some of the videos, `to_pandas` and
+    `to_arrow` tables of their values.
 
     Attributes
     ----------
     fields : dict of str to Field
-        dtype, axes, unit and meaning of each field as stored, before window, layout and dtype are applied.
+        dtype, axes, unit and meaning of each field as stored, before window, layout and dtype are applied; `codes` are
+        the names of its codes, if it has some.
+    splits : dict of str to int
+        Number of videos of each split of the dataset.
+    config : mapping
+        The resolved config of the dataset, as plain values.
+    fps : float
+        Frames per second.
     stats : dict
         Mean, std, min and max of each component of the frames and states, by field, over the sample that
         `manifest.stats_sampled` describes. Units are those of the stored values: frames are from 0 to 255 even with
@@ -362,8 +371,52 @@ class Dataset:
         """List of videos; torch's DataLoader calls this method once per batch."""
         return unbatch(self.batch(indices))
 
-    def __repr__(self) -> str:
-        return f"<{len(self)} {self.options.split} videos of {self.root}: {', '.join(self.fields)}>"
+    @property
+    def splits(self) -> dict[str, int]:
+        """Number of videos of each split of the dataset."""
+        return dict(self.manifest.splits)
+
+    @property
+    def config(self) -> Mapping[str, Any]:
+        """The resolved config of the dataset, as plain values."""
+        return self.manifest.config
+
+    @property
+    def fps(self) -> float:
+        """Frames per second."""
+        return self.manifest.fps
+
+    @property
+    def stored_fields(self) -> Mapping[str, Field]:
+        """All stored fields of the dataset, by name, whichever were opened."""
+        return self.manifest.fields
+
+    @property
+    def stored_sizes(self) -> Mapping[str, int]:
+        """Sizes of the axes of the stored fields."""
+        return self.manifest.sizes
+
+    @property
+    def short_name(self) -> str:
+        """Name of the dataset for error messages."""
+        return f"{self.root}"
+
+    @property
+    def title(self) -> str:
+        """First line of the description."""
+        return f"{len(self):,} {self.options.split} videos of {self.root}"
+
+    @property
+    def details(self) -> list[str]:
+        """Further lines of the description."""
+        options, others = self.options, [name for name in self.manifest.splits if name != self.options.split]
+        size = f" of {self.sizes['W']} x {self.sizes['H']} px" if {"W", "H"} <= self.sizes.keys() else ""
+        lines = [f"{self._frames} frames{size}, {self.fps:g} per second"]
+        if options.window is not None and options.window_fields:
+            start = "at random" if options.is_random else f"at frame {options.first}"
+            lines.append(f"windows of {options.window} frames, {start}, stride {options.stride}")
+        lines += [f"layout {options.layout}, frames {options.dtype}"] if "frames" in self.fields else []
+        return lines + ([f"other splits: {', '.join(others)}"] if others else [])
 
     @property
     def exact(self) -> bool:
@@ -452,6 +505,20 @@ class Dataset:
                     self._read(read, column, chunk, int(numbers[step]), column.chunk_view(buffer, number))
                 if scratch is not None:
                     column.convert(scratch, begin, target)
+
+    def stored(self, names: Sequence[str], indices: Numbers) -> Batch:
+        """Stored values of whole videos, [n, ...] by field name, whatever was opened; raises the errors of `batch`.
+
+        Parameters
+        ----------
+        names : sequence of str
+            Names of stored fields.
+        indices : sequence of int [n]
+            Indices of the videos.
+        """
+        whole = {"window": None, "stride": 1, "start": "first", "layout": "THWC", "dtype": "uint8"}
+        options = dataclasses.replace(self.options, fields=tuple(names), **whole)
+        return Dataset(self.root, self.manifest, options).batch(indices)
 
     def _begins(self, numbers: np.ndarray, starts: Numbers | None) -> np.ndarray:
         """First frame of the window of each of these videos. Raises ConfigError if `starts` do not fit."""
@@ -549,7 +616,7 @@ def _select_split(root: Place, manifest: Manifest, split: str | None) -> str:
     if split is None:
         return "train" if "train" in splits else next(iter(splits))
     if split not in splits:
-        raise ConfigError(f"{root} has no split {split!r}{_suggestion(split, splits)}")
+        raise ConfigError(f"{root} has no split {split!r}{suggestion(split, splits)}")
     return split
 
 
@@ -571,14 +638,9 @@ def select_fields(
         matches = [pattern] if pattern in rendered else fnmatch.filter(names, pattern)
         if not matches:
             known = dict.fromkeys([*names, *rendered])
-            raise ConfigError(f"{source} has no field {pattern!r}{_suggestion(pattern, known)}")
+            raise ConfigError(f"{source} has no field {pattern!r}{suggestion(pattern, known)}")
         selected |= dict.fromkeys(matches)
     return tuple(selected)
-
-
-def _suggestion(name: str, names: Sequence[str] | Mapping[str, Any]) -> str:
-    near = difflib.get_close_matches(name, [*names], n=1, cutoff=0.4)
-    return f": did you mean {near[0]!r}?" if near else f": it has {', '.join(names)}"
 
 
 def _check_cache(options: ViewOptions, largest: int) -> None:

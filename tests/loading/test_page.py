@@ -4,7 +4,6 @@ import re
 from pathlib import Path
 
 import pytest
-import synthetic
 from packages import require
 
 import gen2d
@@ -18,8 +17,9 @@ OTHERS = "torch", "torchdata", "lightning", "accelerate", "grain", "tensorflow",
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Folder with the dataset that the blocks name."""
     home = tmp_path_factory.mktemp("page")
-    sizes = {"T": 28, "H": 8, "W": 8, "K": 3}
-    synthetic.make(synthetic.dataset(home / "datasets" / "bouncing", train=32, sizes=sizes))
+    scene = {"name": "bouncing", "balls": [2, 8], "gravity": [0, [-20, 0]], "radius": 0.4}
+    video = {"frames": 28, "height": 16, "width": 16}
+    gen2d.generate({"scene": scene, "video": video}, 32, home / "datasets" / "bouncing")
     return home
 
 

@@ -27,6 +27,8 @@ def train(root: Path) -> float:
     for tensors in gen2d.DataLoader(ds, batch_size=8, epochs=1, to="torch", device="cpu"):
         assert_type(tensors, dict[str, torch.Tensor])
         total += tensors["frames"].float().mean().item()
+    few = ds.filter("factors/balls > 3").select([0, 1])
+    print(len(few), ds.splits, ds.fps, ds.config["scene"], ds.fields["objects/kind"].codes, few.to_pandas())
     videos = assert_type(gen2d.torch.dataset(ds, seed=1), gen2d.torch.VideoDataset)
     videos.set_epoch(3)
     order = gen2d.torch.sampler(videos)
