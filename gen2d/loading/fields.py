@@ -28,16 +28,16 @@ MOST = 12  # names in a list
 def suggestion(name: str, names: Iterable[str]) -> str:
     """End of a sentence that says that there is no field of this name: the option that makes it, or close names."""
     known = list(names)
-    group, separator, _ = name.rpartition("/")
-    own = [each for each in known if each.rpartition("/")[0] == group] if separator else known
-    near = difflib.get_close_matches(name, own, 1, CLOSE) or difflib.get_close_matches(name, known, 1, CLOSE)
+    group, separator, last = name.rpartition("/")
+    own = {each.rpartition("/")[2]: each for each in known if each.rpartition("/")[0] == group} if separator else {}
+    near_own = [own[each] for each in difflib.get_close_matches(last, own, 1, CLOSE)]
+    near = near_own or ([] if own else difflib.get_close_matches(name, known, 1, CLOSE))
     maker = next((option for begin, option in MAKERS.items() if name.startswith(begin)), None)
-    has_group = bool(separator) and bool(own)
-    if maker is not None and not (has_group and near):
+    if maker is not None and not near_own:
         renders = "render={} in gen2d.open renders it, and " if name.startswith(RENDERED) else ""
         return f", which is not stored: {renders}the option {maker} of gen2d.generate stores it"
     if near:
         return f": did you mean {near[0]!r}?"
-    listed = own or known
+    listed = list(own.values()) or known
     more = f" and {len(listed) - MOST} more" if len(listed) > MOST else ""
     return f": it has {', '.join(listed[:MOST])}{more}"
