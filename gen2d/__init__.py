@@ -68,7 +68,10 @@ __all__ = [
     "mix", "open", "plot", "preview", "render", "render_soft", "simulate_again", "stream", "verify",
 ]  # fmt: skip
 
-__getattr__, __dir__ = attach(__name__, _HOMES)
+__getattr__, __dir__ = attach(__name__, _HOMES, ("grain", "torch"))
+if TYPE_CHECKING:
+    from gen2d import grain as grain
+    from gen2d import torch as torch
 
 # XLA reads it when jax is imported. Its log says that it is slow, and nothing that is not raised as an error too.
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")

@@ -2,6 +2,7 @@
 
 import doctest
 import importlib
+import importlib.util
 import shutil
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,13 @@ import gen2d
 
 PACKAGE = Path(gen2d.__file__).parent
 ROOTS = PACKAGE, PACKAGE / "renderers"  # the latter is a link
-TEXTS = {path: path.read_text(encoding="utf-8") for root in ROOTS for path in sorted(root.rglob("*.py"))}
+WITHOUT_TORCH = {PACKAGE / "torch.py"} if importlib.util.find_spec("torch") is None else set[Path]()
+TEXTS = {
+    path: path.read_text(encoding="utf-8")
+    for root in ROOTS
+    for path in sorted(root.rglob("*.py"))
+    if path not in WITHOUT_TORCH
+}
 SHORTER = {"10_000": "64", '"cuda"': '"cpu"', "epochs=10": "epochs=1"}  # fewer videos, on what there is
 
 
@@ -60,6 +67,8 @@ def test_examples_show_what_they_say(name: str, folder: Path, tmp_path: Path, mo
     test = EXAMPLES[name]
     if any('to="torch"' in example.source for example in test.examples):
         require("torch")
+    if any("to_pandas" in example.source for example in test.examples):
+        require("pandas")
     for example in test.examples:
         for long, short in SHORTER.items():
             example.source = example.source.replace(long, short)

@@ -24,7 +24,7 @@ LAYERS = (
     ("records", "xla", "storage"),
     ("config", "dataset", "media"),
     ("renderers", "physics", "loading"),
-    ("sampling", "annotations", "captions", "page"),
+    ("sampling", "annotations", "captions", "page", "grain", "torch"),
     ("scenes",),
     ("programs", "engines"),
     ("space",),

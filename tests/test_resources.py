@@ -45,7 +45,7 @@ def held() -> Counter[str]:
 
 def read(toy: Path, _: Path) -> None:
     for window in (None, 2):
-        gen2d.open(toy, fields="*", window=window)[:]
+        gen2d.open(toy, fields="*", window=window, start="first")[:]
 
 
 def read_url(toy: Path, folder: Path) -> None:

@@ -13,7 +13,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK=1 PIP_QUIET=2
 unset PYTHONPATH
 
 # Loading, datasets, exports, images, servers, clusters, configs, joints (SciPy), rendering, and Box2D and pymunk.
-tests="loading/test_dataset.py loading/test_dataloader.py loading/test_frameworks.py dataset/test_shards.py
+tests="loading/test_dataset.py loading/test_dataloader.py loading/test_frameworks.py loading/test_torch.py dataset/test_shards.py
     dataset/test_cards.py exports/test_exports.py media/test_images.py storage/test_codecs.py storage/test_remote.py
     engines/test_engines.py config/test_config.py physics/test_rigid_joints.py renderers/test_camera.py"
 

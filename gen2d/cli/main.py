@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 from gen2d.cli import clean, export, generate, info, listing, plot, preview, verify, view
 from gen2d.cli.parser import parse
-from gen2d.core.errors import Error
+from gen2d.core.errors import Error, command_line
 from gen2d.core.progress import logged_to_stderr
 from gen2d.engines.protocol import HeadLostError
 from gen2d.storage.explain import reading_error
@@ -35,8 +35,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")  # not every terminal encodes every character
     try:
-        options = parse(sys.argv[1:] if arguments is None else arguments, VERBS)
-        with logged_to_stderr():
+        with command_line(), logged_to_stderr():
+            options = parse(sys.argv[1:] if arguments is None else arguments, VERBS)
             code = options.run(options)
         sys.stdout.flush()
         return code

@@ -30,7 +30,7 @@ from gen2d.config.sections import (
 )
 from gen2d.config.splits import CHANGES, Split, distributions_of_splits, with_splits
 from gen2d.core import palettes
-from gen2d.core.errors import ConfigError
+from gen2d.core.errors import ConfigError, argument
 from gen2d.storage.explain import reason
 from gen2d.storage.sealed import read_bytes
 
@@ -93,7 +93,9 @@ class Config:
         """Index of a split in the config; 0 if there are no splits. Raises ConfigError if the name is unknown."""
         split_names = [s.name for s in self.splits]
         if split_names and split not in split_names:
-            raise ConfigError(f"--split is {split!r}, but must be one of the config's: {', '.join(split_names)}")
+            raise ConfigError(
+                f"{argument('split')} is {split!r}, but must be one of the config's: {', '.join(split_names)}"
+            )
         return split_names.index(split) if split_names else 0
 
     @property
@@ -136,10 +138,10 @@ def _merge_section(section: Mapping[str, Any], changes: Any) -> Any:
     return {**section, **changes} if changes.get("name", name) == name else dict(changes)
 
 
-def checked_seed(value: Any, what: str = "--seed") -> int:
-    """The seed, an integer from 0 to 2**63 - 1. Raises ConfigError, naming `what`, if it is anything else."""
+def checked_seed(value: Any, what: str = "") -> int:
+    """The seed, an integer from 0 to 2**63 - 1. Raises ConfigError, naming `what`, for other values."""
     if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value <= MAX_SEED:
-        raise ConfigError(f"{what} is {value!r}, but must be a whole number from 0 to 2**63 - 1")
+        raise ConfigError(f"{what or argument('seed')} is {value!r}, but must be a whole number from 0 to 2**63 - 1")
     return value
 
 

@@ -10,7 +10,7 @@ from types import ModuleType
 from typing import Any, TypeGuard
 
 from gen2d.config.contracts import Annotation, Export, Family, Look
-from gen2d.core.errors import ConfigError
+from gen2d.core.errors import ConfigError, argument
 
 # For each kind of plug-in, its package and the type of the constant that declares it, such as FAMILY = Family(...).
 KINDS = {
@@ -33,12 +33,13 @@ def names(kind: str) -> list[str]:
     return sorted(module.name for module in pkgutil.iter_modules(importlib.import_module(KINDS[kind][0]).__path__))
 
 
-def load(kind: str, name: str, where: str = "--set", content: bytes = b"") -> Any:
+def load(kind: str, name: str, where: str = "", content: bytes = b"") -> Any:
     """The contract declared by a built-in plug-in, or by the user file with this path and `content`.
 
     Raises ConfigError, beginning with `where`, if the name is unknown, or if the file fails to run or does not declare
     a contract of this kind.
     """
+    where = where or argument("set")
     if not is_user_file(name) and name not in names(kind):
         raise ConfigError(f"{where} is {name!r}, which is not known; {nearest(name, names(kind))}")
     try:
@@ -116,8 +117,10 @@ def find_config(name: str) -> pathlib.Path:
     if path.is_file():
         return path
     if name and path.is_dir():
-        raise ConfigError(f"--config is {name!r}, which is a folder; name a YAML file")
+        raise ConfigError(f"{argument('config')} is {name!r}, which is a folder; name a YAML file")
     for candidate in (path.name, f"{path.name}.yaml"):
         if path.parent == pathlib.Path() and (config_folder() / candidate).is_file():
             return config_folder() / candidate
-    raise ConfigError(f"--config is {name!r}, but there is no such file; {nearest(path.name, config_names())}")
+    raise ConfigError(
+        f"{argument('config')} is {name!r}, but there is no such file; {nearest(path.name, config_names())}"
+    )

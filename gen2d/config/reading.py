@@ -10,7 +10,7 @@ from ruamel.yaml.error import YAMLError
 from ruamel.yaml.events import AliasEvent, CollectionEndEvent, CollectionStartEvent, DocumentStartEvent, ScalarEvent
 
 from gen2d.config.plugin_options import named
-from gen2d.core.errors import ConfigError
+from gen2d.core.errors import ConfigError, argument
 
 YAML_BYTES = 2**20  # size of a config file, at most
 YAML_DEPTH, YAML_NODES = 40, 50_000  # levels and nodes of a text, at most; an alias counts as its expanded nodes
@@ -87,13 +87,17 @@ def overridden(values: dict, overrides: Sequence[str]) -> dict:
         user_file = re.fullmatch(r"(annotations)\.(.+\.py)(?:\.([^.]+))?", path.strip())  # a file's path may have dots
         keys = [key for key in user_file.groups() if key] if user_file else path.strip().split(".")
         if not equals or not all(keys):
-            raise ConfigError(f"--set is {text!r}, but must be section.option=value, such as physics.substeps=8")
+            raise ConfigError(
+                f"{argument('set')} is {text!r}, but must be section.option=value, such as physics.substeps=8"
+            )
         mapping = values
         for key in keys[:-1]:
             inner = mapping.get(key)
             if not isinstance(inner, str | Mapping | None):
-                raise ConfigError(f"--set is {text!r}, but {key} is {inner!r}, which has no options of its own")
+                raise ConfigError(
+                    f"{argument('set')} is {text!r}, but {key} is {inner!r}, which has no options of its own"
+                )
             mapping[key] = dict(named(inner) or {})
             mapping = mapping[key]
-        mapping[keys[-1]] = parse_yaml(value, f"--set {path}")
+        mapping[keys[-1]] = parse_yaml(value, f"{argument('set')} {path}")
     return values

@@ -13,7 +13,7 @@ import time
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
-from gen2d.core.errors import ConfigError, UntrustedError
+from gen2d.core.errors import ConfigError, UntrustedError, argument
 from gen2d.storage.sealed import open_regular, sha256
 
 _HASH = re.compile(r"[0-9a-f]{64}")
@@ -36,14 +36,16 @@ def check_trusted(copies: Mapping[str, bytes], trust: str | Sequence[str], root:
     trusted = {trust} if isinstance(trust, str) else set(trust)
     for entry in trusted:
         if not isinstance(entry, str) or not _HASH.fullmatch(entry):
-            raise ConfigError(f"--trust is {entry!r}, but must be the sha256 of a file, 64 hexadecimal digits")
+            raise ConfigError(
+                f"{argument('trust')} is {entry!r}, but must be the sha256 of a file, 64 hexadecimal digits"
+            )
     digests = {path: sha256(content) for path, content in copies.items()}
     allowed = trusted | _read_list() if digests.keys() and not set(digests.values()) <= trusted else trusted
     for path, digest in sorted(digests.items()):
         if digest not in allowed:
             raise UntrustedError(
                 f"{root}/{path} is code that came with the dataset and would have to run: read it, and if you trust "
-                f"it say --trust {digest} (in Python trust={digest!r}), or add that line to {list_path()}"
+                f"it say {argument('trust', digest)}, or add that line to {list_path()}"
             )
 
 

@@ -1,5 +1,8 @@
 """Errors that end a command: one sentence each, and an exit code."""
 
+import contextlib
+from collections.abc import Generator
+
 LONGEST = 800  # characters of a message; longer messages lose their middle
 
 
@@ -52,3 +55,32 @@ class UnreachableError(Error):
     """A server or disk that does not respond; the data itself may be intact. Exit code 3."""
 
     exit_code = 3
+
+
+# ---- Names of arguments
+
+_PYTHON = {"config": "config", "set": "overrides"}  # names that differ from those of the flags
+_command_lines = 0  # in progress
+
+
+@contextlib.contextmanager
+def command_line() -> Generator[None]:
+    """Context of a command line, in which errors name flags."""
+    global _command_lines
+    _command_lines += 1
+    try:
+        yield
+    finally:
+        _command_lines -= 1
+
+
+def argument(name: str, value: object = None) -> str:
+    """An argument for a message as its user writes it: `--out` on a command line, `out` in Python.
+
+    With a value it is `--device cpu`, or `device='cpu'`; with True `--overwrite`, or `overwrite=True`.
+    """
+    if _command_lines:
+        flag = f"--{name.replace('_', '-')}"
+        return flag if value is None or value is True else f"{flag} {value}"
+    own = _PYTHON.get(name, name)
+    return own if value is None else f"{own}={[value] if name == 'set' else value!r}"

@@ -8,6 +8,7 @@ because neither torch nor jax has text arrays.
 """
 
 import dataclasses
+import re
 from collections.abc import Mapping
 
 
@@ -34,6 +35,12 @@ class Field:
     def is_text(self) -> bool:
         """Whether the field is text, stored as bytes."""
         return self.dtype.startswith("S")
+
+    @property
+    def codes(self) -> dict[int, str]:
+        """Name of each code of a field of codes, as its meaning lists them; empty for other fields."""
+        listed = re.search(r": (\d+ \w+(?:, \d+ \w+)*)$", self.meaning)
+        return {int(code): name for code, name in map(str.split, listed[1].split(", "))} if listed else {}
 
     def shape(self, sizes: Mapping[str, int]) -> tuple[int, ...]:
         """Shape of one video's value, without ``n``."""

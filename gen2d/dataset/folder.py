@@ -18,7 +18,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from gen2d.core.errors import ConfigError, DamagedError, FolderError, UnreachableError
+from gen2d.core.errors import ConfigError, DamagedError, FolderError, UnreachableError, argument
 from gen2d.dataset.manifest import MARK_SEAL, identity_of, read_manifest, schema_of
 from gen2d.dataset.manifest_parser import SHARDS
 from gen2d.dataset.records import Records, read_records
@@ -80,7 +80,7 @@ def open_folder(spec: DatasetSpec, overwrite: bool = False) -> list[Shard]:
     with translate_errors(root):
         check_links(root)
         if root.is_dir() and not _is_dataset(root) and any(root.iterdir()):
-            raise FolderError(f"{root} holds something other than a gen2d dataset: choose another --out")
+            raise FolderError(f"{root} holds something other than a gen2d dataset: choose another {argument('out')}")
         with folder_lock(root):
             if overwrite and _is_dataset(root):
                 _clear(root)
@@ -196,8 +196,8 @@ def _claim(spec: DatasetSpec) -> None:
     schema = schema_of(root)
     if schema is not None and schema != SCHEMA:
         raise FolderError(
-            f"{root} holds a dataset with the schema {schema}, but this gen2d writes {SCHEMA}: choose another --out, "
-            "or --overwrite to make the dataset anew"
+            f"{root} holds a dataset with the schema {schema}, but this gen2d writes {SCHEMA}: choose another "
+            f"{argument('out')}, or {argument('overwrite', True)} to make the dataset anew"
         )
     for folder in (RECORDS, "shards", "index"):
         (root / folder).mkdir(parents=True, exist_ok=True)
@@ -207,13 +207,17 @@ def _claim(spec: DatasetSpec) -> None:
     except DamagedError:
         there = None
     if there is None and mark.exists():
-        raise FolderError(f"{mark} is damaged: choose another --out, or --overwrite to make the dataset anew")
+        raise FolderError(
+            f"{mark} is damaged: choose another {argument('out')}, or {argument('overwrite', True)} to make the "
+            "dataset anew"
+        )
     if there is not None and there != spec.identity:
         sources = sources_of(root), spec.producer.get("sources", {})
         difference = describe_differences(there, spec.identity, *sources)
         if difference:
             raise FolderError(
-                f"{root} holds another dataset ({difference}): choose another --out, or --overwrite to replace it"
+                f"{root} holds another dataset ({difference}): choose another {argument('out')}, or "
+                f"{argument('overwrite', True)} to replace it"
             )
     publish_changed(mark, mark_content(spec))
 

@@ -19,7 +19,7 @@ from collections import deque
 from collections.abc import Hashable, Iterator, Sequence
 from typing import Any, NamedTuple
 
-from gen2d.core.errors import Error, FolderError, UserError
+from gen2d.core.errors import Error, FolderError, UserError, argument
 from gen2d.core.humanize import with_noun
 from gen2d.core.progress import Event, Log, progress, stopping_on_sigterm, waiting
 from gen2d.engines.protocol import Done, EngineError, Job, Report
@@ -75,13 +75,17 @@ class Ray:
     def __post_init__(self) -> None:
         low, high = self.limits
         if not (_is_whole(low, 1) and (high is None or _is_whole(high, low))):
-            raise EngineError(f"--workers is {low}:{high}, but must be MIN:MAX with whole numbers, 1 <= MIN <= MAX")
+            raise EngineError(
+                f"{argument('workers')} is {low}:{high}, but must be MIN:MAX with whole numbers, 1 <= MIN <= MAX"
+            )
         if not self.gpus_per_worker > 0 or (self.gpus_per_worker > 1 and self.gpus_per_worker % 1):
-            raise EngineError(f"--gpus-per-worker is {self.gpus_per_worker}, but must be a whole number or part of 1")
+            raise EngineError(
+                f"{argument('gpus_per_worker')} is {self.gpus_per_worker}, but must be a whole number or part of 1"
+            )
         if self.cpus_per_worker is not None and not _is_whole(self.cpus_per_worker, 1):
-            raise EngineError(f"--cpus-per-worker is {self.cpus_per_worker}, but must be 1 or more")
+            raise EngineError(f"{argument('cpus_per_worker')} is {self.cpus_per_worker}, but must be 1 or more")
         if not _is_whole(self.retries, 1):
-            raise EngineError(f"--retries is {self.retries}, but must be 1 or more")
+            raise EngineError(f"{argument('retries')} is {self.retries}, but must be 1 or more")
 
     @property
     def limits(self) -> tuple[int, int | None]:
@@ -262,14 +266,15 @@ class RayWorkers:
             return (
                 f"no worker can take part: {reasons[-1]}"
                 if not self._reported_count()
-                else (f"--workers asks for {low} or more, but fewer can take part: {reasons[-1]}")
+                else (f"{argument('workers')} asks for {low} or more, but fewer can take part: {reasons[-1]}")
             )
         device, slot = self.device or "cpu", next(iter(self._slots().values()), None)
         need = f"{with_noun(slot.gpus, 'GPU')} and " if slot and slot.gpus else "1 GPU and " if device == "gpu" else ""
         cores = slot.cpus if slot else self.engine.cpus_per_worker or 1
         return (
             f"there is no room for {with_noun(low, 'worker')} of {need}{with_noun(cores, 'core')}: "
-            f"{self._resources()}; lower --workers, --gpus-per-worker or --cpus-per-worker, or add machines"
+            f"{self._resources()}; lower {argument('workers')}, {argument('gpus_per_worker')} or "
+            f"{argument('cpus_per_worker')}, or add machines"
         )
 
     def _nodes(self) -> list[dict[str, Any]]:
@@ -333,7 +338,9 @@ class RayWorkers:
         for member in members:
             assert member.report is not None
             if kind not in member.report.device.lower():
-                self._refuse(member, f"its device is {member.report.device!r}, but --device-kind is {kind!r}")
+                self._refuse(
+                    member, f"its device is {member.report.device!r}, but {argument('device_kind')} is {kind!r}"
+                )
             else:
                 able.append(member)
         if able:

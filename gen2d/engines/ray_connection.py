@@ -15,7 +15,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from gen2d.core.errors import one_line
+from gen2d.core.errors import argument, one_line
 from gen2d.core.progress import Log, waiting
 from gen2d.engines.protocol import EngineError, HeadLostError
 from gen2d.storage.atomic import remove_tree
@@ -58,7 +58,9 @@ class Connection:
                 context = ray.init(address, **options)
         except Exception as error:
             self._remove_folder()
-            raise EngineError(f"--address is {address}, but Ray cannot be used there ({_reason(error)})") from None
+            raise EngineError(
+                f"{argument('address')} is {address}, but Ray cannot be used there ({_reason(error)})"
+            ) from None
         with contextlib.suppress(ImportError):  # it would print every death again, on standard output
             worker: Any = importlib.import_module("ray._private.worker")
             worker.print_to_stdstream = lambda *_, **__: None
@@ -120,12 +122,12 @@ def _check_reachable(address: str) -> None:
     if address == "auto":
         return
     if not match:
-        raise EngineError(f"--address is {address!r}, but must be auto, HOST:PORT or ray://HOST:PORT")
+        raise EngineError(f"{argument('address')} is {address!r}, but must be auto, HOST:PORT or ray://HOST:PORT")
     try:
         socket.create_connection((match[1].strip("[]"), int(match[2])), CONNECTING).close()
     except (OSError, OverflowError) as error:
         reason = getattr(error, "strerror", None) or str(error)
-        raise EngineError(f"--address is {address}, where nothing answers ({reason})") from None
+        raise EngineError(f"{argument('address')} is {address}, where nothing answers ({reason})") from None
 
 
 def _reason(error: Exception) -> str:

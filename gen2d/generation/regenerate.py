@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from gen2d.config.config import Config
-from gen2d.core.errors import DamagedError, FolderError
+from gen2d.core.errors import DamagedError, FolderError, argument
 from gen2d.core.progress import Log, inform, waiting
 from gen2d.dataset import folder, hdf5
 from gen2d.dataset.hdf5_check import faults
@@ -290,7 +290,9 @@ def _generate(
         generate_shards(source, dataset, todo, log)
         return
     if isinstance(root, Url):
-        raise FolderError(f"{root} is repaired on one machine, as the new shards are checked there: leave out --engine")
+        raise FolderError(
+            f"{root} is repaired on one machine, as the new shards are checked there: leave out {argument('engine')}"
+        )
     job = GenerationJob(source.config, dataset.root, dataset.splits, "auto", identity)
     workers = engine.start(job, log)
     try:

@@ -10,7 +10,7 @@ from typing import Any
 
 from gen2d.config.config import Config, checked_seed, load_config
 from gen2d.config.trust import remember
-from gen2d.core.errors import ConfigError, DamagedError
+from gen2d.core.errors import ConfigError, DamagedError, argument
 from gen2d.core.humanize import in_bytes, in_time
 from gen2d.core.progress import Log, inform, waiting
 from gen2d.dataset import folder as shards
@@ -125,7 +125,9 @@ def generate(
     if seed is not None:
         config = dataclasses.replace(config, seed=checked_seed(seed))
     if engine is not None and worker != (0, 1):
-        raise ConfigError("--worker and --engine cannot go together: the engine divides the work")
+        raise ConfigError(
+            f"{argument('worker')} and {argument('engine')} cannot go together: the engine divides the work"
+        )
     counts = _counts(config, _check_run(n, split, worker, overwrite), split)
     network = Network(timeout, deadline)
     out = place(out, network) if out is not None else Path("datasets") / config.name
@@ -222,11 +224,16 @@ def _counts(config: Config, n: int, split: str | None) -> dict[str, int]:
 def _check_run(n: Any, split: str | None, worker: tuple[int, int], overwrite: bool) -> int:
     """`n` as an int; raises ConfigError if an argument is invalid."""
     if isinstance(n, bool) or not isinstance(n, numbers.Integral) or not 1 <= int(n) <= MAX_VIDEOS:
-        raise ConfigError(f"--n is {n!r}, but must be a whole number from 1 to 2**32 - 1")
+        raise ConfigError(f"{argument('n')} is {n!r}, but must be a whole number from 1 to 2**32 - 1")
     if split is not None and not SPLIT.fullmatch(split):
-        raise ConfigError(f"--split is {split!r}, but must be letters, digits, '.', '_' and '-', 64 at most")
+        raise ConfigError(
+            f"{argument('split')} is {split!r}, but must be letters, digits, '.', '_' and '-', 64 at most"
+        )
     if overwrite and worker[1] > 1:
-        raise ConfigError("--overwrite and --worker cannot go together: a worker would remove what others have made")
+        raise ConfigError(
+            f"{argument('overwrite')} and {argument('worker')} cannot go together: a worker would remove what others "
+            "have made"
+        )
     if not 0 <= worker[0] < worker[1]:
-        raise ConfigError(f"--worker is {worker[0]}/{worker[1]}, but must be r/W with r from 0 to W - 1")
+        raise ConfigError(f"{argument('worker')} is {worker[0]}/{worker[1]}, but must be r/W with r from 0 to W - 1")
     return int(n)

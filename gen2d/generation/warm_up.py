@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 import jax
 import numpy as np
 
-from gen2d.core.errors import FolderError, UserError
+from gen2d.core.errors import FolderError, UserError, argument
 from gen2d.core.humanize import in_bytes, in_time, with_noun
 from gen2d.core.progress import waiting
 from gen2d.dataset import folder as shards
@@ -73,7 +73,7 @@ def check_disk(root: Place, size: float) -> None:
     if size > free:
         raise FolderError(
             f"{root} would need about {in_bytes(size)}, but its disk has {in_bytes(free)} free; "
-            "ask for fewer videos, or name another disk with --out"
+            f"ask for fewer videos, or name another disk with {argument('out')}"
         )
 
 
@@ -114,12 +114,16 @@ def _warn_of_low_compression(dataset: DatasetSpec, block: Block, log: Callable[[
     raw = len(block) * int(np.prod(dataset.fields["frames"].shape(dataset.sizes)))
     ratio = raw / sum(map(len, block.chunks["frames"]))
     if dataset.codec == "gzip" and ratio < 3:
-        log(f"gzip makes these frames only {ratio:.1f} times smaller; --set storage.codec=zstd may do better.")
+        log(
+            f"gzip makes these frames only {ratio:.1f} times smaller; {argument('set', 'storage.codec=zstd')} may do "
+            "better."
+        )
 
 
 def _device_error(error: Exception) -> Exception:
     if "RESOURCE_EXHAUSTED" in str(error):
         return DeviceMemoryError(
-            "the device has too little memory for a batch: lower storage.batch_size, or use --device cpu"
+            "the device has too little memory for a batch: lower storage.batch_size, or use "
+            f"{argument('device', 'cpu')}"
         )
     return error

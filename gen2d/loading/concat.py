@@ -1,6 +1,7 @@
 """Concatenation of datasets."""
 
 from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -19,9 +20,10 @@ from gen2d.loading.protocols import (
     read_batch,
     unbatch,
 )
+from gen2d.loading.selection import Selectable
 
 
-class ConcatDataset:
+class ConcatDataset(Selectable):
     """Concatenation of datasets, as `gen2d.open` returns it for a list of paths.
 
     Index i counts through the datasets in their order. It is a map-style dataset, so torch and grain accept it too.
@@ -48,8 +50,41 @@ class ConcatDataset:
         """List of videos; torch's DataLoader calls this method once per batch."""
         return unbatch(self.batch(indices))
 
-    def __repr__(self) -> str:
-        return f"<{len(self)} videos, one after the other of {', '.join(map(repr, self.datasets))}>"
+    def __getattr__(self, name: str) -> Any:
+        if name in ("config", "splits"):
+            raise AttributeError(f"each of the {len(self.datasets)} datasets has its own {name}: ds.datasets[0].{name}")
+        raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
+
+    @property
+    def stored_fields(self) -> Mapping[str, Field]:
+        """The stored fields that all datasets have, by name."""
+        first, *others = (source.stored_fields for source in self.datasets)
+        return {name: field for name, field in first.items() if all(name in fields for fields in others)}
+
+    @property
+    def stored_sizes(self) -> Mapping[str, int]:
+        """Sizes of the axes of the stored fields."""
+        return self.datasets[0].stored_sizes
+
+    @property
+    def short_name(self) -> str:
+        """Names of the datasets for error messages."""
+        return ", ".join(source.short_name for source in self.datasets)
+
+    @property
+    def fps(self) -> float:
+        """Frames per second."""
+        return self.datasets[0].fps
+
+    @property
+    def title(self) -> str:
+        """First line of the description."""
+        return f"{len(self):,} videos of {len(self.datasets)} datasets, one after the other"
+
+    @property
+    def details(self) -> list[str]:
+        """Further lines of the description."""
+        return [*(source.title for source in self.datasets), *self.datasets[0].details[:1]]
 
     @property
     def fields(self) -> dict[str, Field]:
@@ -104,6 +139,15 @@ class ConcatDataset:
             own_starts = None if starts is None else np.asarray(starts)[members]
             self.datasets[owner].fill(out, targets[members], numbers[members] - self.firsts[owner], own_starts)
 
+    def stored(self, names: Sequence[str], indices: Numbers) -> Batch:
+        """Stored values of whole videos, as those of `Dataset.stored`."""
+        numbers, found = np.asarray(indices), self.datasets[0].stored(names, [])
+        out = {name: np.empty((len(numbers), *values.shape[1:]), values.dtype) for name, values in found.items()}
+        for owner, members in self._group_by_dataset(numbers):
+            for name, values in self.datasets[owner].stored(names, numbers[members] - self.firsts[owner]).items():
+                out[name][members] = values
+        return out
+
     def numbers_at(self, positions: np.ndarray, epoch: int = 0, seed: int | None = None) -> np.ndarray:
         """Indices of the videos at these positions of an epoch, shuffled over all datasets unless `seed` is None."""
         return epoch_indices(seed, epoch, positions, len(self))
@@ -112,7 +156,7 @@ class ConcatDataset:
         """First frame of each video's window, sampled from random bits; None if windows are not random."""
         starts = np.zeros(len(numbers), np.int64)
         for owner, members in self._group_by_dataset(numbers):
-            own_starts = self.datasets[owner].starts(numbers[members], bits[members])
+            own_starts = self.datasets[owner].starts(numbers[members] - self.firsts[owner], bits[members])
             if own_starts is None:
                 return None
             starts[members] = own_starts

@@ -6,7 +6,6 @@ frames that must be rendered need jax, and a process that was not forked.
 
 import contextlib
 import dataclasses
-import difflib
 import fnmatch
 import math
 from collections.abc import Collection, Generator, Iterator, Mapping, Sequence
@@ -24,7 +23,9 @@ from gen2d.loading.chunks import Chunk, Reader, SplitFiles
 from gen2d.loading.column import LAYOUTS, Column
 from gen2d.loading.concat import ConcatDataset
 from gen2d.loading.epochs import check_one_of, epoch_indices
+from gen2d.loading.fields import suggestion
 from gen2d.loading.protocols import Batch, Key, Numbers, Snapshot, checked_numbers, item, read_batch, unbatch
+from gen2d.loading.selection import Selectable
 from gen2d.storage import codecs
 from gen2d.storage.cache import Cache
 from gen2d.storage.explain import reason
@@ -105,12 +106,14 @@ def open(
         Names or patterns of fields, such as "states/*". The default is the frames, where stored, and all states. If
         "frames" is named but not stored, frames are rendered when they are read.
     window : int, optional
-        Number of frames in a window. By default a video is returned whole.
+        Number of frames in a window. By default a video is returned whole. Batches of windows also hold
+        `window/start`, the first frame of each window, int64 [n], and `window/time`, the times of its frames in s,
+        float64 [n, window].
     stride : int
         Distance between the frames of a window, in frames of the video.
     start : "random", "first" or int
-        First frame of a window. With "random", `DataLoader` samples it for each video and epoch; windows that are read
-        from the `Dataset` itself then begin at frame 0 unless `starts` is given.
+        First frame of a window. With "random", `DataLoader`, `gen2d.torch` and `gen2d.grain` sample it for each video
+        and epoch, and reading by index needs `Dataset.batch(indices, starts)`. 0 and "first" are the same.
     layout : "THWC", "TCHW" or "CTHW"
         Order of the axes of images with channels.
     dtype : "uint8" or "float32"
@@ -154,7 +157,7 @@ def open(
 
     Examples
     --------
-    >>> ds = gen2d.open("datasets/bouncing", fields=["frames", "states/position"], window=16, dtype="float32")
+    >>> ds = gen2d.open("datasets/bouncing", fields=["frames", "states/position"], window=16, start=0, dtype="float32")
     >>> ds[0]["frames"].shape  # [T, H, W, C]
     (16, 64, 64, 3)
     >>> ds[:32]["states/position"].shape  # m, [n, T, slot, (x, y)]
@@ -207,15 +210,21 @@ class ViewOptions:
     verify: str
     cache_dir: str | Path | None = None
     cache_bytes: int | None = None
+    window_fields: bool = True  # whether batches of windows say where the windows lie
 
     @property
     def first(self) -> int:
-        """First frame of windows that are read without `starts`."""
+        """First frame of windows that are not random."""
         return self.start if isinstance(self.start, int) else 0
+
+    @property
+    def is_random(self) -> bool:
+        """Whether the first frames of windows are sampled."""
+        return self.window is not None and self.start == "random"
 
     def starts(self, bits: np.ndarray, frames: int) -> np.ndarray | None:
         """First frame of each window, int64 [n], sampled from random bits; None if windows are not random."""
-        if self.window is None or self.start != "random":
+        if not self.is_random:
             return None
         return (bits % np.uint64(frames - self.span + 1)).astype(np.int64)
 
@@ -233,7 +242,7 @@ class ViewOptions:
         self._check(frames)
         if self.window is not None or frames == stored_frames:
             return self
-        return dataclasses.replace(self, window=frames, stride=1, start="first")
+        return dataclasses.replace(self, window=frames, stride=1, start="first", window_fields=False)
 
     def _check(self, frames: int) -> None:
         check_one_of("layout", self.layout, tuple(LAYOUTS))
@@ -250,20 +259,42 @@ class ViewOptions:
             raise ConfigError(f"{need} {self.first + self.span} frames, but the videos have {frames}")
 
 
+def window_fields(begins: np.ndarray, options: ViewOptions, frame_times: np.ndarray) -> Batch | None:
+    """Fields that say where windows lie, from their first frames [n] and the times of all frames, s; None without.
+
+    They are `window/start`, int64 [n], and `window/time`, s, float64 [n, window].
+    """
+    if options.window is None or not options.window_fields:
+        return None
+    begins = begins.astype(np.int64)
+    return {
+        "window/start": begins,
+        "window/time": frame_times[begins[:, None] + options.stride * np.arange(options.window)],
+    }
+
+
 _HINT = "gen2d verify finds all such damage"
 
 
-class Dataset:
+class Dataset(Selectable):
     """One split of a dataset, as `gen2d.open` returns it; also a map-style dataset for torch and grain.
 
     `ds[i]` is a video, a dictionary of NumPy arrays by field name; `ds[2:5]` and `ds[[2, 7]]` are batches, whose arrays
     have a leading axis of videos. `info` lists the axes and the unit of each field. A `Dataset` can be pickled, and can
-    be read from several threads at once.
+    be read from several threads at once. `select` and `filter` give datasets of some of the videos, `to_pandas` and
+    `to_arrow` tables of their values.
 
     Attributes
     ----------
     fields : dict of str to Field
-        dtype, axes, unit and meaning of each field as stored, before window, layout and dtype are applied.
+        dtype, axes, unit and meaning of each field as stored, before window, layout and dtype are applied; `codes` are
+        the names of its codes, if it has some.
+    splits : dict of str to int
+        Number of videos of each split of the dataset.
+    config : mapping
+        The resolved config of the dataset, as plain values.
+    fps : float
+        Frames per second.
     stats : dict
         Mean, std, min and max of each component of the frames and states, by field, over the sample that
         `manifest.stats_sampled` describes. Units are those of the stored values: frames are from 0 to 255 even with
@@ -302,6 +333,7 @@ class Dataset:
             cache = Cache(Path(options.cache_dir), options.cache_bytes)
         self._files = SplitFiles(root, manifest, options.split, cache, options.verify == "checksum")
         self._count, self._frames = manifest.splits[options.split], manifest.frames[options.split]
+        self._frame_times = manifest.constants.get("time", np.arange(self._frames) / manifest.fps)
 
     def __reduce__(self) -> tuple[Any, ...]:
         return Dataset, (self.root, self.manifest, self.options)
@@ -339,8 +371,52 @@ class Dataset:
         """List of videos; torch's DataLoader calls this method once per batch."""
         return unbatch(self.batch(indices))
 
-    def __repr__(self) -> str:
-        return f"<{len(self)} {self.options.split} videos of {self.root}: {', '.join(self.fields)}>"
+    @property
+    def splits(self) -> dict[str, int]:
+        """Number of videos of each split of the dataset."""
+        return dict(self.manifest.splits)
+
+    @property
+    def config(self) -> Mapping[str, Any]:
+        """The resolved config of the dataset, as plain values."""
+        return self.manifest.config
+
+    @property
+    def fps(self) -> float:
+        """Frames per second."""
+        return self.manifest.fps
+
+    @property
+    def stored_fields(self) -> Mapping[str, Field]:
+        """All stored fields of the dataset, by name, whichever were opened."""
+        return self.manifest.fields
+
+    @property
+    def stored_sizes(self) -> Mapping[str, int]:
+        """Sizes of the axes of the stored fields."""
+        return self.manifest.sizes
+
+    @property
+    def short_name(self) -> str:
+        """Name of the dataset for error messages."""
+        return f"{self.root}"
+
+    @property
+    def title(self) -> str:
+        """First line of the description."""
+        return f"{len(self):,} {self.options.split} videos of {self.root}"
+
+    @property
+    def details(self) -> list[str]:
+        """Further lines of the description."""
+        options, others = self.options, [name for name in self.manifest.splits if name != self.options.split]
+        size = f" of {self.sizes['W']} x {self.sizes['H']} px" if {"W", "H"} <= self.sizes.keys() else ""
+        lines = [f"{self._frames} frames{size}, {self.fps:g} per second"]
+        if options.window is not None and options.window_fields:
+            start = "at random" if options.is_random else f"at frame {options.first}"
+            lines.append(f"windows of {options.window} frames, {start}, stride {options.stride}")
+        lines += [f"layout {options.layout}, frames {options.dtype}"] if "frames" in self.fields else []
+        return lines + ([f"other splits: {', '.join(others)}"] if others else [])
 
     @property
     def exact(self) -> bool:
@@ -360,7 +436,7 @@ class Dataset:
         indices : sequence of int [n]
             Indices of the videos; negative ones count from the end.
         starts : sequence of int [n], optional
-            First frame of each video's window. The default is the `start` of `open`, and 0 for "random".
+            First frame of each video's window. The default is the `start` of `open`; "random" has none.
         out : dict of str to ndarray, optional
             Batch to fill, as `empty(n)` returns it. By default a new one is made.
 
@@ -374,7 +450,7 @@ class Dataset:
         IndexError, TypeError
             If an index is out of range, or not an integer.
         ConfigError
-            If `starts` or `out` do not fit.
+            If `starts` or `out` do not fit, or if windows are random and `starts` is not given.
         DamagedError
             If stored data differs from what was written.
         FolderError, UnreachableError
@@ -390,7 +466,8 @@ class Dataset:
     def empty(self, count: int) -> Batch:
         """Uninitialised batch of `count` videos. Raises UserError if it does not fit in memory."""
         try:
-            return {column.name: np.empty((count, *column.shape), column.dtype) for column in self._columns}
+            batch = {column.name: np.empty((count, *column.shape), column.dtype) for column in self._columns}
+            return batch | (window_fields(np.zeros(count, np.int64), self.options, self._frame_times) or {})
         except (MemoryError, ValueError):  # too large for the memory, too large for NumPy
             size = sum(math.prod((count, *column.shape)) * column.dtype.itemsize for column in self._columns)
             raise UserError(f"{self.root}: {count} videos take {in_bytes(size)}, more than there is memory") from None
@@ -412,7 +489,9 @@ class Dataset:
             First frame of each video's window, as in `batch`.
         """
         numbers = self.numbers(indices)
-        begins, targets = self._begins(numbers, starts).tolist(), np.asarray(rows).tolist()
+        first_frames, targets = self._begins(numbers, starts), np.asarray(rows).tolist()
+        begins = first_frames.tolist()
+        self._fill_window(out, targets, first_frames)
         with self._lookup_errors(numbers):
             videos = self._files.videos(numbers)
             chunks = [self._files.chunks_of(column, numbers, videos, begins) for column in self._stored_columns]
@@ -427,13 +506,38 @@ class Dataset:
                 if scratch is not None:
                     column.convert(scratch, begin, target)
 
+    def stored(self, names: Sequence[str], indices: Numbers) -> Batch:
+        """Stored values of whole videos, [n, ...] by field name, whatever was opened; raises the errors of `batch`.
+
+        Parameters
+        ----------
+        names : sequence of str
+            Names of stored fields.
+        indices : sequence of int [n]
+            Indices of the videos.
+        """
+        whole = {"window": None, "stride": 1, "start": "first", "layout": "THWC", "dtype": "uint8"}
+        options = dataclasses.replace(self.options, fields=tuple(names), **whole)
+        return Dataset(self.root, self.manifest, options).batch(indices)
+
     def _begins(self, numbers: np.ndarray, starts: Numbers | None) -> np.ndarray:
         """First frame of the window of each of these videos. Raises ConfigError if `starts` do not fit."""
-        first = np.full(len(numbers), self.options.first) if starts is None else np.asarray(starts)
         last = self._frames - self.options.span
+        if starts is None and self.options.is_random and last > 0 and len(numbers):
+            raise ConfigError(
+                f"{self.root}: start is 'random', so a window that is read by index has no first frame: use "
+                "gen2d.torch.dataset(ds) in torch's DataLoader, gen2d.grain.source(ds) in Grain, or gen2d.DataLoader; "
+                "or say ds.batch(indices, starts), or start=0 in gen2d.open"
+            )
+        first = np.full(len(numbers), self.options.first) if starts is None else np.asarray(starts)
         if first.shape != numbers.shape or ((first < 0) | (first > last)).any():
             raise ConfigError(f"starts must be a frame from 0 to {last} for each video, but are {first.tolist()}")
         return first
+
+    def _fill_window(self, out: Batch, rows: Numbers, begins: np.ndarray) -> None:
+        """Write where these windows lie into these rows of a batch."""
+        for name, values in (window_fields(begins, self.options, self._frame_times) or {}).items():
+            out[name][rows] = values
 
     @contextlib.contextmanager
     def _lookup_errors(self, numbers: np.ndarray) -> Generator[None]:
@@ -512,7 +616,7 @@ def _select_split(root: Place, manifest: Manifest, split: str | None) -> str:
     if split is None:
         return "train" if "train" in splits else next(iter(splits))
     if split not in splits:
-        raise ConfigError(f"{root} has no split {split!r}{_suggestion(split, splits)}")
+        raise ConfigError(f"{root} has no split {split!r}{suggestion(split, splits)}")
     return split
 
 
@@ -534,14 +638,9 @@ def select_fields(
         matches = [pattern] if pattern in rendered else fnmatch.filter(names, pattern)
         if not matches:
             known = dict.fromkeys([*names, *rendered])
-            raise ConfigError(f"{source} has no field {pattern!r}{_suggestion(pattern, known)}")
+            raise ConfigError(f"{source} has no field {pattern!r}{suggestion(pattern, known)}")
         selected |= dict.fromkeys(matches)
     return tuple(selected)
-
-
-def _suggestion(name: str, names: Sequence[str] | Mapping[str, Any]) -> str:
-    near = difflib.get_close_matches(name, [*names], n=1, cutoff=0.4)
-    return f": did you mean {near[0]!r}?" if near else f": it has {', '.join(names)}"
 
 
 def _check_cache(options: ViewOptions, largest: int) -> None:

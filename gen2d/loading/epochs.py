@@ -141,7 +141,7 @@ def check_one_of(name: str, value: Any, allowed: tuple[object, ...]) -> None:
 
 
 # Streams of random numbers, so that no two uses share any.
-ORDER, WINDOWS, SOURCES = 0, 1, 2
+ORDER, WINDOWS, SOURCES, INDEX_WINDOWS = 0, 1, 2, 3
 
 
 def epoch_indices(seed: int | None, epoch: int, positions: np.ndarray, count: int) -> np.ndarray:

@@ -8,14 +8,17 @@ and keeps the dataset of each position, so every batch has the proportions of th
 import math
 from collections.abc import Mapping, Sequence
 from fractions import Fraction
+from typing import Any
 
 import numpy as np
 
 from gen2d.core.errors import ConfigError
 from gen2d.core.permutation import hashed
+from gen2d.core.schema import Field
 from gen2d.loading.concat import ConcatDataset, at_snapshots, groups_of
 from gen2d.loading.epochs import SOURCES
 from gen2d.loading.protocols import Batch, Key, Numbers, Snapshot, VideoReader, checked_numbers, item, unbatch
+from gen2d.loading.tables import describe_html, describe_text
 
 FINEST = 1000  # largest denominator of a weight; weights are rounded to such a fraction
 Weights = Mapping[str, float] | Sequence[float]
@@ -102,9 +105,35 @@ class Mixture:
         """List of videos; torch's DataLoader calls this method once per batch."""
         return unbatch(self.batch(positions))
 
+    def __getattr__(self, name: str) -> Any:
+        if name in ("select", "filter", "to_pandas", "to_arrow"):
+            raise AttributeError(
+                f"a mixture has other videos in each epoch: call {name} of its datasets, then gen2d.mix"
+            )
+        if name in ("config", "splits"):
+            raise AttributeError(f"each dataset of a mixture has its own {name}: mixture.datasets[NAME].{name}")
+        raise AttributeError(f"'Mixture' object has no attribute {name!r}")
+
     def __repr__(self) -> str:
-        parts = (f"{share} of {name}" for name, share in zip(self.datasets, self.shares, strict=True))
-        return f"<{len(self)} videos, in every {sum(self.shares)} {', '.join(parts)}>"
+        return describe_text(*self._description)
+
+    def _repr_html_(self) -> str:
+        return describe_html(*self._description)
+
+    @property
+    def _description(self) -> tuple[str, list[str], Mapping[str, Field]]:
+        """Title, lines and fields of the description."""
+        title = f"{len(self):,} videos, mixed from {len(self.datasets)} datasets"
+        parts = (
+            f"{share} in {sum(self.shares)}: {name}, {source.title}"
+            for (name, source), share in zip(self.datasets.items(), self.shares, strict=True)
+        )
+        return title, list(parts), self.fields
+
+    @property
+    def fps(self) -> float:
+        """Frames per second of the first dataset."""
+        return self._concatenation.fps
 
     @property
     def exact(self) -> bool:

@@ -26,12 +26,30 @@ class VideoSequence(Protocol):
 
 
 class VideoReader(Protocol):
-    """Source of videos for `DataLoader`: a Dataset or a ConcatDataset. `Dataset` describes the methods."""
+    """Source of videos for `DataLoader`: a Dataset, a ConcatDataset or a Subset. `Dataset` describes the methods."""
 
     def __len__(self) -> int: ...
 
     @property
     def fields(self) -> dict[str, Field]: ...
+
+    @property
+    def stored_fields(self) -> Mapping[str, Field]: ...
+
+    @property
+    def stored_sizes(self) -> Mapping[str, int]: ...
+
+    @property
+    def short_name(self) -> str: ...  # for error messages
+
+    @property
+    def title(self) -> str: ...  # first line of the description
+
+    @property
+    def details(self) -> list[str]: ...  # further lines
+
+    @property
+    def fps(self) -> float: ...
 
     @property
     def slice_size(self) -> int: ...  # number of videos that are best filled together
@@ -51,6 +69,10 @@ class VideoReader(Protocol):
     def at(self, snapshot: Snapshot) -> "VideoReader": ...
 
     def empty(self, count: int) -> Batch: ...
+
+    def batch(self, indices: Numbers, /) -> Batch: ...
+
+    def stored(self, names: Sequence[str], indices: Numbers) -> Batch: ...
 
     def fill(self, out: Batch, rows: Numbers, indices: Numbers, starts: Numbers | None = None) -> None: ...
 

@@ -19,7 +19,7 @@ import PIL
 import zstandard
 
 from gen2d._version import __version__
-from gen2d.core.errors import UserError
+from gen2d.core.errors import UserError, argument
 
 DEVICES = ("auto", "cpu", "gpu")
 Device = Any  # jax.Device, which jax declares in a way that type checkers do not take
@@ -55,7 +55,7 @@ def prepare(device: str = "auto") -> list[Device]:
     Raises DeviceError if there is no such device, or if jax is in 64-bit mode.
     """
     if device not in DEVICES:
-        raise DeviceError(f"--device is {device!r}, but must be one of {', '.join(DEVICES)}")
+        raise DeviceError(f"{argument('device')} is {device!r}, but must be one of {', '.join(DEVICES)}")
     keep_freed_memory()
     jax.config.update("jax_threefry_partitionable", True)  # sampled values depend on it
     if jax.config.values["jax_enable_x64"]:
@@ -76,13 +76,14 @@ def prepare(device: str = "auto") -> list[Device]:
         return jax.devices()
     if device == "cpu" and jax.default_backend() != "cpu":
         raise DeviceError(
-            f"--device is 'cpu', but this process already runs jax on {jax.default_backend()}: start another"
+            f"{argument('device')} is 'cpu', but this process already runs jax on {jax.default_backend()}: start "
+            "another"
         )
     try:
         return jax.devices(device)
     except RuntimeError as error:
-        hint = "; install gen2d[cuda], or use --device cpu" if device == "gpu" else ""
-        raise DeviceError(f"--device is {device!r}, but jax finds none{hint} ({error})") from None
+        hint = f"; install gen2d[cuda], or use {argument('device', 'cpu')}" if device == "gpu" else ""
+        raise DeviceError(f"{argument('device')} is {device!r}, but jax finds none{hint} ({error})") from None
 
 
 def default() -> Device:

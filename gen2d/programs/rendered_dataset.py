@@ -101,7 +101,7 @@ class RenderedDataset(Dataset):
         # Noise depends on the number of the frame, motion blur and some annotations on neighbouring frames.
         whole = rendered.keys() != {"frames"} or image.exposure > 0 or image.noise.support != (0.0, 0.0)
         every_frame = {"window": None, "stride": 1, "start": "first"} if whole else {}
-        self._inputs, self._whole = dataclasses.replace(options, fields=(), **every_frame), whole
+        self._inputs, self._whole = dataclasses.replace(options, fields=(), window_fields=False, **every_frame), whole
         self._started: _Renderer | None = None
 
         sizes = {name: self.sizes[name] for name in "TK"} | {"H": video.height, "W": video.width}
@@ -146,9 +146,11 @@ class RenderedDataset(Dataset):
 
         Raises UserError in a process that was forked from the one that opened the dataset.
         """
-        if self._stored_columns:
-            super().fill(out, rows, indices, starts)
         numbers, targets = self.numbers(indices), np.asarray(rows)
+        if self._stored_columns:
+            super().fill(out, rows, numbers, starts)
+        else:
+            self._fill_window(out, targets, self._begins(numbers, starts))
         if "camera/scale" in self.fields:
             out["camera/scale"][targets] *= np.float32(self._settings.zoom)  # px of these frames
         if not self._rendered_columns:

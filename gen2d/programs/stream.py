@@ -25,7 +25,7 @@ from gen2d.core.progress import waiting
 from gen2d.core.schema import Field
 from gen2d.loading.column import LAYOUTS
 from gen2d.loading.dataloader import without_text
-from gen2d.loading.dataset import ViewOptions, select_fields
+from gen2d.loading.dataset import ViewOptions, select_fields, window_fields
 from gen2d.loading.epochs import EpochSampler, GlobalBatch, check_one_of, epoch_indices
 from gen2d.programs import devices
 from gen2d.programs.rollout import DeviceBatch, divisor
@@ -84,7 +84,8 @@ def stream(
     fields : sequence of str, optional
         Names or patterns of fields; by default "frames" and "states/*".
     window : int, optional
-        Number of frames of each video in a batch; by default all.
+        Number of frames of each video in a batch; by default all. Batches of windows also hold `window/start` and
+        `window/time`, as those of `open`.
     stride : int
         Distance of the window's frames, in frames.
     start : int or str
@@ -244,6 +245,9 @@ class Stream:
         numbers, starts = jnp.asarray(cell.numbers.astype(np.int32)), jnp.asarray(cell.starts, jnp.int32)
         with jax.enable_x64(self.source.config.physics.x64):
             fields = self._jitted_cell_views(columns, numbers, starts, np.int32(row))
+        windows = window_fields(cell.starts, self.options, self.source.schema.constants["time"])
+        with jax.enable_x64(True):  # each array type rounds 64 bits as it does those of a DataLoader
+            fields |= {name: jnp.asarray(values) for name, values in (windows or {}).items()}
         fields |= self._host_fields(batch, row, host_fields) if host_fields else {}
         return fields if cell.videos == self.cell else {name: array[: cell.videos] for name, array in fields.items()}
 

@@ -4,7 +4,7 @@ import errno
 import os
 from pathlib import Path
 
-from gen2d.core.errors import DamagedError, FolderError, UnreachableError, UserError
+from gen2d.core.errors import DamagedError, FolderError, UnreachableError, UserError, argument
 
 FULL = (errno.ENOSPC, errno.EDQUOT)
 # The disk or its network fails; the data may be whole.
@@ -52,11 +52,13 @@ def writing_error(where: Path, error: OSError, again: str = "run the same comman
     full or fails, and 2 for errors that another folder avoids.
     """
     if isinstance(error, FileExistsError | NotADirectoryError):
-        return FolderError(f"{error.filename} is a file, not a folder: choose another --out")
+        return FolderError(f"{error.filename} is a file, not a folder: choose another {argument('out')}")
     if isinstance(error, PermissionError):
-        return FolderError(f"you have no permission to write in {error.filename or where}: choose another --out")
+        return FolderError(
+            f"you have no permission to write in {error.filename or where}: choose another {argument('out')}"
+        )
     if error.errno == errno.EROFS:
-        return FolderError(f"{where} is on a disk that is read-only: choose another --out")
+        return FolderError(f"{where} is on a disk that is read-only: choose another {argument('out')}")
     if error.errno in _TOO_MANY:
         return UserError(f"{where} cannot be written: too many files are open; allow more of them (ulimit -n)")
     if isinstance(error, FileNotFoundError):
@@ -73,7 +75,7 @@ def writing_error(where: Path, error: OSError, again: str = "run the same comman
             f"{where} cannot be written, as the disk or its network fails ({reason(error)}): repair it and {again}"
         )
     else:
-        return FolderError(f"{where} cannot be written ({reason(error)}): choose another --out")
+        return FolderError(f"{where} cannot be written ({reason(error)}): choose another {argument('out')}")
     failure = FolderError(sentence)
     failure.exit_code = 1
     return failure

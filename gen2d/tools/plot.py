@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from gen2d.core.enums import BEGIN, IMPACT, STATIC
-from gen2d.core.errors import UserError
+from gen2d.core.errors import UserError, argument
 from gen2d.core.progress import waiting
 from gen2d.dataset.manifest import read_manifest
 from gen2d.loading.dataset import Dataset
@@ -83,7 +83,7 @@ def plot(
     out, root = Path(out), place(source if isinstance(source, Url) else str(source), Network(timeout, deadline))
     ds = open_dataset(root, split, ["index"])
     if not 0 <= video < len(ds):
-        raise UserError(f"--video is {video}, but must be from 0 to {len(ds) - 1} for {ds.options.split}")
+        raise UserError(f"{argument('video')} is {video}, but must be from 0 to {len(ds) - 1} for {ds.options.split}")
     check_folder(out)
     name = folder_name(root, ds.manifest)
     with waiting(f"Plotting video {video} of {ds.options.split}"):

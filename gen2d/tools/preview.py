@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gen2d.core.errors import UserError
+from gen2d.core.errors import UserError, argument
 from gen2d.core.progress import waiting
 from gen2d.dataset.manifest import Manifest
 from gen2d.loading.dataset import Dataset
@@ -103,7 +103,7 @@ def folder_name(root: Place, manifest: Manifest) -> str:
 def check_videos(videos: int) -> None:
     """Raise UserError unless `videos` is positive."""
     if videos < 1:
-        raise UserError(f"--videos is {videos}, but must be 1 or more")
+        raise UserError(f"{argument('videos')} is {videos}, but must be 1 or more")
 
 
 def _dataset_frames(ds: Dataset, numbers: Sequence[int], trust: Sequence[str]) -> np.ndarray:

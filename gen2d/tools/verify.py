@@ -16,7 +16,16 @@ from pathlib import Path
 import numpy as np
 
 from gen2d._version import __version__
-from gen2d.core.errors import ConfigError, DamagedError, Error, IncompleteError, UnreachableError, UserError, one_line
+from gen2d.core.errors import (
+    ConfigError,
+    DamagedError,
+    Error,
+    IncompleteError,
+    UnreachableError,
+    UserError,
+    argument,
+    one_line,
+)
 from gen2d.core.progress import Log, inform, progress, waiting
 from gen2d.dataset.croissant import croissant
 from gen2d.dataset.folder import is_foreign
@@ -164,7 +173,7 @@ def find_problems(
     if level not in LEVELS:
         raise ConfigError(f"level is {level!r}, but must be one of {', '.join(LEVELS)}")
     if videos < 1:
-        raise ConfigError(f"--videos is {videos}, but must be 1 or more")
+        raise ConfigError(f"{argument('videos')} is {videos}, but must be 1 or more")
     while True:
         try:
             manifest = read_manifest(root)

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from gen2d.core.errors import ConfigError, Error, UserError
+from gen2d.core.errors import ConfigError, Error, UserError, argument
 from gen2d.core.progress import inform
 from gen2d.dataset.manifest import Manifest, read_manifest
 from gen2d.dataset.readme import card_split
@@ -66,7 +66,7 @@ def view(
         If the port is in use, or the source or an option is invalid.
     """
     if not 0 <= port < 2**16:
-        raise ConfigError(f"--port is {port}, but must be from 0 to 65535")
+        raise ConfigError(f"{argument('port')} is {port}, but must be from 0 to 65535")
     with contextlib.ExitStack() as stack:
         root = place(source if isinstance(source, Url) else str(source), Network(timeout, deadline))
         if not (isinstance(root, Url) or root.is_dir()):
@@ -170,7 +170,9 @@ def serving(library: Library, port: int) -> Iterator[ThreadingHTTPServer]:
     except OSError as error:
         if error.errno in (errno.EADDRINUSE, errno.EACCES):
             reason = "in use" if error.errno == errno.EADDRINUSE else "not allowed"
-            raise UserError(f"port {port} is {reason}: choose another with --port, or 0 for a free one") from None
+            raise UserError(
+                f"port {port} is {reason}: choose another with {argument('port')}, or 0 for a free one"
+            ) from None
         raise
     try:
         yield server

@@ -301,7 +301,7 @@ def states(folder: Path, videos: int = 512, turns: int = 7, window: int = 16, ov
 
         works[f"make {name}"] = timed(remake, videos)
         for view, length in (("videos", None), ("windows", window)):
-            ds = gen2d.open(root, fields=["frames"], window=length)
+            ds = gen2d.open(root, fields=["frames"], window=length, start="first")
             out = ds.empty(batch)
 
             def load(ds: Any = ds, out: Any = out) -> None:

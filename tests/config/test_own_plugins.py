@@ -167,7 +167,7 @@ def test_what_came_with_a_dataset_runs_only_if_it_is_trusted(foreign: Path, tmp_
             call()
     with pytest.raises(UntrustedError):
         gen2d.render(ds, [0], trust="0" * 64)
-    with pytest.raises(ConfigError, match="--trust is 'yes'"):
+    with pytest.raises(ConfigError, match=r"^trust is 'yes'"):
         gen2d.render(ds, [0], trust="yes")
     assert not (tmp_path / SEEN).exists()
     assert repair(foreign, ["train-00000-n3"], trust=digest) == ["train-00000-n3"]

@@ -316,7 +316,7 @@ def test_verify_while_a_dataset_grows(tmp_path: Path, between: Between, step: st
 
 
 def test_overwriting_is_for_one_process(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="--overwrite and --worker cannot go together"):
+    with pytest.raises(ConfigError, match=r"^overwrite and worker cannot go together"):
         generate("bouncing.yaml", 8, tmp_path, worker=(0, 2), overwrite=True)
 
 

@@ -278,7 +278,7 @@ def test_another_dataset_is_refused(tmp_path: Path, change: dict[str, Any], told
     else:
         (tmp_path / ".gen2d").rename(tmp_path.parent / f"{tmp_path.name}-mark")
     before = synthetic.tree(tmp_path)
-    with pytest.raises(FolderError, match="--overwrite") as caught:
+    with pytest.raises(FolderError, match="overwrite=True") as caught:
         open_folder(synthetic.dataset(tmp_path, train=3, **change))
     assert told in str(caught.value)
     assert synthetic.tree(tmp_path) == before

@@ -128,7 +128,7 @@ def test_a_cluster_may_lose_and_gain_machines(cluster: Cluster, tmp_path: Path):
 def test_fewer_workers_than_asked_for_is_one_sentence(cluster: Cluster, tmp_path: Path):
     foreign = add_node(cluster, FAKE_IDENTITY="other")
     try:
-        with pytest.raises(EngineError, match=r"^--workers asks for 3 or more, but fewer can take part: .*makes "):
+        with pytest.raises(EngineError, match=r"^workers asks for 3 or more, but fewer can take part: .*makes "):
             squares(Ray(cluster.address, workers=3, cpus_per_worker=1, patience=20), SquareJob(tmp_path), 4)
     finally:
         cluster.remove_node(foreign)
@@ -159,7 +159,7 @@ def test_a_worker_has_its_gpus_and_the_same_share_of_the_cores(cluster: Cluster,
 
 def test_nobody_who_can_work_is_one_sentence(cluster: Cluster, tmp_path: Path):
     job = SquareJob(tmp_path)
-    with pytest.raises(EngineError, match=r"its device is 'cpu fake', but --device-kind is 'h100'$"):
+    with pytest.raises(EngineError, match=r"its device is 'cpu fake', but device_kind is 'h100'$"):
         squares(Ray(cluster.address, device_kind="H100"), job, 1)
     with pytest.raises(EngineError, match=r"^there is no room for 9 workers of 2 cores: the cluster has .* machines"):
         squares(Ray(cluster.address, workers=(9, 9), cpus_per_worker=2, patience=1), job, 1)

@@ -246,7 +246,8 @@ def test_batches_stay_as_they_were_while_others_follow(toy: Path, kind: Any) -> 
         assert actual.keys() == batch.keys()
         for name, values in batch.items():
             assert isinstance(actual[name], library.Array if kind == "jax" else library.Tensor)
-            assert_array_equal(np.asarray(actual[name]), values)
+            rounded = values.astype(np.float32) if kind == "jax" and values.dtype == np.float64 else values
+            assert_array_equal(np.asarray(actual[name]), rounded)
 
 
 def test_an_abandoned_iterator_joins_no_thread(toy: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -59,7 +59,9 @@ def test_a_stream_gives_the_batches_of_the_dataset(root: Path, batch_size: int, 
 )
 def test_windows_layouts_and_types_are_those_of_the_loader(root: Path, view: dict):
     options: dict[str, Any] = {"shuffle": True, "epochs": 2}
-    assert_same(open_stream(**view, **options), gen2d.DataLoader(gen2d.open(root, **view), 4, **options))
+    ds = gen2d.open(root, **view)
+    assert_same(open_stream(**view, **options), gen2d.DataLoader(ds, 4, **options, to="jax"))
+    assert open_stream(**view).fields.keys() == ds.fields.keys()
 
 
 @pytest.mark.parametrize("drop_last", [True, False])

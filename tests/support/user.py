@@ -27,6 +27,15 @@ def train(root: Path) -> float:
     for tensors in gen2d.DataLoader(ds, batch_size=8, epochs=1, to="torch", device="cpu"):
         assert_type(tensors, dict[str, torch.Tensor])
         total += tensors["frames"].float().mean().item()
+    few = ds.filter("factors/balls > 3").select([0, 1])
+    print(len(few), ds.splits, ds.fps, ds.config["scene"], ds.fields["objects/kind"].codes, few.to_pandas())
+    videos = assert_type(gen2d.torch.dataset(ds, seed=1), gen2d.torch.VideoDataset)
+    videos.set_epoch(3)
+    order = gen2d.torch.sampler(videos)
+    print(next(iter(torch.utils.data.DataLoader(videos, batch_size=8, sampler=order)))["frames"])
+    several = assert_type(gen2d.torch.iterable(ds, batch_size=8), gen2d.torch.IterableVideoDataset)
+    several.load_state_dict(several.state_dict())
+    print(len(gen2d.grain.source(ds, epochs=2)), videos.epoch)
     for arrays in gen2d.stream(config, batch_size=8, n=8, epochs=1, fields=["states/position"]):
         total += float(arrays["states/position"].sum())
     larger = gen2d.open(root, fields=["frames"], render={"height": 128, "width": 128, "look": "shaded"})

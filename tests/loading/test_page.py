@@ -1,0 +1,37 @@
+"""The blocks of the page on loading run, each on its own, beside a small dataset."""
+
+import re
+from pathlib import Path
+
+import pytest
+from packages import require
+
+import gen2d
+
+PAGE = Path(gen2d.__file__).parent / "loading" / "README.md"
+BLOCKS = re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
+OTHERS = "torch", "torchdata", "lightning", "accelerate", "grain", "tensorflow", "pandas", "pyarrow"
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder with the dataset that the blocks name."""
+    home = tmp_path_factory.mktemp("page")
+    scene = {"name": "bouncing", "balls": [2, 8], "gravity": [0, [-20, 0]], "radius": 0.4}
+    video = {"frames": 28, "height": 16, "width": 16}
+    gen2d.generate({"scene": scene, "video": video}, 32, home / "datasets" / "bouncing")
+    return home
+
+
+@pytest.mark.filterwarnings("ignore")  # of other libraries
+@pytest.mark.parametrize("number", range(len(BLOCKS)))
+def test_a_block_runs(number: int, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    block = BLOCKS[number]
+    needed = {name for name in OTHERS if re.search(rf"^(?:import|from) {name}\b", block, re.MULTILINE)}
+    require(*sorted(needed | ({"torch"} if "gen2d.torch" in block else set())))
+    monkeypatch.chdir(folder)
+    names: dict[str, object] = {"__name__": "__main__"}
+    exec(compile(block, f"block {number} of {PAGE}", "exec"), names)
+    for value in names.values():
+        if isinstance(value, gen2d.DataLoader):
+            value.close()
