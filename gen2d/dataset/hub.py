@@ -35,7 +35,7 @@ def dataset_metadata(manifest: Manifest) -> str:
 def metadata(name: str, videos: int, licence: str, fields: Collection[str], files: Mapping[str, Sequence[str]]) -> str:
     """The metadata, from the number of videos, the fields, and patterns of the files of each split."""
     tasks = [task for field, task in TASKS.items() if field in fields]
-    lines = ["---", f"pretty_name: {json.dumps(name)}", *_licence(licence)]
+    lines = ["---", f"pretty_name: {json.dumps(name)}", *licence_lines(licence)]
     for key, values in (("task_categories", tasks), ("size_categories", [size_category(videos)]), ("tags", TAGS)):
         lines += [f"{key}:", *(f"- {value}" for value in values)] if values else []
     if files:
@@ -82,7 +82,8 @@ def size_category(videos: int) -> str:
     return f"{short(power)}<n<{short(power + 1)}"
 
 
-def _licence(licence: str) -> list[str]:
+def licence_lines(licence: str) -> list[str]:
+    """The lines of a licence; none if none was chosen."""
     if not licence:
         return []
     if licence.lower() in LICENCES:

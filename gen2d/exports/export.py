@@ -17,10 +17,10 @@ from gen2d.config.contracts import Export
 from gen2d.core.errors import ConfigError, FolderError
 from gen2d.core.progress import inform, progress, stopping_on_sigterm
 from gen2d.engines.protocol import Engine, results
+from gen2d.exports.partial import PartialExport
 from gen2d.exports.parts import ExportJob, ExportTask, load_format, write_part
 from gen2d.exports.selection import selected
 from gen2d.exports.source import Source, source_of
-from gen2d.exports.partial import PartialExport
 from gen2d.loading.dataset import RenderOptions
 from gen2d.media import films
 from gen2d.storage.atomic import publishing, publishing_folder, replace_folder, sweep_beside
@@ -250,7 +250,7 @@ def _check_out(out: Path, format_: Export, description: Mapping[str, Any], overw
 
 
 def _check_folder(out: Path, description: Mapping[str, Any], overwrite: bool) -> None:
-    previous = _read_description(out)
+    previous = read_description(out)
     known = {DESCRIPTION, *(name.split("/")[0] for name in previous["files"])} if previous else set()
     foreign = {path.name for path in out.iterdir()} - known
     if foreign:
@@ -263,7 +263,7 @@ def _check_folder(out: Path, description: Mapping[str, Any], overwrite: bool) ->
         raise FolderError(f"{out} holds another export: choose another --out, or --overwrite to replace it")
 
 
-def _read_description(out: Path) -> dict[str, Any]:
+def read_description(out: Path) -> dict[str, Any]:
     """Contents of the folder's export.json; empty if there is no valid one."""
     try:
         description = parse_json(read_bytes(out / DESCRIPTION, JSON_BYTES)) or {}

@@ -114,3 +114,15 @@ def test_without_arrow_the_extra_is_named(toy: Path, tmp_path: Path, monkeypatch
     with pytest.raises(UserError, match=r"pip install gen2d\[hub\]"):
         gen2d.export(toy, to, tmp_path / "out")
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.filterwarnings("ignore:Exception ignored in:pytest.PytestUnraisableExceptionWarning")  # it closes no file
+def test_webdataset_reads_tars(toy: Path, tmp_path: Path) -> None:
+    webdataset = package("webdataset")
+    out, stored = gen2d.export(toy, "webdataset", tmp_path / "out").out, synthetic.stored(toy)
+    tars = [str(path) for path in out.glob("*.tar")]
+    found = list(webdataset.WebDataset(tars, shardshuffle=False).decode())
+    assert [sample["json"]["number"] for sample in found] == list(range(TRAIN))
+    for number, sample in enumerate(found):
+        check(dict(sample["npz"]) | {"time": np.arange(6) / 10}, stored, number)
+        assert film(sample["mp4"]).shape == stored["frames"][number].shape

@@ -9,7 +9,7 @@ import io
 import tarfile
 from pathlib import Path
 
-from gen2d.plugin import Batch, Export, Source, arrays, as_json, films
+from gen2d.plugin import Batch, Export, Source, arrays, as_json, films, tables
 
 TAR_BYTES, TAR_VIDEOS = 2**28, 1000  # about the maximum of a tar file, which holds one video at least
 ARRAYS = "npz"  # instead of a codec
@@ -36,6 +36,13 @@ def write(target: Path, source: Source) -> None:
                 member.size = len(content)
                 tar.addfile(member, io.BytesIO(content))
             source.advance(1)
+
+
+def finish(target: Path, source: Source) -> None:
+    """Write the card."""
+    split = source.ds.options.split
+    text = "Each video is a group of files in a tar file, for `webdataset` and for\n`datasets.load_dataset(FOLDER)`."
+    tables.write_card(target, source, [*source.fields], f"{split}-*.tar", text)
 
 
 def _files(source: Source, video: Batch) -> dict[str, bytes]:
@@ -66,5 +73,6 @@ EXPORT = Export(
     check=check,
     separate=True,
     part_videos=part_videos,
+    finish=finish,
     codecs=("h264", "av1", "ffv1", "mp4v", ARRAYS),
 )
