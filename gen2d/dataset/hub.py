@@ -32,11 +32,22 @@ def dataset_metadata(manifest: Manifest) -> str:
     return metadata(manifest.name, sum(manifest.splits.values()), manifest.licence, manifest.fields, files)
 
 
-def metadata(name: str, videos: int, licence: str, fields: Collection[str], files: Mapping[str, Sequence[str]]) -> str:
-    """The metadata, from the number of videos, the fields, and patterns of the files of each split."""
+def metadata(
+    name: str,
+    videos: int,
+    licence: str,
+    fields: Collection[str],
+    files: Mapping[str, Sequence[str]],
+    tags: Sequence[str] = (),
+) -> str:
+    """The metadata, from the number of videos, the fields, patterns of the files of each split, and further tags."""
     tasks = [task for field, task in TASKS.items() if field in fields]
     lines = ["---", f"pretty_name: {json.dumps(name)}", *licence_lines(licence)]
-    for key, values in (("task_categories", tasks), ("size_categories", [size_category(videos)]), ("tags", TAGS)):
+    for key, values in (
+        ("task_categories", tasks),
+        ("size_categories", [size_category(videos)]),
+        ("tags", [*TAGS, *tags]),
+    ):
         lines += [f"{key}:", *(f"- {value}" for value in values)] if values else []
     if files:
         lines += ["configs:", "- config_name: default", "  data_files:"]

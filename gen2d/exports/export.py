@@ -173,7 +173,7 @@ def export(
 
     with _translate_errors(out):
         if format_.separate:
-            size = _write_staged(out, write_parts, description, [*source.numbers], source.codec)
+            size = _write_staged(out, write_parts, description, [[*source.numbers], source.codec, sha256(content)])
         else:
             size = _write_output(out, format_, write, description)
     return Exported(out, len(source), size, time.perf_counter() - start, _loss(format_, source.codec))
@@ -287,12 +287,15 @@ def _write_output(out: Path, format_: Export, write: Callable[[Path], None], des
 
 
 def _write_staged(
-    out: Path, write: Callable[[PartialExport], None], description: Mapping[str, Any], numbers: list[int], codec: str
+    out: Path, write: Callable[[PartialExport], None], description: Mapping[str, Any], choices: list[Any]
 ) -> int:
-    """Write `out` part by part and return its size in bytes; go on with what a stopped export of the same has left."""
+    """Write `out` part by part and return its size in bytes; go on with what a stopped export of the same has left.
+
+    `choices` are what decides the files beside the description.
+    """
     out.parent.mkdir(parents=True, exist_ok=True)
     sweep_beside(out)
-    identity = sha256(as_json([dict(description), numbers, codec, __version__]))
+    identity = sha256(as_json([dict(description), choices, __version__]))
     with PartialExport(out, identity) as staging:
         write(staging)
         size = _describe(staging.files, description)

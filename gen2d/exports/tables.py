@@ -65,9 +65,9 @@ class Table:
         if not rows:
             return
         arrays = [self._column(name, [row[name] for row in rows]) for name in (*self.first, *self.media)]
-        for name, field in self.fields.items():
+        for name in self.fields:
             values = [self.time if name == "time" else row[name] for row in rows]
-            arrays.append(self._nested(np.stack(values), field))
+            arrays.append(nested(np.stack(values)))
         self.writer.write_table(self.arrow.Table.from_arrays(arrays, schema=self.schema))
 
     def __enter__(self) -> "Table":
@@ -89,24 +89,26 @@ class Table:
             kind = self.arrow.list_(kind)
         return kind
 
-    def _nested(self, values: np.ndarray, field: Field) -> Any:
-        """Arrow's array of nested lists with these values [rows, ...]."""
-        flat = values.reshape(-1)
-        if field.is_text:
-            leaf = self.arrow.array([text.decode() for text in flat.tolist()], self.arrow.string())
-        else:
-            leaf = self.arrow.array(flat)
-        for axis in range(values.ndim - 1, 0, -1):
-            count = int(np.prod(values.shape[:axis]))
-            offsets = np.arange(count + 1, dtype=np.int32) * values.shape[axis]
-            leaf = self.arrow.ListArray.from_arrays(self.arrow.array(offsets), leaf)
-        return leaf
+
+def nested(values: np.ndarray) -> Any:
+    """Arrow's array of nested lists with these values [rows, ...]; bytes become text."""
+    arrow, flat = pyarrow(), values.reshape(-1)
+    is_text = values.dtype.kind == "S"
+    leaf = arrow.array([text.decode() for text in flat.tolist()], arrow.string()) if is_text else arrow.array(flat)
+    for axis in range(values.ndim - 1, 0, -1):
+        count = int(np.prod(values.shape[:axis]))
+        offsets = np.arange(count + 1, dtype=np.int32) * values.shape[axis]
+        leaf = arrow.ListArray.from_arrays(arrow.array(offsets), leaf)
+    return leaf
 
 
-def write_card(target: Path, source: Source, names: Sequence[str], pattern: str, text: str) -> None:
+def write_card(
+    target: Path, source: Source, names: Sequence[str], pattern: str, text: str, tags: Sequence[str] = ()
+) -> None:
     """Write the dataset card, README.md, with the Hub's metadata: one split, whose files match `pattern`."""
     manifest, split = source.ds.manifest, source.ds.options.split
-    head = metadata(manifest.name, len(source), manifest.licence, names, {split_names([split])[split]: [pattern]})
+    files = {split_names([split])[split]: [pattern]}
+    head = metadata(manifest.name, len(source), manifest.licence, names, files, tags)
     body = f"""# {manifest.name}
 
 {len(source)} videos of two-dimensional rigid bodies, of the split {split}, {manifest.fps:g} frames per second, made by

@@ -35,7 +35,7 @@ from gen2d.media import films
 SIZES = {"T": 6, "H": 64, "W": 48, "K": 3}
 TRAIN = 10
 FILMS = {"mp4": ".mp4", "h264": ".mp4", "av1": ".mp4", "ffv1": ".mkv"}
-TABLES = ["parquet", "videofolder"] if importlib.util.find_spec("pyarrow") else []
+TABLES = ["parquet", "videofolder", "lerobot"] if importlib.util.find_spec("pyarrow") else []
 FOLDERS = [*FILMS, "npz", "webdataset", *TABLES]
 
 
@@ -468,7 +468,7 @@ def parts(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     for name in ("npz", "webdataset", *TABLES):
         form = dataclasses.replace(plugins.load("export", name), part_videos=lambda source: 4)
         monkeypatch.setattr(sys.modules[f"gen2d.exports.formats.{name}"], "EXPORT", form)
-    for name in ("webdataset", *TABLES[:1]):
+    for name in ("webdataset", *(name for name in TABLES if name != "videofolder")):
         monkeypatch.setattr(f"gen2d.exports.formats.{name}.part_videos", lambda source: 4)
     return written
 
@@ -567,7 +567,7 @@ def test_every_format_keeps_the_contract(name: str, balls: Path, tmp_path: Path)
     [
         (
             ["--to", "mp3"],
-            "--to is 'mp3', but must be one of av1, coco, ffv1, flo, h264, kitti_flow, mot, mp4, npz, objects",
+            "--to is 'mp3', but must be one of av1, coco, ffv1, flo, h264, kitti_flow, lerobot, mot, mp4, npz, objects",
         ),
         ([], "required: --to"),
         (["--to", "npz", "--split", "tran"], "has no split 'tran': did you mean 'train'?"),
@@ -578,7 +578,10 @@ def test_every_format_keeps_the_contract(name: str, balls: Path, tmp_path: Path)
         (["--to", "mot", "--fields", "index"], "--fields is index, but mot has its own: choose av1 or ffv1 or h264"),
         (["--to", "mp4", "--fields", "index"], "--fields is index, but must contain frames for mp4"),
         (["--to", "webdataset", "--codec", "gif"], "--codec is 'gif', but must be one of h264, av1, ffv1, mp4v, npz"),
-        (["--to", "mp4", "--codec", "ffv1"], "--codec is 'ffv1', but mp4 has one encoding only: choose parquet or"),
+        (
+            ["--to", "mp4", "--codec", "ffv1"],
+            "--codec is 'ffv1', but mp4 has one encoding only: choose lerobot or parquet",
+        ),
         (["--to", "npz", "--jobs", "0"], "--jobs is 0, but must be from 1 to 256"),
         (["--to", "npz", "--select", "index > 99"], "no video of the split train is like that"),
         (["--to", "npz", "--out", "file/child"], "is a file, not a folder"),
