@@ -32,6 +32,7 @@ if TYPE_CHECKING:
         UserError,
     )
     from gen2d.exports.export import export
+    from gen2d.exports.upload import push
     from gen2d.generation.run import generate
     from gen2d.loading.dataloader import DataLoader
     from gen2d.loading.dataset import Dataset, open
@@ -50,6 +51,7 @@ _HOMES = {
         "ConfigError DamagedError Error FolderError IncompleteError UnreachableError UntrustedError UserError"
     ),
     "gen2d.exports.export": "export",
+    "gen2d.exports.upload": "push",
     "gen2d.generation.run": "generate",
     "gen2d.loading.dataloader": "DataLoader",
     "gen2d.loading.dataset": "Dataset open",
@@ -65,7 +67,7 @@ _HOMES = {
 __all__ = [
     "Config", "ConfigError", "DamagedError", "DataLoader", "Dataset", "Error", "FolderError", "IncompleteError",
     "Space", "UnreachableError", "UntrustedError", "UserError", "export", "generate", "info", "load_config",
-    "mix", "open", "plot", "preview", "render", "render_soft", "simulate_again", "stream", "verify",
+    "mix", "open", "plot", "preview", "push", "render", "render_soft", "simulate_again", "stream", "verify",
 ]  # fmt: skip
 
 __getattr__, __dir__ = attach(__name__, _HOMES, ("grain", "torch"))

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from gen2d.core.enums import CIRCLE, DYNAMIC, KINEMATIC, POLYGON, STATIC
     from gen2d.core.errors import ConfigError
     from gen2d.core.schema import Field
+    from gen2d.exports import arrays, tables
     from gen2d.exports.source import Source
     from gen2d.loading import dataset
     from gen2d.loading.protocols import Batch
@@ -59,6 +60,7 @@ _HOMES = {
     "gen2d.core.enums": "CIRCLE DYNAMIC KINEMATIC POLYGON STATIC",
     "gen2d.core.errors": "ConfigError",
     "gen2d.core.schema": "Field",
+    "gen2d.exports": "arrays tables",
     "gen2d.exports.source": "Source",
     "gen2d.loading": "dataset",
     "gen2d.loading.protocols": "Batch",
@@ -125,6 +127,7 @@ __all__ = [
     "alone",
     "are_lines",
     "are_moving",
+    "arrays",
     "as_json",
     "builder",
     "caption",
@@ -151,6 +154,7 @@ __all__ = [
     "questions",
     "reduce_halves",
     "start_position",
+    "tables",
     "tile_windows",
     "to_pixels"
 ]  # fmt: skip

@@ -14,7 +14,7 @@ from gen2d.cli.parser import (
     limits,
     whole_number,
 )
-from gen2d.config.plugins import names
+from gen2d.config.plugins import load, names
 from gen2d.core.humanize import in_bytes, in_time
 
 
@@ -41,9 +41,24 @@ def add_arguments(parser: Parser) -> None:
         parser.add_argument(f"--{name}", type=whole_number, metavar=letter, help=meaning)
     parser.add_argument("--look", metavar="NAME", help="look of the frames, which are rendered again")
     add_overrides(parser)
+    parser.add_argument(
+        "--select",
+        metavar="CONDITIONS",
+        help="export only videos such as 'factors/balls > 3 and factors/gravity[1] < -5'",
+    )
+    parser.add_argument("--codec", metavar="NAME", help=f"encoding of the frames: {_codecs()} (default: the first)")
+    parser.add_argument(
+        "--jobs", type=whole_number, metavar="N", help="threads that encode videos (default: one a core, 8 at most)"
+    )
     add_trust(parser)
     add_engine(parser)
     add_network(parser)
+
+
+def _codecs() -> str:
+    """The codecs of each format that has several."""
+    formats = {name: load("export", name).codecs for name in names("export")}
+    return "; ".join(f"{name} has {', '.join(codecs)}" for name, codecs in formats.items() if codecs)
 
 
 def run(options: argparse.Namespace) -> int:
@@ -65,6 +80,9 @@ def run(options: argparse.Namespace) -> int:
         trust=options.trust,
         engine=engine_of(options),
         render=render or None,
+        select=options.select,
+        codec=options.codec,
+        jobs=options.jobs,
         **limits(options),
     )
     size = f"{in_time(exported.seconds)}, {in_bytes(exported.bytes)}"

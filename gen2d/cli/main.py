@@ -5,7 +5,7 @@ import os
 import sys
 from collections.abc import Sequence
 
-from gen2d.cli import clean, export, generate, info, listing, plot, preview, verify, view
+from gen2d.cli import clean, export, generate, info, listing, plot, preview, push, verify, view
 from gen2d.cli.parser import parse
 from gen2d.core.errors import Error, command_line
 from gen2d.core.progress import logged_to_stderr
@@ -20,6 +20,7 @@ VERBS = {
     "info": info,
     "verify": verify,
     "export": export,
+    "push": push,
     "clean": clean,
     "list": listing,
 }

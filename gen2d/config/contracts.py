@@ -42,6 +42,15 @@ def _no_blur(*_: Any) -> float:
     return 0.0
 
 
+def _few_videos(source: Any) -> int:
+    """Number of videos of a part, by default."""
+    return 64
+
+
+def _no_finish(target: Path, source: Any) -> None:
+    """Write nothing more."""
+
+
 def _no_sizes(*_: Any) -> dict[str, int]:
     """No further axes."""
     return {}
@@ -136,9 +145,13 @@ class Export(_Contract):
     check(source): raises ConfigError, before anything is written, if the format cannot hold these videos.
     fixed: whether the format holds these fields only.
     suffix: suffix of the single file written; "" for a folder.
-    separate: whether the files of a video depend on nothing but the video, as with `source.each`, so that several
-        machines may each write some of the videos.
-    loss: description of the information that the format drops; "" if it drops none.
+    separate: whether the files of a part of the videos depend on nothing but these, as with `source.each`, so that
+        several machines may each write some parts, and a killed export goes on. `write` is then called for each part.
+    part_videos(source): number of videos of a part; a part begins at a multiple of it.
+    finish(target, source): writes the files that describe all videos, if there are any, when all parts are there.
+    codecs: names of the encodings of frames that can be chosen, of which the first is the default; one is then in
+        `source.codec`. `films.CODECS` has those of films, with what each does not preserve.
+    loss: description of the information that the format drops; "" if it drops none but what its codec drops.
     """
 
     fields: tuple[str, ...]
@@ -147,4 +160,7 @@ class Export(_Contract):
     fixed: bool = False
     suffix: str = ""
     separate: bool = False
+    part_videos: Callable[[Any], int] = _few_videos
+    finish: Callable[[Path, Any], None] = _no_finish
+    codecs: tuple[str, ...] = ()
     loss: str = ""

@@ -10,6 +10,7 @@ there are no locks, as at a URL, a manifest is replaced only if it has not chang
 """
 
 import contextlib
+import dataclasses
 import json
 import math
 import os
@@ -19,13 +20,14 @@ from pathlib import Path
 from typing import Any
 
 from gen2d.core.errors import ConfigError, DamagedError, FolderError, UnreachableError, argument
-from gen2d.dataset.manifest import MARK_SEAL, identity_of, read_manifest, schema_of
+from gen2d.dataset.manifest import MARK_SEAL, folder_schema, identity_of, read_manifest, schema_of
 from gen2d.dataset.manifest_parser import SHARDS
 from gen2d.dataset.records import Records, read_records
 from gen2d.dataset.shard_writer import AGAIN
 from gen2d.dataset.snapshots import current_manifest, remove_replaced, remove_snapshots
 from gen2d.dataset.spec import (
     CONFIG,
+    EARLIER_SCHEMA,
     FILE_NAME,
     LOCK,
     MANIFEST,
@@ -34,6 +36,7 @@ from gen2d.dataset.spec import (
     PAGE,
     RECORDS,
     SCHEMA,
+    SCHEMAS,
     SHEET,
     SNAPSHOTS,
     TABLE_NAME,
@@ -194,7 +197,7 @@ def _claim(spec: DatasetSpec) -> None:
     """Write the mark of this dataset into the folder; raises FolderError for a folder of another dataset."""
     root = spec.root
     schema = schema_of(root)
-    if schema is not None and schema != SCHEMA:
+    if schema is not None and schema not in SCHEMAS:
         raise FolderError(
             f"{root} holds a dataset with the schema {schema}, but this gen2d writes {SCHEMA}: choose another "
             f"{argument('out')}, or {argument('overwrite', True)} to make the dataset anew"
@@ -219,12 +222,13 @@ def _claim(spec: DatasetSpec) -> None:
                 f"{root} holds another dataset ({difference}): choose another {argument('out')}, or "
                 f"{argument('overwrite', True)} to replace it"
             )
-    publish_changed(mark, mark_content(spec))
+    publish_changed(mark, mark_content(dataclasses.replace(spec, schema=folder_schema(root, spec.schema))))
 
 
 def mark_content(spec: DatasetSpec) -> bytes:
     """The content of the mark, the file that holds the dataset's identity."""
-    return as_json(seal({**spec.identity, "sources": spec.producer.get("sources", {})}, MARK_SEAL))
+    schema = {} if spec.schema == EARLIER_SCHEMA else {"schema": spec.schema}  # earlier versions named none
+    return as_json(seal({**spec.identity, **schema, "sources": spec.producer.get("sources", {})}, MARK_SEAL))
 
 
 def sources_of(root: Place) -> Mapping[str, str]:

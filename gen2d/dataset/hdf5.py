@@ -2,8 +2,9 @@
 
 Any HDF5 program reads them. Four files decide the bytes of a shard: `block.py` divides images into chunks,
 `storage/codecs.py` compresses each chunk, this file lays out chunks, values and attributes, and `rows.py` defines the
-index, by which gen2d reads without h5py. The bytes do not depend on times, hosts or users, nor on how the videos were
-grouped into blocks. h5py serves one thread at a time, so compression happens in
+index, by which gen2d reads without h5py. Each HDF5 dataset has a row per video, also those of the values that all
+videos share, and none has named columns, so that programs for tables read them. The bytes do not depend on times, hosts
+or users, nor on how the videos were grouped into blocks. h5py serves one thread at a time, so compression happens in
 other threads and chunks pass through h5py unchanged.
 """
 
@@ -22,6 +23,7 @@ import numpy as np
 from gen2d.core.schema import Field
 from gen2d.dataset.block import Block, image_names, row_names
 from gen2d.dataset.rows import seal_rows, video_type
+from gen2d.dataset.spec import EARLIER_SCHEMA, SCHEMA, stored_axes
 from gen2d.storage import codecs
 
 INDEX = "chunk_index"  # the HDF5 dataset of the videos' rows
@@ -47,14 +49,19 @@ def write(
     attributes: Mapping[str, str | int | float],
     constants: Mapping[str, np.ndarray],
     origin: int,
+    schema: str = SCHEMA,
 ) -> Offsets:
     """Write a file of these videos of a split; returns the offsets of its uncompressed fields.
 
     `blocks` hold the videos in order; chunks are written as they arrive, so that memory holds one block and never the
     images of a shard. `constants` are the values of the fields that all videos share, `origin` is the start value of
-    the index's checksums. Raises OSError, and ValueError for blocks that do not hold exactly these videos.
+    the index's checksums, `schema` one of SCHEMAS. Raises OSError, and ValueError for blocks that do not hold exactly
+    these videos.
     """
     images, rows, count = image_names(fields), row_names(fields), len(videos)
+    shared = {name: np.asarray(values) for name, values in constants.items()}
+    if schema != EARLIER_SCHEMA:
+        shared = {name: np.broadcast_to(values, (count, *values.shape)) for name, values in shared.items()}
     with _create(path) as file:
         file.attrs.update(attributes)
         shapes = {name: (count, *fields[name].shape(sizes)) for name in images + rows}
@@ -76,16 +83,18 @@ def write(
                 own[name]["crc32"] = block.crc[name].reshape(len(block), -1)
         for name, dataset in chunked.items():
             _fill_offsets(dataset, index[name])
-        tables = table | dict(constants)
-        _reserve(file, metadata + index.nbytes + sum(np.asarray(values).nbytes for values in tables.values()))
+        tables = table | shared
+        _reserve(file, metadata + index.nbytes + sum(values.nbytes for values in tables.values()))
         for name, values in sorted(tables.items()):
             file.create_dataset(name, data=np.asarray(values, _stored_type(fields[name])))
         for name, field in sorted(fields.items()):
-            file[name].attrs.update(axes=field.axes, unit=field.unit, meaning=field.meaning)
-        stored = file.create_dataset(INDEX, data=seal_rows(index, origin, videos))
-        stored.attrs.update(
-            axes="n", unit="", meaning="where each video's chunks lie, and CRC-32 of all that is stored"
-        )
+            file[name].attrs.update(axes=stored_axes(field, schema), unit=field.unit, meaning=field.meaning)
+        own = seal_rows(index, origin, videos)
+        axes, meaning = "n", "where each video's chunks lie, and CRC-32 of all that is stored"
+        if schema != EARLIER_SCHEMA:
+            own, axes = own.view(np.uint8).reshape(count, -1), "n bytes"
+        stored = file.create_dataset(INDEX, data=own)
+        stored.attrs.update(axes=axes, unit="", meaning=meaning)
         return Offsets(_offset(stored), [_offset(file[name]) for name in rows])
 
 

@@ -16,7 +16,17 @@ from gen2d.core.schema import Field
 from gen2d.dataset.block import row_names, stored_bytes
 from gen2d.dataset.manifest_parser import HASH, InvalidValueError, ManifestParser, ShardTable
 from gen2d.dataset.rows import shard_type, video_type
-from gen2d.dataset.spec import IDENTITY, MANIFEST, MARK, SCHEMA, DatasetSpec, mark_path, snapshot_path
+from gen2d.dataset.spec import (
+    EARLIER_SCHEMA,
+    IDENTITY,
+    MANIFEST,
+    MARK,
+    SCHEMA,
+    SCHEMAS,
+    DatasetSpec,
+    mark_path,
+    snapshot_path,
+)
 from gen2d.dataset.statistics import SAMPLED, Stats
 from gen2d.storage.explain import reading_error
 from gen2d.storage.paths import Place, Url, reading
@@ -59,6 +69,11 @@ class Manifest:
     def identity(self) -> dict[str, Any]:
         """The values that another run must share to add to this dataset."""
         return {key: self.plain[key] for key in IDENTITY}
+
+    @property
+    def schema(self) -> str:
+        """The schema of its files, one of SCHEMAS."""
+        return self.plain["schema"]
 
     @functools.cached_property
     def identity_sha256(self) -> str:
@@ -157,7 +172,7 @@ def parse(content: bytes, source: str) -> Manifest:
     if plain is None:
         raise DamagedError(f"{source} is not what was written")
     schema = plain.get("schema")
-    if schema != SCHEMA:
+    if schema not in SCHEMAS:
         raise FolderError(
             f"{source} has {f'the schema {schema}' if _is_schema(schema) else 'an unknown schema'}, but this gen2d "
             f"reads {SCHEMA}: make the dataset anew"
@@ -191,6 +206,19 @@ def schema_of(root: Place) -> str | None:
     return schema if _is_schema(schema) else None
 
 
+def folder_schema(root: Place, default: str) -> str:
+    """The schema that all files of the folder's dataset have; `default` if there is none yet, or if it is damaged.
+
+    The marks of EARLIER_SCHEMA name none.
+    """
+    for path, key in ((root / MANIFEST, SEAL), (mark_path(root), MARK_SEAL)):
+        values = read_sealed(path, key)
+        if values is not None:
+            schema = values.get("schema", EARLIER_SCHEMA)
+            return schema if schema in SCHEMAS else default
+    return default
+
+
 def _is_schema(schema: object) -> TypeGuard[str]:
     """Whether this value can be the name of a schema."""
     return isinstance(schema, str) and len(schema) < 100 and schema.isprintable()
@@ -211,7 +239,7 @@ def describe(
     It contains no time, host or folder: the same dataset gives the same bytes.
     """
     plain = spec.identity | {
-        "schema": SCHEMA,
+        "schema": folder_schema(spec.root, spec.schema),
         "name": spec.name,
         "splits": dict(splits),
         "rng": spec.rng,

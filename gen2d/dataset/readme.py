@@ -1,7 +1,8 @@
 """The dataset card, README.md, from the manifest."""
 
+from gen2d.dataset.hub import dataset_metadata, split_names
 from gen2d.dataset.manifest import Manifest, statistics
-from gen2d.dataset.spec import PAGE, SHEET, shard_name, shard_of
+from gen2d.dataset.spec import EARLIER_SCHEMA, PAGE, SHEET, shard_name, shard_of
 
 
 def card_split(manifest: Manifest) -> str:
@@ -12,9 +13,11 @@ def card_split(manifest: Manifest) -> str:
 def readme(manifest: Manifest, command: str) -> str:
     """The dataset card as Markdown; `command` is the command that made the dataset."""
     fields, first = manifest.fields, card_split(manifest)
+    plugin = ", hdf5plugin" if manifest.codec == "zstd" else ""
+    reads_rows = manifest.schema != EARLIER_SCHEMA
     lines = (f"| {name} | {f.dtype} | {f.axes} | {f.unit} | {f.meaning} |" for name, f in fields.items())
     shard = shard_of(first, 0, min(manifest.splits[first], manifest.videos_per_shard), manifest.videos_per_shard)
-    return _README.format(
+    return dataset_metadata(manifest) + _README.format(
         name=manifest.name,
         counts=", ".join(f"{count} {split}" for split, count in manifest.splits.items()),
         fps=manifest.fps,
@@ -28,7 +31,8 @@ def readme(manifest: Manifest, command: str) -> str:
         statistics="\n".join(f"| {' | '.join(row)} |" for row in statistics(manifest)),
         sampled=manifest.stats_sampled,
         field="frames" if "frames" in fields else min(fields),
-        plugin=", hdf5plugin" if manifest.codec == "zstd" else "",
+        hub=_HUB.format(split=split_names(manifest.splits)[first], plugin=plugin) if reads_rows else "",
+        plugin=plugin,
         command="` and `".join(f"{command} --n {n} --split {split}" for split, n in manifest.splits.items()),
         seed=manifest.seed,
         licence=manifest.licence or "None was chosen: choose one before publishing.",
@@ -39,6 +43,17 @@ _PICTURED = "the first videos, time from left to right; below them annotations o
 _PAGE = f"""[{PAGE}]({PAGE}) plays the first videos in any browser, without a network: outlines, velocities, contacts,
 trails, boxes and masks over the frames, the videos of a matched set side by side, energies and factors.
 `python -m gen2d view .` shows all videos."""
+
+_HUB = """With Hugging Face's `datasets`, also from the Hub, by the name of its repository (`streaming=True` downloads
+videos as they are read; each row also has the fields that all videos share, and gen2d's own `chunk_index`):
+
+```python
+import datasets, os{plugin}
+dataset = datasets.load_dataset(os.path.abspath("."), split="{split}")
+video = dataset.with_format("numpy")[0]
+```
+
+"""
 
 # The folder is `.` in the examples, as a copy may have another name.
 _README = """# {name}
@@ -85,7 +100,7 @@ for batch in loader:
     means = jax.tree.map(jax.numpy.mean, batch)
 ```
 
-With h5py alone:
+{hub}With h5py alone:
 
 ```python
 import h5py{plugin}

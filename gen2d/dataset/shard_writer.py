@@ -8,9 +8,10 @@ import numpy as np
 from gen2d.core.errors import FolderError, UnreachableError, UserError
 from gen2d.dataset import hdf5
 from gen2d.dataset.block import Block, stored_bytes
+from gen2d.dataset.manifest import folder_schema
 from gen2d.dataset.records import RecordLog
 from gen2d.dataset.rows import origin, seal_rows, shard_type
-from gen2d.dataset.spec import SCHEMA, DatasetSpec, Shard, shard_path
+from gen2d.dataset.spec import DatasetSpec, Shard, shard_path
 from gen2d.dataset.statistics import merge_moments, pack_moments
 from gen2d.storage.atomic import publishing, work_folder
 from gen2d.storage.explain import FULL, writing_error
@@ -25,6 +26,7 @@ class ShardWriter:
 
     def __init__(self, spec: DatasetSpec) -> None:
         self.spec, self.log = spec, RecordLog(spec.root)
+        self.schema = folder_schema(spec.root, spec.schema)
 
     def write(self, shard: Shard, blocks: Iterable[Block]) -> np.ndarray:
         """Write a shard from its blocks and record it; returns its row [1].
@@ -34,13 +36,13 @@ class ShardWriter:
         """
         spec, totals = self.spec, _Totals()
         begin = origin(spec.identity_sha256, shard.split)
-        attributes = {"schema": SCHEMA, "name": spec.name, "split": shard.split, "first": shard.first}
+        attributes = {"schema": self.schema, "name": spec.name, "split": shard.split, "first": shard.first}
         attributes |= {"fps": spec.fps, "seed": spec.seed, "conventions": spec.conventions}
         videos = range(shard.first, shard.first + shard.count)
         try:
             with publishing(shard_path(spec.root, shard.name)) as temporary:
                 stored = spec.fields, spec.sizes, videos, totals.count(blocks), spec.codec, spec.chunk_frames
-                offsets = hdf5.write(temporary, *stored, attributes, spec.constants, begin)
+                offsets = hdf5.write(temporary, *stored, attributes, spec.constants, begin, self.schema)
                 row = np.zeros(1, shard_type(spec.fields))
                 row["first"], row["count"], row["data_bytes"] = shard.first, shard.count, totals.bytes
                 row["bytes"], row["index"], row["offsets"] = temporary.stat().st_size, offsets.index, offsets.rows

@@ -14,7 +14,11 @@ from gen2d.core.schema import Field
 from gen2d.storage.paths import Place
 from gen2d.storage.sealed import as_json, sha256
 
-SCHEMA = "gen2d.dataset/3"
+SCHEMA = "gen2d.dataset/4"
+# In its shards, fields that all videos share have no leading axis of videos, and the index has rows with named columns:
+# programs that expect the same number of rows in all HDF5 datasets, such as Hugging Face's, cannot read it.
+EARLIER_SCHEMA = "gen2d.dataset/3"
+SCHEMAS = (EARLIER_SCHEMA, SCHEMA)  # those that gen2d reads, and writes into folders that have them
 MANIFEST, SHEET, PAGE, CONFIG = "manifest.json", "sheet.png", "index.html", "config.yaml"
 MARK = Path(".gen2d")  # the subfolder of files that only gen2d needs
 RECORDS = MARK / "records"  # logs of the shards that are done and not in the manifest yet
@@ -57,6 +61,7 @@ class DatasetSpec:
     command: str = ""
     licence: str = ""
     copies: Mapping[str, bytes] = dataclasses.field(default_factory=dict)  # the user's own files, by name in the folder
+    schema: str = SCHEMA  # of a new folder; one that is there keeps its own
 
     @property
     def identity(self) -> dict[str, Any]:
@@ -114,6 +119,11 @@ def plan(counts: Mapping[str, int], videos_per_shard: int) -> list[Shard]:
 def shards_of_worker(shards: Iterable[Shard], worker: int, workers: int) -> list[Shard]:
     """The shards that worker number `worker` of `workers` makes, independent of what the others have done."""
     return [shard for shard in shards if shard.place % workers == worker]
+
+
+def stored_axes(field: Field, schema: str) -> str:
+    """The axes of a field in the shards of a dataset with this schema."""
+    return field.axes if field.per_video or schema == EARLIER_SCHEMA else f"n {field.axes}".rstrip()
 
 
 def shard_name(name: str) -> str:

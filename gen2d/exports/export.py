@@ -1,4 +1,8 @@
-"""Export of one split of a dataset to another format, written completely or not at all."""
+"""Export of one split of a dataset to another format, written completely or not at all.
+
+Formats whose files belong to parts of the videos are written part by part into a folder beside the output, and an
+export that was killed goes on with the parts that are missing.
+"""
 
 import contextlib
 import dataclasses
@@ -7,21 +11,26 @@ from collections.abc import Callable, Generator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from gen2d._version import __version__
 from gen2d.config import plugins
 from gen2d.config.contracts import Export
 from gen2d.core.errors import ConfigError, FolderError
 from gen2d.core.progress import inform, progress, stopping_on_sigterm
 from gen2d.engines.protocol import Engine, results
-from gen2d.exports.parts import PART, ExportJob, ExportTask, load_format
+from gen2d.exports.partial import PartialExport
+from gen2d.exports.parts import ExportJob, ExportTask, load_format, write_part
+from gen2d.exports.selection import selected
 from gen2d.exports.source import Source, source_of
 from gen2d.loading.dataset import RenderOptions
-from gen2d.storage.atomic import publishing, publishing_folder, remove_tree, sweep_beside
+from gen2d.media import films
+from gen2d.storage.atomic import publishing, publishing_folder, replace_folder, sweep_beside
 from gen2d.storage.explain import writing_error
 from gen2d.storage.paths import Place, Url, place
 from gen2d.storage.retries import Network
-from gen2d.storage.sealed import JSON_BYTES, as_json, parse_json, read_bytes
+from gen2d.storage.sealed import JSON_BYTES, as_json, parse_json, read_bytes, sha256
 
 SCHEMA = "gen2d.export/1"
+MOST_JOBS = 256
 DESCRIPTION = "export.json"  # in every exported folder: its origin, and the files that belong to it
 
 
@@ -48,12 +57,16 @@ def export(
     trust: Sequence[str] = (),
     engine: Engine | None = None,
     render: RenderOptions | None = None,
+    select: str | None = None,
+    codec: str | None = None,
+    jobs: int | None = None,
     timeout: float = 30.0,
     deadline: float = 300.0,
 ) -> Exported:
     """Export one split of a complete dataset to another format.
 
-    The output appears when it is complete. Frames that are not stored are rendered, which imports jax.
+    The output appears when it is complete. Frames that are not stored are rendered, which imports jax. An export that
+    was stopped goes on where it was when it is started again, in formats that have files for each video.
 
     Parameters
     ----------
@@ -82,6 +95,13 @@ def export(
         machines must see the dataset and the folder of `out`.
     render : RenderOptions, optional
         Size, look and other options of the frames, such as `{"height": 256, "width": 256}`, as in `open`.
+    select : str, optional
+        Conditions on the values of the videos to export, such as "factors/balls > 3 and factors/gravity[1] < -5". By
+        default all videos of the split are exported.
+    codec : str, optional
+        Encoding of the frames, in formats that have several, such as "ffv1" for lossless films in "webdataset".
+    jobs : int, optional
+        Number of threads that encode videos; by default one for each core, but at most 8.
     timeout : float
         Maximum time, in s, to wait for a server to connect or to send the next part of an answer.
     deadline : float
@@ -115,7 +135,10 @@ def export(
     folder = place(root, Network(timeout, deadline))
     source = source_of(folder, split, _patterns(to, format_, fields), trust, render)
     out = Path(out) if out is not None else _default_out(folder, f"{name.removesuffix('.py')}{format_.suffix}")
-    description = _export_description(source, name)
+    source = dataclasses.replace(source, codec=_codec(to, format_, codec), jobs=_jobs(jobs))
+    if select is not None:
+        source = dataclasses.replace(source, selection=selected(source.ds, select))
+    description = _export_description(source, name) | ({"select": select} if select else {})
     format_.check(source)
     _check_out(out, format_, description, overwrite)
     log = log or inform
@@ -124,21 +147,60 @@ def export(
         raise ConfigError(f"--to is {to}, whose files hold many videos: leave out --engine, or choose one of {names}")
 
     def write(target: Path) -> None:
-        if engine is not None:
-            there = folder.absolute() if isinstance(folder, Path) else folder
-            fields = tuple(source.fields)
-            options = source.ds.options.split, fields, trust, render, to, content
-            job = ExportJob(ExportTask(there, *options, target.absolute()))
-            parts = [source.numbers[first : first + PART] for first in range(0, len(source), PART)]
-            for _ in results(engine, job, parts, log):
-                pass
-            return
         with stopping_on_sigterm(log), progress("Exporting", len(source), log) as advance:
             format_.write(target, dataclasses.replace(source, advance=advance))
 
+    def write_parts(staging: PartialExport) -> None:
+        size, count = format_.part_videos(source), len(source)
+        parts = [range(first, min(first + size, count)) for first in range(0, count, size)]
+        todo = [part for part in parts if part.start not in staging.done]
+        left = sum(map(len, todo))
+        if len(todo) < len(parts):
+            log(f"{count - left:,} of {count:,} videos are written already")
+        if engine is not None:
+            there = folder.absolute() if isinstance(folder, Path) else folder
+            options = source.ds.options.split, tuple(source.fields), trust, render, to, content
+            more = source.selection, source.codec, source.jobs
+            job = ExportJob(ExportTask(there, *options, staging.files.absolute(), *more))
+            for done in results(engine, job, todo, log):
+                staging.add(done.item.start)
+        else:
+            with stopping_on_sigterm(log), progress("Exporting", left, log) as advance:
+                for part in todo:
+                    write_part(format_, dataclasses.replace(source, part=part, advance=advance), staging.files)
+                    staging.add(part.start)
+        format_.finish(staging.files, source)
+
     with _translate_errors(out):
-        size = _write_output(out, format_, write, description)
-    return Exported(out, len(source), size, time.perf_counter() - start, format_.loss)
+        if format_.separate:
+            size = _write_staged(out, write_parts, description, [[*source.numbers], source.codec, sha256(content)])
+        else:
+            size = _write_output(out, format_, write, description)
+    return Exported(out, len(source), size, time.perf_counter() - start, _loss(format_, source.codec))
+
+
+def _codec(to: str, format_: Export, codec: str | None) -> str:
+    """The codec that is chosen, or the format's default; "" if the format has one only."""
+    if codec is None:
+        return format_.codecs[0] if format_.codecs else ""
+    if not format_.codecs:
+        several = [name for name in plugins.names("export") if plugins.load("export", name).codecs]
+        raise ConfigError(f"--codec is {codec!r}, but {to} has one encoding only: choose {' or '.join(several)}")
+    if codec not in format_.codecs:
+        raise ConfigError(f"--codec is {codec!r}, but must be one of {', '.join(format_.codecs)} for {to}")
+    return codec
+
+
+def _jobs(jobs: int | None) -> int:
+    if jobs is not None and not 1 <= jobs <= MOST_JOBS:
+        raise ConfigError(f"--jobs is {jobs}, but must be from 1 to {MOST_JOBS}")
+    return jobs or 0
+
+
+def _loss(format_: Export, codec: str) -> str:
+    """What the format and its codec do not preserve."""
+    losses = [films.CODECS[codec].loss] if codec in films.CODECS else []
+    return "; ".join(filter(None, [*losses, format_.loss]))
 
 
 def _patterns(to: str, format_: Export, fields: Sequence[str] | None) -> Sequence[str]:
@@ -188,19 +250,20 @@ def _check_out(out: Path, format_: Export, description: Mapping[str, Any], overw
 
 
 def _check_folder(out: Path, description: Mapping[str, Any], overwrite: bool) -> None:
-    previous = _read_description(out)
+    previous = read_description(out)
     known = {DESCRIPTION, *(name.split("/")[0] for name in previous["files"])} if previous else set()
     foreign = {path.name for path in out.iterdir()} - known
     if foreign:
         raise FolderError(f"{out} holds {min(foreign)}, which no export made: choose another --out")
     if not known:
         return  # an empty folder
-    same = all(previous.get(key) == description[key] for key in ("format", "split", "name", "seed", "config_sha256"))
+    keys = "format", "split", "name", "seed", "config_sha256", "select"
+    same = all(previous.get(key) == description.get(key) for key in keys)
     if not same and not overwrite:
         raise FolderError(f"{out} holds another export: choose another --out, or --overwrite to replace it")
 
 
-def _read_description(out: Path) -> dict[str, Any]:
+def read_description(out: Path) -> dict[str, Any]:
     """Contents of the folder's export.json; empty if there is no valid one."""
     try:
         description = parse_json(read_bytes(out / DESCRIPTION, JSON_BYTES)) or {}
@@ -219,11 +282,33 @@ def _write_output(out: Path, format_: Export, write: Callable[[Path], None], des
         return out.stat().st_size
     with publishing_folder(out) as temporary:
         write(temporary)
-        for path in temporary.glob(".part-*"):  # of workers that were killed
-            remove_tree(path)
-        paths = sorted(path for path in temporary.rglob("*") if path.is_file())
-        files = {path.relative_to(temporary).as_posix(): path.stat().st_size for path in paths}
-        (temporary / DESCRIPTION).write_bytes(as_json({**description, "files": files}))
+        size = _describe(temporary, description)
+    return size
+
+
+def _write_staged(
+    out: Path, write: Callable[[PartialExport], None], description: Mapping[str, Any], choices: list[Any]
+) -> int:
+    """Write `out` part by part and return its size in bytes; go on with what a stopped export of the same has left.
+
+    `choices` are what decides the files beside the description.
+    """
+    out.parent.mkdir(parents=True, exist_ok=True)
+    sweep_beside(out)
+    identity = sha256(as_json([dict(description), choices, __version__]))
+    with PartialExport(out, identity) as staging:
+        write(staging)
+        size = _describe(staging.files, description)
+        replace_folder(out, staging.files)
+        staging.remove()
+    return size
+
+
+def _describe(folder: Path, description: Mapping[str, Any]) -> int:
+    """Write export.json and return the bytes of the other files."""
+    paths = sorted(path for path in folder.rglob("*") if path.is_file() and path != folder / DESCRIPTION)
+    files = {path.relative_to(folder).as_posix(): path.stat().st_size for path in paths}
+    (folder / DESCRIPTION).write_bytes(as_json({**description, "files": files}))
     return sum(files.values())
 
 

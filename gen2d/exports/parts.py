@@ -7,17 +7,17 @@ import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
+
 from gen2d._version import __version__
 from gen2d.config import plugins
 from gen2d.config.contracts import Export
 from gen2d.core.errors import ConfigError
 from gen2d.core.progress import Log
 from gen2d.engines.protocol import Report, other_version
-from gen2d.exports.source import source_of
+from gen2d.exports.source import Source, source_of
 from gen2d.loading.dataset import RenderOptions
 from gen2d.storage.paths import Place
-
-PART = 64  # videos that are written together
 
 
 def load_format(to: str) -> tuple[Export, bytes]:
@@ -41,10 +41,25 @@ class ExportTask:
     to: str
     content: bytes  # of the format's file, if it is the user's
     target: Path
+    selection: np.ndarray | None = None
+    codec: str = ""
+    jobs: int = 0
+
+
+def write_part(format_: Export, source: Source, target: Path) -> None:
+    """Write the files of a part of the videos into the folder, each whole or not at all."""
+    with tempfile.TemporaryDirectory(dir=target.parent, prefix=".part-") as folder:
+        format_.write(Path(folder), source)
+        for path in sorted(Path(folder).rglob("*")):  # whole files only, as another worker may write the same
+            to = target / path.relative_to(folder)
+            if path.is_dir():
+                to.mkdir(exist_ok=True)
+            else:
+                path.replace(to)
 
 
 class ExportJob:
-    """Numbers of the videos to export, in ranges, for an engine."""
+    """Places of the videos to export among those that are selected, in ranges, for an engine."""
 
     title, unit, noun = "Exporting", "videos", "part"
 
@@ -65,7 +80,8 @@ class _ExportWorker:
     def __init__(self, task: ExportTask, device: str, log: Log) -> None:
         if device == "cpu":
             os.environ["JAX_PLATFORMS"] = "cpu"
-        self.source = source_of(task.root, task.split, task.fields, task.trust, task.render)
+        source = source_of(task.root, task.split, task.fields, task.trust, task.render)
+        self.source = dataclasses.replace(source, selection=task.selection, codec=task.codec, jobs=task.jobs)
         self.format: Export = plugins.load("export", task.to, "--to", task.content)
         self.target = task.target
 
@@ -77,10 +93,7 @@ class _ExportWorker:
 
     def run(self, items: Sequence[range]) -> list[int]:
         for part in items:
-            with tempfile.TemporaryDirectory(dir=self.target, prefix=".part-") as folder:
-                self.format.write(Path(folder), dataclasses.replace(self.source, part=part))
-                for path in Path(folder).iterdir():  # whole files only, as another worker may write the same
-                    path.replace(self.target / path.name)
+            write_part(self.format, dataclasses.replace(self.source, part=part), self.target)
         return [len(part) for part in items]
 
     def run_all(self, items: Sequence[range], log: Log) -> list[int]:

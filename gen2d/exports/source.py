@@ -6,6 +6,9 @@ import os
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from typing import TypeVar
+
+import numpy as np
 
 from gen2d.core.errors import ConfigError
 from gen2d.core.schema import Field
@@ -17,6 +20,7 @@ from gen2d.storage.paths import Place
 
 DRAWN = ("frames", "masks/", "boxes/", "visibility/", "flow/", "tracks/")  # what can be rendered from states
 BATCH_BYTES = 2**26  # of videos that are read, or rendered, at once
+Result = TypeVar("Result")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -25,15 +29,25 @@ class Source:
 
     ds: Dataset
     advance: Callable[[int], None]  # to be called with the number of videos just written
-    part: range | None = None  # numbers of the videos, if these are not all of the split
+    part: range | None = None  # of the selected videos, by their places, if these are not all
+    selection: np.ndarray | None = None  # numbers of the selected videos, ascending, if these are not all of the split
+    codec: str = ""  # encoding of the frames; "" where the format has one only
+    jobs: int = 0  # number of threads; 0: one for each core, but at most 8
 
     @property
-    def numbers(self) -> range:
+    def places(self) -> range:
+        """Places of these videos among those that are selected."""
+        count = len(self.ds) if self.selection is None else len(self.selection)
+        return range(count) if self.part is None else self.part
+
+    @property
+    def numbers(self) -> range | list[int]:
         """Numbers of the videos in the dataset."""
-        return range(len(self.ds)) if self.part is None else self.part
+        places = self.places
+        return places if self.selection is None else [int(n) for n in self.selection[places.start : places.stop]]
 
     def __len__(self) -> int:
-        return len(self.numbers)
+        return len(self.places)
 
     @property
     def fields(self) -> dict[str, Field]:
@@ -55,29 +69,38 @@ class Source:
         """Size of one video before compression, bytes."""
         return sum(stored_bytes(field, self.ds.sizes) for field in self.fields.values())
 
+    @property
+    def stored_video_bytes(self) -> int:
+        """Size of one video of the split in its shards, with all fields, bytes."""
+        split = self.ds.options.split
+        return -(-self.ds.manifest.tables[split].bytes // max(1, self.ds.manifest.splits[split]))
+
     def key(self, number: int) -> str:
         """File name of a video, without suffix: the split and the index, padded so that names sort by index."""
         return f"{self.ds.options.split}-{number:09d}"
 
     def videos(self) -> Iterator[Batch]:
         """Videos one at a time, as dictionaries of arrays by field name."""
-        count = max(1, BATCH_BYTES // max(1, self.video_bytes))
-        for first in range(0, len(self), count):
-            yield from unbatch(self.ds.batch(self.numbers[first : first + count]))
+        count, numbers = max(1, BATCH_BYTES // max(1, self.video_bytes)), self.numbers
+        for first in range(0, len(numbers), count):
+            yield from unbatch(self.ds.batch(numbers[first : first + count]))
 
     def each(self, write: Callable[[str, Batch], None]) -> None:
         """Call `write(key, video)` for every video in several threads, and report the progress to `advance`."""
-        threads = min(os.cpu_count() or 1, 8)
-        running: deque[Future[None]] = deque()
+        for _ in self.map(write):
+            self.advance(1)
+
+    def map(self, function: Callable[[str, Batch], Result]) -> Iterator[Result]:
+        """Results of `function(key, video)` of every video, in their order, from several threads."""
+        threads = self.jobs or min(os.cpu_count() or 1, 8)
+        running: deque[Future[Result]] = deque()
         with ThreadPoolExecutor(threads) as pool:
             for number, video in zip(self.numbers, self.videos(), strict=True):
-                running.append(pool.submit(write, self.key(number), video))
+                running.append(pool.submit(function, self.key(number), video))
                 if len(running) > threads:
-                    running.popleft().result()
-                    self.advance(1)
-            for future in running:
-                future.result()
-                self.advance(1)
+                    yield running.popleft().result()
+            while running:
+                yield running.popleft().result()
 
 
 def source_of(

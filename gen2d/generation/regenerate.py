@@ -15,7 +15,7 @@ from gen2d.core.errors import DamagedError, FolderError, argument
 from gen2d.core.progress import Log, inform, waiting
 from gen2d.dataset import folder, hdf5
 from gen2d.dataset.hdf5_check import faults
-from gen2d.dataset.manifest import Manifest, identity_of, read_manifest
+from gen2d.dataset.manifest import Manifest, folder_schema, identity_of, read_manifest
 from gen2d.dataset.records import Records, read_records, read_tables, tables_by_name
 from gen2d.dataset.rows import shard_type
 from gen2d.dataset.snapshots import SupersededError, check_current, publish_snapshot
@@ -238,7 +238,7 @@ def _original_spec(source: VideoSource, root: Place, identity: Identity, manifes
         difference = difference or "their fields differ"
         raise FolderError(f"{root}: its config makes other videos here than the dataset holds: {difference}")
     producer = {**manifest.producer, "fingerprint": identity["fingerprint"]} if manifest else spec.producer
-    return dataclasses.replace(spec, producer=producer)
+    return dataclasses.replace(spec, producer=producer, schema=folder_schema(root, spec.schema))
 
 
 def _damaged_shards(

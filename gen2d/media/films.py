@@ -1,6 +1,8 @@
 """Film files: MPEG-4 by OpenCV, a required dependency, and other codecs by PyAV, an optional one."""
 
+import dataclasses
 import os
+import tempfile
 from collections.abc import Mapping
 from fractions import Fraction
 from pathlib import Path
@@ -14,6 +16,41 @@ from gen2d.core.errors import ConfigError, UserError
 LOSS = "lossy: colours at half the resolution, and rounded"  # of YUV 4:2:0
 SLOWEST = 0.1  # frames/s; OpenCV rounds rates to a thousandth
 FASTEST = 2**16 - 1  # frames/s; MPEG-4 stores 16 bits
+
+
+@dataclasses.dataclass(frozen=True)
+class Codec:
+    """A way to encode frames as a film."""
+
+    meaning: str
+    suffix: str
+    fastest: float = FASTEST  # frames/s
+    loss: str = LOSS  # what it does not preserve; "" if it preserves all
+    encoder: str = ""  # FFmpeg's name; "" for MPEG-4 by OpenCV
+    pixels: str = "yuv420p"  # FFmpeg's name of the pixel format
+    options: Mapping[str, str] = dataclasses.field(default_factory=dict[str, str])  # FFmpeg's
+
+    def check(self, name: str, size: tuple[int, int], fps: float) -> None:
+        """Raise ConfigError for unsupported frame sizes and rates, and UserError without PyAV if that is needed."""
+        if self.loss:
+            check_size(name, size)
+        check_rate(name, fps, self.fastest)
+        if self.encoder:
+            pyav()
+
+    def write(self, path: Path, frames: np.ndarray, fps: float) -> None:
+        """Write frames [T, H, W, 3], uint8 RGB; raises OSError."""
+        if self.encoder:
+            encode(path, frames, fps, self.encoder, self.pixels, self.options)
+        else:
+            mp4v(path, frames, fps)
+
+    def content(self, frames: np.ndarray, fps: float) -> bytes:
+        """Content of the film's file; raises OSError."""
+        with tempfile.TemporaryDirectory(prefix="gen2d-") as folder:
+            path = Path(folder) / f"film{self.suffix}"
+            self.write(path, frames, fps)
+            return path.read_bytes()
 
 
 def mp4v(path: Path, frames: np.ndarray, fps: float) -> None:
@@ -72,12 +109,39 @@ def check_size(name: str, size: tuple[int, int]) -> None:
     """Raise ConfigError for an odd height or width, at which colours cannot have half the resolution."""
     for side, pixels in zip(("height", "width"), size, strict=True):
         if pixels % 2:
-            raise ConfigError(f"video.{side} is {pixels}, but must be even for {name}: choose ffv1, npz or webdataset")
+            raise ConfigError(f"video.{side} is {pixels}, but must be even for {name}: choose ffv1 or npz")
 
 
 def check_rate(name: str, fps: float, fastest: float) -> None:
     """Raise ConfigError for a frame rate that a format cannot store."""
     if not SLOWEST <= fps <= fastest:
-        raise ConfigError(
-            f"video.fps is {fps:g}, but must be from {SLOWEST:g} to {fastest:g} for {name}: choose npz or webdataset"
-        )
+        raise ConfigError(f"video.fps is {fps:g}, but must be from {SLOWEST:g} to {fastest:g} for {name}: choose npz")
+
+
+CODECS = {
+    "mp4v": Codec("MPEG-4 part 2 by OpenCV: needs no extra package; browsers do not play it", ".mp4"),
+    # Flat discs need a better quality than camera images, for which the default crf of 23 is meant. With mbtree (x264
+    # in PyAV 18) encoding is not reproducible: 1 in 5 videos of 64 px and 32 frames had other bytes in another run.
+    "h264": Codec(
+        "H.264 by PyAV, which browsers play",
+        ".mp4",
+        encoder="libx264",
+        options={"crf": "12", "x264-params": "no-mbtree=1", "movflags": "+faststart"},
+    ),
+    "av1": Codec(
+        "AV1 by PyAV: smaller than H.264, but slower to encode",
+        ".mp4",
+        fastest=240,  # the maximum of this encoder
+        encoder="libsvtav1",
+        options={"crf": "20", "preset": "8", "svtav1-params": "lp=1"},
+    ),
+    "ffv1": Codec(
+        "FFV1 in Matroska by PyAV, lossless, with a checksum in every frame",
+        ".mkv",
+        fastest=1000,  # Matroska stores times in milliseconds
+        loss="",
+        encoder="ffv1",
+        pixels="bgr0",  # the stored bytes in another order; every YUV format would round them
+        options={"level": "3", "coder": "1", "context": "1", "slicecrc": "1"},
+    ),
+}

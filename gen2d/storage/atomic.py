@@ -41,19 +41,29 @@ def publishing(path: Place) -> Iterator[Path]:
 @contextlib.contextmanager
 def publishing_folder(path: Path) -> Iterator[Path]:
     """Context with a temporary folder, which replaces `path` when the block ends without an error."""
-    temporary, replaced = (path.with_name(temporary_name(path.name + old)) for old in ("", _OLD))
-    with _lease_folder(temporary), _lease_folder(replaced):
+    temporary = path.with_name(temporary_name(path.name))
+    with _lease_folder(temporary):
         try:
             temporary.mkdir()
             yield temporary
+            replace_folder(path, temporary)
+        except BaseException:  # including an interrupt
+            shutil.rmtree(temporary, ignore_errors=True)
+            raise
+
+
+def replace_folder(path: Path, new: Path) -> None:
+    """Give the folder `new`, on the same disk, the name `path`, and remove the folder that has it; all or nothing."""
+    replaced = path.with_name(temporary_name(path.name + _OLD))
+    with _lease_folder(replaced):
+        try:
             os.sync()  # all at once: syncing many small files one by one takes minutes
             if path.exists():
                 path.rename(replaced)
-            temporary.rename(path)
+            new.rename(path)
         except BaseException:  # including an interrupt
             if replaced.exists() and not path.exists():
                 replaced.rename(path)
-            shutil.rmtree(temporary, ignore_errors=True)
             raise
         sync(path.parent)
         shutil.rmtree(replaced, ignore_errors=True)

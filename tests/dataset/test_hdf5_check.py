@@ -43,7 +43,10 @@ CHANGES: dict[str, tuple[Callable[[h5py.File], object], str]] = {
         lambda file: file["states/angle"].attrs.update(axes="n K T"),
         "states/angle has axes 'n K T', but must have 'n T K'",
     ),
-    "constant": (lambda file: replaced(file, "time", np.arange(5.0)), "time differs from the manifest"),
+    "constant": (
+        lambda file: replaced(file, "time", np.tile(np.arange(5.0), (3, 1))),
+        "time differs from the manifest",
+    ),
     "missing": (lambda file: file.pop("states/angle"), "states/angle is missing"),
     "type": (
         lambda file: replaced(file, "states/angle", np.zeros((3, 5, 3))),

@@ -22,13 +22,14 @@ import pytest
 import synthetic
 from numpy.testing import assert_allclose, assert_array_equal
 
+import gen2d
 from gen2d.core.errors import DamagedError, FolderError
 from gen2d.dataset import hdf5
 from gen2d.dataset.block import Block, encode, head
 from gen2d.dataset.folder import clean, free_bytes, log, open_folder
 from gen2d.dataset.manifest import read_manifest
 from gen2d.dataset.records import read_records, remove_logs
-from gen2d.dataset.spec import plan, shards_of_worker
+from gen2d.dataset.spec import EARLIER_SCHEMA, IDENTITY, DatasetSpec, plan, shards_of_worker
 from gen2d.generation.complete import complete
 from gen2d.storage import codecs
 from gen2d.storage.leases import lease
@@ -59,7 +60,8 @@ def test_workers_share_the_plan_whatever_is_done() -> None:
 def test_every_field_is_read_back(tmp_path: Path, codec: str) -> None:
     made = synthetic.make(synthetic.dataset(tmp_path / "toy", codec=codec))
     for shard in plan(made.splits, made.videos_per_shard):
-        expected = synthetic.columns(made, shard) | dict(made.constants)
+        shared = {name: np.stack([values] * shard.count) for name, values in made.constants.items()}
+        expected = synthetic.columns(made, shard) | shared
         found = hdf5.read(tmp_path / "toy" / "shards" / f"{shard.name}.h5")
         assert found.keys() == expected.keys()
         for name, values in expected.items():
@@ -97,7 +99,7 @@ def test_the_index_says_where_the_bytes_are(tmp_path: Path, codec: str) -> None:
         with h5py.File(path) as file:
             stored = file["chunk_index"]
             assert isinstance(stored, h5py.Dataset)
-            index = stored[()]
+            index = stored[()].view(read_manifest(tmp_path).video_type)[:, 0]
             assert stored.id.get_offset() == row["index"]
         for number, video in enumerate(index, shard.first):
             ((offset, size, crc),) = video["masks/instance"].tolist()
@@ -114,7 +116,7 @@ def test_a_chunk_holds_its_frames_and_the_index_says_where_it_is(tmp_path: Path,
     made = synthetic.make(synthetic.dataset(tmp_path, train=3, sizes=sizes, chunk_frames=frames))
     content = (tmp_path / "shards" / "train-00000-n3.h5").read_bytes()
     with h5py.File(io.BytesIO(content)) as file:
-        index = np.asarray(file["chunk_index"])
+        index = np.asarray(file["chunk_index"]).view(read_manifest(tmp_path).video_type)[:, 0]
         assert_array_equal(file["frames"], [synthetic.video(made, "train", number)["frames"] for number in range(3)])
     for number, video in enumerate(index):
         assert len(video["frames"]) == 6 // frames
@@ -284,17 +286,69 @@ def test_another_dataset_is_refused(tmp_path: Path, change: dict[str, Any], told
     assert synthetic.tree(tmp_path) == before
 
 
-@pytest.mark.parametrize("schema", ["gen2d.dataset/2", "gen2d.dataset/4", None, 3])
+def test_every_hdf5_dataset_has_a_row_for_each_video(tmp_path: Path) -> None:
+    made = synthetic.make(synthetic.dataset(tmp_path, chunk_frames=1))
+    for shard in plan(made.splits, made.videos_per_shard):
+        with h5py.File(tmp_path / "shards" / f"{shard.name}.h5") as file:
+            names: list[str] = []
+            file.visititems(lambda name, item, to=names: to.append(name) if isinstance(item, h5py.Dataset) else None)
+            assert sorted(names) == sorted([*made.fields, "chunk_index"])
+            for name in names:
+                stored = file[name]
+                assert isinstance(stored, h5py.Dataset)
+                assert (stored.shape[0], stored.dtype.names) == (shard.count, None)
+                assert str(stored.attrs["axes"]).split()[0] == "n"
+
+
+def earlier(root: Path, **changes: Any) -> DatasetSpec:
+    return synthetic.dataset(root, schema=EARLIER_SCHEMA, **changes)
+
+
+def test_an_earlier_dataset_is_read_and_grows_in_its_own_schema(tmp_path: Path) -> None:
+    """As one run of its version made it: the present spec, which does not know the schema, adds the same bytes."""
+    whole, grown = earlier(tmp_path / "whole"), earlier(tmp_path / "grown", train=9)
+    synthetic.make(whole)
+    synthetic.make(grown)
+    mark = json.loads((tmp_path / "grown" / ".gen2d" / "dataset.json").read_text())
+    assert mark.keys() == {*IDENTITY, "sources", "identity_sha256"}  # as earlier versions wrote it
+    with h5py.File(tmp_path / "grown" / "shards" / "train-00000.h5") as file:
+        assert file.attrs["schema"] == EARLIER_SCHEMA
+        assert np.asarray(file["time"]).shape == (5,)
+        assert np.asarray(file["chunk_index"]).dtype == read_manifest(tmp_path / "grown").video_type
+    found, new = gen2d.open(tmp_path / "grown", "train", "*")[:], synthetic.columns(whole, plan({"train": 9}, 16)[0])
+    assert all(found[name].tobytes() == new[name].tobytes() for name in new)
+    synthetic.make(synthetic.dataset(tmp_path / "grown"))
+    assert synthetic.tree(tmp_path / "grown") == synthetic.tree(tmp_path / "whole")
+    assert read_manifest(tmp_path / "grown").schema == EARLIER_SCHEMA
+    assert gen2d.verify(tmp_path / "grown") == []
+
+
+def test_an_earlier_dataset_that_was_begun_goes_on_in_its_own_schema(tmp_path: Path) -> None:
+    begun = earlier(tmp_path / "begun")
+    synthetic.write(begun, open_folder(begun)[0], synthetic.blocks(begun, plan(begun.splits, 8)[0]))
+    synthetic.make(synthetic.dataset(tmp_path / "begun"))
+    synthetic.make(earlier(tmp_path / "whole"))
+    assert synthetic.tree(tmp_path / "begun") == synthetic.tree(tmp_path / "whole")
+
+
+def test_an_earlier_dataset_that_is_overwritten_has_the_new_schema(tmp_path: Path) -> None:
+    synthetic.make(earlier(tmp_path / "data"))
+    synthetic.make(synthetic.dataset(tmp_path / "data"), overwrite=True)
+    synthetic.make(synthetic.dataset(tmp_path / "new"))
+    assert synthetic.tree(tmp_path / "data") == synthetic.tree(tmp_path / "new")
+
+
+@pytest.mark.parametrize("schema", ["gen2d.dataset/2", "gen2d.dataset/5", None, 3])
 def test_another_schema_is_neither_read_nor_added_to(tmp_path: Path, schema: Any) -> None:
     made = synthetic.make(synthetic.dataset(tmp_path, train=3))
     manifest = json.loads((tmp_path / "manifest.json").read_text()) | {"schema": schema}
     (tmp_path / "manifest.json").write_bytes(as_json(seal(manifest, "manifest_sha256")))
     before = synthetic.tree(tmp_path)
     named = f"the schema {schema}" if isinstance(schema, str) else "an unknown schema"
-    with pytest.raises(FolderError, match=f"has {named}, but this gen2d reads gen2d.dataset/3: make the dataset anew"):
+    with pytest.raises(FolderError, match=f"has {named}, but this gen2d reads gen2d.dataset/4: make the dataset anew"):
         read_manifest(tmp_path)
     if isinstance(schema, str):
-        with pytest.raises(FolderError, match=f"a dataset with {named}, but this gen2d writes gen2d.dataset/3"):
+        with pytest.raises(FolderError, match=f"a dataset with {named}, but this gen2d writes gen2d.dataset/4"):
             open_folder(synthetic.dataset(tmp_path, train=20))
         assert synthetic.tree(tmp_path) == before
     synthetic.make(made, overwrite=True)
@@ -542,7 +596,7 @@ def test_forty_kills_leave_no_trace(tmp_path: Path) -> None:
 def test_the_manifest_keeps_to_the_schema_and_to_itself(tmp_path: Path) -> None:
     made = synthetic.make(synthetic.dataset(tmp_path))
     manifest = read_manifest(tmp_path)
-    assert manifest.plain["schema"] == "gen2d.dataset/3"
+    assert manifest.plain["schema"] == manifest.schema == "gen2d.dataset/4"
     assert manifest.splits == {"train": 20, "test": 3}
     assert manifest.config == made.config
     assert socket.gethostname() not in json.dumps(manifest.plain)

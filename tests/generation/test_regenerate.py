@@ -1,5 +1,6 @@
 """Videos made again from the recipe are those that are stored, and what is damaged is made again to the byte."""
 
+import functools
 import json
 import shutil
 from pathlib import Path
@@ -10,6 +11,8 @@ from synthetic import contents, flip
 from tiny import run_command, sentences, tiny_config
 
 from gen2d.core.errors import FolderError
+from gen2d.dataset.manifest import read_manifest
+from gen2d.dataset.spec import EARLIER_SCHEMA, DatasetSpec
 from gen2d.generation.regenerate import repair
 from gen2d.generation.run import generate
 from gen2d.tools.verify import chosen_videos, verify, verify_and_repair
@@ -77,6 +80,19 @@ def test_a_repair_restores_every_byte(pristine: Path, root: Path, damage: str) -
     listed = DAMAGES[damage][:1] if damage.startswith("manifest") else DAMAGES[damage]
     assert all(name in named for name in listed)
     assert contents(root) == contents(pristine)
+
+
+def test_an_earlier_dataset_is_repaired_in_its_own_schema(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with monkeypatch.context() as earlier:
+        earlier.setattr("gen2d.generation.worker.DatasetSpec", functools.partial(DatasetSpec, schema=EARLIER_SCHEMA))
+        generate(tiny_config(), 9, tmp_path / "pristine")
+    assert read_manifest(tmp_path / "pristine").schema == EARLIER_SCHEMA
+    for damage in (["shards/train-00000.h5"], [".gen2d/dataset.json"], ["manifest.json", "shards/train-00001-n1.h5"]):
+        root = Path(shutil.copytree(tmp_path / "pristine", tmp_path / f"{len(list(tmp_path.iterdir()))}"))
+        for name in damage:
+            flip(root / name, 8 * ((root / name).stat().st_size // 2) + 3)
+        assert verify_and_repair(root, "full", lambda names, root=root: repair(root, names)).problems == []
+        assert contents(root) == contents(tmp_path / "pristine")
 
 
 def test_missing_and_empty_files_are_restored(pristine: Path, root: Path) -> None:

@@ -1,27 +1,17 @@
-"""One AV1 film (MP4) per video, encoded by PyAV: smaller than H.264, but slower to encode."""
+"""One AV1 film (MP4) per video, encoded by PyAV: smaller than H.264, but slower to encode.
 
-from pathlib import Path
+The other fields of a video are in a NumPy archive beside its film, KEY.npz, as `--to npz` writes them.
+"""
 
-from gen2d.plugin import Export, Source, films
+from functools import partial
 
-FASTEST = 240  # frames/s, the maximum of this encoder
-OPTIONS = {"crf": "20", "preset": "8", "svtav1-params": "lp=1"}
+from gen2d.plugin import Export, arrays, films
 
-
-def check(source: Source) -> None:
-    """Raise ConfigError for unsupported frame sizes and rates, UserError without PyAV."""
-    films.check_size("av1", source.frame_size)
-    films.check_rate("av1", source.fps, FASTEST)
-    films.pyav()
-
-
-def write(target: Path, source: Source) -> None:
-    """Write KEY.mp4 for each video to the folder."""
-
-    def write_film(key: str, video: dict) -> None:
-        films.encode(target / f"{key}.mp4", video["frames"], source.fps, "libsvtav1", "yuv420p", OPTIONS)
-
-    source.each(write_film)
-
-
-EXPORT = Export(fields=("frames",), write=write, separate=True, check=check, fixed=True, loss=films.LOSS)
+CODEC = films.CODECS["av1"]
+EXPORT = Export(
+    fields=("frames", "*"),
+    write=partial(arrays.write_films, codec=CODEC),
+    separate=True,
+    check=partial(arrays.check_films, name="av1", codec=CODEC),
+    loss=CODEC.loss,
+)

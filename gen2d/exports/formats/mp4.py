@@ -1,19 +1,17 @@
-"""One MPEG-4 part 2 film (MP4) per video, encoded by OpenCV: needs no extra package; browsers do not play it."""
+"""One MPEG-4 part 2 film (MP4) per video, encoded by OpenCV: needs no extra package; browsers do not play it.
 
-from pathlib import Path
+The other fields of a video are in a NumPy archive beside its film, KEY.npz, as `--to npz` writes them.
+"""
 
-from gen2d.plugin import Export, Source, films
+from functools import partial
 
+from gen2d.plugin import Export, arrays, films
 
-def check(source: Source) -> None:
-    """Raise ConfigError for unsupported frame sizes and rates."""
-    films.check_size("mp4", source.frame_size)
-    films.check_rate("mp4", source.fps, films.FASTEST)
-
-
-def write(target: Path, source: Source) -> None:
-    """Write KEY.mp4 for each video to the folder."""
-    source.each(lambda key, video: films.mp4v(target / f"{key}.mp4", video["frames"], source.fps))
-
-
-EXPORT = Export(fields=("frames",), write=write, separate=True, check=check, fixed=True, loss=films.LOSS)
+CODEC = films.CODECS["mp4v"]
+EXPORT = Export(
+    fields=("frames", "*"),
+    write=partial(arrays.write_films, codec=CODEC),
+    separate=True,
+    check=partial(arrays.check_films, name="mp4", codec=CODEC),
+    loss=CODEC.loss,
+)

@@ -1,0 +1,53 @@
+"""Files that several formats write: NumPy archives, and films with archives beside them."""
+
+import io
+import zipfile
+from pathlib import Path
+
+import numpy as np
+
+from gen2d.core.errors import ConfigError
+from gen2d.exports.source import Source
+from gen2d.loading.protocols import Batch
+from gen2d.media.films import Codec
+
+
+def archive(video: Batch) -> bytes:
+    """Content of a compressed NumPy archive (npz) with these arrays; equal arrays give equal bytes."""
+    file = io.BytesIO()
+    with zipfile.ZipFile(file, "w") as entries:
+        for name, values in video.items():
+            entry = zipfile.ZipInfo(f"{name}.npy")  # of 1980
+            entry.compress_type = zipfile.ZIP_DEFLATED
+            with entries.open(entry, "w", force_zip64=values.nbytes >= 2**31) as target:
+                np.lib.format.write_array(target, np.asanyarray(values), allow_pickle=False)
+    return file.getvalue()
+
+
+def write_films(target: Path, source: Source, codec: Codec) -> None:
+    """Write a film for each video to the folder, and KEY.npz with its other fields, and `time`, if there are any."""
+
+    def write_film(key: str, video: Batch) -> None:
+        codec.write(target / f"{key}{codec.suffix}", video["frames"], source.fps)
+        others = without_frames(video)
+        if others:
+            (target / f"{key}.npz").write_bytes(archive({**others, "time": source.ds.time}))
+
+    source.each(write_film)
+
+
+def check_films(source: Source, name: str, codec: Codec) -> None:
+    """Raise ConfigError for unsupported frame sizes and rates, or if frames are left out, UserError without PyAV."""
+    check_frames(source, name)
+    codec.check(name, source.frame_size, source.fps)
+
+
+def check_frames(source: Source, name: str) -> None:
+    """Raise ConfigError if the frames are left out."""
+    if "frames" not in source.fields:
+        raise ConfigError(f"--fields is {' '.join(source.fields)}, but must contain frames for {name}")
+
+
+def without_frames(video: Batch) -> Batch:
+    """The fields of a video but for its frames."""
+    return {name: values for name, values in video.items() if name != "frames"}
