@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gen2d.core.errors import ConfigError
+from gen2d.core.errors import ConfigError, argument
 from gen2d.exports.source import Source
 from gen2d.loading.protocols import Batch
 from gen2d.media.films import Codec
@@ -45,7 +45,7 @@ def check_films(source: Source, name: str, codec: Codec) -> None:
 def check_frames(source: Source, name: str) -> None:
     """Raise ConfigError if the frames are left out."""
     if "frames" not in source.fields:
-        raise ConfigError(f"--fields is {' '.join(source.fields)}, but must contain frames for {name}")
+        raise ConfigError(f"{argument('fields')} is {' '.join(source.fields)}, but must contain frames for {name}")
 
 
 def without_frames(video: Batch) -> Batch:

@@ -11,17 +11,19 @@ from collections.abc import Callable, Generator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from gen2d._version import __version__
 from gen2d.config import plugins
 from gen2d.config.contracts import Export
-from gen2d.core.errors import ConfigError, FolderError
+from gen2d.core.errors import ConfigError, FolderError, argument
 from gen2d.core.progress import inform, progress, stopping_on_sigterm
 from gen2d.engines.protocol import Engine, results
 from gen2d.exports.partial import PartialExport
 from gen2d.exports.parts import ExportJob, ExportTask, load_format, write_part
-from gen2d.exports.selection import selected
 from gen2d.exports.source import Source, source_of
 from gen2d.loading.dataset import RenderOptions
+from gen2d.loading.selection import matching
 from gen2d.media import films
 from gen2d.storage.atomic import publishing, publishing_folder, replace_folder, sweep_beside
 from gen2d.storage.explain import writing_error
@@ -137,14 +139,17 @@ def export(
     out = Path(out) if out is not None else _default_out(folder, f"{name.removesuffix('.py')}{format_.suffix}")
     source = dataclasses.replace(source, codec=_codec(to, format_, codec), jobs=_jobs(jobs))
     if select is not None:
-        source = dataclasses.replace(source, selection=selected(source.ds, select))
+        source = dataclasses.replace(source, selection=_selection(source, select))
     description = _export_description(source, name) | ({"select": select} if select else {})
     format_.check(source)
     _check_out(out, format_, description, overwrite)
     log = log or inform
     if engine is not None and not format_.separate:
         names = ", ".join(each for each in plugins.names("export") if plugins.load("export", each).separate)
-        raise ConfigError(f"--to is {to}, whose files hold many videos: leave out --engine, or choose one of {names}")
+        raise ConfigError(
+            f"{argument('to')} is {to}, whose files hold many videos: leave out "
+            f"{argument('engine')}, or choose one of {names}"
+        )
 
     def write(target: Path) -> None:
         with stopping_on_sigterm(log), progress("Exporting", len(source), log) as advance:
@@ -179,21 +184,32 @@ def export(
     return Exported(out, len(source), size, time.perf_counter() - start, _loss(format_, source.codec))
 
 
+def _selection(source: Source, select: str) -> np.ndarray:
+    """Numbers of the videos that are selected; raises ConfigError if there are none."""
+    numbers = matching(source.ds, select, argument("select"))
+    if not len(numbers):
+        split = source.ds.options.split
+        raise ConfigError(f"{argument('select')} is {select!r}, but no video of the split {split} is like that")
+    return numbers
+
+
 def _codec(to: str, format_: Export, codec: str | None) -> str:
     """The codec that is chosen, or the format's default; "" if the format has one only."""
     if codec is None:
         return format_.codecs[0] if format_.codecs else ""
     if not format_.codecs:
         several = [name for name in plugins.names("export") if plugins.load("export", name).codecs]
-        raise ConfigError(f"--codec is {codec!r}, but {to} has one encoding only: choose {' or '.join(several)}")
+        raise ConfigError(
+            f"{argument('codec')} is {codec!r}, but {to} has one encoding only: choose {' or '.join(several)}"
+        )
     if codec not in format_.codecs:
-        raise ConfigError(f"--codec is {codec!r}, but must be one of {', '.join(format_.codecs)} for {to}")
+        raise ConfigError(f"{argument('codec')} is {codec!r}, but must be one of {', '.join(format_.codecs)} for {to}")
     return codec
 
 
 def _jobs(jobs: int | None) -> int:
     if jobs is not None and not 1 <= jobs <= MOST_JOBS:
-        raise ConfigError(f"--jobs is {jobs}, but must be from 1 to {MOST_JOBS}")
+        raise ConfigError(f"{argument('jobs')} is {jobs}, but must be from 1 to {MOST_JOBS}")
     return jobs or 0
 
 
@@ -209,9 +225,11 @@ def _patterns(to: str, format_: Export, fields: Sequence[str] | None) -> Sequenc
         return format_.fields
     if format_.fixed:
         free = [name for name in plugins.names("export") if not plugins.load("export", name).fixed]
-        raise ConfigError(f"--fields is {' '.join(fields)}, but {to} has its own: choose {' or '.join(free)}")
+        raise ConfigError(
+            f"{argument('fields')} is {' '.join(fields)}, but {to} has its own: choose {' or '.join(free)}"
+        )
     if not fields:
-        raise ConfigError("--fields is empty, but must name one field or more")
+        raise ConfigError(f"{argument('fields')} is empty, but must name one field or more")
     return fields
 
 
@@ -242,11 +260,14 @@ def _check_out(out: Path, format_: Export, description: Mapping[str, Any], overw
         if out.is_dir() == bool(format_.suffix):
             kinds = ("folder", "file") if out.is_dir() else ("file", "folder")
             name = description["format"]
-            raise FolderError(f"{out} is a {kinds[0]}, but {name} makes a {kinds[1]}: choose another --out")
+            raise FolderError(f"{out} is a {kinds[0]}, but {name} makes a {kinds[1]}: choose another {argument('out')}")
         if out.is_dir():
             _check_folder(out, description, overwrite)
         elif not overwrite:
-            raise FolderError(f"{out} is there already: choose another --out, or --overwrite to replace it")
+            raise FolderError(
+                f"{out} is there already: choose another {argument('out')}, or "
+                f"{argument('overwrite', True)} to replace it"
+            )
 
 
 def _check_folder(out: Path, description: Mapping[str, Any], overwrite: bool) -> None:
@@ -254,13 +275,16 @@ def _check_folder(out: Path, description: Mapping[str, Any], overwrite: bool) ->
     known = {DESCRIPTION, *(name.split("/")[0] for name in previous["files"])} if previous else set()
     foreign = {path.name for path in out.iterdir()} - known
     if foreign:
-        raise FolderError(f"{out} holds {min(foreign)}, which no export made: choose another --out")
+        raise FolderError(f"{out} holds {min(foreign)}, which no export made: choose another {argument('out')}")
     if not known:
         return  # an empty folder
     keys = "format", "split", "name", "seed", "config_sha256", "select"
     same = all(previous.get(key) == description.get(key) for key in keys)
     if not same and not overwrite:
-        raise FolderError(f"{out} holds another export: choose another --out, or --overwrite to replace it")
+        raise FolderError(
+            f"{out} holds another export: choose another {argument('out')}, or "
+            f"{argument('overwrite', True)} to replace it"
+        )
 
 
 def read_description(out: Path) -> dict[str, Any]:

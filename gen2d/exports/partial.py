@@ -5,7 +5,7 @@ import os
 import time
 from pathlib import Path
 
-from gen2d.core.errors import FolderError
+from gen2d.core.errors import FolderError, argument
 from gen2d.storage.atomic import publish, remove_tree
 from gen2d.storage.leases import exclusive_lock
 from gen2d.storage.sealed import JSON_BYTES, as_json, parse_json, read_bytes
@@ -33,7 +33,7 @@ class PartialExport:
             self._open.enter_context(exclusive_lock(self.folder / "lock", 0.0))
         except TimeoutError:
             raise FolderError(
-                f"{self.out} is being written by another process: wait, or choose another --out"
+                f"{self.out} is being written by another process: wait, or choose another {argument('out')}"
             ) from None
         for path in self.folder.glob(".part-*"):  # of processes that were killed
             remove_tree(path)

@@ -12,7 +12,7 @@ import numpy as np
 from gen2d._version import __version__
 from gen2d.config import plugins
 from gen2d.config.contracts import Export
-from gen2d.core.errors import ConfigError
+from gen2d.core.errors import ConfigError, argument
 from gen2d.core.progress import Log
 from gen2d.engines.protocol import Report, other_version
 from gen2d.exports.source import Source, source_of
@@ -24,9 +24,9 @@ def load_format(to: str) -> tuple[Export, bytes]:
     """Format with this name, or from this Python file, and the file's content."""
     known, is_file = plugins.names("export"), plugins.is_user_file(to)
     if not is_file and to not in known:
-        raise ConfigError(f"--to is {to!r}, but must be one of {', '.join(known)}, or a Python file")
-    content = plugins.content_of(to, "--to") if is_file else b""
-    return plugins.load("export", to, "--to", content), content
+        raise ConfigError(f"{argument('to')} is {to!r}, but must be one of {', '.join(known)}, or a Python file")
+    content = plugins.content_of(to, argument("to")) if is_file else b""
+    return plugins.load("export", to, argument("to"), content), content
 
 
 @dataclasses.dataclass(frozen=True)
@@ -89,7 +89,11 @@ class _ExportWorker:
         return Report("cpu", versions={"gen2d": __version__})
 
     def check(self) -> str:
-        return "" if self.target.is_dir() else f"it does not see {self.target}: name an --out that all machines share"
+        return (
+            ""
+            if self.target.is_dir()
+            else f"it does not see {self.target}: name an {argument('out')} that all machines share"
+        )
 
     def run(self, items: Sequence[range]) -> list[int]:
         for part in items:

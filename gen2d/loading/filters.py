@@ -195,8 +195,8 @@ class _Parser:
             return _constant(float(token) if re.search(r"[.eEn]", token) else int(token))
         if kind == "text":
             return _constant(token[1:-1])
-        if token in ("true", "false"):
-            return _constant(token == "true")
+        if token.lower() in ("true", "false"):
+            return _constant(token.lower() == "true")
         name, index = self._component(token)
         if name not in self._fields:
             is_text = "/" not in name and self._next >= 2 and self._tokens[self._next - 2][1] in COMPARISONS

@@ -30,6 +30,19 @@ if TYPE_CHECKING:
 SCANNED = 4096  # videos whose values are read at once
 
 
+def matching(videos: VideoReader, condition: str, name: str = "filter") -> np.ndarray:
+    """Numbers of the videos of which a condition is true, ascending, int64; only the fields in it are read.
+
+    Error messages call the condition `name`. Raises ConfigError if it is invalid, or names a field that is not stored.
+    """
+    parsed = parse_filter(condition, videos.stored_fields, videos.stored_sizes, videos.short_name, name)
+    mask = np.zeros(len(videos), bool)
+    for first in range(0, len(videos), SCANNED):
+        numbers = np.arange(first, min(first + SCANNED, len(videos)))
+        mask[numbers] = parsed.evaluate(videos.stored(parsed.fields, numbers))
+    return np.flatnonzero(mask)
+
+
 class Selectable:
     """Methods of everything that has videos with stored fields."""
 
@@ -90,13 +103,7 @@ class Selectable:
         --------
         >>> many = ds.filter("factors/balls >= 4 and index < 50")
         """
-        fields = self.stored_fields
-        parsed = parse_filter(condition, fields, self.stored_sizes, self.short_name)
-        mask = np.zeros(len(self), bool)
-        for first in range(0, len(self), SCANNED):
-            numbers = np.arange(first, min(first + SCANNED, len(self)))
-            mask[numbers] = parsed.evaluate(self.stored(parsed.fields, numbers))
-        return Subset(self, np.flatnonzero(mask))
+        return Subset(self, matching(self, condition))
 
     def to_pandas(self: VideoReader, fields: Sequence[str] | str | None = None) -> "pandas.DataFrame":
         """DataFrame with a row per video; needs pandas.

@@ -212,14 +212,13 @@ def test_selected_videos_alone_are_exported(toy: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("select", "told"),
     [
-        ("index", "must be conditions such as 'factors/balls > 3"),
-        ("index > 3 and index", "must be conditions such as"),
-        ("index > many", "'many' is no number"),
+        ("index", "must compare values with <=, >=, ==, !=, <, >, as 'factors/balls > 3"),
+        ("index > many", "compares a number with 'many', which must be a number or a field"),
         ("index > 99", "no video of the split train is like that"),
         ("inedx > 3", "has no field 'inedx': did you mean 'index'?"),
-        ("index[0] > 3", "index takes no index"),
-        ("objects/mass > 3", "objects/mass takes 1 indices below 3, such as objects/mass[0]"),
-        ("objects/mass[3] > 3", "objects/mass takes 1 indices below 3"),
+        ("index[0] > 3", "index has one value per video, and takes no index"),
+        ("objects/mass > 3", "objects/mass has 3 values per video: choose one, such as objects/mass[0]"),
+        ("objects/mass[3] > 3", "objects/mass has 3 values per video: choose one"),
     ],
 )
 def test_a_selection_that_means_nothing_is_told(toy: Path, tmp_path: Path, select: str, told: str) -> None:
@@ -512,7 +511,7 @@ def test_its_own_is_replaced_and_what_others_made_is_not(toy: Path, tmp_path: Pa
     out.mkdir()  # an empty folder is as good as none
     gen2d.export(toy, "webdataset", out, codec="npz")
     gen2d.export(toy, "webdataset", out, fields="index")
-    with pytest.raises(FolderError, match="another export: choose another --out, or --overwrite"):
+    with pytest.raises(FolderError, match="another export: choose another out, or overwrite=True"):
         gen2d.export(toy, "mp4", out)
     gen2d.export(toy, "mp4", out, overwrite=True)
     assert not list(out.glob("*.tar"))
@@ -528,7 +527,7 @@ def test_an_export_of_another_dataset_stays(toy: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     other = synthetic.make(synthetic.dataset(tmp_path / "toy", train=TRAIN, sizes=SIZES, seed=8))
     before = tree(gen2d.export(synthetic.folder(other), "npz", out).out)
-    with pytest.raises(FolderError, match="holds another export: choose another --out, or --overwrite"):
+    with pytest.raises(FolderError, match="holds another export: choose another out, or overwrite=True"):
         gen2d.export(toy, "npz", out)
     with pytest.raises(FolderError, match="holds another export"):
         gen2d.export(synthetic.folder(other), "npz", out, split="test")
@@ -538,7 +537,7 @@ def test_an_export_of_another_dataset_stays(toy: Path, tmp_path: Path) -> None:
 def test_a_file_is_replaced_only_when_asked(balls: Path, tmp_path: Path) -> None:
     out = tmp_path / "train.hdf5"
     out.write_text("mine")
-    with pytest.raises(FolderError, match="is there already: choose another --out, or --overwrite"):
+    with pytest.raises(FolderError, match="is there already: choose another out, or overwrite=True"):
         gen2d.export(balls, "phyworld", out)
     assert out.read_text() == "mine"
     gen2d.export(balls, "phyworld", out, overwrite=True)

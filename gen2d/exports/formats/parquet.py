@@ -33,7 +33,7 @@ def check(source: Source) -> None:
     for name, field in source.fields.items():
         if len(field.shape(source.ds.sizes)) > MOST_AXES:
             raise ConfigError(
-                f"{name} has more than {MOST_AXES} axes, which parquet cannot hold: leave it out of --fields"
+                f"{name} has more than {MOST_AXES} axes, which parquet cannot hold: leave it out of the fields"
             )
 
 
