@@ -1,5 +1,6 @@
 """torch's own loaders give the same windows for any sampler and workers, and torchdata resumes at the very batch."""
 
+import ast
 import copy
 import itertools
 import pickle
@@ -354,6 +355,38 @@ def test_ranks_are_those_of_torchrun(toy: Path, monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setenv("RANK", "1")
     monkeypatch.setenv("WORLD_SIZE", "2")
     same(gen2d.torch.iterable(ds, 4), expected)
+
+
+RANK = """
+import sys, torch, gen2d
+root, meeting, rank = sys.argv[1], sys.argv[2], int(sys.argv[3])
+torch.distributed.init_process_group("gloo", init_method=f"file://{meeting}", rank=rank, world_size=2)
+ds = gen2d.open(root, fields="index", window=2)
+batches = torch.utils.data.DataLoader(gen2d.torch.iterable(ds, 4), batch_size=None, num_workers=1)
+print([batch["index"].tolist() + batch["window/start"].tolist() for batch in batches])
+data = gen2d.torch.dataset(ds)
+order = torch.utils.data.DistributedSampler(data)
+print([batch["index"].tolist() for batch in torch.utils.data.DataLoader(data, batch_size=5, sampler=order)])
+torch.distributed.destroy_process_group()
+"""
+
+
+@pytest.mark.full
+def test_the_ranks_of_a_process_group_share_the_videos(toy: Path, tmp_path: Path) -> None:
+    torch()
+    words = [sys.executable, "-c", RANK, str(toy), str(tmp_path / "meeting")]
+    running = [subprocess.Popen([*words, str(rank)], stdout=subprocess.PIPE, text=True) for rank in range(2)]
+    shown = [process.communicate(timeout=120)[0].splitlines() for process in running]
+    ds = loader.open(toy, fields="index", window=2)
+    for rank, lines in enumerate(shown):
+        expected = [
+            batch["index"].tolist() + batch["window/start"].tolist()
+            for batch in gen2d.DataLoader(ds, 4, epochs=1, rank=rank, world_size=2)
+        ]
+        assert lines[0] == str(expected)
+    assert sorted(index for lines in shown for batch in ast.literal_eval(lines[1]) for index in batch) == [
+        *range(TRAIN)
+    ]
 
 
 # ---- States

@@ -111,7 +111,10 @@ def test_what_is_read_is_what_is_in_the_folder(
             (tmp_path / "one").write_bytes(content)
             upload(tmp_path / "one", Url(f"{urls[kind]}/{name}"))
     cache = tmp_path / "cache" if cached else None
-    cases: list[dict[str, Any]] = [{"fields": "*"}, {"window": 2, "stride": 2, "layout": "TCHW", "dtype": "float32"}]
+    cases: list[dict[str, Any]] = [
+        {"fields": "*"},
+        {"window": 2, "start": 1, "stride": 2, "layout": "TCHW", "dtype": "float32"},
+    ]
     for options in cases:
         found, expected = gen2d.open(urls[kind], cache_dir=cache, **options), gen2d.open(toy, **options)
         same(found[:], expected[:])
