@@ -38,7 +38,7 @@ def sprite_sheet(frames: np.ndarray, quality: int | None) -> bytes:
     columns = -(-count // rows)
     padded = np.concatenate([frames, np.repeat(frames[-1:], rows * columns - count, axis=0)])
     sheet = np.concatenate(padded.reshape(columns, rows * height, width, frames.shape[3]), axis=1)
-    lossless = {"lossless": True, "quality": 30, "method": 3}
+    lossless = {"lossless": True, "quality": 30, "method": 1}
     content = io.BytesIO()
     options = lossless if quality is None else {"quality": quality, "method": 2}
     Image.fromarray(np.ascontiguousarray(sheet)).save(content, "WEBP", **options)

@@ -21,9 +21,10 @@ from gen2d.storage.paths import Place
 VIDEOS = 24  # maximum number on a dataset's page
 PAGE_BYTES = 980_000  # maximum size of a page, unless a single video is larger
 FRAME_BYTES = 2**30  # of the shown videos before compression: they are decoded for the page
-# Frames of a video and quality of WebP, best first; the search for the first that fits the page begins at START.
-LADDER = ((64, 80), (64, 50), (32, 60), (32, 35), (32, 20), (16, 20))
-START = 1
+# Frames of a video and quality of WebP, None for lossless, best first; the search for the first that fits the page begins
+# at START.
+LADDER = ((64, None), (64, 80), (64, 50), (32, 60), (32, 35), (32, 20), (16, 20))
+START = 2
 PROBES = 3  # videos from which the size is estimated
 SLACK = 1.08  # an estimate may be so much too large
 _FOLDER = Path(__file__).parent
@@ -56,7 +57,8 @@ def index_page(root: Place, manifest: Manifest) -> bytes:
 
         probes, rung = numbers[:: -(-len(numbers) // PROBES)], START
         if fits(START):
-            rung -= fits(START - 1)
+            while rung and fits(rung - 1):
+                rung -= 1
         else:
             rung = next((rung for rung in range(START + 1, len(LADDER)) if fits(rung)), len(LADDER) - 1)
         while True:
@@ -71,7 +73,7 @@ def index_page(root: Place, manifest: Manifest) -> bytes:
             rung += 1  # the probes were smaller than the others
 
 
-def _detail(frames: int, quality: int) -> Detail:
+def _detail(frames: int, quality: int | None) -> Detail:
     return Detail(frames, side=128, mask_side=64, quality=quality, objects=48, contacts=60)
 
 

@@ -50,7 +50,7 @@ class Detail:
     frames: int  # maximum number, evenly spaced from the first
     side: int  # px, of a square of as many pixels as a frame has at most
     mask_side: int
-    quality: int  # of WebP, 0 to 100
+    quality: int | None  # of WebP, 0 to 100; None: lossless
     objects: int  # maximum numbers
     contacts: int
 
