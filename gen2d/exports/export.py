@@ -255,6 +255,8 @@ def _export_description(source: Source, to: str) -> dict[str, Any]:
 def _check_out(out: Path, format_: Export, description: Mapping[str, Any], overwrite: bool) -> None:
     """Raise FolderError if `out` holds something that must not be replaced."""
     with _translate_errors(out):
+        if Path.cwd().is_relative_to(out.resolve()):
+            raise FolderError(f"{out} is the current folder, or holds it: choose another {argument('out')}")
         if not out.exists():
             return
         if out.is_dir() == bool(format_.suffix):

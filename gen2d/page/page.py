@@ -21,7 +21,7 @@ from gen2d.storage.paths import Place
 VIDEOS = 24  # maximum number on a dataset's page
 PAGE_BYTES = 980_000  # maximum size of a page, unless a single video is larger
 FRAME_BYTES = 2**30  # of the shown videos before compression: they are decoded for the page
-# Frames of a video and quality of WebP, None for lossless, best first; the search for the first that fits the page begins
+# Frames of a video and quality of WebP, None: lossless, best first. The search for the first that fits the page begins
 # at START.
 LADDER = ((64, None), (64, 80), (64, 50), (32, 60), (32, 35), (32, 20), (16, 20))
 START = 2

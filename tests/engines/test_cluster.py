@@ -150,13 +150,13 @@ def test_verify_and_export_run_on_a_cluster(cluster: Cluster, plain: dict[str, b
         (tmp_path / "good" / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / "good" / name).write_bytes(content)
     assert gen2d.verify(tmp_path / "good", engine=engine) == []
-    for name, where in (("one", None), ("two", engine)):
-        gen2d.export(tmp_path / "good", "npz", tmp_path / name, engine=where)
-    assert files(tmp_path / "one") == files(tmp_path / "two")
-    with pytest.raises(
-        gen2d.ConfigError, match=r"^--to is webdataset, whose files hold many videos: leave out --engine"
-    ):
-        gen2d.export(tmp_path / "good", "webdataset", tmp_path / "three", engine=engine)
+    for to in ("npz", "webdataset"):
+        for name, where in (("one", None), ("two", engine)):
+            out = tmp_path / f"{to}-{name}"
+            gen2d.export(tmp_path / "good", to, out, engine=where, select="index >= 5", fields="states/*")
+        assert files(tmp_path / f"{to}-one") == files(tmp_path / f"{to}-two")
+    with pytest.raises(gen2d.ConfigError, match=r"^--to is coco, whose files hold many videos: leave out --engine"):
+        gen2d.export(tmp_path / "good", "coco", tmp_path / "three", engine=engine)
 
 
 # ---- Without Ray

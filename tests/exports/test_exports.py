@@ -583,6 +583,8 @@ def test_every_format_keeps_the_contract(name: str, balls: Path, tmp_path: Path)
         ),
         (["--to", "npz", "--jobs", "0"], "--jobs is 0, but must be from 1 to 256"),
         (["--to", "npz", "--select", "index > 99"], "no video of the split train is like that"),
+        (["--to", "npz", "--out", "."], ". is the current folder, or holds it: choose another --out"),
+        (["--to", "npz", "--out", ".."], ".. is the current folder, or holds it: choose another --out"),
         (["--to", "npz", "--out", "file/child"], "is a file, not a folder"),
         (["--to", "phyworld"], "has no field 'states/velocity'"),
     ],

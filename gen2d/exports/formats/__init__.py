@@ -13,4 +13,6 @@ Each file ends with an `EXPORT`; `gen2d.plugin.Export` describes its members. Th
     EXPORT = Export(fields=("frames",), write=write, fixed=True)
 
 `source.each(function)` calls `function(key, video)` for every video in several threads, and reports the progress.
+`source.map(function)` gives the results in the order of the videos. With `separate=True`, `write` is called for parts
+of the videos, so that a stopped export goes on.
 """
