@@ -7,7 +7,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from gen2d.core.errors import ConfigError, DamagedError, FolderError, UnreachableError, UserError
+from gen2d.core.errors import ConfigError, DamagedError, FolderError, UnreachableError, UserError, argument
 from gen2d.core.humanize import with_noun
 from gen2d.core.progress import Log, inform, waiting
 from gen2d.dataset.hub import dataset_metadata, licence_lines
@@ -84,7 +84,7 @@ def push(
     names = list(_names(root))
     missing = [name for name in names if not (root / name).is_file()]
     if missing:
-        raise DamagedError(f"{root / missing[0]} is missing: run gen2d verify --repair, or export again")
+        raise DamagedError(f"{root / missing[0]} is missing: verify with {argument('repair', True)}, or export again")
     card = _card(root, licence)
     size = sum((root / name).stat().st_size for name in names)
     api = hub.HfApi(library_name="gen2d")

@@ -10,8 +10,7 @@ import gen2d
 from gen2d.core.errors import Error, argument, command_line
 
 PACKAGE = Path(gen2d.__file__).parent
-# Modules of the command line, and those whose messages still name flags.
-ELSEWHERE = ("cli/", "exports/")
+COMMAND_LINE = "cli/"
 
 
 def test_an_argument_is_a_flag_on_a_command_line() -> None:
@@ -60,7 +59,9 @@ def raised_texts(path: Path) -> list[str]:
 
 
 def test_no_error_of_python_names_a_flag() -> None:
-    paths = [path for path in PACKAGE.rglob("*.py") if not path.relative_to(PACKAGE).as_posix().startswith(ELSEWHERE)]
+    paths = [
+        path for path in PACKAGE.rglob("*.py") if not path.relative_to(PACKAGE).as_posix().startswith(COMMAND_LINE)
+    ]
     texts = {text: path for path in paths for text in raised_texts(path)}
     assert len(texts) > 300
     assert not [(path.name, text) for text, path in texts.items() if "--" in text]

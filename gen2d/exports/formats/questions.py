@@ -89,7 +89,7 @@ def check(source: Source) -> None:
     """Raise ConfigError if contacts are not stored."""
     if "contacts/kind" not in source.ds.manifest.fields:
         raise ConfigError(
-            f"{source.ds.root} has no contacts, but --to questions needs them: make it with annotations.contacts=4"
+            f"{source.ds.root} has no contacts, which questions need: make it with annotations.contacts=4"
         )
 
 
