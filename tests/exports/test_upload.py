@@ -121,7 +121,7 @@ def test_bad_input_is_one_sentence_and_sends_nothing(
     cases = [
         ((toy, "a b/c"), 2, "REPO is 'a b/c', but must be NAME or OWNER/NAME"),
         ((tmp_path / "nowhere", "me/toy"), 2, "is not a gen2d dataset"),
-        ((lost, "me/toy"), 1, "train-00000.h5 is missing: run gen2d verify --repair"),
+        ((lost, "me/toy"), 1, "train-00000.h5 is missing: verify with --repair"),
     ]
     for words, code, told in cases:
         done = push(environment, *words)
