@@ -5,7 +5,7 @@ import os
 import sys
 from collections.abc import Sequence
 
-from gen2d.cli import clean, export, generate, info, listing, plot, preview, verify, view
+from gen2d.cli import clean, config, export, generate, info, listing, plot, preview, verify, view
 from gen2d.cli.parser import parse
 from gen2d.core.errors import Error
 from gen2d.core.progress import logged_to_stderr
@@ -21,6 +21,7 @@ VERBS = {
     "verify": verify,
     "export": export,
     "clean": clean,
+    "config": config,
     "list": listing,
 }
 

@@ -83,7 +83,9 @@ def parse(arguments: Sequence[str], verbs: Mapping[str, ModuleType]) -> argparse
     parser = parser_of[verb]
     verbs[verb].add_arguments(parser)
     parser.check_names(words)
-    options, extra = parser.parse_known_args(words, argparse.Namespace(arguments=arguments, run=verbs[verb].run))
+    options, extra = parser.parse_known_intermixed_args(
+        words, argparse.Namespace(arguments=arguments, run=verbs[verb].run)
+    )
     if extra:
         parser.error(f"{extra[0]!r} is one argument too many")
     return options
