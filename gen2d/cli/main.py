@@ -5,7 +5,7 @@ import os
 import sys
 from collections.abc import Sequence
 
-from gen2d.cli import clean, config, export, generate, info, listing, plot, preview, verify, view
+from gen2d.cli import clean, config, diff, export, generate, info, listing, plot, preview, verify, view
 from gen2d.cli.parser import parse
 from gen2d.core.errors import Error
 from gen2d.core.progress import logged_to_stderr
@@ -21,6 +21,7 @@ VERBS = {
     "verify": verify,
     "export": export,
     "clean": clean,
+    "diff": diff,
     "config": config,
     "list": listing,
 }
@@ -29,8 +30,8 @@ VERBS = {
 def main(arguments: Sequence[str] | None = None) -> int:
     """Exit code of a command line, that of the process by default.
 
-    0: success; 1: damaged data or a full disk; 2: an error that the user can correct; 3: a server or disk that does not
-    answer; 130: interrupted.
+    0: success; 1: damaged data, a full disk, or a difference (`diff`); 2: an error that the user can correct; 3: a
+    server or disk that does not answer; 130: interrupted.
     """
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
