@@ -6,6 +6,7 @@ import sys
 from collections.abc import Sequence
 
 from gen2d.cli import clean, config, diff, export, generate, info, listing, plot, preview, verify, view
+from gen2d.cli.output import output
 from gen2d.cli.parser import parse
 from gen2d.core.errors import Error
 from gen2d.core.progress import logged_to_stderr
@@ -38,7 +39,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             stream.reconfigure(errors="backslashreplace")  # not every terminal encodes every character
     try:
         options = parse(sys.argv[1:] if arguments is None else arguments, VERBS)
-        with logged_to_stderr():
+        with output(options), logged_to_stderr():
             code = options.run(options)
         sys.stdout.flush()
         return code
