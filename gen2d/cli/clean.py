@@ -1,6 +1,7 @@
 """Remove old snapshots of a dataset, and temporary files that no process writes any more."""
 
 import argparse
+import json
 
 from gen2d.cli.parser import Parser, add_dataset, add_network, limits
 from gen2d.core.errors import one_line
@@ -9,6 +10,7 @@ from gen2d.core.errors import one_line
 def add_arguments(parser: Parser) -> None:
     """Add the arguments of the verb."""
     add_dataset(parser)
+    parser.add_argument("--json", action="store_true", help="print the removed files as JSON")
     add_network(parser)
 
 
@@ -19,7 +21,11 @@ def run(options: argparse.Namespace) -> int:
     from gen2d.storage.retries import Network
 
     root = place(options.dataset, Network(**limits(options)))
-    for name in folder.clean(root):
+    removed = [str(name) for name in folder.clean(root)]
+    if options.json:
+        print(json.dumps({"dataset": f"{root}", "removed": removed}))
+        return 0
+    for name in removed:
         print(one_line(f"removed: {name}"))
     print(f"{root}: clean")
     return 0

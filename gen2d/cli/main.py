@@ -5,7 +5,8 @@ import os
 import sys
 from collections.abc import Sequence
 
-from gen2d.cli import clean, export, generate, info, listing, plot, preview, push, verify, view
+from gen2d.cli import clean, config, diff, export, generate, info, listing, plot, preview, push, verify, view
+from gen2d.cli.output import output
 from gen2d.cli.parser import parse
 from gen2d.core.errors import Error, command_line
 from gen2d.core.progress import logged_to_stderr
@@ -22,6 +23,8 @@ VERBS = {
     "export": export,
     "push": push,
     "clean": clean,
+    "diff": diff,
+    "config": config,
     "list": listing,
 }
 
@@ -29,16 +32,17 @@ VERBS = {
 def main(arguments: Sequence[str] | None = None) -> int:
     """Exit code of a command line, that of the process by default.
 
-    0: success; 1: damaged data or a full disk; 2: an error that the user can correct; 3: a server or disk that does not
-    answer; 130: interrupted.
+    0: success; 1: damaged data, a full disk, or a difference (`diff`); 2: an error that the user can correct; 3: a
+    server or disk that does not answer; 130: interrupted.
     """
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")  # not every terminal encodes every character
     try:
-        with command_line(), logged_to_stderr():
+        with command_line():
             options = parse(sys.argv[1:] if arguments is None else arguments, VERBS)
-            code = options.run(options)
+            with output(options), logged_to_stderr():
+                code = options.run(options)
         sys.stdout.flush()
         return code
     except Error as error:

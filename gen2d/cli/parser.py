@@ -72,7 +72,18 @@ def parse(arguments: Sequence[str], verbs: Mapping[str, ModuleType]) -> argparse
         verb: parsers.add_parser(verb, help=module.__doc__, description=module.__doc__)
         for verb, module in verbs.items()
     }
+    top.add_argument(
+        "--print-completion", metavar="SHELL", help="print the completion script of a shell: bash, zsh or tcsh"
+    )
     words = list(arguments) or ["--help"]
+    if words[0].partition("=")[0] == "--print-completion":
+        from gen2d.cli.completion import completion_script
+
+        for name, module in verbs.items():
+            module.add_arguments(parser_of[name])
+            add_output(parser_of[name])
+        print(completion_script(top, words))
+        raise SystemExit(0)
     if words[0] in ("--help", "-h", "--version"):
         top.parse_args(words)  # exits
     if words[0].endswith((".yaml", ".yml")):
@@ -82,8 +93,11 @@ def parse(arguments: Sequence[str], verbs: Mapping[str, ModuleType]) -> argparse
         raise UserError(f"{verb!r} is not a verb; {nearest(verb, [*verbs])}")
     parser = parser_of[verb]
     verbs[verb].add_arguments(parser)
+    add_output(parser)
     parser.check_names(words)
-    options, extra = parser.parse_known_args(words, argparse.Namespace(arguments=arguments, run=verbs[verb].run))
+    options, extra = parser.parse_known_intermixed_args(
+        words, argparse.Namespace(arguments=arguments, run=verbs[verb].run)
+    )
     if extra:
         parser.error(f"{extra[0]!r} is one argument too many")
     return options
@@ -115,6 +129,17 @@ def add_network(parser: Parser) -> None:
 def limits(options: argparse.Namespace) -> dict[str, float]:
     """The arguments that `add_network` added, as keywords."""
     return {"timeout": options.timeout, "deadline": options.deadline}
+
+
+def add_output(parser: Parser) -> None:
+    """Adds how much a verb prints, and where else."""
+    group = parser.add_argument_group("output")
+    amount = group.add_mutually_exclusive_group()
+    amount.add_argument("-q", "--quiet", action="store_true", help="print the result and errors only")
+    amount.add_argument(
+        "-v", "--verbose", action="store_true", help="print the time before each message, and where an error was raised"
+    )
+    group.add_argument("--log", metavar="FILE", help="append all that is printed to this file, with dates and times")
 
 
 def add_overrides(parser: Parser) -> None:

@@ -1,6 +1,7 @@
 """Draw a contact sheet and an animation of a dataset or a config."""
 
 import argparse
+import json
 from pathlib import Path
 
 from gen2d.cli.parser import Parser, add_network, add_overrides, add_trust, limits, whole_number
@@ -28,6 +29,7 @@ def add_arguments(parser: Parser) -> None:
     parser.add_argument("--seed", type=whole_number, metavar="S", help="the seed of a config's videos")
     add_overrides(parser)
     add_trust(parser)
+    parser.add_argument("--json", action="store_true", help="print the paths of the pictures as JSON")
     add_network(parser)
 
 
@@ -45,5 +47,5 @@ def run(options: argparse.Namespace) -> int:
         from gen2d.tools.preview import preview
 
         paths = preview(options.source, options.out, **keywords)
-    print(*paths, sep="\n")
+    print(json.dumps({"files": [*map(str, paths)]}) if options.json else "\n".join(map(str, paths)))
     return 0

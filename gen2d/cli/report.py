@@ -1,6 +1,7 @@
 """A dataset's data sheet, and the options of all plug-ins, as text."""
 
 import dataclasses
+import textwrap
 from collections.abc import Iterator, Mapping
 from typing import Any
 
@@ -81,12 +82,45 @@ def _fingerprint(entries: Mapping[str, Any], prefix: str = "") -> Iterator[tuple
             yield f"{prefix}{key}", (text[:16] if prefix else text) or "-"
 
 
+WIDTH = 100  # characters of a line of the overview, at most
 TITLES = {
     "scene": "Scene families",
     "look": "Looks",
     "annotation": "Annotations of pixels",
     "export": "Formats of exports",
 }
+
+
+def catalogue() -> dict[str, dict[str, str] | list[str]]:
+    """Names of all plug-ins, with their summaries by kind, and of configs and sections."""
+    from gen2d.config import plugins
+
+    kinds = {kind: {name: plugins.written_summary(kind, name) for name in plugins.names(kind)} for kind in TITLES}
+    return {**kinds, "config": plugins.config_names()}
+
+
+def overview() -> str:
+    """Names of all plug-ins and configs as text of one screen, with the summaries of scene families.
+
+    Nothing is imported, so it is quick.
+    """
+    from gen2d.config import plugins
+
+    lines: list[str] = []
+    for kind, title in TITLES.items():
+        if kind == "scene":
+            rows = [(name, plugins.written_summary(kind, name)) for name in plugins.names(kind)]
+            lines += [f"{title}:"]
+            lines += [line if len(line) <= WIDTH else f"{line[: WIDTH - 4]} ..." for line in _table(rows)]
+        else:
+            lines += _wrapped(title, plugins.names(kind))
+    lines += _wrapped("Configs", [name.removesuffix(".yaml") for name in plugins.config_names()])
+    list_verb, schema = "python -m gen2d list", "python -m gen2d config schema"
+    return "\n".join([*lines, f"Options: {list_verb} NAME, {list_verb} --options; {schema}"])
+
+
+def _wrapped(title: str, names: list[str]) -> list[str]:
+    return textwrap.wrap(f"{title}: {', '.join(names)}", WIDTH, subsequent_indent="  ", break_on_hyphens=False)
 
 
 def plugins(name: str | None = None) -> str:

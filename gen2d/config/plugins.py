@@ -1,8 +1,10 @@
 """Plug-ins and configs by name or path: finding, loading and listing them."""
 
+import ast
 import difflib
 import functools
 import importlib
+import importlib.util
 import pathlib
 import pkgutil
 import sys
@@ -30,7 +32,13 @@ def nearest(name: str, names: list[str]) -> str:
 @functools.lru_cache(maxsize=8)  # of the few kinds; the folders do not change
 def names(kind: str) -> list[str]:
     """Sorted names of the built-in plug-ins of a kind."""
-    return sorted(module.name for module in pkgutil.iter_modules(importlib.import_module(KINDS[kind][0]).__path__))
+    return sorted(module.name for module in pkgutil.iter_modules(_folders(kind)))
+
+
+def _folders(kind: str) -> list[str]:
+    """Folders of the built-in plug-ins of a kind; their package is not imported, as it may import jax."""
+    spec = importlib.util.find_spec(KINDS[kind][0])
+    return [*((spec and spec.submodule_search_locations) or ())]
 
 
 def load(kind: str, name: str, where: str = "", content: bytes = b"") -> Any:
@@ -62,6 +70,15 @@ def load(kind: str, name: str, where: str = "", content: bytes = b"") -> Any:
 def summary(kind: str, name: str) -> str:
     """First line of a built-in plug-in's docstring."""
     return (_module(kind, name).__doc__ or "").strip().partition("\n")[0]
+
+
+def written_summary(kind: str, name: str) -> str:
+    """The `summary` of a built-in plug-in, read from its file without importing it."""
+    for folder in _folders(kind):
+        path = pathlib.Path(folder) / f"{name}.py"
+        if path.is_file():
+            return (ast.get_docstring(ast.parse(path.read_bytes())) or "").partition("\n")[0]
+    return ""
 
 
 def _module(kind: str, name: str) -> ModuleType:
