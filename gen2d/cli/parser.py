@@ -95,9 +95,9 @@ def parse(arguments: Sequence[str], verbs: Mapping[str, ModuleType]) -> argparse
     verbs[verb].add_arguments(parser)
     add_output(parser)
     parser.check_names(words)
-    options, extra = parser.parse_known_intermixed_args(
-        words, argparse.Namespace(arguments=arguments, run=verbs[verb].run)
-    )
+    # Options may stand between positional arguments, but intermixed parsing loses a '--'.
+    read = parser.parse_known_args if "--" in words else parser.parse_known_intermixed_args
+    options, extra = read(words, argparse.Namespace(arguments=arguments, run=verbs[verb].run))
     if extra:
         parser.error(f"{extra[0]!r} is one argument too many")
     return options

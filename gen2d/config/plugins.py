@@ -134,10 +134,8 @@ def find_config(name: str) -> pathlib.Path:
     if path.is_file():
         return path
     if name and path.is_dir():
-        raise ConfigError(f"{argument('config')} is {name!r}, which is a folder; name a YAML file")
+        raise ConfigError(f"the config is {name!r}, which is a folder; name a YAML file")
     for candidate in (path.name, f"{path.name}.yaml"):
         if path.parent == pathlib.Path() and (config_folder() / candidate).is_file():
             return config_folder() / candidate
-    raise ConfigError(
-        f"{argument('config')} is {name!r}, but there is no such file; {nearest(path.name, config_names())}"
-    )
+    raise ConfigError(f"the config is {name!r}, but there is no such file; {nearest(path.name, config_names())}")

@@ -31,7 +31,11 @@ def test_an_argument_is_a_flag_on_a_command_line() -> None:
         ({"split": "a b"}, ["--split", "a b"], "{split} is 'a b', but must be letters"),
         ({"overrides": ["fps"]}, ["--set", "fps"], "{set} is 'fps', but must be section.option=value"),
         ({"overrides": ["video.fps=["]}, ["--set", "video.fps=["], "{set} video.fps"),
-        ({"config": "nothing.yaml"}, ["--config", "nothing.yaml"], "{config} is 'nothing.yaml', but there is no such"),
+        (
+            {"config": "nothing.yaml"},
+            ["--config", "nothing.yaml"],
+            "the config is 'nothing.yaml', but there is no such",
+        ),
     ],
 )
 def test_one_error_in_two_languages(options: dict, flags: list[str], said: str, tmp_path: Path) -> None:
