@@ -243,3 +243,8 @@ def test_public_names_stay_callable_after_their_modules_are_imported():
     importlib.import_module("gen2d.tools.verify")
     for name in gen2d.__all__:
         assert callable(getattr(gen2d, name)), name
+
+
+def test_a_citation_names_this_version():
+    citation = (Path(__file__).parent.parent / "CITATION.cff").read_text(encoding="utf-8")
+    assert f"\nversion: {gen2d.__version__}\n" in citation
