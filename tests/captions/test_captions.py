@@ -111,7 +111,8 @@ def test_exports_hold_text_as_other_programs_read_it(toy: Path, tmp_path: Path) 
             assert archive["text/name"] == text["text/name"]
         assert content[f"{key}.text.name.txt"] == text["text/name"].item()
         assert json.loads(content[f"{key}.text.list.json"]) == list(range(number % 4))
-        assert np.load(io.BytesIO(content[f"{key}.states.angle.npy"])).dtype == np.float32
+        with np.load(io.BytesIO(content[f"{key}.npz"])) as archive:
+            assert archive["states/angle"].dtype == np.float32
 
 
 def test_cards_say_that_it_is_text(toy: Path) -> None:
