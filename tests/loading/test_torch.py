@@ -64,7 +64,8 @@ def data_loader(data: Any, workers: tuple[int, str | None] = (0, None), stateful
         else package("torch").utils.data.DataLoader
     )
     number, method = workers
-    return cls(data, num_workers=number, multiprocessing_context=method, **options)
+    timeout = 120 if number else 0  # s: a worker that is forked beside threads of other libraries may wait forever
+    return cls(data, num_workers=number, multiprocessing_context=method, timeout=timeout, **options)
 
 
 def check_windows(batch: dict[str, Any], stored: dict[str, np.ndarray]) -> None:
