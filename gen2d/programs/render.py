@@ -11,12 +11,14 @@ from gen2d import annotations
 from gen2d.config.annotations import Annotations
 from gen2d.config.config import Config
 from gen2d.config.sections import ImageOptions
+from gen2d.core.errors import ConfigError
 from gen2d.records.axes import Array, check_shapes
 from gen2d.records.keys import key_for
 from gen2d.records.layout import Layout
 from gen2d.records.scene import Scene, State
 from gen2d.renderers import camera
 from gen2d.renderers.camera import CameraView
+from gen2d.renderers.compositing import OCCLUDER
 from gen2d.renderers.paint import Paint
 from gen2d.renderers.plan import FramePlan, Occluders, RenderScene
 from gen2d.renderers.primitives import BodyGeometry, Instants
@@ -24,8 +26,18 @@ from gen2d.renderers.rasterizer import draw
 
 
 def plan_of(config: Config, layout: Layout) -> FramePlan:
-    """Frame plan of a config: everything static that rendering needs."""
+    """Frame plan of a config: everything static that rendering needs.
+
+    Raises ConfigError if an annotation tells apart more objects than a byte can number.
+    """
     video, image, look = config.video, config.image, config.look
+    owners = annotations.need_owners(config.annotations)
+    if owners and layout.slots >= OCCLUDER:
+        name = next(plugin.name for plugin in config.annotations.wanted if plugin.contract.owners)
+        raise ConfigError(
+            f"annotations.{name} is on for {layout.slots} objects of scene {config.scene.name}, "
+            f"but must be off for more than {OCCLUDER - 1}"
+        )
     seconds = video.frames / video.fps
     scale = camera.largest_scale(config.camera, layout, video.height, video.width, seconds)
     return FramePlan(
@@ -38,7 +50,7 @@ def plan_of(config: Config, layout: Layout) -> FramePlan:
         still=not camera.may_move(config.camera),
         linear=image.blending == "linear",
         frames=config.storage.frames != "none",
-        owners=annotations.need_owners(config.annotations),
+        owners=owners,
         exposed=image.exposure_samples if image.exposure else 0,
     )
 

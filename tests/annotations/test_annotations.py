@@ -16,11 +16,12 @@ from gen2d.annotations.boxes import visible_boxes
 from gen2d.annotations.visibility import pixel_counts
 from gen2d.config import plugins
 from gen2d.config.config import load_config
+from gen2d.core.errors import ConfigError
 from gen2d.programs import redraw, render
 from gen2d.programs.rollout import Rollout
 from gen2d.records import keys as keys_module
 from gen2d.records import scene as scene_module
-from gen2d.records.layout import SlotGroup
+from gen2d.records.layout import Layout, SlotGroup
 from gen2d.renderers.primitives import BodyGeometry
 
 ALL = [f"annotations.{name}={plugins.load('annotation', name).usual}" for name in plugins.names("annotation")]
@@ -329,3 +330,15 @@ def test_tracked_points_are_uniform_in_the_area_of_their_shape():
         exact = shares_of_cells(np.stack([x, y], -1)[there], 1.5)
         assert exact.max() < 0.2
         assert_allclose(shares_of_cells(points, 1.5), exact, atol=0.012, err_msg=shape)
+
+
+@pytest.mark.parametrize("name", ["masks", "boxes", "visibility", "flow"])
+def test_more_objects_than_a_mask_can_number_are_refused(name: str) -> None:
+    config = load_config("bouncing.yaml", [f"annotations.{name}=true"])
+
+    def layout(balls: int) -> Layout:
+        return Layout((SlotGroup("circle", balls),))
+
+    assert render.plan_of(config, layout(254)).owners
+    with pytest.raises(ConfigError, match=rf"annotations\.{name} is on for 255 objects .* off for more than 254"):
+        render.plan_of(config, layout(255))
