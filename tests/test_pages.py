@@ -1,5 +1,6 @@
 """The pages of the documentation: their blocks run, their links lead somewhere, their tables are those of the code."""
 
+import importlib
 import re
 import subprocess
 import sys
@@ -92,6 +93,21 @@ def test_the_site_is_built_without_a_warning(tmp_path: Path):
     assert done.returncode == 0, done.stderr
     names = {path.relative_to(tmp_path / "site").as_posix() for path in (tmp_path / "site").rglob("*.html")}
     assert names >= {"index.html", "physics/index.html", "api/gen2d/index.html"}
+
+
+@pytest.mark.parametrize("module", ["gen2d", "gen2d.plugin", "gen2d.grain", "gen2d.torch", "gen2d.engines"])
+def test_every_public_name_is_in_the_reference(module: str):
+    if module == "gen2d.torch":
+        require("torch")
+    public = importlib.import_module(module)
+    names = getattr(public, "__all__", None) or [
+        name for name in dir(public) if name[0].isupper() and name != "TYPE_CHECKING"
+    ]
+    text = "\n".join((ROOT / page).read_text(encoding="utf-8") for page in pages.DOCS if "/api/" in page)
+    described = set(re.findall(rf"^::: {re.escape(module)}\.(\w+)$", text, re.MULTILINE)) | set(
+        re.findall(r"`(\w+)`", text)
+    )
+    assert set(names) <= described
 
 
 @pytest.mark.parametrize("page", ["gen2d/README.md", "tests/README.md", *pages.DOCS])
