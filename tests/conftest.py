@@ -16,7 +16,14 @@ Reports = Generator[None, pytest.TestReport, pytest.TestReport]
 
 _CACHE = pathlib.Path(os.environ.get("XDG_CACHE_HOME") or pathlib.Path.home() / ".cache") / "gen2d-tests"
 _CACHE_BYTES = 2**32
-_LONGEST = ("test_readme.py", "test_recovery.py", "test_versions.py", "test_families.py", "test_random_worlds.py")
+_LONGEST = (
+    "test_pages.py",
+    "test_readme.py",
+    "test_recovery.py",
+    "test_versions.py",
+    "test_families.py",
+    "test_random_worlds.py",
+)
 _CONFIG = tempfile.TemporaryDirectory(prefix="gen2d-test-config-")
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(_CACHE))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.2")

@@ -21,7 +21,7 @@ ROOT = TESTS.parent
 CLAIMS: dict[str, dict[str, list[str] | str]] = tomllib.loads((TESTS / "claims.toml").read_text(encoding="utf-8"))
 PAGES = [
     *("README.md", "datasets/README.md", "tests/README.md", "gen2d/README.md"),
-    *sorted(path.relative_to(ROOT).as_posix() for path in (ROOT / "gen2d").glob("*/README.md")),
+    *sorted(path.relative_to(ROOT).as_posix() for path in (ROOT / "docs").rglob("*.md")),
 ]
 REASONS = {
     "definition": "what a word, symbol, field, unit or option means",
@@ -40,7 +40,7 @@ NUMBER = r"(?<![\w.,^-])\.?\d[\d.,]*(?:e-?\d+)?(?![\w-])"
 PROMISE = re.compile(rf"\b(?:{STRONG}|{WORDS}|{COUNTS})\b|{NUMBER}", re.IGNORECASE)
 # Numbers and words in code, the targets of links, and the dates and numbers of citations promise nothing.
 SILENT = re.compile(r"`[^`]*`|\]\([^)]*\)|arXiv \d+\.\d+|\b(?:19|20)\d\d\b")
-MACHINE = re.compile(r"EPYC|#how-fast")  # the machine of the figures, or a link to the section that names it
+MACHINE = re.compile(r"EPYC|\bspeed\.md\b")  # the machine of the figures, or a link to the page that names it
 
 
 class Sentence(NamedTuple):
@@ -168,7 +168,7 @@ def test_measured_figures_stand_beside_their_machine(page: str):
     for entry, proofs in CLAIMS.get(page, {}).items():
         if any(proof.startswith("tests/bench/bench") for proof in proofs if isinstance(proofs, list)):
             wrong += [
-                f"Section '{each.heading}' says figures but not on what machine: name it, or link to #how-fast."
+                f"Section '{each.heading}' says figures but not on what machine: name it, or link to docs/speed.md."
                 for each in sentences(page)
                 if each.text == entry and not MACHINE.search(sections[each.heading])
             ]

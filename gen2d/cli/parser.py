@@ -170,7 +170,7 @@ ENGINE_OPTIONS = ("address", "workers", "gpus_per_worker", "cpus_per_worker", "d
 
 def add_engine(parser: Parser) -> None:
     """Adds where the work runs."""
-    group = parser.add_argument_group("clusters", "see gen2d/engines/README.md")
+    group = parser.add_argument_group("clusters", "see docs/engines.md")
     group.add_argument(
         "--engine",
         default="local",

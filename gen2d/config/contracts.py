@@ -60,20 +60,20 @@ def _no_sizes(*_: Any) -> dict[str, int]:
 class Family(_Contract):
     """A scene family: `FAMILY = Family(options=Options, layout=layout, sample=sample)` in gen2d/scenes/NAME.py.
 
-    options: frozen dataclass with fields declared by `option`. Options with `draw=True` are sampled: the factors.
-    layout(options): the `Layout`, large enough for every scene that `sample` may return.
-    sample(key, factors, options): the `SampledScene` of one video, traced by jax. `factors` has one array per factor:
+    - options: frozen dataclass with fields declared by `option`. Options with `draw=True` are sampled: the factors.
+    - layout(options): the `Layout`, large enough for every scene that `sample` may return.
+    - sample(key, factors, options): the `SampledScene` of one video, traced by jax. `factors` has one array per factor:
         [], or [count] with `each`, [parts] with `parts`, [count, parts] with both.
         Numbers of the options are arguments of the compiled program here and in `layout`: jax, NumPy, arithmetic,
         `maximum` and `minimum` take them as they are. A comparison, `int`, or a function of `math` makes the program
         one for this outcome alone, so another number compiles again.
-    check(options): raises ValueError if no scene is possible with these options; the message begins with an option's
+    - check(options): raises ValueError if no scene is possible with these options; the message begins with an option's
         name.
-    sizes(options): lengths of the axes named by `each`, for names that are not factors themselves.
-    derived: fields computed from the factors and stored as factors/NAME, by NAME; `SampledScene.derived` holds the
+    - sizes(options): lengths of the axes named by `each`, for names that are not factors themselves.
+    - derived: fields computed from the factors and stored as factors/NAME, by NAME; `SampledScene.derived` holds the
         values.
-    crowded_by: options to name in the error when an object finds no free position.
-    begins_outside: whether moving objects may start outside the layout's bounds.
+    - crowded_by: options to name in the error when an object finds no free position.
+    - begins_outside: whether moving objects may start outside the layout's bounds.
     """
 
     options: type
@@ -90,12 +90,12 @@ class Family(_Contract):
 class Look(_Contract):
     """A look: `LOOK = Look(options=Options, paint=paint, margin=line_margin)` in renderers/looks/NAME.py.
 
-    options: frozen dataclass with fields declared by `option`, often a subclass of `PlainOptions`.
-    paint(scene, layout, options, key): the `Paint` of one video, with one entry per slot (K), traced by jax.
-    margin(options): largest distance, in px, to which an object is rendered beyond its outline; `line_margin` for
+    - options: frozen dataclass with fields declared by `option`, often a subclass of `PlainOptions`.
+    - paint(scene, layout, options, key): the `Paint` of one video, with one entry per slot (K), traced by jax.
+    - margin(options): largest distance, in px, to which an object is rendered beyond its outline; `line_margin` for
         `LineOptions`.
-    blur(options, layout): largest half width of the soft edges of shadows, in m; 0 for looks without shadows.
-    check(options): raises ValueError if the options are invalid; the message begins with an option's name.
+    - blur(options, layout): largest half width of the soft edges of shadows, in m; 0 for looks without shadows.
+    - check(options): raises ValueError if the options are invalid; the message begins with an option's name.
     """
 
     options: type
@@ -109,15 +109,15 @@ class Look(_Contract):
 class Annotation(_Contract):
     """A pixel annotation: `ANNOTATION = Annotation(...)` in gen2d/annotations/NAME.py.
 
-    options: one `option`, written `NAME: value` in a config and off if false or 0; or a frozen dataclass of options,
+    - options: one `option`, written `NAME: value` in a config and off if false or 0; or a frozen dataclass of options,
         written `NAME: {...}`, with `NAME: true` for the defaults. None of them may be sampled (`draw=True`).
-    fields: stored fields by full name. Their axes begin with n; T, K, H and W are known, `sizes` gives all others.
-    annotate(scenes, owners, plan, value): one array per field, with the n videos first, traced by jax. `scenes` is a
+    - fields: stored fields by full name. Their axes begin with n; T, K, H and W are known, `sizes` gives all others.
+    - annotate(scenes, owners, plan, value): one array per field, with the n videos first, traced by jax. `scenes` is a
         `RenderScene` of n videos. `owners` [n, T, H, W] uint8 is the slot + 1 visible at each pixel (0 background, 255
         occluder). `plan` is the `FramePlan`; `value` is the option's value, or the dataclass.
-    sizes(plan, value): lengths of further axes, by letter.
-    owners: whether `annotate` needs `owners`; without it `owners` is None, unless another annotation needs it.
-    usual: value with which `gen2d.render` switches the annotation on when its fields are requested.
+    - sizes(plan, value): lengths of further axes, by letter.
+    - owners: whether `annotate` needs `owners`; without it `owners` is None, unless another annotation needs it.
+    - usual: value with which `gen2d.render` switches the annotation on when its fields are requested.
     """
 
     options: type | dataclasses.Field
@@ -139,19 +139,19 @@ class Annotation(_Contract):
 class Export(_Contract):
     """An export format: `EXPORT = Export(fields=..., write=write)` in gen2d/exports/formats/NAME.py.
 
-    fields: names of the fields exported by default, or patterns such as "states/*". If "frames" is among them, frames
+    - fields: names of the fields exported by default, or patterns such as "states/*". If "frames" is among them, frames
         that are not stored are rendered.
-    write(target, source): writes the videos of the `Source` to the folder, or to the single file, `target`.
-    check(source): raises ConfigError, before anything is written, if the format cannot hold these videos.
-    fixed: whether the format holds these fields only.
-    suffix: suffix of the single file written; "" for a folder.
-    separate: whether the files of a part of the videos depend on nothing but these, as with `source.each`, so that
+    - write(target, source): writes the videos of the `Source` to the folder, or to the single file, `target`.
+    - check(source): raises ConfigError, before anything is written, if the format cannot hold these videos.
+    - fixed: whether the format holds these fields only.
+    - suffix: suffix of the single file written; "" for a folder.
+    - separate: whether the files of a part of the videos depend on nothing but these, as with `source.each`, so that
         several machines may each write some parts, and a killed export goes on. `write` is then called for each part.
-    part_videos(source): number of videos of a part; a part begins at a multiple of it.
-    finish(target, source): writes the files that describe all videos, if there are any, when all parts are there.
-    codecs: names of the encodings of frames that can be chosen, of which the first is the default; one is then in
+    - part_videos(source): number of videos of a part; a part begins at a multiple of it.
+    - finish(target, source): writes the files that describe all videos, if there are any, when all parts are there.
+    - codecs: names of the encodings of frames that can be chosen, of which the first is the default; one is then in
         `source.codec`. `films.CODECS` has those of films, with what each does not preserve.
-    loss: description of the information that the format drops; "" if it drops none but what its codec drops.
+    - loss: description of the information that the format drops; "" if it drops none but what its codec drops.
     """
 
     fields: tuple[str, ...]

@@ -157,8 +157,10 @@ def repair(
         sha256 of code in the dataset that may run.
     engine : gen2d.engines.Ray, optional
         Where shards are generated, if the dataset is on a disk that all machines share; by default in this process.
-    timeout, deadline : float
-        Limits in s of a server's silence and of a whole request, as in `open`.
+    timeout : float
+        Limit in s of a server's silence, as in `open`.
+    deadline : float
+        Limit in s of a whole request, as in `open`.
 
     Returns
     -------

@@ -93,8 +93,10 @@ def generate(
     log : callable, optional
         Receives lines of progress; by default, the logger "gen2d" does, at level INFO, and a terminal or notebook where
         no handler of logging is set.
-    timeout, deadline : float
-        Limits in s of a server's silence and of a whole request, as in `open`.
+    timeout : float
+        Limit in s of a server's silence, as in `open`.
+    deadline : float
+        Limit in s of a whole request, as in `open`.
 
     Returns
     -------

@@ -55,8 +55,10 @@ def plot(
         Number of the video in its split.
     split : str, optional
         Name of the split. The default is "train", or the only split.
-    timeout, deadline : float
-        Limits in s of a server's silence and of a whole request, as in `open`.
+    timeout : float
+        Limit in s of a server's silence, as in `open`.
+    deadline : float
+        Limit in s of a whole request, as in `open`.
 
     Returns
     -------

@@ -46,8 +46,10 @@ def preview(
         Options of the config to change, such as 'video.height=128'.
     trust : sequence of str
         sha256 of code in the dataset that may run, as in `render`; only for datasets without frames.
-    timeout, deadline : float
-        Limits in s of a server's silence and of a whole request, as in `open`.
+    timeout : float
+        Limit in s of a server's silence, as in `open`.
+    deadline : float
+        Limit in s of a whole request, as in `open`.
 
     Returns
     -------

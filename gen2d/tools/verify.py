@@ -106,8 +106,10 @@ def verify(
         sha256 of code in the dataset that may run, as in `render`; only for "regen".
     engine : gen2d.engines.Ray, optional
         Where the shards are read and checked; by default in this process. "regen" regenerates in this process.
-    timeout, deadline : float
-        Limits in s of a server's silence and of a whole request, as in `open`.
+    timeout : float
+        Limit in s of a server's silence, as in `open`.
+    deadline : float
+        Limit in s of a whole request, as in `open`.
 
     Returns
     -------

@@ -57,8 +57,10 @@ def view(
         Seed of the videos of a config; by default that of the config.
     overrides : sequence of str
         Options of the config to change, such as 'video.height=128'.
-    timeout, deadline : float
-        Limits in s of a server's silence and of a whole request, as in `open`.
+    timeout : float
+        Limit in s of a server's silence, as in `open`.
+    deadline : float
+        Limit in s of a whole request, as in `open`.
 
     Raises
     ------

@@ -1,7 +1,7 @@
 """Frames and annotations of whole videos against a reference in float64 that shares no code with gen2d.
 
 `support/reference.py` computes them from the stored fields of each video. Bounds follow from the accuracy that
-renderers/README.md states. Where two objects share a pixel equally within that accuracy, either may own it: such ties
+docs/frames.md states. Where two objects share a pixel equally within that accuracy, either may own it: such ties
 are counted, and the boxes, counts and flows of the video must be those of its choice.
 """
 
@@ -49,7 +49,7 @@ STEPS = 8  # of the solver per frame, in videos with motion blur
 STATIC = 1  # objects/kind
 OCCLUDERS = ("image.occluders=2", "image.occluder_front=[0,1]")
 LOOKS = {"cradle": ("look=outline",), "uniform_motion": ("look=phyworld",), "galton": ("image.blending=linear",)}
-# Accuracy of coverages of shapes with radii up to these, px (renderers/README.md), in grey levels.
+# Accuracy of coverages of shapes with radii up to these, px (docs/frames.md), in grey levels.
 ACCURACY = {4: 0.001, 32: 0.1, 64: 0.4, np.inf: 2.0}
 ROUNDING = 0.5 + 2**-5  # grey levels, of a layer
 POSITION = 2.0**-21  # of a position in px, in float32

@@ -2,7 +2,7 @@
 
     python tests/bench/bench_cluster.py
 
-Prints the figures of gen2d/engines/README.md; only ratios are meaningful on a shared machine.
+Prints the figures of docs/engines.md; only ratios are meaningful on a shared machine.
 """
 
 import argparse

@@ -1,6 +1,6 @@
 """Cost of physics against the number of objects: gen2d, Chipmunk (pymunk) and phyjax2d on the same scenes.
 
-    python tests/bench/bench.py --only physics --plot gen2d/physics/physics_cost.png     # about 5 minutes
+    python tests/bench/bench.py --only physics --plot docs/physics_cost.png     # about 5 minutes
 
 In each scene, N discs of random radii, or 8 rectangles, fall and bounce in a box with a constant area per object, for
 64 frames at 60 Hz with 4 steps each. Every engine has its default number of iterations and returns the states of all

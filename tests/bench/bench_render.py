@@ -1,6 +1,6 @@
 """Cost of rendering against the frame size and the number of objects: gen2d, OpenCV and a plain copy.
 
-    python tests/bench/bench.py --only render --plot renderers/render_cost.png  # 2 minutes, 5 with nothing compiled
+    python tests/bench/bench.py --only render --plot docs/render_cost.png  # 2 minutes, 5 with nothing compiled
 
 The scene is that of configs/benchmark.yaml: N discs in a box of 10 m, 64 frames per video. Simulation is not timed.
 gen2d renders in slices, as in a run; OpenCV is called from Python for every disc, as in peer.py, on the same states and

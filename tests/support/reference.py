@@ -1,6 +1,6 @@
 """Reference for frames and annotations: NumPy in float64, written from the definitions of the stored fields alone.
 
-It imports nothing of gen2d and shares no method with it. The definitions are those of renderers/README.md and of the
+It imports nothing of gen2d and shares no method with it. The definitions are those of docs/frames.md and of the
 fields (`meaning` in a dataset's manifest). A video is a mapping from stored names to the arrays of one video, without
 the axis n. What a dataset does not store, the colour of the background, the line width of segments and the places of
 occluders, is passed as a `View`.
