@@ -26,6 +26,22 @@ class _Contract:
         options: Any = getattr(self, "options", None)
         if options is not None and not all("option" in field.metadata for field in option_fields(options)):
             raise TypeError(f"{type(self).__name__}.options is {options!r}, of which not every field is an option(...)")
+        hidden = _hidden_attribute(options)
+        if hidden:
+            raise TypeError(
+                f"{type(self).__name__}.options has an option {hidden}, which its base class uses: rename it"
+            )
+
+
+def _hidden_attribute(options: Any) -> str | None:
+    """Name of a field that hides an attribute of a base class which is no field there; None without one."""
+    bases = options.__mro__[1:-1] if isinstance(options, type) else ()
+    names = {field.name for field in option_fields(options)} if bases else set[str]()
+    for base in bases:
+        fields = dataclasses.fields(base) if dataclasses.is_dataclass(base) else ()
+        for name in sorted(names & vars(base).keys() - {field.name for field in fields}):
+            return name
+    return None
 
 
 def option_fields(options: Any) -> tuple[dataclasses.Field[Any], ...]:

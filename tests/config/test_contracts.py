@@ -12,7 +12,7 @@ from gen2d.config.config import load_config
 from gen2d.config.reading import parse_yaml
 from gen2d.core.errors import ConfigError
 from gen2d.core.schema import Field
-from gen2d.plugin import Annotation, Export, Family, Look, option
+from gen2d.plugin import Annotation, Export, Family, Look, PlainOptions, option
 
 ALL = [(kind, name) for kind in plugins.KINDS for name in plugins.names(kind)]
 IN_A_CONFIG = [(kind, name) for kind, name in ALL if kind != "export"]
@@ -92,6 +92,13 @@ class Empty:
     """No options."""
 
 
+@dataclasses.dataclass(frozen=True)
+class Hiding(PlainOptions):
+    """An option with the name of an attribute of its base class."""
+
+    grounds: float = option(1.0, float, "1", "one")  # pyright: ignore[reportIncompatibleMethodOverride, reportAssignmentType]
+
+
 def nothing(*_: Any) -> Any:
     """What a plug-in's functions are here."""
 
@@ -104,6 +111,10 @@ WRONG: dict[str, tuple[type, dict[str, Any]]] = {
         {"options": Empty, "layout": nothing, "sample": nothing, "derived": []},
     ),
     "Look.options is {}, but must be": (Look, {"options": {}, "paint": nothing, "margin": nothing}),
+    "Look.options has an option grounds, which its base class uses": (
+        Look,
+        {"options": Hiding, "paint": nothing, "margin": nothing},
+    ),
     "Annotation.options is False, but must be": (Annotation, {"options": False, "fields": {}, "annotate": nothing}),
     "Annotation.owners is 1, but must be": (
         Annotation,
