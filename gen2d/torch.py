@@ -254,9 +254,6 @@ class IterableVideoDataset(_Epochs, torch.utils.data.IterableDataset[Sample]):
         drop_last: bool,
     ) -> None:
         super().__init__()
-        is_distributed = torch.distributed.is_available() and torch.distributed.is_initialized()
-        if rank is None and world_size is None and is_distributed:
-            rank, world_size = torch.distributed.get_rank(), torch.distributed.get_world_size()
         size = 1 if batch_size is None else whole_number("batch_size", batch_size, 1)
         self._epochs = epochs if epochs is None else whole_number("epochs", epochs, 1)
         self._source, self._is_single = checked_source(ds), batch_size is None

@@ -74,7 +74,7 @@ def _check_intervention(name: str, scene: Any, layout: Layout, video: Any, camer
         raise ValueError("change is remove, but camera.follow may be what is gone: it must be null")
     gravity = getattr(scene.options, "gravity", ())
     if name == "gravity_flip" and all(part.support == (0, 0) for part in gravity):
-        raise ValueError("change is gravity_flip, but there is no scene.gravity")
+        raise ValueError("change is gravity_flip, but there is no scene.gravity to reverse")
 
 
 def _check_factor(name: str, options: Any, scene: Any, layout: Layout) -> None:

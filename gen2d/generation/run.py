@@ -131,6 +131,8 @@ def generate(
             f"{argument('worker')} and {argument('engine')} cannot go together: the engine divides the work"
         )
     counts = _counts(config, _check_run(n, split, worker, overwrite), split)
+    for sentence in _incomplete_sets(config, counts):
+        log(sentence)
     network = Network(timeout, deadline)
     out = place(out, network) if out is not None else Path("datasets") / config.name
     remember(config.copies.values())
@@ -221,6 +223,16 @@ def _counts(config: Config, n: int, split: str | None) -> dict[str, int]:
         config.split_index(split)  # raises ConfigError if there is no such split
         return {split: n}
     return {each.name: each.videos or n for each in config.splits} or {"train": n}
+
+
+def _incomplete_sets(config: Config, counts: Mapping[str, int]) -> list[str]:
+    """A sentence for each split whose last matched set lacks videos."""
+    members = config.matched.members if config.matched.change else 1
+    return [
+        f"{split}: {count:,} videos are no multiple of matched.members, {members}, so the last set is incomplete"
+        for split, count in counts.items()
+        if count % members
+    ]
 
 
 def _check_run(n: Any, split: str | None, worker: tuple[int, int], overwrite: bool) -> int:

@@ -48,11 +48,12 @@ class DataLoader(Generic[A]):
     epochs : int, optional
         Number of epochs in an iteration. By default an iteration never ends.
     rank, world_size : int, optional
-        Number of this process, and of all processes. If both are omitted, they are RANK and WORLD_SIZE of the
-        environment, which torchrun sets, and otherwise 0 and 1.
+        Number of this process, and of all processes. If both are omitted, they are those of torch.distributed, if it is
+        initialized, else RANK and WORLD_SIZE of the environment, which torchrun sets, else 0 and 1.
     drop_last : bool
         Whether the videos at the end of an epoch that do not fill a global batch are skipped. With False they form a
-        smaller one, of which the ranks' slices differ by at most one video and may be empty.
+        smaller one, of which the ranks' slices differ by at most one video and may be empty. An evaluation of all
+        videos needs False.
     num_threads : int, optional
         Number of reading threads. The default is the number of CPUs, at most 8.
     prefetch : int

@@ -6,6 +6,7 @@ and the position, so iteration resumes anywhere without replay.
 
 import copy
 import os
+import sys
 from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
 
@@ -125,13 +126,21 @@ class EpochSampler:
 
 
 def _rank_and_world_size(rank: int | None, world_size: int | None) -> tuple[int, int]:
-    """Rank and world size: the arguments, else RANK and WORLD_SIZE as torchrun sets them, else 0 and 1."""
-    if rank is None and world_size is None and {"RANK", "WORLD_SIZE"} <= os.environ.keys():
+    """Rank and world size: the arguments, else those of torch.distributed or of the environment, else 0 and 1.
+
+    `torch.multiprocessing.spawn` sets no RANK, so without the process group each process would read the same videos.
+    """
+    if rank is not None or world_size is not None:
+        return 0 if rank is None else rank, 1 if world_size is None else world_size
+    distributed = sys.modules.get("torch.distributed")  # a process that has not imported it has no group
+    if distributed is not None and distributed.is_available() and distributed.is_initialized():
+        return distributed.get_rank(), distributed.get_world_size()
+    if {"RANK", "WORLD_SIZE"} <= os.environ.keys():
         values = os.environ["RANK"], os.environ["WORLD_SIZE"]
         if not all(word.isdecimal() for word in values):
             raise ConfigError(f"RANK and WORLD_SIZE are {values[0]!r} and {values[1]!r}, but must be whole numbers")
         return int(values[0]), int(values[1])
-    return 0 if rank is None else rank, 1 if world_size is None else world_size
+    return 0, 1
 
 
 def check_one_of(name: str, value: Any, allowed: tuple[object, ...]) -> None:

@@ -5,7 +5,7 @@ import itertools
 
 import numpy as np
 
-from gen2d.core.enums import DYNAMIC, STATIC
+from gen2d.core.enums import DYNAMIC, JOINT_KINDS, STATIC
 
 
 @dataclasses.dataclass(frozen=True)
@@ -23,12 +23,18 @@ class SlotGroup:
 
 @dataclasses.dataclass(frozen=True)
 class JointSpec:
-    """A joint between slots `a` and `b`: "distance" or "revolute". The two bodies collide only if `collide`."""
+    """A joint between slots `a` and `b`: "distance" or "revolute". The two bodies collide only if `collide`.
+
+    The slots count the objects of all groups of the layout, from 0.
+    """
 
     kind: str
     a: int
     b: int
     collide: bool = False
+
+    def __post_init__(self) -> None:
+        assert self.kind in JOINT_KINDS, f"a joint is {self.kind!r}, but must be one of {', '.join(JOINT_KINDS)}"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -44,6 +50,11 @@ class Layout:
     bounds: tuple[float, float, float, float] = (0.0, 0.0, 1.0, 1.0)
     reach: float = 1.0
     joints: tuple[JointSpec, ...] = ()
+
+    def __post_init__(self) -> None:
+        for joint in self.joints:
+            ends = {joint.a, joint.b} & set(range(self.slots))
+            assert len(ends) == 2, f"{joint} must connect two of the layout's slots, 0 to {self.slots - 1}"
 
     @property
     def slots(self) -> int:

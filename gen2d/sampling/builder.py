@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from gen2d.core.enums import DYNAMIC, SHAPES, STATIC
 from gen2d.physics.inertia import (
@@ -210,12 +211,19 @@ def _group(
 def assemble(
     layout: Layout, groups: Sequence[BodyGroup], gravity: Array, joints: Joints | None = None
 ) -> tuple[Scene, State]:
-    """Scene and initial state of these groups, with `gravity` [2] m/s^2.
+    """Scene and initial state of these groups, with `gravity` [2] m/s^2, and of `joints`, if the layout has any.
 
-    Raises AssertionError unless the layout has the same slot groups.
+    Joints whose `rest` was not given have their rest length from the initial state; that of revolute joints is 0 rad.
+
+    Raises AssertionError unless the layout has the same slot groups, and as many joints.
     """
     runs = tuple(group.run for group in groups)
     assert runs == layout.groups, f"the groups are {runs}, but the layout has {layout.groups}"
+    given = 0 if joints is None else len(joints.anchor_a)
+    assert given == len(layout.joints), (
+        f"assemble() was given {given} joints, but the layout has {len(layout.joints)}; "
+        "builder.distance_joints and builder.hinge_chain make them"
+    )
     corners = max(run.vertices for run in runs)
     names = [*groups[0].objects, *(name for name in OPTIONAL if any(name in group.objects for group in groups))]
     fields = {
@@ -223,6 +231,8 @@ def assemble(
     }
     depth = jnp.where(fields["present"], jnp.asarray(layout.depths), 0).astype(jnp.int16)
     state = jax.tree.map(lambda *values: jnp.concatenate(values), *(group.state for group in groups))
+    if joints is not None and joints.rest is None:
+        joints = dataclasses.replace(joints, rest=_rest_of(joints, layout, fields["present"], state))
     return Scene(Objects(depth=depth, **fields), jnp.asarray(gravity, jnp.float32), joints), state
 
 
@@ -242,20 +252,45 @@ def _values_of(group: BodyGroup, name: str, corners: int) -> Array:
     return values
 
 
-def distance_joints(anchor_a: Any, anchor_b: Any, **numbers: Any) -> Joints:
-    """Joints in the layout's order, with anchors [J, 2] m in the frames of their objects.
+def _rest_of(joints: Joints, layout: Layout, present: Array, state: State) -> Array:
+    """Distance of the anchors in this state [J], m, of distance joints with both objects; 0 for the other joints."""
+    is_distance = np.array([joint.kind == "distance" for joint in layout.joints])
+    if not is_distance.any():
+        return jnp.zeros(len(is_distance))
+    slots = [np.array([getattr(joint, side) for joint in layout.joints]) for side in "ab"]
+    anchors = zip(slots, (joints.anchor_a, joints.anchor_b), strict=True)
+    one, other = (state.position[own] + _turned(anchor, state.angle[own]) for own, anchor in anchors)
+    there = present[slots[0]] & present[slots[1]] & is_distance
+    return jnp.where(there, jnp.hypot(*(other - one).T), 0.0)
 
-    `numbers` are other fields of `Joints`, scalars or arrays [J]. By default, joints are rigid and have neither limits
-    nor motors.
+
+def _turned(points: Array, angle: Array) -> Array:
+    """Points [J, 2] after rotations by these angles [J], rad."""
+    cos, sin = jnp.cos(angle), jnp.sin(angle)
+    return jnp.stack([cos * points[:, 0] - sin * points[:, 1], sin * points[:, 0] + cos * points[:, 1]], -1)
+
+
+def distance_joints(anchor_a: Any, anchor_b: Any, *, rest: Any = None, **numbers: Any) -> Joints:
+    """Joints of both kinds in the layout's order, with anchors [J, 2] m in the frames of their objects.
+
+        layout(options): Layout(groups, joints=(JointSpec("distance", 0, 1),))
+        sample(...): joints = builder.distance_joints([[0, 0]], [[0, 0]], stiffness=factors["stiffness"])
+                     builder.assemble(layout(options), [pin, ball], factors["gravity"], joints)
+
+    `rest` is the rest length (m) of distance joints and the rest angle (rad) of revolute ones; by default, `assemble`
+    takes the length from the initial state, and the angle is 0. `numbers` are other fields of `Joints`, scalars or
+    arrays [J]: `stiffness` (N/m) and `damping` (N s/m) of distance joints, and `lower`, `upper` (rad), `motor_speed`
+    (rad/s) and `motor_torque` (N m) of revolute ones. By default, joints are rigid and have neither limits nor motors.
     """
     anchors = [jnp.asarray(x, jnp.float32) for x in (anchor_a, anchor_b)]
-    defaults = {"rest": 0.0, "stiffness": jnp.inf, "damping": 0.0, "lower": -jnp.inf, "upper": jnp.inf}
+    defaults = {"stiffness": jnp.inf, "damping": 0.0, "lower": -jnp.inf, "upper": jnp.inf}
     defaults |= {"motor_speed": 0.0, "motor_torque": 0.0}
     names = [field.name for field in dataclasses.fields(Joints) if field.name in defaults]
     assert not numbers.keys() - set(names), f"{numbers.keys() - set(names)} are not of {names}"
-    values = {
+    values: dict[str, Any] = {
         name: jnp.broadcast_to(jnp.asarray((defaults | numbers)[name], jnp.float32), len(anchors[0])) for name in names
     }
+    values["rest"] = rest if rest is None else jnp.broadcast_to(jnp.asarray(rest, jnp.float32), len(anchors[0]))
     return Joints(*anchors, **values)
 
 

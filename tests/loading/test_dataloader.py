@@ -8,6 +8,7 @@ import subprocess
 import sys
 import threading
 import time
+import types
 import weakref
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -151,7 +152,9 @@ def test_random_windows_follow_from_seed_epoch_and_position(toy: Path) -> None:
     assert len(starts()) == 3 * TRAIN
 
 
-def test_ranks_are_those_that_torchrun_tells_unless_given(toy: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_ranks_are_those_of_the_process_group_or_torchrun_unless_given(
+    toy: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     ds = loader.open(toy, fields="index")
     monkeypatch.setenv("RANK", "1")
     monkeypatch.setenv("WORLD_SIZE", "2")
@@ -160,6 +163,12 @@ def test_ranks_are_those_that_torchrun_tells_unless_given(toy: Path, monkeypatch
     assert len(told) == len(given) == TRAIN // 8 != len(alone)
     for one, other in zip(told, given, strict=True):
         assert_array_equal(one["index"], other["index"])
+    group = {"is_available": lambda: True, "is_initialized": lambda: True}
+    group |= {"get_rank": lambda: 0, "get_world_size": lambda: 4}
+    with monkeypatch.context() as patched:  # a process group comes before the environment
+        patched.setitem(sys.modules, "torch.distributed", types.SimpleNamespace(**group))
+        assert len(DataLoader(ds, 4, epochs=1)) == TRAIN // 16
+        assert len(DataLoader(ds, 4, epochs=1, rank=0, world_size=1)) == len(alone)
     monkeypatch.setenv("RANK", "one")
     with pytest.raises(ConfigError, match="RANK and WORLD_SIZE are 'one'"):
         DataLoader(ds, 4)

@@ -19,7 +19,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     home = tmp_path_factory.mktemp("page")
     scene = {"name": "bouncing", "balls": [2, 8], "gravity": [0, [-20, 0]], "radius": 0.4}
     video = {"frames": 28, "height": 16, "width": 16}
-    gen2d.generate({"scene": scene, "video": video}, 32, home / "datasets" / "bouncing")
+    config = {"scene": scene, "video": video, "annotations": {"masks": True}}
+    gen2d.generate(config, 32, home / "datasets" / "bouncing")
+    (home / "datasets" / "annotated").symlink_to("bouncing")
     return home
 
 

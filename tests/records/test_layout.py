@@ -1,9 +1,10 @@
 """Layouts: slots in the order of their groups, and depths in the order in which they are drawn."""
 
 import numpy as np
+import pytest
 
 from gen2d.core.enums import STATIC
-from gen2d.records.layout import Layout, SlotGroup
+from gen2d.records.layout import JointSpec, Layout, SlotGroup
 
 LAYOUT = Layout((
     SlotGroup("circle", 2),
@@ -24,3 +25,11 @@ def test_the_depth_of_a_slot_is_its_rank_in_the_drawing_order() -> None:
     assert [first for _, first in LAYOUT.back_to_front] == [5, 2, 0, 6]
     assert np.argsort(LAYOUT.depths).tolist() == drawn
     assert LAYOUT.depths.tolist() == [drawn.index(slot) for slot in range(8)]
+
+
+def test_a_joint_connects_two_slots_in_one_of_two_ways() -> None:
+    with pytest.raises(AssertionError, match="'spring', but must be one of distance, revolute"):
+        JointSpec("spring", 0, 1)
+    for ends in ((0, 2), (1, 1), (-1, 0)):
+        with pytest.raises(AssertionError, match="two of the layout's slots, 0 to 1"):
+            Layout((SlotGroup("circle", 2),), joints=(JointSpec("distance", *ends),))

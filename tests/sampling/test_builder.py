@@ -2,8 +2,10 @@
 
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
-from gen2d.records.layout import Layout, SlotGroup
+from gen2d.core.enums import STATIC
+from gen2d.records.layout import JointSpec, Layout, SlotGroup
 from gen2d.sampling import builder
 
 
@@ -61,3 +63,35 @@ def test_walls_of_a_box_face_inwards():
     np.testing.assert_allclose(walls.objects["half_length"], [2, 1.5, 2, 1.5])
     inwards = np.stack([-np.sin(angle), np.cos(angle)], -1)
     assert (((np.array([2, 1.5]) - position) * inwards).sum(-1) > 0).all()
+
+
+def _rods(kind: str = "distance", present: bool = True, **numbers: object):
+    """Rest lengths of joints between a pin and two discs, the first of which is turned by a quarter."""
+    joints = JointSpec(kind, 0, 1), JointSpec("revolute", 1, 2), JointSpec("distance", 0, 2)
+    layout = Layout((SlotGroup("circle", 1, STATIC), SlotGroup("circle", 2)), joints=joints)
+    pin = builder.discs(jnp.zeros((1, 2)), 0.1, kind=STATIC)
+    discs = builder.discs(
+        jnp.array([[3.0, 0.0], [0.0, 7.0]]), 0.5, jnp.array([True, present]), angle=jnp.array([jnp.pi / 2, 0.0])
+    )
+    anchors = jnp.array([[0.0, 4.0], [0.0, 0.0], [0.0, 1.0]]), jnp.array([[0.0, 3.0], [0.0, 0.0], [0.0, 0.0]])
+    made = builder.distance_joints(*anchors, **numbers)
+    scene, _ = builder.assemble(layout, [pin, discs], jnp.zeros(2), made)
+    assert scene.joints is not None
+    return np.asarray(scene.joints.rest)
+
+
+def test_a_rest_length_that_is_not_given_is_that_of_the_start():
+    """The anchor (0, 3) of the turned disc lies at (0, 0) of the world, 4 m below that of the pin."""
+    np.testing.assert_allclose(_rods(), [4, 0, 6], atol=1e-6)
+    np.testing.assert_allclose(_rods("revolute"), [0, 0, 6], atol=1e-6)
+    np.testing.assert_allclose(_rods(present=False), [4, 0, 0], atol=1e-6)
+    np.testing.assert_allclose(_rods(rest=2.5), 2.5)
+
+
+def test_joints_are_those_of_the_layout():
+    layout = Layout((SlotGroup("circle", 2),), joints=(JointSpec("distance", 0, 1),))
+    discs = builder.discs(jnp.eye(2), 0.1)
+    two = builder.distance_joints(jnp.zeros((2, 2)), jnp.zeros((2, 2)))
+    for count, joints in ((0, None), (2, two)):
+        with pytest.raises(AssertionError, match=f"given {count} joints, but the layout has 1;"):
+            builder.assemble(layout, [discs], jnp.zeros(2), joints)

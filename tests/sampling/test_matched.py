@@ -15,6 +15,7 @@ from gen2d.config import matched
 from gen2d.config.config import load_config
 from gen2d.core.enums import STATIC
 from gen2d.core.errors import ConfigError, FolderError
+from gen2d.generation import run
 from gen2d.records.layout import Layout
 from gen2d.sampling.builder import assemble, boxes, capsules, discs
 from gen2d.sampling.matched import counterfactuals, violations
@@ -383,6 +384,15 @@ def test_what_cannot_be_is_one_sentence(kind: str, also: str, told: str):
         load_config(CONFIG, [f"matched.change={kind}", also])
     assert told in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+def test_incomplete_sets_are_told_before_the_run():
+    plain: dict[str, Any] = {name: options for name, options in CONFIG.items() if name != "matched"}
+    counts = {"train": 3 * MEMBERS + 1, "test": 2 * MEMBERS}
+    assert run._incomplete_sets(load_config(plain), counts) == []
+    assert run._incomplete_sets(load_config(CONFIG), counts) == [
+        "train: 10 videos are no multiple of matched.members, 3, so the last set is incomplete"
+    ]
 
 
 def test_without_sets_nothing_is_told_and_keys_are_the_videos_own():

@@ -56,7 +56,7 @@ def fields(options: Any) -> dict[str, Field]:
     return {
         "matched/set": Field("int32", "n", "1", f"number of the set, which has {options.members} consecutive videos"),
         "matched/member": Field("uint8", "n", "1", "number of the video in its set; 0: the original"),
-        "matched/kind": Field("uint8", "n", "1", f"code of the change: {codes}"),
+        "matched/kind": Field("uint8", "n", "1", f"code of the change in the set, whose original has it too: {codes}"),
         "matched/onset": Field("int32", "n", "1", "first frame that differs from the original; -1: none"),
         "matched/object": Field("int16", "n", "object", "slot of the changed object; -1: none, or more than one"),
         "matched/partner": Field("int16", "n", "object", "slot of the other object of a swap; -1: none"),
