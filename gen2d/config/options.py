@@ -136,6 +136,7 @@ def build(cls: type, values: Any, where: str, source: str) -> Any:
     if not isinstance(values, Mapping):
         raise ConfigError(f"{source}: {where} is {values!r}, but must be a mapping of options")
     known = {f.name: f.metadata["option"] for f in dataclasses.fields(cls)}
+    defaults = {f.name: plain_value(f.default) for f in dataclasses.fields(cls)}
     filled = {}
     for key, value in values.items():
         if key not in known:
@@ -143,7 +144,10 @@ def build(cls: type, values: Any, where: str, source: str) -> Any:
         try:
             filled[key] = parse_value(known[key], value)
         except ValueError as error:
-            raise ConfigError(f"{source}: {where}.{key} is {value!r}, but must be {error}") from None
+            usual = defaults[key] if known[key].parts and not isinstance(value, list) else None
+            is_short = isinstance(usual, list) and all(isinstance(part, int | float) for part in usual)
+            example = f", such as {usual}" if is_short else ""
+            raise ConfigError(f"{source}: {where}.{key} is {value!r}, but must be {error}{example}") from None
     return cls(**filled)
 
 

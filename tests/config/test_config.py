@@ -27,7 +27,7 @@ BAD = {
     "scene: {radius: {normal: [1, 0.1]}}": ("scene.radius is", "0.001 or more for every value drawn"),
     "scene: {radius: 7}": ("scene.radius may be 7 m", "must fit a box"),
     "scene: {elasticity: 1.5}": ("scene.elasticity is 1.5", "1 or less"),
-    "scene: {gravity: -9.8}": ("scene.gravity is -9.8", "a list of 2 numbers"),
+    "scene: {gravity: -9.8}": ("scene.gravity is -9.8", "a list of 2 numbers, such as [0, -9.8]"),
     "scene: {ball: 3}": ("scene.ball is not an option", "did you mean balls?"),
     "scene: bounce": ("scene is 'bounce'", "did you mean bouncing?"),
     "look: {name: flatt}": ("look is 'flatt'", "did you mean flat?"),
