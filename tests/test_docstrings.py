@@ -4,12 +4,14 @@ import doctest
 import importlib
 import importlib.util
 import shutil
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
 import pytest
+from hub import hub
 from packages import require
 
 import gen2d
@@ -59,7 +61,22 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return home
 
 
+@pytest.fixture
+def stand_in_for_the_hub(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """A server in place of the Hugging Face Hub, where that may be asked."""
+    if importlib.util.find_spec("huggingface_hub") is None:
+        yield
+        return
+    constants = importlib.import_module("huggingface_hub.constants")
+    with hub() as server:
+        monkeypatch.setattr(constants, "ENDPOINT", server.url)
+        monkeypatch.setattr(constants, "HF_HUB_DISABLE_XET", True)
+        monkeypatch.setenv("HF_TOKEN", "hf_of_nobody")
+        yield
+
+
 @pytest.mark.full
+@pytest.mark.usefixtures("stand_in_for_the_hub")
 @pytest.mark.parametrize("name", EXAMPLES)
 def test_examples_show_what_they_say(name: str, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.chdir(tmp_path)
@@ -67,6 +84,8 @@ def test_examples_show_what_they_say(name: str, folder: Path, tmp_path: Path, mo
     test = EXAMPLES[name]
     if any('to="torch"' in example.source for example in test.examples):
         require("torch")
+    if any("gen2d.push" in example.source for example in test.examples):
+        require("huggingface_hub")
     if any("to_pandas" in example.source for example in test.examples):
         require("pandas")
     for example in test.examples:

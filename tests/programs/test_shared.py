@@ -74,7 +74,7 @@ def test_no_edited_number_of_a_shipped_config_needs_another_program(name: str) -
         "physics.bounce_threshold": 0.02,
     }
     overrides |= {"video.fps": config.video.fps * 1.001, "seed": 7}
-    assert len(overrides) > 10
+    assert len(overrides) >= 10
     for where, value in overrides.items():
         changed = load_config(config, [f"{where}={value}"])
         assert [bound.program for bound in trace(changed).values()] == programs, where
@@ -204,7 +204,7 @@ def test_a_shared_program_gives_the_bits_of_an_own_one(tmp_path: Path) -> None:
         "scene.radius=[0.45,1.0]",
         "video.fps=31",
     ]
-    generate("bouncing.yaml", 8, tmp_path / "first", overrides=[*SMALL, "scene.gravity=[0,-9.8]"])
+    generate("bouncing.yaml", 8, tmp_path / "first", overrides=[*SMALL, "scene.gravity=[0,-9.8]", "look.background=[0,0,0]"])
     before = set(programs())
     generate("bouncing.yaml", 8, tmp_path / "shared", overrides=overrides)
     assert set(programs()) == before
