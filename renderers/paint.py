@@ -35,6 +35,7 @@ class Surface(NamedTuple):
     stripe: Array | None = None  # [K] half width of a band along the x axis of discs, over the radius; 0: none
     stripe_light: Array | None = None  # [K] 1: in the colour of highlights; -a: darker by the part a
     pattern: "Pattern | None" = None
+    mirror: Array | None = None  # [K] part of the light that is a reflection of the room, as of metal; 0: none
 
 
 class Pattern(NamedTuple):

@@ -48,13 +48,14 @@ class Finish(NamedTuple):
     cell: Any = 1.0
     stretch: Any = 1.0
     contrast: Any = 0.0
+    mirror: Any = 0.0
 
 
 MATERIALS = {
-    "rubber": Finish(1.0, 50.0, 0.95, striped=1.0),
-    "wood": Finish(0.3, 15.0, 0.9, cell=0.12, stretch=9.0, contrast=0.45),
-    "metal": Finish(1.6, 80.0, 0.95, cell=0.05, stretch=20.0, contrast=0.25),
-    "paper": Finish(0.0, 10.0, 0.3, cell=0.08, contrast=0.12),
+    "rubber": Finish(0.8, 25.0, 0.95, striped=1.0),
+    "wood": Finish(0.15, 12.0, 0.9, cell=0.35, stretch=8.0, contrast=1.0),
+    "metal": Finish(2.2, 100.0, 0.95, cell=0.05, stretch=20.0, contrast=0.15, mirror=0.85),
+    "paper": Finish(0.0, 10.0, 0.3, cell=0.12, contrast=0.25),
 }
 
 
@@ -86,7 +87,7 @@ class Options(PlainOptions):
         draw=True, low=0, high=1,
     )  # fmt: skip
     gloss: Distribution = option(
-        0.45, float, "1", "strength of the highlights of rubber",
+        0.45, float, "1", "strength of highlights, of which a material has a part or a multiple",
         draw=True, low=0, high=0.6,
     )  # fmt: skip
     shadow: Distribution = option(
@@ -131,6 +132,8 @@ def paint(scene: Scene, layout: Layout, options: Options, key: Array) -> Paint:
         seed = jax.random.bits(seed_key, (layout.slots,), jnp.uint32)
         pattern = Pattern(seed, material.cell * _size(layout), material.stretch, material.contrast)
         surface = surface._replace(pattern=pattern)
+    if "metal" in options.material:
+        surface = surface._replace(mirror=material.mirror)
     offset = -direction[:2] / high * (LIFT * _size(layout))
     shadow = Shadow(offset, jnp.float32(1) * blur(options, layout), drawn["shadow"], jnp.asarray(DARK))
     return base._replace(background=_backdrop(base, options), light=light, surface=surface, shadow=shadow)
