@@ -7,6 +7,8 @@ from typing import NamedTuple
 
 from gen2d.records.axes import Array
 
+NO_MATERIAL = 255  # of slots without an object, and of looks without materials
+
 
 class Texture(NamedTuple):
     """Procedural noise that is fixed to an object or to the background."""
@@ -83,3 +85,4 @@ class Paint(NamedTuple):
     light: Light | None = None  # lights `surface`
     surface: Surface | None = None
     shadow: Shadow | None = None
+    material: Array | None = None  # [K] int, index into `materials` of the look's options, stored as `objects/material`

@@ -1,7 +1,7 @@
 """Bodies under a lamp: domes and bevels of some material, highlights, soft shadows, and a backdrop."""
 
 import dataclasses
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -49,6 +49,7 @@ class Finish(NamedTuple):
     stretch: Any = 1.0
     contrast: Any = 0.0
     mirror: Any = 0.0
+    number: Any = 0.0  # in MATERIALS
 
 
 MATERIALS = {
@@ -63,6 +64,7 @@ MATERIALS = {
 class Options(PlainOptions):
     """Options of light, materials and shadows, in addition to those of plain shapes."""
 
+    materials: ClassVar[tuple[str, ...]] = (*MATERIALS,)
     wall_width: float = option(3.0, float, "px", "line width of segments beyond their radius; 0: not drawn", low=0)
     palette: str = palette_option("paper")
     material: tuple[str, ...] = option(
@@ -136,12 +138,16 @@ def paint(scene: Scene, layout: Layout, options: Options, key: Array) -> Paint:
         surface = surface._replace(mirror=material.mirror)
     offset = -direction[:2] / high * (LIFT * _size(layout))
     shadow = Shadow(offset, jnp.float32(1) * blur(options, layout), drawn["shadow"], jnp.asarray(DARK))
-    return base._replace(background=_backdrop(base, options), light=light, surface=surface, shadow=shadow)
+    number = material.number.astype(jnp.uint8)
+    return base._replace(
+        background=_backdrop(base, options), light=light, surface=surface, shadow=shadow, material=number
+    )
 
 
 def _materials(options: Options, moving: Array, key: Array) -> Finish:
     """Materials of the slots; arrays [K]."""
-    table = np.asarray([MATERIALS[name] for name in options.material], np.float32)
+    finishes = [MATERIALS[name]._replace(number=options.materials.index(name)) for name in options.material]
+    table = np.asarray(finishes, np.float32)
     chosen = jax.random.randint(key, moving.shape, 0, len(table))
     return Finish(*jnp.asarray(table)[jnp.where(moving, chosen, 0)].T)
 

@@ -87,7 +87,7 @@ VIEWS = {
     ),
     "tower": View(
         4, ("name: studio, palette: paper, material: [wood, paper]", "name: flat, palette: dusk, wall_width: 3"),
-        options=("scene.blocks=6",),
+        options=("scene.blocks=6", "camera={center: [-1.2, 3.1], scale: 20.5}"),
     ),
     "wrecking_ball": View(
         3, (f"name: studio, palette: dusk, {ALL}", "name: textured, palette: paper, wall_width: 3"), 0.9,

@@ -66,7 +66,7 @@ def test_a_family_is_rendered_in_both_looks_with_masks_and_flow() -> None:
     assert_array_equal(background, 0)
     assert_array_equal((film.flow[:3] < 255).any(-1), ball[:3])  # only the ball moves
     first, second = (np.abs(look[3].astype(int) - look[0]).max(-1) > 30 for look in (film.first, film.second))
-    assert second.any()
-    assert ball[[0, 3]].any(0)[second].all()
-    assert (first & ~ball[[0, 3]].any(0)).any()  # its shadow
-    assert first[second].mean() > 0.5
+    there = ball[[0, 3]].any(0)
+    assert second.sum() > 20
+    assert there[second].mean() > 0.7  # the others are on its rim
+    assert (first & ~there).sum() > (second & ~there).sum()  # its shadow
