@@ -7,7 +7,14 @@ A surface with the normal n gets the light
 from a source in the direction l of softness s, by Lambert's law without a kink at its end, and of ambient light a, a
 part of which comes from above, where u is the upward part of n. A surface that faces the viewer gets 1, and has its own
 colour. Display values are proportional to F = E^(1/2.2), so one factor serves all channels; where it exceeds 1, it is
-1 + (F - 1) / (1 + 12 (F - 1)), so that few colours reach 255. Highlights mix in their own colour: that of J. Blinn,
+1 + (F - 1) / (1 + 12 (F - 1)), so that few colours reach 255.
+
+Of metal, a part m of E(n) is instead the reflection of a room,
+
+    R(v) = 1 + 0.3 v - 0.72 (1 - ((v + 0.4) / 0.4)^2)^2,
+
+where v is the part of n towards the light's azimuth: bright on the side of the light, with a dark band, the horizon,
+beyond the middle (the last term is 0 outside of it). Highlights mix in their own colour: that of J. Blinn,
 'Models of light reflection' (1977), as the fourth power of a parabola instead of a power of the cosine, and a faint one
 at the rim.
 """
@@ -25,6 +32,9 @@ from gen2d.renderers.relief import Relief, tilt
 FROM_ABOVE = 0.25  # part of the ambient light that comes from above
 SHOULDER = 12.0  # of display values above 1
 RIM = 0.25  # part of the light of the rim, seen at a grazing angle
+SKY = 0.3  # change of the light of a room from its middle to its sides
+HORIZON, DARKEST = 0.4, 0.72  # place and half width of the dark band, and what it lacks
+SHEEN = 0.7  # of metal: part of the light of the highlights' colour where a surface is vertical, towards the light
 STEEPEST = 0.98  # largest square of the tilt; beyond the rim, surfaces are as at the rim
 
 
@@ -64,6 +74,12 @@ def lit_color(
     cosine = along + nz * lz
     strength = (1 - ambient) / (lz + jnp.sqrt(lz * lz + square))
     irradiance = strength * (cosine + jnp.sqrt(cosine * cosine + square)) + ambient * (1 - FROM_ABOVE * ny)
+    # In pixels: the length over which the surface tilts, for averages over a pixel.
+    radius = jnp.maximum(relief.radius if relief.normal is None else surface.bevel * pose.scale, 0.5)[..., None, None]
+    toward = along / jnp.maximum(jnp.sqrt(lx * lx + ly * ly), 1e-6)
+    mirror = None if surface.mirror is None else surface.mirror[..., None, None]
+    if mirror is not None:
+        irradiance = irradiance + mirror * (_room(toward, slope / radius) - irradiance)
     if surface.pattern is not None:
         irradiance = irradiance * (1 + _pattern(surface.pattern, pose, x, y))
     irradiance = jnp.clip(irradiance, 0.01, 2.0)  # beyond the rim, where the tilt is larger than any
@@ -72,13 +88,15 @@ def lit_color(
     half_cosine = (along + nz * (lz + 1)) * norm
     # The average over a pixel widens the lobe, whose variance is 1 / sharpness in the plane of tilts, and lowers it: in
     # two directions on a disc, across the core of a capsule, and across the bevel of a polygon.
-    radius = jnp.maximum(relief.radius if relief.normal is None else surface.bevel * pose.scale, 0.5)[..., None, None]
     width = 1 / sharpness + (slope / radius) ** 2 * ((1 + 4 * norm * norm) / 24)
     part = 1 / (sharpness * width)
     shown = shown * (part if relief.is_disc else jnp.sqrt(part))
     lobe = jnp.clip(1 - (1 - half_cosine) * (0.25 / width), 0.0, 1.0)
     lobe, grazing = lobe * lobe, 1 - nz
-    shine = jnp.minimum(gloss * shown * (lobe * lobe) + RIM * (grazing * grazing * grazing), 1.0)
+    shine = gloss * shown * (lobe * lobe) + RIM * (grazing * grazing * grazing)
+    if mirror is not None:
+        shine = shine + SHEEN * mirror * jnp.maximum(toward, 0.0) ** 2
+    shine = jnp.minimum(shine, 1.0)
     share = display(irradiance) * (1 - shine)
     if surface.stripe is None or surface.stripe_light is None or not relief.is_disc:
         return ShadedColor(color, light.highlight[..., None, None, :], share, shine)
@@ -93,6 +111,14 @@ def lit_color(
         share - jnp.abs(bright) * band,
         shine + jnp.maximum(bright, 0.0) * band,
     )
+
+
+def _room(toward: Array, change: Array) -> Array:
+    """Light of a room as reflected where the normal has the part `toward` towards the light; it changes by `change` in
+    a pixel, over which the dark band is averaged: widened and lowered."""
+    width = jnp.sqrt(HORIZON * HORIZON + 7 / 12 * change * change)
+    band = jnp.maximum(1 - ((toward + HORIZON) / width) ** 2, 0.0)
+    return 1 + SKY * toward - DARKEST * HORIZON / width * (band * band)
 
 
 def _beyond_edge(depth: Array, cos: Array, sin: Array) -> Array:

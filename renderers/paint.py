@@ -7,6 +7,8 @@ from typing import NamedTuple
 
 from gen2d.records.axes import Array
 
+NO_MATERIAL = 255  # of slots without an object, and of looks without materials
+
 
 class Texture(NamedTuple):
     """Procedural noise that is fixed to an object or to the background."""
@@ -35,6 +37,7 @@ class Surface(NamedTuple):
     stripe: Array | None = None  # [K] half width of a band along the x axis of discs, over the radius; 0: none
     stripe_light: Array | None = None  # [K] 1: in the colour of highlights; -a: darker by the part a
     pattern: "Pattern | None" = None
+    mirror: Array | None = None  # [K] part of the light that is a reflection of the room, as of metal; 0: none
 
 
 class Pattern(NamedTuple):
@@ -82,3 +85,4 @@ class Paint(NamedTuple):
     light: Light | None = None  # lights `surface`
     surface: Surface | None = None
     shadow: Shadow | None = None
+    material: Array | None = None  # [K] int, index into `materials` of the look's options, stored as `objects/material`

@@ -47,6 +47,11 @@ def boxes_overlay(frame: VideoFields) -> np.ndarray:
     return image
 
 
+def directions(flow: np.ndarray) -> np.ndarray:
+    """Hues [...] in degrees, 0 to 350 in steps of 10, of displacements [..., 2] in px: 0 is to the right, 90 down."""
+    return (np.degrees(np.arctan2(flow[..., 1], flow[..., 0])) / 10).round().astype(int) % 36 * 10
+
+
 def flow_overlay(frame: VideoFields) -> np.ndarray:
     """Flow to the next frame: direction as hue, speed as saturation."""
     x, y = np.moveaxis(frame["flow/forward"], -1, 0)

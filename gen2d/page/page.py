@@ -23,10 +23,11 @@ PAGE_BYTES = 980_000  # maximum size of a page, unless a single video is larger
 FRAME_BYTES = 2**30  # of the shown videos before compression: they are decoded for the page
 # Frames of a video and quality of WebP, None: lossless, best first. The search for the first that fits the page begins
 # at START.
-LADDER = ((64, None), (64, 80), (64, 50), (32, 60), (32, 35), (32, 20), (16, 20))
+LADDER = ((64, None), (64, 80), (64, 50), (64, 35), (32, 60), (32, 35), (32, 20), (16, 20))
 START = 2
 PROBES = 3  # videos from which the size is estimated
 SLACK = 1.08  # an estimate may be so much too large
+SCRIPTS = ("page.js", "drawing.js", "player.js", "values.js", "gallery.js")  # one script, in this order
 _FOLDER = Path(__file__).parent
 
 
@@ -112,7 +113,8 @@ def page(manifest: Manifest, videos: list[dict[str, Any]], **server: Any) -> byt
     A string of the dataset enters as escaped HTML text or in compressed JSON, of which the script sets texts alone. A
     policy in the page lets a browser run no script but that of gen2d.
     """
-    script, style = ((_FOLDER / name).read_text("utf-8") for name in ("page.js", "page.css"))
+    script = "\n".join((_FOLDER / name).read_text("utf-8") for name in SCRIPTS)
+    style = (_FOLDER / "page.css").read_text("utf-8")
     sizes, total = manifest.sizes, sum(manifest.splits.values())
     has_frames = "frames" in manifest.fields
     picture = f" of {sizes['W']} x {sizes['H']} px" if has_frames else ""

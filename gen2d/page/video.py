@@ -6,13 +6,14 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
+import cv2
 import numpy as np
 
 from gen2d.core.enums import BEGIN, DYNAMIC, IMPACT, SHAPES
 from gen2d.core.schema import Field
 from gen2d.dataset.manifest import Manifest
 from gen2d.loading.dataset import Dataset, ViewOptions
-from gen2d.media.overlays import colors
+from gen2d.media.overlays import colors, directions
 from gen2d.media.sprites import reduced, sprite_rows, sprite_sheet
 from gen2d.page.arrays import packed
 from gen2d.storage.paths import Place
@@ -21,6 +22,7 @@ from gen2d.storage.paths import Place
 DRAWN = {
     "frames": "n T H W 3",
     "masks/instance": "n T H W",
+    "flow/forward": "n T H W 2",
     "boxes/visible": "n T K 4",
     "states/position": "n T K 2",
     "states/angle": "n T K",
@@ -92,6 +94,11 @@ class Videos:
             step = math.ceil(math.sqrt(height * width) / detail.mask_side)
             masks = _false_colors()[values["masks/instance"][::stride, ::step, ::step]]
             video["masks"] = _sprite(sprite_sheet(masks, None), masks)
+        if "flow/forward" in values:
+            height, width = values["flow/forward"].shape[1:3]
+            step = math.ceil(math.sqrt(height * width) / detail.mask_side)
+            flow = flow_colors(values["flow/forward"][::stride, ::step, ::step])
+            video["flow"] = _sprite(sprite_sheet(flow, None), flow)
         present = values.get("objects/present", np.zeros(sizes.get("K", 0), bool))
         slots = np.flatnonzero(present)[: detail.objects]
         if len(slots):
@@ -166,6 +173,8 @@ def _is_drawn(name: str, field: Field | None, axes: str) -> bool:
         return False
     if name in ("frames", "masks/instance", "objects/color"):
         return field.dtype == "uint8"
+    if name == "flow/forward":
+        return field.dtype in ("float16", "float32")
     if name.removeprefix("contacts/") in CONTACT_CODES:
         return np.issubdtype(field.dtype, np.integer)
     return field.dtype != "bool" or name == "objects/present"
@@ -196,6 +205,19 @@ def _false_colors() -> np.ndarray:
     """Colours of ids [256, 4], uint8: no object is transparent."""
     opaque = np.where(np.arange(256) > 0, 255, 0)
     return np.concatenate([colors(256), opaque[:, None].astype(np.uint8)], axis=1)
+
+
+def flow_colors(flow: np.ndarray) -> np.ndarray:
+    """Colours [T, H, W, 4], uint8, of flow [T, H, W, 2] in px: the direction as hue in steps of 10 degrees, the speed
+    as opacity in eighths of the largest one."""
+    finite = np.nan_to_num(flow.astype(np.float32), posinf=0, neginf=0)
+    speed = np.hypot(finite[..., 0], finite[..., 1])
+    level = np.rint(8 * speed / max(float(speed.max()), 1e-6)).astype(np.uint8)
+    hue = np.where(level > 0, directions(finite), 0) // 2  # OpenCV counts in 2 degrees
+    hsv = np.stack([hue, np.full_like(hue, 255), np.full_like(hue, 255)], -1).astype(np.uint8)
+    rgb = cv2.cvtColor(hsv.reshape(1, -1, 3), cv2.COLOR_HSV2RGB)
+    rgba = np.concatenate([rgb.reshape(*hue.shape, 3), (31 * level)[..., None]], -1)
+    return np.where(level[..., None] > 0, rgba, 0).astype(np.uint8)
 
 
 def _sprite(content: bytes, frames: np.ndarray) -> dict[str, Any]:

@@ -19,7 +19,7 @@ from gen2d.records.scene import Scene, State
 from gen2d.renderers import camera
 from gen2d.renderers.camera import CameraView
 from gen2d.renderers.compositing import OCCLUDER
-from gen2d.renderers.paint import Paint
+from gen2d.renderers.paint import NO_MATERIAL, Paint
 from gen2d.renderers.plan import FramePlan, Occluders, RenderScene
 from gen2d.renderers.primitives import BodyGeometry, Instants
 from gen2d.renderers.rasterizer import draw
@@ -165,6 +165,13 @@ def painted_colors(paint: Paint, scene: Scene) -> Array:
     """Rendered colours [K, 3] uint8 of the slots; zero for empty slots."""
     present = scene.objects.present[:, None]
     return jnp.where(present, jnp.clip(jnp.round(paint.color), 0, 255), 0).astype(jnp.uint8)
+
+
+def material_columns(paint: Paint, scene: Scene) -> dict[str, Array]:
+    """The materials of the slots, by stored name, if the look has any; NO_MATERIAL for empty slots."""
+    if paint.material is None:
+        return {}
+    return {"objects/material": jnp.where(scene.objects.present, paint.material, NO_MATERIAL).astype(jnp.uint8)}
 
 
 def camera_columns(view: CameraView) -> dict[str, Array]:

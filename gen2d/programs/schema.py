@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -18,6 +19,7 @@ from gen2d.physics import lyapunov
 from gen2d.physics.simulate import SaveAt
 from gen2d.records import axes, scene, trajectory
 from gen2d.records.layout import Layout
+from gen2d.renderers.paint import NO_MATERIAL
 from gen2d.renderers.plan import FramePlan
 from gen2d.sampling import rejection, sampler
 from gen2d.sampling.matched import sets
@@ -105,12 +107,20 @@ class VideoSchema:
 
     @functools.cached_property
     def host_fields(self) -> dict[str, Field]:
-        """Fields that the host computes from the others: split, names of colours, and captions."""
+        """Fields that the host computes from the others: split, names of colours and materials, and captions."""
         longest = max((len(split.name) for split in self.config.splits), default=0)
         fields = {"split": Field(f"S{longest}", "n", "", "split of the video")} if longest else {}
         if any(palette_of(config.look.options) for config in self._split_configs):
             meaning = "name of the color in the look's palette; empty: none"
             fields["objects/color_name"] = Field(f"S{NAME_BYTES}", "n K", "", meaning)
+        found = [names for config in self._split_configs if (names := materials_of(config.look.options))]
+        if found:
+            listed = " or ".join(sorted({", ".join(names) for names in found}))
+            meaning = f"material, an index into {listed}; {NO_MATERIAL}: none"
+            fields["objects/material"] = Field("uint8", "n K", "1", meaning)
+            meaning = "name of the material in the look; empty: none"
+            longest = max(len(name) for names in found for name in names)
+            fields["objects/material_name"] = Field(f"S{longest}", "n K", "", meaning)
         captioned = self.config.annotations.simulated.captions
         return fields | (caption.fields(self.layout.slots, self.config.video.frames) if captioned else {})
 
@@ -128,11 +138,23 @@ class VideoSchema:
         if "objects/color_name" in self.host_fields:
             palette = palette_of(config.of_split(split).look.options)
             host_columns["objects/color_name"] = _color_names(columns, palette)
+        if "objects/material" in self.host_fields:
+            names = materials_of(config.of_split(split).look.options)
+            present = columns["objects/present"]
+            material = columns.get("objects/material", np.full(present.shape, NO_MATERIAL, np.uint8))
+            table = np.zeros(NO_MATERIAL + 1, self.host_fields["objects/material_name"].dtype)
+            table[: len(names)] = [name.encode() for name in names]
+            host_columns |= {"objects/material": material, "objects/material_name": table[material]}
         return host_columns | (
             caption.caption_fields(columns | host_columns, config.video, self.constants)
             if config.annotations.simulated.captions
             else {}
         )
+
+
+def materials_of(options: Any) -> tuple[str, ...]:
+    """Names of the materials of a look with these options; empty if it has none."""
+    return getattr(options, "materials", ())
 
 
 def _color_names(columns: dict[str, np.ndarray], palette: Palette | None) -> np.ndarray:

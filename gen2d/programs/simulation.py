@@ -163,13 +163,15 @@ class Staging:
     def __call__(self, keys: Array, scene: Scene, states: State, between: State | None) -> StagedBatch:
         """Render scenes of these videos [n, ...]."""
 
-        def build(key: Array, scene: Scene, states: State, between: State | None) -> tuple[RenderScene, Array]:
+        def build(
+            key: Array, scene: Scene, states: State, between: State | None
+        ) -> tuple[RenderScene, dict[str, Array]]:
             render_scene = render.render_scene(key, self.config, self.plan, scene, states, between=between)
-            return render_scene, render.painted_colors(render_scene.paint, scene)
+            colors = {"objects/color": render.painted_colors(render_scene.paint, scene)}
+            return render_scene, colors | render.material_columns(render_scene.paint, scene)
 
-        render_scenes, colors = jax.vmap(build)(wrapped(keys), scene, states, between)
-        columns = {"objects/color": colors} | render.camera_columns(render_scenes.instants.view)
-        return StagedBatch(render_scenes, columns)
+        render_scenes, columns = jax.vmap(build)(wrapped(keys), scene, states, between)
+        return StagedBatch(render_scenes, columns | render.camera_columns(render_scenes.instants.view))
 
 
 def device_batch(config: Config, sampled: SampledBatch, simulated: SimulatedBatch, staged: StagedBatch) -> DeviceBatch:

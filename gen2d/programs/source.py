@@ -14,6 +14,7 @@ import numpy as np
 from gen2d.config.config import Config
 from gen2d.core.errors import UserError
 from gen2d.programs.rollout import Rollout
+from gen2d.programs.schema import VideoSchema
 from gen2d.programs.simulation import DeviceBatch
 from gen2d.records.axes import Array
 
@@ -81,23 +82,23 @@ class VideoSlice(NamedTuple):
 
 
 class VideoSource:
-    """Videos of one config on some devices; `schema` lists their fields."""
+    """Videos of one config on some devices; `schema` lists their fields, by default those of this config."""
 
-    def __init__(self, config: Config, devices: Sequence[Any]) -> None:
+    def __init__(self, config: Config, devices: Sequence[Any], schema: VideoSchema | None = None) -> None:
         self.config, self.rollout = config, Rollout(config, devices)
-        self.schema = self.rollout.schema
+        self.schema = schema or self.rollout.schema
         self._kept: tuple[Request, list[DeviceBatch]] | None = None
 
     def of_splits(self, splits: Iterable[str]) -> Iterator[tuple["VideoSource", set[str]]]:
         """Sources of these splits, each with the splits that share it.
 
-        A split with its own look or physics has its own source.
+        A split with its own look or physics has its own source, whose videos have the fields of the whole config.
         """
         groups: dict[Config, set[str]] = {}
         for split in splits:
             groups.setdefault(self.config.of_split(split), set()).add(split)
         for config, group in groups.items():
-            yield self if config == self.config else VideoSource(config, self.rollout.devices), group
+            yield self if config == self.config else VideoSource(config, self.rollout.devices, self.schema), group
 
     def videos(self, split: str, numbers: Any, fields: Sequence[str] | None = None) -> dict[str, np.ndarray]:
         """Fields [n, ...] by name of the videos of a split with these numbers [n]; by default all fields.

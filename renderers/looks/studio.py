@@ -1,7 +1,7 @@
 """Bodies under a lamp: domes and bevels of some material, highlights, soft shadows, and a backdrop."""
 
 import dataclasses
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -48,13 +48,15 @@ class Finish(NamedTuple):
     cell: Any = 1.0
     stretch: Any = 1.0
     contrast: Any = 0.0
+    mirror: Any = 0.0
+    number: Any = 0.0  # in MATERIALS
 
 
 MATERIALS = {
-    "rubber": Finish(1.0, 50.0, 0.95, striped=1.0),
-    "wood": Finish(0.3, 15.0, 0.9, cell=0.12, stretch=9.0, contrast=0.45),
-    "metal": Finish(1.6, 80.0, 0.95, cell=0.05, stretch=20.0, contrast=0.25),
-    "paper": Finish(0.0, 10.0, 0.3, cell=0.08, contrast=0.12),
+    "rubber": Finish(0.8, 25.0, 0.95, striped=1.0),
+    "wood": Finish(0.15, 12.0, 0.9, cell=0.35, stretch=8.0, contrast=1.0),
+    "metal": Finish(2.2, 100.0, 0.95, cell=0.05, stretch=20.0, contrast=0.15, mirror=0.85),
+    "paper": Finish(0.0, 10.0, 0.3, cell=0.12, contrast=0.25),
 }
 
 
@@ -62,6 +64,7 @@ MATERIALS = {
 class Options(PlainOptions):
     """Options of light, materials and shadows, in addition to those of plain shapes."""
 
+    materials: ClassVar[tuple[str, ...]] = (*MATERIALS,)
     wall_width: float = option(3.0, float, "px", "line width of segments beyond their radius; 0: not drawn", low=0)
     palette: str = palette_option("paper")
     material: tuple[str, ...] = option(
@@ -86,7 +89,7 @@ class Options(PlainOptions):
         draw=True, low=0, high=1,
     )  # fmt: skip
     gloss: Distribution = option(
-        0.45, float, "1", "strength of the highlights of rubber",
+        0.45, float, "1", "strength of highlights, of which a material has a part or a multiple",
         draw=True, low=0, high=0.6,
     )  # fmt: skip
     shadow: Distribution = option(
@@ -131,14 +134,20 @@ def paint(scene: Scene, layout: Layout, options: Options, key: Array) -> Paint:
         seed = jax.random.bits(seed_key, (layout.slots,), jnp.uint32)
         pattern = Pattern(seed, material.cell * _size(layout), material.stretch, material.contrast)
         surface = surface._replace(pattern=pattern)
+    if "metal" in options.material:
+        surface = surface._replace(mirror=material.mirror)
     offset = -direction[:2] / high * (LIFT * _size(layout))
     shadow = Shadow(offset, jnp.float32(1) * blur(options, layout), drawn["shadow"], jnp.asarray(DARK))
-    return base._replace(background=_backdrop(base, options), light=light, surface=surface, shadow=shadow)
+    number = material.number.astype(jnp.uint8)
+    return base._replace(
+        background=_backdrop(base, options), light=light, surface=surface, shadow=shadow, material=number
+    )
 
 
 def _materials(options: Options, moving: Array, key: Array) -> Finish:
     """Materials of the slots; arrays [K]."""
-    table = np.asarray([MATERIALS[name] for name in options.material], np.float32)
+    finishes = [MATERIALS[name]._replace(number=options.materials.index(name)) for name in options.material]
+    table = np.asarray(finishes, np.float32)
     chosen = jax.random.randint(key, moving.shape, 0, len(table))
     return Finish(*jnp.asarray(table)[jnp.where(moving, chosen, 0)].T)
 

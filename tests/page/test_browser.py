@@ -15,12 +15,12 @@ from test_page import hostile
 import gen2d
 from gen2d.dataset.manifest import read_manifest
 from gen2d.page.page import page
-from gen2d.page.video import Videos
+from gen2d.page.video import Videos, flow_colors
 from gen2d.tools.view import DETAIL, Library, serving
 
 pytestmark = pytest.mark.full
 ONSET = 6  # frames that the videos of a set share, at least
-OVERLAYS = ("Outlines", "Velocities", "Trails", "Boxes", "Masks", "Numbers")
+OVERLAYS = ("Outlines", "Velocities", "Trails", "Boxes", "Masks", "Numbers", "Flow")
 PIXELS = "JSON.stringify([...document.querySelectorAll('#views canvas')].map((canvas) => canvas.toDataURL()))"
 
 # Mean difference of the pixels of two shown videos, in grey levels.
@@ -50,7 +50,7 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
     config = tiny.tiny_config(
         video={"frames": 24, "height": 48, "width": 60},
         matched={"change": ["teleport"], "onset": 0.5, "distance": [1, 2]},
-        annotations={"masks": True, "boxes": True},
+        annotations={"masks": True, "boxes": True, "flow": True},
     )
     folder = tmp_path_factory.mktemp("browser") / "twins"
     gen2d.generate(config, n=30, out=folder)
@@ -144,6 +144,34 @@ def test_the_script_reads_what_was_stored(opened: Tab, root: Path) -> None:
     assert_allclose(np.reshape(found, expected.shape), expected, atol=np.ptp(expected) / 2**15)
     shape = "state.shown[0].arrays['states/position'].shape"
     assert opened.evaluate(shape) == list(expected.shape)
+
+
+def test_the_wheel_of_flow_has_the_colours_of_flow(opened: Tab) -> None:
+    """A frame that moves as a whole, in each of four directions, has the colour of that side of the wheel."""
+    for column, row in ((1, 0), (0, 1), (-1, 0), (0, -1)):
+        expected = flow_colors(np.array([column, row], float).reshape(1, 1, 1, 2))[0, 0, 0, :3]
+        pixel = opened.evaluate(f"""(() => {{
+          const canvas = document.createElement("canvas");
+          [canvas.width, canvas.height] = [400, 400];
+          const video = {{ width: 400, height: 400, flow: {{ image: new Image(), rows: 1, width: 1, height: 1 }} }};
+          drawFlow(canvas.getContext("2d"), video, 0, 1);
+          return [...canvas.getContext("2d").getImageData({376 + 12 * column}, {23 + 12 * row}, 1, 1).data];
+        }})()""")
+        assert_allclose(pixel[:3], expected, atol=2)
+
+
+def test_colours_of_a_palette_are_shown_instead_of_the_scenes(opened: Tab) -> None:
+    assert "not drawn" not in opened.evaluate("$('others').textContent")
+    shown = opened.evaluate("""(() => {
+      for (const { objects } of state.shown) objects.color = objects.color.map((_, k) => [k, 2, 3]);
+      fillValues();
+      return [$("values").textContent, $("others").textContent];
+    })()""")
+    assert "colors drawn" in shown[0]
+    assert "not drawn: color" in shown[1]
+    chips = opened.evaluate("[...$('values').querySelectorAll('.chip')].map((chip) => chip.title)")
+    moving = opened.evaluate("state.shown.flatMap(({ objects }) => objects.color.filter((_, k) => !fixed(objects, k)))")
+    assert chips == [", ".join(map(str, color)) for color in moving]
 
 
 def test_hostile_strings_are_shown_and_do_nothing(tab: Tab, root: Path, tmp_path: Path) -> None:

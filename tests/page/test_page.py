@@ -1,6 +1,7 @@
 """The page of a dataset holds its first videos, is bounded in size, and treats every string as text."""
 
 import base64
+import colorsys
 import dataclasses
 import io
 import json
@@ -13,7 +14,7 @@ import numpy as np
 import pytest
 import synthetic
 import tiny
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image
@@ -24,7 +25,7 @@ from gen2d.dataset.manifest import Manifest, read_manifest
 from gen2d.media.sprites import reduced, sprite_rows, sprite_sheet
 from gen2d.page.arrays import packed
 from gen2d.page.page import index_page, page, shown_videos
-from gen2d.page.video import Detail, Videos, energies
+from gen2d.page.video import Detail, Videos, energies, flow_colors
 
 DETAIL = Detail(frames=100, side=512, mask_side=512, quality=90, objects=100, contacts=100)
 CAMERA = {
@@ -111,7 +112,22 @@ def test_the_page_holds_the_first_videos_of_all_splits(tmp_path: Path) -> None:
         assert_allclose(unpacked(video["arrays"])["states/position"], position, atol=np.ptp(position) / 2**16)
         masks = pictures(video["masks"], made.sizes["T"])
         assert_array_equal(masks[..., 3] > 0, truth["masks/instance"] > 0)
+        flow = truth["flow/forward"].astype(float)
+        speed = np.hypot(flow[..., 0], flow[..., 1])
+        opacity = pictures(video["flow"], made.sizes["T"])[..., 3]
+        assert_array_equal(opacity > 0, speed > speed.max() / 16)
         assert_array_equal(pictures(video["sprite"], made.sizes["T"]), truth["frames"])  # small ones are lossless
+
+
+@settings(deadline=None)
+@given(st.floats(-np.pi, np.pi), st.floats(0.1, 1), st.floats(1e-2, 1e3))
+def test_colours_of_flow_tell_direction_and_speed(angle: float, part: float, fastest: float) -> None:
+    flow = fastest * np.array([[1, 0], [part * np.cos(angle), part * np.sin(angle)]])
+    colors = flow_colors(flow.reshape(1, 1, 2, 2))[0, 0].astype(float)
+    assert abs(colors[1, 3] / colors[0, 3] - part) <= 1 / 16 + 1e-5
+    hues = [colorsys.rgb_to_hsv(*color[:3] / 255)[0] * 360 for color in colors]
+    assert hues[0] == 0
+    assert abs((hues[1] - np.degrees(angle) + 180) % 360 - 180) < 5 + 2
 
 
 def test_a_page_is_the_same_however_the_dataset_was_made(tmp_path: Path) -> None:

@@ -204,7 +204,8 @@ def test_a_shared_program_gives_the_bits_of_an_own_one(tmp_path: Path) -> None:
         "scene.radius=[0.45,1.0]",
         "video.fps=31",
     ]
-    generate("bouncing.yaml", 8, tmp_path / "first", overrides=[*SMALL, "scene.gravity=[0,-9.8]", "look.background=[0,0,0]"])
+    others = [*SMALL, "scene.gravity=[0,-9.8]", "look.background=[0,0,0]"]
+    generate("bouncing.yaml", 8, tmp_path / "first", overrides=others)
     before = set(programs())
     generate("bouncing.yaml", 8, tmp_path / "shared", overrides=overrides)
     assert set(programs()) == before

@@ -9,13 +9,16 @@ import pytest
 from tiny import CONFIG
 from worlds import world
 
+import gen2d
 from gen2d.config.config import load_config
+from gen2d.core.enums import STATIC
 from gen2d.core.errors import ConfigError
 from gen2d.core.palettes import NAME_BYTES, PALETTES
 from gen2d.programs import render
 from gen2d.programs.rollout import Rollout
 from gen2d.records.layout import Layout, SlotGroup
 from gen2d.renderers.color import to_linear
+from gen2d.renderers.paint import NO_MATERIAL
 
 # To XYZ relative to the white point D65 (IEC 61966-2-1).
 TO_XYZ = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]])
@@ -86,9 +89,31 @@ def test_the_name_of_each_colour_is_stored():
     )
 
 
-def test_without_a_palette_no_name_is_stored():
+def test_without_a_palette_and_materials_no_names_are_stored():
     schema = Rollout(load_config(CONFIG), jax.devices()[:1]).schema
-    assert "objects/color_name" not in schema.fields
+    assert not {"objects/color_name", "objects/material_name", "objects/material"} & set(schema.fields)
+
+
+@pytest.mark.full
+def test_the_name_of_each_material_is_stored(tmp_path):
+    """Of a split with a look that has materials and a palette; in another split there are no names."""
+    splits = {"train": {}, "plain": {"look": "flat", "videos": 8, "overlaps": True}}
+    config = {**CONFIG, "look": {"name": "studio", "material": ["paper", "metal"]}, "splits": splits}
+    gen2d.generate(config, n=24, out=tmp_path)
+    fields = ["objects/material", "objects/material_name", "objects/present", "objects/kind"]
+    video = gen2d.open(tmp_path, "train", fields=fields)[:]
+    present, names = video["objects/present"], video["objects/material_name"]
+    assert not present.all()
+    assert not names[~present].any()
+    assert set(names[present & (video["objects/kind"] != STATIC)].tolist()) == {b"paper", b"metal"}
+    assert set(names[present & (video["objects/kind"] == STATIC)].tolist()) == {b"paper"}
+    listed = load_config(config).look.options.materials
+    codes = video["objects/material"][present]
+    assert [listed[code].encode() for code in codes] == names[present].tolist()
+    other = gen2d.open(tmp_path, "plain", fields=fields)[:]
+    assert not other["objects/material_name"].any()
+    assert not gen2d.open(tmp_path, "plain", fields=["objects/color_name"])[:]["objects/color_name"].any()
+    assert (other["objects/material"] == NO_MATERIAL).all()
 
 
 @pytest.mark.parametrize(("change", "palette"), [("color", "paper"), ("remove", "grey"), ("balls", "grey")])
