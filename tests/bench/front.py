@@ -26,8 +26,10 @@ DOCS = Path(__file__).parents[2] / "docs"
 FRAMES, FPS = 64, 16  # of one pass of front.webp, and of each loop
 GAP, GROUND = 4, (38, 40, 50)  # px between tiles, and their sRGB colour
 BAND, SLANT = 0.34, 0.25  # width of a band over that of the picture, and its shift per height
-FRONT_BYTES, LOOP_BYTES = 2_000_000, 75_000  # largest sizes
-QUALITIES = (80, 72, 64, 56, 48, 40, 32, 24)  # of WebP, tried in this order
+DIM = 0.4  # brightness of frames under masks and flow
+FRONT_BYTES, LOOP_BYTES = 2_000_000, 78_000  # largest sizes
+QUALITIES = range(80, 20, -4)  # of WebP, tried in this order
+KEY_FRAMES = 8  # frames between those that are stored whole, so that errors of others do not stay
 BATCH = 8  # videos simulated at once
 METALS, ALL = "material: metal", "material: [rubber, wood, metal, paper]"
 
@@ -151,9 +153,9 @@ class Film(NamedTuple):
     """Frames [T, H, W, 3], uint8, of a family."""
 
     first: np.ndarray  # in its first look
-    masks: np.ndarray
+    masks: np.ndarray  # black where nothing is
     second: np.ndarray  # in its second look
-    flow: np.ndarray
+    flow: np.ndarray  # white where nothing moves
 
 
 def tiles() -> dict[str, Tile]:
@@ -212,20 +214,40 @@ def front(films: Mapping[str, Film], places: Mapping[str, Tile]) -> np.ndarray:
     column = (np.arange(width) / width)[None, :] - SLANT * (np.arange(height) / height - 0.5)[:, None]
     column = column[..., None]
     pictures = []
-    for plain, annotated in (("first", "masks"), ("second", "flow")):
-        below, above = (_mosaic(films, places, part, (count, height, width)) for part in (plain, annotated))
+    drawn = {name: (film.first, with_masks(film), film.second, with_flow(film)) for name, film in films.items()}
+    for look in (0, 2):
+        below, above = (_mosaic(drawn, places, part, (count, height, width)) for part in (look, look + 1))
         for t in range(count):
             # The band begins and ends outside of the picture.
-            end = (1 + BAND + SLANT) * (t + 0.5) / count - SLANT / 2
+            end = (1 + BAND + SLANT) * t / count - SLANT / 2
             pictures.append(np.where((column < end) & (column >= end - BAND), above[t], below[t]))
     return np.stack(pictures)
 
 
-def _mosaic(films: Mapping[str, Film], places: Mapping[str, Tile], part: str, size: tuple[int, int, int]) -> np.ndarray:
+def with_masks(film: Film) -> np.ndarray:
+    """Masks over the dimmed frames of the first look."""
+    return np.where(film.masks.any(-1, keepdims=True), film.masks, dimmed(film.first))
+
+
+def with_flow(film: Film) -> np.ndarray:
+    """Flow over the dimmed frames of the second look, which show where flow is white."""
+    white = film.flow.min(-1, keepdims=True) / 255
+    return np.rint(film.flow - white * (255.0 - dimmed(film.second))).astype(np.uint8)
+
+
+def dimmed(frames: np.ndarray) -> np.ndarray:
+    """Dark, grey frames [..., 3], uint8."""
+    grey = DIM * frames.mean(-1, keepdims=True)
+    return np.broadcast_to(grey.astype(np.uint8), frames.shape)
+
+
+def _mosaic(
+    films: Mapping[str, Sequence[np.ndarray]], places: Mapping[str, Tile], part: int, size: tuple[int, int, int]
+) -> np.ndarray:
     picture = np.full((*size, 3), GROUND, np.uint8)
     for name, own in films.items():
         left, top, width, height = places[name]
-        picture[:, top : top + height, left : left + width] = getattr(own, part)
+        picture[:, top : top + height, left : left + width] = own[part]
     return picture
 
 
@@ -237,7 +259,7 @@ def webp(frames: Iterable[np.ndarray], fps: float, most: int) -> bytes:
         file, duration = io.BytesIO(), round(1000 / fps)
         first.save(
             file, "WEBP", save_all=True, append_images=others, duration=duration, loop=0, quality=quality, method=4,
-            minimize_size=False, kmax=1000,
+            minimize_size=False, kmin=KEY_FRAMES - 1, kmax=KEY_FRAMES,
         )  # fmt: skip
         content = file.getvalue()
         if len(content) <= most:

@@ -31,6 +31,7 @@ def test_every_family_has_a_view_and_a_tile_of_its_own() -> None:
 def test_bands_of_masks_and_flow_cross_every_tile() -> None:
     places = {"one": front.Tile(0, 0, 30, 40), "other": front.Tile(34, 0, 50, 40)}
     parts = [np.full((16, 40, 84, 3), shade, np.uint8) for shade in (50, 100, 150, 200)]
+    parts[3][..., 1:] = 0  # saturated
     films = {name: front.Film(*(part[:, :, : tile.width] for part in parts)) for name, tile in places.items()}
     film = front.front(films, places)
     assert film.shape == (32, 40, 84, 3)
@@ -42,7 +43,18 @@ def test_bands_of_masks_and_flow_cross_every_tile() -> None:
         covered = look == look.max()
         assert covered.any(0).all()
         assert covered.mean() < 0.5
-        assert covered[0].mean() < 0.1  # the band comes from outside
+        assert not covered[0].any()  # the band comes from outside
+
+
+def test_masks_and_flow_lie_over_dimmed_frames() -> None:
+    frames = np.random.default_rng(0).integers(0, 256, (2, 8, 9, 3), np.uint8)
+    black, white = np.zeros_like(frames), np.full_like(frames, 255)
+    black[:, :4], white[:, :4] = (9, 200, 70), (0, 255, 128)
+    film = front.Film(frames, black, frames, white)
+    for drawn, color in ((front.with_masks(film), (9, 200, 70)), (front.with_flow(film), (0, 255, 128))):
+        assert_array_equal(drawn[:, :4], np.broadcast_to(color, (2, 4, 9, 3)))
+        assert_array_equal(drawn[:, 4:], front.dimmed(frames)[:, 4:])
+    assert front.dimmed(frames).max() < 128
 
 
 def test_a_film_has_the_best_quality_that_fits_and_the_same_bytes_again() -> None:
