@@ -244,7 +244,7 @@ def _export_description(source: Source, to: str) -> dict[str, Any]:
     """Contents of a folder's export.json, without the list of files."""
     manifest = source.ds.manifest
     keys = ("name", "seed", "fps", "conventions", "licence", "manifest_sha256", "config_sha256")
-    origin = {key: manifest.plain[key] for key in keys} | {"split": source.ds.options.split, "sizes": source.ds.sizes}
+    origin = {key: manifest.plain[key] for key in keys} | {"split": source.ds.options.split, "sizes": source.sizes}
     fields = {name: dataclasses.asdict(field) for name, field in source.fields.items()}
     return origin | {"schema": SCHEMA, "format": to, "fields": fields, "videos": len(source)}
 

@@ -51,7 +51,7 @@ _PANDAS = {
 
 def part_videos(source: Source) -> int:
     """Number of videos in a data file."""
-    size = sum(math.prod(_shape(source, field)) * 8 for field in _frame_fields(source).values()) * source.ds.sizes["T"]
+    size = sum(math.prod(_shape(source, field)) * 8 for field in _frame_fields(source).values()) * source.sizes["T"]
     return max(1, min(FILE_VIDEOS, FILE_BYTES // max(1, size)))
 
 
@@ -88,7 +88,7 @@ def write(target: Path, source: Source) -> None:
 
 def finish(target: Path, source: Source) -> None:
     """Write meta/ and the card."""
-    arrow, fields, frames = tables.pyarrow(), _frame_fields(source), source.ds.sizes["T"]
+    arrow, fields, frames = tables.pyarrow(), _frame_fields(source), source.sizes["T"]
     statistics, episodes, tasks = _Statistics(), [], dict[str, int]()
     for place, video in enumerate(_videos(source)):
         statistics.add({STATE: _state(video), **{_column(name): video[name] for name in fields}})
@@ -125,7 +125,7 @@ def _column(name: str) -> str:
 
 def _shape(source: Source, field: Field) -> tuple[int, ...]:
     """Shape of a frame's value; a single value has the shape (1,)."""
-    return field.shape(source.ds.sizes)[1:] or (1,)
+    return field.shape(source.sizes)[1:] or (1,)
 
 
 def _state(video: Batch) -> np.ndarray:
@@ -141,7 +141,7 @@ def _state_names(source: Source) -> list[str]:
     names = []
     for name in STATES:
         if name in source.fields:
-            shape = source.fields[name].shape(source.ds.sizes)[1:]
+            shape = source.fields[name].shape(source.sizes)[1:]
             ends = (".x", ".y") if len(shape) == 2 else ("",)
             names += [f"{name.split('/')[1]}.{slot}{end}" for slot in range(shape[0]) for end in ends]
     return names
@@ -173,7 +173,7 @@ def _types(source: Source, fields: dict[str, Field]) -> dict[str, Any]:
 
 def _rows(source: Source, fields: dict[str, Field], group: list[Batch], places: list[int]) -> dict[str, np.ndarray]:
     """Columns of the frames of these videos."""
-    frames, rows = source.ds.sizes["T"], dict[str, np.ndarray]()
+    frames, rows = source.sizes["T"], dict[str, np.ndarray]()
     if _state_names(source):
         rows[STATE] = np.concatenate([_state(video) for video in group])
     for name in fields:
@@ -214,7 +214,7 @@ def _task(video: Batch) -> str:
 
 def _episode(source: Source, place: int, task: str, video: Batch) -> dict[str, Any]:
     """Row of an episode."""
-    frames, data = source.ds.sizes["T"], place // part_videos(source)
+    frames, data = source.sizes["T"], place // part_videos(source)
     row = {
         "episode_index": place,
         "tasks": [task],
@@ -254,7 +254,7 @@ def _info(source: Source, fields: dict[str, Field], episodes: int, tasks: int) -
         "codebase_version": VERSION,
         "robot_type": "gen2d",
         "total_episodes": episodes,
-        "total_frames": episodes * source.ds.sizes["T"],
+        "total_frames": episodes * source.sizes["T"],
         "total_tasks": tasks,
         "chunks_size": CHUNK,
         "data_files_size_in_mb": 100,
@@ -301,7 +301,7 @@ def _frame_statistics(source: Source) -> dict[str, Any]:
     if stats is None:
         return {}
     channels = {key: [[[value / 255]] for value in stats[key] or []] for key in ("min", "max", "mean", "std")}
-    return {CAMERA: channels | {"count": [len(source) * source.ds.sizes["T"]]}}
+    return {CAMERA: channels | {"count": [len(source) * source.sizes["T"]]}}
 
 
 EXPORT = Export(
