@@ -113,11 +113,12 @@ def test_episodes_of_many_files_name_theirs(made: Path, tmp_path: Path, monkeypa
 
 
 @pytest.mark.filterwarnings("ignore")  # of lerobot and what it imports
-def test_lerobot_removes_an_episode(exported: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """It needs the statistics of the other episodes."""
+def test_lerobot_removes_an_episode(made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It needs the statistics of the other episodes, and columns of one axis."""
     monkeypatch.setenv("HF_HUB_OFFLINE", "1")
     tools, reader = package("lerobot.datasets.dataset_tools"), package("lerobot.datasets.lerobot_dataset")
-    ds = reader.LeRobotDataset("me/tiny", root=exported, video_backend="pyav")
+    out = gen2d.export(made, "lerobot", tmp_path / "out", fields=("frames", "states/*angle*", "index")).out
+    ds = reader.LeRobotDataset("me/tiny", root=out, video_backend="pyav")
     left = tools.delete_episodes(ds, [1], output_dir=tmp_path / "left", repo_id="me/left")
     assert left.meta.total_episodes == VIDEOS - 1
     assert left.meta.stats["observation.state"]["count"] == [(VIDEOS - 1) * FRAMES]
