@@ -174,7 +174,7 @@ def export(
                 for part in todo:
                     write_part(format_, dataclasses.replace(source, part=part, advance=advance), staging.files)
                     staging.add(part.start)
-        format_.finish(staging.files, source)
+        format_.finish(staging.files, dataclasses.replace(source, notes=staging.notes))
 
     with _translate_errors(out):
         if format_.separate:

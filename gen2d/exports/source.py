@@ -6,6 +6,7 @@ import os
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
@@ -32,6 +33,9 @@ class Source:
     part: range | None = None  # of the selected videos, by their places, if these are not all
     selection: np.ndarray | None = None  # numbers of the selected videos, ascending, if these are not all of the split
     codec: str = ""  # encoding of the frames; "" where the format has one only
+    notes: Path = (
+        Path()
+    )  # folder for what `write` has to tell `finish` about a part, which finds the notes of all there
     jobs: int = 0  # number of threads; 0: one for each core, but at most 8
 
     @property
