@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from gen2d.config.distributions import Distribution
     from gen2d.config.options import option
     from gen2d.core.enums import CIRCLE, DYNAMIC, KINEMATIC, POLYGON, STATIC
-    from gen2d.core.errors import ConfigError
+    from gen2d.core.errors import ConfigError, UserError
     from gen2d.core.schema import Field
     from gen2d.exports import arrays, tables
     from gen2d.exports.source import Source
@@ -58,7 +58,7 @@ _HOMES = {
     "gen2d.config.distributions": "Distribution",
     "gen2d.config.options": "option",
     "gen2d.core.enums": "CIRCLE DYNAMIC KINEMATIC POLYGON STATIC",
-    "gen2d.core.errors": "ConfigError",
+    "gen2d.core.errors": "ConfigError UserError",
     "gen2d.core.schema": "Field",
     "gen2d.exports": "arrays tables",
     "gen2d.exports.source": "Source",
@@ -124,6 +124,7 @@ __all__ = [
     "Source",
     "Surface",
     "Texture",
+    "UserError",
     "alone",
     "are_lines",
     "are_moving",

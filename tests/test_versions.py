@@ -1,6 +1,7 @@
 """Every version that pyproject.toml promises works, in environments of its own (`versions.sh`)."""
 
 import os
+import re
 import subprocess
 import tomllib
 from collections.abc import Callable
@@ -26,6 +27,23 @@ def test_the_versions_that_are_promised_work(
         if line.startswith("not run: "):
             record_property("not run", line.removeprefix("not run: "))
     assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_pages_install_extras_of_a_checkout() -> None:
+    """As `pip install ".[torch]"`: the name alone would need an index, and an extra must be there."""
+    root = floors.PROJECT.parent
+    extras = tomllib.loads(floors.PROJECT.read_text())["project"]["optional-dependencies"]
+    pages = [root / "README.md", root / "CONTRIBUTING.md", *sorted((root / "gen2d").rglob("README.md"))]
+    found = [
+        (page, path, name)
+        for page in pages
+        for path, names in re.findall(r'"(\.|[\w./-]*gen2d)\[([\w,]+)\]"', page.read_text())
+        for name in names.split(",")
+    ]
+    assert len(found) >= 8
+    for page, path, name in found:
+        assert path != "gen2d", page
+        assert name in extras, (page, name)
 
 
 def test_every_requirement_has_a_lowest_version() -> None:

@@ -75,9 +75,10 @@ newest() {
 }
 
 sdist() {
-    pip install build
-    python -m build --outdir dist "$root"
-    pip uninstall --yes build
+    python -m venv tools
+    tools/bin/pip install build twine
+    tools/bin/python -m build --outdir dist "$root"
+    tools/bin/twine check --strict dist/*
     pip install dist/gen2d-*.tar.gz
     main_job
     python "$root/tests/wheel.py" dist/gen2d-*.whl
@@ -93,7 +94,7 @@ for section in ${*:-lowest newest sdist}; do
             continue
         fi
         began=$SECONDS ran=1
-        rm -rf "$work/env" "$work/job" "$work/copy" "$work/dist"
+        rm -rf "$work/env" "$work/job" "$work/copy" "$work/dist" "$work/tools"
         "$python" -m venv "$work/env"
         result=0
         # Not in a condition: `set -e` would not hold in it.

@@ -1,6 +1,8 @@
 """Write a dataset as films, tar files, NumPy archives or in the layout of another program."""
 
 import argparse
+import dataclasses
+import json
 from pathlib import Path
 
 from gen2d.cli.parser import (
@@ -50,6 +52,7 @@ def add_arguments(parser: Parser) -> None:
     parser.add_argument(
         "--jobs", type=whole_number, metavar="N", help="threads that encode videos (default: one a core, 8 at most)"
     )
+    parser.add_argument("--json", action="store_true", help="print the result as JSON")
     add_trust(parser)
     add_engine(parser)
     add_network(parser)
@@ -85,6 +88,9 @@ def run(options: argparse.Namespace) -> int:
         jobs=options.jobs,
         **limits(options),
     )
+    if options.json:
+        print(json.dumps(dataclasses.asdict(exported) | {"out": str(exported.out)}))
+        return 0
     size = f"{in_time(exported.seconds)}, {in_bytes(exported.bytes)}"
     print(f"{exported.videos:,} videos in {size}, in {exported.out}")
     if exported.loss:

@@ -1,6 +1,8 @@
 """Upload a dataset, or an export, to the Hugging Face Hub."""
 
 import argparse
+import dataclasses
+import json
 
 from gen2d.cli.parser import Parser
 from gen2d.core.humanize import in_bytes, with_noun
@@ -13,6 +15,7 @@ def add_arguments(parser: Parser) -> None:
     parser.add_argument("--private", action="store_true", help="make a new repository private")
     parser.add_argument("--licence", default="", metavar="NAME", help="licence in the card, such as cc-by-4.0")
     parser.add_argument("--branch", default="main", metavar="NAME", help="branch of the repository (default: main)")
+    parser.add_argument("--json", action="store_true", help="print the result as JSON")
 
 
 def run(options: argparse.Namespace) -> int:
@@ -22,6 +25,9 @@ def run(options: argparse.Namespace) -> int:
 
     given = {"private": options.private, "licence": options.licence, "branch": options.branch}
     pushed = push(options.folder, options.repository, **given, log=to_stderr)
+    if options.json:
+        print(json.dumps(dataclasses.asdict(pushed)))
+        return 0
     removed = f", {with_noun(pushed.removed, 'old file')} removed" if pushed.removed else ""
     print(f"{with_noun(pushed.files, 'file')}, {in_bytes(pushed.bytes)}{removed}, in {pushed.url}")
     return 0

@@ -162,7 +162,8 @@ class Export(_Contract):
     - fixed: whether the format holds these fields only.
     - suffix: suffix of the single file written; "" for a folder.
     - separate: whether the files of a part of the videos depend on nothing but these, as with `source.each`, so that
-        several machines may each write some parts, and a killed export goes on. `write` is then called for each part.
+        several machines may each write some parts, and a killed export goes on. `write` is then called for each part,
+        and may leave files for `finish` in the folder `source.notes`.
     - part_videos(source): number of videos of a part; a part begins at a multiple of it.
     - finish(target, source): writes the files that describe all videos, if there are any, when all parts are there.
     - codecs: names of the encodings of frames that can be chosen, of which the first is the default; one is then in

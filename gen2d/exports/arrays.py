@@ -2,6 +2,7 @@
 
 import io
 import zipfile
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -46,6 +47,13 @@ def check_frames(source: Source, name: str) -> None:
     """Raise ConfigError if the frames are left out."""
     if "frames" not in source.fields:
         raise ConfigError(f"{argument('fields')} is {' '.join(source.fields)}, but must contain frames for {name}")
+
+
+def notes(source: Source, name: str) -> Iterator[tuple[int, str]]:
+    """Lines of the notes NAME-PLACE of all parts, in their order, with their numbers from 1 on."""
+    paths = sorted(source.notes.glob(f"{name}-*"))
+    lines = (line.removesuffix("\n") for path in paths for line in path.read_text().splitlines(keepends=True))
+    return enumerate(lines, 1)
 
 
 def without_frames(video: Batch) -> Batch:

@@ -174,7 +174,7 @@ def export(
                 for part in todo:
                     write_part(format_, dataclasses.replace(source, part=part, advance=advance), staging.files)
                     staging.add(part.start)
-        format_.finish(staging.files, source)
+        format_.finish(staging.files, dataclasses.replace(source, notes=staging.notes))
 
     with _translate_errors(out):
         if format_.separate:
@@ -244,7 +244,7 @@ def _export_description(source: Source, to: str) -> dict[str, Any]:
     """Contents of a folder's export.json, without the list of files."""
     manifest = source.ds.manifest
     keys = ("name", "seed", "fps", "conventions", "licence", "manifest_sha256", "config_sha256")
-    origin = {key: manifest.plain[key] for key in keys} | {"split": source.ds.options.split, "sizes": source.ds.sizes}
+    origin = {key: manifest.plain[key] for key in keys} | {"split": source.ds.options.split, "sizes": source.sizes}
     fields = {name: dataclasses.asdict(field) for name, field in source.fields.items()}
     return origin | {"schema": SCHEMA, "format": to, "fields": fields, "videos": len(source)}
 

@@ -10,20 +10,22 @@ from gen2d.storage.atomic import publish, remove_tree
 from gen2d.storage.leases import exclusive_lock
 from gen2d.storage.sealed import JSON_BYTES, as_json, parse_json, read_bytes
 
+NOTES = "notes"
 SECONDS = 5.0  # between two notes of the parts that are done, each after all files are flushed to the disk
 
 
 class PartialExport:
     """Context with the folder `.NAME.partial` beside the output NAME, which one process at a time uses.
 
-    `files` is the folder of the files, and `done` the first places of the parts that are there. What another export has
-    left, by `identity`, is removed. If the block fails, the folder stays; `remove` removes it.
+    `files` is the folder of the files, `notes` that of `Source.notes`, and `done` the first places of the parts that
+    are there. What another export has left, by `identity`, is removed. If the block fails, the folder stays;
+    `remove` removes it.
     """
 
     def __init__(self, out: Path, identity: str) -> None:
         self.out, self.identity = out, identity
         self.folder = out.with_name(f".{out.name}.partial")
-        self.files, self._notes = self.folder / "files", self.folder / "done.json"
+        self.files, self.notes, self._done = self.folder / "files", self.folder / NOTES, self.folder / "done.json"
         self.done: set[int] = set()
         self._open, self._noted = contextlib.ExitStack(), 0.0
 
@@ -38,12 +40,13 @@ class PartialExport:
         for path in self.folder.glob(".part-*"):  # of processes that were killed
             remove_tree(path)
         with contextlib.suppress(OSError):
-            notes = parse_json(read_bytes(self._notes, JSON_BYTES)) or {}
-            if notes.get("identity") == self.identity and self.files.is_dir():
-                self.done = set(notes["done"])
+            stated = parse_json(read_bytes(self._done, JSON_BYTES)) or {}
+            if stated.get("identity") == self.identity and self.files.is_dir() and self.notes.is_dir():
+                self.done = set(stated["done"])
         if not self.done:
-            remove_tree(self.files)
-            self.files.mkdir()
+            for folder in (self.files, self.notes):
+                remove_tree(folder)
+                folder.mkdir()
         self._noted = time.monotonic()
         return self
 
@@ -55,7 +58,7 @@ class PartialExport:
 
     def _note(self) -> None:
         os.sync()
-        publish(self._notes, as_json({"identity": self.identity, "done": sorted(self.done)}))
+        publish(self._done, as_json({"identity": self.identity, "done": sorted(self.done)}))
         self._noted = time.monotonic()
 
     def remove(self) -> None:

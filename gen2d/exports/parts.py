@@ -15,6 +15,7 @@ from gen2d.config.contracts import Export
 from gen2d.core.errors import ConfigError, argument
 from gen2d.core.progress import Log
 from gen2d.engines.protocol import Report, other_version
+from gen2d.exports.partial import NOTES
 from gen2d.exports.source import Source, source_of
 from gen2d.loading.dataset import RenderOptions
 from gen2d.storage.paths import Place
@@ -47,15 +48,19 @@ class ExportTask:
 
 
 def write_part(format_: Export, source: Source, target: Path) -> None:
-    """Write the files of a part of the videos into the folder, each whole or not at all."""
+    """Write the files of a part of the videos into the folder, and its notes beside it, each whole or not at all."""
     with tempfile.TemporaryDirectory(dir=target.parent, prefix=".part-") as folder:
-        format_.write(Path(folder), source)
-        for path in sorted(Path(folder).rglob("*")):  # whole files only, as another worker may write the same
-            to = target / path.relative_to(folder)
-            if path.is_dir():
-                to.mkdir(exist_ok=True)
-            else:
-                path.replace(to)
+        files, notes = Path(folder, "files"), Path(folder, NOTES)
+        files.mkdir()
+        notes.mkdir()
+        format_.write(files, dataclasses.replace(source, notes=notes))
+        for own, others in ((files, target), (notes, target.parent / NOTES)):
+            for path in sorted(own.rglob("*")):  # whole files only, as another worker may write the same
+                to = others / path.relative_to(own)
+                if path.is_dir():
+                    to.mkdir(exist_ok=True)
+                else:
+                    path.replace(to)
 
 
 class ExportJob:

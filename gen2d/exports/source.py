@@ -6,6 +6,7 @@ import os
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
@@ -32,13 +33,15 @@ class Source:
     part: range | None = None  # of the selected videos, by their places, if these are not all
     selection: np.ndarray | None = None  # numbers of the selected videos, ascending, if these are not all of the split
     codec: str = ""  # encoding of the frames; "" where the format has one only
+    notes: Path = (
+        Path()
+    )  # folder for what `write` has to tell `finish` about a part, which finds the notes of all there
     jobs: int = 0  # number of threads; 0: one for each core, but at most 8
 
     @property
     def places(self) -> range:
         """Places of these videos among those that are selected."""
-        count = len(self.ds) if self.selection is None else len(self.selection)
-        return range(count) if self.part is None else self.part
+        return range(self.total) if self.part is None else self.part
 
     @property
     def numbers(self) -> range | list[int]:
@@ -50,9 +53,24 @@ class Source:
         return len(self.places)
 
     @property
+    def total(self) -> int:
+        """Number of videos of the whole export, of which these may be a part."""
+        return len(self.ds) if self.selection is None else len(self.selection)
+
+    @property
     def fields(self) -> dict[str, Field]:
         """The fields of each video, by name."""
         return self.ds.fields
+
+    @property
+    def sizes(self) -> dict[str, int]:
+        """Sizes of the axes of the fields; T are the frames of this split, of which more may be stored."""
+        return {**self.ds.sizes, "T": len(self.ds.time)} if "T" in self.ds.sizes else self.ds.sizes
+
+    @property
+    def threads(self) -> int:
+        """Number of threads that encode videos."""
+        return self.jobs or min(os.cpu_count() or 1, 8)
 
     @property
     def fps(self) -> float:
@@ -92,12 +110,11 @@ class Source:
 
     def map(self, function: Callable[[str, Batch], Result]) -> Iterator[Result]:
         """Results of `function(key, video)` of every video, in their order, from several threads."""
-        threads = self.jobs or min(os.cpu_count() or 1, 8)
         running: deque[Future[Result]] = deque()
-        with ThreadPoolExecutor(threads) as pool:
+        with ThreadPoolExecutor(self.threads) as pool:
             for number, video in zip(self.numbers, self.videos(), strict=True):
                 running.append(pool.submit(function, self.key(number), video))
-                if len(running) > threads:
+                if len(running) > self.threads:
                     yield running.popleft().result()
             while running:
                 yield running.popleft().result()

@@ -42,7 +42,7 @@ class Table:
         first: Sequence[str] = (),
     ) -> None:
         self.arrow, self.fields, self.media, self.first = pyarrow(), {**fields, "time": TIME}, media, first
-        arrow, sizes = self.arrow, source.ds.sizes
+        arrow, sizes = self.arrow, source.sizes
         columns, features = [arrow.field(name, arrow.string()) for name in first], dict[str, Any]()
         features |= {name: _value("string") for name in first}
         file = arrow.struct([("bytes", arrow.binary()), ("path", arrow.string())])

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from gen2d.core.errors import ConfigError, Error, UserError, argument
-from gen2d.core.progress import inform
+from gen2d.core.progress import Event, inform
 from gen2d.dataset.manifest import Manifest, read_manifest
 from gen2d.dataset.readme import card_split
 from gen2d.loading.dataset import Dataset, ViewOptions
@@ -42,6 +42,7 @@ def view(
     *,
     seed: int | None = None,
     overrides: Sequence[str] = (),
+    log: Callable[[str], None] = inform,
     timeout: float = 30.0,
     deadline: float = 300.0,
 ) -> None:
@@ -57,6 +58,8 @@ def view(
         Seed of the videos of a config; by default that of the config.
     overrides : sequence of str
         Options of the config to change, such as 'video.height=128'.
+    log : callable, optional
+        Function that is called with the line that says where the page is, once it is served.
     timeout : float
         Limit in s of a server's silence, as in `open`.
     deadline : float
@@ -78,7 +81,8 @@ def view(
             root = Path(folder) / "videos"
             generate(str(source), n=CONFIG_VIDEOS, out=root, seed=seed, overrides=overrides)
         server = stack.enter_context(serving(Library(root), port))
-        inform(f"Showing {root} at http://{HOST}:{server.server_port}/ until you press Ctrl-C")
+        url = f"http://{HOST}:{server.server_port}/"
+        log(Event.of(f"Showing {root} at {url} until you press Ctrl-C", "serving", dataset=f"{root}", url=url))
         server.serve_forever()
 
 

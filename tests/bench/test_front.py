@@ -77,7 +77,9 @@ def test_a_family_is_rendered_in_both_looks_with_masks_and_flow() -> None:
     ball, background = film.masks.any(-1), film.masks[0, 0, 0]
     assert_array_equal(background, 0)
     assert_array_equal((film.flow[:3] < 255).any(-1), ball[:3])  # only the ball moves
-    first, second = [np.asarray(np.abs(look[3].astype(int) - look[0]).max(-1) > 30) for look in (film.first, film.second)]
+    first, second = (
+        np.asarray(np.abs(look[3].astype(int) - look[0]).max(-1)) > 30 for look in (film.first, film.second)
+    )
     there = ball[[0, 3]].any(0)
     assert second.sum() > 20
     assert there[second].mean() > 0.7  # the others are on its rim

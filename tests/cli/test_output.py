@@ -15,6 +15,7 @@ from tiny import CONFIG, run_main
 
 import gen2d
 from gen2d.cli.main import VERBS
+from gen2d.cli.parser import Parser
 from gen2d.config.plugins import config_names, names, summary, written_summary
 from gen2d.config.reading import yaml_text
 
@@ -75,9 +76,20 @@ def test_json_is_what_other_programs_read(folder: Path) -> None:
     files = json.loads(run_main("preview", "data", "--out", "pictures", "--json", cwd=folder).stdout)["files"]
     assert files
     assert all((folder / file).is_file() for file in files)
+    made = json.loads(run_main("export", "data", "--to", "npz", "--out", "arrays", "--json", cwd=folder).stdout)
+    size = sum(path.stat().st_size for path in (folder / "arrays").glob("*.npz"))
+    assert made.pop("seconds") > 0
+    assert made == {"out": "arrays", "videos": 2, "bytes": size, "loss": ""}
     listed = json.loads(run_main("list", "--json").stdout)
     assert [*listed["scene"]] == names("scene")
     assert listed["config"] == config_names()
+
+
+@pytest.mark.parametrize("verb", VERBS)
+def test_every_verb_can_print_json(verb: str) -> None:
+    parser = Parser()
+    VERBS[verb].add_arguments(parser)
+    assert "--json" in parser.format_help()
 
 
 def test_list_is_one_screen_and_details_are_shown_on_request() -> None:

@@ -155,8 +155,8 @@ def test_verify_and_export_run_on_a_cluster(cluster: Cluster, plain: dict[str, b
             out = tmp_path / f"{to}-{name}"
             gen2d.export(tmp_path / "good", to, out, engine=where, select="index >= 5", fields="states/*")
         assert files(tmp_path / f"{to}-one") == files(tmp_path / f"{to}-two")
-    with pytest.raises(gen2d.ConfigError, match=r"^to is coco, whose files hold many videos: leave out engine"):
-        gen2d.export(tmp_path / "good", "coco", tmp_path / "three", engine=engine)
+    with pytest.raises(gen2d.ConfigError, match=r"^to is objects, whose files hold many videos: leave out engine"):
+        gen2d.export(tmp_path / "good", "objects", tmp_path / "three", engine=engine)
 
 
 # ---- Without Ray

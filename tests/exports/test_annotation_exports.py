@@ -2,9 +2,11 @@
 
 import configparser
 import csv
+import dataclasses
 import json
 import pickle
 import re
+import sys
 from collections import Counter
 from pathlib import Path
 from types import SimpleNamespace
@@ -20,8 +22,10 @@ from packages import package
 import gen2d
 from gen2d.captions.colors import COLORS
 from gen2d.captions.questions import Question
+from gen2d.config import plugins
 from gen2d.exports.formats.coco import run_lengths
 from gen2d.exports.formats.questions import Balance
+from gen2d.exports.source import Source
 
 VIDEOS, FRAMES, HEIGHT, WIDTH = 3, 5, 40, 48
 CONFIG = tiny.tiny_config(
@@ -282,6 +286,40 @@ def test_equal_datasets_give_equal_files(made: Path, tmp_path: Path, to: str) ->
     about = json.loads((first / "export.json").read_text())["files"]
     assert {path.as_posix() for path in trees[0]} == {*about, "export.json"}
     gen2d.export(made, to, first)  # its own folder is replaced
+
+
+@pytest.mark.parametrize("to", [name for name in ANNOTATED if plugins.load("export", name).separate])
+def test_a_stopped_export_of_annotations_goes_on_where_it_was(
+    made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, to: str
+) -> None:
+    """In parts of a video each: those before the stop are not written again, and all ids are those of one run."""
+    whole = gen2d.export(made, to, tmp_path / "whole").out
+    module, written = sys.modules[f"gen2d.exports.formats.{to}"], list[int]()
+
+    def noted(target: Path, source: Source) -> None:
+        if len(written) == 2:
+            written.append(-1)
+            raise KeyboardInterrupt
+        written.append(source.places.start)
+        form.write(target, source)
+
+    form = plugins.load("export", to)
+    monkeypatch.setattr(module, "part_videos", lambda source: 1, raising=False)
+    monkeypatch.setattr(module, "EXPORT", dataclasses.replace(form, write=noted, part_videos=lambda source: 1))
+    with pytest.raises(KeyboardInterrupt):
+        gen2d.export(made, to, tmp_path / "out")
+    out = gen2d.export(made, to, tmp_path / "out").out
+    assert written == [0, 1, -1, 2]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["out", "whole"]
+    if to == "tapvid":  # a pickle for each part
+        contents = [pickle.loads(path.read_bytes()) for path in sorted(out.glob("*.pkl"))]
+        assert [[*content] for content in contents] == [[f"train-{number:09d}"] for number in range(VIDEOS)]
+        return
+    trees = [
+        {path.relative_to(root): path.read_bytes() for path in root.rglob("*") if path.is_file()}
+        for root in (out, whole)
+    ]
+    assert trees[0] == trees[1]
 
 
 @pytest.mark.full

@@ -36,7 +36,8 @@ SIZES = {"T": 6, "H": 64, "W": 48, "K": 3}
 TRAIN = 10
 FILMS = {"mp4": ".mp4", "h264": ".mp4", "av1": ".mp4", "ffv1": ".mkv"}
 TABLES = ["parquet", "videofolder", "lerobot"] if importlib.util.find_spec("pyarrow") else []
-FOLDERS = [*FILMS, "npz", "webdataset", *TABLES]
+ZARR = ["zarr"] if importlib.util.find_spec("zarr") else []
+FOLDERS = [*FILMS, "npz", "webdataset", *TABLES, *ZARR]
 
 
 @pytest.fixture(scope="module")
@@ -246,6 +247,18 @@ def test_fields_and_split_can_be_chosen(toy: Path, tmp_path: Path) -> None:
     assert sorted(path.name for path in out.glob("*.npz")) == [f"test-{number:09d}.npz" for number in range(3)]
     with np.load(out / "test-000000002.npz") as archive:
         assert set(archive) == {"states/position", "states/angle", "time"}
+
+
+@pytest.mark.skipif(not TABLES, reason="needs pyarrow")
+def test_a_split_of_fewer_frames_than_are_stored_is_declared_as_it_is(tmp_path: Path) -> None:
+    config = {"scene": {"name": "toy"}, "fps": 10, "splits": {"train": {}, "test": {"frames": 4}}}
+    made = synthetic.make(synthetic.dataset(tmp_path / "toy", train=1, sizes=SIZES, config=config))
+    (path,) = gen2d.export(made.root, "parquet", tmp_path / "table", split="test").out.glob("*.parquet")
+    about = json.loads(importlib.import_module("pyarrow.parquet").read_schema(path).metadata[b"huggingface"])
+    assert about["info"]["features"]["states/position"]["shape"] == [4, 3, 2]
+    out = gen2d.export(made.root, "lerobot", tmp_path / "lerobot", split="test").out
+    info = json.loads((out / "meta" / "info.json").read_text())
+    assert (info["total_episodes"], info["total_frames"]) == (3, 12)
 
 
 def test_a_part_of_an_export_is_of_its_own_videos(toy: Path, tmp_path: Path) -> None:
@@ -464,15 +477,15 @@ def parts(monkeypatch: pytest.MonkeyPatch) -> list[int]:
         written.append(source.places.start)
 
     monkeypatch.setattr(export, "write_part", noted)
-    for name in ("npz", "webdataset", *TABLES):
+    for name in ("npz", "webdataset", *TABLES, *ZARR):
         form = dataclasses.replace(plugins.load("export", name), part_videos=lambda source: 4)
         monkeypatch.setattr(sys.modules[f"gen2d.exports.formats.{name}"], "EXPORT", form)
-    for name in ("webdataset", *(name for name in TABLES if name != "videofolder")):
+    for name in ("webdataset", *ZARR, *(name for name in TABLES if name != "videofolder")):
         monkeypatch.setattr(f"gen2d.exports.formats.{name}.part_videos", lambda source: 4)
     return written
 
 
-@pytest.mark.parametrize("to", ["npz", "webdataset", *TABLES])
+@pytest.mark.parametrize("to", ["npz", "webdataset", *TABLES, *ZARR])
 def test_a_stopped_export_goes_on_where_it_was(toy: Path, tmp_path: Path, parts: list[int], to: str) -> None:
     lines: list[str] = []
     with pytest.raises(KeyboardInterrupt):

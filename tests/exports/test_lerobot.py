@@ -13,6 +13,7 @@ from packages import package
 
 import gen2d
 from gen2d.core.errors import ConfigError
+from gen2d.exports.formats import lerobot
 
 parquet = package("pyarrow.parquet")
 VIDEOS, FRAMES = 5, 6
@@ -86,6 +87,44 @@ def test_statistics_are_those_of_the_frames(exported: Path, stored: dict[str, np
     assert 0 < np.mean(stats[CAMERA]["mean"]) < 1
 
 
+def test_each_episode_has_statistics_of_its_own(exported: Path, stored: dict[str, np.ndarray]) -> None:
+    rows = parquet.read_table(exported / "meta/episodes/chunk-000/file-000.parquet").to_pylist()
+    for number, row in enumerate(rows):
+        frames, angle = stored["frames"][number] / 255, stored["states/angle"][number].astype(float)
+        for name, least in [("min", np.min), ("max", np.max), ("mean", np.mean), ("std", np.std)]:
+            channels = np.array(row[f"stats/{CAMERA}/{name}"])
+            assert channels.shape == (3, 1, 1)
+            assert_allclose(channels.ravel(), least(frames, (0, 1, 2)), rtol=1e-9, atol=1e-12)
+            assert_allclose(row[f"stats/observation.states.angle/{name}"], least(angle, 0), rtol=1e-6, atol=1e-6)
+        assert len(row["stats/observation.state/mean"]) == stored["states/position"].shape[2] * 6
+        assert row[f"stats/{CAMERA}/count"] == row["stats/observation.state/count"] == [FRAMES]
+
+
+def test_episodes_of_many_files_name_theirs(made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(lerobot, "FILE_VIDEOS", 2)
+    out = gen2d.export(made, "lerobot", tmp_path / "out", fields=("frames", "index")).out
+    numbers = []
+    for path in sorted((out / "meta/episodes").rglob("*.parquet")):
+        for row in parquet.read_table(path).to_pylist():
+            chunk, file = row["meta/episodes/chunk_index"], row["meta/episodes/file_index"]
+            assert path == out / f"meta/episodes/chunk-{chunk:03d}/file-{file:03d}.parquet"
+            numbers.append((row["episode_index"], row["gen2d/index"]))
+    assert numbers == [(n, n) for n in range(VIDEOS)]
+
+
+@pytest.mark.filterwarnings("ignore")  # of lerobot and what it imports
+def test_lerobot_removes_an_episode(made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It needs the statistics of the other episodes, and columns of one axis."""
+    monkeypatch.setenv("HF_HUB_OFFLINE", "1")
+    tools, reader = package("lerobot.datasets.dataset_tools"), package("lerobot.datasets.lerobot_dataset")
+    out = gen2d.export(made, "lerobot", tmp_path / "out", fields=("frames", "states/*angle*", "index")).out
+    ds = reader.LeRobotDataset("me/tiny", root=out, video_backend="pyav")
+    left = tools.delete_episodes(ds, [1], output_dir=tmp_path / "left", repo_id="me/left")
+    assert left.meta.total_episodes == VIDEOS - 1
+    assert left.meta.stats["observation.state"]["count"] == [(VIDEOS - 1) * FRAMES]
+    assert left.meta.stats[CAMERA]["mean"].shape == (3, 1, 1)
+
+
 def test_selected_videos_are_episodes_from_0_on(made: Path, tmp_path: Path, stored: dict[str, np.ndarray]) -> None:
     out = gen2d.export(made, "lerobot", tmp_path / "out", select="index > 2").out
     rows = parquet.read_table(out / "meta/episodes/chunk-000/file-000.parquet").to_pylist()
@@ -103,8 +142,8 @@ def test_a_rate_that_is_no_whole_number_is_refused(tmp_path: Path) -> None:
 @pytest.mark.filterwarnings("ignore")  # of lerobot and what it imports
 def test_lerobot_reads_episodes(exported: Path, stored: dict[str, np.ndarray], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("HF_HUB_OFFLINE", "1")
-    lerobot = package("lerobot.datasets.lerobot_dataset")
-    ds = lerobot.LeRobotDataset("me/tiny", root=exported, video_backend="pyav")
+    reader = package("lerobot.datasets.lerobot_dataset")
+    ds = reader.LeRobotDataset("me/tiny", root=exported, video_backend="pyav")
     assert (ds.num_episodes, ds.num_frames, ds.fps) == (VIDEOS, VIDEOS * FRAMES, 20)
     for row in (0, 7, 29):
         item, number, frame = ds[row], row // FRAMES, row % FRAMES

@@ -84,8 +84,11 @@ def test_what_a_grown_dataset_replaces_leaves_the_repository(
 
 def test_an_export_is_pushed_with_its_card(toy: Path, tmp_path: Path, server: Hub, environment: dict[str, str]) -> None:
     out = gen2d.export(toy, "webdataset", tmp_path / "tars", codec="npz").out
-    done = push(environment, out, "toy-tars", "--licence", "MIT")
+    done = push(environment, out, "toy-tars", "--licence", "MIT", "--json")
     assert done.returncode == 0, done.stderr
+    pushed = json.loads(done.stdout)
+    assert pushed["url"].endswith("/datasets/me/toy-tars")
+    assert (pushed["files"], pushed["removed"]) == (3, 0)
     there = server.repositories["me/toy-tars"]
     assert there.keys() == {".gitattributes", "README.md", "export.json", "train-000000.tar"}
     assert there["train-000000.tar"] == (out / "train-000000.tar").read_bytes()

@@ -3,6 +3,7 @@
 import http.client
 import json
 import re
+import subprocess
 import threading
 import time
 import urllib.parse
@@ -110,6 +111,18 @@ def test_damage_is_one_sentence(tmp_path: Path) -> None:
     assert status == 500
     assert b"train-00000.h5" in content
     assert content.count(b"\n") == 0
+
+
+def test_with_json_the_address_is_one_object(served: tuple[Path, int]) -> None:
+    words, environment = tiny.command("view", served[0], "--port", 0, "--json")
+    with subprocess.Popen(
+        words, env=environment, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
+    ) as server:
+        assert server.stdout is not None
+        about = json.loads(server.stdout.readline())
+        status, _ = ask(urllib.parse.urlsplit(about["url"]).port or 0, "/")
+        server.terminate()
+    assert (status, about["event"], about["dataset"]) == (200, "serving", str(served[0]))
 
 
 def test_a_busy_port_is_one_sentence(served: tuple[Path, int]) -> None:

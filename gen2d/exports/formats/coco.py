@@ -14,45 +14,46 @@ from typing import Any
 import cv2
 import numpy as np
 
-from gen2d.plugin import Batch, Export, Source, facts
+from gen2d.plugin import Batch, Export, Source, arrays, facts
 
 SKELETON = [[1, 2]]
 DESCRIPTION = "annotations.json"
 
 
 def write(target: Path, source: Source) -> None:
-    """Write the images and the file of annotations to the folder."""
-    parts = {name: (target / f".{name}.json") for name in ("images", "annotations")}
+    """Write the images to the folder, and notes with the entries of the annotations, but for their ids."""
     height, width = source.frame_size
     size = SimpleNamespace(fps=source.fps, height=height, width=width)
-    counts = dict.fromkeys(parts, 0)
-    with parts["images"].open("w") as images, parts["annotations"].open("w") as annotations:
-        for number, video in zip(source.numbers, source.videos(), strict=True):
+    first = source.places.start
+    with (
+        (source.notes / f"images-{first:09d}").open("w") as images,
+        (source.notes / f"annotations-{first:09d}").open("w") as annotations,
+    ):
+        for place, number, video in zip(source.places, source.numbers, source.videos(), strict=True):
             scene = facts.VideoFacts(video | dict(source.ds.manifest.constants), size)
             for frame, mask in enumerate(video["masks/instance"]):
-                counts["images"] += 1
-                name = f"{source.key(number)}-{frame:04d}.png"
+                image_id, name = place * source.sizes["T"] + frame + 1, f"{source.key(number)}-{frame:04d}.png"
                 _write_png(target / name, video["frames"][frame])
-                image = {"id": counts["images"], "file_name": name, "height": height, "width": width}
-                image |= {"video_id": number, "frame_id": frame}
-                images.write(f"{',' if counts['images'] > 1 else ''}\n{json.dumps(image)}")
+                image = {"id": image_id, "file_name": name, "height": height, "width": width}
+                images.write(json.dumps(image | {"video_id": number, "frame_id": frame}) + "\n")
                 for entry in _annotations(video, scene, mask, frame):
-                    counts["annotations"] += 1
-                    entry = {"id": counts["annotations"], "image_id": counts["images"], **entry}
-                    annotations.write(f"{',' if counts['annotations'] > 1 else ''}\n{json.dumps(entry)}")
+                    annotations.write(json.dumps({"image_id": image_id, **entry}) + "\n")
             source.advance(1)
+
+
+def finish(target: Path, source: Source) -> None:
+    """Write the file of annotations from the notes of all parts."""
     keypoints = {"keypoints": ["centre", "front"], "skeleton": SKELETON}
     categories = [{"id": i, "name": name, **keypoints} for i, name in enumerate(facts.CLASSES, 1)]
     info = {"description": source.ds.manifest.plain["name"], "version": "1.0"}
     with (target / DESCRIPTION).open("w", newline="\n") as file:
         file.write(f'{{"info": {json.dumps(info)},\n"categories": {json.dumps(categories)}')
-        for name, part in parts.items():
-            file.write(f',\n"{name}": [')
-            with part.open() as lines:
-                file.writelines(lines)
-            file.write("]")
-            part.unlink()
-        file.write("}\n")
+        file.write(',\n"images": [')
+        file.writelines("," * (i > 1) + f"\n{entry}" for i, entry in arrays.notes(source, "images"))
+        file.write('],\n"annotations": [')
+        entries = arrays.notes(source, "annotations")
+        file.writelines("," * (i > 1) + f'\n{{"id": {i}, {entry[1:]}' for i, entry in entries)
+        file.write("]}\n")
 
 
 def _write_png(path: Path, image: np.ndarray) -> None:
@@ -120,6 +121,8 @@ def run_lengths(mask: np.ndarray) -> str:
 EXPORT = Export(
     fields=("frames", "masks/instance", "objects/*", "states/*", "camera/*", "world/*"),
     write=write,
+    separate=True,
+    finish=finish,
     fixed=True,
     loss="frames, masks, boxes and keypoints alone",
 )

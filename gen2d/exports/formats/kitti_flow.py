@@ -40,6 +40,7 @@ def _write_png(path: Path, image: np.ndarray) -> None:
 EXPORT = Export(
     fields=("frames", "flow/forward", "flow/forward_valid"),
     write=write,
+    separate=True,
     fixed=True,
     loss="frames and forward flow alone, rounded to 1/64 px",
 )

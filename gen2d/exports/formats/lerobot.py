@@ -2,7 +2,8 @@
 
     data/chunk-000/file-000.parquet         a row per frame: the fields that have a value per frame
     videos/observation.images.frames/...    a film per episode
-    meta/info.json, stats.json, tasks.parquet, episodes/...     features, statistics, tasks; a row per episode
+    meta/info.json, stats.json, tasks.parquet                   features, statistics, tasks
+    meta/episodes/chunk-000/file-000.parquet                    a row per episode, with its own statistics
 
 `observation.state` is the vector of all states; each field of a value per frame also has a column of its own, such as
 `observation.states.position` [slot, (x, y)]. Fields of a value per video, such as factors, are columns `gen2d/NAME` of
@@ -12,7 +13,7 @@ PyAV but for the codec mp4v.
 
 import json
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -23,6 +24,7 @@ from gen2d.plugin import Batch, ConfigError, Export, Field, Source, arrays, film
 from gen2d.plugin import dataset as loader
 
 VERSION = "v3.0"
+EPISODES = "meta/episodes"
 CAMERA, STATE = "observation.images.frames", "observation.state"
 STATES = ("states/position", "states/velocity", "states/angle", "states/angular_velocity")
 TASK, CAPTION = "Predict the motion of the objects.", "text/short_caption"
@@ -51,7 +53,7 @@ _PANDAS = {
 
 def part_videos(source: Source) -> int:
     """Number of videos in a data file."""
-    size = sum(math.prod(_shape(source, field)) * 8 for field in _frame_fields(source).values()) * source.ds.sizes["T"]
+    size = sum(math.prod(_shape(source, field)) * 8 for field in _frame_fields(source).values()) * source.sizes["T"]
     return max(1, min(FILE_VIDEOS, FILE_BYTES // max(1, size)))
 
 
@@ -64,17 +66,17 @@ def check(source: Source) -> None:
 
 
 def write(target: Path, source: Source) -> None:
-    """Write a data file, and the films of its episodes."""
+    """Write a data file, the films of its episodes, and a file with their rows."""
     codec, fields, arrow = films.CODECS[source.codec], _frame_fields(source), tables.pyarrow()
-    first = source.places.start
-    path = _file(target / "data", first // part_videos(source), ".parquet")
+    number, episodes = source.places.start // part_videos(source), []
+    path = _file(target / "data", number, ".parquet")
     schema = arrow.schema([(name, kind) for name, kind in _types(source, fields).items()])
     episode_of = {source.key(number): place for place, number in zip(source.places, source.numbers, strict=True)}
 
     def encoded(key: str, video: Batch) -> Batch:
         film = _file(target / "videos" / CAMERA, episode_of[key], codec.suffix)
         codec.write(film, video["frames"], source.fps)
-        return arrays.without_frames(video)
+        return arrays.without_frames(video) | {CAMERA: _histogram(video["frames"])}
 
     with arrow.parquet.ParquetWriter(path, schema, compression="zstd") as writer:
         videos, places = source.map(encoded), iter(source.places)
@@ -83,26 +85,25 @@ def write(target: Path, source: Source) -> None:
             rows = _rows(source, fields, group, own)
             table = arrow.Table.from_arrays([tables.nested(values) for values in rows.values()], schema=schema)
             writer.write_table(table)
+            episodes += [_episode(source, place, video) for place, video in zip(own, group, strict=True)]
             source.advance(len(group))
+    arrow.parquet.write_table(arrow.Table.from_pylist(episodes), _file(target / EPISODES, number, ".parquet"))
 
 
 def finish(target: Path, source: Source) -> None:
-    """Write meta/ and the card."""
-    arrow, fields, frames = tables.pyarrow(), _frame_fields(source), source.ds.sizes["T"]
-    statistics, episodes, tasks = _Statistics(), [], dict[str, int]()
-    for place, video in enumerate(_videos(source)):
-        statistics.add({STATE: _state(video), **{_column(name): video[name] for name in fields}})
-        task = _task(video)
-        tasks.setdefault(task, len(tasks))
-        episodes.append(_episode(source, place, task, video))
-    about, meta = _info(source, fields, len(episodes), len(tasks)), target / "meta"
+    """Write the files of meta/ that are of all episodes, and the card."""
+    arrow, fields, frames = tables.pyarrow(), _frame_fields(source), source.sizes["T"]
+    statistics, tasks = _Statistics(), dict[str, int]()
+    for video in _videos(source):
+        statistics.add(_columns(source, video, fields))
+        tasks.setdefault(_task(video), len(tasks))
+    about, meta = _info(source, fields, len(source), len(tasks)), target / "meta"
     meta.mkdir(exist_ok=True)
     (meta / "info.json").write_text(json.dumps(about, indent=4) + "\n")
     (meta / "stats.json").write_text(json.dumps(statistics.as_json() | _frame_statistics(source), indent=4) + "\n")
     table = arrow.table({"task_index": list(tasks.values()), "__index_level_0__": list(tasks)})
     arrow.parquet.write_table(table.replace_schema_metadata({"pandas": json.dumps(_PANDAS)}), meta / "tasks.parquet")
-    arrow.parquet.write_table(arrow.Table.from_pylist(episodes), _file(meta / "episodes", 0, ".parquet"))
-    text = f"{len(episodes)} episodes of {frames} frames for `lerobot`: `LeRobotDataset(REPOSITORY, root=FOLDER)`."
+    text = f"{len(source)} episodes of {frames} frames for `lerobot`: `LeRobotDataset(REPOSITORY, root=FOLDER)`."
     tables.write_card(target, source, [*source.fields], "data/*/*.parquet", text, ("LeRobot",))
 
 
@@ -125,7 +126,7 @@ def _column(name: str) -> str:
 
 def _shape(source: Source, field: Field) -> tuple[int, ...]:
     """Shape of a frame's value; a single value has the shape (1,)."""
-    return field.shape(source.ds.sizes)[1:] or (1,)
+    return field.shape(source.sizes)[1:] or (1,)
 
 
 def _state(video: Batch) -> np.ndarray:
@@ -141,7 +142,7 @@ def _state_names(source: Source) -> list[str]:
     names = []
     for name in STATES:
         if name in source.fields:
-            shape = source.fields[name].shape(source.ds.sizes)[1:]
+            shape = source.fields[name].shape(source.sizes)[1:]
             ends = (".x", ".y") if len(shape) == 2 else ("",)
             names += [f"{name.split('/')[1]}.{slot}{end}" for slot in range(shape[0]) for end in ends]
     return names
@@ -173,7 +174,7 @@ def _types(source: Source, fields: dict[str, Field]) -> dict[str, Any]:
 
 def _rows(source: Source, fields: dict[str, Field], group: list[Batch], places: list[int]) -> dict[str, np.ndarray]:
     """Columns of the frames of these videos."""
-    frames, rows = source.ds.sizes["T"], dict[str, np.ndarray]()
+    frames, rows = source.sizes["T"], dict[str, np.ndarray]()
     if _state_names(source):
         rows[STATE] = np.concatenate([_state(video) for video in group])
     for name in fields:
@@ -212,12 +213,12 @@ def _task(video: Batch) -> str:
     return bytes(video[CAPTION]).decode() or TASK if CAPTION in video else TASK
 
 
-def _episode(source: Source, place: int, task: str, video: Batch) -> dict[str, Any]:
-    """Row of an episode."""
-    frames, data = source.ds.sizes["T"], place // part_videos(source)
+def _episode(source: Source, place: int, video: Batch) -> dict[str, Any]:
+    """Row of an episode, from the video with the histogram of its frames in their place."""
+    frames, data = source.sizes["T"], place // part_videos(source)
     row = {
         "episode_index": place,
-        "tasks": [task],
+        "tasks": [_task(video)],
         "length": frames,
         "data/chunk_index": data // CHUNK,
         "data/file_index": data % CHUNK,
@@ -227,14 +228,44 @@ def _episode(source: Source, place: int, task: str, video: Batch) -> dict[str, A
         f"videos/{CAMERA}/file_index": place % CHUNK,
         f"videos/{CAMERA}/from_timestamp": 0.0,
         f"videos/{CAMERA}/to_timestamp": frames / source.fps,
-        "meta/episodes/chunk_index": 0,
-        "meta/episodes/file_index": 0,
+        f"{EPISODES}/chunk_index": data // CHUNK,
+        f"{EPISODES}/file_index": data % CHUNK,
     }
     for name, field in source.fields.items():
         if "T" not in field.axes.split():
             value = video[name]
             row[f"gen2d/{name}"] = bytes(value).decode() if field.is_text and not value.ndim else _plain(value)
+    for name, values in _episode_statistics(source, video).items():
+        row |= {f"stats/{name}/{key}": value for key, value in values.items()}
     return row
+
+
+def _episode_statistics(source: Source, video: Batch) -> dict[str, Any]:
+    """Statistics of an episode, of the frames and of columns of one axis; LeRobot reads those of no others back."""
+    statistics, fields = _Statistics(), _frame_fields(source)
+    statistics.add(_columns(source, video, [name for name in fields if len(_shape(source, fields[name])) == 1]))
+    return statistics.as_json() | {CAMERA: _camera_statistics(video[CAMERA], source.sizes["T"])}
+
+
+def _columns(source: Source, video: Batch, names: Iterable[str]) -> Batch:
+    """Values of a video's frames by LeRobot's names: the vector of all states, and these fields."""
+    state = {STATE: _state(video)} if _state_names(source) else {}
+    return state | {_column(name): video[name] for name in names}
+
+
+def _histogram(frames: np.ndarray) -> np.ndarray:
+    """Number of pixels of each grey level, by channel [3, 256]."""
+    return np.stack([np.bincount(frames[..., channel].ravel(), minlength=256) for channel in range(3)])
+
+
+def _camera_statistics(histogram: np.ndarray, frames: int) -> dict[str, Any]:
+    """Statistics of an episode's frames, from 0 to 1."""
+    levels, share = np.arange(256) / 255, histogram / histogram.sum(-1, keepdims=True)
+    mean = share @ levels
+    ends = [[levels[np.flatnonzero(counts)[end]] for counts in histogram] for end in (0, -1)]
+    std = np.sqrt((share * (levels - mean[:, None]) ** 2).sum(-1))
+    values = {"min": ends[0], "max": ends[1], "mean": mean, "std": std}
+    return {key: [[[float(value)]] for value in channels] for key, channels in values.items()} | {"count": [frames]}
 
 
 def _plain(value: np.ndarray) -> Any:
@@ -254,7 +285,7 @@ def _info(source: Source, fields: dict[str, Field], episodes: int, tasks: int) -
         "codebase_version": VERSION,
         "robot_type": "gen2d",
         "total_episodes": episodes,
-        "total_frames": episodes * source.ds.sizes["T"],
+        "total_frames": episodes * source.sizes["T"],
         "total_tasks": tasks,
         "chunks_size": CHUNK,
         "data_files_size_in_mb": 100,
@@ -301,7 +332,7 @@ def _frame_statistics(source: Source) -> dict[str, Any]:
     if stats is None:
         return {}
     channels = {key: [[[value / 255]] for value in stats[key] or []] for key in ("min", "max", "mean", "std")}
-    return {CAMERA: channels | {"count": [len(source) * source.ds.sizes["T"]]}}
+    return {CAMERA: channels | {"count": [len(source) * source.sizes["T"]]}}
 
 
 EXPORT = Export(

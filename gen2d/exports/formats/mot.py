@@ -50,6 +50,7 @@ def _lines(video: Batch, height: int, width: int) -> list[str]:
 EXPORT = Export(
     fields=("frames", "boxes/amodal", "visibility/fraction", "objects/present", "objects/kind"),
     write=write,
+    separate=True,
     fixed=True,
     loss="frames, boxes and visibility of moving objects alone",
 )

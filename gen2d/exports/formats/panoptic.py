@@ -11,7 +11,7 @@ from types import SimpleNamespace
 import cv2
 import numpy as np
 
-from gen2d.plugin import Export, Source, facts
+from gen2d.plugin import Export, Source, arrays, facts
 
 OCCLUDER, BACKGROUND = 255, 256
 STUFF = ("background", "occluder")
@@ -19,40 +19,41 @@ CLASSES = (*facts.CLASSES, *STUFF)
 
 
 def write(target: Path, source: Source) -> None:
-    """Write images, segments and their description to the folder."""
+    """Write images and segments to the folder, and notes with their entries."""
     for name in ("images", "panoptic"):
         (target / name).mkdir()
     height, width = source.frame_size
     size = SimpleNamespace(fps=source.fps, height=height, width=width)
-    images, annotations = target / ".images", target / ".annotations"
-    with images.open("w") as image_lines, annotations.open("w") as annotation_lines:
-        count = 0
-        for number, video in zip(source.numbers, source.videos(), strict=True):
+    first = source.places.start
+    with (
+        (source.notes / f"images-{first:09d}").open("w") as images,
+        (source.notes / f"annotations-{first:09d}").open("w") as annotations,
+    ):
+        for place, number, video in zip(source.places, source.numbers, source.videos(), strict=True):
             nouns = facts.VideoFacts(video | dict(source.ds.manifest.constants), size).nouns
             for frame, mask in enumerate(video["masks/instance"]):
-                count += 1
+                image_id = place * source.sizes["T"] + frame + 1
                 name = f"{source.key(number)}-{frame:04d}.png"
                 segments = np.where(mask == 0, BACKGROUND, mask.astype(np.int32))
                 _write_png(target / "images" / name, video["frames"][frame])
                 _write_png(target / "panoptic" / name, np.stack([segments & 255, segments >> 8, 0 * segments], -1))
                 infos = [_segment(segments == i, int(i), nouns) for i in np.unique(segments)]
-                image = {"id": count, "file_name": name, "height": height, "width": width, "video_id": number}
-                comma = ",\n" if count > 1 else ""
-                image_lines.write(comma + json.dumps(image))
-                annotation = {"image_id": count, "file_name": name, "segments_info": infos}
-                annotation_lines.write(comma + json.dumps(annotation))
+                image = {"id": image_id, "file_name": name, "height": height, "width": width, "video_id": number}
+                images.write(json.dumps(image) + "\n")
+                annotation = {"image_id": image_id, "file_name": name, "segments_info": infos}
+                annotations.write(json.dumps(annotation) + "\n")
             source.advance(1)
+
+
+def finish(target: Path, source: Source) -> None:
+    """Write the description from the notes of all parts."""
     categories = [{"id": i, "name": name, "isthing": int(name not in STUFF)} for i, name in enumerate(CLASSES, 1)]
     with (target / "panoptic.json").open("w", newline="\n") as file:
         file.write(f'{{"categories": {json.dumps(categories)},\n"images": [\n')
-        with images.open() as lines:
-            file.writelines(lines)
+        file.writelines(",\n" * (i > 1) + entry for i, entry in arrays.notes(source, "images"))
         file.write('\n],\n"annotations": [\n')
-        with annotations.open() as lines:
-            file.writelines(lines)
+        file.writelines(",\n" * (i > 1) + entry for i, entry in arrays.notes(source, "annotations"))
         file.write("\n]}\n")
-    images.unlink()
-    annotations.unlink()
 
 
 def _segment(shown: np.ndarray, number: int, nouns: dict[int, str]) -> dict:
@@ -73,6 +74,8 @@ def _write_png(path: Path, image: np.ndarray) -> None:
 EXPORT = Export(
     fields=("frames", "masks/instance", "objects/*", "states/*", "camera/*", "world/*"),
     write=write,
+    separate=True,
+    finish=finish,
     fixed=True,
     loss="frames and visible masks alone",
 )

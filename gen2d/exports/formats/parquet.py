@@ -31,7 +31,7 @@ def check(source: Source) -> None:
     if "frames" in source.fields and source.codec != "png":
         films.CODECS[source.codec].check(f"parquet with the codec {source.codec}", source.frame_size, source.fps)
     for name, field in source.fields.items():
-        if len(field.shape(source.ds.sizes)) > MOST_AXES:
+        if len(field.shape(source.sizes)) > MOST_AXES:
             raise ConfigError(
                 f"{name} has more than {MOST_AXES} axes, which parquet cannot hold: leave it out of the fields"
             )

@@ -6,7 +6,6 @@ code when it is loaded: load only those that you trust.
 """
 
 import pickle
-from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -16,18 +15,20 @@ from gen2d.plugin import Batch, Export, Source
 FILE_BYTES, FILE_VIDEOS = 2**28, 100  # maximum of a pickle, which holds one video at least
 
 
+def part_videos(source: Source) -> int:
+    """Number of videos in a pickle."""
+    return max(1, min(FILE_VIDEOS, FILE_BYTES // source.video_bytes))
+
+
 def write(target: Path, source: Source) -> None:
-    """Write the pickles to the folder."""
+    """Write SPLIT-000000.pkl, or another pickle of these videos."""
     height, width = source.frame_size
-    videos = zip(source.numbers, source.videos(), strict=True)
-    per_file = max(1, min(FILE_VIDEOS, FILE_BYTES // source.video_bytes))
-    for number in range(-(-len(source) // per_file)):
-        content = {}
-        for index, video in islice(videos, per_file):
-            content[source.key(index)] = tracks(video, height, width)
-            source.advance(1)
-        data = pickle.dumps(content, protocol=4)
-        (target / f"{source.ds.options.split}-{number:06d}.pkl").write_bytes(data)
+    content = {}
+    for index, video in zip(source.numbers, source.videos(), strict=True):
+        content[source.key(index)] = tracks(video, height, width)
+        source.advance(1)
+    path = target / f"{source.ds.options.split}-{source.places.start // part_videos(source):06d}.pkl"
+    path.write_bytes(pickle.dumps(content, protocol=4))
 
 
 def tracks(video: Batch, height: int, width: int) -> dict[str, np.ndarray]:
@@ -42,6 +43,8 @@ def tracks(video: Batch, height: int, width: int) -> dict[str, np.ndarray]:
 EXPORT = Export(
     fields=("frames", "tracks/points", "tracks/visible", "tracks/object"),
     write=write,
+    separate=True,
+    part_videos=part_videos,
     fixed=True,
     loss="frames and tracks alone",
 )
