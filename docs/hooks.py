@@ -20,10 +20,7 @@ JOINING = {
     "CHANGELOG.md": "changes.md",
     "gen2d/README.md": "tour.md",
     "tests/README.md": "tests.md",
-    "gen2d/gallery.png": "gallery.png",
 }
-# Pictures and notebooks that one command makes, and that a checkout may lack: their links are left out.
-MADE = re.compile(r"docs/(?:families/\w+\.webp|notebooks/\w+\.ipynb)")
 LINK = re.compile(r"(!?)\[((?:[^\[\]]|\[[^\]]*\])*)\]\(([^)\s]+)\)")
 BLOCK = re.compile(r"(^```.*?^```$)", re.DOTALL | re.MULTILINE)
 
@@ -49,8 +46,6 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
             return found[0]
         path = posixpath.normpath(posixpath.join(posixpath.dirname(home), target))
         missing = not (ROOT / path).exists()
-        if missing and MADE.fullmatch(path):
-            return "" if picture else text
         if missing:
             log.warning("%s links to %s, which is not there", home, link)
         name = JOINING.get(path) or (path.removeprefix("docs/") if path.startswith("docs/") else None)

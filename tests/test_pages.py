@@ -20,9 +20,6 @@ ELSEWHERE = {"docs/loading.md"}  # whose blocks loading/test_loading_page.py run
 OTHERS = [
     *("README.md", "CONTRIBUTING.md", "CHANGELOG.md", "datasets/README.md", "gen2d/README.md", "tests/README.md"),
 ]
-# Pictures and notebooks that one command makes, and that a checkout may lack; hooks.py leaves their links out.
-MADE = re.compile(r"docs/(?:families/\w+\.webp|notebooks/\w+\.ipynb)")
-
 NOT_OURS = {"config.yaml", "my/format.py"}  # of a dataset, of a reader
 
 
@@ -81,7 +78,7 @@ def test_links_lead_to_files_and_headings(page: str):
             continue
         path = ((ROOT / page).parent / target).resolve() if target else ROOT / page
         name = path.relative_to(ROOT).as_posix()
-        assert path.exists() or MADE.fullmatch(name), f"{page} links to {link}"
+        assert path.exists(), f"{page} links to {link}"
         assert not anchor or anchor in anchors(path), f"{page} links to {link}, but {name} has no such heading"
 
 
