@@ -36,11 +36,11 @@ class ConcatDataset(Selectable):
 
     def __init__(self, datasets: Sequence[VideoReader]) -> None:
         self.datasets = list(datasets)
-        self.sizes = np.array([len(source) for source in self.datasets])
-        self.firsts = np.cumsum(self.sizes) - self.sizes  # index of each dataset's first video
+        self._sizes = np.array([len(source) for source in self.datasets])
+        self._firsts = np.cumsum(self._sizes) - self._sizes  # index of each dataset's first video
 
     def __len__(self) -> int:
-        return int(self.sizes.sum())
+        return int(self._sizes.sum())
 
     def __getitem__(self, key: Key) -> Batch:
         """One video for an integer, or a batch of videos for a slice or a sequence of integers."""
@@ -56,20 +56,20 @@ class ConcatDataset(Selectable):
         raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
 
     @property
-    def stored_fields(self) -> Mapping[str, Field]:
+    def _stored_fields(self) -> Mapping[str, Field]:
         """The stored fields that all datasets have, by name."""
-        first, *others = (source.stored_fields for source in self.datasets)
+        first, *others = (source._stored_fields for source in self.datasets)
         return {name: field for name, field in first.items() if all(name in fields for fields in others)}
 
     @property
-    def stored_sizes(self) -> Mapping[str, int]:
+    def _stored_sizes(self) -> Mapping[str, int]:
         """Sizes of the axes of the stored fields."""
-        return self.datasets[0].stored_sizes
+        return self.datasets[0]._stored_sizes
 
     @property
-    def short_name(self) -> str:
+    def _short_name(self) -> str:
         """Names of the datasets for error messages."""
-        return ", ".join(source.short_name for source in self.datasets)
+        return ", ".join(source._short_name for source in self.datasets)
 
     @property
     def fps(self) -> float:
@@ -77,14 +77,14 @@ class ConcatDataset(Selectable):
         return self.datasets[0].fps
 
     @property
-    def title(self) -> str:
+    def _title(self) -> str:
         """First line of the description."""
         return f"{len(self):,} videos of {len(self.datasets)} datasets, one after the other"
 
     @property
-    def details(self) -> list[str]:
+    def _details(self) -> list[str]:
         """Further lines of the description."""
-        return [*(source.title for source in self.datasets), *self.datasets[0].details[:1]]
+        return [*(source._title for source in self.datasets), *self.datasets[0]._details[:1]]
 
     @property
     def fields(self) -> dict[str, Field]:
@@ -97,9 +97,9 @@ class ConcatDataset(Selectable):
         return all(source.exact for source in self.datasets)
 
     @property
-    def slice_size(self) -> int:
+    def _slice_size(self) -> int:
         """Number of videos that are best filled together."""
-        return max(source.slice_size for source in self.datasets)
+        return max(source._slice_size for source in self.datasets)
 
     @property
     def time(self) -> np.ndarray:
@@ -110,7 +110,7 @@ class ConcatDataset(Selectable):
     def stats(self) -> FieldStats:
         """Pooled statistics of each field; datasets are weighted by their numbers of videos."""
         parts = [source.stats for source in self.datasets]
-        return {name: _pool_stats([part[name] for part in parts], self.sizes) for name in parts[0]}
+        return {name: _pool_stats([part[name] for part in parts], self._sizes) for name in parts[0]}
 
     @property
     def snapshot(self) -> Snapshot:
@@ -132,31 +132,31 @@ class ConcatDataset(Selectable):
         """Uninitialised batch of `count` videos."""
         return self.datasets[0].empty(count)
 
-    def fill(self, out: Batch, rows: Numbers, indices: Numbers, starts: Numbers | None = None) -> None:
-        """Read the videos with these indices into these rows of `out`. Parameters are those of `Dataset.fill`."""
+    def _fill(self, out: Batch, rows: Numbers, indices: Numbers, starts: Numbers | None = None) -> None:
+        """Read the videos with these indices into these rows of `out`. Parameters are those of `Dataset._fill`."""
         numbers, targets = np.asarray(indices), np.asarray(rows)
         for owner, members in self._group_by_dataset(numbers):
             own_starts = None if starts is None else np.asarray(starts)[members]
-            self.datasets[owner].fill(out, targets[members], numbers[members] - self.firsts[owner], own_starts)
+            self.datasets[owner]._fill(out, targets[members], numbers[members] - self._firsts[owner], own_starts)
 
-    def stored(self, names: Sequence[str], indices: Numbers) -> Batch:
-        """Stored values of whole videos, as those of `Dataset.stored`."""
-        numbers, found = np.asarray(indices), self.datasets[0].stored(names, [])
+    def _stored(self, names: Sequence[str], indices: Numbers) -> Batch:
+        """Stored values of whole videos, as those of `Dataset._stored`."""
+        numbers, found = np.asarray(indices), self.datasets[0]._stored(names, [])
         out = {name: np.empty((len(numbers), *values.shape[1:]), values.dtype) for name, values in found.items()}
         for owner, members in self._group_by_dataset(numbers):
-            for name, values in self.datasets[owner].stored(names, numbers[members] - self.firsts[owner]).items():
+            for name, values in self.datasets[owner]._stored(names, numbers[members] - self._firsts[owner]).items():
                 out[name][members] = values
         return out
 
-    def numbers_at(self, positions: np.ndarray, epoch: int = 0, seed: int | None = None) -> np.ndarray:
+    def _numbers_at(self, positions: np.ndarray, epoch: int = 0, seed: int | None = None) -> np.ndarray:
         """Indices of the videos at these positions of an epoch, shuffled over all datasets unless `seed` is None."""
         return epoch_indices(seed, epoch, positions, len(self))
 
-    def starts(self, numbers: np.ndarray, bits: np.ndarray) -> np.ndarray | None:
+    def _starts(self, numbers: np.ndarray, bits: np.ndarray) -> np.ndarray | None:
         """First frame of each video's window, sampled from random bits; None if windows are not random."""
         starts = np.zeros(len(numbers), np.int64)
         for owner, members in self._group_by_dataset(numbers):
-            own_starts = self.datasets[owner].starts(numbers[members] - self.firsts[owner], bits[members])
+            own_starts = self.datasets[owner]._starts(numbers[members] - self._firsts[owner], bits[members])
             if own_starts is None:
                 return None
             starts[members] = own_starts
@@ -164,7 +164,7 @@ class ConcatDataset(Selectable):
 
     def _group_by_dataset(self, numbers: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
         """Position of each dataset that holds some of these videos, and their positions in `numbers`."""
-        return groups_of(np.searchsorted(self.firsts, numbers, side="right") - 1)
+        return groups_of(np.searchsorted(self._firsts, numbers, side="right") - 1)
 
 
 def at_snapshots(datasets: Sequence[VideoReader], snapshots: Snapshot) -> list[VideoReader]:

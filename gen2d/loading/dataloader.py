@@ -247,13 +247,13 @@ class DataLoader(Generic[A]):
     def _submit(self, pool: ThreadPoolExecutor, step: GlobalBatch) -> Future[Any]:
         """Future of this rank's slice of a global batch, which all threads fill together."""
         positions = self.epoch_sampler.rank_positions(step)
-        indices = self.dataset.numbers_at(positions, step.epoch, self.epoch_sampler.shuffled_by)
-        starts = self.dataset.starts(indices, self.epoch_sampler.window_bits(step, positions))
+        indices = self.dataset._numbers_at(positions, step.epoch, self.epoch_sampler.shuffled_by)
+        starts = self.dataset._starts(indices, self.epoch_sampler.window_bits(step, positions))
         # A new batch each time, because jax may keep the memory of the arrays that it receives.
         out = self.dataset.empty(len(indices))
-        slices = -(-len(indices) // self.dataset.slice_size)
+        slices = -(-len(indices) // self.dataset._slice_size)
         parts = [
-            pool.submit(self.dataset.fill, out, part, indices[part], None if starts is None else starts[part])
+            pool.submit(self.dataset._fill, out, part, indices[part], None if starts is None else starts[part])
             for part in np.array_split(np.arange(len(indices)), min(self.threads, slices or 1))
             if len(part)
         ]

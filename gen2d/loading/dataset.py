@@ -308,6 +308,8 @@ class Dataset(Selectable):
         or rendered by other versions or another kind of device, which changes values by a grey level.
     snapshot : str
         sha256 of the manifest, which identifies the current state of a growing dataset.
+    root : Path or Url
+        Folder or URL of the dataset.
     manifest : Manifest
         Contents of manifest.json: sizes, fps, config, splits, checksums and more.
     options : ViewOptions
@@ -326,7 +328,7 @@ class Dataset(Selectable):
         self.fields, self.sizes = {name: manifest.fields[name] for name in options.fields}, dict(manifest.sizes)
         self.stats = {name: values for name, values in manifest.stats[options.split].items() if name in self.fields}
         view = options.layout, options.window, options.stride, options.dtype
-        self.slice_size = 1  # videos that are best filled together
+        self._slice_size = 1  # videos that are best filled together
         self._columns = self._stored_columns = [Column(name, manifest, *view) for name in self.fields]
         cache = None
         if isinstance(root, Url) and options.cache_dir is not None:
@@ -387,27 +389,27 @@ class Dataset(Selectable):
         return self.manifest.fps
 
     @property
-    def stored_fields(self) -> Mapping[str, Field]:
+    def _stored_fields(self) -> Mapping[str, Field]:
         """All stored fields of the dataset, by name, whichever were opened."""
         return self.manifest.fields
 
     @property
-    def stored_sizes(self) -> Mapping[str, int]:
+    def _stored_sizes(self) -> Mapping[str, int]:
         """Sizes of the axes of the stored fields."""
         return self.manifest.sizes
 
     @property
-    def short_name(self) -> str:
+    def _short_name(self) -> str:
         """Name of the dataset for error messages."""
         return f"{self.root}"
 
     @property
-    def title(self) -> str:
+    def _title(self) -> str:
         """First line of the description."""
         return f"{len(self):,} {self.options.split} videos of {self.root}"
 
     @property
-    def details(self) -> list[str]:
+    def _details(self) -> list[str]:
         """Further lines of the description."""
         options, others = self.options, [name for name in self.manifest.splits if name != self.options.split]
         size = f" of {self.sizes['W']} x {self.sizes['H']} px" if {"W", "H"} <= self.sizes.keys() else ""
@@ -461,7 +463,7 @@ class Dataset(Selectable):
         >>> batch = ds.batch([3, 1, 4])
         >>> ds.batch([5, 9, 2], out=batch)  # reuses the arrays
         """
-        return read_batch(self, self.numbers(indices), starts, out)
+        return read_batch(self, self._numbers(indices), starts, out)
 
     def empty(self, count: int) -> Batch:
         """Uninitialised batch of `count` videos. Raises UserError if it does not fit in memory."""
@@ -472,7 +474,7 @@ class Dataset(Selectable):
             size = sum(math.prod((count, *column.shape)) * column.dtype.itemsize for column in self._columns)
             raise UserError(f"{self.root}: {count} videos take {in_bytes(size)}, more than there is memory") from None
 
-    def fill(self, out: Batch, rows: Numbers, indices: Numbers, starts: Numbers | None = None) -> None:
+    def _fill(self, out: Batch, rows: Numbers, indices: Numbers, starts: Numbers | None = None) -> None:
         """Read the videos with these indices into `out`; raises the errors of `batch`.
 
         Several threads may fill different rows of one batch.
@@ -488,7 +490,7 @@ class Dataset(Selectable):
         starts : sequence of int [n], optional
             First frame of each video's window, as in `batch`.
         """
-        numbers = self.numbers(indices)
+        numbers = self._numbers(indices)
         first_frames, targets = self._begins(numbers, starts), np.asarray(rows).tolist()
         begins = first_frames.tolist()
         self._fill_window(out, targets, first_frames)
@@ -506,7 +508,7 @@ class Dataset(Selectable):
                 if scratch is not None:
                     column.convert(scratch, begin, target)
 
-    def stored(self, names: Sequence[str], indices: Numbers) -> Batch:
+    def _stored(self, names: Sequence[str], indices: Numbers) -> Batch:
         """Stored values of whole videos, [n, ...] by field name, whatever was opened; raises the errors of `batch`.
 
         Parameters
@@ -564,18 +566,18 @@ class Dataset(Selectable):
                 raise type(error)(where) from error
             raise (FolderError if isinstance(error, FileNotFoundError) else UnreachableError)(where) from error
 
-    def numbers_at(self, positions: np.ndarray, epoch: int = 0, seed: int | None = None) -> np.ndarray:
+    def _numbers_at(self, positions: np.ndarray, epoch: int = 0, seed: int | None = None) -> np.ndarray:
         """Indices of the videos at these positions of an epoch: shuffled by the seed, or in order if it is None."""
         return epoch_indices(seed, epoch, positions, len(self))
 
-    def starts(self, numbers: np.ndarray, bits: np.ndarray) -> np.ndarray | None:
+    def _starts(self, numbers: np.ndarray, bits: np.ndarray) -> np.ndarray | None:
         """First frames of the windows of the videos `numbers` [n], int64 [n], sampled from random `bits`, uint64 [n].
 
         None if windows are not random.
         """
         return self.options.starts(bits, self._frames)
 
-    def numbers(self, indices: Numbers) -> np.ndarray:
+    def _numbers(self, indices: Numbers) -> np.ndarray:
         """Indices from 0 to `len(self) - 1`, int64 [n]; negative indices count from the end.
 
         Raises TypeError for indices that are not integers, IndexError for indices out of range.

@@ -83,7 +83,7 @@ class Mixture:
         self.datasets, self.shares = dict(datasets), list(shares)
         self.fields = next(iter(datasets.values())).fields
         self._concatenation = ConcatDataset(list(datasets.values()))
-        sizes = self._concatenation.sizes
+        sizes = self._concatenation._sizes
         self._schedule = tijdeman_schedule(self.shares, sizes.tolist())
         counts = np.cumsum(self._schedule[:, None] == np.arange(len(shares)), axis=0)
         # Videos of each dataset before each position of the period, and in a whole epoch.
@@ -125,7 +125,7 @@ class Mixture:
         """Title, lines and fields of the description."""
         title = f"{len(self):,} videos, mixed from {len(self.datasets)} datasets"
         parts = (
-            f"{share} in {sum(self.shares)}: {name}, {source.title}"
+            f"{share} in {sum(self.shares)}: {name}, {source._title}"
             for (name, source), share in zip(self.datasets.items(), self.shares, strict=True)
         )
         return title, list(parts), self.fields
@@ -141,9 +141,9 @@ class Mixture:
         return self._concatenation.exact
 
     @property
-    def slice_size(self) -> int:
+    def _slice_size(self) -> int:
         """Number of videos that are best filled together."""
-        return self._concatenation.slice_size
+        return self._concatenation._slice_size
 
     @property
     def snapshot(self) -> Snapshot:
@@ -167,18 +167,18 @@ class Mixture:
         """
         checked = checked_numbers(positions, len(self), "the mixture")
         out = self.empty(len(checked))
-        self.fill(out, range(len(checked)), self.numbers_at(checked))
+        self._fill(out, range(len(checked)), self._numbers_at(checked))
         return out
 
     def empty(self, count: int) -> Batch:
         """Uninitialised batch of `count` videos."""
         return self._concatenation.empty(count)
 
-    def fill(self, out: Batch, rows: Numbers, indices: Numbers, starts: Numbers | None = None) -> None:
-        """Read videos of the concatenated datasets into these rows of `out`. Parameters are those of `Dataset.fill`."""
-        self._concatenation.fill(out, rows, indices, starts)
+    def _fill(self, out: Batch, rows: Numbers, indices: Numbers, starts: Numbers | None = None) -> None:
+        """Read videos of the concatenation into these rows of `out`. Parameters are those of `Dataset._fill`."""
+        self._concatenation._fill(out, rows, indices, starts)
 
-    def numbers_at(self, positions: np.ndarray, epoch: int = 0, seed: int | None = None) -> np.ndarray:
+    def _numbers_at(self, positions: np.ndarray, epoch: int = 0, seed: int | None = None) -> np.ndarray:
         """Indices into the concatenated datasets, int64 [n], of the videos at these positions of an epoch.
 
         Each dataset is shuffled by a seed of its own, or read in order if `seed` is None. An epoch continues in each
@@ -189,17 +189,17 @@ class Mixture:
         for owner, rows in groups_of(owners):
             counts = self._counts_before[:, owner]
             offset = epoch * self._epoch_counts[owner] + periods[rows] * counts[-1] + counts[steps[rows]]
-            source, cycles = self._concatenation.datasets[owner], offset // self._concatenation.sizes[owner]
+            source, cycles = self._concatenation.datasets[owner], offset // self._concatenation._sizes[owner]
             source_seed = None if seed is None else int(hashed(SOURCES, seed, owner)[0])
             for cycle in np.unique(cycles):
                 selected = rows[cycles == cycle]
-                indices = source.numbers_at(offset[cycles == cycle] % len(source), int(cycle), source_seed)
-                numbers[selected] = self._concatenation.firsts[owner] + indices
+                indices = source._numbers_at(offset[cycles == cycle] % len(source), int(cycle), source_seed)
+                numbers[selected] = self._concatenation._firsts[owner] + indices
         return numbers
 
-    def starts(self, numbers: np.ndarray, bits: np.ndarray) -> np.ndarray | None:
+    def _starts(self, numbers: np.ndarray, bits: np.ndarray) -> np.ndarray | None:
         """First frame of each video's window, sampled from random bits; None if windows are not random."""
-        return self._concatenation.starts(numbers, bits)
+        return self._concatenation._starts(numbers, bits)
 
     def source_of(self, positions: Numbers) -> list[str]:
         """Name of the dataset at each of these positions, which is the same in every epoch."""

@@ -26,7 +26,10 @@ class VideoSequence(Protocol):
 
 
 class VideoReader(Protocol):
-    """Source of videos for `DataLoader`: a Dataset, a ConcatDataset or a Subset. `Dataset` describes the methods."""
+    """Source of videos for `DataLoader`: a Dataset, a ConcatDataset or a Subset. `Dataset` describes the methods.
+
+    Names with an underscore are for gen2d's own loaders.
+    """
 
     def __len__(self) -> int: ...
 
@@ -34,25 +37,25 @@ class VideoReader(Protocol):
     def fields(self) -> dict[str, Field]: ...
 
     @property
-    def stored_fields(self) -> Mapping[str, Field]: ...
+    def _stored_fields(self) -> Mapping[str, Field]: ...
 
     @property
-    def stored_sizes(self) -> Mapping[str, int]: ...
+    def _stored_sizes(self) -> Mapping[str, int]: ...
 
     @property
-    def short_name(self) -> str: ...  # for error messages
+    def _short_name(self) -> str: ...  # for error messages
 
     @property
-    def title(self) -> str: ...  # first line of the description
+    def _title(self) -> str: ...  # first line of the description
 
     @property
-    def details(self) -> list[str]: ...  # further lines
+    def _details(self) -> list[str]: ...  # further lines
 
     @property
     def fps(self) -> float: ...
 
     @property
-    def slice_size(self) -> int: ...  # number of videos that are best filled together
+    def _slice_size(self) -> int: ...  # number of videos that are best filled together
 
     @property
     def exact(self) -> bool: ...
@@ -72,13 +75,13 @@ class VideoReader(Protocol):
 
     def batch(self, indices: Numbers, /) -> Batch: ...
 
-    def stored(self, names: Sequence[str], indices: Numbers) -> Batch: ...
+    def _stored(self, names: Sequence[str], indices: Numbers) -> Batch: ...
 
-    def fill(self, out: Batch, rows: Numbers, indices: Numbers, starts: Numbers | None = None) -> None: ...
+    def _fill(self, out: Batch, rows: Numbers, indices: Numbers, starts: Numbers | None = None) -> None: ...
 
-    def numbers_at(self, positions: np.ndarray, epoch: int = 0, seed: int | None = None) -> np.ndarray: ...
+    def _numbers_at(self, positions: np.ndarray, epoch: int = 0, seed: int | None = None) -> np.ndarray: ...
 
-    def starts(self, numbers: np.ndarray, bits: np.ndarray) -> np.ndarray | None: ...
+    def _starts(self, numbers: np.ndarray, bits: np.ndarray) -> np.ndarray | None: ...
 
 
 def item(videos: VideoSequence, key: Key) -> Batch:
@@ -115,7 +118,7 @@ def read_batch(source: VideoReader, numbers: np.ndarray, starts: Numbers | None,
         out = source.empty(len(numbers))
     else:
         _check_out(out, source.empty(0), len(numbers))
-    source.fill(out, range(len(numbers)), numbers, starts)
+    source._fill(out, range(len(numbers)), numbers, starts)  # pyright: ignore[reportPrivateUsage]
     return out
 
 

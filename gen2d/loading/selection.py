@@ -35,11 +35,11 @@ def matching(videos: VideoReader, condition: str, name: str = "filter") -> np.nd
 
     Error messages call the condition `name`. Raises ConfigError if it is invalid, or names a field that is not stored.
     """
-    parsed = parse_filter(condition, videos.stored_fields, videos.stored_sizes, videos.short_name, name)
+    parsed = parse_filter(condition, videos._stored_fields, videos._stored_sizes, videos._short_name, name)
     mask = np.zeros(len(videos), bool)
     for first in range(0, len(videos), SCANNED):
         numbers = np.arange(first, min(first + SCANNED, len(videos)))
-        mask[numbers] = parsed.evaluate(videos.stored(parsed.fields, numbers))
+        mask[numbers] = parsed.evaluate(videos._stored(parsed.fields, numbers))
     return np.flatnonzero(mask)
 
 
@@ -154,7 +154,7 @@ class Selectable:
         ModuleNotFoundError
             If pyarrow is not installed.
         """
-        package, known = optional_package("pyarrow", "to_arrow"), self.stored_fields
+        package, known = optional_package("pyarrow", "to_arrow"), self._stored_fields
         found = {name: package.array(values) for name, values in _columns_of(self, fields).items()}
         about = {name: known[name.partition("[")[0]] for name in found}
         schema = [
@@ -168,18 +168,18 @@ class Selectable:
         return (item(self, index) for index in range(len(self)))
 
     def __repr__(self: VideoReader) -> str:
-        return describe_text(self.title, self.details, self.fields)
+        return describe_text(self._title, self._details, self.fields)
 
     def _repr_html_(self: VideoReader) -> str:
-        return describe_html(self.title, self.details, self.fields)
+        return describe_html(self._title, self._details, self.fields)
 
 
 def _columns_of(source: VideoReader, names: Sequence[str] | str | None) -> dict[str, Any]:
-    fields = source.stored_fields
-    chosen = table_fields(fields, names, source.short_name)
+    fields = source._stored_fields
+    chosen = table_fields(fields, names, source._short_name)
     numbers = np.arange(len(source))
     parts = [
-        source.stored(chosen, numbers[first : first + SCANNED]) for first in range(0, max(len(source), 1), SCANNED)
+        source._stored(chosen, numbers[first : first + SCANNED]) for first in range(0, max(len(source), 1), SCANNED)
     ]
     return columns({name: np.concatenate([part[name] for part in parts]) for name in chosen}, fields)
 
@@ -217,14 +217,14 @@ class Subset(Selectable):
         return self.source.fields
 
     @property
-    def stored_fields(self) -> Mapping[str, Field]:
+    def _stored_fields(self) -> Mapping[str, Field]:
         """All stored fields, by name."""
-        return self.source.stored_fields
+        return self.source._stored_fields
 
     @property
-    def stored_sizes(self) -> Mapping[str, int]:
+    def _stored_sizes(self) -> Mapping[str, int]:
         """Sizes of the axes of the stored fields."""
-        return self.source.stored_sizes
+        return self.source._stored_sizes
 
     @property
     def exact(self) -> bool:
@@ -232,9 +232,9 @@ class Subset(Selectable):
         return self.source.exact
 
     @property
-    def slice_size(self) -> int:
+    def _slice_size(self) -> int:
         """Number of videos that are best filled together."""
-        return self.source.slice_size
+        return self.source._slice_size
 
     @property
     def time(self) -> np.ndarray:
@@ -257,19 +257,19 @@ class Subset(Selectable):
         return [self.source.snapshot, hashlib.sha256(self.indices.astype("<i8").tobytes()).hexdigest()]
 
     @property
-    def short_name(self) -> str:
+    def _short_name(self) -> str:
         """Name of the source for error messages."""
-        return self.source.short_name
+        return self.source._short_name
 
     @property
-    def title(self) -> str:
+    def _title(self) -> str:
         """First line of the description."""
-        return f"{len(self):,} of the {self.source.title}"
+        return f"{len(self):,} of the {self.source._title}"
 
     @property
-    def details(self) -> list[str]:
+    def _details(self) -> list[str]:
         """Further lines of the description."""
-        return self.source.details
+        return self.source._details
 
     def at(self, snapshot: Snapshot) -> "Subset":
         """The same videos of an earlier snapshot of the source.
@@ -290,18 +290,18 @@ class Subset(Selectable):
         """Uninitialised batch of `count` videos."""
         return self.source.empty(count)
 
-    def fill(self, out: Batch, rows: Numbers, indices: Numbers, starts: Numbers | None = None) -> None:
-        """Read the videos with these indices into these rows of `out`. Parameters are those of `Dataset.fill`."""
-        self.source.fill(out, rows, self.indices[np.asarray(indices)], starts)
+    def _fill(self, out: Batch, rows: Numbers, indices: Numbers, starts: Numbers | None = None) -> None:
+        """Read the videos with these indices into these rows of `out`. Parameters are those of `Dataset._fill`."""
+        self.source._fill(out, rows, self.indices[np.asarray(indices)], starts)
 
-    def stored(self, names: Sequence[str], indices: Numbers) -> Batch:
-        """Stored values of whole videos, as those of `Dataset.stored`."""
-        return self.source.stored(names, self.indices[np.asarray(indices)])
+    def _stored(self, names: Sequence[str], indices: Numbers) -> Batch:
+        """Stored values of whole videos, as those of `Dataset._stored`."""
+        return self.source._stored(names, self.indices[np.asarray(indices)])
 
-    def numbers_at(self, positions: np.ndarray, epoch: int = 0, seed: int | None = None) -> np.ndarray:
+    def _numbers_at(self, positions: np.ndarray, epoch: int = 0, seed: int | None = None) -> np.ndarray:
         """Indices of the videos at these positions of an epoch, shuffled unless `seed` is None."""
         return epoch_indices(seed, epoch, positions, len(self))
 
-    def starts(self, numbers: np.ndarray, bits: np.ndarray) -> np.ndarray | None:
+    def _starts(self, numbers: np.ndarray, bits: np.ndarray) -> np.ndarray | None:
         """First frame of each video's window, sampled from random bits; None if windows are not random."""
-        return self.source.starts(self.indices[numbers], bits)
+        return self.source._starts(self.indices[numbers], bits)

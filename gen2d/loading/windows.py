@@ -18,7 +18,7 @@ from gen2d.loading.protocols import Batch, Numbers, VideoReader, checked_numbers
 
 def checked_source(ds: object) -> VideoReader | Mixture:
     """The dataset itself. Raises ConfigError for anything that `gen2d.open` and `gen2d.mix` do not return."""
-    if not all(hasattr(ds, name) for name in ("numbers_at", "starts", "fill", "empty")):
+    if not all(hasattr(ds, name) for name in ("_numbers_at", "_starts", "_fill", "empty")):
         raise ConfigError(f"ds is {ds!r:.80}, but must be a dataset from gen2d.open or gen2d.mix")
     return ds  # pyright: ignore[reportReturnType]
 
@@ -41,20 +41,20 @@ def batch_of_epoch(source: VideoReader | Mixture, indices: Numbers, epoch: int, 
     """
     positions = checked_numbers(indices, len(source), "the dataset")
     bits = hashed(INDEX_WINDOWS, seed, epoch, positions)
-    return _read(source, source.numbers_at(positions, epoch), bits)
+    return _read(source, source._numbers_at(positions, epoch), bits)
 
 
 def batch_at(
     source: VideoReader | Mixture, positions: np.ndarray, epoch: int, seed: int, shuffled_by: int | None
 ) -> Batch:
     """Batch of the videos at these positions of an epoch: those, with their windows, that `DataLoader` gives."""
-    numbers = source.numbers_at(positions, epoch, shuffled_by)
+    numbers = source._numbers_at(positions, epoch, shuffled_by)
     return _read(source, numbers, hashed(WINDOWS, seed, epoch, positions))
 
 
 def _read(source: VideoReader | Mixture, numbers: np.ndarray, bits: np.ndarray) -> Batch:
     out = source.empty(len(numbers))
-    source.fill(out, range(len(numbers)), numbers, source.starts(numbers, bits))
+    source._fill(out, range(len(numbers)), numbers, source._starts(numbers, bits))
     return out
 
 

@@ -136,7 +136,7 @@ def render(
     >>> masks = gen2d.render(ds, range(8), fields=["masks/instance"])["masks/instance"]
     """
     base, config = configs_of(ds, height, width, look, overrides, fields, trust)
-    numbers = ds.numbers(np.atleast_1d(indices))
+    numbers = ds._numbers(np.atleast_1d(indices))
     if config.image.exposure and states is not None:
         raise ConfigError("states have no motion between frames: image.exposure must be 0 where they are given")
     if config.image.exposure:
@@ -203,7 +203,7 @@ def render_soft(
         raise ConfigError(f"sigma is {sigma!r}, but must be a number of pixels from 0 to 1000")
     plain = [*overrides, "image.exposure=0", "image.noise=0"]
     base, config = configs_of(ds, height, width, look, plain, None, trust)
-    numbers, settings = ds.numbers(np.atleast_1d(indices)), RenderSettings(base, config)
+    numbers, settings = ds._numbers(np.atleast_1d(indices)), RenderSettings(base, config)
     return _compile(_render_soft_frames, settings, float(sigma))(_render_scenes(ds, settings, numbers, states))
 
 
@@ -264,7 +264,7 @@ def simulate_again(
         *([] if fps is None else [f"video.fps={fps}"]),
         *([] if frames is None else [f"video.frames={frames}"]),
     ]
-    base, numbers = config_of(ds, (), trust), ds.numbers(np.atleast_1d(indices))
+    base, numbers = config_of(ds, (), trust), ds._numbers(np.atleast_1d(indices))
     config = load_config(base, changes)
     if not set(matched.VIOLATIONS).isdisjoint(config.matched.change or ()):
         raise ConfigError(f"{ds.root}: matched.change has violations, which cannot be simulated again from a scene")

@@ -115,7 +115,7 @@ class RenderedDataset(Dataset):
         self._columns = [columns[name] for name in names]
         self.fields = {name: columns[name].field for name in names}
         video_bytes = sum(column.size for column in self._rendered_columns)
-        self.slice_size = power_of_two(SLICE_BYTES // video_bytes) if rendered else 1
+        self._slice_size = power_of_two(SLICE_BYTES // video_bytes) if rendered else 1
 
     def __reduce__(self) -> tuple[Any, ...]:
         return RenderedDataset, (self.root, self.manifest, self.options, self.render)
@@ -138,17 +138,17 @@ class RenderedDataset(Dataset):
             )
         with _LOCK:
             if self._started is None:
-                self._started = _Renderer(self, self._settings, self._inputs, self.slice_size)
+                self._started = _Renderer(self, self._settings, self._inputs, self._slice_size)
             return self._started
 
-    def fill(self, out: Batch, rows: Numbers, indices: Numbers, starts: Numbers | None = None) -> None:
-        """Read and render the videos with these indices into `out`. Parameters and errors are those of `Dataset.fill`.
+    def _fill(self, out: Batch, rows: Numbers, indices: Numbers, starts: Numbers | None = None) -> None:
+        """Read and render the videos with these indices into `out`. Parameters and errors are those of `Dataset._fill`.
 
         Raises UserError in a process that was forked from the one that opened the dataset.
         """
-        numbers, targets = self.numbers(indices), np.asarray(rows)
+        numbers, targets = self._numbers(indices), np.asarray(rows)
         if self._stored_columns:
-            super().fill(out, rows, numbers, starts)
+            super()._fill(out, rows, numbers, starts)
         else:
             self._fill_window(out, targets, self._begins(numbers, starts))
         if "camera/scale" in self.fields:
@@ -157,7 +157,7 @@ class RenderedDataset(Dataset):
             return
         renderer, begins = self._renderer, self._begins(numbers, starts)
         inputs = renderer.inputs.batch(numbers, None if self._whole else begins)
-        size = max(1, len(numbers)) if self._settings.config.image.exposure else self.slice_size
+        size = max(1, len(numbers)) if self._settings.config.image.exposure else self._slice_size
         for first in range(0, len(numbers), size):
             part = np.arange(first, min(first + size, len(numbers)))
             padded = np.minimum(np.arange(first, first + size), len(numbers) - 1)  # with the last video

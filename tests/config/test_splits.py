@@ -63,7 +63,7 @@ def test_a_split_may_give_the_first_frames_only(whole):
     assert (short[0]["frames"].shape[0], len(short.time)) == (6, 6)
     assert (long[0]["frames"].shape[0], len(long.time)) == (10, 10)
     every = gen2d.open(whole, "train", window=2)
-    starts = every.starts(np.zeros(5, np.int64), np.arange(5, dtype=np.uint64) * 7)
+    starts = every._starts(np.zeros(5, np.int64), np.arange(5, dtype=np.uint64) * 7)
     assert starts is not None
     assert starts.max() <= 4
     with pytest.raises(ConfigError, match="need 7 frames, but the videos have 6"):

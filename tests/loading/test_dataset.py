@@ -19,6 +19,7 @@ from numpy.testing import assert_array_equal
 from gen2d.core.errors import ConfigError, DamagedError, FolderError
 from gen2d.loading import chunks
 from gen2d.loading import dataset as loader
+from gen2d.loading.mixture import mix
 
 TRAIN = 20
 AXES = {"THWC": (0, 1, 2, 3, 4), "TCHW": (0, 1, 4, 2, 3), "CTHW": (0, 4, 1, 2, 3)}
@@ -212,6 +213,27 @@ def test_blocks_of_tables_are_dropped_when_many_are_read(tmp_path: Path, monkeyp
         assert dataset[number]["index"] == number
         assert len(dataset._files._blocks) <= 2
         assert len(dataset._files._shards) <= 3
+
+
+# What can be called or read; all else has an underscore.
+COMMON = ["at", "batch", "empty", "exact", "fields", "fps", "snapshot", "stats", "time"]
+SELECTABLE = [*COMMON, "filter", "select", "to_arrow", "to_pandas"]
+PUBLIC = {
+    "Dataset": [*SELECTABLE, "config", "manifest", "options", "root", "sizes", "splits"],
+    "ConcatDataset": [*SELECTABLE, "datasets"],
+    "Subset": [*SELECTABLE, "indices", "source"],
+    "Mixture": [*(name for name in COMMON if name not in ("stats", "time")), "datasets", "shares", "source_of"],
+}
+
+
+def test_public_names_are_those_of_the_documentation(toy: Path) -> None:
+    ds = loader.open(toy)
+    for made in (ds, loader.open([toy, toy]), ds.select([1]), mix({"a": ds, "b": ds}, [1, 2])):
+        names = {name for name in dir(made) if not name.startswith("_")}
+        assert names == {*PUBLIC[type(made).__name__]}, type(made)
+        for name in names - vars(made).keys():
+            assert getattr(type(made), name).__doc__, name
+    assert all(f"    {name} : " in (loader.Dataset.__doc__ or "") for name in vars(ds) if not name.startswith("_"))
 
 
 # ---- Processes

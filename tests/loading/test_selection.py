@@ -112,7 +112,7 @@ def test_every_loader_reads_a_selection(roots: list[Path]) -> None:
     batches = list(gen2d.DataLoader(some, 4, epochs=2, seed=1))
     for epoch in (batches[:2], batches[2:]):
         assert sorted(np.concatenate([batch["index"] for batch in epoch]).tolist()) == expected
-    starts = some.starts(np.arange(8), np.arange(8, dtype=np.uint64))
+    starts = some._starts(np.arange(8), np.arange(8, dtype=np.uint64))
     assert starts is not None
     batch = some.batch(range(8), starts)
     for row, number in enumerate(numbers):

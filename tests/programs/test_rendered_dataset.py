@@ -72,7 +72,7 @@ def test_batches_threads_and_order_do_not_change_bits(roots: tuple[Path, Path], 
         for batch in loader:
             assert_array_equal(batch["frames"], frames[batch["index"]])
     out = ds.empty(VIDEOS)
-    ds.fill(out, order, range(VIDEOS))
+    ds._fill(out, order, range(VIDEOS))
     assert_array_equal(out["frames"][order], frames)
 
 
