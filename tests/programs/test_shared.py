@@ -74,7 +74,7 @@ def test_no_edited_number_of_a_shipped_config_needs_another_program(name: str) -
         "physics.bounce_threshold": 0.02,
     }
     overrides |= {"video.fps": config.video.fps * 1.001, "seed": 7}
-    assert len(overrides) > 10
+    assert len(overrides) >= 10
     for where, value in overrides.items():
         changed = load_config(config, [f"{where}={value}"])
         assert [bound.program for bound in trace(changed).values()] == programs, where
