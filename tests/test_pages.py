@@ -120,7 +120,7 @@ def test_pages_name_only_files_that_are_there(page: str):
 EVERY = ("energy", "masks", "amodal", "boxes", "visibility", "flow", "captions", "lyapunov")
 DESCRIBED = {
     "scene": "bouncing",
-    "look": {"name": "flat", "palette": "paper"},
+    "look": {"name": "studio", "palette": "paper"},
     "annotations": {"contacts": 4, "tracks": 8, **dict.fromkeys(EVERY, True)},
     "quality": {"min_contacts": 1},
     "splits": {"train": {}, "large": {"factors": {"radius": [1.0, 1.1]}}},
