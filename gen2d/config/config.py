@@ -35,6 +35,7 @@ from gen2d.storage.explain import reason
 from gen2d.storage.sealed import read_bytes
 
 MAX_SEED = 2**63 - 1
+MAX_LICENCE = 100  # characters
 
 
 @dataclasses.dataclass(frozen=True)
@@ -54,13 +55,15 @@ class Config:
     quality: QualityOptions
     storage: StorageOptions
     splits: tuple[Split, ...] = ()
+    licence: str = ""  # of the dataset, for its cards; "" if none was chosen
 
     def plain(self) -> dict[str, Any]:
         """The config as plain YAML and JSON values, with every default filled in."""
         sections = {s: plain_of(getattr(self, s)) for s in SECTIONS} | {"annotations": self.annotations.plain()}
         plugs = {p: getattr(self, p).plain() for p in DEFAULT_PLUGINS}
         splits = {"splits": {split.name: split.plain() for split in self.splits}} if self.splits else {}
-        return {"name": self.name, "seed": self.seed, **sections, **plugs, **splits}
+        licence = {"licence": self.licence} if self.licence else {}  # without one, configs keep their hashes
+        return {"name": self.name, "seed": self.seed, **licence, **sections, **plugs, **splits}
 
     def text(self) -> str:
         """The resolved config as YAML; reading it gives an equal config."""
@@ -159,7 +162,7 @@ def from_mapping(values: Any, source: str, name: str = "dataset", copies: Copies
     if not isinstance(values, Mapping):
         raise ConfigError(f"{source}: holds {type(values).__name__}, but must hold a mapping of sections")
     section_names = (*SECTIONS, "annotations", *DEFAULT_PLUGINS)
-    known = ["name", "seed", *section_names, "splits"]
+    known = ["name", "seed", "licence", *section_names, "splits"]
     for key in values:
         if key not in known:
             raise ConfigError(f"{source}: {key} is not a section; {plugins.nearest(key, known)}")
@@ -167,6 +170,12 @@ def from_mapping(values: Any, source: str, name: str = "dataset", copies: Copies
     if not isinstance(name, str) or not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}", name):
         raise ConfigError(f"{source}: name is {name!r}, but must be letters, digits, '.', '_' and '-', 100 at most")
     seed = checked_seed(values.get("seed", 0), f"{source}: seed")
+    licence = "" if values.get("licence") is None else values["licence"]
+    if not isinstance(licence, str) or not licence.isprintable() or len(licence) > MAX_LICENCE:
+        raise ConfigError(
+            f"{source}: licence is {licence!r:.120}, but must be the name of a licence, such as cc-by-4.0, in one line "
+            f"of {MAX_LICENCE} characters at most"
+        )
     sections: dict[str, Any] = {s: _parse_section(s, values.get(s), source, copies) for s in section_names}
     frames, chunk = sections["video"].frames, sections["storage"].chunk_frames
     if chunk is not None and frames % chunk:
@@ -176,7 +185,7 @@ def from_mapping(values: Any, source: str, name: str = "dataset", copies: Copies
         raise ConfigError(
             f"{source}: annotations.contacts is 0, but annotations.captions needs them: 4 is a good number"
         )
-    config = Config(name=name, seed=seed, **sections)
+    config = Config(name=name, seed=seed, licence=licence.strip(), **sections)
     _check_grids(config, source)
     try:
         quality_module.check(config.quality, {f"annotations.{name}" for name in config.annotations.enabled})

@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from gen2d.config import plugins
-from gen2d.config.config import DEFAULT_PLUGINS, MAX_SEED, SECTIONS
+from gen2d.config.config import DEFAULT_PLUGINS, MAX_LICENCE, MAX_SEED, SECTIONS
 from gen2d.config.distribution_syntax import MAX_MAGNITUDE, MAX_NUMBERS, MAX_PARTS
 from gen2d.config.options import Option, factor_options, plain_value
 from gen2d.config.sections import SimulationAnnotations
@@ -55,6 +55,12 @@ def json_schema(family: str | None = None) -> Schema:
                 "description": "name of the dataset; by default that of the file",
             },
             "seed": {"type": "integer", "minimum": 0, "maximum": MAX_SEED, "default": 0, "description": "seed"},
+            "licence": {
+                "type": ["string", "null"],
+                "maxLength": MAX_LICENCE,
+                "pattern": r"^[^\n\r\t]*$",
+                "description": "licence of the dataset, such as cc-by-4.0, for its cards",
+            },
             **references,
             "splits": _splits(family),
         },

@@ -56,11 +56,12 @@ def only_sections(config: Config, *sections: str, simulated: bool = False, pixel
 
 
 def _replaced(config: Config, convert: Number) -> Config:
-    """The config with its numbers converted, and without its name, seed and storage."""
+    """The config with its numbers converted, and without its name, seed, licence and storage."""
     parts: dict[tuple[str, int], Distribution] = {}
     splits = tuple(Split(s.name, None, "{}", _converted_joint(s.distribution, convert, parts)) for s in config.splits)
     storage = StorageOptions(frames=config.storage.frames)
-    static = {"name": "", "seed": 0, "storage": storage, "splits": splits, "annotations": config.annotations}
+    static = {"name": "", "seed": 0, "licence": "", "storage": storage, "splits": splits}
+    static |= {"annotations": config.annotations}
     names = [f.name for f in dataclasses.fields(config) if f.name not in static]
     return dataclasses.replace(config, **static, **{n: _converted(getattr(config, n), convert) for n in names})
 

@@ -61,6 +61,7 @@ def dataset_of(
         constants=schema.constants,
         conventions=CONVENTIONS,
         command="python -m gen2d --config config.yaml",
+        licence=config.licence,
         copies={path: config.copies[name] for path, name in user_plugin_files(config.plain()).items()},
     )
 

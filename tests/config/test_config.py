@@ -12,6 +12,7 @@ from gen2d.config import plugins, sections
 from gen2d.config.config import MAX_SEED, load_config
 from gen2d.config.distribution_syntax import parse
 from gen2d.config.reading import parse_yaml, yaml_text
+from gen2d.config.resolved import resolved
 from gen2d.core.errors import ConfigError
 from gen2d.engines import Ray
 
@@ -136,6 +137,17 @@ def test_the_hash_sees_every_option_but_not_the_seed():
     assert load_config({**CONFIG, "seed": 5}).sha256() == config.sha256()
     assert load_config(tiny_config(physics={"damping": 0.1})).sha256() != config.sha256()
     assert load_config(tiny_config(scene={"friction": 0.1})).sha256() != config.sha256()
+
+
+def test_a_licence_is_part_of_the_recipe_only_where_there_is_one() -> None:
+    plain, licensed = load_config("bouncing.yaml"), load_config("bouncing.yaml", ["licence=cc-by-4.0"])
+    assert "licence" not in plain.plain()
+    assert load_config("bouncing.yaml", ["licence=null"]).sha256() == plain.sha256() != licensed.sha256()
+    assert load_config(licensed.plain()) == licensed
+    assert resolved(licensed)["licence"] == "cc-by-4.0"
+    for text in ("1", "[MIT]", '"two\\nlines"', "x" * 101):
+        with pytest.raises(ConfigError, match=r"licence is .*, but must be the name of a licence"):
+            load_config("bouncing.yaml", [f"licence={text}"])
 
 
 @given(st.integers(0, MAX_SEED))

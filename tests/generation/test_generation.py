@@ -268,6 +268,22 @@ def test_impossible_runs_are_refused(tmp_path: Path, n: int, worker: tuple[int, 
         generate(CONFIG, n, tmp_path, worker=worker)
 
 
+def test_the_licence_of_a_config_is_that_of_the_dataset(tmp_path: Path):
+    """On all its cards, also after a repair; the videos are those without a licence."""
+    made = tmp_path / "data"
+    generate({**CONFIG, "licence": "CC-BY-4.0"}, 4, made)
+    assert gen2d.open(made).manifest.licence == "CC-BY-4.0"
+    assert "\nlicense: cc-by-4.0\n" in (made / "README.md").read_text()
+    assert json.loads((made / "croissant.json").read_text())["license"] == "CC-BY-4.0"
+    card = (made / "README.md").read_bytes()
+    (made / "README.md").unlink()
+    next((made / "shards").iterdir()).unlink()
+    assert run_command("verify", made, "--repair").returncode == 0
+    assert (made / "README.md").read_bytes() == card
+    generate(CONFIG, 4, tmp_path / "plain")
+    same(everything(made), everything(tmp_path / "plain"))
+
+
 @pytest.mark.full
 def test_the_frame_rate_does_not_change_the_motion(tmp_path: Path):
     """Frame t is the state at t / fps: two rates agree where their frames fall together, at steps of one length."""
