@@ -33,7 +33,7 @@ def test_pages_install_extras_of_a_checkout() -> None:
     """As `pip install ".[torch]"`: the name alone would need an index, and an extra must be there."""
     root = floors.PROJECT.parent
     extras = tomllib.loads(floors.PROJECT.read_text())["project"]["optional-dependencies"]
-    pages = [root / "README.md", root / "CONTRIBUTING.md", *sorted((root / "gen2d").rglob("README.md"))]
+    pages = [root / "README.md", root / "CONTRIBUTING.md", *sorted((root / "docs").rglob("*.md"))]
     found = [
         (page, path, name)
         for page in pages
