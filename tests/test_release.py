@@ -56,7 +56,7 @@ def test_versions_that_agree_in_a_clean_tree_pass(checkout: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "old", "new", "told"),
+    ("name", "old", "new", "message"),
     [
         ("CITATION.cff", "version: 1.2.3", "version: 1.2.4", "CITATION.cff has the version 1.2.4, but"),
         (
@@ -74,12 +74,12 @@ def test_versions_that_agree_in_a_clean_tree_pass(checkout: Path) -> None:
         ("gen2d/_version.py", "__version__", "version", "gen2d/_version.py has no line"),
     ],
 )
-def test_versions_that_differ_are_named(checkout: Path, name: str, old: str, new: str, told: str) -> None:
+def test_versions_that_differ_are_named(checkout: Path, name: str, old: str, new: str, message: str) -> None:
     edit(checkout / name, old, new)
     git(checkout, "commit", "--all", "--quiet", "--message", "another")
     done = release(checkout)
     assert (done.returncode, done.stderr.count("\n")) == (1, 1)
-    assert told in done.stderr
+    assert message in done.stderr
 
 
 def test_a_tree_that_is_not_clean_and_a_tag_that_is_there_are_named(checkout: Path) -> None:

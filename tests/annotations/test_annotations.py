@@ -95,9 +95,9 @@ def test_fields_are_as_described(made):
 @pytest.mark.full
 def test_the_form_for_gpus_tells_the_same(made, monkeypatch):
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    told = jax.jit(lambda stages: render.render_frames(stages, made.rollout.plan, made.options))(made.stages)
-    assert_array_equal(told.pop("masks/instance"), made.mask)
-    for name, array in told.items():
+    annotated = jax.jit(lambda stages: render.render_frames(stages, made.rollout.plan, made.options))(made.stages)
+    assert_array_equal(annotated.pop("masks/instance"), made.mask)
+    for name, array in annotated.items():
         here, there = np.asarray(array), made.of[name]
         if here.dtype in (bool, np.uint8):  # an end of a flow on a pixel's edge, half a pixel covered, a level of grey
             assert (np.abs(here.astype(int) - there) > (name == "frames")).mean() < 2e-3, name

@@ -190,17 +190,17 @@ def rows_of(made: dict[str, np.ndarray]) -> list[tuple[int, ...]]:
 
 
 @pytest.mark.parametrize("seed", range(20))
-def test_every_impact_is_told_once_unless_the_pair_was_in_touch(seed: int) -> None:
+def test_every_impact_is_an_event_once_unless_the_pair_was_in_touch(seed: int) -> None:
     made = seen(seed)
-    told = [(e.frame, e.about["a"], e.about["b"]) for e in events_module.video_events(made, VIDEO) if e.kind == "hit"]
+    stated = [(e.frame, e.about["a"], e.about["b"]) for e in events_module.video_events(made, VIDEO) if e.kind == "hit"]
     rows, impacts = rows_of(made), []
     for kind, frame, a, b, time in rows:
         before = [r for r in rows if r[1:4] == (frame - 1, a, b)]
         held = before and (before[0][0] in (2, 3) or (before[0][0] == 1 and time - before[0][4] < 0.1))
         if kind == 1 and not held:
             impacts.append((frame, a, b))
-    assert len(told) == len(set(told))
-    assert sorted(told) == sorted(impacts)
+    assert len(stated) == len(set(stated))
+    assert sorted(stated) == sorted(impacts)
 
 
 @pytest.mark.parametrize(("seconds", "hits"), [(0.09, 1), (0.11, 2)])
@@ -246,7 +246,7 @@ def test_a_ball_leaves_when_its_rim_crosses_the_edge_and_comes_back_when_it_does
     assert [event.about["side"] for event in events_module.view_events(made, VIDEO)] == ["top", "top"]
 
 
-def test_rest_is_told_where_all_is_still_to_the_end() -> None:
+def test_rest_is_an_event_where_all_is_still_to_the_end() -> None:
     made = seen(0)
     made["states/velocity"][11:] = 0
     assert [(event.frame, event.time) for event in events_module.rest_events(made, VIDEO.fps)] == [(11, 0.55)]

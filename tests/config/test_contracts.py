@@ -124,12 +124,12 @@ WRONG: dict[str, tuple[type, dict[str, Any]]] = {
 }
 
 
-@pytest.mark.parametrize("told", WRONG)
-def test_a_member_of_a_wrong_type_is_refused_where_it_is_declared(told: str) -> None:
-    contract, members = WRONG[told]
+@pytest.mark.parametrize("message", WRONG)
+def test_a_member_of_a_wrong_type_is_refused_where_it_is_declared(message: str) -> None:
+    contract, members = WRONG[message]
     with pytest.raises(TypeError) as caught:
         contract(**members)
-    assert told in str(caught.value)
+    assert message in str(caught.value)
 
 
 def test_drawn_options_of_an_annotation_are_refused() -> None:

@@ -64,16 +64,16 @@ def test_the_card_begins_with_the_metadata_of_the_hub(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("licence", "told"),
+    ("licence", "entries"),
     [
         ("", {}),
         ("MIT", {"license": "mit"}),
         ('Ask "me"', {"license": "other", "license_name": 'Ask "me"'}),
     ],
 )
-def test_the_licence_is_one_of_the_hub_s(tmp_path: Path, licence: str, told: dict[str, str]) -> None:
+def test_the_licence_is_one_of_the_hub_s(tmp_path: Path, licence: str, entries: dict[str, str]) -> None:
     synthetic.make(synthetic.dataset(tmp_path, licence=licence))
-    assert {key: value for key, value in front_matter(tmp_path).items() if key.startswith("license")} == told
+    assert {key: value for key, value in front_matter(tmp_path).items() if key.startswith("license")} == entries
 
 
 @pytest.mark.parametrize(

@@ -59,16 +59,16 @@ def tried(root: str, folder: Path, writable: bool) -> Iterator[str]:
                 library.video(split, "0")
     for words in verbs:
         yield " ".join(words)
-        out, told = io.StringIO(), io.StringIO()
-        with contextlib.redirect_stdout(out), contextlib.redirect_stderr(told):
+        out, errors = io.StringIO(), io.StringIO()
+        with contextlib.redirect_stdout(out), contextlib.redirect_stderr(errors):
             try:
                 code = main([*words, "--timeout", "2", "--deadline", "4"])
             except SystemExit as end:
                 code = end.code
         assert code in (0, 1, 2, 3), code
-        assert "Traceback" not in told.getvalue()
-        assert all(c.isprintable() or c == "\n" for c in out.getvalue() + told.getvalue()), out.getvalue()
-        assert told.getvalue().count("\n") <= 1 or code == 0, told.getvalue()
+        assert "Traceback" not in errors.getvalue()
+        assert all(c.isprintable() or c == "\n" for c in out.getvalue() + errors.getvalue()), out.getvalue()
+        assert errors.getvalue().count("\n") <= 1 or code == 0, errors.getvalue()
 
 
 @dataclasses.dataclass
@@ -106,15 +106,15 @@ class Trial:
                 seed = int(line)
                 folder = self.home / f"{seed}"
                 folder.mkdir()
-                told = fault = ""
+                damage = fault = ""
                 try:
-                    told = crafted.craft(self.pristine, folder / "data", seed)
+                    damage = crafted.craft(self.pristine, folder / "data", seed)
                     for root, writable in ((self.server.url(folder / "data"), False), (str(folder / "data"), True)):
                         for action in tried(root, folder, writable):
-                            print(json.dumps({"doing": action, "what": told}), file=out, flush=True)
+                            print(json.dumps({"doing": action, "what": damage}), file=out, flush=True)
                 except BaseException as error:
                     fault = f"{type(error).__name__}: {error}"
-                print(json.dumps({"done": True, "fault": fault, "what": told}), file=out, flush=True)
+                print(json.dumps({"done": True, "fault": fault, "what": damage}), file=out, flush=True)
 
     def faults(self, seed: int) -> list[str]:
         """What went wrong with the dataset of this seed."""

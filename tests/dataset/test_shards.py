@@ -264,7 +264,7 @@ def test_fewer_videos_keep_what_is_there(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("change", "told"),
+    ("change", "message"),
     [
         ({"seed": 8}, "seed is 7 there and 8 here"),
         ({"config": {"scene": {"name": "toy", "balls": 4}, "fps": 10}}, "config.scene.balls is 3 there and 4 here"),
@@ -273,7 +273,7 @@ def test_fewer_videos_keep_what_is_there(tmp_path: Path) -> None:
     ],
 )
 @pytest.mark.parametrize("marked_by", [".gen2d", "manifest.json"])
-def test_another_dataset_is_refused(tmp_path: Path, change: dict[str, Any], told: str, marked_by: str) -> None:
+def test_another_dataset_is_refused(tmp_path: Path, change: dict[str, Any], message: str, marked_by: str) -> None:
     synthetic.make(synthetic.dataset(tmp_path, train=3))
     if marked_by == ".gen2d":
         (tmp_path / "manifest.json").unlink()
@@ -282,7 +282,7 @@ def test_another_dataset_is_refused(tmp_path: Path, change: dict[str, Any], told
     before = synthetic.tree(tmp_path)
     with pytest.raises(FolderError, match="overwrite=True") as caught:
         open_folder(synthetic.dataset(tmp_path, train=3, **change))
-    assert told in str(caught.value)
+    assert message in str(caught.value)
     assert synthetic.tree(tmp_path) == before
 
 
@@ -374,15 +374,15 @@ def test_what_is_no_dataset_is_left_alone(tmp_path: Path, overwrite: bool) -> No
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
 
 
-@pytest.mark.parametrize(("code", "told"), [(errno.EACCES, "permission"), (errno.EROFS, "read-only")])
+@pytest.mark.parametrize(("code", "message"), [(errno.EACCES, "permission"), (errno.EROFS, "read-only")])
 def test_a_folder_that_cannot_be_made_is_explained(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: int, told: str
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: int, message: str
 ) -> None:
     def mkdir(path: Path, **_: object) -> None:
         raise OSError(code, os.strerror(code), str(path))
 
     monkeypatch.setattr(Path, "mkdir", mkdir)
-    with pytest.raises(FolderError, match=told):
+    with pytest.raises(FolderError, match=message):
         open_folder(synthetic.dataset(tmp_path / "toy"))
 
 

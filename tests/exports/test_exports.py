@@ -211,7 +211,7 @@ def test_selected_videos_alone_are_exported(toy: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("select", "told"),
+    ("select", "message"),
     [
         ("index", "must compare values with <=, >=, ==, !=, <, >, as 'factors/balls > 3"),
         ("index > many", "compares a number with 'many', which must be a number or a field"),
@@ -222,10 +222,10 @@ def test_selected_videos_alone_are_exported(toy: Path, tmp_path: Path) -> None:
         ("objects/mass[3] > 3", "objects/mass has 3 values per video: choose one"),
     ],
 )
-def test_a_selection_that_means_nothing_is_told(toy: Path, tmp_path: Path, select: str, told: str) -> None:
+def test_a_selection_that_means_nothing_is_an_error(toy: Path, tmp_path: Path, select: str, message: str) -> None:
     with pytest.raises(ConfigError) as caught:
         gen2d.export(toy, "npz", tmp_path / "out", select=select)
-    assert told in str(caught.value)
+    assert message in str(caught.value)
     assert not list(tmp_path.iterdir())
 
 
@@ -381,7 +381,7 @@ def test_phyworld_s_frame_is_ten_units_wide(tmp_path: Path, monkeypatch: pytest.
 
 
 @pytest.mark.parametrize(
-    ("changes", "told"),
+    ("changes", "message"),
     [
         ({"objects/kind": np.zeros(4)}, "something else than a ball moves in it"),
         ({"objects/present": np.ones(4)}, "the number of balls that move in it is 3, but must be 2"),
@@ -391,12 +391,12 @@ def test_phyworld_s_frame_is_ten_units_wide(tmp_path: Path, monkeypatch: pytest.
     ],
 )
 def test_phyworld_refuses_what_its_layout_cannot_hold(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, changes: dict[str, np.ndarray], told: str
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, changes: dict[str, np.ndarray], message: str
 ) -> None:
     root = two_balls(tmp_path / "balls", monkeypatch, **changes)
     with pytest.raises(ConfigError) as caught:
         gen2d.export(root, "phyworld", tmp_path / "out.hdf5")
-    assert str(caught.value) == f"phyworld cannot hold train video 1 of {root}: {told}"
+    assert str(caught.value) == f"phyworld cannot hold train video 1 of {root}: {message}"
     assert [path.name for path in tmp_path.iterdir()] == ["balls"]
 
 
@@ -575,7 +575,7 @@ def test_every_format_keeps_the_contract(name: str, balls: Path, tmp_path: Path)
 
 
 @pytest.mark.parametrize(
-    ("words", "told"),
+    ("words", "message"),
     [
         (
             ["--to", "mp3"],
@@ -602,16 +602,16 @@ def test_every_format_keeps_the_contract(name: str, balls: Path, tmp_path: Path)
         (["--to", "phyworld"], "has no field 'states/velocity'"),
     ],
 )
-def test_bad_input_gets_one_line_and_code_2(toy: Path, tmp_path: Path, words: list[str], told: str) -> None:
+def test_bad_input_gets_one_line_and_code_2(toy: Path, tmp_path: Path, words: list[str], message: str) -> None:
     (tmp_path / "file").write_text("")
     done = tiny.run_main("export", toy, *words, cwd=tmp_path)
     assert done.returncode == 2, done
-    assert told in done.stderr
+    assert message in done.stderr
     assert len(tiny.sentences(done.stderr)) == 1
     assert not done.stdout
 
 
-def test_a_folder_that_is_no_dataset_is_told(tmp_path: Path) -> None:
+def test_a_folder_that_is_no_dataset_is_an_error(tmp_path: Path) -> None:
     done = tiny.run_command("export", tmp_path, "--to", "npz")
     assert (done.returncode, len(tiny.sentences(done.stderr))) == (2, 1)
     assert "is not a gen2d dataset" in done.stderr
@@ -629,7 +629,7 @@ def test_the_command_says_what_it_made_and_what_was_lost(toy: Path, tmp_path: Pa
 
 
 @pytest.mark.parametrize(
-    ("to", "changes", "told"),
+    ("to", "changes", "message"),
     [
         ("mp4", {"sizes": SIZES | {"W": 47}}, "video.width is 47, but must be even for mp4"),
         ("h264", {"sizes": SIZES | {"H": 63}}, "video.height is 63, but must be even for h264"),
@@ -638,11 +638,13 @@ def test_the_command_says_what_it_made_and_what_was_lost(toy: Path, tmp_path: Pa
         ("mp4", {"fps": 0.01}, "video.fps is 0.01, but must be from 0.1 to 65535 for mp4"),
     ],
 )
-def test_what_a_format_cannot_hold_is_told_first(tmp_path: Path, to: str, changes: dict[str, Any], told: str) -> None:
+def test_what_a_format_cannot_hold_is_an_error_first(
+    tmp_path: Path, to: str, changes: dict[str, Any], message: str
+) -> None:
     made = synthetic.make(synthetic.dataset(tmp_path / "toy", train=1, **changes))
     with pytest.raises(ConfigError) as caught:
         gen2d.export(synthetic.folder(made), to, tmp_path / "out")
-    assert told in str(caught.value)
+    assert message in str(caught.value)
     assert not (tmp_path / "out").exists()
 
 

@@ -98,7 +98,7 @@ def test_an_export_is_pushed_with_its_card(toy: Path, tmp_path: Path, server: Hu
 
 
 @pytest.mark.parametrize(
-    ("code", "exit_code", "told"),
+    ("code", "exit_code", "message"),
     [
         (401, 2, "me/toy: the Hub refuses the upload (401): run `hf auth login`"),
         (403, 2, "me/toy: the Hub refuses the upload (403)"),
@@ -107,12 +107,12 @@ def test_an_export_is_pushed_with_its_card(toy: Path, tmp_path: Path, server: Hu
     ],
 )
 def test_a_refusal_is_one_sentence(
-    toy: Path, server: Hub, environment: dict[str, str], code: int, exit_code: int, told: str
+    toy: Path, server: Hub, environment: dict[str, str], code: int, exit_code: int, message: str
 ) -> None:
     server.refusal = code
     done = push(environment, toy, "me/toy")
     assert (done.returncode, len(tiny.sentences(done.stderr))) == (exit_code, 1), done.stderr
-    assert told in done.stderr
+    assert message in done.stderr
     assert not server.repositories
 
 
@@ -126,10 +126,10 @@ def test_bad_input_is_one_sentence_and_sends_nothing(
         ((tmp_path / "nowhere", "me/toy"), 2, "is not a gen2d dataset"),
         ((lost, "me/toy"), 1, "train-00000.h5 is missing: verify with --repair"),
     ]
-    for words, code, told in cases:
+    for words, code, message in cases:
         done = push(environment, *words)
         assert (done.returncode, len(tiny.sentences(done.stderr))) == (code, 1), done.stderr
-        assert told in done.stderr
+        assert message in done.stderr
     assert not server.asked
 
 

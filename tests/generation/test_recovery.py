@@ -128,8 +128,8 @@ def test_two_hundred_kills_while_a_dataset_grows(tmp_path: Path) -> None:
     def count_killed(processes: list[subprocess.Popen]) -> int:
         codes = []
         for process in processes:
-            told = process.communicate()[1]
-            assert process.returncode in (0, -signal.SIGKILL), told
+            output = process.communicate()[1]
+            assert process.returncode in (0, -signal.SIGKILL), output
             codes.append(process.returncode)
         return sum(code != 0 for code in codes)
 

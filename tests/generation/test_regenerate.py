@@ -125,7 +125,7 @@ def test_a_dataset_that_may_have_been_larger_is_not_guessed(root: Path) -> None:
     assert contents(root) == before
 
 
-def test_other_versions_are_told_and_nothing_is_changed(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_other_versions_are_an_error_and_nothing_is_changed(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XLA_FLAGS", "--xla_cpu_enable_fast_math=false")
     flip(root / "shards" / "train-00000.h5", 80000)
     before = contents(root)

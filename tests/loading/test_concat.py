@@ -80,7 +80,7 @@ def test_windows_and_layouts_are_those_of_each_dataset(roots: list[Path], data: 
 
 
 @pytest.mark.parametrize("index", [TOTAL, -TOTAL - 1, [0, TOTAL]])
-def test_a_video_that_is_not_there_is_told(roots: list[Path], index: Any) -> None:
+def test_a_video_that_is_not_there_is_an_error(roots: list[Path], index: Any) -> None:
     with pytest.raises(IndexError, match="has 30 videos"):
         loader.open(roots)[index]
 
@@ -179,7 +179,7 @@ def test_another_split_is_named(roots: list[Path], tmp_path: Path) -> None:
     assert len(loader.open([roots[0], only], "test")) == 5
 
 
-def test_what_is_no_list_of_datasets_is_told(roots: list[Path], tmp_path: Path) -> None:
+def test_what_is_no_list_of_datasets_is_an_error(roots: list[Path], tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="path is an empty list"):
         loader.open([])
     with pytest.raises(FolderError, match="not a gen2d dataset"):

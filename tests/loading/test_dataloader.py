@@ -158,10 +158,10 @@ def test_ranks_are_those_of_the_process_group_or_torchrun_unless_given(
     ds = loader.open(toy, fields="index")
     monkeypatch.setenv("RANK", "1")
     monkeypatch.setenv("WORLD_SIZE", "2")
-    told, given = DataLoader(ds, 4, epochs=1), DataLoader(ds, 4, epochs=1, rank=1, world_size=2)
+    inferred, given = DataLoader(ds, 4, epochs=1), DataLoader(ds, 4, epochs=1, rank=1, world_size=2)
     alone = DataLoader(ds, 4, epochs=1, rank=0, world_size=1)
-    assert len(told) == len(given) == TRAIN // 8 != len(alone)
-    for one, other in zip(told, given, strict=True):
+    assert len(inferred) == len(given) == TRAIN // 8 != len(alone)
+    for one, other in zip(inferred, given, strict=True):
         assert_array_equal(one["index"], other["index"])
     group = {"is_available": lambda: True, "is_initialized": lambda: True}
     group |= {"get_rank": lambda: 0, "get_world_size": lambda: 4}
@@ -334,15 +334,15 @@ def test_torch_batches_lie_where_they_are_asked_to(toy: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("options", "told"),
+    ("options", "message"),
     [
         ({"device": "cpu"}, "device is 'cpu', but must be None with to='numpy'"),
         ({"sharding": "all", "to": "torch"}, "sharding is 'all', but must be None unless to is 'jax'"),
         ({"sharding": "all", "device": "cpu", "to": "jax"}, "sharding is 'all', but must be None"),
     ],
 )
-def test_a_place_that_cannot_be_is_refused(toy: Path, options: dict[str, Any], told: str) -> None:
-    with pytest.raises(ConfigError, match=told):
+def test_a_place_that_cannot_be_is_refused(toy: Path, options: dict[str, Any], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
         DataLoader(loader.open(toy), 4, **options)
 
 

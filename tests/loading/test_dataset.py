@@ -139,14 +139,14 @@ def test_a_wrong_option_is_named(toy: Path, options: dict[str, Any], message: st
 
 
 @pytest.mark.parametrize("index", [TRAIN, -TRAIN - 1, [0, TRAIN]])
-def test_a_video_that_is_not_there_is_told(toy: Path, index: Any) -> None:
+def test_a_video_that_is_not_there_is_an_error(toy: Path, index: Any) -> None:
     with pytest.raises(IndexError, match="train has 20 videos"):
         loader.open(toy)[index]
     with pytest.raises(TypeError, match="must be an integer"):
         loader.open(toy)[cast(Any, 1.5)]
 
 
-def test_a_folder_that_is_no_complete_dataset_is_told(tmp_path: Path) -> None:
+def test_a_folder_that_is_no_complete_dataset_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(FolderError, match="not a gen2d dataset"):
         loader.open(tmp_path)
     (tmp_path / ".gen2d").mkdir()

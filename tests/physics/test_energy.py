@@ -67,7 +67,7 @@ def test_falling_disc_tells_its_bounces():
     holds("drop: times, s", rows.time[0, :2] - times, 1e-6)
     holds("drop: approach, m/s", rows.approach_speed[0, :2] - GRAVITY * first * np.array([1, 0.5]), 1e-5)
     holds("drop: separation, m/s", rows.separation_speed[0, :2] - GRAVITY * first * np.array([0.5, 0.25]), 1e-5)
-    holds("drop: place, m", rows.point[0, :2] - [0.25, 0], 1e-4)  # g h^2 / 2: told from the speed after the kick
+    holds("drop: place, m", rows.point[0, :2] - [0.25, 0], 1e-4)  # g h^2 / 2: from the speed after the kick
     holds("drop: impulse, N s", rows.normal_impulse[0, 0] - mass * 1.5 * GRAVITY * first, 1e-5)
     holds("drop: books in double precision, J", found.energy.residual, 1e-9)
     lost = mass * GRAVITY * 2 * 0.75

@@ -225,7 +225,7 @@ def test_threads_compile_once(roots: tuple[Path, Path], monkeypatch: pytest.Monk
         ({"producer": {"sources": {"renderers/tiles.py": "0"}}}, "renderers/tiles.py"),
     ],
 )
-def test_a_foreign_fingerprint_is_told(
+def test_a_foreign_fingerprint_is_logged(
     roots: tuple[Path, Path], frames: np.ndarray, change: Any, said: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     ds = gen2d.open(roots[1], fields="frames")
@@ -242,7 +242,7 @@ def test_a_foreign_fingerprint_is_told(
     assert np.abs(actual.astype(int) - frames).max() <= 1
 
 
-def test_what_is_exact_is_told_once(roots: tuple[Path, Path], caplog: pytest.LogCaptureFixture) -> None:
+def test_what_is_exact_is_logged_once(roots: tuple[Path, Path], caplog: pytest.LogCaptureFixture) -> None:
     with caplog.at_level(logging.INFO, "gen2d"):
         ds = gen2d.open(roots[1], fields="frames")
         assert ds[0].keys() == ds[1].keys() == {"frames"}

@@ -119,13 +119,13 @@ def test_cells_waste_little(batch_size: int, lanes: int):
         ({"n": 3}, "only 3"),
     ],
 )
-def test_a_wrong_option_is_told(options: dict, message: str):
+def test_a_wrong_option_is_an_error(options: dict, message: str):
     with pytest.raises(ConfigError, match=message) as caught:
         gen2d.stream(CONFIG, **{"batch_size": 4, **options})
     assert "\n" not in str(caught.value)
 
 
 @pytest.mark.full
-def test_a_scene_that_does_not_fit_is_told():
+def test_a_scene_that_does_not_fit_is_an_error():
     with pytest.raises(NoPlaceError, match="could not be placed"):
         next(iter(gen2d.stream(tiny_config(scene=CROWDED), batch_size=4)))

@@ -1,4 +1,4 @@
-"""Matched sets: their members are the same to the bit but for one thing, which is what is told of them."""
+"""Matched sets: their members are the same to the bit but for one thing, which their fields name."""
 
 from pathlib import Path
 from typing import Any
@@ -127,8 +127,8 @@ def test_members_share_all_that_was_drawn_but_for_the_factor_they_are_about(vide
     names = [name for name in videos if name.split("/")[0] in ("factors", "objects", "world", "camera")]
     for one, other in pairs(videos, *CHANGES[1:]):
         kind = CHANGES[other["matched/kind"]]
-        told = {"density": {"objects/mass", "objects/moment"}, "gravity": {"world/gravity"}}.get(kind, set())
-        assert {n for n in names if (one[n] != other[n]).any()} == told | ({f"factors/{kind}"} if told else set())
+        changed = {"density": {"objects/mass", "objects/moment"}, "gravity": {"world/gravity"}}.get(kind, set())
+        assert {n for n in names if (one[n] != other[n]).any()} == changed | ({f"factors/{kind}"} if changed else set())
 
 
 # ---- Counterfactuals
@@ -361,15 +361,15 @@ BAD: dict[str, tuple[list[str], str]] = {
 
 @pytest.mark.parametrize("case", BAD)
 def test_a_bad_set_is_one_sentence(case: str):
-    sets, told = BAD[case]
+    sets, message = BAD[case]
     with pytest.raises(ConfigError) as caught:
         load_config(CONFIG, [f"matched.{text}" for text in sets])
-    assert told in str(caught.value)
+    assert message in str(caught.value)
     assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize(
-    ("kind", "also", "told"),
+    ("kind", "also", "message"),
     [
         ("teleport", "annotations.contacts=4", "annotations.contacts must be off"),
         ("energy_gain", "annotations.energy=true", "annotations.energy must be off"),
@@ -379,14 +379,14 @@ def test_a_bad_set_is_one_sentence(case: str):
         ("remove", "camera.follow=0", "camera.follow may be what is gone"),
     ],
 )
-def test_what_cannot_be_is_one_sentence(kind: str, also: str, told: str):
+def test_what_cannot_be_is_one_sentence(kind: str, also: str, message: str):
     with pytest.raises(ConfigError) as caught:
         load_config(CONFIG, [f"matched.change={kind}", also])
-    assert told in str(caught.value)
+    assert message in str(caught.value)
     assert "\n" not in str(caught.value)
 
 
-def test_incomplete_sets_are_told_before_the_run():
+def test_incomplete_sets_are_logged_before_the_run():
     plain: dict[str, Any] = {name: options for name, options in CONFIG.items() if name != "matched"}
     counts = {"train": 3 * MEMBERS + 1, "test": 2 * MEMBERS}
     assert run._incomplete_sets(load_config(plain), counts) == []
@@ -395,7 +395,7 @@ def test_incomplete_sets_are_told_before_the_run():
     ]
 
 
-def test_without_sets_nothing_is_told_and_keys_are_the_videos_own():
+def test_without_sets_nothing_is_stored_and_keys_are_the_videos_own():
     plain: dict[str, Any] = {name: options for name, options in CONFIG.items() if name != "matched"}
     config = load_config(plain)
     words, numbers = jnp.zeros(3, jnp.uint32), jnp.arange(6, dtype=jnp.uint32)

@@ -248,7 +248,7 @@ BAD = {
 
 
 @pytest.mark.parametrize("family", BAD)
-def test_options_that_cannot_be_are_told_in_one_sentence(family):
-    change, told = BAD[family]
-    with pytest.raises(ConfigError, match=told):
+def test_options_that_cannot_be_are_refused_in_one_sentence(family):
+    change, message = BAD[family]
+    with pytest.raises(ConfigError, match=message):
         load_config(f"{family}.yaml", [f"scene.{change}"])

@@ -140,9 +140,9 @@ BROKEN = {
 
 
 @pytest.mark.parametrize("family", BROKEN)
-def test_options_that_cannot_be_met_are_told_in_one_sentence(family):
-    option, value, told = BROKEN[family]
-    with pytest.raises(ConfigError, match=told) as error:
+def test_options_that_cannot_be_met_are_refused_in_one_sentence(family):
+    option, value, message = BROKEN[family]
+    with pytest.raises(ConfigError, match=message) as error:
         load_config({"scene": {"name": family, option: value}})
     assert f"scene.{option} " in str(error.value)
     assert "\n" not in str(error.value)

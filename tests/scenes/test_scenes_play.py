@@ -102,7 +102,7 @@ def test_a_video_begins_in_view_without_overlap_and_stays_finite(name):
 
 
 @pytest.mark.parametrize(("name", "wrong"), [(name, wrong) for name, some in WRONG.items() for wrong in some])
-def test_what_cannot_be_is_told_in_one_sentence(name, wrong):
+def test_what_cannot_be_is_refused_in_one_sentence(name, wrong):
     with pytest.raises(ConfigError, match=r": scene\..* but ") as caught:
         load_config(f"{name}.yaml", [f"scene.{wrong}"])
     assert wrong.partition("=")[0] in str(caught.value)

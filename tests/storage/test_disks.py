@@ -450,7 +450,7 @@ def test_the_command_goes_on_after_what_happens_to_machines(tmp_path: Path, what
             process.send_signal(signal.SIGSTOP)
             time.sleep(60)
             process.send_signal(signal.SIGCONT)
-        told, errors = process.communicate(timeout=600)
+        output, errors = process.communicate(timeout=600)
     if what == "moved":
         assert process.returncode == 2
         assert f"was {out} moved or removed during the run?" in errors
@@ -460,7 +460,7 @@ def test_the_command_goes_on_after_what_happens_to_machines(tmp_path: Path, what
         assert tiny.run_command("--config", config, "--n", 10_000, "--out", out).returncode == 0
     else:
         assert process.returncode == 0, errors
-        assert "10,000 videos in" in told
+        assert "10,000 videos in" in output
     assert verify(out, "quick") == []
 
 

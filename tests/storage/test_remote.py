@@ -192,7 +192,7 @@ def test_what_fails_is_tried_again(server: Server, toy: Path, tmp_path: Path, ki
 
 @pytest.mark.parametrize("cached", [False, True])
 @pytest.mark.parametrize("kind", ["fail", "cut"])
-def test_what_keeps_failing_is_told(server: Server, toy: Path, tmp_path: Path, kind: str, cached: bool) -> None:
+def test_what_keeps_failing_is_an_error(server: Server, toy: Path, tmp_path: Path, kind: str, cached: bool) -> None:
     dataset = gen2d.open(TOY, cache_dir=tmp_path if cached else None)
     server.fault = always(kind, "GET", "/shards/train-00001.h5")
     with pytest.raises(UnreachableError, match=rf"{TOY}/shards/train-00001.h5 cannot be reached \(.+\)"):
@@ -204,7 +204,7 @@ def test_what_keeps_failing_is_told(server: Server, toy: Path, tmp_path: Path, k
             gen2d.open(TOY)[0]
 
 
-def test_a_server_without_parts_is_told_and_a_cache_helps(server: Server, toy: Path, tmp_path: Path) -> None:
+def test_a_server_without_parts_is_an_error_and_a_cache_helps(server: Server, toy: Path, tmp_path: Path) -> None:
     url = f"{server.address}/files/toy"
     server.has_ranges = False
     try:
@@ -255,7 +255,7 @@ def test_damage_is_never_returned_and_verify_tells_as_of_a_folder(
 
 
 @pytest.mark.parametrize("change", [flip, shorten])
-def test_a_damaged_index_is_told(toy: Path, change: Callable[[bytearray], Any]) -> None:
+def test_a_damaged_index_is_an_error(toy: Path, change: Callable[[bytearray], Any]) -> None:
     url = f"s3://bucket/index-{change.__name__}"
     damaged(toy, url, "index/train-20.npy", change)
     with pytest.raises(DamagedError, match=rf"^{url}/index/train-20.npy"):
@@ -339,11 +339,11 @@ def test_a_killed_fetch_leaves_nothing_that_counts(server: Server, toy: Path, tm
 
 
 @pytest.mark.parametrize(
-    ("options", "told"),
+    ("options", "message"),
     [({"cache_bytes": 10**9}, "say cache_dir="), ({"cache_dir": "/tmp", "cache_bytes": 1000}, "for the largest shard")],
 )
-def test_a_cache_that_cannot_be_is_told(toy: Path, options: dict[str, Any], told: str) -> None:
-    with pytest.raises(ConfigError, match=told):
+def test_a_cache_that_cannot_be_is_an_error(toy: Path, options: dict[str, Any], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
         gen2d.open(TOY, **options)
 
 
@@ -476,7 +476,7 @@ def test_an_upload_of_which_a_part_arrives_is_tried_again(tmp_path: Path, monkey
 
 
 @pytest.mark.parametrize("part", ["/shards/train-00001.h5", "/records/train."])
-def test_an_upload_that_keeps_failing_is_told_and_resumed(server: Server, toy: Path, part: str) -> None:
+def test_an_upload_that_keeps_failing_is_an_error_and_is_resumed(server: Server, toy: Path, part: str) -> None:
     url = f"s3://bucket/failing{part.replace('/', '-')}"
     server.fault = always("fail", "PUT", part)
     with pytest.raises(UnreachableError, match=rf"^{url}/.*train.* cannot be reached .*same command again"):
@@ -571,7 +571,7 @@ def test_what_is_no_dataset_is_left_alone(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("method", ["PUT", "GET"])
-def test_no_permission_is_told(server: Server, toy: Path, method: str) -> None:
+def test_no_permission_is_an_error(server: Server, toy: Path, method: str) -> None:
     server.fault = always("deny", method, "/")
     with pytest.raises(FolderError, match=r"s3://bucket/denied.* cannot be read or written \(permission denied\)"):
         synthetic.make(at("s3://bucket/denied"))
@@ -599,7 +599,7 @@ def test_a_full_disk_is_that_of_temporary_files(monkeypatch: pytest.MonkeyPatch)
 
 
 @pytest.mark.parametrize(
-    ("url", "told"),
+    ("url", "message"),
     [
         ("s3://", "must be PROTOCOL://FOLDER"),
         ("nope://bucket/toy", r"Protocol not known: nope\); common protocols are"),
@@ -608,13 +608,13 @@ def test_a_full_disk_is_that_of_temporary_files(monkeypatch: pytest.MonkeyPatch)
         ("http://127.0.0.1:1/toy", r"http://127.0.0.1:1/toy/.* cannot be reached \("),
     ],
 )
-def test_a_wrong_url_is_one_sentence(url: str, told: str) -> None:
-    with pytest.raises((UserError, UnreachableError), match=told):
+def test_a_wrong_url_is_one_sentence(url: str, message: str) -> None:
+    with pytest.raises((UserError, UnreachableError), match=message):
         gen2d.open(url)
     for verb in ("verify", "info"):
         done = tiny.run_main(verb, url)
-        assert done.returncode == (3 if "reached" in told else 2)
-        assert re.fullmatch(rf"gen2d: .*{told}.*\n", done.stderr), done.stderr
+        assert done.returncode == (3 if "reached" in message else 2)
+        assert re.fullmatch(rf"gen2d: .*{message}.*\n", done.stderr), done.stderr
 
 
 @pytest.mark.parametrize(

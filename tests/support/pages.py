@@ -119,9 +119,9 @@ class Reader:
         words = [sys.executable, "-c", shorter]
         done = subprocess.run(words, cwd=self.folder, capture_output=True, text=True, check=False)
         assert done.returncode == 0, block + done.stderr
-        told = re.search(r"error ([\d.]+), of .* ([\d.]+)", done.stdout)
-        assert told is None or float(told[1]) < 0.9 * float(told[2]), done.stdout
-        self.compared += told is not None
+        printed = re.search(r"error ([\d.]+), of .* ([\d.]+)", done.stdout)
+        assert printed is None or float(printed[1]) < 0.9 * float(printed[2]), done.stdout
+        self.compared += printed is not None
 
     def lacks(self, name: str) -> bool:
         """Whether a package is not installed."""

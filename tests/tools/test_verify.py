@@ -88,8 +88,8 @@ def test_files_in_each_others_place_are_found_and_never_read(root: Path, level: 
         found = verify(root, level)
         if level == "full" or len(contents[0]) != len(contents[1]) or not kind.startswith("shards"):
             assert all(any(str(path) in sentence for sentence in found) for path in (one, other)), kind
-        told = refused(root, expected) or str(one)
-        assert str(one) in told or str(other) in told
+        sentence = refused(root, expected) or str(one)
+        assert str(one) in sentence or str(other) in sentence
         for path, content in zip((one, other), contents, strict=True):
             path.write_bytes(content)
     assert verify(root, level) == []
@@ -105,9 +105,9 @@ def test_a_file_of_another_length_is_found_and_never_read(root: Path, size: str)
         if size == "gone":
             path.unlink()
         found = verify(root, "quick")
-        told = root if size == "gone" and path.name == "manifest.json" else path
-        assert any(str(told) in sentence for sentence in found), path
-        assert str(told) in (refused(root, expected) or str(told))
+        named = root if size == "gone" and path.name == "manifest.json" else path
+        assert any(str(named) in sentence for sentence in found), path
+        assert str(named) in (refused(root, expected) or str(named))
         path.write_bytes(content)
     assert verify(root, "quick") == []
 
