@@ -1,5 +1,6 @@
 """The loader gives what h5py gives, in whatever window and layout is asked for."""
 
+import inspect
 import os
 import pickle
 import shutil
@@ -233,7 +234,8 @@ def test_public_names_are_those_of_the_documentation(toy: Path) -> None:
         assert names == {*PUBLIC[type(made).__name__]}, type(made)
         for name in names - vars(made).keys():
             assert getattr(type(made), name).__doc__, name
-    assert all(f"    {name} : " in (loader.Dataset.__doc__ or "") for name in vars(ds) if not name.startswith("_"))
+    text = inspect.getdoc(loader.Dataset) or ""
+    assert all(f"\n{name} : " in text for name in vars(ds) if not name.startswith("_"))
 
 
 # ---- Processes
