@@ -320,6 +320,10 @@ def test_a_stopped_export_of_annotations_goes_on_where_it_was(
         for root in (out, whole)
     ]
     assert trees[0] == trees[1]
+    if to == "coco":  # what parts leave for the end is there
+        content = json.loads((whole / "annotations.json").read_text())
+        assert content["annotations"]
+        assert {one["image_id"] for one in content["annotations"]} <= {image["id"] for image in content["images"]}
 
 
 @pytest.mark.full
