@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from gen2d.core.enums import CIRCLE, DYNAMIC, KINEMATIC, POLYGON, STATIC
     from gen2d.core.errors import ConfigError, UserError
     from gen2d.core.schema import Field
+    from gen2d.core.sizes import power_of_two
     from gen2d.exports import arrays, tables
     from gen2d.exports.source import Source
     from gen2d.loading import dataset
@@ -60,6 +61,7 @@ _HOMES = {
     "gen2d.core.enums": "CIRCLE DYNAMIC KINEMATIC POLYGON STATIC",
     "gen2d.core.errors": "ConfigError UserError",
     "gen2d.core.schema": "Field",
+    "gen2d.core.sizes": "power_of_two",
     "gen2d.exports": "arrays tables",
     "gen2d.exports.source": "Source",
     "gen2d.loading": "dataset",
@@ -152,6 +154,7 @@ __all__ = [
     "pixel_at",
     "place",
     "plain",
+    "power_of_two",
     "questions",
     "reduce_halves",
     "start_position",

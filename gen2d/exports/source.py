@@ -33,9 +33,7 @@ class Source:
     part: range | None = None  # of the selected videos, by their places, if these are not all
     selection: np.ndarray | None = None  # numbers of the selected videos, ascending, if these are not all of the split
     codec: str = ""  # encoding of the frames; "" where the format has one only
-    notes: Path = (
-        Path()
-    )  # folder for what `write` has to tell `finish` about a part, which finds the notes of all there
+    notes: Path = Path()  # folder of the files that `write` leaves for `finish`, those of all parts
     jobs: int = 0  # number of threads; 0: one for each core, but at most 8
 
     @property

@@ -19,6 +19,7 @@ import numpy as np
 from gen2d import annotations
 from gen2d.config.config import Config
 from gen2d.core.errors import ConfigError, UserError
+from gen2d.core.sizes import power_of_two
 from gen2d.dataset.folder import describe_differences
 from gen2d.dataset.manifest import Manifest
 from gen2d.loading.column import Column
@@ -36,7 +37,7 @@ from gen2d.programs.redraw import (
     render_frames,
     seed_words_of,
 )
-from gen2d.programs.rollout import Rollout, power_of_two
+from gen2d.programs.rollout import Rollout
 from gen2d.programs.schema import FRAMES
 from gen2d.programs.shared import cached_jit
 from gen2d.records import axes

@@ -20,6 +20,7 @@ from gen2d.config import quality
 from gen2d.config.config import Config
 from gen2d.config.parameters import only_sections
 from gen2d.core import enums
+from gen2d.core.sizes import power_of_two
 from gen2d.programs import render
 from gen2d.programs.devices import Device
 from gen2d.programs.schema import VideoSchema
@@ -46,11 +47,6 @@ SHARD_BYTES = 2**30  # of raw frames in a shard
 SHARD_VIDEOS = 1024  # largest default number of videos in a shard
 # Limits of a default batch: videos, and pairs of their bodies, which take 300 bytes each.
 BATCH_SIZE, PAIRS = 512, 2**20
-
-
-def power_of_two(limit: int) -> int:
-    """Largest power of two that does not exceed the limit; 1 for a smaller limit."""
-    return 1 << max(0, limit.bit_length() - 1)
 
 
 def divisor(number: int, limit: int) -> int:

@@ -259,15 +259,15 @@ def _rest_of(joints: Joints, layout: Layout, present: Array, state: State) -> Ar
         return jnp.zeros(len(is_distance))
     slots = [np.array([getattr(joint, side) for joint in layout.joints]) for side in "ab"]
     anchors = zip(slots, (joints.anchor_a, joints.anchor_b), strict=True)
-    one, other = (state.position[own] + _turned(anchor, state.angle[own]) for own, anchor in anchors)
+    one, other = (state.position[own] + rotate(anchor, state.angle[own]) for own, anchor in anchors)
     there = present[slots[0]] & present[slots[1]] & is_distance
     return jnp.where(there, jnp.hypot(*(other - one).T), 0.0)
 
 
-def _turned(points: Array, angle: Array) -> Array:
-    """Points [J, 2] after rotations by these angles [J], rad."""
-    cos, sin = jnp.cos(angle), jnp.sin(angle)
-    return jnp.stack([cos * points[:, 0] - sin * points[:, 1], sin * points[:, 0] + cos * points[:, 1]], -1)
+def rotate(vector: Array, angle: Array) -> Array:
+    """Vectors [..., 2] rotated counter-clockwise by angles [...], rad."""
+    cos, sin, (x, y) = jnp.cos(angle), jnp.sin(angle), (vector[..., 0], vector[..., 1])
+    return jnp.stack([cos * x - sin * y, sin * x + cos * y], axis=-1)
 
 
 def distance_joints(anchor_a: Any, anchor_b: Any, *, rest: Any = None, **numbers: Any) -> Joints:

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from gen2d.plugin import Export, Field, Source, UserError, tables
+from gen2d.plugin import Export, Field, Source, UserError, power_of_two, tables
 
 PART_BYTES, PART_VIDEOS = 2**28, 1024  # about the maximum of a part, compressed; at least one video
 SHARD_BYTES, CHUNK_BYTES = 2**26, 2**16  # about the maximum of several videos in a shard and in a chunk, uncompressed
@@ -22,7 +22,7 @@ INDEX = Field("int64", "n", "", "number of the video in its split")
 
 def part_videos(source: Source) -> int:
     """Number of videos in a part: a power of two, which whole shards and chunks fill."""
-    return _power(min(PART_VIDEOS, PART_BYTES // max(1, source.stored_video_bytes)))
+    return power_of_two(min(PART_VIDEOS, PART_BYTES // max(1, source.stored_video_bytes)))
 
 
 def check(source: Source) -> None:
@@ -63,8 +63,8 @@ class _Array:
     def __init__(self, group: Any, name: str, field: Field, source: Source) -> None:
         shape, part = field.shape(source.sizes), part_videos(source)
         size = max(1, int(np.prod(shape)) * np.dtype(field.dtype).itemsize)
-        self.per_shard = min(part, _power(SHARD_BYTES // size))
-        per_chunk = min(self.per_shard, _power(CHUNK_BYTES // size))
+        self.per_shard = min(part, power_of_two(SHARD_BYTES // size))
+        per_chunk = min(self.per_shard, power_of_two(CHUNK_BYTES // size))
         others = [max(1, length) for length in shape]
         self.array = group.create_array(
             name,
@@ -117,11 +117,6 @@ def _about(field: Field) -> dict[str, Any]:
     """Attributes of an array."""
     about = {key: getattr(field, key) for key in ("unit", "axes", "meaning")}
     return about | ({"codes": {str(code): name for code, name in field.codes.items()}} if field.codes else {})
-
-
-def _power(number: int) -> int:
-    """The largest power of two that is not above a number; 1 if there is none."""
-    return 1 << max(0, number.bit_length() - 1)
 
 
 EXPORT = Export(

@@ -11,6 +11,7 @@ from gen2d.records.axes import Array
 from gen2d.records.keys import key_for
 from gen2d.records.layout import Layout
 from gen2d.records.scene import Objects, Scene, State
+from gen2d.sampling.builder import rotate
 from gen2d.sampling.matched.sets import SetMember, along_slots
 
 CLEARANCE = 1e-3  # m around an object that has jumped
@@ -94,7 +95,7 @@ def _ghost_contact(member: SetMember, now: SceneInstant, options: Any, layout: L
     slot, possible = _random_slot(key_for(member.set_key, "object"), _fast_objects(now))
     velocity = state.velocity[slot]
     skew = MAX_INCIDENCE * _uniform(key_for(member.own_key, "skew"), (), -1.0)
-    normal = _rotate(velocity, jnp.pi + skew)
+    normal = rotate(velocity, jnp.pi + skew)
     square = jnp.maximum((normal**2).sum(), 1e-12)
     mirrored = velocity - 2 * (velocity @ normal) / square * normal
     state = dataclasses.replace(state, velocity=state.velocity.at[slot].set(mirrored))
@@ -140,12 +141,6 @@ def _fast_objects(now: SceneInstant) -> Array:
     return now.free & (speed > 0) & (speed >= jnp.max(speed) / 2)
 
 
-def _rotate(vector: Array, angle: Array) -> Array:
-    """Vectors [..., 2] rotated counter-clockwise."""
-    cos, sin, (x, y) = jnp.cos(angle), jnp.sin(angle), (vector[..., 0], vector[..., 1])
-    return jnp.stack([cos * x - sin * y, sin * x + cos * y], axis=-1)
-
-
 def extent(objects: Objects) -> Array:
     """Largest distance [K] m of each object's boundary from its centre."""
     corner = 0.0 if objects.vertices is None else jnp.linalg.norm(objects.vertices, axis=-1).max(axis=-1)
@@ -154,7 +149,7 @@ def extent(objects: Objects) -> Array:
 
 def gaps(point: Array, objects: Objects, state: State) -> Array:
     """Distance [K] m of a point [2] from each object's boundary, negative inside; a lower bound near corners."""
-    local = _rotate(point - state.position, -state.angle)
+    local = rotate(point - state.position, -state.angle)
     along = jnp.maximum(jnp.abs(local[:, 0]) - objects.half_length, 0)
     distance = jnp.hypot(along, local[:, 1])
     if objects.vertices is not None:

@@ -1,0 +1,6 @@
+"""Sizes of batches, shards and chunks."""
+
+
+def power_of_two(limit: int) -> int:
+    """Largest power of two that does not exceed the limit; 1 for a smaller limit."""
+    return 1 << max(0, limit.bit_length() - 1)
