@@ -75,7 +75,7 @@ def _problem_of(video: Batch, count: int) -> str:
 
 
 def _film(path: Path, video: Batch, fps: float) -> np.ndarray:
-    films.mp4v(path, video["frames"], fps)
+    films.CODECS["mp4v"].write(path, video["frames"], fps)
     return np.frombuffer(path.read_bytes(), np.uint8)
 
 
