@@ -155,6 +155,8 @@ def _is_ours(name: str) -> bool:
 
 def _translated(repository: str, error: Exception) -> Exception:
     """The error of gen2d, with one sentence, for one of the library."""
+    if isinstance(error, RuntimeError) and isinstance(error.__cause__, Exception):  # of one large file
+        return _translated(repository, error.__cause__)
     response: Any = getattr(error, "response", None)
     code = getattr(response, "status_code", None)
     if code in (401, 403):

@@ -193,7 +193,9 @@ class DataLoader(Generic[A]):
     def state_dict(self) -> LoaderState:
         """State after the last batch delivered, as values that JSON can store; batches read ahead do not count.
 
-        It holds the epoch, the position, the values that determine the order, and the snapshot of the dataset.
+        It holds the epoch, the position, the values that determine the order, and the snapshot of the dataset. Taken in
+        the loop after the last batch, it is that of a loader whose iteration ends at once; taken after the loop, that of
+        one which goes on with the next `epochs` epochs.
         """
         shares = {"shares": self.dataset.shares} if isinstance(self.dataset, Mixture) else {}
         return self.epoch_sampler.state_dict() | {"snapshot": self.dataset.snapshot} | shares
@@ -239,6 +241,7 @@ class DataLoader(Generic[A]):
                 ahead.extend((next_step, self._submit(pool, next_step)) for next_step in itertools.islice(steps, 1))
                 self.epoch_sampler.advance(step)
                 yield batch
+            self.epoch_sampler.finish()
         finally:
             # An abandoned iterator ends in the garbage collector, which may run while a thread starts and holds the
             # lock that joining a thread needs. `close` waits.

@@ -106,13 +106,42 @@ class Mixture:
         return unbatch(self.batch(positions))
 
     def __getattr__(self, name: str) -> Any:
-        if name in ("select", "filter", "to_pandas", "to_arrow"):
+        if name in ("select", "to_pandas", "to_arrow"):
             raise AttributeError(
                 f"a mixture has other videos in each epoch: call {name} of its datasets, then gen2d.mix"
             )
         if name in ("config", "splits"):
             raise AttributeError(f"each dataset of a mixture has its own {name}: mixture.datasets[NAME].{name}")
         raise AttributeError(f"'Mixture' object has no attribute {name!r}")
+
+    def filter(self, condition: str) -> "Mixture":
+        """Mixture of the same datasets in the same proportions, each with the videos of which a condition is true.
+
+        Parameters
+        ----------
+        condition : str
+            As that of `Dataset.filter`; every dataset must store the fields in it.
+
+        Returns
+        -------
+        Mixture
+            Its epoch ends when one of the datasets has no further video, so it may be much shorter.
+
+        Raises
+        ------
+        ConfigError
+            If the condition is invalid, names a field that a dataset does not store, or is true of no video of a
+            dataset. Reading raises the errors of `Dataset.batch`.
+
+        Examples
+        --------
+        >>> heavy = mixture.filter("factors/gravity_y < -5")
+        """
+        datasets = {name: source.filter(condition) for name, source in self.datasets.items()}
+        for name, source in datasets.items():
+            if not len(source):
+                raise ConfigError(f"filter is {condition!r}, which is true of no video of dataset {name}")
+        return Mixture(datasets, self.shares)
 
     def __repr__(self) -> str:
         return describe_text(*self._description)

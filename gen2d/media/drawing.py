@@ -5,12 +5,13 @@ from collections.abc import Sequence
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
+from gen2d.core.palettes import Color
+
 FONT = 12  # px, size of labels
 LINE = 17  # px, from one line of a label to the next
 LEFT, TOP = 4, 10  # px, of the first line
 CORNERS = 64  # of the polygons that stand for discs
 FINEST, LARGEST = 4, 4096  # samples per pixel along each axis, of a picture of up to so many samples a side
-Color = tuple[int, int, int]  # sRGB
 
 
 def label(lines: Sequence[str], height: int, width: int) -> np.ndarray:

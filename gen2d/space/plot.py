@@ -11,9 +11,10 @@ import numpy as np
 
 from gen2d.core.enums import DYNAMIC
 from gen2d.core.errors import ConfigError
+from gen2d.core.palettes import Color
 from gen2d.core.progress import waiting
 from gen2d.media import films
-from gen2d.media.drawing import CORNERS, Canvas, Color
+from gen2d.media.drawing import CORNERS, Canvas
 from gen2d.media.images import animate, write
 from gen2d.space.bodies import Body, Drawable, Film
 
