@@ -352,6 +352,7 @@ class IterableVideoDataset(_Epochs, torch.utils.data.IterableDataset[Sample]):
                     f"the state has {name} {state[name]}, but this dataset has {value}: its order would differ"
                 )
         self._next = whole_number("epoch", state["epoch"]), whole_number("position", state["position"])
+        self._unset_reads.fill_(min(int(self._unset_reads), 0))
 
     def __repr__(self) -> str:
         return f"<iterable of {self._source!r}, rank {self._sampler.rank} of {self._sampler.world_size}>"

@@ -193,9 +193,9 @@ class DataLoader(Generic[A]):
     def state_dict(self) -> LoaderState:
         """State after the last batch delivered, as values that JSON can store; batches read ahead do not count.
 
-        It holds the epoch, the position, the values that determine the order, and the snapshot of the dataset. Taken in
-        the loop after the last batch, it is that of a loader whose iteration ends at once; taken after the loop, that of
-        one which goes on with the next `epochs` epochs.
+        It holds the epoch, the position, the values that determine the order, and the snapshot of the dataset. A state
+        that the loop takes at the last batch resumes to an iteration that ends at once; one that is taken after the
+        loop resumes with the next `epochs` epochs.
         """
         shares = {"shares": self.dataset.shares} if isinstance(self.dataset, Mixture) else {}
         return self.epoch_sampler.state_dict() | {"snapshot": self.dataset.snapshot} | shares

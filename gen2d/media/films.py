@@ -73,7 +73,7 @@ def pyav() -> ModuleType:
     try:
         import av
     except ImportError:
-        raise UserError("this format needs PyAV: pip install gen2d[video]") from None
+        raise UserError("this format needs PyAV: pip install 'gen2d[video]'") from None
     return av
 
 

@@ -80,7 +80,7 @@ def prepare(device: str = "auto") -> list[Device]:
     try:
         return jax.devices(device)
     except RuntimeError as error:
-        hint = f"; install gen2d[cuda], or use {argument('device', 'cpu')}" if device == "gpu" else ""
+        hint = f"; pip install 'gen2d[cuda]', or use {argument('device', 'cpu')}" if device == "gpu" else ""
         raise DeviceError(f"{argument('device')} is {device!r}, but jax finds none{hint} ({error})") from None
 
 

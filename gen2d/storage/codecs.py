@@ -113,7 +113,7 @@ def _zstandard() -> ModuleType:
     try:
         import zstandard
     except ImportError:
-        raise UserError("the codec zstd needs zstandard: pip install gen2d[zstd]") from None
+        raise UserError("the codec zstd needs zstandard: pip install 'gen2d[zstd]'") from None
     return zstandard
 
 

@@ -165,5 +165,5 @@ def test_bad_input_is_one_sentence_and_sends_nothing(
 
 def test_a_missing_library_is_named(toy: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "huggingface_hub", None)
-    with pytest.raises(UserError, match=r"pip install gen2d\[hub\]"):
+    with pytest.raises(UserError, match=r"pip install 'gen2d\[hub\]'"):
         gen2d.push(toy, "me/toy")

@@ -259,6 +259,32 @@ def test_the_sampler_sets_the_epoch_of_order_and_windows(toy: Path) -> None:
     assert list(gen2d.torch.sampler(data, shuffle=False)) == list(range(TRAIN))
 
 
+@pytest.mark.parametrize("workers", WORKERS)
+@pytest.mark.parametrize("kind", ["map-style", "iterable"])
+def test_an_epoch_that_is_never_set_gives_one_warning(toy: Path, kind: str, workers: tuple[int, str | None]) -> None:
+    torch()
+
+    def new(**options: Any) -> tuple[Any, Any]:
+        ds = loader.open(toy, fields=FIELDS, **options)
+        data = gen2d.torch.dataset(ds) if kind == "map-style" else gen2d.torch.iterable(ds, 5)
+        return data, data_loader(data, workers, batch_size=5 if kind == "map-style" else None)
+
+    data, batches = new(window=2)
+    for _ in range(2):
+        list(batches)
+    with pytest.raises(UserWarning, match="set_epoch was not called, so each epoch is the same"):
+        list(batches)
+    list(batches)
+    data, batches = new(window=2)
+    data.set_epoch(0)
+    for _ in range(4):
+        list(batches)
+    if kind == "map-style":  # whole videos do not depend on the epoch
+        _, batches = new()
+        for _ in range(4):
+            list(batches)
+
+
 @pytest.mark.parametrize("epoch", [-1, 1.5, "2", None, True])
 def test_an_epoch_is_a_whole_number(toy: Path, epoch: Any) -> None:
     torch()

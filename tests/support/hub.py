@@ -1,7 +1,7 @@
 """A stand-in for the Hugging Face Hub on this machine: repositories of files, as huggingface_hub and datasets ask.
 
-As on the Hub, files of binary formats and large ones are uploaded by Git LFS, whole or in parts, and the others within the
-commit. It does not speak Xet.
+As on the Hub, files of binary formats and large ones are uploaded by Git LFS, whole or in parts, and the others within
+the commit. It does not speak Xet.
 """
 
 import base64
