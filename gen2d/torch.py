@@ -17,10 +17,10 @@ import numpy as np
 
 from gen2d.core.errors import ConfigError
 from gen2d.loading.dataloader import without_text
-from gen2d.loading.epochs import EpochSampler, GlobalBatch, check_one_of, epoch_indices
+from gen2d.loading.epochs import EpochSampler, GlobalBatch, check_one_of, epoch_indices, whole_number
 from gen2d.loading.mixture import Mixture
 from gen2d.loading.protocols import Batch, Numbers, VideoReader
-from gen2d.loading.windows import batch_at, batch_of_epoch, checked_source, whole_number
+from gen2d.loading.windows import batch_at, batch_of_epoch, checked_source
 
 try:
     import torch

@@ -16,9 +16,9 @@ if TYPE_CHECKING:
 
 def add_arguments(parser: Parser) -> None:
     """Add the arguments of the verb."""
-    parser.add_argument(
-        "--config", required=True, metavar="YAML", help="a config file, or the name of one that comes with gen2d"
-    )
+    meaning = "a config file, or the name of one that comes with gen2d"
+    parser.add_argument("positional", nargs="?", metavar="YAML", help=meaning)
+    parser.add_argument("--config", metavar="YAML", help="the same, by a flag")
     parser.add_argument(
         "--n",
         required=True,
@@ -68,6 +68,11 @@ def run(options: argparse.Namespace) -> int:
     """Generate the dataset, or this worker's share of it; the exit code of the verb."""
     from gen2d.core.progress import Event, to_json, to_stderr, waiting
 
+    if options.positional is not None and options.config is not None:
+        raise UserError(f"{options.positional!r} is one argument too many; see {PROG} generate --help")
+    config = options.positional if options.config is None else options.config
+    if config is None:
+        raise UserError(f"a config is needed, such as bouncing.yaml; `{PROG} list` names those that come with gen2d")
     log, engine = to_json if options.json else to_stderr, engine_of(options)
     with waiting("Importing jax", log):
         from gen2d.generation.run import generate
@@ -75,7 +80,7 @@ def run(options: argparse.Namespace) -> int:
 
     try:
         summary = generate(
-            options.config,
+            config,
             options.n,
             options.out,
             seed=options.seed,

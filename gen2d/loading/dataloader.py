@@ -17,6 +17,7 @@ from gen2d.core.errors import ConfigError
 from gen2d.loading.epochs import EpochSampler, GlobalBatch, check_one_of
 from gen2d.loading.mixture import Mixture
 from gen2d.loading.protocols import Batch, LoaderState, Snapshot, VideoReader
+from gen2d.loading.windows import checked_source
 
 if TYPE_CHECKING:
     import jax
@@ -162,6 +163,7 @@ class DataLoader(Generic[A]):
         _check_device(to, device, sharding)
         if min(self.prefetch, self.threads) < 1:
             raise ConfigError("prefetch and num_threads must be 1 or more")
+        checked_source(dataset, "dataset")
         self.epoch_sampler = EpochSampler(len(dataset), batch_size, seed, shuffle, epochs, rank, world_size, drop_last)
         self.dataset, self.transform, self.to = dataset, transform, to
         self.device, self.sharding = device, sharding

@@ -5,6 +5,7 @@ and the position, so iteration resumes anywhere without replay.
 """
 
 import copy
+import operator
 import os
 import sys
 from collections.abc import Iterator, Mapping
@@ -46,8 +47,10 @@ class EpochSampler:
         rank, world_size = _rank_and_world_size(rank, world_size)
         check_one_of("shuffle", shuffle, ("global", True, False))
         check_one_of("drop_last", drop_last, (True, False))
-        if min(batch_size, world_size) < 1 or not 0 <= rank < world_size:
-            raise ConfigError("batch_size and world_size must be 1 or more, and rank from 0 to world_size - 1")
+        batch_size, world_size = whole_number("batch_size", batch_size, 1), whole_number("world_size", world_size, 1)
+        seed, epochs = whole_number("seed", seed, None), epochs if epochs is None else whole_number("epochs", epochs, 1)
+        if not 0 <= whole_number("rank", rank) < world_size:
+            raise ConfigError(f"rank is {rank}, but must be from 0 to world_size - 1, which is {world_size - 1}")
         self.videos, self.seed, self.shuffle, self.epochs = videos, seed, bool(shuffle), epochs
         self.rank, self.world_size, self.global_size = rank, world_size, batch_size * world_size
         self.min_videos = self.global_size if drop_last else 1  # in a global batch
@@ -154,6 +157,17 @@ def _rank_and_world_size(rank: int | None, world_size: int | None) -> tuple[int,
             raise ConfigError(f"RANK and WORLD_SIZE are {values[0]!r} and {values[1]!r}, but must be whole numbers")
         return int(values[0]), int(values[1])
     return 0, 1
+
+
+def whole_number(name: str, value: object, low: int | None = 0) -> int:
+    """The value as an int. Raises ConfigError unless it is a whole number, `low` or more."""
+    try:
+        number = operator.index(value)  # pyright: ignore[reportArgumentType]
+    except TypeError:
+        number = None
+    if number is None or isinstance(value, bool) or (low is not None and number < low):
+        raise ConfigError(f"{name} is {value!r}, but must be a whole number{'' if low is None else f', {low} or more'}")
+    return number
 
 
 def check_one_of(name: str, value: Any, allowed: tuple[object, ...]) -> None:

@@ -55,6 +55,8 @@ def mix(datasets: Mapping[str, VideoReader], weights: Weights | None = None) -> 
     >>> mixture = gen2d.mix({"easy": easy, "hard": hard}, {"easy": 3, "hard": 1})
     >>> loader = gen2d.DataLoader(mixture, batch_size=32)  # 24 videos of easy and 8 of hard in each batch
     """
+    if not isinstance(datasets, Mapping):
+        raise ConfigError(f"datasets is {datasets!r:.80}, but must be a mapping of names to datasets")
     if not datasets:
         raise ConfigError("datasets is empty, but must name one dataset or more")
     first = next(iter(datasets))

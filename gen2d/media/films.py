@@ -100,7 +100,7 @@ CODECS = {
         "MPEG-4 part 2 by PyAV, for old programs; browsers do not play it",
         ".mp4",
         "mpeg4",
-        options={"flags": "+bitexact+qscale", "global_quality": "236"},  # a quality of 2 (of 1 to 31), in FFmpeg's unit
+        options={"flags": "+bitexact", "qmin": "3", "qmax": "3"},  # the scale of quality is from 1 to 31
     ),
     # Flat discs need a better quality than camera images, for which the default crf of 23 is meant. With mbtree (x264
     # in PyAV 18) encoding is not reproducible: 1 in 5 videos of 64 px and 32 frames had other bytes in another run.

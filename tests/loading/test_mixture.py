@@ -120,7 +120,8 @@ def test_a_filtered_mixture_keeps_its_proportions(sources: dict) -> None:
     mixture = gen2d.mix(sources, WEIGHTS)
     found, expected = mixture.filter("index >= 4"), {name: own.filter("index >= 4") for name, own in sources.items()}
     assert found.shares == mixture.shares
-    assert videos(found, [found[:]]) == videos(other := gen2d.mix(expected, WEIGHTS), [other[:]])
+    other = gen2d.mix(expected, WEIGHTS)
+    assert videos(found, [found[:]]) == videos(other, [other[:]])
     assert (found[:]["index"] >= 4).all()
     with pytest.raises(ConfigError, match=r"filter is 'index > 900', which is true of no video of dataset \w+"):
         mixture.filter("index > 900")

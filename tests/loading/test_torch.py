@@ -305,7 +305,10 @@ def test_wrong_arguments_are_named(toy: Path) -> None:
         (lambda: gen2d.torch.iterable(ds, 4, epochs=0), "epochs is 0"),
         (lambda: gen2d.torch.iterable(ds, 4, shuffle="local"), "shuffle is 'local'"),
         (lambda: gen2d.torch.iterable(ds, 21), "21 videos make a global batch, but there are only 20"),
-        (lambda: gen2d.torch.iterable(ds, 4, rank=2, world_size=2), "rank from 0 to world_size - 1"),
+        (
+            lambda: gen2d.torch.iterable(ds, 4, rank=2, world_size=2),
+            "rank is 2, but must be from 0 to world_size - 1, which is 1",
+        ),
         (lambda: gen2d.grain.source(ds, epochs=0), "epochs is 0"),
         (lambda: gen2d.grain.source(5), "ds is 5"),  # pyright: ignore
     ]
