@@ -326,10 +326,12 @@ def _overridden_config(
     try:
         return from_mapping(overridden(dict(values), overrides), source, name, copies)
     except ConfigError as error:
-        culprit = _first_wrong(values, overrides, source, copies)
-        if culprit is None or not str(error).startswith(f"{source}: "):
+        head, said = f"{source}: ", str(error).removeprefix(f"{source}: ")
+        named = [text for text in overrides if said.startswith(f"{text.partition('=')[0].strip()} ")]
+        culprit = named[-1] if named else _first_wrong(values, overrides, source, copies)
+        if culprit is None or not str(error).startswith(head):
             raise
-        raise ConfigError(f"{argument('set', culprit)}: {str(error).removeprefix(f'{source}: ')}") from None
+        raise ConfigError(f"{argument('set', culprit)}: {said}") from None
 
 
 def _first_wrong(values: Mapping[str, object], overrides: Sequence[str], source: str, copies: Copies) -> str | None:

@@ -62,10 +62,18 @@ def test_an_error_names_the_override_or_the_file_that_causes_it(tmp_path: Path) 
             gen2d.load_config(config, overrides)
         assert str(caught.value).startswith(f"--set video.fps=-1: {said}")
     (tmp_path / "own.yaml").write_text("scene: {name: bouncing, bals: 3}")
-    for given in ([], ["look=flat"], overrides):
+    for given, cause in (
+        ([], f"{tmp_path / 'own.yaml'}: scene.bals is not an option"),
+        (["look=flat"], f"{tmp_path / 'own.yaml'}: scene.bals is not an option"),
+        (overrides, f"overrides=['video.fps=-1']: {said}"),
+        (
+            ["scene.radius=0.1", "scene=chain", "scene.bals=4"],
+            "overrides=['scene.bals=4']: scene.bals is not an option",
+        ),
+    ):
         with pytest.raises(ConfigError) as caught:
             gen2d.load_config(tmp_path / "own.yaml", given)
-        assert str(caught.value).startswith(f"{tmp_path / 'own.yaml'}: scene.bals is not an option")
+        assert str(caught.value).startswith(cause)
 
 
 def raised_texts(path: Path) -> list[str]:
