@@ -223,6 +223,26 @@ def test_a_plain_installation_is_what_the_main_job_imports() -> None:
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
+def test_a_plain_installation_is_mostly_jax() -> None:
+    project = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text())["project"]
+    sizes, todo = dict[str, int](), list(project["dependencies"])
+    while todo:
+        requirement = todo.pop()
+        name = re.split(r"[^\w.-]", requirement)[0].lower()
+        if "extra ==" in requirement or name in sizes:
+            continue
+        try:
+            distribution = importlib.metadata.distribution(name)
+        except importlib.metadata.PackageNotFoundError:  # for another Python or system
+            continue
+        sizes[name] = sum(file.size or 0 for file in distribution.files or ())
+        todo += distribution.requires or []
+    largest = sum(sizes[name] for name in ("jax", "jaxlib", "numpy", "scipy"))
+    assert largest > 400 * 2**20
+    assert sum(sizes.values()) - largest < 70 * 2**20
+    assert sum(sizes.values()) < 670 * 2**20
+
+
 def test_data_folders_hold_no_code():
     for folder in ("datasets", "configs"):
         assert not list((ROOT / folder).rglob("*.py"))
