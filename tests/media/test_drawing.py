@@ -50,7 +50,7 @@ def test_shapes_cover_their_areas_at_their_places(at: tuple[float, float]) -> No
         (line, 3 * length + 2.25 * np.pi, 2 * length + 3 * np.pi),
     ):
         assert -0.01 * exact < area - exact < perimeter / 5  # Pillow adds a part of a sample at the edges
-    assert_allclose([disc[1], square[1], line[1]], [at] * 3, atol=0.1)
+    assert_allclose([disc[1], square[1], line[1]], [at] * 3, atol=0.15)  # half a sample
     assert drawn("outline", box, 1.0)[0] == pytest.approx(40 + 80 / 8, rel=0.1)
 
 
