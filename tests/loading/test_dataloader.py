@@ -21,6 +21,7 @@ from numpy.testing import assert_array_equal
 from packages import package
 from tiny import run_on
 
+import gen2d
 from gen2d.core.errors import ConfigError
 from gen2d.core.permutation import hashed
 from gen2d.loading import dataset as loader
@@ -92,6 +93,40 @@ def test_the_length_is_the_number_of_batches(toy: Path, drop_last: bool) -> None
     for size in (1, 3, 5, 6, 19, 20):
         batches = DataLoader(dataset, size, epochs=1, drop_last=drop_last)
         assert len(batches) == len(list(batches))
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"batch_size": 0}, "batch_size is 0, but must be a whole number, 1 or more"),
+        ({"batch_size": "4"}, "batch_size is '4', but must be a whole number"),
+        ({"epochs": 0}, "epochs is 0, but must be a whole number, 1 or more"),
+        ({"seed": "a"}, "seed is 'a', but must be a whole number"),
+        ({"rank": 3, "world_size": 2}, "rank is 3, but must be from 0 to world_size - 1, which is 1"),
+        ({"dataset": [1, 2, 3]}, r"dataset is \[1, 2, 3\], but must be a dataset from gen2d.open or gen2d.mix"),
+    ],
+)
+def test_an_argument_that_is_wrong_is_named(toy: Path, options: dict[str, Any], message: str) -> None:
+    given: dict[str, Any] = {"dataset": loader.open(toy), "batch_size": 4, **options}
+    with pytest.raises(ConfigError, match=message):
+        DataLoader(given.pop("dataset"), given.pop("batch_size"), **given)
+
+
+def test_what_is_no_folder_or_dataset_is_named(toy: Path, tmp_path: Path) -> None:
+    ds: Any = loader.open(toy)
+    for call, message in (
+        (lambda: gen2d.mix([ds]), r"datasets is .*, but must be a mapping of names to datasets"),
+        (lambda: gen2d.export(ds, "npz", tmp_path / "out"), r"a folder is given as .*, but must be a path or a URL"),
+        (lambda: loader.open(toy, stride=0), "stride is 0, but must be 1 or more"),
+        (lambda: gen2d.load_config("bouncing", "a.b=1"), r"overrides is .a.b=1., but must be a list"),
+        (
+            lambda: gen2d.render(ds.select([0]), [0]),
+            r"ds is Subset, .* one folder: give ds\.source",
+        ),
+        (lambda: gen2d.render("toy", [0]), "ds is str, but must be a dataset of one folder"),
+    ):
+        with pytest.raises(ConfigError, match=message):
+            call()
 
 
 def test_each_iteration_goes_on_with_the_next_epoch(toy: Path) -> None:
