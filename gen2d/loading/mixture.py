@@ -18,6 +18,7 @@ from gen2d.core.schema import Field
 from gen2d.loading.concat import ConcatDataset, at_snapshots, groups_of
 from gen2d.loading.epochs import SOURCES
 from gen2d.loading.protocols import Batch, Key, Numbers, Snapshot, VideoReader, checked_numbers, item, unbatch
+from gen2d.loading.selection import Subset, matching
 from gen2d.loading.tables import describe_html, describe_text
 
 FINEST = 1000  # largest denominator of a weight; weights are rounded to such a fraction
@@ -139,7 +140,7 @@ class Mixture:
         --------
         >>> heavy = mixture.filter("factors/gravity_y < -5")
         """
-        datasets = {name: source.filter(condition) for name, source in self.datasets.items()}
+        datasets = {name: Subset(source, matching(source, condition)) for name, source in self.datasets.items()}
         for name, source in datasets.items():
             if not len(source):
                 raise ConfigError(f"filter is {condition!r}, which is true of no video of dataset {name}")

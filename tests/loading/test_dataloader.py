@@ -114,8 +114,10 @@ def test_an_argument_that_is_wrong_is_named(toy: Path, options: dict[str, Any], 
 
 def test_what_is_no_folder_or_dataset_is_named(toy: Path, tmp_path: Path) -> None:
     ds: Any = loader.open(toy)
+    name: Any = "toy"
+    pair: Any = [ds, ds]
     for call, message in (
-        (lambda: gen2d.mix([ds]), r"datasets is .*, but must be a mapping of names to datasets"),
+        (lambda: gen2d.mix(pair), r"datasets is .*, but must be a mapping of names to datasets"),
         (lambda: gen2d.export(ds, "npz", tmp_path / "out"), r"a folder is given as .*, but must be a path or a URL"),
         (lambda: loader.open(toy, stride=0), "stride is 0, but must be 1 or more"),
         (lambda: gen2d.load_config("bouncing", "a.b=1"), r"overrides is .a.b=1., but must be a list"),
@@ -123,7 +125,7 @@ def test_what_is_no_folder_or_dataset_is_named(toy: Path, tmp_path: Path) -> Non
             lambda: gen2d.render(ds.select([0]), [0]),
             r"ds is Subset, .* one folder: give ds\.source",
         ),
-        (lambda: gen2d.render("toy", [0]), "ds is str, but must be a dataset of one folder"),
+        (lambda: gen2d.render(name, [0]), "ds is str, but must be a dataset of one folder"),
     ):
         with pytest.raises(ConfigError, match=message):
             call()

@@ -71,6 +71,6 @@ def test_lines_of_a_label_stand_below_each_other() -> None:
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
 def test_opencv_reads_the_same_pixels(dtype: type) -> None:
     image = np.random.default_rng(0).integers(0, np.iinfo(dtype).max, (7, 12, 3), dtype, endpoint=True)
-    found = cv2.imdecode(np.frombuffer(png(image), np.uint8), cv2.IMREAD_UNCHANGED)
+    found = np.asarray(cv2.imdecode(np.frombuffer(png(image), np.uint8), cv2.IMREAD_UNCHANGED))
     assert found.dtype == dtype
-    assert (np.asarray(found)[..., ::-1] == image).all()
+    assert (found[..., ::-1] == image).all()

@@ -36,7 +36,7 @@ def test_what_is_decoded_is_what_was_encoded(codec: str, array: np.ndarray) -> N
 
 def test_zstd_without_its_package_is_one_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     made = synthetic.make(synthetic.dataset(tmp_path / "toy", train=2, codec="zstd"))
-    video = {name: values[1] for name, values in synthetic.stored(made.root).items()}
+    video = {name: values[1] for name, values in synthetic.stored(synthetic.folder(made)).items()}
     monkeypatch.setitem(sys.modules, "zstandard", None)
     sentence = r"the codec zstd needs zstandard: pip install 'gen2d\[zstd\]'"
     with pytest.raises(UserError, match=sentence):
