@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from gen2d.exports.source import Source
     from gen2d.loading import dataset
     from gen2d.loading.protocols import Batch
-    from gen2d.media import films
+    from gen2d.media import films, images
     from gen2d.records.axes import Array
     from gen2d.records.layout import JointSpec, Layout, SlotGroup
     from gen2d.records.parameter import maximum, minimum
@@ -66,7 +66,7 @@ _HOMES = {
     "gen2d.exports.source": "Source",
     "gen2d.loading": "dataset",
     "gen2d.loading.protocols": "Batch",
-    "gen2d.media": "films",
+    "gen2d.media": "films images",
     "gen2d.records.axes": "Array",
     "gen2d.records.layout": "JointSpec Layout SlotGroup",
     "gen2d.records.parameter": "maximum minimum",
@@ -143,6 +143,7 @@ __all__ = [
     "films",
     "fraction",
     "hashed",
+    "images",
     "line_fields",
     "line_margin",
     "maximum",

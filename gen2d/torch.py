@@ -9,6 +9,7 @@
 `import gen2d` does not import torch; this module does.
 """
 
+import warnings
 from collections.abc import Iterator, Mapping
 from typing import Any
 
@@ -16,10 +17,10 @@ import numpy as np
 
 from gen2d.core.errors import ConfigError
 from gen2d.loading.dataloader import without_text
-from gen2d.loading.epochs import EpochSampler, GlobalBatch, check_one_of, epoch_indices
+from gen2d.loading.epochs import EpochSampler, GlobalBatch, check_one_of, epoch_indices, whole_number
 from gen2d.loading.mixture import Mixture
 from gen2d.loading.protocols import Batch, Numbers, VideoReader
-from gen2d.loading.windows import batch_at, batch_of_epoch, checked_source, whole_number
+from gen2d.loading.windows import batch_at, batch_of_epoch, checked_source
 
 try:
     import torch
@@ -30,6 +31,7 @@ except ModuleNotFoundError as error:
 __all__ = ["IterableVideoDataset", "VideoDataset", "VideoSampler", "dataset", "iterable", "sampler"]
 
 Sample = dict[str, Any]  # tensors by field name; text fields are bytes
+_NEVER = -(2**62)  # a count that does not reach a limit
 
 
 def dataset(ds: VideoReader | Mixture, seed: int = 0) -> "VideoDataset":
@@ -37,7 +39,7 @@ def dataset(ds: VideoReader | Mixture, seed: int = 0) -> "VideoDataset":
 
     A random window follows from the seed, the epoch and the index of its video alone. So samplers, batch sizes and any
     number of workers, forked or spawned, give the same windows. Call `set_epoch` before each epoch, or let `sampler`
-    do so; otherwise each video keeps its window.
+    do so; otherwise each video keeps its window, and there is a UserWarning once more than two epochs have been read.
 
     Parameters
     ----------
@@ -163,10 +165,12 @@ class _Epochs:
 
     def __init__(self) -> None:
         self._shared_epoch = torch.zeros(1, dtype=torch.int64).share_memory_()
+        self._unset_reads = torch.zeros(1, dtype=torch.int64).share_memory_()  # videos read before `set_epoch`
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
-        self._shared_epoch.share_memory_()  # a copy by pickle alone is of its own
+        for shared in (self._shared_epoch, self._unset_reads):
+            shared.share_memory_()  # a copy by pickle alone is of its own
 
     @property
     def epoch(self) -> int:
@@ -179,6 +183,21 @@ class _Epochs:
         Call it between iterations, as that of `torch.utils.data.DistributedSampler`.
         """
         self._shared_epoch.fill_(whole_number("epoch", epoch))
+        self._unset_reads.fill_(_NEVER)
+
+    def _count(self, videos: int, epoch_videos: int) -> None:
+        """Count videos that are read, and warn once if more than two epochs of them were read without `set_epoch`.
+
+        Processes may miss some of each other's counts, which makes the warning come a little later.
+        """
+        self._unset_reads += videos
+        if self._unset_reads > 2 * epoch_videos:
+            self._unset_reads.fill_(_NEVER)
+            warnings.warn(
+                "set_epoch was not called, so each epoch is the same: call set_epoch(epoch) of the dataset or its "
+                "sampler before each epoch, or set_epoch(0) once if this is meant",
+                stacklevel=3,
+            )
 
 
 class VideoDataset(_Epochs, torch.utils.data.Dataset[Sample]):
@@ -195,6 +214,7 @@ class VideoDataset(_Epochs, torch.utils.data.Dataset[Sample]):
     def __init__(self, ds: VideoReader | Mixture, seed: int) -> None:
         super().__init__()
         self._source, self.seed = checked_source(ds), whole_number("seed", seed, None)
+        self._differs = isinstance(ds, Mixture) or _has_random_windows(self._source)
 
     def __len__(self) -> int:
         return len(self._source)
@@ -205,6 +225,8 @@ class VideoDataset(_Epochs, torch.utils.data.Dataset[Sample]):
 
     def __getitems__(self, indices: Numbers) -> list[Sample]:
         """List of videos or windows; torch's DataLoader calls this method once per batch."""
+        if self._differs:
+            self._count(len(indices), len(self))
         batch = _tensors(batch_of_epoch(self._source, np.asarray(indices), self.epoch, self.seed))
         return [{name: values[row] for name, values in batch.items()} for row in range(len(indices))]
 
@@ -259,6 +281,7 @@ class IterableVideoDataset(_Epochs, torch.utils.data.IterableDataset[Sample]):
         self._source, self._is_single = checked_source(ds), batch_size is None
         seed = whole_number("seed", seed, None)
         self._sampler = EpochSampler(len(ds), size, seed, shuffle, epochs, rank, world_size, drop_last)
+        self._differs = bool(shuffle) or isinstance(ds, Mixture) or _has_random_windows(self._source)
         self._position = 0, 0  # first epoch, and the step of worker 0 that comes next
         self._next: tuple[int, int] | None = None  # position of a state that has been loaded
 
@@ -284,6 +307,8 @@ class IterableVideoDataset(_Epochs, torch.utils.data.IterableDataset[Sample]):
             self._position = first, step - worker
             if self._is_single and not len(positions):
                 continue  # of the last videos of an epoch, there is none for this rank
+            if self._differs and self._epochs is not None:
+                self._count(len(positions), len(self._source) * self._epochs // sampler.world_size)
             batch = _tensors(batch_at(self._source, positions, epoch, sampler.seed, sampler.shuffled_by))
             yield {name: values[0] for name, values in batch.items()} if self._is_single else batch
 
@@ -327,9 +352,16 @@ class IterableVideoDataset(_Epochs, torch.utils.data.IterableDataset[Sample]):
                     f"the state has {name} {state[name]}, but this dataset has {value}: its order would differ"
                 )
         self._next = whole_number("epoch", state["epoch"]), whole_number("position", state["position"])
+        self._unset_reads.fill_(min(int(self._unset_reads), 0))
 
     def __repr__(self) -> str:
         return f"<iterable of {self._source!r}, rank {self._sampler.rank} of {self._sampler.world_size}>"
+
+
+def _has_random_windows(source: VideoReader | Mixture) -> bool:
+    """Whether windows differ between epochs."""
+    first = np.zeros(min(len(source), 1), np.int64)
+    return source._starts(first, first.astype(np.uint64)) is not None
 
 
 def _worker() -> tuple[int, int]:

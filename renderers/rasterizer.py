@@ -14,12 +14,11 @@ import dataclasses
 import functools
 from collections.abc import Callable
 
-import chex
 import jax
 import jax.numpy as jnp
 
 from gen2d.core.enums import STATIC
-from gen2d.records.axes import Array
+from gen2d.records.axes import Array, assert_shape
 from gen2d.renderers.color import to_linear, to_srgb
 from gen2d.renderers.compositing import (
     LayerCanvas,
@@ -46,7 +45,7 @@ def draw(scenes: RenderScene, plan: FramePlan) -> tuple[Array | None, Array | No
 
     Uses tiles on a CPU, and `draw_dense` elsewhere. Raises AssertionError for scenes of another layout.
     """
-    chex.assert_shape(scenes.instants.position, (None, None, plan.layout.slots, 2))
+    assert_shape(scenes.instants.position, (None, None, plan.layout.slots, 2), "states/position")
     return (draw_tiles if on_cpu() else draw_dense)(scenes, plan)
 
 
@@ -87,7 +86,7 @@ def draw_soft(scene: RenderScene, plan: FramePlan, sigma: float = 0.0) -> Array:
     They are differentiable in positions, angles, sizes, colours and the camera. `sigma` (px) blurs the coverage of each
     object; with 0 the frames are those of `draw` up to rounding. Raises AssertionError for a scene of another layout.
     """
-    chex.assert_shape(scene.instants.position, (None, plan.layout.slots, 2))
+    assert_shape(scene.instants.position, (None, plan.layout.slots, 2), "states/position")
     at, paint = scene.instants, float_painter(plan.linear, sigma)
     image = background_image(scene, at, plan)
     image = jnp.broadcast_to(to_linear(image) if plan.linear else image, (len(at.angle), *image.shape[1:]))

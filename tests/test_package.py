@@ -8,6 +8,7 @@ import pkgutil
 import re
 import subprocess
 import sys
+import tomllib
 from collections.abc import Callable
 from pathlib import Path
 
@@ -212,11 +213,34 @@ def test_reading_data_never_imports_jax() -> None:
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
-def test_a_plain_installation_needs_no_display_engine_or_codec() -> None:
-    required = [each for each in importlib.metadata.requires("gen2d") or [] if "extra ==" not in each]
-    names = {re.split(r"[^\w-]", each)[0].lower() for each in required}
-    assert "opencv-python-headless" in names
-    assert not names & {"opencv-python", "matplotlib", "pymunk", "box2d", "mujoco", "av", "imageio", "moviepy"}
+def test_a_plain_installation_is_what_the_main_job_imports() -> None:
+    project = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text())["project"]
+    names = {re.split(r"[^\w.-]", each)[0].lower() for each in project["dependencies"]}
+    assert names == {"h5py", "isal", "jax", "numpy", "pillow", "ruamel.yaml", "scipy", "tqdm"}
+    extras = ("av", "chex", "cv2", "fsspec", "hdf5plugin", "matplotlib", "pyarrow", "ray", "torch", "zstandard")
+    code = f"import sys; sys.modules.update(dict.fromkeys({extras})); from gen2d.cli import main; "
+    code += "import gen2d.generation.run, gen2d.generation.regenerate, gen2d.tools.preview, gen2d.tools.gallery"
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_a_plain_installation_is_mostly_jax() -> None:
+    project = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text())["project"]
+    sizes, todo = dict[str, int](), list(project["dependencies"])
+    while todo:
+        requirement = todo.pop()
+        name = re.split(r"[^\w.-]", requirement)[0].lower()
+        if "extra ==" in requirement or name in sizes:
+            continue
+        try:
+            distribution = importlib.metadata.distribution(name)
+        except importlib.metadata.PackageNotFoundError:  # for another Python or system
+            continue
+        sizes[name] = sum(file.size or 0 for file in distribution.files or ())
+        todo += distribution.requires or []
+    largest = sum(sizes[name] for name in ("jax", "jaxlib", "numpy", "scipy"))
+    assert largest > 400 * 2**20
+    assert sum(sizes.values()) - largest < 70 * 2**20
+    assert sum(sizes.values()) < 670 * 2**20
 
 
 def test_data_folders_hold_no_code():

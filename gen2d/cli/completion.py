@@ -20,6 +20,6 @@ def completion_script(parser: argparse.ArgumentParser, words: Sequence[str]) -> 
     try:
         import shtab
     except ImportError:
-        raise UserError("completion needs shtab: pip install shtab") from None
+        raise UserError("completion needs shtab: pip install 'gen2d[completion]'") from None
     parser.prog = COMMAND
     return shtab.complete(parser, shell)

@@ -4,7 +4,7 @@ import argparse
 import dataclasses
 import os
 import shlex
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from gen2d.cli.parser import PROG, Parser, add_engine, add_network, add_overrides, engine_of, limits, whole_number
 from gen2d.core.errors import UserError
@@ -16,9 +16,9 @@ if TYPE_CHECKING:
 
 def add_arguments(parser: Parser) -> None:
     """Add the arguments of the verb."""
-    parser.add_argument(
-        "--config", required=True, metavar="YAML", help="a config file, or the name of one that comes with gen2d"
-    )
+    meaning = "a config file, or the name of one that comes with gen2d"
+    parser.add_argument("config", nargs="?", default=argparse.SUPPRESS, action=_OneConfig, metavar="YAML", help=meaning)
+    parser.add_argument("--config", action=_OneConfig, metavar="YAML", help="the same, by a flag")
     parser.add_argument(
         "--n",
         required=True,
@@ -57,6 +57,15 @@ def add_arguments(parser: Parser) -> None:
     add_network(parser)
 
 
+class _OneConfig(argparse.Action):
+    """Store the config, which is given by its place or by its flag."""
+
+    def __call__(self, parser: Any, namespace: Any, values: Any, option_string: str | None = None) -> None:
+        if option_string is None and getattr(namespace, "config", None) is not None:
+            parser.error(f"{values!r} is one argument too many")
+        namespace.config = values
+
+
 def _worker(text: str) -> tuple[int, int]:
     number, slash, count = text.partition("/")
     if not slash or not all(part.isascii() and part.isdecimal() for part in (number, count)):
@@ -68,6 +77,8 @@ def run(options: argparse.Namespace) -> int:
     """Generate the dataset, or this worker's share of it; the exit code of the verb."""
     from gen2d.core.progress import Event, to_json, to_stderr, waiting
 
+    if options.config is None:
+        raise UserError(f"a config is needed, such as bouncing.yaml; `{PROG} list` names those that come with gen2d")
     log, engine = to_json if options.json else to_stderr, engine_of(options)
     with waiting("Importing jax", log):
         from gen2d.generation.run import generate

@@ -1,13 +1,15 @@
 """Argument parsers of the command line: verbs, arguments that they share, and one sentence for each error."""
 
 import argparse
+import difflib
 import itertools
+import re
 from collections.abc import Callable, Mapping, Sequence
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
 from gen2d._version import __version__
-from gen2d.config.plugins import nearest
+from gen2d.config.plugins import config_names, nearest
 from gen2d.core.errors import UserError
 
 if TYPE_CHECKING:
@@ -39,7 +41,12 @@ class Parser(argparse.ArgumentParser):
         super().__init__(allow_abbrev=False, **options)
 
     def error(self, message: str) -> NoReturn:
-        raise UserError(f"{message.removeprefix('argument ')}; see {self.prog} --help")
+        message = message.removeprefix("argument ")
+        if found := re.fullmatch(r"(\S+): invalid choice: (.*) \(choose from (.*)\)", message):
+            name, value, allowed = found.groups()
+            allowed = allowed.replace("'", "")
+            raise UserError(f"{name} is {value}, but must be one of {allowed}")
+        raise UserError(f"{message}; see {self.prog} --help")
 
     def check_names(self, words: Sequence[str]) -> None:
         """Raises UserError for an unknown option; argparse would first complain of one that is missing."""
@@ -48,7 +55,9 @@ class Parser(argparse.ArgumentParser):
             name = word.partition("=")[0]
             if name.startswith("--") and name not in known:
                 likely = [option for option in known if option.startswith(name)] or known
-                raise UserError(f"{name} is not an option; {nearest(name, likely)}")
+                close = difflib.get_close_matches(name[2:], [option[2:] for option in likely], n=1)
+                hint = f"did you mean --{close[0]}?" if close else f"there are: {', '.join(sorted(known))}"
+                raise UserError(f"{name} is not an option; {hint}")
 
 
 def parse(arguments: Sequence[str], verbs: Mapping[str, ModuleType]) -> argparse.Namespace:
@@ -86,9 +95,8 @@ def parse(arguments: Sequence[str], verbs: Mapping[str, ModuleType]) -> argparse
         raise SystemExit(0)
     if words[0] in ("--help", "-h", "--version"):
         top.parse_args(words)  # exits
-    if words[0].endswith((".yaml", ".yml")):
-        words.insert(0, "--config")
-    verb, *words = ["generate", *words] if words[0].startswith("-") else words
+    is_config = words[0].endswith((".yaml", ".yml")) or f"{words[0]}.yaml" in config_names()
+    verb, *words = ["generate", *words] if words[0].startswith("-") or is_config else words
     if verb not in verbs:
         raise UserError(f"{verb!r} is not a verb; {nearest(verb, [*verbs])}")
     parser = parser_of[verb]

@@ -306,7 +306,7 @@ def load_config(
     if isinstance(config, Config):
         return load_config(config.plain(), overrides, config.copies) if overrides else config
     if isinstance(config, Mapping):
-        return from_mapping(overridden(dict(config), overrides), "config", copies=copies)
+        return _overridden_config(config, overrides, "config", "dataset", copies)
     path = plugins.find_config(str(config))
     try:
         text = read_bytes(path, YAML_BYTES).decode("utf-8")
@@ -316,4 +316,29 @@ def load_config(
     if values is not None and not isinstance(values, Mapping):
         raise ConfigError(f"{path}: holds {type(values).__name__}, but must hold a mapping of sections")
     stem = re.sub(r"[^A-Za-z0-9._-]+", "-", path.stem).lstrip("._-")[:100] or "dataset"
-    return from_mapping(overridden(dict(values or {}), overrides), str(path), stem)
+    return _overridden_config(values or {}, overrides, str(path), stem, copies)
+
+
+def _overridden_config(
+    values: Mapping[str, object], overrides: Sequence[str], source: str, name: str, copies: Copies
+) -> Config:
+    """The Config of a mapping with overrides; an error names the override that causes it, if one does."""
+    try:
+        return from_mapping(overridden(dict(values), overrides), source, name, copies)
+    except ConfigError as error:
+        head, said = f"{source}: ", str(error).removeprefix(f"{source}: ")
+        named = [text for text in overrides if said.startswith(f"{text.partition('=')[0].strip()} ")]
+        culprit = named[-1] if named else _first_wrong(values, overrides, source, copies)
+        if culprit is None or not str(error).startswith(head):
+            raise
+        raise ConfigError(f"{argument('set', culprit)}: {said}") from None
+
+
+def _first_wrong(values: Mapping[str, object], overrides: Sequence[str], source: str, copies: Copies) -> str | None:
+    """The first override with which a valid config becomes invalid; None if there is none."""
+    for count in range(len(overrides) + 1):
+        try:
+            from_mapping(overridden(dict(values), overrides[:count]), source, copies=copies)
+        except ConfigError:
+            return overrides[count - 1] if count else None
+    return None

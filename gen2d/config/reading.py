@@ -82,6 +82,8 @@ def _yaml() -> YAML:
 
 def overridden(values: dict, overrides: Sequence[str]) -> dict:
     """The mapping, changed in place by overrides `section.option=value`. Raises ConfigError if one is malformed."""
+    if isinstance(overrides, str):
+        raise ConfigError(f"{argument('set')} is {overrides!r}, but must be a list, such as ['physics.substeps=8']")
     for text in overrides:
         path, equals, value = text.partition("=")
         user_file = re.fullmatch(r"(annotations)\.(.+\.py)(?:\.([^.]+))?", path.strip())  # a file's path may have dots

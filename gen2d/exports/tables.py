@@ -22,7 +22,7 @@ def pyarrow() -> ModuleType:
         import pyarrow as arrow
         import pyarrow.parquet
     except ImportError:
-        raise UserError("this format needs PyArrow: pip install gen2d[hub]") from None
+        raise UserError("this format needs PyArrow: pip install 'gen2d[hub]'") from None
     return arrow
 
 

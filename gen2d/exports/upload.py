@@ -1,5 +1,6 @@
 """Upload of a dataset, or of an export, to a repository of the Hugging Face Hub."""
 
+import contextlib
 import dataclasses
 import re
 from collections.abc import Iterator
@@ -9,7 +10,7 @@ from typing import Any
 
 from gen2d.core.errors import ConfigError, DamagedError, FolderError, UnreachableError, UserError, argument
 from gen2d.core.humanize import with_noun
-from gen2d.core.progress import Log, inform, waiting
+from gen2d.core.progress import Log, inform, is_interactive, waiting
 from gen2d.dataset.hub import dataset_metadata, licence_lines
 from gen2d.dataset.manifest import read_manifest
 from gen2d.dataset.spec import MANIFEST, plan, shard_name
@@ -94,7 +95,7 @@ def push(
         stale = [name for name in there if _is_ours(name) and name not in {*names, CARD}]
         changes = [hub.CommitOperationAdd(name, str(root / name)) for name in names if name != CARD]
         changes += [hub.CommitOperationAdd(CARD, card.encode()), *map(hub.CommitOperationDelete, stale)]
-        with waiting(f"Uploading {with_noun(len(names), 'file')}", log):
+        with waiting(f"Uploading {with_noun(len(names), 'file')}", log), _bars(hub):
             message = f"{root.resolve().name}, by gen2d"
             api.create_commit(url.repo_id, changes, commit_message=message, repo_type="dataset", revision=branch)
     except hub.errors.HFValidationError:
@@ -106,12 +107,26 @@ def push(
     return Pushed(str(url), len({*names, CARD}), len(stale), size)
 
 
+@contextlib.contextmanager
+def _bars(hub: ModuleType) -> Iterator[None]:
+    """Let the library draw its progress bars for a person only."""
+    if is_interactive() or hub.utils.are_progress_bars_disabled():
+        yield
+        return
+    hub.utils.disable_progress_bars()
+    try:
+        yield
+    finally:
+        hub.utils.enable_progress_bars()
+
+
 def _library() -> ModuleType:
     try:
         import huggingface_hub
         import huggingface_hub.errors
+        import huggingface_hub.utils
     except ImportError:
-        raise UserError("push needs huggingface_hub: pip install gen2d[hub]") from None
+        raise UserError("push needs huggingface_hub: pip install 'gen2d[hub]'") from None
     return huggingface_hub
 
 
@@ -155,6 +170,8 @@ def _is_ours(name: str) -> bool:
 
 def _translated(repository: str, error: Exception) -> Exception:
     """The error of gen2d, with one sentence, for one of the library."""
+    if isinstance(error, RuntimeError) and isinstance(error.__cause__, Exception):  # of one large file
+        return _translated(repository, error.__cause__)
     response: Any = getattr(error, "response", None)
     code = getattr(response, "status_code", None)
     if code in (401, 403):

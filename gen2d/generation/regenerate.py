@@ -48,8 +48,8 @@ from gen2d.storage.retries import Network
 from gen2d.storage.sealed import file_sha256
 
 Identity = Mapping[str, Any]  # of a dataset; its manifest has the same keys
-# The packages that decide the bytes of a shard with the same values.
-CODECS = ("h5py", "hdf5", "isal", "zstandard", "numpy")
+# The packages that decide the bytes of a shard with the same values, besides that of its codec.
+WRITERS = ("h5py", "hdf5", "isal", "numpy")
 
 
 def source_of(root: Place, identity: Identity, trust: Trust = (), on_cpu: bool = False) -> VideoSource:
@@ -326,13 +326,14 @@ def _regenerate_shards(
     generate(staged_spec, list(todo), log)
     staged = read_records(staged_spec, stage)
     versions = devices.versions()
-    same_codecs = manifest is None or all(manifest.producer.get(key) == versions[key] for key in CODECS)
+    writers = (*WRITERS, "zstandard") if spec.codec == "zstd" else WRITERS
+    same_writers = manifest is None or all(manifest.producer.get(key) == versions.get(key) for key in writers)
     for shard in todo:
         path, row, before = stage / shard_name(shard.name), staged.row_of(shard), records.row_of(shard)
         assert row is not None
         problems = _faults(path, shard, row, manifest)
         differs = before is not None and before["sha256"].tobytes() != row["sha256"].tobytes()
-        if not problems and same_codecs and differs and not _reproduces(spec.root, shard, path, manifest):
+        if not problems and same_writers and differs and not _reproduces(spec.root, shard, path, manifest):
             problems = ["none of its videos has the bits that were written"]
         if problems:
             raise FolderError(

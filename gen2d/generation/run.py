@@ -23,6 +23,7 @@ from gen2d.generation.warm_up import check_disk
 from gen2d.generation.worker import SEEN, GenerationJob
 from gen2d.records.keys import MAX_VIDEOS
 from gen2d.storage.atomic import sweep
+from gen2d.storage.codecs import check_installed
 from gen2d.storage.paths import Place, place
 from gen2d.storage.retries import Network
 
@@ -133,6 +134,7 @@ def generate(
     counts = _counts(config, _check_run(n, split, worker, overwrite), split)
     for sentence in _incomplete_sets(config, counts):
         log(sentence)
+    check_installed(config.storage.codec)
     network = Network(timeout, deadline)
     out = place(out, network) if out is not None else Path("datasets") / config.name
     remember(config.copies.values())

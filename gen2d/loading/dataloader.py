@@ -17,6 +17,7 @@ from gen2d.core.errors import ConfigError
 from gen2d.loading.epochs import EpochSampler, GlobalBatch, check_one_of
 from gen2d.loading.mixture import Mixture
 from gen2d.loading.protocols import Batch, LoaderState, Snapshot, VideoReader
+from gen2d.loading.windows import checked_source
 
 if TYPE_CHECKING:
     import jax
@@ -162,6 +163,7 @@ class DataLoader(Generic[A]):
         _check_device(to, device, sharding)
         if min(self.prefetch, self.threads) < 1:
             raise ConfigError("prefetch and num_threads must be 1 or more")
+        checked_source(dataset, "dataset")
         self.epoch_sampler = EpochSampler(len(dataset), batch_size, seed, shuffle, epochs, rank, world_size, drop_last)
         self.dataset, self.transform, self.to = dataset, transform, to
         self.device, self.sharding = device, sharding
@@ -193,7 +195,9 @@ class DataLoader(Generic[A]):
     def state_dict(self) -> LoaderState:
         """State after the last batch delivered, as values that JSON can store; batches read ahead do not count.
 
-        It holds the epoch, the position, the values that determine the order, and the snapshot of the dataset.
+        It holds the epoch, the position, the values that determine the order, and the snapshot of the dataset. A state
+        that the loop takes at the last batch resumes to an iteration that ends at once; one that is taken after the
+        loop resumes with the next `epochs` epochs.
         """
         shares = {"shares": self.dataset.shares} if isinstance(self.dataset, Mixture) else {}
         return self.epoch_sampler.state_dict() | {"snapshot": self.dataset.snapshot} | shares
@@ -239,6 +243,7 @@ class DataLoader(Generic[A]):
                 ahead.extend((next_step, self._submit(pool, next_step)) for next_step in itertools.islice(steps, 1))
                 self.epoch_sampler.advance(step)
                 yield batch
+            self.epoch_sampler.finish()
         finally:
             # An abandoned iterator ends in the garbage collector, which may run while a thread starts and holds the
             # lock that joining a thread needs. `close` waits.

@@ -252,8 +252,10 @@ class ViewOptions:
             raise ConfigError(f"start is {self.start!r}, but must be 'random', 'first' or a frame's number")
         if isinstance(self.start, int) and self.window is None:
             raise ConfigError(f"start is {self.start}, but without a window all frames are given: say window=")
-        if self.window is not None and (self.window < 1 or self.stride < 1 or self.first < 0):
-            raise ConfigError("window and stride must be 1 or more, and start 0 or more")
+        for name, low in (("window", 1), ("stride", 1), ("start", 0)):
+            value = getattr(self, name)
+            if isinstance(value, int) and value < low:
+                raise ConfigError(f"{name} is {value}, but must be {low} or more")
         if self.window is not None and self.first + self.span > frames:
             need = f"window {self.window}, stride {self.stride} and start {self.start} need"
             raise ConfigError(f"{need} {self.first + self.span} frames, but the videos have {frames}")

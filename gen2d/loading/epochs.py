@@ -5,6 +5,7 @@ and the position, so iteration resumes anywhere without replay.
 """
 
 import copy
+import operator
 import os
 import sys
 from collections.abc import Iterator, Mapping
@@ -46,12 +47,15 @@ class EpochSampler:
         rank, world_size = _rank_and_world_size(rank, world_size)
         check_one_of("shuffle", shuffle, ("global", True, False))
         check_one_of("drop_last", drop_last, (True, False))
-        if min(batch_size, world_size) < 1 or not 0 <= rank < world_size:
-            raise ConfigError("batch_size and world_size must be 1 or more, and rank from 0 to world_size - 1")
+        batch_size, world_size = whole_number("batch_size", batch_size, 1), whole_number("world_size", world_size, 1)
+        seed, epochs = whole_number("seed", seed, None), epochs if epochs is None else whole_number("epochs", epochs, 1)
+        if not 0 <= whole_number("rank", rank) < world_size:
+            raise ConfigError(f"rank is {rank}, but must be from 0 to world_size - 1, which is {world_size - 1}")
         self.videos, self.seed, self.shuffle, self.epochs = videos, seed, bool(shuffle), epochs
         self.rank, self.world_size, self.global_size = rank, world_size, batch_size * world_size
         self.min_videos = self.global_size if drop_last else 1  # in a global batch
         self.epoch = self.position = 0
+        self._is_loaded = False  # whether the next iteration continues the one of a state
         self._check_size()
 
     def _check_size(self) -> None:
@@ -84,7 +88,7 @@ class EpochSampler:
         epoch, position = state["epoch"], state["position"]
         if not (isinstance(epoch, int) and isinstance(position, int) and min(epoch, position) >= 0):
             raise ConfigError(f"the state has epoch and position {(epoch, position)}, but must have whole numbers")
-        self.epoch, self.position = self._wrap(epoch, position)
+        self.epoch, self.position, self._is_loaded = epoch, position, True
 
     def with_videos(self, videos: int) -> "EpochSampler":
         """Sampler at its beginning with the same options for another number of videos."""
@@ -94,17 +98,29 @@ class EpochSampler:
         return other
 
     def steps(self) -> Iterator[GlobalBatch]:
-        """Global batches from the current position on, until `epochs` epochs are complete."""
-        epoch, position = self.epoch, self.position
-        end = None if self.epochs is None else (epoch // self.epochs + 1) * self.epochs
+        """Global batches from the current position on, until `epochs` epochs are complete.
+
+        After a state that was taken behind the last batch of an iteration, but before its end, there are none.
+        """
+        if not self._is_loaded:
+            self.finish()
+        self._is_loaded = False
+        end = None if self.epochs is None else (self.epoch // self.epochs + 1) * self.epochs
+        epoch, position = self._wrap(self.epoch, self.position)
         while end is None or epoch < end:
             size = min(self.global_size, self.videos - position)
             yield GlobalBatch(epoch, position, size)
             epoch, position = self._wrap(epoch, position + size)
 
     def advance(self, step: GlobalBatch) -> None:
-        """Move the current position to the end of a global batch."""
+        """Move the current position behind a global batch; behind the last of an iteration, to the end of its epoch."""
         self.epoch, self.position = self._wrap(step.epoch, step.position + step.size)
+        if self.epochs is not None and self.position == 0 and self.epoch % self.epochs == 0:
+            self.epoch, self.position = step.epoch, self.videos
+
+    def finish(self) -> None:
+        """Move the current position from the end of an epoch to the beginning of the next one."""
+        self.epoch, self.position = self._wrap(self.epoch, self.position)
 
     def _wrap(self, epoch: int, position: int) -> tuple[int, int]:
         """Epoch and position of the next global batch; a position near the end of an epoch wraps to the next epoch."""
@@ -141,6 +157,17 @@ def _rank_and_world_size(rank: int | None, world_size: int | None) -> tuple[int,
             raise ConfigError(f"RANK and WORLD_SIZE are {values[0]!r} and {values[1]!r}, but must be whole numbers")
         return int(values[0]), int(values[1])
     return 0, 1
+
+
+def whole_number(name: str, value: object, low: int | None = 0) -> int:
+    """The value as an int. Raises ConfigError unless it is a whole number, `low` or more."""
+    try:
+        number = operator.index(value)  # pyright: ignore[reportArgumentType]
+    except TypeError:
+        number = None
+    if number is None or isinstance(value, bool) or (low is not None and number < low):
+        raise ConfigError(f"{name} is {value!r}, but must be a whole number{'' if low is None else f', {low} or more'}")
+    return number
 
 
 def check_one_of(name: str, value: Any, allowed: tuple[object, ...]) -> None:

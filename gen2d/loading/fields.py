@@ -1,25 +1,34 @@
 """What is said of fields that a dataset does not have."""
 
 import difflib
+import fnmatch
 from collections.abc import Iterable
 
-# Options that make fields, by the beginnings of their names; the first that fits counts.
-MAKERS = {
-    "frames": "storage.frames=video",
-    "masks/amodal": "annotations.amodal=true",
-    "masks/": "annotations.masks=true",
-    "boxes/": "annotations.boxes=true",
-    "visibility/": "annotations.visibility=true",
-    "quality/min_visibility": "annotations.visibility=true",
-    "flow/": "annotations.flow=true",
-    "tracks/": "annotations.tracks=8",
-    "contacts/": "annotations.contacts=4",
-    "energy/": "annotations.energy=true",
-    "momentum/": "annotations.energy=true",
-    "quality/energy_residual": "annotations.energy=true",
-    "quality/lyapunov": "annotations.lyapunov=true",
-    "text/": "annotations.captions=true",
+# Fields that only some datasets have, by the option that makes them.
+_MADE = {
+    "storage.frames=video": "frames",
+    "annotations.amodal=true": "masks/amodal",
+    "annotations.masks=true": "masks/instance",
+    "annotations.boxes=true": "boxes/amodal boxes/visible",
+    "annotations.visibility=true": "visibility/fraction visibility/pixels quality/min_visibility",
+    "annotations.flow=true": "flow/forward flow/forward_valid flow/backward flow/backward_valid",
+    "annotations.tracks=8": "tracks/points tracks/visible tracks/object",
+    "annotations.contacts=4": (
+        "contacts/a contacts/b contacts/count contacts/time contacts/frame contacts/point contacts/normal "
+        "contacts/kind contacts/normal_impulse contacts/tangent_impulse contacts/approach_speed "
+        "contacts/separation_speed"
+    ),
+    "annotations.energy=true": (
+        "energy/kinetic energy/rotational energy/potential energy/lost_in_contact energy/lost_to_damping "
+        "energy/work_in energy/residual momentum/linear momentum/angular quality/energy_residual"
+    ),
+    "annotations.lyapunov=true": "quality/lyapunov",
+    "annotations.captions=true": "text/caption text/short_caption text/questions text/events text/event_count",
+    "matched.change": (
+        "matched/set matched/member matched/kind matched/onset matched/object matched/partner matched/size"
+    ),
 }
+MAKERS = {name: option for option, names in _MADE.items() for name in names.split()}
 RENDERED = "frames", "masks/", "boxes/", "visibility/", "flow/", "tracks/"  # what can be rendered from states
 CLOSE = 0.6  # of difflib
 MOST = 12  # names in a list
@@ -28,16 +37,24 @@ MOST = 12  # names in a list
 def suggestion(name: str, names: Iterable[str]) -> str:
     """End of a sentence that says that there is no field of this name: the option that makes it, or close names."""
     known = list(names)
+    absent = [each for each in MAKERS if each not in known]
     group, separator, last = name.rpartition("/")
-    own = {each.rpartition("/")[2]: each for each in known if each.rpartition("/")[0] == group} if separator else {}
-    near_own = [own[each] for each in difflib.get_close_matches(last, own, 1, CLOSE)]
-    near = near_own or ([] if own else difflib.get_close_matches(name, known, 1, CLOSE))
-    maker = next((option for begin, option in MAKERS.items() if name.startswith(begin)), None)
-    if maker is not None and not near_own:
-        renders = "render={} in gen2d.open renders it, and " if name.startswith(RENDERED) else ""
-        return f", which is not stored: {renders}the option {maker} of gen2d.generate stores it"
-    if near:
-        return f": did you mean {near[0]!r}?"
-    listed = list(own.values()) or known
+    own = {each.rpartition("/")[2]: each for each in [*known, *absent] if each.rpartition("/")[0] == group}
+    near = difflib.get_close_matches(last, own, 1, CLOSE) if separator else []
+    of_pattern = fnmatch.filter(absent, name)
+    found = of_pattern[0] if of_pattern else own[near[0]] if near else ""
+    if not found and not (own and separator):
+        candidates = [*known, *absent] if separator else known
+        found = next(iter(difflib.get_close_matches(name, candidates, 1, CLOSE)), "")
+    if found in absent:
+        meant = "" if of_pattern else f": did you mean {found!r}"
+        renders = "render={} in gen2d.open renders it, and " if found.startswith(RENDERED) else ""
+        return f"{meant}, which is not stored: {renders}the option {MAKERS[found]} of gen2d.generate stores it"
+    if found:
+        return f": did you mean {found!r}?"
+    listed = [each for each in own.values() if each in known] if separator else []
+    listed = listed or known
     more = f" and {len(listed) - MOST} more" if len(listed) > MOST else ""
-    return f": it has {', '.join(listed[:MOST])}{more}"
+    makers = sorted({MAKERS[each] for each in own.values() if each in absent}) if separator else []
+    made = f"; {' and '.join(makers)} make{'s' * (len(makers) == 1)} others of {group}/" if makers else ""
+    return f": it has {', '.join(listed[:MOST])}{more}{made}"

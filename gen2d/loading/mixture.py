@@ -18,6 +18,7 @@ from gen2d.core.schema import Field
 from gen2d.loading.concat import ConcatDataset, at_snapshots, groups_of
 from gen2d.loading.epochs import SOURCES
 from gen2d.loading.protocols import Batch, Key, Numbers, Snapshot, VideoReader, checked_numbers, item, unbatch
+from gen2d.loading.selection import Subset, matching
 from gen2d.loading.tables import describe_html, describe_text
 
 FINEST = 1000  # largest denominator of a weight; weights are rounded to such a fraction
@@ -55,6 +56,8 @@ def mix(datasets: Mapping[str, VideoReader], weights: Weights | None = None) -> 
     >>> mixture = gen2d.mix({"easy": easy, "hard": hard}, {"easy": 3, "hard": 1})
     >>> loader = gen2d.DataLoader(mixture, batch_size=32)  # 24 videos of easy and 8 of hard in each batch
     """
+    if not isinstance(datasets, Mapping):
+        raise ConfigError(f"datasets is {datasets!r:.80}, but must be a mapping of names to datasets")
     if not datasets:
         raise ConfigError("datasets is empty, but must name one dataset or more")
     first = next(iter(datasets))
@@ -106,13 +109,42 @@ class Mixture:
         return unbatch(self.batch(positions))
 
     def __getattr__(self, name: str) -> Any:
-        if name in ("select", "filter", "to_pandas", "to_arrow"):
+        if name in ("select", "to_pandas", "to_arrow"):
             raise AttributeError(
                 f"a mixture has other videos in each epoch: call {name} of its datasets, then gen2d.mix"
             )
         if name in ("config", "splits"):
             raise AttributeError(f"each dataset of a mixture has its own {name}: mixture.datasets[NAME].{name}")
         raise AttributeError(f"'Mixture' object has no attribute {name!r}")
+
+    def filter(self, condition: str) -> "Mixture":
+        """Mixture of the same datasets in the same proportions, each with the videos of which a condition is true.
+
+        Parameters
+        ----------
+        condition : str
+            As that of `Dataset.filter`; every dataset must store the fields in it.
+
+        Returns
+        -------
+        Mixture
+            Its epoch ends when one of the datasets has no further video, so it may be much shorter.
+
+        Raises
+        ------
+        ConfigError
+            If the condition is invalid, names a field that a dataset does not store, or is true of no video of a
+            dataset. Reading raises the errors of `Dataset.batch`.
+
+        Examples
+        --------
+        >>> heavy = mixture.filter("factors/gravity_y < -5")
+        """
+        datasets = {name: Subset(source, matching(source, condition)) for name, source in self.datasets.items()}
+        for name, source in datasets.items():
+            if not len(source):
+                raise ConfigError(f"filter is {condition!r}, which is true of no video of dataset {name}")
+        return Mixture(datasets, self.shares)
 
     def __repr__(self) -> str:
         return describe_text(*self._description)

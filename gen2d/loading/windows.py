@@ -4,34 +4,25 @@ A random window is computed from the seed, the epoch and the index or position o
 order of reading, so any number of workers reads the same windows.
 """
 
-import operator
 import sys
 
 import numpy as np
 
 from gen2d.core.errors import ConfigError
 from gen2d.core.permutation import hashed
-from gen2d.loading.epochs import INDEX_WINDOWS, WINDOWS, check_one_of
+from gen2d.loading.epochs import INDEX_WINDOWS, WINDOWS, check_one_of, whole_number
 from gen2d.loading.mixture import Mixture
 from gen2d.loading.protocols import Batch, Numbers, VideoReader, checked_numbers
 
 
-def checked_source(ds: object) -> VideoReader | Mixture:
-    """The dataset itself. Raises ConfigError for anything that `gen2d.open` and `gen2d.mix` do not return."""
+def checked_source(ds: object, name: str = "ds") -> VideoReader | Mixture:
+    """The dataset itself, which error messages call `name`.
+
+    Raises ConfigError for anything that `gen2d.open` and `gen2d.mix` do not return.
+    """
     if not all(hasattr(ds, name) for name in ("_numbers_at", "_starts", "_fill", "empty")):
-        raise ConfigError(f"ds is {ds!r:.80}, but must be a dataset from gen2d.open or gen2d.mix")
+        raise ConfigError(f"{name} is {ds!r:.80}, but must be a dataset from gen2d.open or gen2d.mix")
     return ds  # pyright: ignore[reportReturnType]
-
-
-def whole_number(name: str, value: object, low: int | None = 0) -> int:
-    """The value as an int. Raises ConfigError unless it is a whole number, `low` or more."""
-    try:
-        number = operator.index(value)  # pyright: ignore[reportArgumentType]
-    except TypeError:
-        number = None
-    if number is None or isinstance(value, bool) or (low is not None and number < low):
-        raise ConfigError(f"{name} is {value!r}, but must be a whole number{'' if low is None else f', {low} or more'}")
-    return number
 
 
 def batch_of_epoch(source: VideoReader | Mixture, indices: Numbers, epoch: int, seed: int) -> Batch:

@@ -1,7 +1,7 @@
 """Contact sheets: one row per video, time from left to right."""
 
-import cv2
 import numpy as np
+from PIL import Image
 
 COLUMNS = 10  # frames across the sheet
 LARGEST = 192  # px; maximum side of a frame on a dataset card
@@ -26,8 +26,12 @@ def downsample(video: np.ndarray) -> np.ndarray:
     factor = -(-max(frames.shape[1:3]) // LARGEST)
     if factor == 1:
         return frames
-    size = frames.shape[2] // factor, frames.shape[1] // factor
-    return np.stack([cv2.resize(frame, size, interpolation=cv2.INTER_AREA) for frame in frames])
+    return np.stack([resized(frame, frames.shape[1] // factor, frames.shape[2] // factor) for frame in frames])
+
+
+def resized(image: np.ndarray, height: int, width: int) -> np.ndarray:
+    """Picture [height, width, 3], uint8, whose pixels are the averages over the areas of a larger one."""
+    return np.array(Image.fromarray(np.ascontiguousarray(image)).resize((width, height), Image.Resampling.BOX))
 
 
 def upscale(image: np.ndarray) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Film files: MPEG-4 by OpenCV, a required dependency, and other codecs by PyAV, an optional one."""
+"""Film files, encoded by PyAV, an optional dependency."""
 
 import dataclasses
 import os
@@ -8,13 +8,12 @@ from fractions import Fraction
 from pathlib import Path
 from types import ModuleType
 
-import cv2
 import numpy as np
 
 from gen2d.core.errors import ConfigError, UserError
 
 LOSS = "lossy: colours at half the resolution, and rounded"  # of YUV 4:2:0
-SLOWEST = 0.1  # frames/s; OpenCV rounds rates to a thousandth
+SLOWEST = 0.1  # frames/s
 FASTEST = 2**16 - 1  # frames/s; MPEG-4 stores 16 bits
 
 
@@ -24,51 +23,29 @@ class Codec:
 
     meaning: str
     suffix: str
+    encoder: str  # FFmpeg's name
     fastest: float = FASTEST  # frames/s
     loss: str = LOSS  # what it does not preserve; "" if it preserves all
-    encoder: str = ""  # FFmpeg's name; "" for MPEG-4 by OpenCV
     pixels: str = "yuv420p"  # FFmpeg's name of the pixel format
     options: Mapping[str, str] = dataclasses.field(default_factory=dict[str, str])  # FFmpeg's
 
     def check(self, name: str, size: tuple[int, int], fps: float) -> None:
-        """Raise ConfigError for unsupported frame sizes and rates, and UserError without PyAV if that is needed."""
+        """Raise ConfigError for unsupported frame sizes and rates, and UserError without PyAV."""
         if self.loss:
             check_size(name, size)
         check_rate(name, fps, self.fastest)
-        if self.encoder:
-            pyav()
+        pyav()
 
     def write(self, path: Path, frames: np.ndarray, fps: float) -> None:
-        """Write frames [T, H, W, 3], uint8 RGB; raises OSError."""
-        if self.encoder:
-            encode(path, frames, fps, self.encoder, self.pixels, self.options)
-        else:
-            mp4v(path, frames, fps)
+        """Write frames [T, H, W, 3], uint8 RGB. Raises OSError, and UserError without PyAV."""
+        encode(path, frames, fps, self.encoder, self.pixels, self.options)
 
     def content(self, frames: np.ndarray, fps: float) -> bytes:
-        """Content of the film's file; raises OSError."""
+        """Content of the film's file. Raises OSError, and UserError without PyAV."""
         with tempfile.TemporaryDirectory(prefix="gen2d-") as folder:
             path = Path(folder) / f"film{self.suffix}"
             self.write(path, frames, fps)
             return path.read_bytes()
-
-
-def mp4v(path: Path, frames: np.ndarray, fps: float) -> None:
-    """Write frames [T, H, W, 3], uint8 RGB with H and W even, as MPEG-4; raises OSError if the file lacks a frame."""
-    height, width = frames.shape[1:3]
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), fps, (width, height))
-    if not writer.isOpened():
-        raise OSError(f"{path}: OpenCV could not write a film")
-    for image in frames:
-        writer.write(np.ascontiguousarray(image[..., ::-1]))
-    writer.release()
-    # OpenCV reports no error, not even for a full disk.
-    film = cv2.VideoCapture(str(path))
-    properties = cv2.CAP_PROP_FRAME_COUNT, cv2.CAP_PROP_FRAME_HEIGHT, cv2.CAP_PROP_FRAME_WIDTH
-    sizes = [film.get(number) for number in properties]
-    film.release()
-    if sizes != [len(frames), height, width]:
-        raise OSError(f"{path}: OpenCV could not write all of a film")
 
 
 def encode(path: Path, frames: np.ndarray, fps: float, codec: str, pixels: str, options: Mapping[str, str]) -> None:
@@ -96,13 +73,13 @@ def pyav() -> ModuleType:
     try:
         import av
     except ImportError:
-        raise UserError("this format needs PyAV: pip install gen2d[video]") from None
+        raise UserError("this format needs PyAV: pip install 'gen2d[video]'") from None
     return av
 
 
 def rate_of(fps: float) -> Fraction:
-    """Frame rate as a fraction, such as 30000/1001."""
-    return Fraction(fps).limit_denominator(1001)
+    """Frame rate as a fraction of numbers of 16 bits, as MPEG-4 stores it, such as 30000/1001."""
+    return Fraction(fps).limit_denominator(max(1, min(1001, int(FASTEST / fps))))
 
 
 def check_size(name: str, size: tuple[int, int]) -> None:
@@ -119,28 +96,33 @@ def check_rate(name: str, fps: float, fastest: float) -> None:
 
 
 CODECS = {
-    "mp4v": Codec("MPEG-4 part 2 by OpenCV: needs no extra package; browsers do not play it", ".mp4"),
+    "mp4v": Codec(
+        "MPEG-4 part 2 by PyAV, for old programs; browsers do not play it",
+        ".mp4",
+        "mpeg4",
+        options={"flags": "+bitexact", "qmin": "3", "qmax": "3"},  # the scale of quality is from 1 to 31
+    ),
     # Flat discs need a better quality than camera images, for which the default crf of 23 is meant. With mbtree (x264
     # in PyAV 18) encoding is not reproducible: 1 in 5 videos of 64 px and 32 frames had other bytes in another run.
     "h264": Codec(
         "H.264 by PyAV, which browsers play",
         ".mp4",
-        encoder="libx264",
+        "libx264",
         options={"crf": "12", "x264-params": "no-mbtree=1", "movflags": "+faststart"},
     ),
     "av1": Codec(
         "AV1 by PyAV: smaller than H.264, but slower to encode",
         ".mp4",
+        "libsvtav1",
         fastest=240,  # the maximum of this encoder
-        encoder="libsvtav1",
         options={"crf": "20", "preset": "8", "svtav1-params": "lp=1"},
     ),
     "ffv1": Codec(
         "FFV1 in Matroska by PyAV, lossless, with a checksum in every frame",
         ".mkv",
+        "ffv1",
         fastest=1000,  # Matroska stores times in milliseconds
         loss="",
-        encoder="ffv1",
         pixels="bgr0",  # the stored bytes in another order; every YUV format would round them
         options={"level": "3", "coder": "1", "context": "1", "slicecrc": "1"},
     ),

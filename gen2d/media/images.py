@@ -3,11 +3,12 @@
 import contextlib
 import errno
 import io
+import struct
 import tempfile
+import zlib
 from collections.abc import Iterator
 from pathlib import Path
 
-import cv2
 import numpy as np
 from PIL import Image
 
@@ -57,8 +58,21 @@ def write(path: Path, image: np.ndarray) -> None:
 
 
 def png(image: np.ndarray) -> bytes:
-    """The bytes of a PNG file that holds a picture [H, W, 3], uint8 RGB."""
-    is_encoded, content = cv2.imencode(".png", image[..., ::-1])
-    if not is_encoded:
-        raise OSError("OpenCV could not write a PNG")
-    return content.tobytes()
+    """The bytes of a PNG file that holds a picture [H, W, 3] of RGB, uint8 or uint16."""
+    if image.dtype == np.uint16:
+        return _png16(image)
+    content = io.BytesIO()
+    Image.fromarray(np.ascontiguousarray(image)).save(content, "PNG")
+    return content.getvalue()
+
+
+def _png16(image: np.ndarray) -> bytes:
+    """PNG of 16 bits a channel, which Pillow does not write; each row is stored as it is (filter 0)."""
+    height, width = image.shape[:2]
+    pixels = np.ascontiguousarray(image, ">u2").reshape(height, -1).view(np.uint8)
+    rows = np.concatenate([np.zeros((height, 1), np.uint8), pixels], axis=1)
+    header = struct.pack(">IIBBBBB", width, height, 16, 2, 0, 0, 0)  # 2: RGB
+    chunks = (b"IHDR", header), (b"IDAT", zlib.compress(rows.tobytes())), (b"IEND", b"")
+    return b"\x89PNG\r\n\x1a\n" + b"".join(
+        struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data)) for kind, data in chunks
+    )

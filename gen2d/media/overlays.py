@@ -2,10 +2,10 @@
 
 from collections.abc import Mapping
 
-import cv2
 import numpy as np
 
 from gen2d.media.contact_sheet import upscale
+from gen2d.media.drawing import rgb_of
 
 VISIBLE, AMODAL = (255, 255, 255), (255, 140, 0)  # colours of visible and amodal boxes
 VideoFields = Mapping[str, np.ndarray]
@@ -13,9 +13,7 @@ VideoFields = Mapping[str, np.ndarray]
 
 def colors(count: int) -> np.ndarray:
     """Distinct colours of ids [count, 3], uint8: 0 is black, 255 grey."""
-    hue = np.arange(count) * 0.618034 % 1 * 180  # golden section: neighbours differ, and no hue repeats
-    hsv = np.stack([hue, np.full(count, 170), np.full(count, 255)], -1).astype(np.uint8)
-    rgb = cv2.cvtColor(hsv[None], cv2.COLOR_HSV2RGB)[0]
+    rgb = rgb_of(np.arange(count) * 0.618034 % 1 * 360, 2 / 3)  # golden section: neighbours differ, and no hue repeats
     rgb[0], rgb[255:] = 0, 128
     return rgb
 
@@ -32,7 +30,8 @@ def amodal_overlay(frame: VideoFields) -> np.ndarray:
     palette = colors(256)
     for slot, packed in enumerate(frame["masks/amodal"]):
         mask = upscale(np.unpackbits(packed)[: height * width].reshape(height, width))
-        image[(mask > 0) & (cv2.erode(mask, np.ones((3, 3), np.uint8)) == 0)] = palette[slot + 1]
+        around = np.lib.stride_tricks.sliding_window_view(np.pad(mask, 1, constant_values=1), (3, 3))
+        image[(mask > 0) & (around == 0).any((-2, -1))] = palette[slot + 1]
     return image
 
 
@@ -43,8 +42,19 @@ def boxes_overlay(frame: VideoFields) -> np.ndarray:
     for name, color in (("boxes/amodal", AMODAL), ("boxes/visible", VISIBLE)):
         for left, top, right, bottom in np.round(frame[name] * factor).astype(int).tolist():
             if right > left:
-                cv2.rectangle(image, (left, top), (right - 1, bottom - 1), color)
+                _draw_box(image, left, top, right, bottom, color)
     return image
+
+
+def _draw_box(image: np.ndarray, left: int, top: int, right: int, bottom: int, color: tuple[int, int, int]) -> None:
+    """Colour the outermost pixels of a box, as far as it lies in the image."""
+    rows, columns = (slice(max(first, 0), max(last, 0)) for first, last in ((top, bottom), (left, right)))
+    for row in {top, bottom - 1}:
+        if 0 <= row < image.shape[0]:
+            image[row, columns] = color
+    for column in {left, right - 1}:
+        if 0 <= column < image.shape[1]:
+            image[rows, column] = color
 
 
 def directions(flow: np.ndarray) -> np.ndarray:
@@ -55,9 +65,7 @@ def directions(flow: np.ndarray) -> np.ndarray:
 def flow_overlay(frame: VideoFields) -> np.ndarray:
     """Flow to the next frame: direction as hue, speed as saturation."""
     x, y = np.moveaxis(frame["flow/forward"], -1, 0)
-    hue = np.degrees(np.arctan2(y, x)) % 360 / 2
-    hsv = np.stack([hue, 255 * np.clip(np.hypot(x, y), 0, 1), np.full_like(x, 255)], -1)
-    return cv2.cvtColor(hsv.astype(np.uint8), cv2.COLOR_HSV2RGB)
+    return rgb_of(np.degrees(np.arctan2(y, x)) % 360, np.clip(np.hypot(x, y), 0, 1))
 
 
 def tracks_overlay(frame: VideoFields) -> np.ndarray:
@@ -66,6 +74,8 @@ def tracks_overlay(frame: VideoFields) -> np.ndarray:
     factor, palette = len(image) // len(frame["frames"]), colors(256)
     for number, (point, visible) in enumerate(zip(frame["tracks/points"], frame["tracks/visible"], strict=True)):
         if visible:
-            pixel = np.floor(point * factor).astype(int).tolist()
-            cv2.circle(image, pixel, 1, palette[number % 254 + 1].tolist(), -1)
+            column, row = np.floor(point * factor).astype(int).tolist()
+            for across, down in ((0, 0), (-1, 0), (1, 0), (0, -1), (0, 1)):
+                if 0 <= row + down < image.shape[0] and 0 <= column + across < image.shape[1]:
+                    image[row + down, column + across] = palette[number % 254 + 1]
     return image

@@ -3,19 +3,18 @@
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 
-import cv2
 import numpy as np
 
 from gen2d.core.schema import Field
 from gen2d.dataset.manifest import Manifest
 from gen2d.loading.dataset import Dataset, ViewOptions
 from gen2d.media import overlays
-from gen2d.media.contact_sheet import GAP, add_border, downsample, sheet_frames
+from gen2d.media.contact_sheet import add_border, downsample, sheet_frames
+from gen2d.media.drawing import label
 from gen2d.page.page import members_of
 from gen2d.storage.paths import Place
 
 LABEL = 118  # px, width of the names
-LINE = 17  # px, height of a line of text
 BETWEEN = 8  # px, between matched sets, and before the annotations
 CHANGED = ("matched/member", "matched/kind", "matched/onset")
 
@@ -60,11 +59,7 @@ def dataset_sheet(root: Place, manifest: Manifest, split: str, numbers: Sequence
 def labelled(lines: Sequence[str], frames: np.ndarray) -> np.ndarray:
     """A row of frames [T, H, W, 3] with lines of text at the left."""
     row = np.concatenate([add_border(frame) for frame in frames], axis=1)
-    strip = np.full((len(row), LABEL, 3), 255, np.uint8)
-    for place, line in enumerate(lines):
-        at = 2 * GAP, 20 + LINE * place
-        cv2.putText(strip, line, at, cv2.FONT_HERSHEY_SIMPLEX, 0.42, (0, 0, 0), 1, cv2.LINE_AA)
-    return np.concatenate([strip, row], axis=1)
+    return np.concatenate([label(lines, len(row), LABEL), row], axis=1)
 
 
 def video_label(split: str, number: int, video: Mapping[str, np.ndarray], fields: Mapping[str, Field]) -> list[str]:

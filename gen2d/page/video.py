@@ -6,13 +6,13 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-import cv2
 import numpy as np
 
 from gen2d.core.enums import BEGIN, DYNAMIC, IMPACT, SHAPES
 from gen2d.core.schema import Field
 from gen2d.dataset.manifest import Manifest
 from gen2d.loading.dataset import Dataset, ViewOptions
+from gen2d.media.drawing import rgb_of
 from gen2d.media.overlays import colors, directions
 from gen2d.media.sprites import reduced, sprite_rows, sprite_sheet
 from gen2d.page.arrays import packed
@@ -213,10 +213,7 @@ def flow_colors(flow: np.ndarray) -> np.ndarray:
     finite = np.nan_to_num(flow.astype(np.float32), posinf=0, neginf=0)
     speed = np.hypot(finite[..., 0], finite[..., 1])
     level = np.rint(8 * speed / max(float(speed.max()), 1e-6)).astype(np.uint8)
-    hue = np.where(level > 0, directions(finite), 0) // 2  # OpenCV counts in 2 degrees
-    hsv = np.stack([hue, np.full_like(hue, 255), np.full_like(hue, 255)], -1).astype(np.uint8)
-    rgb = cv2.cvtColor(hsv.reshape(1, -1, 3), cv2.COLOR_HSV2RGB)
-    rgba = np.concatenate([rgb.reshape(*hue.shape, 3), (31 * level)[..., None]], -1)
+    rgba = np.concatenate([rgb_of(directions(finite), 1.0), (31 * level)[..., None]], -1)
     return np.where(level[..., None] > 0, rgba, 0).astype(np.uint8)
 
 

@@ -7,16 +7,14 @@ import os
 import pathlib
 import platform
 import sys
-from importlib.metadata import version
+from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
-import cv2
 import h5py
 import isal
 import jax
 import numpy as np
 import PIL
-import zstandard
 
 from gen2d._version import __version__
 from gen2d.core.errors import UserError, argument
@@ -82,7 +80,7 @@ def prepare(device: str = "auto") -> list[Device]:
     try:
         return jax.devices(device)
     except RuntimeError as error:
-        hint = f"; install gen2d[cuda], or use {argument('device', 'cpu')}" if device == "gpu" else ""
+        hint = f"; pip install 'gen2d[cuda]', or use {argument('device', 'cpu')}" if device == "gpu" else ""
         raise DeviceError(f"{argument('device')} is {device!r}, but jax finds none{hint} ({error})") from None
 
 
@@ -125,7 +123,10 @@ def processor_kind() -> str:
 
 
 def versions() -> dict[str, str]:
-    """Versions of gen2d, Python and the libraries that generate a dataset."""
+    """Versions of gen2d, Python and the libraries that generate a dataset; zstandard only where it is installed."""
+    zstandard = {}
+    with contextlib.suppress(PackageNotFoundError):
+        zstandard["zstandard"] = version("zstandard")
     return {
         "gen2d": __version__,
         "python": ".".join(map(str, sys.version_info[:3])),
@@ -135,7 +136,6 @@ def versions() -> dict[str, str]:
         "h5py": h5py.__version__,
         "hdf5": h5py.version.hdf5_version,
         "isal": isal.__version__,
-        "zstandard": zstandard.__version__,
-        "opencv": cv2.__version__,
+        **zstandard,
         "pillow": PIL.__version__,
     }

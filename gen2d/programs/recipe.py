@@ -24,7 +24,9 @@ def config_of(ds: Dataset, overrides: Sequence[str] = (), trust: Trust = ()) -> 
     needs code from the dataset that is not trusted.
     """
     if not isinstance(ds, Dataset):
-        raise ConfigError(f"ds is of {len(ds.datasets)} folders, but must be of one: give one of ds.datasets")
+        hint = {"datasets": ": give one of ds.datasets", "source": ": give ds.source, and ds.indices as indices"}
+        given = next((said for name, said in hint.items() if hasattr(ds, name)), "")
+        raise ConfigError(f"ds is {type(ds).__name__}, but must be a dataset of one folder{given}")
     return load_config(config_from(ds.root, ds.manifest.identity, trust).of_split(ds.options.split), overrides)
 
 

@@ -3,7 +3,6 @@
 Each of them has its own key, so changing the look or the camera changes nothing else.
 """
 
-import chex
 import jax
 import jax.numpy as jnp
 
@@ -12,7 +11,7 @@ from gen2d.config.annotations import Annotations
 from gen2d.config.config import Config
 from gen2d.config.sections import ImageOptions
 from gen2d.core.errors import ConfigError
-from gen2d.records.axes import Array, check_shapes
+from gen2d.records.axes import Array, assert_shape, check_shapes
 from gen2d.records.keys import key_for
 from gen2d.records.layout import Layout
 from gen2d.records.scene import Scene, State
@@ -86,7 +85,7 @@ def render_scene(
     slots = plan.layout.slots
     check_shapes(states, absent="n", K=slots)
     paint = paint_of(key, config, scene, plan.layout)
-    chex.assert_shape(paint.color, (slots, 3))
+    assert_shape(paint.color, (slots, 3), "the look's colours")
     view = view_of(key, config, plan.layout, states) if view is None else view
     objects, image = scene.objects, config.image
     bodies = BodyGeometry(objects.radius, objects.half_length, objects.vertices)

@@ -214,6 +214,7 @@ class Stream:
                     parts = []
                     self.epoch_sampler.advance(cell.step)
                     yield _CONVERTERS[self.to](fields)
+        self.epoch_sampler.finish()
 
     def _cells(self) -> Iterator[_Cell]:
         for step in self.epoch_sampler.steps():

@@ -6,10 +6,9 @@ threads run over the last axis. Only `to_device` and `to_stored` transpose.
 """
 
 import dataclasses
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from typing import Any, TypeVar, dataclass_transform
 
-import chex
 import jax
 import jax.numpy as jnp
 
@@ -68,7 +67,17 @@ def check_shapes(value: Any, absent: Collection[str] = (), device: bool = False,
         shape = [int(token) if token.isdigit() else sizes.get(token) for token in tokens]
         if device:
             shape = [shape[i] for i in _device_order(" ".join(tokens), len(tokens))]
-        chex.assert_shape(arrays[name], tuple(shape), custom_message=f"{name} has axes [{' '.join(tokens)}]")
+        assert_shape(arrays[name], shape, f"{name} [{' '.join(tokens)}]")
+
+
+def assert_shape(array: Array, shape: Sequence[int | None], name: str) -> None:
+    """Raise AssertionError, which names the array, unless it has this shape; None stands for any length."""
+    fits = len(array.shape) == len(shape) and all(
+        wanted in (None, length) for length, wanted in zip(array.shape, shape, strict=True)
+    )
+    if not fits:
+        wanted = ", ".join("any" if length is None else str(length) for length in shape)
+        raise AssertionError(f"{name} has the shape {array.shape}, but must have ({wanted})")
 
 
 def _device_order(stored: str, dimensions: int) -> list[int]:

@@ -7,18 +7,18 @@ contacts as red arrows along their normals.
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
 from gen2d.core.enums import DYNAMIC
 from gen2d.core.errors import ConfigError
+from gen2d.core.palettes import Color
 from gen2d.core.progress import waiting
 from gen2d.media import films
+from gen2d.media.drawing import CORNERS, Canvas
 from gen2d.media.images import animate, write
 from gen2d.space.bodies import Body, Drawable, Film
 
-RED, DARK, WHITE = (220, 30, 30), (60, 60, 60), (255, 255, 255)
-SHIFT = 6  # fractional bits of the coordinates that OpenCV takes
+RED, DARK = (220, 30, 30), (60, 60, 60)
 MARGIN = 0.05  # of the longer side of the default view, on each side
 FORMATS = (".png", ".webp", ".mp4")
 ViewBounds = tuple[float, float, float, float]
@@ -32,36 +32,42 @@ class PlotCanvas:
         if not (right > left and top > bottom):
             raise ConfigError(f"view is {view}, but must be left, bottom, right, top, each side longer than 0 m")
         self.left, self.top, self.scale = left, top, size / max(right - left, top - bottom)
-        height, width = (max(2, round(side * self.scale / 2) * 2) for side in (top - bottom, right - left))
-        self.image = np.full((height, width, 3), WHITE, np.uint8)  # even sizes, which video codecs need
-        self.thickness = max(1, round(size / 300))
+        # Even sizes, which video codecs need.
+        self.height, self.width = (max(2, round(side * self.scale / 2) * 2) for side in (top - bottom, right - left))
+        self.thickness = max(1.0, size / 250)  # px
+        self._canvas = Canvas(self.height, self.width)
+
+    @property
+    def image(self) -> np.ndarray:
+        """The image [H, W, 3], uint8."""
+        return self._canvas.image
 
     def to_pixels(self, points: Any) -> np.ndarray:
-        """World points [..., 2] in OpenCV's fixed-point pixels; pixel centres are integers."""
-        pixels = (np.asarray(points) - (self.left, self.top)) * (self.scale, -self.scale) - 0.5
-        return np.clip(np.round(pixels * 2**SHIFT), -(2**30), 2**30).astype(np.int32)
+        """World points [..., 2] in px from the image's corner, y down."""
+        return (np.asarray(points) - (self.left, self.top)) * (self.scale, -self.scale)
 
-    def disc(self, centre: Any, radius: float, color: tuple, filled: bool) -> None:
+    def disc(self, center: Any, radius: float, color: Color, filled: bool) -> None:
         """Draw a disc or its outline."""
-        thickness = -1 if filled else self.thickness
-        pixels = round(radius * self.scale * 2**SHIFT)
-        cv2.circle(self.image, self.to_pixels(centre).tolist(), pixels, color, thickness, cv2.LINE_AA, SHIFT)
+        if filled:
+            self._canvas.disc(self.to_pixels(center), radius * self.scale, color)
+        else:
+            turn = np.linspace(0, 2 * np.pi, CORNERS, endpoint=False)
+            self.outline(center + radius * np.stack([np.cos(turn), np.sin(turn)], axis=1), color, False)
 
-    def outline(self, points: Any, color: tuple, filled: bool) -> None:
+    def outline(self, points: Any, color: Color, filled: bool) -> None:
         """Draw a convex polygon or its outline."""
         if filled:
-            cv2.fillConvexPoly(self.image, self.to_pixels(points), color, cv2.LINE_AA, SHIFT)
+            self._canvas.polygon(self.to_pixels(points), color)
         else:
-            cv2.polylines(self.image, [self.to_pixels(points)], True, color, self.thickness, cv2.LINE_AA, SHIFT)
+            self._canvas.outline(self.to_pixels(points), self.thickness, color)
 
-    def line(self, a: Any, b: Any, color: tuple, thickness: int | None = None) -> None:
+    def line(self, a: Any, b: Any, color: Color, thickness: float | None = None) -> None:
         """Draw a line between two points."""
-        start, end = (self.to_pixels(point).tolist() for point in (a, b))
-        cv2.line(self.image, start, end, color, thickness or self.thickness, cv2.LINE_AA, SHIFT)
+        self._canvas.line(self.to_pixels(a), self.to_pixels(b), thickness or self.thickness, color)
 
     def arrow(self, start: Any, along: np.ndarray) -> None:
         """Draw a red arrow of a fixed length in pixels from a point along a unit vector."""
-        length = 0.07 * max(self.image.shape) / self.scale
+        length = 0.07 * max(self.height, self.width) / self.scale
         end, side = start + length * along, 0.15 * length * np.array([-along[1], along[0]])
         neck = start + 0.6 * length * along
         self.line(start, neck, RED, self.thickness + 1)
@@ -108,8 +114,8 @@ def overlay(of: Drawable, *, view: ViewBounds | None = None, size: int = 400, co
 def save(of: Film, path: str | Path, **options: Any) -> Path:
     """Write an image of all frames over each other (.png) or a film (.webp, which loops, or .mp4); return the path.
 
-    Options are those of `overlay` for images, and of `picture` for films. Raises ConfigError for another suffix, and
-    OSError if the file cannot be written.
+    Options are those of `overlay` for images, and of `picture` for films. Raises ConfigError for another suffix,
+    UserError for .mp4 without PyAV, and OSError if the file cannot be written.
     """
     path = Path(path)
     if path.suffix not in FORMATS:
@@ -122,7 +128,7 @@ def save(of: Film, path: str | Path, **options: Any) -> Path:
     if path.suffix == ".webp":
         animate(path, film[None], of.fps)
     else:
-        films.mp4v(path, film, of.fps)
+        films.CODECS["h264"].write(path, film, of.fps)
     return path
 
 

@@ -10,13 +10,13 @@ Each zstd frame contains its size and a checksum, because HDF5's zstd filter che
 
 import threading
 from collections.abc import Callable
+from types import ModuleType
 from typing import Any
 
 import numpy as np
-import zstandard
 from isal import isal_zlib
 
-from gen2d.core.errors import DamagedError
+from gen2d.core.errors import DamagedError, UserError
 
 CODECS = ("gzip", "zstd", "none")
 
@@ -29,14 +29,20 @@ _ISAL_LEVEL = 0
 crc32: Callable[[Any], int] = isal_zlib.crc32
 
 # isal's stub declares its exception class as an instance.
-_ERRORS: tuple[type[Exception], ...] = (isal_zlib.error, zstandard.ZstdError, MemoryError)  # pyright: ignore
+_ERRORS: tuple[type[Exception], ...] = (isal_zlib.error, MemoryError)  # pyright: ignore
 
 # A zstd context is costly to create and serves one thread at a time.
 _contexts = threading.local()
 
 
+def check_installed(codec: str) -> None:
+    """Raise UserError unless what the codec needs is installed."""
+    if codec == "zstd":
+        _zstandard()
+
+
 def encode(codec: str, array: np.ndarray) -> bytes:
-    """Compressed bytes of an array in C order."""
+    """Compressed bytes of an array in C order; raises UserError if what the codec needs is not installed."""
     data = np.ascontiguousarray(array).data
     if codec == "gzip":
         return isal_zlib.compress(data, _ISAL_LEVEL)
@@ -48,12 +54,13 @@ def encode(codec: str, array: np.ndarray) -> bytes:
 def decode_into(codec: str, data: bytes | memoryview, out: np.ndarray) -> None:
     """Decompress `data`, a result of `encode`, into the contiguous array `out`.
 
-    Raises DamagedError unless `data` is intact, ends where it should and fills `out` exactly.
+    Raises DamagedError unless `data` is intact, ends where it should and fills `out` exactly, and UserError if what the
+    codec needs is not installed.
     """
+    if codec == "zstd":
+        _decompress_zstd(data, out)
+        return
     try:
-        if codec == "zstd":
-            _decompress_zstd(data, out)
-            return
         plain = _inflate(data, out.nbytes) if codec == "gzip" else memoryview(data).cast("B")
     except _ERRORS as error:
         raise DamagedError(f"compressed data is damaged ({error})") from error
@@ -73,21 +80,24 @@ def _inflate(data: bytes | memoryview, size: int) -> bytes:
 
 
 def _decompress_zstd(data: bytes | memoryview, out: np.ndarray) -> None:
-    # Checked before decompressing, so that a damaged size cannot exhaust the memory.
-    if zstandard.frame_content_size(data) != out.nbytes:
-        raise DamagedError(f"compressed data does not hold {out.nbytes} bytes, as it must")
-    if _frame_end(data) != len(data):
-        raise DamagedError("compressed data does not end where it should")
-    # With the whole input and the whole buffer at once, zstd decompresses right into the buffer.
-    buffer = out.reshape(-1).view(np.uint8)
-    size = _decompressor().stream_reader(data).readinto(buffer.data) if out.nbytes else 0
+    zstandard = _zstandard()
+    try:
+        # Checked before decompressing, so that a damaged size cannot exhaust the memory.
+        if zstandard.frame_content_size(data) != out.nbytes:
+            raise DamagedError(f"compressed data does not hold {out.nbytes} bytes, as it must")
+        if _frame_end(data, zstandard.frame_header_size(data)) != len(data):
+            raise DamagedError("compressed data does not end where it should")
+        # With the whole input and the whole buffer at once, zstd decompresses right into the buffer.
+        buffer = out.reshape(-1).view(np.uint8)
+        size = _decompressor().stream_reader(data).readinto(buffer.data) if out.nbytes else 0
+    except (zstandard.ZstdError, MemoryError) as error:
+        raise DamagedError(f"compressed data is damaged ({error})") from error
     if size != out.nbytes:
         raise DamagedError(f"compressed data holds {size} bytes, but must hold {out.nbytes}")
 
 
-def _frame_end(data: bytes | memoryview) -> int:
-    """The end of a zstd frame, from the headers of its blocks (RFC 8878, 3.1.1.2), one per 128 kB."""
-    position = zstandard.frame_header_size(data)
+def _frame_end(data: bytes | memoryview, position: int) -> int:
+    """The end of a zstd frame, from the headers of its blocks (RFC 8878, 3.1.1.2), one per 128 kB, from `position`."""
     last = False
     while not last:
         header = int.from_bytes(data[position : position + 3], "little")
@@ -98,13 +108,23 @@ def _frame_end(data: bytes | memoryview) -> int:
     return position + 4  # the checksum
 
 
-def _compressor() -> zstandard.ZstdCompressor:
+def _zstandard() -> ModuleType:
+    """The module; raises UserError if it is not installed."""
+    try:
+        import zstandard
+    except ImportError:
+        raise UserError("the codec zstd needs zstandard: pip install 'gen2d[zstd]'") from None
+    return zstandard
+
+
+def _compressor() -> Any:
     if not hasattr(_contexts, "compressor"):
-        _contexts.compressor = zstandard.ZstdCompressor(level=3, write_checksum=True, write_content_size=True)
+        options = {"level": 3, "write_checksum": True, "write_content_size": True}
+        _contexts.compressor = _zstandard().ZstdCompressor(**options)
     return _contexts.compressor
 
 
-def _decompressor() -> zstandard.ZstdDecompressor:
+def _decompressor() -> Any:
     if not hasattr(_contexts, "decompressor"):
-        _contexts.decompressor = zstandard.ZstdDecompressor()
+        _contexts.decompressor = _zstandard().ZstdDecompressor()
     return _contexts.decompressor

@@ -52,7 +52,9 @@ def writing_error(where: Path, error: OSError, again: str = "run the same comman
     full or fails, and 2 for errors that another folder avoids.
     """
     if isinstance(error, FileExistsError | NotADirectoryError):
-        return FolderError(f"{error.filename} is a file, not a folder: choose another {argument('out')}")
+        path = Path(error.filename or where)
+        found = next((each for each in (path, *path.parents) if each.is_file()), path)
+        return FolderError(f"{found} is a file, not a folder: choose another {argument('out')}")
     if isinstance(error, PermissionError):
         return FolderError(
             f"you have no permission to write in {error.filename or where}: choose another {argument('out')}"

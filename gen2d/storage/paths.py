@@ -19,7 +19,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path, PurePath
 from typing import Any
 
-from gen2d.core.errors import DamagedError, FolderError
+from gen2d.core.errors import ConfigError, DamagedError, FolderError
 from gen2d.storage.filesystems import file_system, redact_url
 from gen2d.storage.retries import Address, Network, attempt, http_status
 
@@ -102,10 +102,13 @@ Place = Path | Url
 def place(path: str | Place, network: Network | None = None) -> Place:
     """The Path of a folder on disk, or the Url of a text with another protocol than `file`.
 
-    `network` holds the limits of a Url that is made. Raises FolderError for a URL that cannot be used.
+    `network` holds the limits of a Url that is made. Raises FolderError for a URL that cannot be used, and ConfigError
+    for anything but a path or a URL.
     """
     if isinstance(path, Url):
         return path  # it has its own limits
+    if not isinstance(path, str | os.PathLike):
+        raise ConfigError(f"a folder is given as {path!r:.60}, but must be a path or a URL")
     if not isinstance(path, str) or "://" not in path:
         return Path(path)
     protocol, _, rest = path.partition("://")

@@ -9,7 +9,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
 from gen2d.config import plugins
@@ -17,7 +16,8 @@ from gen2d.config.config import load_config
 from gen2d.generation.run import generate
 from gen2d.loading.dataset import Dataset
 from gen2d.loading.dataset import open as open_dataset
-from gen2d.media.contact_sheet import GAP, contact_sheet, sheet_frames
+from gen2d.media.contact_sheet import contact_sheet, resized, sheet_frames
+from gen2d.media.drawing import label
 from gen2d.media.images import check_folder, write, writing
 from gen2d.media.overlays import amodal_overlay, boxes_overlay, flow_overlay, masks_overlay, tracks_overlay
 from gen2d.programs.recipe import config_of
@@ -90,7 +90,7 @@ def families(
 
 def _resize_to_page(sheet: np.ndarray) -> np.ndarray:
     """A sheet resized to the width of the page."""
-    return cv2.resize(sheet, (PAGE, round(PAGE * sheet.shape[0] / sheet.shape[1])), interpolation=cv2.INTER_AREA)
+    return resized(sheet, round(PAGE * sheet.shape[0] / sheet.shape[1]), PAGE)
 
 
 @contextlib.contextmanager
@@ -122,9 +122,7 @@ def _sheet(
 
 def _add_label(name: str, image: np.ndarray) -> np.ndarray:
     """An image with its name on a white strip at the left."""
-    strip = np.full((len(image), LABEL, 3), 255, np.uint8)
-    cv2.putText(strip, name, (2 * GAP, 20), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (0, 0, 0), 1, cv2.LINE_AA)
-    return np.concatenate([strip, image], axis=1)
+    return np.concatenate([label([name], len(image), LABEL), image], axis=1)
 
 
 Rows = Iterator[tuple[str, np.ndarray]]

@@ -81,7 +81,7 @@ def plot(
     try:
         from matplotlib.figure import Figure
     except ImportError:
-        raise UserError("plots need matplotlib: pip install gen2d[plot]") from None
+        raise UserError("plots need matplotlib: pip install 'gen2d[plot]'") from None
     out, root = Path(out), place(source if isinstance(source, Url) else str(source), Network(timeout, deadline))
     ds = open_dataset(root, split, ["index"])
     if not 0 <= video < len(ds):

@@ -79,7 +79,17 @@ def test_a_misspelt_verb_is_an_error_that_names_it(verb: str) -> None:
     [
         (("a.yaml", "--n", "1e400"), "--n: '1e400' is not a whole number, such as 100; see "),
         (("a.yaml", "--n", "0.5"), "--n: '0.5' is not a whole number, such as 100; see "),
-        (("bouncing",), "'bouncing' is not a verb; "),
+        (("bounce",), "'bounce' is not a verb; "),
+        (("bouncing",), "the following arguments are required: --n; see python -m gen2d generate --help"),
+        (("-q", "bouncing", "--n", "1", "--set", "a.b=1"), "--set a.b=1: a is not a section; there are: "),
+        (
+            ("generate", "chain", "--n", "1", "--set", "scene.linkz=1"),
+            "--set scene.linkz=1: scene.linkz is not an option",
+        ),
+        (("--n", "1"), "a config is needed, such as bouncing.yaml; "),
+        (("bouncing", "--n", "1", "--device", "tpu"), "--device is 'tpu', but must be one of auto, cpu, gpu"),
+        (("info", "data", "--verbal"), "--verbal is not an option; did you mean --verbose?"),
+        (("info", "data", "--fps"), "--fps is not an option; there are: --deadline, "),
         (("--config", "a.yaml", "--n", "many"), "--n: 'many' is not a whole number, such as 100; see "),
         (("--config", "a.yaml", "--n", "1", "extra"), "'extra' is one argument too many; see "),
         (("--config", "a.yaml"), "the following arguments are required: --n; see python -m gen2d generate --help"),

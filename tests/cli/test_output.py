@@ -147,4 +147,4 @@ def test_completion_without_shtab_or_of_an_unknown_shell_is_one_sentence(monkeyp
     monkeypatch.setattr(builtins, "__import__", without_shtab)
     done = run_main("--print-completion", "bash")
     assert (done.returncode, done.stdout) == (2, "")
-    assert done.stderr == "gen2d: completion needs shtab: pip install shtab\n"
+    assert done.stderr == "gen2d: completion needs shtab: pip install 'gen2d[completion]'\n"

@@ -7,7 +7,7 @@ import pytest
 from tiny import run_main
 
 import gen2d
-from gen2d.core.errors import Error, argument, command_line
+from gen2d.core.errors import ConfigError, Error, argument, command_line
 
 PACKAGE = Path(gen2d.__file__).parent
 COMMAND_LINE = "cli/"
@@ -49,6 +49,31 @@ def test_one_error_in_two_languages(options: dict, flags: list[str], said: str, 
     assert done.returncode == 2
     assert said.format(**{name: f"--{name}" for name in python}).partition(",")[0] in done.stderr
     assert argument("out") == "out"  # the command line has ended
+
+
+def test_an_error_names_the_override_or_the_file_that_causes_it(tmp_path: Path) -> None:
+    overrides = ["video.frames=4", "video.fps=-1", "look=flat"]
+    said = "video.fps is -1, but must be a number, above 0"
+    for config in ("bouncing.yaml", {"scene": "bouncing"}):
+        with pytest.raises(ConfigError) as caught:
+            gen2d.load_config(config, overrides)
+        assert str(caught.value).startswith(f"overrides=['video.fps=-1']: {said}")
+        with command_line(), pytest.raises(ConfigError) as caught:
+            gen2d.load_config(config, overrides)
+        assert str(caught.value).startswith(f"--set video.fps=-1: {said}")
+    (tmp_path / "own.yaml").write_text("scene: {name: bouncing, bals: 3}")
+    for given, cause in (
+        ([], f"{tmp_path / 'own.yaml'}: scene.bals is not an option"),
+        (["look=flat"], f"{tmp_path / 'own.yaml'}: scene.bals is not an option"),
+        (overrides, f"overrides=['video.fps=-1']: {said}"),
+        (
+            ["scene.radius=0.1", "scene=chain", "scene.bals=4"],
+            "overrides=['scene.bals=4']: scene.bals is not an option",
+        ),
+    ):
+        with pytest.raises(ConfigError) as caught:
+            gen2d.load_config(tmp_path / "own.yaml", given)
+        assert str(caught.value).startswith(cause)
 
 
 def raised_texts(path: Path) -> list[str]:

@@ -126,7 +126,7 @@ def repaired(monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setattr(regenerate, "source_of", lambda *_, **__: None)
     monkeypatch.setattr(regenerate, "check_fingerprint", lambda *_: None)
-    monkeypatch.setattr(regenerate.devices, "versions", lambda: dict.fromkeys(regenerate.CODECS))
+    monkeypatch.setattr(regenerate.devices, "versions", lambda: dict.fromkeys(regenerate.WRITERS))
     monkeypatch.setattr(regenerate, "dataset_of", made)
     monkeypatch.setattr(regenerate, "generate_shards", make)
 

@@ -367,9 +367,9 @@ def test_what_is_no_dataset_is_left_alone(tmp_path: Path, overwrite: bool) -> No
     (tmp_path / "thesis.tex").write_text("years of work")
     with pytest.raises(FolderError, match="something other"):
         open_folder(synthetic.dataset(tmp_path), overwrite)
-    with pytest.raises(FolderError, match="is a file, not a folder"):
+    with pytest.raises(FolderError, match=r"/thesis.tex is a file, not a folder"):
         open_folder(synthetic.dataset(tmp_path / "thesis.tex"), overwrite)
-    with pytest.raises(FolderError, match="is a file, not a folder"):
+    with pytest.raises(FolderError, match=r"/thesis.tex is a file, not a folder"):
         open_folder(synthetic.dataset(tmp_path / "thesis.tex" / "toy"), overwrite)
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
 

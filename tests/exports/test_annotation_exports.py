@@ -27,7 +27,7 @@ from gen2d.exports.formats.coco import run_lengths
 from gen2d.exports.formats.questions import Balance
 from gen2d.exports.source import Source
 
-VIDEOS, FRAMES, HEIGHT, WIDTH = 3, 5, 40, 48
+VIDEOS, FRAMES, HEIGHT, WIDTH = 3, 6, 40, 48  # as many frames as in test_lerobot.py, which simulates the same
 CONFIG = tiny.tiny_config(
     video={"frames": FRAMES, "height": HEIGHT, "width": WIDTH},
     scene={"balls": [2, 3], "gravity": [0, -9.8]},

@@ -650,8 +650,8 @@ def test_what_a_format_cannot_hold_is_an_error_first(
 
 def test_a_missing_extra_is_named(toy: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "av", None)
-    for to in ("h264", "av1", "ffv1", "webdataset"):
-        with pytest.raises(UserError, match=r"pip install gen2d\[video\]"):
+    for to in ("mp4", "h264", "av1", "ffv1", "webdataset", "videofolder", "lerobot", "parquet"):
+        with pytest.raises(UserError, match=r"pip install 'gen2d\[video\]'"):
             gen2d.export(toy, to, tmp_path / "out")
     assert not (tmp_path / "out").exists()
 

@@ -111,7 +111,7 @@ def test_the_card_of_an_export_has_the_hub_s_metadata(toy: Path, tmp_path: Path,
 @pytest.mark.parametrize("to", ["parquet", "videofolder"])
 def test_without_arrow_the_extra_is_named(toy: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, to: str) -> None:
     monkeypatch.setitem(__import__("sys").modules, "pyarrow", None)
-    with pytest.raises(UserError, match=r"pip install gen2d\[hub\]"):
+    with pytest.raises(UserError, match=r"pip install 'gen2d\[hub\]'"):
         gen2d.export(toy, to, tmp_path / "out")
     assert not (tmp_path / "out").exists()
 

@@ -1,5 +1,6 @@
 """Datasets and exports that are pushed to a stand-in for the Hugging Face Hub are there, and are loaded from it."""
 
+import hashlib
 import json
 import os
 import shutil
@@ -97,6 +98,35 @@ def test_an_export_is_pushed_with_its_card(toy: Path, tmp_path: Path, server: Hu
     assert (out / "README.md").read_text().startswith('---\npretty_name: "toy"\nlicense: cc0-1.0\n')
 
 
+@pytest.mark.parametrize("part_bytes", [0, 5000])
+def test_shards_are_uploaded_once_by_git_lfs(
+    toy: Path, server: Hub, environment: dict[str, str], part_bytes: int
+) -> None:
+    server.part_bytes = part_bytes
+    assert push(environment, toy, "me/toy").returncode == 0
+    shards = {name: content for name, content in files_of(toy).items() if name.endswith(".h5")}
+    assert shards
+    assert {hashlib.sha256(content).hexdigest() for content in shards.values()} <= server.objects.keys()
+    largest = max(shards.values(), key=len)
+    sent = [path for path in server.asked if path.startswith("PUT ") and hashlib.sha256(largest).hexdigest() in path]
+    assert len(sent) == (-(-len(largest) // part_bytes) if part_bytes else 1)
+    assert {name: server.repositories["me/toy"][name] for name in shards} == shards
+    server.asked.clear()
+    assert push(environment, toy, "me/other").returncode == 0
+    assert not [path for path in server.asked if path.startswith("PUT ")]
+    assert {name: server.repositories["me/other"][name] for name in shards} == shards
+
+
+@pytest.mark.parametrize(("code", "exit_code"), [(403, 2), (501, 3)])
+def test_a_refused_object_is_one_sentence_and_no_commit(
+    toy: Path, server: Hub, environment: dict[str, str], code: int, exit_code: int
+) -> None:
+    server.lfs_refusal = code
+    done = push(environment, toy, "me/toy")
+    assert (done.returncode, len(tiny.sentences(done.stderr))) == (exit_code, 1), done.stderr
+    assert server.repositories["me/toy"].keys() == {".gitattributes"}
+
+
 @pytest.mark.parametrize(
     ("code", "exit_code", "message"),
     [
@@ -135,5 +165,5 @@ def test_bad_input_is_one_sentence_and_sends_nothing(
 
 def test_a_missing_library_is_named(toy: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "huggingface_hub", None)
-    with pytest.raises(UserError, match=r"pip install gen2d\[hub\]"):
+    with pytest.raises(UserError, match=r"pip install 'gen2d\[hub\]'"):
         gen2d.push(toy, "me/toy")

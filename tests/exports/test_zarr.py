@@ -120,6 +120,6 @@ def test_xarray_reads_it_without_a_warning(toy: Path, tmp_path: Path) -> None:
 
 def test_a_missing_package_is_named(toy: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "zarr", None)
-    with pytest.raises(UserError, match=r"needs zarr 3: pip install gen2d\[zarr\]"):
+    with pytest.raises(UserError, match=r"needs zarr 3: pip install 'gen2d\[zarr\]'"):
         gen2d.export(toy, "zarr", tmp_path / "out")
     assert not list(tmp_path.iterdir())

@@ -27,7 +27,10 @@ from gen2d.generation.regenerate import repair
 from gen2d.generation.run import generate
 from gen2d.tools.verify import verify, verify_and_repair
 
-CONFIG = tiny.tiny_config(video={"frames": 12, "height": 32, "width": 32}, annotations={"masks": True})
+# Simulated by the program of `tiny.CONFIG`.
+CONFIG = tiny.tiny_config(
+    video={"height": 32, "width": 32}, annotations={"masks": True}, storage={"videos_per_shard": 16}
+)
 slow = pytest.mark.slow
 
 
@@ -38,7 +41,7 @@ slow = pytest.mark.slow
 def pristine(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Three shards of frames, states and masks, about 300 kB."""
     out = tmp_path_factory.mktemp("flipped") / "data"
-    generate(CONFIG, 21, out)
+    generate(CONFIG, 42, out)
     return out
 
 

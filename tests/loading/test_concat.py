@@ -186,5 +186,5 @@ def test_what_is_no_list_of_datasets_is_an_error(roots: list[Path], tmp_path: Pa
         loader.open([roots[0], tmp_path])
     assert isinstance(loader.open(roots), ConcatDataset)
     concatenated: Any = loader.open(roots)
-    with pytest.raises(UserError, match="ds is of 3 folders, but must be of one"):
+    with pytest.raises(UserError, match="ds is ConcatDataset, but must be a dataset of one folder"):
         render(concatenated, [0])

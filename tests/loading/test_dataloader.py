@@ -21,6 +21,7 @@ from numpy.testing import assert_array_equal
 from packages import package
 from tiny import run_on
 
+import gen2d
 from gen2d.core.errors import ConfigError
 from gen2d.core.permutation import hashed
 from gen2d.loading import dataset as loader
@@ -94,10 +95,59 @@ def test_the_length_is_the_number_of_batches(toy: Path, drop_last: bool) -> None
         assert len(batches) == len(list(batches))
 
 
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"batch_size": 0}, "batch_size is 0, but must be a whole number, 1 or more"),
+        ({"batch_size": "4"}, "batch_size is '4', but must be a whole number"),
+        ({"epochs": 0}, "epochs is 0, but must be a whole number, 1 or more"),
+        ({"seed": "a"}, "seed is 'a', but must be a whole number"),
+        ({"rank": 3, "world_size": 2}, "rank is 3, but must be from 0 to world_size - 1, which is 1"),
+        ({"dataset": [1, 2, 3]}, r"dataset is \[1, 2, 3\], but must be a dataset from gen2d.open or gen2d.mix"),
+    ],
+)
+def test_an_argument_that_is_wrong_is_named(toy: Path, options: dict[str, Any], message: str) -> None:
+    given: dict[str, Any] = {"dataset": loader.open(toy), "batch_size": 4, **options}
+    with pytest.raises(ConfigError, match=message):
+        DataLoader(given.pop("dataset"), given.pop("batch_size"), **given)
+
+
+def test_what_is_no_folder_or_dataset_is_named(toy: Path, tmp_path: Path) -> None:
+    ds: Any = loader.open(toy)
+    name: Any = "toy"
+    pair: Any = [ds, ds]
+    for call, message in (
+        (lambda: gen2d.mix(pair), r"datasets is .*, but must be a mapping of names to datasets"),
+        (lambda: gen2d.export(ds, "npz", tmp_path / "out"), r"a folder is given as .*, but must be a path or a URL"),
+        (lambda: loader.open(toy, stride=0), "stride is 0, but must be 1 or more"),
+        (lambda: gen2d.load_config("bouncing", "a.b=1"), r"overrides is .a.b=1., but must be a list"),
+        (
+            lambda: gen2d.render(ds.select([0]), [0]),
+            r"ds is Subset, .* one folder: give ds\.source",
+        ),
+        (lambda: gen2d.render(name, [0]), "ds is str, but must be a dataset of one folder"),
+    ):
+        with pytest.raises(ConfigError, match=message):
+            call()
+
+
 def test_each_iteration_goes_on_with_the_next_epoch(toy: Path) -> None:
     dataset = loader.open(toy, fields="index")
     one, two = (DataLoader(dataset, 6, epochs=epochs) for epochs in (1, 2))
     assert numbers(list(one)) + numbers(list(one)) == numbers(list(two))
+    again, length = DataLoader(dataset, 6, epochs=1), len(one)
+    parts = [numbers(list(itertools.islice(again, length))) for _ in range(2)]  # the iterations do not reach their end
+    assert parts[0] + parts[1] == numbers(list(DataLoader(dataset, 6, epochs=2)))
+
+
+def test_a_state_from_after_the_loop_goes_on_with_the_next_epoch(toy: Path) -> None:
+    dataset = loader.open(toy, fields="index")
+    expected = numbers(list(DataLoader(dataset, 6, epochs=3)))
+    one, other = (DataLoader(dataset, 6, epochs=1) for _ in range(2))
+    first = numbers(list(one))
+    other.load_state_dict(one.state_dict())
+    assert other.state_dict()["epoch"] == 1
+    assert first + numbers(list(other)) + numbers(list(other)) == expected
 
 
 @pytest.mark.parametrize("drop_last", [True, False])
@@ -120,7 +170,7 @@ def test_a_state_resumes_at_the_very_batch_on_any_world_size(toy: Path, drop_las
     for batch in full:
         batches.append(batch)
         states.append(pickle.loads(pickle.dumps(full.state_dict())))
-    for done, state in enumerate(states[:-1]):
+    for done, state in enumerate(states):  # the last one is taken in the loop, too, and nothing is left to read
         for world_size in (1, 2, 3):
             ranks = []
             for rank in range(world_size):

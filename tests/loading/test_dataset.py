@@ -223,7 +223,13 @@ PUBLIC = {
     "Dataset": [*SELECTABLE, "config", "manifest", "options", "root", "sizes", "splits"],
     "ConcatDataset": [*SELECTABLE, "datasets"],
     "Subset": [*SELECTABLE, "indices", "source"],
-    "Mixture": [*(name for name in COMMON if name not in ("stats", "time")), "datasets", "shares", "source_of"],
+    "Mixture": [
+        *(name for name in COMMON if name not in ("stats", "time")),
+        "datasets",
+        "filter",
+        "shares",
+        "source_of",
+    ],
 }
 
 

@@ -164,6 +164,26 @@ def test_tf_data_reads_from_a_generator(windows: Any) -> None:
     same(data.as_numpy_iterator(), list(gen2d.DataLoader(ds, 5, seed=3, epochs=2)))
 
 
+@pytest.mark.filterwarnings("ignore")
+def test_tensorflow_datasets_keeps_a_copy_of_every_bit(tmp_path: Any) -> None:
+    tfds = package("tensorflow_datasets")
+    root = synthetic.make(synthetic.dataset(tmp_path / "toy")).root
+    ds = loader.open(root, "train", FIELDS)
+    features = {name: tfds.features.Tensor(shape=own.shape[1:], dtype=own.dtype) for name, own in ds.empty(0).items()}
+    tfds.dataset_builders.store_as_tfds_dataset(
+        name="toy",
+        version="1.0.0",
+        features=tfds.features.FeaturesDict(features),
+        split_datasets={"train": enumerate(ds)},
+        data_dir=tmp_path / "tfds",
+    )
+    found = sorted(
+        tfds.as_numpy(tfds.load("toy", split="train", data_dir=tmp_path / "tfds")),
+        key=lambda video: int(video["index"]),
+    )
+    same(found, list(ds))
+
+
 # ---- Lightning and Accelerate
 
 

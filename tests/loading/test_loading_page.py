@@ -10,7 +10,18 @@ import gen2d
 
 PAGE = Path(__file__).parents[2] / "docs" / "loading.md"
 BLOCKS = re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
-OTHERS = "torch", "torchdata", "lightning", "accelerate", "grain", "tensorflow", "pandas", "pyarrow", "datasets"
+OTHERS = (
+    "torch",
+    "torchdata",
+    "lightning",
+    "accelerate",
+    "grain",
+    "tensorflow",
+    "tensorflow_datasets",
+    "pandas",
+    "pyarrow",
+    "datasets",
+)
 
 
 @pytest.fixture(scope="module")

@@ -116,6 +116,19 @@ def test_a_state_of_other_weights_is_refused(sources: dict) -> None:
         other.load_state_dict(state)
 
 
+def test_a_filtered_mixture_keeps_its_proportions(sources: dict) -> None:
+    mixture = gen2d.mix(sources, WEIGHTS)
+    found, expected = mixture.filter("index >= 4"), {name: own.filter("index >= 4") for name, own in sources.items()}
+    assert found.shares == mixture.shares
+    other = gen2d.mix(expected, WEIGHTS)
+    assert videos(found, [found[:]]) == videos(other, [other[:]])
+    assert (found[:]["index"] >= 4).all()
+    with pytest.raises(ConfigError, match=r"filter is 'index > 900', which is true of no video of dataset \w+"):
+        mixture.filter("index > 900")
+    with pytest.raises(AttributeError, match="call select of its datasets, then"):
+        mixture.select([0])
+
+
 def test_a_mixture_of_mixtures_is_refused(sources: dict) -> None:
     inner: Any = gen2d.mix(sources)
     with pytest.raises(ConfigError, match="dataset inner is a mixture, but must be a dataset"):

@@ -358,7 +358,7 @@ def test_properties_of_a_dataset(roots: list[Path]) -> None:
             getattr(both, name)
         with pytest.raises(AttributeError, match=f"each dataset of a mixture has its own {name}"):
             getattr(mixture, name)
-    for name in ("select", "filter", "to_pandas", "to_arrow"):
+    for name in ("select", "to_pandas", "to_arrow"):
         with pytest.raises(AttributeError, match=f"call {name} of its datasets, then gen2d.mix"):
             getattr(mixture, name)
     with pytest.raises(AttributeError, match="no attribute 'nothing'"):

@@ -259,6 +259,32 @@ def test_the_sampler_sets_the_epoch_of_order_and_windows(toy: Path) -> None:
     assert list(gen2d.torch.sampler(data, shuffle=False)) == list(range(TRAIN))
 
 
+@pytest.mark.parametrize("workers", WORKERS)
+@pytest.mark.parametrize("kind", ["map-style", "iterable"])
+def test_an_epoch_that_is_never_set_gives_one_warning(toy: Path, kind: str, workers: tuple[int, str | None]) -> None:
+    torch()
+
+    def new(**options: Any) -> tuple[Any, Any]:
+        ds = loader.open(toy, fields=FIELDS, **options)
+        data = gen2d.torch.dataset(ds) if kind == "map-style" else gen2d.torch.iterable(ds, 5)
+        return data, data_loader(data, workers, batch_size=5 if kind == "map-style" else None)
+
+    data, batches = new(window=2)
+    for _ in range(2):
+        list(batches)
+    with pytest.raises(UserWarning, match="set_epoch was not called, so each epoch is the same"):
+        list(batches)
+    list(batches)
+    data, batches = new(window=2)
+    data.set_epoch(0)
+    for _ in range(4):
+        list(batches)
+    if kind == "map-style":  # whole videos do not depend on the epoch
+        _, batches = new()
+        for _ in range(4):
+            list(batches)
+
+
 @pytest.mark.parametrize("epoch", [-1, 1.5, "2", None, True])
 def test_an_epoch_is_a_whole_number(toy: Path, epoch: Any) -> None:
     torch()
@@ -279,7 +305,10 @@ def test_wrong_arguments_are_named(toy: Path) -> None:
         (lambda: gen2d.torch.iterable(ds, 4, epochs=0), "epochs is 0"),
         (lambda: gen2d.torch.iterable(ds, 4, shuffle="local"), "shuffle is 'local'"),
         (lambda: gen2d.torch.iterable(ds, 21), "21 videos make a global batch, but there are only 20"),
-        (lambda: gen2d.torch.iterable(ds, 4, rank=2, world_size=2), "rank from 0 to world_size - 1"),
+        (
+            lambda: gen2d.torch.iterable(ds, 4, rank=2, world_size=2),
+            "rank is 2, but must be from 0 to world_size - 1, which is 1",
+        ),
         (lambda: gen2d.grain.source(ds, epochs=0), "epochs is 0"),
         (lambda: gen2d.grain.source(5), "ds is 5"),  # pyright: ignore
     ]

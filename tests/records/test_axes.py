@@ -47,7 +47,7 @@ def test_declared_axes_are_checked_in_all_layouts():
 
 @pytest.mark.parametrize("wrong", [{"K": SLOTS + 1}, {"T": 1}, {"n": 2}, {"absent": "n"}, {"device": True}])
 def test_other_axes_are_refused_with_the_name_of_the_field(wrong: dict):
-    with pytest.raises(AssertionError, match=r"states/position.* has axes"):
+    with pytest.raises(AssertionError, match=r"states/position.* has the shape"):
         check_shapes(states(), **wrong)
 
 

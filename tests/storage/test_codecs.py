@@ -1,14 +1,19 @@
 """A codec gives back what it was given, or says that it cannot."""
 
+import sys
 import zlib
+from pathlib import Path
 
 import numpy as np
 import pytest
+import synthetic
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
+from numpy.testing import assert_array_equal
 
-from gen2d.core.errors import DamagedError
+import gen2d
+from gen2d.core.errors import DamagedError, UserError
 from gen2d.storage import codecs
 
 SHAPES = hnp.array_shapes(min_dims=0, max_dims=4, min_side=0, max_side=7)
@@ -27,6 +32,21 @@ def test_what_is_decoded_is_what_was_encoded(codec: str, array: np.ndarray) -> N
     out = np.empty_like(array)
     codecs.decode_into(codec, codecs.encode(codec, array), out)
     assert out.tobytes() == array.tobytes()
+
+
+def test_zstd_without_its_package_is_one_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    made = synthetic.make(synthetic.dataset(tmp_path / "toy", train=2, codec="zstd"))
+    video = {name: values[1] for name, values in synthetic.stored(synthetic.folder(made)).items()}
+    monkeypatch.setitem(sys.modules, "zstandard", None)
+    sentence = r"the codec zstd needs zstandard: pip install 'gen2d\[zstd\]'"
+    with pytest.raises(UserError, match=sentence):
+        gen2d.open(made.root)[1]
+    assert_array_equal(gen2d.open(made.root, fields="states/*")[1]["states/angle"], video["states/angle"])
+    with pytest.raises(UserError, match=sentence):
+        gen2d.verify(made.root)
+    with pytest.raises(UserError, match=sentence):
+        gen2d.generate("bouncing.yaml", 1, tmp_path / "other", overrides=["storage.codec=zstd"])
+    assert not (tmp_path / "other").exists()
 
 
 @pytest.mark.parametrize("codec", codecs.CODECS)

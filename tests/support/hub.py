@@ -1,4 +1,8 @@
-"""A stand-in for the Hugging Face Hub on this machine: repositories of files, as huggingface_hub and datasets ask."""
+"""A stand-in for the Hugging Face Hub on this machine: repositories of files, as huggingface_hub and datasets ask.
+
+As on the Hub, files of binary formats and large ones are uploaded by Git LFS, whole or in parts, and the others within
+the commit. It does not speak Xet.
+"""
 
 import base64
 import contextlib
@@ -8,9 +12,12 @@ import re
 import threading
 from collections.abc import Iterator
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from typing import Any
 from urllib.parse import unquote, urlparse
 
 SHA = "0123456789abcdef" * 2 + "01234567"  # of every commit
+LFS = (".h5", ".parquet", ".tar", ".mp4", ".mkv", ".npz", ".npy", ".zst")  # files that are always uploaded by Git LFS
+LFS_BYTES = 10 * 2**20  # smallest size of other files that are
 
 
 class Hub(ThreadingHTTPServer):
@@ -20,6 +27,10 @@ class Hub(ThreadingHTTPServer):
         super().__init__(("127.0.0.1", 0), Handler)
         self.repositories: dict[str, dict[str, bytes]] = {}
         self.private: dict[str, bool] = {}
+        self.objects: dict[str, bytes] = {}  # of Git LFS, by sha256
+        self.parts: dict[str, dict[int, bytes]] = {}  # of objects that are not yet complete
+        self.part_bytes = 0  # size of the parts in which objects are uploaded; 0: whole
+        self.lfs_refusal = 0  # HTTP status of uploads of objects
         self.asked: list[str] = []
         self.refusal = 0  # HTTP status of all answers
 
@@ -68,7 +79,7 @@ class Handler(BaseHTTPRequestHandler):
             self.answer({"errors": [], "warnings": []})
         elif found := re.fullmatch(r"/api/datasets/(.+)/preupload/[^/]+", path):
             files = [
-                {"path": file["path"], "uploadMode": "regular", "shouldIgnore": False, "oid": None}
+                {"path": file["path"], "uploadMode": _mode(file), "shouldIgnore": False, "oid": None}
                 for file in json.loads(body)["files"]
             ]
             self.answer({"files": files})
@@ -78,9 +89,18 @@ class Handler(BaseHTTPRequestHandler):
                 value = line["value"]
                 if line["key"] == "file":
                     files[value["path"]] = base64.b64decode(value["content"])
+                elif line["key"] == "lfsFile":
+                    files[value["path"]] = self.server.objects[value["oid"]]
                 elif line["key"] == "deletedFile":
                     del files[value["path"]]
             self.answer({"commitUrl": f"{self.server.url}/datasets/{found[1]}/commit/{SHA}", "commitOid": SHA})
+        elif found := re.fullmatch(r"/datasets/(.+)\.git/info/lfs/objects/batch", path):
+            self.answer({"transfer": "basic", "objects": [self._upload(each) for each in json.loads(body)["objects"]]})
+        elif found := re.fullmatch(r"/lfs/complete/(\w+)", path):
+            parts = self.server.parts.pop(found[1])
+            self._keep(found[1], b"".join(parts[number["partNumber"]] for number in json.loads(body)["parts"]))
+        elif found := re.fullmatch(r"/lfs/verify", path):
+            self.answer({}, 200 if json.loads(body)["oid"] in self.server.objects else 404)
         elif found := re.fullmatch(r"/api/datasets/(.+)/paths-info/[^/]+", path):
             files, names = self.server.repositories[found[1]], self._names(body)
             self.answer([_entry(name, files[name]) for name in names if name in files])
@@ -91,6 +111,37 @@ class Handler(BaseHTTPRequestHandler):
         if self.headers.get("Content-Type", "").startswith("application/json"):
             return json.loads(body)["paths"]
         return [unquote(part.removeprefix("paths=").replace("+", " ")) for part in body.decode().split("&")]
+
+    def _upload(self, wanted: dict[str, Any]) -> dict[str, Any]:
+        """Where an object of Git LFS is uploaded to, unless it is there."""
+        oid, size, url, part = wanted["oid"], wanted["size"], self.server.url, self.server.part_bytes
+        if oid in self.server.objects:
+            return {"oid": oid, "size": size}
+        upload: dict[str, Any] = {"href": f"{url}/lfs/whole/{oid}"}
+        if part:
+            urls = {str(number): f"{url}/lfs/part/{oid}/{number}" for number in range(1, -(-size // part) + 1)}
+            upload = {"href": f"{url}/lfs/complete/{oid}", "header": {"chunk_size": str(part), **urls}}
+        return {"oid": oid, "size": size, "actions": {"upload": upload, "verify": {"href": f"{url}/lfs/verify"}}}
+
+    def _keep(self, oid: str, content: bytes) -> None:
+        if hashlib.sha256(content).hexdigest() != oid:
+            self.answer({"error": "other content"}, 422)
+            return
+        self.server.objects[oid] = content
+        self.answer({}, ETag='"whole"')
+
+    def do_PUT(self) -> None:
+        body = self.rfile.read(int(self.headers.get("Content-Length", 0)))
+        self.server.asked.append(f"PUT {self.path}")
+        if self.server.lfs_refusal:
+            self.answer({"error": "no"}, self.server.lfs_refusal)
+        elif found := re.fullmatch(r"/lfs/part/(\w+)/(\d+)", self.path):
+            self.server.parts.setdefault(found[1], {})[int(found[2])] = body
+            self.answer({}, ETag=f'"{found[2]}"')
+        elif found := re.fullmatch(r"/lfs/whole/(\w+)", self.path):
+            self._keep(found[1], body)
+        else:
+            self.answer({}, 404)
 
     def do_HEAD(self) -> None:
         self.do_GET()
@@ -152,6 +203,10 @@ class Handler(BaseHTTPRequestHandler):
             self.answer(content[begin : end + 1], 206, **headers)
         else:
             self.answer(content, 200, **headers)
+
+
+def _mode(file: dict[str, Any]) -> str:
+    return "lfs" if file["path"].endswith(LFS) or file["size"] >= LFS_BYTES else "regular"
 
 
 def _oid(content: bytes) -> str:

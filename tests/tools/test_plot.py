@@ -38,4 +38,4 @@ def test_what_cannot_be_plotted_is_one_sentence(tmp_path: Path, monkeypatch: pyt
     assert (done.returncode, done.stderr) == (2, "gen2d: --video is 20, but must be from 0 to 19 for train\n")
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
     done = tiny.run_main("plot", tmp_path / "toy")
-    assert (done.returncode, done.stderr) == (2, "gen2d: plots need matplotlib: pip install gen2d[plot]\n")
+    assert (done.returncode, done.stderr) == (2, "gen2d: plots need matplotlib: pip install 'gen2d[plot]'\n")

@@ -11,10 +11,9 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-import cv2
 import numpy as np
 
-from gen2d.plugin import Batch, Export, Source, arrays, facts
+from gen2d.plugin import Batch, Export, Source, arrays, facts, images
 
 SKELETON = [[1, 2]]
 DESCRIPTION = "annotations.json"
@@ -26,16 +25,16 @@ def write(target: Path, source: Source) -> None:
     size = SimpleNamespace(fps=source.fps, height=height, width=width)
     first = source.places.start
     with (
-        (source.notes / f"images-{first:09d}").open("w") as images,
+        (source.notes / f"images-{first:09d}").open("w") as image_notes,
         (source.notes / f"annotations-{first:09d}").open("w") as annotations,
     ):
         for place, number, video in zip(source.places, source.numbers, source.videos(), strict=True):
             scene = facts.VideoFacts(video | dict(source.ds.manifest.constants), size)
             for frame, mask in enumerate(video["masks/instance"]):
                 image_id, name = place * source.sizes["T"] + frame + 1, f"{source.key(number)}-{frame:04d}.png"
-                _write_png(target / name, video["frames"][frame])
+                (target / name).write_bytes(images.png(video["frames"][frame]))
                 image = {"id": image_id, "file_name": name, "height": height, "width": width}
-                images.write(json.dumps(image | {"video_id": number, "frame_id": frame}) + "\n")
+                image_notes.write(json.dumps(image | {"video_id": number, "frame_id": frame}) + "\n")
                 for entry in _annotations(video, scene, mask, frame):
                     annotations.write(json.dumps({"image_id": image_id, **entry}) + "\n")
             source.advance(1)
@@ -54,11 +53,6 @@ def finish(target: Path, source: Source) -> None:
         entries = arrays.notes(source, "annotations")
         file.writelines("," * (i > 1) + f'\n{{"id": {i}, {entry[1:]}' for i, entry in entries)
         file.write("]}\n")
-
-
-def _write_png(path: Path, image: np.ndarray) -> None:
-    if not cv2.imwrite(str(path), image[..., ::-1]):
-        raise OSError(f"{path}: OpenCV could not write an image")
 
 
 def _annotations(video: Batch, scene: Any, mask: np.ndarray, frame: int) -> list[dict[str, Any]]:

@@ -6,10 +6,9 @@ at all pixels, also at those that are hidden in the next frame.
 
 from pathlib import Path
 
-import cv2
 import numpy as np
 
-from gen2d.plugin import Batch, Export, Source
+from gen2d.plugin import Batch, Export, Source, images
 
 
 def write(target: Path, source: Source) -> None:
@@ -17,9 +16,7 @@ def write(target: Path, source: Source) -> None:
 
     def write_video(key: str, video: Batch) -> None:
         for frame, image in enumerate(video["frames"]):
-            path = target / f"{key}-{frame:04d}.png"
-            if not cv2.imwrite(str(path), image[..., ::-1]):
-                raise OSError(f"{path}: OpenCV could not write an image")
+            (target / f"{key}-{frame:04d}.png").write_bytes(images.png(image))
         for frame, flow in enumerate(video["flow/forward"][:-1]):
             height, width = flow.shape[:2]
             head = b"PIEH" + np.array([width, height], "<i4").tobytes()

@@ -6,10 +6,9 @@ ends in the next frame at a pixel of the same object (KITTI's non-occluded pixel
 
 from pathlib import Path
 
-import cv2
 import numpy as np
 
-from gen2d.plugin import Batch, Export, Source
+from gen2d.plugin import Batch, Export, Source, images
 
 SCALE, ZERO, LARGEST = 64, 32768, 65535
 
@@ -21,20 +20,15 @@ def write(target: Path, source: Source) -> None:
 
     def write_video(key: str, video: Batch) -> None:
         for frame, image in enumerate(video["frames"]):
-            _write_png(target / "image_2" / f"{key}_{frame:04d}.png", image)
+            (target / "image_2" / f"{key}_{frame:04d}.png").write_bytes(images.png(image))
         for frame, flow in enumerate(video["flow/forward"][:-1].astype(np.float64)):
             coded = np.round(SCALE * flow) + ZERO
             valid = (video["flow/forward_valid"][frame] > 0) & ((coded >= 0) & (coded <= LARGEST)).all(-1)
             channels = np.where(valid[..., None], coded, 0)
             image = np.concatenate([channels, valid[..., None]], -1).astype(np.uint16)
-            _write_png(target / "flow_noc" / f"{key}_{frame:04d}.png", image)
+            (target / "flow_noc" / f"{key}_{frame:04d}.png").write_bytes(images.png(image))
 
     source.each(write_video)
-
-
-def _write_png(path: Path, image: np.ndarray) -> None:
-    if not cv2.imwrite(str(path), image[..., ::-1]):
-        raise OSError(f"{path}: OpenCV could not write an image")
 
 
 EXPORT = Export(

@@ -7,8 +7,8 @@
 
 `observation.state` is the vector of all states; each field of a value per frame also has a column of its own, such as
 `observation.states.position` [slot, (x, y)]. Fields of a value per video, such as factors, are columns `gen2d/NAME` of
-the episodes. The task of an episode is its caption, where captions are stored. There are no actions. Needs PyArrow, and
-PyAV but for the codec mp4v.
+the episodes. The task of an episode is its caption, where captions are stored. There are no actions.
+Needs PyArrow and PyAV.
 """
 
 import json

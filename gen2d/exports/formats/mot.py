@@ -7,10 +7,9 @@ and may reach beyond the image.
 
 from pathlib import Path
 
-import cv2
 import numpy as np
 
-from gen2d.plugin import STATIC, Batch, Export, Source
+from gen2d.plugin import STATIC, Batch, Export, Source, images
 
 
 def write(target: Path, source: Source) -> None:
@@ -22,9 +21,7 @@ def write(target: Path, source: Source) -> None:
         for name in ("img1", "gt"):
             (folder / name).mkdir(parents=True)
         for frame, image in enumerate(video["frames"], 1):
-            path = folder / "img1" / f"{frame:06d}.png"
-            if not cv2.imwrite(str(path), image[..., ::-1]):
-                raise OSError(f"{path}: OpenCV could not write an image")
+            (folder / "img1" / f"{frame:06d}.png").write_bytes(images.png(image))
         info = {"name": key, "imDir": "img1", "frameRate": f"{source.fps:g}", "seqLength": len(video["frames"])}
         info |= {"imWidth": width, "imHeight": height, "imExt": ".png"}
         text = "[Sequence]\n" + "".join(f"{name}={value}\n" for name, value in info.items())

@@ -1,4 +1,4 @@
-"""One MPEG-4 part 2 film (MP4) per video, encoded by OpenCV: needs no extra package; browsers do not play it.
+"""One MPEG-4 part 2 film (MP4) per video, encoded by PyAV, for old programs; browsers do not play it.
 
 The other fields of a video are in a NumPy archive beside its film, KEY.npz, as `--to npz` writes them.
 """

@@ -8,10 +8,9 @@ import json
 from pathlib import Path
 from types import SimpleNamespace
 
-import cv2
 import numpy as np
 
-from gen2d.plugin import Export, Source, arrays, facts
+from gen2d.plugin import Export, Source, arrays, facts, images
 
 OCCLUDER, BACKGROUND = 255, 256
 STUFF = ("background", "occluder")
@@ -26,7 +25,7 @@ def write(target: Path, source: Source) -> None:
     size = SimpleNamespace(fps=source.fps, height=height, width=width)
     first = source.places.start
     with (
-        (source.notes / f"images-{first:09d}").open("w") as images,
+        (source.notes / f"images-{first:09d}").open("w") as image_notes,
         (source.notes / f"annotations-{first:09d}").open("w") as annotations,
     ):
         for place, number, video in zip(source.places, source.numbers, source.videos(), strict=True):
@@ -35,11 +34,12 @@ def write(target: Path, source: Source) -> None:
                 image_id = place * source.sizes["T"] + frame + 1
                 name = f"{source.key(number)}-{frame:04d}.png"
                 segments = np.where(mask == 0, BACKGROUND, mask.astype(np.int32))
-                _write_png(target / "images" / name, video["frames"][frame])
-                _write_png(target / "panoptic" / name, np.stack([segments & 255, segments >> 8, 0 * segments], -1))
+                (target / "images" / name).write_bytes(images.png(video["frames"][frame]))
+                channels = np.stack([segments & 255, segments >> 8, 0 * segments], -1).astype(np.uint8)
+                (target / "panoptic" / name).write_bytes(images.png(channels))
                 infos = [_segment(segments == i, int(i), nouns) for i in np.unique(segments)]
                 image = {"id": image_id, "file_name": name, "height": height, "width": width, "video_id": number}
-                images.write(json.dumps(image) + "\n")
+                image_notes.write(json.dumps(image) + "\n")
                 annotation = {"image_id": image_id, "file_name": name, "segments_info": infos}
                 annotations.write(json.dumps(annotation) + "\n")
             source.advance(1)
@@ -64,11 +64,6 @@ def _segment(shown: np.ndarray, number: int, nouns: dict[int, str]) -> dict:
     box = [x, y, int(columns[-1]) + 1 - x, int(rows[-1]) + 1 - y]
     category = CLASSES.index(names.get(number) or nouns[number - 1]) + 1
     return {"id": number, "category_id": category, "area": int(shown.sum()), "bbox": box, "iscrowd": 0}
-
-
-def _write_png(path: Path, image: np.ndarray) -> None:
-    if not cv2.imwrite(str(path), image[..., ::-1].astype(np.uint8)):
-        raise OSError(f"{path}: OpenCV could not write an image")
 
 
 EXPORT = Export(

@@ -2,7 +2,7 @@
 
 `datasets.load_dataset("parquet", ...)` decodes films and images, and gives arrays of the right shape; pandas, Polars
 and DuckDB read the same files. Axes, units and meanings are metadata of the columns. README.md is a card for the Hub.
-Needs PyArrow, and PyAV but for the codecs mp4v and png.
+Needs PyArrow, and PyAV but for the codec png.
 """
 
 from collections.abc import Iterator
@@ -10,10 +10,7 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
-import cv2
-import numpy as np
-
-from gen2d.plugin import Batch, ConfigError, Export, Source, films, tables
+from gen2d.plugin import Batch, ConfigError, Export, Source, films, images, tables
 
 FILE_BYTES, FILE_VIDEOS = 2**28, 10_000  # about the maximum of a file, which holds one video at least
 GROUP_BYTES = 2**26  # of videos in a row group, before compression
@@ -56,15 +53,8 @@ def _encoded(source: Source, video: Batch) -> dict[str, Any]:
     if "frames" not in video:
         return video
     if source.codec == "png":
-        return {**video, "frames": [_png(image) for image in video["frames"]]}
+        return {**video, "frames": [images.png(image) for image in video["frames"]]}
     return {**video, "frames": films.CODECS[source.codec].content(video["frames"], source.fps)}
-
-
-def _png(image: np.ndarray) -> bytes:
-    done, content = cv2.imencode(".png", image[..., ::-1])
-    if not done:
-        raise OSError("OpenCV could not encode an image")
-    return content.tobytes()
 
 
 def finish(target: Path, source: Source) -> None:

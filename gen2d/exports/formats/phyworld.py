@@ -24,12 +24,11 @@ GROUP = 1000  # videos in an HDF5 dataset
 
 
 def check(source: Source) -> None:
-    """Raise ConfigError for unsupported frame sizes and rates, and for videos that the format cannot represent.
+    """Raise ConfigError for unsupported sizes, rates and videos, and UserError without PyAV.
 
     Each video must have one or two moving balls, as many as the first one, and a camera that is upright and at rest.
     """
-    films.check_size("phyworld", source.frame_size)
-    films.check_rate("phyworld", source.fps, films.FASTEST)
+    films.CODECS["mp4v"].check("phyworld", source.frame_size, source.fps)
     ds = loader.open(source.ds.root, source.ds.options.split, (*OBJECTS, *CAMERA))
     count = len(_balls(ds[0]))
     for number in range(len(ds)):
@@ -75,7 +74,7 @@ def _problem_of(video: Batch, count: int) -> str:
 
 
 def _film(path: Path, video: Batch, fps: float) -> np.ndarray:
-    films.mp4v(path, video["frames"], fps)
+    films.CODECS["mp4v"].write(path, video["frames"], fps)
     return np.frombuffer(path.read_bytes(), np.uint8)
 
 

@@ -1,7 +1,7 @@
 """A folder of films with a table, as Hugging Face's `videofolder` reads it: SPLIT/KEY.mp4 and SPLIT/metadata.parquet.
 
 The table has a row per video: `file_name`, and all fields but images, as nested lists. README.md is a card for the Hub.
-Needs PyArrow, and PyAV but for the codec mp4v.
+Needs PyArrow and PyAV.
 """
 
 from itertools import islice

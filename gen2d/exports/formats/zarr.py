@@ -98,7 +98,7 @@ def _zarr() -> ModuleType:
         import zarr
         import zarr.codecs
     except ImportError:
-        raise UserError("this format needs zarr 3: pip install gen2d[zarr]") from None
+        raise UserError("this format needs zarr 3: pip install 'gen2d[zarr]'") from None
     return zarr
 
 
