@@ -297,16 +297,35 @@ def solve_impact(
 MAX_STACK_IMPACT = 1.0  # m/s: faster contacts count as impacts even inside a stack
 
 
-def _next_impulse(contact: ActiveContact, bounced: Array, impulse: Impulse) -> Impulse:
+IMPULSE_GROWTH = 1.3  # from step to step, of the impulse that a resting contact starts with
+
+
+def _next_impulse(
+    constraint: ContactConstraint,
+    contact: ActiveContact,
+    bounced: Array,
+    impulse: Impulse,
+    old: Impulse,
+    setup: PassSetup,
+) -> Impulse:
     """Impulse that the next step starts with.
 
     Impacts do not warm-start the next step, so `warm_start_impulses` drops negative impulses. The impulse is stored
     negated when the bodies were already touching, so that a resting pile mistaken for an impact recovers in the next
     step.
+
+    The impulse of a contact that rests is at most that of the last step times `IMPULSE_GROWTH`, and what gravity adds
+    in two steps. A pile that is crushed has large impulses once; applied again in the next steps, they would throw it
+    apart.
     """
+    most = IMPULSE_GROWTH * jnp.maximum(old.normal, 0.0) + setup.threshold * contact.frame.normal_mass
+    normal = jnp.minimum(impulse.normal, most)
+    friction = constraint.friction * normal
     negated = jnp.minimum(impulse.normal, MAX_STACK_IMPACT * contact.frame.normal_mass)
-    normal = jnp.where(bounced, jnp.where(contact.gap <= 0, -negated, 0.0), impulse.normal)
-    return Impulse(normal, jnp.where(bounced, 0.0, impulse.tangent))
+    return Impulse(
+        jnp.where(bounced, jnp.where(contact.gap <= 0, -negated, 0.0), normal),
+        jnp.where(bounced, 0.0, jnp.clip(impulse.tangent, -friction, friction)),
+    )
 
 
 def warm_start_impulses(
@@ -325,6 +344,7 @@ def warm_start_impulses(
 
 def relax(
     constraint: ContactConstraint,
+    memory: WarmStart,
     points: list[ContactPoint],
     solved: SolvedPair,
     a: BodySide,
@@ -344,8 +364,10 @@ def relax(
         return relaxed_target(constraint, contact, speed, old, threshold)
 
     a, new_b, last = _apply_pass(constraint, solved._replace(contacts=contacts), target_of, a, b)
-    of = zip(last.contacts, bounced, last.impulses, strict=True)
-    impulses = materialize([_next_impulse(c, (c.tau >= 0) | again, impulse) for c, again, impulse in of])
+    of = zip(last.contacts, bounced, last.impulses, memory.impulses, strict=True)
+    impulses = materialize(
+        [_next_impulse(constraint, c, (c.tau >= 0) | again, new, old, setup) for c, again, new, old in of]
+    )
     if constraint.static:
         new_b = new_b._replace(motion=materialize(new_b.motion))
     return a, new_b, (last, WarmStart(impulses, last.roll))
