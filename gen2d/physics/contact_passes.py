@@ -306,7 +306,7 @@ def solve_impact(
 MAX_STACK_IMPACT = 1.0  # m/s: faster contacts count as impacts even inside a stack
 
 
-IMPULSE_GROWTH = 1.3  # from step to step, of the impulse that a resting contact starts with
+IMPULSE_GROWTH = 1.5  # from step to step, of the impulse that a resting contact starts with
 
 
 def _next_impulse(

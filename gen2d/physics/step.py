@@ -199,7 +199,7 @@ def step(world: WorldState, model: Model, params: SolverParams) -> WorldState:
 
     displacements = [jax.tree.map(lambda x, y: h * x + y, *of) for of in zip(motions, drifts, strict=True)]
     solid = [s if g.collides else None for s, g in zip(shapes, groups, strict=True)]
-    displacements = clamp_displacement(displacements, solid, model.segments)
+    displacements = clamp_displacement(displacements, solid, model.barriers)
     bodies = [_displace(*of) for of in zip(world.bodies, displacements, motions, strict=True)]
 
     joints, motions, _, work_relax = springs_limits_motors.solve(

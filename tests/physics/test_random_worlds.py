@@ -22,6 +22,7 @@ FULL = Recipe(discs=(6, 6), capsules=(2, 2), polygons=(3, 3))
 DISCS = Recipe(discs=(6, 6), capsules=(0, 0), polygons=(0, 0))
 ONE, NONE = (1.0, 1.0), (0.0, 0.0)
 SMOOTH = replace(FULL, elasticity=ONE, friction=NONE, gravity=0.0, fixed=0.0, boxes=True)
+WILD = replace(FULL, density=3, speed=40, spin=40)  # speeds of 100 m/s and spins of 80 rad/s occur
 RECIPES = {
     "discs": DISCS,
     "elastic discs": replace(DISCS, elasticity=ONE),
@@ -31,6 +32,7 @@ RECIPES = {
     "mass ratios up to 1e6": replace(FULL, density=3, speed=10),
     "smooth elastic boxes": replace(SMOOTH, discs=(0, 0), spin=15, speed=20, radius=(0.6, 1.0)),
     "smooth elastic boxes and fast small discs": replace(SMOOTH, fast=60),
+    **{f"fast, mass ratios up to 1e6, e = {e}": replace(WILD, elasticity=(e, e)) for e in (0.0, 0.5, 1.0)},
     "joints, with gravity": Recipe(joints=True, gravity=1),
     "joints, without": Recipe(joints=True, gravity=0),
 }
