@@ -155,7 +155,8 @@ class AllPairs(ContactSolver):
         time: Array,
     ) -> tuple[list[BodySide], AllPairsCarry]:
         def play(k: int, a: BodySide, b: BodySide) -> tuple[BodySide, BodySide, tuple[SolvedPair, WarmStart]]:
-            return contact_passes.relax(self.constraints[k], solved.points[k], solved.pairs[k], a, b, self.setup)
+            of = self.constraints[k], carry.warm[k], solved.points[k], solved.pairs[k]
+            return contact_passes.relax(*of, a, b, self.setup)
 
         sides, relaxed = run_schedule(sides, statics, self.order, play)
         events, observed = carry.events, dict(carry.observed)

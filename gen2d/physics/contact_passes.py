@@ -228,6 +228,14 @@ def _update_drift(old: BodySide, new: BodySide, time: Array, push: Array | None)
     return new._replace(drift=Motion(velocity, spin), push=new.push if push is None else jnp.maximum(new.push, push))
 
 
+def _with_shock(old: BodySide, new: BodySide, bounces: Array) -> BodySide:
+    """The side with its change of velocity added to its shock where a contact bounces."""
+    if old.shock is None or old.motion is None or new.motion is None:
+        return new
+    of = zip(old.shock, old.motion, new.motion, strict=True)
+    return new._replace(shock=Motion(*(shock + jnp.where(bounces, y - x, 0.0) for shock, x, y in of)))
+
+
 def _after_impulses(
     constraint: ContactConstraint,
     old: tuple[BodySide, BodySide],
@@ -236,11 +244,12 @@ def _after_impulses(
     time: Array,
     push: Array | None,
 ) -> tuple[BodySide, BodySide]:
-    """Both sides with the drift, the push and the clock after impulses at this time, s."""
+    """Both sides with the drift, the push, the shock and the clock after impulses at this time, s."""
     (a, b), (new_a, new_b) = old, new
     new_b = _update_drift(b, new_b, time, push)
     if constraint.a is not None and a.drift is not None:
         new_a = _update_drift(a, new_a, time, push)
+    new_a, new_b = _with_shock(a, new_a, bounces), _with_shock(b, new_b, bounces)
     return after_impact(new_a, new_b, bounces, time)
 
 
@@ -297,16 +306,35 @@ def solve_impact(
 MAX_STACK_IMPACT = 1.0  # m/s: faster contacts count as impacts even inside a stack
 
 
-def _next_impulse(contact: ActiveContact, bounced: Array, impulse: Impulse) -> Impulse:
+IMPULSE_GROWTH = 1.5  # from step to step, of the impulse that a resting contact starts with
+
+
+def _next_impulse(
+    constraint: ContactConstraint,
+    contact: ActiveContact,
+    bounced: Array,
+    impulse: Impulse,
+    old: Impulse,
+    setup: PassSetup,
+) -> Impulse:
     """Impulse that the next step starts with.
 
     Impacts do not warm-start the next step, so `warm_start_impulses` drops negative impulses. The impulse is stored
     negated when the bodies were already touching, so that a resting pile mistaken for an impact recovers in the next
     step.
+
+    The impulse of a contact that rests is at most that of the last step times `IMPULSE_GROWTH`, and what gravity adds
+    in two steps. A pile that is crushed has large impulses once; applied again in the next steps, they would throw it
+    apart.
     """
+    most = IMPULSE_GROWTH * jnp.maximum(old.normal, 0.0) + setup.threshold * contact.frame.normal_mass
+    normal = jnp.minimum(impulse.normal, most)
+    friction = constraint.friction * normal
     negated = jnp.minimum(impulse.normal, MAX_STACK_IMPACT * contact.frame.normal_mass)
-    normal = jnp.where(bounced, jnp.where(contact.gap <= 0, -negated, 0.0), impulse.normal)
-    return Impulse(normal, jnp.where(bounced, 0.0, impulse.tangent))
+    return Impulse(
+        jnp.where(bounced, jnp.where(contact.gap <= 0, -negated, 0.0), normal),
+        jnp.where(bounced, 0.0, jnp.clip(impulse.tangent, -friction, friction)),
+    )
 
 
 def warm_start_impulses(
@@ -325,6 +353,7 @@ def warm_start_impulses(
 
 def relax(
     constraint: ContactConstraint,
+    memory: WarmStart,
     points: list[ContactPoint],
     solved: SolvedPair,
     a: BodySide,
@@ -343,12 +372,16 @@ def relax(
         bounced.append(bounces_again(contact, speed, threshold))
         return relaxed_target(constraint, contact, speed, old, threshold)
 
-    a, new_b, last = _apply_pass(constraint, solved._replace(contacts=contacts), target_of, a, b)
-    of = zip(last.contacts, bounced, last.impulses, strict=True)
-    impulses = materialize([_next_impulse(c, (c.tau >= 0) | again, impulse) for c, again, impulse in of])
+    new_a, new_b, last = _apply_pass(constraint, solved._replace(contacts=contacts), target_of, a, b)
+    again = functools.reduce(jnp.logical_or, bounced)
+    new_a, new_b = _with_shock(a, new_a, again), _with_shock(b, new_b, again)
+    of = zip(last.contacts, bounced, last.impulses, memory.impulses, strict=True)
+    impulses = materialize(
+        [_next_impulse(constraint, c, (c.tau >= 0) | bounce, new, old, setup) for c, bounce, new, old in of]
+    )
     if constraint.static:
         new_b = new_b._replace(motion=materialize(new_b.motion))
-    return a, new_b, (last, WarmStart(impulses, last.roll))
+    return new_a, new_b, (last, WarmStart(impulses, last.roll))
 
 
 def touching(solved: SolvedPair, last: SolvedPair) -> Array:

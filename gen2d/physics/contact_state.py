@@ -26,6 +26,7 @@ class BodySide(NamedTuple):
     drift: Motion | None = None  # m, rad: displacement beyond h times the new velocity, as impulses act at their time
     displacement: Motion | None = None  # m, rad: where the impulses of a pass act; None: of static bodies
     push: Any = None  # [N, ...] m/s: bound on the speed from pushing overlaps apart; 0: no contact; None: static
+    shock: Motion | None = None  # m/s, rad/s: change by the impacts of a pass; None: static, and without rigid joints
     work: Work | None = None
     support: Support | None = None  # None: static bodies, and without shock propagation
     first: Array | None = None  # [N, ...] s: least time of impact of a body in the step; infinite without one

@@ -245,13 +245,15 @@ def solve(
     anchors: Anchors,
     motions: list[Motion],
     drifts: list[Motion],
+    shocks: list[Motion],
     statics: list[Any],
     impulses: Array,
     h: float,
-) -> tuple[list[Motion], Array, Work]:
-    """Motions with which the anchors meet after a step of h seconds, the accumulated impulses, and their work.
+) -> tuple[list[Motion], Array, Array, Work]:
+    """Motions with which the anchors meet after a step of h seconds, the accumulated impulses, those of them that
+    answer the impacts, and the work.
 
-    A body's displacement is h times its motion plus its drift.
+    A body's displacement is h times its motion plus its drift; impacts changed its motion by its shock.
     """
     still = [body.motion for body in statics]
     now, drift = table_of(motions, still), table_of(drifts, [jax.tree.map(jnp.zeros_like, m) for m in still])
@@ -264,7 +266,8 @@ def solve(
         error = _error(system, rows, _displace(system, anchors, displacement).offset)
         impulses, now, work = factored.solve(now, impulses, (error - remaining) / h)
         works.append(work)
-    return groups_of(now, motions), impulses, jax.tree.map(lambda *x: sum(x), *works)
+    to_shocks = factored.response(table_of(shocks, [jax.tree.map(jnp.zeros_like, m) for m in still]))
+    return groups_of(now, motions), impulses, to_shocks, jax.tree.map(lambda *x: sum(x), *works)
 
 
 def relax(
@@ -272,18 +275,21 @@ def relax(
     anchors: Anchors,
     motions: list[Motion],
     displacements: list[Motion],
+    shocks: list[Motion],
     statics: list[Any],
     impulses: Array,
     h: float,
-) -> tuple[list[Motion], Array, Work]:
-    """Motions with which the anchors stay together after the displacements, the accumulated impulses, and their
-    work."""
+) -> tuple[list[Motion], Array, Array, Work]:
+    """Motions with which the anchors stay together after the displacements, the accumulated impulses, those of them
+    that answer the impacts of the pass, and the work."""
     still = [body.motion for body in statics]
     now = table_of(motions, still)
     displacement = table_of(displacements, [jax.tree.map(lambda x: h * x, m) for m in still])
     rows = _rows(system, _displace(system, anchors, displacement))
-    impulses, now, work = _FactoredSystem(system, rows).solve(now, impulses, _speeds(system, rows, now))
-    return groups_of(now, motions), impulses, work
+    factored = _FactoredSystem(system, rows)
+    impulses, now, work = factored.solve(now, impulses, _speeds(system, rows, now))
+    to_shocks = factored.response(table_of(shocks, [jax.tree.map(jnp.zeros_like, m) for m in still]))
+    return groups_of(now, motions), impulses, to_shocks, work
 
 
 def _displace(system: JointSystem, anchors: Anchors, displacement: Motion) -> Anchors:
@@ -308,6 +314,12 @@ class _FactoredSystem:
 
     def solve(self, now: Motion, impulses: Array, speeds: Array) -> tuple[Array, Motion, Work]:
         """Accumulated impulses that cancel the speeds of the rows, motions with them, and the work done."""
-        target = materialize(speeds + self._compliance * impulses)
-        more = -materialize(solve_factored(self._factors, target))
+        more = self._impulses(speeds + self._compliance * impulses)
         return impulses + more, *_apply(self._system, self._rows, now, more)
+
+    def response(self, change: Motion) -> Array:
+        """Impulses that cancel the speeds of the rows that a change of motion causes."""
+        return self._impulses(_speeds(self._system, self._rows, change))
+
+    def _impulses(self, speeds: Array) -> Array:
+        return -materialize(solve_factored(self._factors, materialize(speeds)))

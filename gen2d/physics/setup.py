@@ -15,7 +15,7 @@ from gen2d.core.enums import DYNAMIC, KINEMATIC
 from gen2d.physics import rigid_joints, springs_limits_motors
 from gen2d.physics.all_pairs import AllPairs
 from gen2d.physics.broad_phase import round_robin_of
-from gen2d.physics.collision import FAR, Stadium
+from gen2d.physics.collision import Stadium
 from gen2d.physics.constraint import ContactConstraint, Inertia, Motion, frame_of, mix_materials, reciprocal
 from gen2d.physics.contact_state import PassSetup
 from gen2d.physics.nearby_pairs import DynamicSide, NearbyPairs, PairBatch, StaticSide, chunk_size
@@ -24,6 +24,7 @@ from gen2d.physics.schedule import matches, pairings, run_schedule
 from gen2d.physics.segment_lines import Neighbours, neighbours_of
 from gen2d.physics.shapes import BodyShape, CapsuleShape, DiscShape, body_shape_of, to_world
 from gen2d.physics.state import BodyGroupState, Model, StaticBody
+from gen2d.physics.tunnelling import barriers_of
 from gen2d.records.axes import Array, Record
 from gen2d.records.layout import JointSpec, Layout, SlotGroup
 from gen2d.records.scene import Objects, Scene, State
@@ -292,9 +293,8 @@ def build_model(
     at_rest = 2 * params.step * jnp.sqrt(jnp.sum(scene.gravity**2, axis=0))
     setup = PassSetup(scene.gravity[:, None], jnp.maximum(params.bounce_threshold, at_rest), log)
     solver = (_nearby_pairs if sparse else _all_pairs)(objects, layout, groups, statics, setup, params)
-    segments = []
+    barriers = []
     for body, (group, slot) in zip(statics, static_slots(layout), strict=True):
-        if group.collides and body.motion is None and isinstance(body.shape, Stadium):
-            half_length = jnp.where(objects.present[slot : slot + 1], body.shape.half_length, -FAR)
-            segments.append(body.shape._replace(half_length=half_length))
-    return Model(groups, statics, segments, scene.gravity, solver, *_joints(scene, layout, groups), forces, one)
+        if group.collides and body.motion is None:
+            barriers += barriers_of(body.shape, objects.present[slot : slot + 1])
+    return Model(groups, statics, barriers, scene.gravity, solver, *_joints(scene, layout, groups), forces, one)

@@ -6,11 +6,12 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 
 from gen2d.physics import rigid_joints, springs_limits_motors
-from gen2d.physics.collision import Shape, Stadium
+from gen2d.physics.collision import Shape
 from gen2d.physics.constraint import Inertia, Motion
 from gen2d.physics.energy import Ledger
 from gen2d.physics.shapes import BodyShape, to_world
 from gen2d.physics.solver_protocol import ContactSolver
+from gen2d.physics.tunnelling import Barrier
 from gen2d.records.axes import Array
 
 
@@ -60,7 +61,7 @@ class Model(NamedTuple):
 
     groups: list[BodyGroupState]
     statics: list[StaticBody]
-    segments: list[Stadium]  # static segments at rest; of negative length where absent
+    barriers: list[Barrier]  # of static bodies at rest
     gravity: Array  # [2, ...] m/s^2
     solver: ContactSolver
     joints: list[springs_limits_motors.JointBatch]

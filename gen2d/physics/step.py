@@ -99,6 +99,7 @@ class _RigidJoints:
     ) -> None:
         self._system, self._world, self._statics, self._h = system, world, statics, h
         self.impulses, self.works = world.joint_system, []
+        self._to_shocks: list[Array] = []
 
     def warm_start(self, motions: list[Motion]) -> list[Motion]:
         """Motions with the impulses of the last step."""
@@ -111,19 +112,33 @@ class _RigidJoints:
         self.works.append(work)
         return motions
 
-    def run(self, solver: Callable, motions: list[Motion], displacements: list[Motion]) -> list[Motion]:
+    def run(self, solver: Callable, sides: list[BodySide], displacements: list[Motion]) -> list[Motion]:
         """Motions after `rigid_joints.solve`, with drifts, or `rigid_joints.relax`, with displacements."""
+        motions = _motions(sides)
         if self._system is None:
             return motions
-        motions, self.impulses, work = solver(
-            self._system, self._anchors, motions, displacements, self._statics, self.impulses, self._h
+        shocks = [side.shock for side in sides if side.shock is not None]
+        motions, self.impulses, to_shocks, work = solver(
+            self._system, self._anchors, motions, displacements, shocks, self._statics, self.impulses, self._h
         )
+        self._to_shocks.append(to_shocks)
         self.works.append(work)
         return motions
+
+    def next_impulses(self) -> Array | None:
+        """Impulses that the next step starts with: those that impacts did not cause, as they act once."""
+        return self.impulses if self.impulses is None else self.impulses - sum(self._to_shocks)
 
 
 def _motions(sides: list[BodySide]) -> list[Motion]:
     return [side.motion for side in sides if side.motion is not None]
+
+
+def _with_shocks(sides: list[BodySide], shocks: list[Motion] | None) -> list[BodySide]:
+    """Sides with these shocks; as they are without rigid joints."""
+    if shocks is None:
+        return sides
+    return [side._replace(shock=shock) for side, shock in zip(sides, shocks, strict=True)]
 
 
 def step(world: WorldState, model: Model, params: SolverParams) -> WorldState:
@@ -175,14 +190,16 @@ def step(world: WorldState, model: Model, params: SolverParams) -> WorldState:
     ]
     if params.by_time:
         sides = [side._replace(clock=jnp.zeros_like(side.push)) for side in sides]
+    still = None if model.joint_system is None else [_scaled(motion, 0.0) for motion in motions]
+    sides = _with_shocks(sides, still)
     statics = [BodySide(motion=side.motion) for side in statics]
     sides, solved = solver.solve(carry, contacts, sides, statics)
     drifts = [jax.tree.map(jnp.add, side.drift, free) for side, free in zip(sides, free_drifts, strict=True)]
-    motions = rigid.run(rigid_joints.solve, _motions(sides), drifts)
+    motions = rigid.run(rigid_joints.solve, sides, drifts)
 
     displacements = [jax.tree.map(lambda x, y: h * x + y, *of) for of in zip(motions, drifts, strict=True)]
     solid = [s if g.collides else None for s, g in zip(shapes, groups, strict=True)]
-    displacements = clamp_displacement(displacements, solid, model.segments)
+    displacements = clamp_displacement(displacements, solid, model.barriers)
     bodies = [_displace(*of) for of in zip(world.bodies, displacements, motions, strict=True)]
 
     joints, motions, _, work_relax = springs_limits_motors.solve(
@@ -193,8 +210,8 @@ def step(world: WorldState, model: Model, params: SolverParams) -> WorldState:
         BodySide(motion=m, displacement=moved, push=side.push, work=side.work, support=side.support)
         for side, m, moved in of_groups
     ]
-    sides, carry = solver.relax(carry, solved, sides, statics, world.time)
-    motions = rigid.run(rigid_joints.relax, _motions(sides), displacements)
+    sides, carry = solver.relax(carry, solved, _with_shocks(sides, still), statics, world.time)
+    motions = rigid.run(rigid_joints.relax, sides, displacements)
     if ledger is not None:
         olds, works = [body.motion for body in world.bodies], [side.work for side in sides]
         done = zip(works, groups, olds, free, free_drifts, displacements, accelerations, spin_ups, strict=True)
@@ -205,6 +222,6 @@ def step(world: WorldState, model: Model, params: SolverParams) -> WorldState:
         time=world.time + h,
         contacts=carry,
         joints=[joint.impulses for joint in joints],
-        joint_system=rigid.impulses,
+        joint_system=rigid.next_impulses(),
         ledger=ledger,
     )

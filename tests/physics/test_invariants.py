@@ -111,12 +111,11 @@ def energy_gains(worlds: list[tuple]) -> np.ndarray:
     return np.diff(energy).max(1) / energy[:, 0]
 
 
-@pytest.mark.asked
 @settings(max_examples=8, deadline=None, derandomize=True)
 @given(SEEDS, st.floats(0, 1), st.floats(0, 1))
 def test_i3_energy_never_grows_among_free_discs(seed, elasticity, friction):
     worlds = [cluster(seed + i, elasticity, friction) for i in range(8)]
-    holds("I3 energy gained in a step, free discs, relative", energy_gains(worlds), 5e-4, asked=1e-4)
+    holds("I3 energy gained in a step, free discs, relative", energy_gains(worlds), 1e-4)
 
 
 @pytest.mark.asked
@@ -124,7 +123,7 @@ def test_i3_energy_never_grows_among_free_discs(seed, elasticity, friction):
 @given(SEEDS, st.floats(0, 1), st.floats(0, 1))
 def test_i3_energy_never_grows_in_a_box(seed, elasticity, friction):
     worlds = [gas(seed + i, elasticity, friction, DOWN) for i in range(8)]
-    holds("I3 energy gained in a step, box, relative", energy_gains(worlds), 4e-3, asked=1e-4)
+    holds("I3 energy gained in a step, box, relative", energy_gains(worlds), 1e-3, asked=1e-4)
 
 
 @pytest.mark.asked
@@ -132,7 +131,7 @@ def test_i3_energy_never_grows_in_a_box(seed, elasticity, friction):
 @given(SEEDS, st.floats(0, 1), st.floats(0, 1))
 def test_i3_energy_never_grows_in_a_wedge(seed, elasticity, friction):
     worlds = [wedge(seed + i, elasticity, friction) for i in range(8)]
-    holds("I3 energy gained in a step, wedge, relative", energy_gains(worlds), 2e-2, asked=1e-4)
+    holds("I3 energy gained in a step, wedge, relative", energy_gains(worlds), 1e-2, asked=1e-4)
 
 
 def test_i3_simultaneous_impacts_gain_no_energy():

@@ -7,10 +7,16 @@ import functools
 import itertools
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from laws import DOWN, FAR, FLOOR, GRAVITY, POSES, QUARTERS, Case, holds, overlaps, pose_world, watch
 from worlds import STEP, rotate, run
+
+from gen2d.physics.collision import Shape, edge_normals
+from gen2d.physics.constraint import Motion
+from gen2d.physics.shapes import BodyShape, CapsuleShape, DiscShape, PolygonShape, to_world
+from gen2d.physics.tunnelling import barriers_of, clamp_displacement
 
 RADIUS = 0.5  # m
 SLOP = 0.005  # m
@@ -294,3 +300,51 @@ def test_a_disc_that_is_hit_meets_the_wall_that_it_reaches_in_the_same_step():
 def test_far_things_are_far():
     """The segments that fill up a case are out of reach of every fall here."""
     assert GRAVITY * 10**2 / 2 < FAR
+
+
+def clamped(shape: Shape, displacement: tuple[float, float], spin: float, barrier: Shape) -> np.ndarray:
+    """Displacement [2] in m of a body beside a static one."""
+    moved = Motion(jnp.asarray(displacement, float).reshape(2, 1, 1), jnp.full((1, 1), spin))
+    (new,) = clamp_displacement([moved], [shape], barriers_of(barrier, jnp.ones((1, 1), bool)))
+    return np.asarray(new.velocity)[:, 0, 0]
+
+
+def shape_at(shape: BodyShape, x: float, y: float) -> Shape:
+    return to_world(shape, jnp.asarray((x, y), float).reshape(2, 1, 1), jnp.zeros((1, 1)))
+
+
+def box(width: float, height: float) -> PolygonShape:
+    corners = [(-width, -height), (width, -height), (width, height), (-width, height)]
+    vertices = tuple(jnp.asarray(corner).reshape(2, 1, 1) / 2 for corner in corners)
+    return PolygonShape(vertices, edge_normals(vertices), jnp.zeros((1, 1)))
+
+
+CAPSULE = CapsuleShape(jnp.full((1, 1), 0.5), jnp.full((1, 1), 0.1))
+BODIES = {"disc": DiscShape(jnp.full((1, 1), 0.1)), "capsule": CAPSULE, "box": box(1.0, 0.4)}
+FLOORS = {
+    "segment": shape_at(CapsuleShape(jnp.full((1, 1), 5.0), jnp.zeros((1, 1))), 0, 0),
+    "polygon": shape_at(box(10.0, 2.0), 0, -1),
+}
+
+
+@pytest.mark.parametrize("floor", FLOORS)
+@pytest.mark.parametrize("body", BODIES)
+def test_no_displacement_takes_a_body_through_a_floor(body, floor):
+    for y, spin, down in itertools.product((0.7, 1.5, 3.0), (0.0, 0.4), (1.0, 4.0, 50.0)):
+        _, moved = clamped(shape_at(BODIES[body], 0, y), (0, -down), spin, FLOORS[floor])
+        assert y + moved > 0
+        if down < y - 0.7:  # does not get there
+            assert moved == -down
+    far = clamped(shape_at(BODIES[body], 8, 1), (0, -50), 0.0, FLOORS[floor])
+    assert far[1] == -50  # beside the floor
+
+
+def test_the_end_of_a_capsule_does_not_turn_through_a_floor():
+    capsule = shape_at(CAPSULE, 0, 0.3)
+    turned = Motion(jnp.zeros((2, 1, 1)), jnp.full((1, 1), 1.5))
+    (new,) = clamp_displacement([turned], [capsule], barriers_of(FLOORS["segment"], jnp.ones((1, 1), bool)))
+    assert 0.3 - 0.5 * np.sin(new.spin.item()) > 0
+
+
+def test_a_body_may_leave_a_polygon():
+    assert clamped(shape_at(BODIES["disc"], 0, -0.3), (0, 3), 0.0, FLOORS["polygon"])[1] == 3

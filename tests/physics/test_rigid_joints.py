@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from bench_demos import bridge
+from laws import holds
 from numpy.testing import assert_allclose
 
 from gen2d import Space
@@ -42,6 +43,21 @@ def ends(video: Video, number: int, half: float) -> np.ndarray:
     angle = video.angle[:, number]
     way = half * np.stack([np.cos(angle), np.sin(angle)], -1)
     return np.stack([video.position[:, number] - way, video.position[:, number] + way])
+
+
+def test_a_bob_on_a_rod_that_strikes_a_wall_gains_no_energy():
+    """The rod is nearly perpendicular to the wall when the bob strikes, so it takes nearly all of each impact."""
+    space, gravity = Space(gravity=(0, -9.81)), 9.81
+    space.add_segment((2.2, -5), (2.2, 5), friction=0.0)
+    bob = space.add_circle((2 * np.cos(1), 2 * np.sin(1)), 0.3, elasticity=0.8, friction=0.0)
+    space.add_joint("distance", bob, anchor_b=(0, 0))
+    video = space.simulate(4, fps=60, contacts=0)
+    x, y = video.position[:, bob].T
+    energy = 0.5 * (video.velocity[:, bob] ** 2).sum(-1) + gravity * y
+    holds("bob that strikes a wall: energy gained, m of height", np.maximum(energy - energy[0], 0) / gravity, 1e-5)
+    holds("bob that strikes a wall: length of the rod, m", np.hypot(x, y) - 2, 1e-5)
+    assert energy[-1] < energy[0] - 1
+    assert x.max() > 1.9
 
 
 @pytest.mark.full
