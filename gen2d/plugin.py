@@ -46,6 +46,7 @@ if TYPE_CHECKING:
     from gen2d.renderers.plan import FramePlan, RenderScene, tile_windows
     from gen2d.renderers.primitives import Instants, PixelWindow
     from gen2d.renderers.rasterizer import alone
+    from gen2d.renderers.sensor import distorted_points
     from gen2d.sampling import builder
     from gen2d.sampling.builder import SampledScene
     from gen2d.sampling.placement import CLEARANCE, place, start_position
@@ -83,6 +84,7 @@ _HOMES = {
     "gen2d.renderers.plan": "FramePlan RenderScene tile_windows",
     "gen2d.renderers.primitives": "Instants PixelWindow",
     "gen2d.renderers.rasterizer": "alone",
+    "gen2d.renderers.sensor": "distorted_points",
     "gen2d.sampling": "builder",
     "gen2d.sampling.builder": "SampledScene",
     "gen2d.sampling.placement": "CLEARANCE place start_position",
@@ -137,6 +139,7 @@ __all__ = [
     "common",
     "contrasting",
     "dataset",
+    "distorted_points",
     "each_video",
     "extents",
     "facts",

@@ -195,6 +195,7 @@ def from_mapping(values: Any, source: str, name: str = "dataset", copies: Copies
         config = _with_splits(config, values["splits"], source, copies)
     _check_matched(config, source)
     _check_palettes(config, source)
+    _check_distortion(config, source)
     return config
 
 
@@ -250,6 +251,18 @@ def _check_palettes(config: Config, source: str) -> None:
                 f"{source}: splits.{split.name}.factors has {hidden[0]}, which look.palette={look.options.palette} "
                 "replaces: look.palette must be scene"
             )
+
+
+def _check_distortion(config: Config, source: str) -> None:
+    """Raise ConfigError if frames are distorted, but an annotation describes frames without distortion."""
+    images = config.image, *(config.of_split(split.name).image for split in config.splits)
+    straight = [plugin.name for plugin in config.annotations.wanted if not plugin.contract.distorted]
+    if straight and any("distortion" in image.sensor for image in images):
+        able = [plugin.name for plugin in config.annotations.pixels if plugin.contract.distorted]
+        raise ConfigError(
+            f"{source}: annotations.{straight[0]} is on, but describes frames without image.distortion: one of them "
+            f"must be off ({' and '.join(able)} describe distorted frames)"
+        )
 
 
 def _keys(values: Any) -> list[str]:

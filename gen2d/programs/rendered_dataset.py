@@ -100,7 +100,8 @@ class RenderedDataset(Dataset):
 
         video, image = config.video, config.image
         # Noise depends on the number of the frame, motion blur and some annotations on neighbouring frames.
-        whole = rendered.keys() != {"frames"} or image.exposure > 0 or image.noise.support != (0.0, 0.0)
+        noisy = not {"noise", "shot_noise"}.isdisjoint(image.sensor)
+        whole = rendered.keys() != {"frames"} or image.exposure > 0 or noisy
         every_frame = {"window": None, "stride": 1, "start": "first"} if whole else {}
         self._inputs, self._whole = dataclasses.replace(options, fields=(), window_fields=False, **every_frame), whole
         self._started: _Renderer | None = None
