@@ -34,6 +34,7 @@ if TYPE_CHECKING:
         PlainOptions,
         are_lines,
         are_moving,
+        backdrop,
         contrasting,
         line_fields,
         line_margin,
@@ -76,8 +77,8 @@ _HOMES = {
     "gen2d.renderers.camera": "pixel_at to_pixels",
     "gen2d.renderers.compositing": "OCCLUDER",
     "gen2d.renderers.look": (
-        "LineOptions PlainOptions are_lines are_moving contrasting line_fields line_margin mean_color palette_option "
-        "plain"
+        "LineOptions PlainOptions are_lines are_moving backdrop contrasting line_fields line_margin mean_color "
+        "palette_option plain"
     ),
     "gen2d.renderers.noise": "fraction hashed",
     "gen2d.renderers.paint": "Background Light Paint Pattern Shadow Surface Texture",
@@ -134,6 +135,7 @@ __all__ = [
     "are_moving",
     "arrays",
     "as_json",
+    "backdrop",
     "builder",
     "caption",
     "common",

@@ -16,6 +16,7 @@ class Texture(NamedTuple):
     seed: Array  # [...] uint32
     cell: Array  # [...] m, size of the coarsest spots
     color: Array  # [..., 3] where the noise is 1; where it is 0 the base colour shows
+    stretch: Array | None = None  # [...] size along the y axis, over that along the x axis
 
 
 class Light(NamedTuple):
