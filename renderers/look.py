@@ -14,7 +14,9 @@ from gen2d.records.axes import Array
 from gen2d.records.layout import Layout
 from gen2d.records.scene import Scene
 from gen2d.renderers.color import palette, to_linear
-from gen2d.renderers.paint import Background, Paint, Texture
+from gen2d.renderers.paint import Background, Paint, Picture, Texture
+
+CROP = 0.6  # least size of a crop of an image, over that of the largest
 
 
 def palette_option(default: str) -> str:
@@ -38,8 +40,17 @@ class PlainOptions(LineOptions):
         "plain",
         str,
         "",
-        "kind of the background; backdrop: that of the palette, with light and grain",
-        choices=("plain", "gradient", "noise", "backdrop"),
+        "kind of the background; backdrop: that of the palette; images: crops of the user's images",
+        choices=("plain", "gradient", "noise", "backdrop", "images"),
+    )
+    background_images: tuple[str, ...] | None = option(
+        None,
+        str,
+        "",
+        "sha256 of the images; null: of all images of the folder that is named",
+        several=True,
+        optional=True,
+        later=True,
     )
     background: tuple[int, ...] | None = option(
         None,
@@ -96,8 +107,15 @@ def plain(scene: Scene, layout: Layout, options: PlainOptions, key: Array) -> Pa
 
 
 def sample_background(options: PlainOptions, layout: Layout, key: Array) -> Background:
-    """Background by `background_kind`: plain, a gradient in a random direction, noise, or the palette's backdrop."""
+    """Background by `background_kind`: plain, a gradient in a random direction, noise, the palette's backdrop, or a
+    crop of an image, of at least `CROP` of the largest."""
     named = options.named_palette
+    if options.background_kind == "images" and options.background_images is not None:
+        index_key, corner_key, extent_key = jax.random.split(key, 3)
+        index = jax.random.randint(index_key, (), 0, len(options.background_images))
+        extent = jax.random.uniform(extent_key, minval=CROP)
+        picture = Picture(index, jax.random.uniform(corner_key, (2,)), extent)
+        return Background(jnp.asarray(options.grounds[0], jnp.float32), picture=picture)
     if options.background_kind == "backdrop" and named is not None:
         return backdrop(named, layout, key)
     color, to_color = (jnp.asarray(c, jnp.float32) for c in options.grounds)

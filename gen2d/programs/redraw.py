@@ -373,7 +373,8 @@ def _render_scenes(
     shapes = [np.shape(columns[name]) for name in ("states/position", "camera/scale")]
     if len({len(shape) and shape[1] for shape in shapes}) > 1:
         raise ConfigError("states and camera have other numbers of frames: give all that simulate_again returned")
-    return _compile(build_render_scenes, settings)(columns, seed_words_of(ds), jnp.asarray(numbers, jnp.uint32))
+    scenes = _compile(build_render_scenes, settings)(columns, seed_words_of(ds), jnp.asarray(numbers, jnp.uint32))
+    return render_module.with_pictures(scenes, settings.config)
 
 
 def build_render_scenes(columns: FieldColumns, words: Array, numbers: Array, settings: RenderSettings) -> RenderScene:

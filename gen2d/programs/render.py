@@ -6,12 +6,14 @@ Each of them has its own key, so changing the look or the camera changes nothing
 import chex
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from gen2d import annotations
 from gen2d.config.annotations import Annotations
 from gen2d.config.config import Config
 from gen2d.config.sections import ImageOptions
 from gen2d.core.errors import ConfigError
+from gen2d.media.backgrounds import crops
 from gen2d.records.axes import Array, check_shapes
 from gen2d.records.keys import key_for
 from gen2d.records.layout import Layout
@@ -39,6 +41,8 @@ def plan_of(config: Config, layout: Layout) -> FramePlan:
             f"annotations.{name} is on for {layout.slots} objects of scene {config.scene.name}, "
             f"but must be off for more than {OCCLUDER - 1}"
         )
+    if getattr(look.options, "background_kind", "") == "images" and camera.may_move(config.camera):
+        raise ConfigError("look.background_kind is images, which are fixed to the frame, but the camera moves")
     seconds = video.frames / video.fps
     scale = camera.largest_scale(config.camera, layout, video.height, video.width, seconds)
     return FramePlan(
@@ -185,6 +189,24 @@ def sensor_columns(sensor: Sensor | None) -> dict[str, Array]:
     """The numbers of the lens and the sensor that are sampled, by stored name."""
     numbers = {} if sensor is None else sensor._asdict()
     return {f"image/{name}": value.astype(jnp.float32) for name, value in numbers.items() if value is not None}
+
+
+def with_pictures(render_scenes: RenderScene, config: Config) -> RenderScene:
+    """Render scenes [n], or their shapes and types, with the pixels of their backgrounds' pictures, if they have any.
+
+    Raises ConfigError for an image that is not there, or that cannot be read.
+    """
+    background, digests = render_scenes.paint.background, getattr(config.look.options, "background_images", None)
+    if background.picture is None or digests is None:
+        return render_scenes
+    index, size = background.picture.index, (config.video.height, config.video.width)
+    if isinstance(index, jax.Array):
+        chosen = (np.asarray(part) for part in (index, background.picture.corner, background.picture.extent))
+        pixels = jax.device_put(crops(digests, *chosen, *size), index.device)
+    else:
+        pixels = jax.ShapeDtypeStruct((*index.shape, *size, 3), np.uint8)
+    background = background._replace(picture=background.picture._replace(pixels=pixels))
+    return render_scenes._replace(paint=render_scenes.paint._replace(background=background))
 
 
 def camera_columns(view: CameraView) -> dict[str, Array]:
