@@ -4,6 +4,7 @@ import json
 import subprocess
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
@@ -15,6 +16,7 @@ from gen2d.config.config import load_config
 from gen2d.config.reading import yaml_text
 from gen2d.core.errors import ConfigError, UserError
 from gen2d.media import backgrounds
+from gen2d.programs.rollout import Rollout
 from gen2d.storage import image_folder
 from gen2d.storage.sealed import sha256
 
@@ -121,6 +123,12 @@ def test_an_image_of_too_many_pixels_is_not_decoded(folder: Path, monkeypatch: p
     gen2d.use_images(folder)
     with pytest.raises(ConfigError, match=r"a\.png: has 200 x 120 px, but may have 100 in all"):
         backgrounds.crops((hashes(folder)[0],), np.zeros(1), np.zeros((1, 2)), np.ones(1), 8, 8)
+
+
+def test_a_camera_that_moves_is_refused(folder: Path) -> None:
+    gen2d.use_images(folder)
+    with pytest.raises(ConfigError, match="background_kind is images, which are fixed to the frame, but the camera"):
+        Rollout(load_config(CONFIG, ["camera.zoom=0.1"]), jax.devices()[:1])
 
 
 @pytest.mark.parametrize(
