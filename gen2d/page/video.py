@@ -99,7 +99,8 @@ class Videos:
             step = math.ceil(math.sqrt(height * width) / detail.mask_side)
             flow = flow_colors(values["flow/forward"][::stride, ::step, ::step])
             video["flow"] = _sprite(sprite_sheet(flow, None), flow)
-        if np.any(values.get("image/distortion", 0)):  # outlines would not lie on what the frames show
+        if "sprite" in video and np.any(values.get("image/distortion", 0)):
+            # Outlines would not lie on what the frames show.
             values = {name: value for name, value in values.items() if not name.startswith("camera/")}
         present = values.get("objects/present", np.zeros(sizes.get("K", 0), bool))
         slots = np.flatnonzero(present)[: detail.objects]

@@ -18,6 +18,7 @@ import gen2d
 from gen2d.config.config import load_config
 from gen2d.core.errors import ConfigError
 from gen2d.generation.run import generate
+from gen2d.page.video import Detail, Videos
 from gen2d.programs.render import render_frames
 from gen2d.renderers import sensor as sensor_module
 from gen2d.renderers.color import to_linear
@@ -256,6 +257,11 @@ def test_sampled_numbers_are_stored_and_frames_can_be_rendered_again(tmp_path: P
     assert not np.array_equal(again, stored["frames"])
     clean = everything(tmp_path / "data", "clean")
     assert not any(clean[f"image/{name}"].any() for name in EFFECTS)
+    with pytest.raises(ConfigError, match=r"frames are distorted .* but objects holds places without distortion"):
+        gen2d.export(tmp_path / "data", "objects", tmp_path / "objects.csv")
+    for split, outlined in (("train", False), ("clean", True)):  # on the dataset's page
+        shown = Videos(ds.root, ds.manifest, split).video(0, Detail(2, 32, 32, None, 8, 8))
+        assert ("camera/scale" in {column["name"] for column in shown["arrays"]["columns"]}) == outlined
 
 
 def test_windows_are_those_of_the_whole_video(tmp_path: Path):

@@ -57,11 +57,18 @@ def _fallen(videos: dict[str, np.ndarray], turned: float = 0.3) -> np.ndarray:
     return (moving & (np.abs(videos["states/angle"][:, -1]) > turned)).sum(1) / moving.sum(1)
 
 
+def _above(videos: dict[str, np.ndarray], height: float) -> np.ndarray:
+    """Whether [n] a moving object is above this height (m) at the end."""
+    moving = videos["objects/present"] & (videos["objects/kind"] != STATIC)
+    return (moving & (videos["states/position"][:, -1, :, 1] > height)).any(1)
+
+
 OUTCOMES: dict[str, Callable[[dict[str, np.ndarray]], np.ndarray]] = {
     "tower": lambda videos: videos["factors/stable"] > 0,
     "seesaw": lambda videos: videos["states/angle"][:, -1, 2] > 0,
     "dominoes": lambda videos: _fallen(videos) == 1,
     "wrecking_ball": lambda videos: _fallen(videos) > 0,
+    "funnel": lambda videos: _above(videos, 3.5),
     "hidden_mass": lambda videos: videos["factors/mass_ratio"][:, 0] > 1,
 }
 
