@@ -19,7 +19,7 @@ distortion of lenses', 1966, whose first radial coefficient is k).
 
 import functools
 import math
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -29,6 +29,9 @@ from gen2d.records.axes import Array
 from gen2d.renderers.color import LINEAR, to_srgb
 from gen2d.renderers.jpeg import round_trip
 from gen2d.renderers.noise import hashed
+
+if TYPE_CHECKING:
+    from gen2d.renderers.plan import RenderScene
 
 SHOT = 1  # word that tells the hashes of shot noise from those of sensor noise
 FAR, STEPS = 2.0, 8  # largest distance of a distorted point, and steps of Newton's method
@@ -43,11 +46,11 @@ class Sensor(NamedTuple):
     shot_noise: Array | None = None  # standard deviation where the light is 1
     white_balance: Array | None = None  # stops, of red over blue
     noise: Array | None = None  # sRGB, standard deviation
-    jpeg_quality: Array | None = None  # 1 to 100; 0: no round trip
+    jpeg_quality: Array | None = None  # 1 to 100
 
 
 def record(
-    scenes: Any, frames: Array | None, owners: Array | None, height: int, width: int
+    scenes: "RenderScene", frames: Array | None, owners: Array | None, height: int, width: int
 ) -> tuple[Array | None, Array | None]:
     """Frames [n, T, H, W, 3] and owners [n, T, H, W] uint8 as the sensors of render scenes [n] record them.
 
@@ -70,20 +73,15 @@ def record(
 def _record_frames(sensor: Sensor, seed: Array, frames: Array) -> Array:
     """Frames [T, H, W, 3] uint8 of one video as its sensor records them."""
     numbers, values = jnp.arange(len(frames)), frames
-    if any(stage is not None for stage in sensor[:5]):
-        values = 255 * _display(_light(sensor, seed, numbers, frames))
+    if any(stage is not None for stage in sensor[: Sensor._fields.index("noise")]):
+        values = to_srgb(jnp.clip(_light(sensor, seed, numbers, frames), 0.0, 1.0))
     if sensor.noise is not None:
-        values = values.astype(jnp.float32) + sensor.noise * _gaussian(values.shape, seed, numbers)
+        values = values.astype(jnp.float32) + _gaussian(sensor.noise, values.shape, seed, numbers)
     if values is not frames:
         values = jnp.clip(jnp.floor(values + 0.5), 0, 255).astype(jnp.uint8)
     if sensor.jpeg_quality is not None:
-        values = jnp.where(sensor.jpeg_quality > 0, round_trip(values, sensor.jpeg_quality), values)
+        values = round_trip(values, sensor.jpeg_quality)
     return values
-
-
-def _display(light: Array) -> Array:
-    """Display values from 0 to 1 of light, of which the sensor keeps what is from 0 to 1."""
-    return to_srgb(jnp.clip(light, 0.0, 1.0)) / 255
 
 
 def _light(sensor: Sensor, seed: Array, numbers: Array, frames: Array) -> Array:
@@ -98,22 +96,21 @@ def _light(sensor: Sensor, seed: Array, numbers: Array, frames: Array) -> Array:
     if sensor.exposure_gain is not None:
         light = light * jnp.exp2(sensor.exposure_gain)
     if sensor.shot_noise is not None:
-        noise = _gaussian(frames.shape, seed, numbers, SHOT)
-        light = light + sensor.shot_noise * jnp.sqrt(light) * noise
+        light = light + jnp.sqrt(light) * _gaussian(sensor.shot_noise, frames.shape, seed, numbers, SHOT)
     if sensor.white_balance is not None:
         light = light * jnp.exp2(sensor.white_balance * jnp.asarray([0.5, 0.0, -0.5]))
     return light
 
 
-def _gaussian(shape: tuple[int, ...], seed: Array, numbers: Array, *stage: int) -> Array:
-    """Approximately Gaussian noise [T, H, W, 3] of standard deviation 1, seeded by frame number.
+def _gaussian(deviation: Array, shape: tuple[int, ...], seed: Array, numbers: Array, *stage: int) -> Array:
+    """Approximately Gaussian noise [T, H, W, 3] of standard deviation `deviation`, seeded by frame number.
 
     The noise of a value is the sum of four random bytes, which has a variance of (256^2 - 1) / 3.
     """
     pixels = jnp.arange(math.prod(shape[1:]), dtype=jnp.uint32).reshape(shape[1:])
     words = hashed(seed, numbers[:, None, None, None], pixels, *stage)
     sums = functools.reduce(jnp.add, [((words >> shift) & 255).astype(jnp.int32) for shift in (0, 8, 16, 24)])
-    return (sums - 510).astype(jnp.float32) * (1 / math.sqrt((256**2 - 1) / 3))
+    return (sums - 510).astype(jnp.float32) * (deviation / math.sqrt((256**2 - 1) / 3))
 
 
 # ---- Distortion

@@ -157,8 +157,10 @@ def test_a_distorted_ball_is_where_the_cubic_puts_it(distortion):
         assert error < 0.6
     points = np.asarray(rendered["tracks/points"])
     from_center = points - (expected + np.array([64, 48]))[:, :, None]
-    near = np.hypot(*np.moveaxis(from_center, -1, 0)) < 3  # not at the ball's rim
-    n, t, p = np.nonzero(near & inside[..., None] & np.asarray(rendered["tracks/object"] == 0)[:, None])
+    distance, own = np.hypot(*np.moveaxis(from_center, -1, 0)), np.asarray(rendered["tracks/object"] == 0)[:, None]
+    own = own & inside[..., None]
+    assert distance[own].max() < 7.5  # a radius of 4.8 px, magnified by 1.4 at most
+    n, t, p = np.nonzero((distance < 3) & own)  # not at the ball's rim
     pixel = np.floor(points[n, t, p]).astype(int)
     assert len(n) > 15
     assert (np.asarray(rendered["masks/instance"])[n, t, pixel[:, 1], pixel[:, 0]] == 1).all()
@@ -227,7 +229,6 @@ def test_a_jpeg_round_trip_is_the_last_stage():
     before = recorded(frames, vignette=0.3, noise=4.0, shot_noise=0.02)
     expected = np.asarray(round_trip(jnp.asarray(before), jnp.float32(30)))
     assert_array_equal(recorded(frames, vignette=0.3, noise=4.0, shot_noise=0.02, jpeg_quality=30), expected)
-    assert_array_equal(recorded(frames, jpeg_quality=0), frames)
 
 
 # ---- Datasets
