@@ -62,7 +62,7 @@ class Shadow(NamedTuple):
 class Picture(NamedTuple):
     """Crop of one of the user's images. A look chooses it, the host decodes it."""
 
-    index: Array  # [] of the image
+    number: Array  # [] of the image
     corner: Array  # [2] place of the crop, from 0, at the left and the top, to 1
     extent: Array  # [] size of the crop, over that of the largest
     pixels: Array | None = None  # [H, W, 3] uint8; None before it is decoded

@@ -54,7 +54,7 @@ def draw(scenes: RenderScene, plan: FramePlan) -> tuple[Array | None, Array | No
 def draw_dense(scenes: RenderScene, plan: FramePlan) -> tuple[Array | None, Array | None]:
     """Frames and owners as from `draw`, with each object evaluated at every pixel. The form for GPUs."""
     frames, owners = jax.vmap(functools.partial(_draw_video, plan=plan))(scenes)
-    return record(scenes, frames, owners, plan.height, plan.width)
+    return record(scenes.sensor, scenes.seed, frames, owners, plan.height, plan.width)
 
 
 def _draw_video(scene: RenderScene, plan: FramePlan) -> tuple[Array | None, Array | None]:

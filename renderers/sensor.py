@@ -19,7 +19,7 @@ distortion of lenses', 1966, whose first radial coefficient is k).
 
 import functools
 import math
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -29,9 +29,6 @@ from gen2d.records.axes import Array
 from gen2d.renderers.color import LINEAR, to_srgb
 from gen2d.renderers.jpeg import round_trip
 from gen2d.renderers.noise import hashed
-
-if TYPE_CHECKING:
-    from gen2d.renderers.plan import RenderScene
 
 SHOT = 1  # word that tells the hashes of shot noise from those of sensor noise
 FAR, STEPS = 2.0, 8  # largest distance of a distorted point, and steps of Newton's method
@@ -50,13 +47,13 @@ class Sensor(NamedTuple):
 
 
 def record(
-    scenes: "RenderScene", frames: Array | None, owners: Array | None, height: int, width: int
+    sensors: Sensor | None, seeds: Array, frames: Array | None, owners: Array | None, height: int, width: int
 ) -> tuple[Array | None, Array | None]:
-    """Frames [n, T, H, W, 3] and owners [n, T, H, W] uint8 as the sensors of render scenes [n] record them.
+    """Frames [n, T, H, W, 3] and owners [n, T, H, W] uint8 as sensors [n] record them, with seeds [n] of noise.
 
     An owner is that of the pixel's centre, without distortion. Either may be None.
     """
-    if scenes.sensor is None:
+    if sensors is None:
         return frames, owners
 
     def video(entry: tuple[Any, ...]) -> tuple[Array | None, Array | None]:
@@ -67,7 +64,7 @@ def record(
             owners = owners.reshape(len(owners), -1)[:, pixel.ravel()].reshape(owners.shape)
         return None if frames is None else _record_frames(sensor, seed, frames), owners
 
-    return jax.lax.map(video, (scenes.sensor, scenes.seed, frames, owners))
+    return jax.lax.map(video, (sensors, seeds, frames, owners))
 
 
 def _record_frames(sensor: Sensor, seed: Array, frames: Array) -> Array:

@@ -53,7 +53,7 @@ def draw_tiles(scenes: RenderScene, plan: FramePlan) -> tuple[Array | None, Arra
 
     canvas = jax.lax.fori_loop(0, videos, video, LayerCanvas(image, owner))
     canvas = jax.tree.map(lambda a: a.reshape(videos, frames, *a.shape[1:]), canvas)
-    return record(scenes, *canvas, plan.height, plan.width)
+    return record(scenes.sensor, scenes.seed, canvas.image, canvas.owner, plan.height, plan.width)
 
 
 class TileEdges(NamedTuple):

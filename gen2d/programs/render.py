@@ -3,6 +3,8 @@
 Each of them has its own key, so changing the look or the camera changes nothing else.
 """
 
+from typing import Any
+
 import chex
 import jax
 import jax.numpy as jnp
@@ -199,13 +201,14 @@ def with_pictures(render_scenes: RenderScene, config: Config) -> RenderScene:
     background, digests = render_scenes.paint.background, getattr(config.look.options, "background_images", None)
     if background.picture is None or digests is None:
         return render_scenes
-    index, size = background.picture.index, (config.video.height, config.video.width)
-    if isinstance(index, jax.Array):
-        chosen = (np.asarray(part) for part in (index, background.picture.corner, background.picture.extent))
-        pixels = jax.device_put(crops(digests, *chosen, *size), index.device)
+    picture, size = background.picture, (config.video.height, config.video.width)
+    chosen = picture.number, picture.corner, picture.extent
+    if isinstance(picture.number, jax.ShapeDtypeStruct):
+        pixels: Any = jax.ShapeDtypeStruct((*picture.number.shape, *size, 3), np.uint8)
     else:
-        pixels = jax.ShapeDtypeStruct((*index.shape, *size, 3), np.uint8)
-    background = background._replace(picture=background.picture._replace(pixels=pixels))
+        number, corner, extent = map(np.asarray, chosen)
+        pixels = jax.device_put(crops(digests, number, corner, extent, *size), picture.number.device)
+    background = background._replace(picture=picture._replace(pixels=pixels))
     return render_scenes._replace(paint=render_scenes.paint._replace(background=background))
 
 

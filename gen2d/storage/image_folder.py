@@ -13,8 +13,9 @@ from gen2d.storage.sealed import read_bytes, sha256
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".webp")
 MAX_FILES, FILE_BYTES = 10_000, 2**26
+MAX_NAMED = 10 * MAX_FILES
 
-_files: dict[str, Path] = {}  # by sha256: of all folders that were named
+_files: dict[str, Path] = {}  # by sha256: of the folders that were named, the oldest first
 _newest: tuple[str, ...] = ()  # hashes of the images of the folder named last
 
 
@@ -59,6 +60,8 @@ def use_images(folder: str | os.PathLike[str]) -> tuple[str, ...]:
     if not found:
         raise UserError(f"{argument('images')} is {root}, but must be a folder of PNG, JPEG or WebP files")
     _files.update(found)
+    while len(_files) > MAX_NAMED:
+        del _files[next(iter(_files))]
     _newest = tuple(found)
     return _newest
 

@@ -1,7 +1,6 @@
 """Lens, sensor and JPEG: each stage by its law, in the stated order; the numbers that a dataset stores."""
 
 import io
-import types
 from pathlib import Path
 
 import jax
@@ -31,11 +30,9 @@ GREY = 150
 
 def recorded(frames, seed=0, **numbers) -> np.ndarray:
     """One video's frames [T, H, W, 3] as a sensor of these numbers records them."""
-    scene = types.SimpleNamespace(
-        sensor=Sensor(**{name: jnp.float32([value]) for name, value in numbers.items()}), seed=jnp.uint32([seed])
-    )
+    sensor = Sensor(**{name: jnp.float32([value]) for name, value in numbers.items()})
     frames = jnp.asarray(np.asarray(frames, np.uint8))[None]
-    return np.asarray(sensor_module.record(scene, frames, None, *frames.shape[2:4])[0][0])
+    return np.asarray(sensor_module.record(sensor, jnp.uint32([seed]), frames, None, *frames.shape[2:4])[0][0])
 
 
 def light(frames) -> np.ndarray:
