@@ -64,11 +64,15 @@ def record(
             owners = owners.reshape(len(owners), -1)[:, pixel.ravel()].reshape(owners.shape)
         return None if frames is None else _record_frames(sensor, seed, frames), owners
 
-    return jax.lax.map(video, (sensors, seeds, frames, owners))
+    frames, owners = jax.lax.map(video, (sensors, seeds, frames, owners))
+    if frames is not None and sensors.jpeg_quality is not None:
+        # In a loop of its own, or the compiler would compute all other stages again for each product of the codec.
+        frames = jax.lax.map(lambda entry: round_trip(*entry), (frames, sensors.jpeg_quality))
+    return frames, owners
 
 
 def _record_frames(sensor: Sensor, seed: Array, frames: Array) -> Array:
-    """Frames [T, H, W, 3] uint8 of one video as its sensor records them."""
+    """Frames [T, H, W, 3] uint8 of one video as its sensor records them, before the codec."""
     numbers, values = jnp.arange(len(frames)), frames
     if any(stage is not None for stage in sensor[: Sensor._fields.index("noise")]):
         values = to_srgb(jnp.clip(_light(sensor, seed, numbers, frames), 0.0, 1.0))
@@ -76,8 +80,6 @@ def _record_frames(sensor: Sensor, seed: Array, frames: Array) -> Array:
         values = values.astype(jnp.float32) + _gaussian(sensor.noise, values.shape, seed, numbers)
     if values is not frames:
         values = jnp.clip(jnp.floor(values + 0.5), 0, 255).astype(jnp.uint8)
-    if sensor.jpeg_quality is not None:
-        values = round_trip(values, sensor.jpeg_quality)
     return values
 
 
