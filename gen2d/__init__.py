@@ -40,6 +40,7 @@ if TYPE_CHECKING:
     from gen2d.programs.redraw import render, render_soft, simulate_again
     from gen2d.programs.stream import stream
     from gen2d.space.space import Space
+    from gen2d.storage.image_folder import use_images
     from gen2d.tools.plot import plot
     from gen2d.tools.preview import preview
     from gen2d.tools.verify import verify
@@ -59,6 +60,7 @@ _HOMES = {
     "gen2d.programs.redraw": "render render_soft simulate_again",
     "gen2d.programs.stream": "stream",
     "gen2d.space.space": "Space",
+    "gen2d.storage.image_folder": "use_images",
     "gen2d.tools.plot": "plot",
     "gen2d.tools.preview": "preview",
     "gen2d.tools.verify": "verify",
@@ -67,7 +69,8 @@ _HOMES = {
 __all__ = [
     "Config", "ConfigError", "DamagedError", "DataLoader", "Dataset", "Error", "FolderError", "IncompleteError",
     "Space", "UnreachableError", "UntrustedError", "UserError", "export", "generate", "info", "load_config",
-    "mix", "open", "plot", "preview", "push", "render", "render_soft", "simulate_again", "stream", "verify",
+    "mix", "open", "plot", "preview", "push", "render", "render_soft", "simulate_again", "stream", "use_images",
+    "verify",
 ]  # fmt: skip
 
 __getattr__, __dir__ = attach(__name__, _HOMES, ("grain", "torch"))

@@ -34,6 +34,7 @@ if TYPE_CHECKING:
         PlainOptions,
         are_lines,
         are_moving,
+        backdrop,
         contrasting,
         line_fields,
         line_margin,
@@ -46,6 +47,7 @@ if TYPE_CHECKING:
     from gen2d.renderers.plan import FramePlan, RenderScene, tile_windows
     from gen2d.renderers.primitives import Instants, PixelWindow
     from gen2d.renderers.rasterizer import alone
+    from gen2d.renderers.sensor import distorted_points
     from gen2d.sampling import builder
     from gen2d.sampling.builder import SampledScene
     from gen2d.sampling.placement import CLEARANCE, place, start_position
@@ -75,14 +77,15 @@ _HOMES = {
     "gen2d.renderers.camera": "pixel_at to_pixels",
     "gen2d.renderers.compositing": "OCCLUDER",
     "gen2d.renderers.look": (
-        "LineOptions PlainOptions are_lines are_moving contrasting line_fields line_margin mean_color palette_option "
-        "plain"
+        "LineOptions PlainOptions are_lines are_moving backdrop contrasting line_fields line_margin mean_color "
+        "palette_option plain"
     ),
     "gen2d.renderers.noise": "fraction hashed",
     "gen2d.renderers.paint": "Background Light Paint Pattern Shadow Surface Texture",
     "gen2d.renderers.plan": "FramePlan RenderScene tile_windows",
     "gen2d.renderers.primitives": "Instants PixelWindow",
     "gen2d.renderers.rasterizer": "alone",
+    "gen2d.renderers.sensor": "distorted_points",
     "gen2d.sampling": "builder",
     "gen2d.sampling.builder": "SampledScene",
     "gen2d.sampling.placement": "CLEARANCE place start_position",
@@ -132,11 +135,13 @@ __all__ = [
     "are_moving",
     "arrays",
     "as_json",
+    "backdrop",
     "builder",
     "caption",
     "common",
     "contrasting",
     "dataset",
+    "distorted_points",
     "each_video",
     "extents",
     "facts",

@@ -140,9 +140,11 @@ def gaussian_blur(cover: Array, sigma: float) -> Array:
 
 
 def background_image(scene: RenderScene, at: Instants, plan: FramePlan) -> Array:
-    """Background [I, H, W, 3] in floats at the instants `at`; [1, H, W, 3] if it is a plain colour."""
+    """Background [I, H, W, 3] in floats at the instants `at`; [1, H, W, 3] if it does not change."""
     background, first = scene.paint.background, scene.instants.view
     color, height, width = background.color, plan.height, plan.width
+    if background.picture is not None and background.picture.pixels is not None:
+        return background.picture.pixels.astype(jnp.float32)[None]
     if background.to_color is None and background.texture is None and background.corners is None:
         return jnp.broadcast_to(color, (1, height, width, 3))
     rows, columns = (jnp.arange(n, dtype=jnp.float32) + 0.5 for n in (height, width))

@@ -14,7 +14,9 @@ from gen2d.records.axes import Array
 from gen2d.records.layout import Layout
 from gen2d.records.scene import Scene
 from gen2d.renderers.color import palette, to_linear
-from gen2d.renderers.paint import Background, Paint, Texture
+from gen2d.renderers.paint import Background, Paint, Picture, Texture
+
+CROP = 0.6  # least size of a crop of an image, over that of the largest
 
 
 def palette_option(default: str) -> str:
@@ -34,7 +36,22 @@ class LineOptions:
 class PlainOptions(LineOptions):
     """Options of the background, colours and lines of plain shapes."""
 
-    background_kind: str = option("plain", str, "", "kind of the background", choices=("plain", "gradient", "noise"))
+    background_kind: str = option(
+        "plain",
+        str,
+        "",
+        "kind of the background; backdrop: that of the palette; images: crops of the user's images",
+        choices=("plain", "gradient", "noise", "backdrop", "images"),
+    )
+    background_images: tuple[str, ...] | None = option(
+        None,
+        str,
+        "",
+        "sha256 of the images; null: of all images of the folder that is named",
+        several=True,
+        optional=True,
+        later=True,
+    )
     background: tuple[int, ...] | None = option(
         None,
         int,
@@ -90,15 +107,45 @@ def plain(scene: Scene, layout: Layout, options: PlainOptions, key: Array) -> Pa
 
 
 def sample_background(options: PlainOptions, layout: Layout, key: Array) -> Background:
-    """Background by `background_kind`: plain, a gradient in a random direction, or noise."""
+    """Background by `background_kind`: plain, a gradient in a random direction, noise, the palette's backdrop, or a
+    crop of an image, of at least `CROP` of the largest."""
+    named = options.named_palette
+    if options.background_kind == "images" and options.background_images is not None:
+        index_key, corner_key, extent_key = jax.random.split(key, 3)
+        index = jax.random.randint(index_key, (), 0, len(options.background_images))
+        extent = jax.random.uniform(extent_key, minval=CROP)
+        picture = Picture(index, jax.random.uniform(corner_key, (2,)), extent)
+        return Background(jnp.asarray(options.grounds[0], jnp.float32), picture=picture)
+    if options.background_kind == "backdrop" and named is not None:
+        return backdrop(named, layout, key)
     color, to_color = (jnp.asarray(c, jnp.float32) for c in options.grounds)
     if options.background_kind == "plain":
         return Background(color)
     if options.background_kind == "gradient":
         return Background(color, to_color, jax.random.uniform(key, maxval=2 * np.pi))
-    left, bottom, right, top = layout.bounds
-    cell = jnp.float32(options.background_cell * min(right - left, top - bottom))
+    if options.background_kind == "backdrop":
+        return Background(color, to_color, jnp.float32(np.pi / 2))
+    cell = jnp.float32(options.background_cell * _shorter_side(layout))
     return Background(color, texture=Texture(jax.random.bits(key, (), jnp.uint32), cell, to_color))
+
+
+def backdrop(named: Palette, layout: Layout, key: Array) -> Background:
+    """The backdrop of a palette: a vertical gradient with other corners, and its grain."""
+    top, bottom, corners = jnp.asarray(named.ground, jnp.float32)
+    background = Background(bottom, top, jnp.float32(np.pi / 2), corners=corners)
+    if named.grain is None:
+        return background
+    cell, stretch, color = named.grain
+    seed = jax.random.bits(key, (), jnp.uint32)
+    texture = Texture(
+        seed, jnp.float32(cell * _shorter_side(layout)), jnp.asarray(color, jnp.float32), jnp.float32(stretch)
+    )
+    return background._replace(texture=texture)
+
+
+def _shorter_side(layout: Layout) -> float:
+    left, bottom, right, top = layout.bounds
+    return min(right - left, top - bottom)
 
 
 def background_colors(background: Background) -> Array:

@@ -56,5 +56,6 @@ def textured(color: Array, texture: Texture, x: Array, y: Array, scale: Array) -
     """Colours [..., 3] of a texture at x and y [...] in m, on a base of `color` [..., 3] (broadcast), in pixels of
     `scale` [...] px/m."""
     pixel = 1 / (texture.cell * scale)
-    share = noise(x / texture.cell, y / texture.cell, texture.seed, pixel)[..., None]
+    tall = texture.cell if texture.stretch is None else texture.cell * texture.stretch
+    share = noise(x / texture.cell, y / tall, texture.seed, pixel)[..., None]
     return color + share * (texture.color - color)

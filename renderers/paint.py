@@ -16,6 +16,7 @@ class Texture(NamedTuple):
     seed: Array  # [...] uint32
     cell: Array  # [...] m, size of the coarsest spots
     color: Array  # [..., 3] where the noise is 1; where it is 0 the base colour shows
+    stretch: Array | None = None  # [...] size along the y axis, over that along the x axis
 
 
 class Light(NamedTuple):
@@ -58,14 +59,24 @@ class Shadow(NamedTuple):
     color: Array  # [3]
 
 
+class Picture(NamedTuple):
+    """Crop of one of the user's images. A look chooses it, the host decodes it."""
+
+    number: Array  # [] of the image
+    corner: Array  # [2] place of the crop, from 0, at the left and the top, to 1
+    extent: Array  # [] size of the crop, over that of the largest
+    pixels: Array | None = None  # [H, W, 3] uint8; None before it is decoded
+
+
 class Background(NamedTuple):
-    """Background: a colour, a gradient, or noise; with `corners` darker or lighter towards the corners of the view."""
+    """Background: a colour, a gradient, noise or a picture; `corners` are other colours towards the view's corners."""
 
     color: Array  # [3]
     to_color: Array | None = None  # [3] at the end of a gradient
     direction: Array | None = None  # rad, of a gradient, from `color` to `to_color`
     texture: Texture | None = None
     corners: Array | None = None  # [3] at the corners of the view of the first frame
+    picture: Picture | None = None  # instead of all others; fixed to the frame
 
 
 class Paint(NamedTuple):

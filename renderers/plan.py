@@ -13,6 +13,7 @@ from gen2d.records.layout import Layout, SlotGroup
 from gen2d.renderers.camera import to_pixels
 from gen2d.renderers.paint import Paint
 from gen2d.renderers.primitives import BodyGeometry, Instants, PixelWindow
+from gen2d.renderers.sensor import Sensor
 
 LANES = 8  # px; tile widths are rounded up to multiples of this, whole SIMD vectors
 
@@ -33,8 +34,8 @@ class RenderScene(NamedTuple):
     exposed: Instants | None  # [T, S, ...] at the S instants of each exposure
     paint: Paint
     occluders: Occluders | None
-    noise: Array | None  # sRGB, standard deviation of the sensor noise
-    seed: Array  # uint32, of the sensor noise and the track points
+    sensor: Sensor | None  # None: frames are not changed by lens and sensor
+    seed: Array  # uint32, of noise and of the track points
 
 
 @dataclasses.dataclass(frozen=True)

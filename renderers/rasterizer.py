@@ -33,8 +33,9 @@ from gen2d.renderers.compositing import (
     static_layer,
 )
 from gen2d.renderers.plan import FramePlan, RenderScene
-from gen2d.renderers.postprocessing import add_noise, expose, exposure_average, exposure_start
+from gen2d.renderers.postprocessing import expose, exposure_average, exposure_start
 from gen2d.renderers.primitives import Instants, PixelWindow
+from gen2d.renderers.sensor import record
 from gen2d.renderers.shading import covered_color, fills_of
 from gen2d.renderers.tiles import draw_tiles
 from gen2d.xla import on_cpu
@@ -51,7 +52,8 @@ def draw(scenes: RenderScene, plan: FramePlan) -> tuple[Array | None, Array | No
 
 def draw_dense(scenes: RenderScene, plan: FramePlan) -> tuple[Array | None, Array | None]:
     """Frames and owners as from `draw`, with each object evaluated at every pixel. The form for GPUs."""
-    return jax.vmap(functools.partial(_draw_video, plan=plan))(scenes)
+    frames, owners = jax.vmap(functools.partial(_draw_video, plan=plan))(scenes)
+    return record(scenes.sensor, scenes.seed, frames, owners, plan.height, plan.width)
 
 
 def _draw_video(scene: RenderScene, plan: FramePlan) -> tuple[Array | None, Array | None]:
@@ -68,8 +70,6 @@ def _draw_video(scene: RenderScene, plan: FramePlan) -> tuple[Array | None, Arra
         exposed = jax.tree.map(lambda a: jnp.moveaxis(a, 1, 0), scene.exposed)
         start = exposure_start((scene.instants.angle.shape[0], plan.height, plan.width, 3), plan.linear)
         frames = exposure_average(jax.lax.scan(add, start, exposed)[0], plan.exposed, plan.linear)
-    if frames is not None and scene.noise is not None:
-        frames = add_noise(frames, scene.noise, scene.seed, jnp.arange(frames.shape[0]))
     return frames, None if owners is None else (owners & 255).astype(jnp.uint8)
 
 
@@ -81,7 +81,7 @@ def _paint_instants(scene: RenderScene, plan: FramePlan, at: Instants) -> LayerC
 
 
 def draw_soft(scene: RenderScene, plan: FramePlan, sigma: float = 0.0) -> Array:
-    """Frames [T, H, W, 3] of one video as floats from 0 to 255, without rounding, noise or motion blur.
+    """Frames [T, H, W, 3] of one video as floats from 0 to 255, without rounding, motion blur, lens and sensor.
 
     They are differentiable in positions, angles, sizes, colours and the camera. `sigma` (px) blurs the coverage of each
     object; with 0 the frames are those of `draw` up to rounding. Raises AssertionError for a scene of another layout.

@@ -25,8 +25,9 @@ from gen2d.renderers.compositing import (
     static_layer,
 )
 from gen2d.renderers.plan import FramePlan, RenderScene, TileGroup, tile_windows
-from gen2d.renderers.postprocessing import add_noise, expose, exposure_average, exposure_start
+from gen2d.renderers.postprocessing import expose, exposure_average, exposure_start
 from gen2d.renderers.primitives import Instants, PixelWindow
+from gen2d.renderers.sensor import record
 from gen2d.renderers.shading import EdgeTerms, covered_color, fills_of
 from gen2d.renderers.shadows import ShadowTerms, shadow_cover, shadow_terms
 
@@ -45,13 +46,14 @@ def draw_tiles(scenes: RenderScene, plan: FramePlan) -> tuple[Array | None, Arra
             for tree in (scenes, layers)
         )
         renderer = _VideoRenderer(scene, plan, layer, v * frames)
-        if plan.still and not plan.exposed and scenes.noise is None:
+        if plan.still and not plan.exposed:
             return renderer.paint_in_place(canvas)
         canvas = renderer.paint_separately(canvas) if plan.frames else canvas
         return renderer.paint_owners(canvas) if plan.owners else canvas
 
     canvas = jax.lax.fori_loop(0, videos, video, LayerCanvas(image, owner))
-    return tuple(jax.tree.map(lambda a: a.reshape(videos, frames, *a.shape[1:]), canvas))
+    canvas = jax.tree.map(lambda a: a.reshape(videos, frames, *a.shape[1:]), canvas)
+    return record(scenes.sensor, scenes.seed, canvas.image, canvas.owner, plan.height, plan.width)
 
 
 class TileEdges(NamedTuple):
@@ -116,7 +118,7 @@ class _VideoRenderer:
         return jax.lax.dynamic_update_slice(owners, (owner & 255).astype(jnp.uint8), (self.first + t, 0, 0))
 
     def paint_separately(self, canvas: LayerCanvas) -> LayerCanvas:
-        """Frames painted on a separate image: for motion blur, a moving camera, or noise."""
+        """Frames painted on a separate image: for motion blur or a moving camera."""
         scene, plan = self.scene, self.plan
         instants = scene.instants
         if scene.exposed is not None:
@@ -139,8 +141,6 @@ class _VideoRenderer:
 
         def frame(t: Array, canvas: LayerCanvas) -> LayerCanvas:
             image = average_exposure(t) if plan.exposed else render_instant(t)
-            if scene.noise is not None:
-                image = add_noise(image, scene.noise, scene.seed, t[None])
             assert canvas.image is not None
             return LayerCanvas(
                 jax.lax.dynamic_update_slice(canvas.image, image, (self.first + t, 0, 0, 0)), canvas.owner

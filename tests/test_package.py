@@ -104,7 +104,11 @@ def definitions(tree: ast.Module) -> set[str]:
 
 
 # Containers of a whole process, and the constants that bound them.
-CONTAINERS = {"gen2d.loading.chunks._files": "OPEN_FILES", "gen2d.programs.shared._programs": "MAX_PROGRAMS"}
+CONTAINERS = {
+    "gen2d.loading.chunks._files": "OPEN_FILES",
+    "gen2d.programs.shared._programs": "MAX_PROGRAMS",
+    "gen2d.storage.image_folder._files": "MAX_NAMED",
+}
 
 
 def unbounded_caches(tree: ast.Module) -> list[str]:

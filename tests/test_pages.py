@@ -121,6 +121,7 @@ EVERY = ("energy", "masks", "amodal", "boxes", "visibility", "flow", "captions",
 DESCRIBED = {
     "scene": "bouncing",
     "look": {"name": "studio", "palette": "paper"},
+    "image": {"noise": 2, "jpeg_quality": 80},
     "annotations": {"contacts": 4, "tracks": 8, **dict.fromkeys(EVERY, True)},
     "quality": {"min_contacts": 1},
     "splits": {"train": {}, "large": {"factors": {"radius": [1.0, 1.1]}}},

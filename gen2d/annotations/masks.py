@@ -20,4 +20,5 @@ ANNOTATION = Annotation(
     },
     annotate=annotate,
     owners=True,
+    distorted=True,
 )

@@ -13,6 +13,7 @@ from gen2d.plugin import (
     FramePlan,
     RenderScene,
     SlotGroup,
+    distorted_points,
     fraction,
     hashed,
     option,
@@ -41,6 +42,8 @@ def _tracks_of_video(scene: RenderScene, owners: Array, plan: FramePlan, count: 
     x, y = local[..., 0], local[..., 1]
     world = at.position[:, :, None] + jnp.stack([x * cos - y * sin, x * sin + y * cos], -1)
     points = to_pixels(at.view, world.reshape(len(world), -1, 2), plan.height, plan.width)
+    if scene.sensor is not None and scene.sensor.distortion is not None:
+        points = distorted_points(points, scene.sensor.distortion, plan.height, plan.width)
     slots = np.repeat(np.arange(plan.layout.slots), count)
     drawn = scene.paint.drawn[slots]
     points = jnp.where(drawn[:, None], points, 0.0)
@@ -105,5 +108,6 @@ ANNOTATION = Annotation(
     annotate=annotate,
     sizes=sizes,
     owners=True,
+    distorted=True,
     usual=8,
 )

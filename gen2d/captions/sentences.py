@@ -14,7 +14,8 @@ from gen2d.captions.facts import VideoFacts
 from gen2d.captions.references import References, number_word, plural
 
 MAX_ACTIONS = 6  # in a caption
-MAX_LISTED = 4  # objects that the first sentence describes one by one; more are counted
+MAX_LISTED = 4  # objects whose size and material the first sentence names; of more it names the colour alone
+MAX_PHRASES = 10  # in the first sentence; where more would be needed, objects are counted by their nouns
 ENOUGH = 2  # actions of objects that can be told apart; others are mentioned only where there are fewer
 GROUP = 3  # objects that do the same share a sentence from this number on
 SLOW, FAST = 0.1, 0.5  # widths of the picture in a second: slower is slowly, faster is quickly
@@ -124,12 +125,13 @@ class Story:
             held = {1: " on a pin", 2: " between two pins"}.get(pins, "")
             things.append(f"a chain of {number_word(len(chain))} links{held}")
         others = [slot for slot in moving if facts.nouns[slot] != "link"]
-        if 0 < len(others) <= MAX_LISTED:
-            colors, sizes, materials = self.references.colors, self.references.sizes, self.references.materials
-            words = [[sizes[s], materials[s], colors[s], facts.nouns[s]] for s in others]
-            phrases = Counter(" ".join(word for word in row if word) for row in words)
-            return things + [_counted(phrase, n) for phrase, n in phrases.items()]
-        return things + [_counted(noun, n) for noun, n in Counter(facts.nouns[slot] for slot in others).items()]
+        colors, sizes, materials = self.references.colors, self.references.sizes, self.references.materials
+        words = [[sizes[s], materials[s], colors[s], facts.nouns[s]] for s in others]
+        words = words if len(others) <= MAX_LISTED else [row[2:] for row in words]
+        phrases = Counter(" ".join(word for word in row if word) for row in words)
+        if len(phrases) > MAX_PHRASES:
+            phrases = Counter(facts.nouns[slot] for slot in others)
+        return things + [_counted(phrase, n) for phrase, n in phrases.items()]
 
     # ---- What the objects do
 

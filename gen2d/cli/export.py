@@ -9,6 +9,7 @@ from gen2d.cli.parser import (
     Parser,
     add_dataset,
     add_engine,
+    add_images,
     add_network,
     add_overrides,
     add_trust,
@@ -55,6 +56,7 @@ def add_arguments(parser: Parser) -> None:
     parser.add_argument("--json", action="store_true", help="print the result as JSON")
     add_trust(parser)
     add_engine(parser)
+    add_images(parser)
     add_network(parser)
 
 

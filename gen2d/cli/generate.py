@@ -6,7 +6,17 @@ import os
 import shlex
 from typing import TYPE_CHECKING, Any
 
-from gen2d.cli.parser import PROG, Parser, add_engine, add_network, add_overrides, engine_of, limits, whole_number
+from gen2d.cli.parser import (
+    PROG,
+    Parser,
+    add_engine,
+    add_images,
+    add_network,
+    add_overrides,
+    engine_of,
+    limits,
+    whole_number,
+)
 from gen2d.core.errors import UserError
 from gen2d.core.humanize import in_bytes, in_time
 
@@ -54,6 +64,7 @@ def add_arguments(parser: Parser) -> None:
         "--json", action="store_true", help="print progress, lost workers and the result as JSON, an object per line"
     )
     add_engine(parser)
+    add_images(parser)
     add_network(parser)
 
 

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 from gen2d._version import __version__
 from gen2d.config.plugins import config_names, nearest
 from gen2d.core.errors import UserError
+from gen2d.storage.image_folder import use_images
 
 if TYPE_CHECKING:
     from gen2d.engines.ray import Ray
@@ -170,6 +171,17 @@ def add_trust(parser: Parser) -> None:
         default=[],
         metavar="SHA256",
         help="allow the Python file with this hash, which came with the dataset, to run (may be repeated)",
+    )
+
+
+def add_images(parser: Parser) -> None:
+    """Adds a folder of images for backgrounds."""
+    parser.add_argument(
+        "--images",
+        type=use_images,
+        metavar="DIR",
+        help="a folder of images for look.background_kind: images; a dataset holds their hashes alone, so name it "
+        "again to render its frames again",
     )
 
 

@@ -4,7 +4,7 @@ import argparse
 import json
 from pathlib import Path
 
-from gen2d.cli.parser import Parser, add_network, add_overrides, add_trust, limits, whole_number
+from gen2d.cli.parser import Parser, add_images, add_network, add_overrides, add_trust, limits, whole_number
 
 
 def add_arguments(parser: Parser) -> None:
@@ -30,6 +30,7 @@ def add_arguments(parser: Parser) -> None:
     add_overrides(parser)
     add_trust(parser)
     parser.add_argument("--json", action="store_true", help="print the paths of the pictures as JSON")
+    add_images(parser)
     add_network(parser)
 
 

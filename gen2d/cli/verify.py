@@ -5,7 +5,17 @@ import dataclasses
 import json
 import secrets
 
-from gen2d.cli.parser import Parser, add_dataset, add_engine, add_network, add_trust, engine_of, limits, whole_number
+from gen2d.cli.parser import (
+    Parser,
+    add_dataset,
+    add_engine,
+    add_images,
+    add_network,
+    add_trust,
+    engine_of,
+    limits,
+    whole_number,
+)
 from gen2d.core.errors import UserError
 
 
@@ -32,6 +42,7 @@ def add_arguments(parser: Parser) -> None:
     parser.add_argument("--json", action="store_true", help="print the result as JSON")
     add_trust(parser)
     add_engine(parser)
+    add_images(parser)
     add_network(parser)
 
 

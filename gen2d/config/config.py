@@ -32,6 +32,7 @@ from gen2d.config.splits import CHANGES, Split, distributions_of_splits, with_sp
 from gen2d.core import palettes
 from gen2d.core.errors import ConfigError, argument
 from gen2d.storage.explain import reason
+from gen2d.storage.image_folder import newest_images
 from gen2d.storage.sealed import read_bytes
 
 MAX_SEED = 2**63 - 1
@@ -151,10 +152,31 @@ def checked_seed(value: Any, what: str = "") -> int:
 def _parse_section(name: str, values: Any, source: str, copies: Copies) -> Any:
     """A section's options, or its plug-in."""
     if name in DEFAULT_PLUGINS:
-        return plugin_of(name, values, DEFAULT_PLUGINS[name], source, copies)
+        plugin = plugin_of(name, values, DEFAULT_PLUGINS[name], source, copies)
+        return _with_images(plugin, source) if name == "look" else plugin
     if name == "annotations":
         return parse_annotations({} if values is None else values, source, copies)
     return build(SECTIONS[name], {} if values is None else values, name, source)
+
+
+def _with_images(look: Plugin, source: str) -> Plugin:
+    """The look with the hashes of the images of its backgrounds: by default, those of the folder named last.
+
+    Raises ConfigError if they are no hashes, or if none are given and no folder was named.
+    """
+    if getattr(look.options, "background_kind", "") != "images":
+        return look
+    digests = look.options.background_images or newest_images()
+    if not digests:
+        raise ConfigError(
+            f"{source}: look.background_kind is images, but no folder of images is named in {argument('images')}"
+        )
+    for digest in digests:
+        if not re.fullmatch(r"[0-9a-f]{64}", digest):
+            raise ConfigError(
+                f"{source}: look.background_images has {digest!r:.80}, but must have sha256, 64 hexadecimal digits each"
+            )
+    return dataclasses.replace(look, options=dataclasses.replace(look.options, background_images=digests))
 
 
 def from_mapping(values: Any, source: str, name: str = "dataset", copies: Copies = NO_COPIES) -> Config:
@@ -195,6 +217,7 @@ def from_mapping(values: Any, source: str, name: str = "dataset", copies: Copies
         config = _with_splits(config, values["splits"], source, copies)
     _check_matched(config, source)
     _check_palettes(config, source)
+    _check_distortion(config, source)
     return config
 
 
@@ -250,6 +273,18 @@ def _check_palettes(config: Config, source: str) -> None:
                 f"{source}: splits.{split.name}.factors has {hidden[0]}, which look.palette={look.options.palette} "
                 "replaces: look.palette must be scene"
             )
+
+
+def _check_distortion(config: Config, source: str) -> None:
+    """Raise ConfigError if frames are distorted, but an annotation describes frames without distortion."""
+    images = config.image, *(config.of_split(split.name).image for split in config.splits)
+    straight = [plugin.name for plugin in config.annotations.wanted if not plugin.contract.distorted]
+    if straight and any("distortion" in image.sensor for image in images):
+        able = [plugin.name for plugin in config.annotations.pixels if plugin.contract.distorted]
+        raise ConfigError(
+            f"{source}: annotations.{straight[0]} is on, but describes frames without image.distortion: one of them "
+            f"must be off ({' and '.join(able)} describe distorted frames)"
+        )
 
 
 def _keys(values: Any) -> list[str]:

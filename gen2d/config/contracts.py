@@ -133,6 +133,8 @@ class Annotation(_Contract):
         occluder). `plan` is the `FramePlan`; `value` is the option's value, or the dataclass.
     - sizes(plan, value): lengths of further axes, by letter.
     - owners: whether `annotate` needs `owners`; without it `owners` is None, unless another annotation needs it.
+    - distorted: whether it describes frames with lens distortion, too: their owners are given, and `distorted_points`
+        gives the places of points. A config with another annotation and `image.distortion` is refused.
     - usual: value with which `gen2d.render` switches the annotation on when its fields are requested.
     """
 
@@ -141,6 +143,7 @@ class Annotation(_Contract):
     annotate: Callable[[Any, Any, Any, Any], Mapping[str, Any]]
     sizes: Callable[[Any, Any], Mapping[str, int]] = _no_sizes
     owners: bool = False
+    distorted: bool = False
     usual: Any = True
 
     def __post_init__(self) -> None:

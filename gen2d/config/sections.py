@@ -86,16 +86,45 @@ class CameraOptions:
     )
 
 
+SENSOR = "distortion", "vignette", "exposure_gain", "shot_noise", "white_balance", "noise", "jpeg_quality"
+
+
 @dataclasses.dataclass(frozen=True)
 class ImageOptions:
-    """Image formation: blending of colours, motion blur, occluders and sensor noise."""
+    """Image formation: blending of colours, motion blur, occluders, lens and sensor."""
 
     blending: str = option("srgb", str, "", "color space for blending; most tools use srgb", choices=("srgb", "linear"))
-    exposure: float = option(0.0, float, "frames", "exposure before each frame; 0: no motion blur", low=0, high=1)
+    exposure: float = option(0.0, float, "frames", "length of an exposure; 0: no motion blur", low=0, high=1)
     exposure_samples: int = option(8, int, "samples", "instants averaged per exposure", low=2, high=256)
+    shutter: str = option(
+        "end", str, "", "part of an exposure at the instant of its frame", choices=("end", "centre"), later=True
+    )
+    distortion: Distribution = option(
+        0.0, float, "1", "radial distortion of the lens; above 0: as a barrel, below 0: as a pincushion",
+        draw=True, low=-0.3, high=0.5, later=True,
+    )  # fmt: skip
+    vignette: Distribution = option(
+        0.0, float, "1", "part of the light that is missing in the corners", draw=True, low=0, high=1, later=True
+    )
+    exposure_gain: Distribution = option(
+        0.0, float, "stops", "exposure, over that at which frames are as rendered; each stop doubles the light",
+        draw=True, low=-10, high=10, later=True,
+    )  # fmt: skip
+    shot_noise: Distribution = option(
+        0.0, float, "1", "standard deviation of the shot noise of white, over its light",
+        draw=True, low=0, high=1, later=True,
+    )  # fmt: skip
+    white_balance: Distribution = option(
+        0.0, float, "stops", "gain of red over that of blue; above 0: warmer",
+        draw=True, low=-4, high=4, later=True,
+    )  # fmt: skip
     noise: Distribution = option(
         0.0, float, "sRGB", "standard deviation of the sensor noise", draw=True, low=0, high=255
     )
+    jpeg_quality: Distribution | None = option(
+        None, int, "1", "quality of a JPEG round trip of each frame, 1 to 100; null: none",
+        draw=True, low=1, high=100, optional=True, later=True,
+    )  # fmt: skip
     occluders: int = option(0, int, "rectangles", "number of occluders, fixed in the image", low=0, high=16)
     occluder_width: Distribution = option([0.1, 0.3], float, "1", "occluder width over frame width", draw=True, low=0)
     occluder_height: Distribution = option(
@@ -108,6 +137,12 @@ class ImageOptions:
     occluder_color: tuple[Distribution, ...] = option(
         [[60, 140]] * 3, int, "sRGB", "color of an occluder", parts=3, draw=True, low=0, high=255
     )
+
+    @property
+    def sensor(self) -> dict[str, Distribution]:
+        """Options of the lens and the sensor that change frames, by name, in the order of their stages."""
+        options = {name: getattr(self, name) for name in SENSOR}
+        return {name: value for name, value in options.items() if value is not None and value.support != (0.0, 0.0)}
 
 
 @dataclasses.dataclass(frozen=True)

@@ -59,7 +59,8 @@ class UnreachableError(Error):
 
 # ---- Names of arguments
 
-_PYTHON = {"config": "config", "set": "overrides"}  # names that differ from those of the flags
+# Names that differ from those of the flags.
+_PYTHON = {"config": "config", "set": "overrides", "images": "gen2d.use_images"}
 _command_lines = 0  # in progress
 
 

@@ -8,6 +8,14 @@ from typing import Any, NamedTuple
 Color = tuple[int, int, int]  # sRGB
 
 
+class Grain(NamedTuple):
+    """Noise of a backdrop."""
+
+    cell: float  # size of the coarsest spots along the x axis, over the shorter side of the scene
+    stretch: float  # size along the y axis, over that along the x axis
+    color: Color  # where the noise is 1
+
+
 class Palette(NamedTuple):
     """Colours of a palette; names are unique within it."""
 
@@ -15,6 +23,7 @@ class Palette(NamedTuple):
     wall: tuple[str, Color]  # of static objects
     objects: dict[str, Color]  # of all other objects, by name
     light: Color = (255, 255, 255)
+    grain: Grain | None = None
 
 
 def palette_of(options: Any) -> Palette | None:
@@ -27,10 +36,18 @@ def _color(digits: str) -> Color:
     return red, green, blue
 
 
-def _palette(ground: str, wall: str, wall_color: str, objects: dict[str, str], light: str = "ffffff") -> Palette:
+def _palette(
+    ground: str,
+    wall: str,
+    wall_color: str,
+    objects: dict[str, str],
+    light: str = "ffffff",
+    grain: tuple[float, float, str] | None = None,
+) -> Palette:
     top, bottom, corners = map(_color, ground.split())
     colors = {name: _color(digits) for name, digits in objects.items()}
-    return Palette((top, bottom, corners), (wall, _color(wall_color)), colors, _color(light))
+    own_grain = None if grain is None else Grain(*grain[:2], _color(grain[2]))
+    return Palette((top, bottom, corners), (wall, _color(wall_color)), colors, _color(light), own_grain)
 
 
 PALETTES = {
@@ -80,6 +97,40 @@ PALETTES = {
             "blue": "3f78a8",
             "pink": "b5838d",
         },
+    ),
+    "chalkboard": _palette(
+        "35524a 2c463f 1d302b",
+        "wood",
+        "a97c50",
+        {
+            "white": "f2f0e6",
+            "yellow": "f2d95c",
+            "pink": "f08fa8",
+            "sky blue": "7fc4ea",
+            "mint": "8fe0b0",
+            "orange": "f0914a",
+            "lilac": "b9a0e8",
+            "red": "e2574c",
+        },
+        light="fffdf4",
+        grain=(0.3, 0.3, "44635a"),
+    ),
+    "grass": _palette(
+        "7fae54 6a9a45 4d7a34",
+        "brown",
+        "6b4a2f",
+        {
+            "white": "f7f5ee",
+            "red": "d43d3d",
+            "yellow": "f7dc4a",
+            "blue": "2b5fb8",
+            "orange": "f08a2c",
+            "purple": "7d3f98",
+            "pink": "f2a3c0",
+            "navy": "232a4d",
+        },
+        light="fffbe6",
+        grain=(0.035, 4.0, "55843a"),
     ),
     # Distinguishable with any colour vision (M. Okabe, K. Ito, 'Color Universal Design', 2008).
     "okabe_ito": _palette(

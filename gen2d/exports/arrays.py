@@ -49,6 +49,14 @@ def check_frames(source: Source, name: str) -> None:
         raise ConfigError(f"{argument('fields')} is {' '.join(source.fields)}, but must contain frames for {name}")
 
 
+def check_undistorted(source: Source, name: str) -> None:
+    """Raise ConfigError for frames with lens distortion, which `name` would describe wrongly."""
+    if "image/distortion" in source.ds.manifest.fields:
+        raise ConfigError(
+            f"{source.ds.root}: frames are distorted (image.distortion), but {name} holds places without distortion"
+        )
+
+
 def notes(source: Source, name: str) -> Iterator[tuple[int, str]]:
     """Lines of the notes NAME-PLACE of all parts, in their order, with their numbers from 1 on."""
     paths = sorted(source.notes.glob(f"{name}-*"))

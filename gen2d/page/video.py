@@ -99,13 +99,17 @@ class Videos:
             step = math.ceil(math.sqrt(height * width) / detail.mask_side)
             flow = flow_colors(values["flow/forward"][::stride, ::step, ::step])
             video["flow"] = _sprite(sprite_sheet(flow, None), flow)
+        if "sprite" in video and np.any(values.get("image/distortion", 0)):
+            # Outlines would not lie on what the frames show.
+            values = {name: value for name, value in values.items() if not name.startswith("camera/")}
         present = values.get("objects/present", np.zeros(sizes.get("K", 0), bool))
         slots = np.flatnonzero(present)[: detail.objects]
         if len(slots):
             video["objects"] = self._objects(values, slots)
         if "contacts/point" in values and "contacts/normal_impulse" in values:
             video["contacts"] = _contacts(values, slots, self.frames, detail.contacts)
-        arrays = {name: values[name][::stride].astype(np.float64) for name in self.drawn if name.startswith("camera/")}
+        cameras = [name for name in self.drawn if name.startswith("camera/") and name in values]
+        arrays = {name: values[name][::stride].astype(np.float64) for name in cameras}
         for name in self.drawn:
             if DRAWN[name].startswith("n T K") and name != "states/angular_velocity":
                 arrays[name] = values[name][::stride][:, slots].astype(np.float64)

@@ -20,6 +20,7 @@ from gen2d.config import matched
 from gen2d.config.annotations import Annotations
 from gen2d.config.config import Config, load_config
 from gen2d.config.plugin_options import named
+from gen2d.config.sections import SENSOR
 from gen2d.core.errors import ConfigError
 from gen2d.core.progress import waiting
 from gen2d.loading.dataset import Dataset
@@ -165,7 +166,7 @@ def render_soft(
     overrides: Sequence[str] = (),
     trust: Trust = (),
 ) -> Array:
-    """Frames that are differentiable in `states`, without noise or motion blur.
+    """Frames that are differentiable in `states`, without motion blur, lens and sensor.
 
     Parameters
     ----------
@@ -201,7 +202,8 @@ def render_soft(
     """
     if not 0 <= sigma <= 1000:
         raise ConfigError(f"sigma is {sigma!r}, but must be a number of pixels from 0 to 1000")
-    plain = [*overrides, "image.exposure=0", "image.noise=0"]
+    off = ["image.jpeg_quality=null", *(f"image.{name}=0" for name in SENSOR if name != "jpeg_quality")]
+    plain = [*overrides, "image.exposure=0", *off]
     base, config = configs_of(ds, height, width, look, plain, None, trust)
     numbers, settings = ds._numbers(np.atleast_1d(indices)), RenderSettings(base, config)
     return _compile(_render_soft_frames, settings, float(sigma))(_render_scenes(ds, settings, numbers, states))
@@ -371,7 +373,8 @@ def _render_scenes(
     shapes = [np.shape(columns[name]) for name in ("states/position", "camera/scale")]
     if len({len(shape) and shape[1] for shape in shapes}) > 1:
         raise ConfigError("states and camera have other numbers of frames: give all that simulate_again returned")
-    return _compile(build_render_scenes, settings)(columns, seed_words_of(ds), jnp.asarray(numbers, jnp.uint32))
+    scenes = _compile(build_render_scenes, settings)(columns, seed_words_of(ds), jnp.asarray(numbers, jnp.uint32))
+    return render_module.with_pictures(scenes, settings.config)
 
 
 def build_render_scenes(columns: FieldColumns, words: Array, numbers: Array, settings: RenderSettings) -> RenderScene:

@@ -3,14 +3,18 @@
 Each of them has its own key, so changing the look or the camera changes nothing else.
 """
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from gen2d import annotations
 from gen2d.config.annotations import Annotations
 from gen2d.config.config import Config
 from gen2d.config.sections import ImageOptions
 from gen2d.core.errors import ConfigError
+from gen2d.media.backgrounds import crops
 from gen2d.records.axes import Array, assert_shape, check_shapes
 from gen2d.records.keys import key_for
 from gen2d.records.layout import Layout
@@ -22,6 +26,7 @@ from gen2d.renderers.paint import NO_MATERIAL, Paint
 from gen2d.renderers.plan import FramePlan, Occluders, RenderScene
 from gen2d.renderers.primitives import BodyGeometry, Instants
 from gen2d.renderers.rasterizer import draw
+from gen2d.renderers.sensor import Sensor
 
 
 def plan_of(config: Config, layout: Layout) -> FramePlan:
@@ -37,6 +42,8 @@ def plan_of(config: Config, layout: Layout) -> FramePlan:
             f"annotations.{name} is on for {layout.slots} objects of scene {config.scene.name}, "
             f"but must be off for more than {OCCLUDER - 1}"
         )
+    if getattr(look.options, "background_kind", "") == "images" and camera.may_move(config.camera):
+        raise ConfigError("look.background_kind is images, which are fixed to the frame, but the camera moves")
     seconds = video.frames / video.fps
     scale = camera.largest_scale(config.camera, layout, video.height, video.width, seconds)
     return FramePlan(
@@ -94,21 +101,20 @@ def render_scene(
         assert between is not None, "motion blur needs the states between frames"
         exposed = _exposure_instants(image, config.video.fps, states, between, view)
     seed = jax.random.bits(key_for(key, "pixels"), (), jnp.uint32)
-    deviation = image.noise.sample(key_for(key, "noise"), ()) if image.noise.support != (0.0, 0.0) else None
+    sampled = {name: source.sample(key_for(key, name), ()) for name, source in image.sensor.items()}
+    sensor = Sensor(**sampled) if sampled else None
     occluders = _sample_occluders(key_for(key, "occluders"), config, plan) if image.occluders else None
-    return RenderScene(
-        bodies, Instants(states.position, states.angle, view), exposed, paint, occluders, deviation, seed
-    )
+    return RenderScene(bodies, Instants(states.position, states.angle, view), exposed, paint, occluders, sensor, seed)
 
 
 def _exposure_instants(image: ImageOptions, fps: float, states: State, between: State, view: CameraView) -> Instants:
     """Positions, angles and views at the samples of each exposure [T, samples, ...].
 
-    An exposure ends at the frame's instant; its samples are the midpoints of equal parts. Motion is linear between
-    steps, and is extrapolated before the first frame.
+    An exposure ends at the frame's instant, or has it in its middle; its samples are the midpoints of equal parts.
+    Motion is linear between steps, and is extrapolated before the first frame and after the last.
     """
-    steps, samples = between.angle.shape[1], image.exposure_samples
-    before = image.exposure * (1 - (jnp.arange(samples) + 0.5) / samples)  # frames
+    steps, samples, centred = between.angle.shape[1], image.exposure_samples, image.shutter == "centre"
+    before = image.exposure * ((0.5 if centred else 1) - (jnp.arange(samples) + 0.5) / samples)  # frames
 
     def interpolate(values: Array, rates: Array, step_values: Array) -> Array:
         """Values [T, samples, ...], interpolated between those of frames [T, ...] and of steps [T - 1, steps, ...]."""
@@ -116,8 +122,11 @@ def _exposure_instants(image: ImageOptions, fps: float, states: State, between: 
         weight = (jnp.arange(steps + 1) / steps).reshape(-1, *[1] * (values.ndim - 1))
         path = jnp.concatenate([values[:-1, None], step_values], axis=1)
         path = jnp.concatenate([(previous + weight * (values[0] - previous))[None], path])
+        if centred:  # the paths to the next frames, too
+            beyond = (values[-1] + weight * rates[-1] / fps)[None]
+            path = jnp.concatenate([path, jnp.concatenate([path[1:], beyond])[:, 1:]], axis=1)
         time = (1 - before) * steps
-        low = jnp.clip(jnp.floor(time).astype(jnp.int32), 0, steps - 1)
+        low = jnp.clip(jnp.floor(time).astype(jnp.int32), 0, path.shape[1] - 2)
         weight = (time - low).reshape(-1, *[1] * (values.ndim - 1))
         return path[:, low] * (1 - weight) + path[:, low + 1] * weight
 
@@ -125,7 +134,11 @@ def _exposure_instants(image: ImageOptions, fps: float, states: State, between: 
         """A camera parameter [T, samples, ...], interpolated linearly between frames."""
         last = jnp.concatenate([2 * values[:1] - values[1:2] if len(values) > 1 else values[:1], values[:-1]])
         weight = before.reshape(-1, *[1] * (values.ndim - 1))
-        return values[:, None] * (1 - weight) + last[:, None] * weight
+        if not centred:
+            return values[:, None] * (1 - weight) + last[:, None] * weight
+        following = jnp.concatenate([values[1:], 2 * values[-1:] - last[-1:]])
+        steps = jnp.where(weight > 0, last[:, None] - values[:, None], values[:, None] - following[:, None])
+        return values[:, None] + weight * steps
 
     position = interpolate(states.position, states.velocity, between.position)
     angle = interpolate(states.angle, states.angular_velocity, between.angle)
@@ -171,6 +184,31 @@ def material_columns(paint: Paint, scene: Scene) -> dict[str, Array]:
     if paint.material is None:
         return {}
     return {"objects/material": jnp.where(scene.objects.present, paint.material, NO_MATERIAL).astype(jnp.uint8)}
+
+
+def sensor_columns(sensor: Sensor | None) -> dict[str, Array]:
+    """The numbers of the lens and the sensor that are sampled, by stored name."""
+    numbers = {} if sensor is None else sensor._asdict()
+    return {f"image/{name}": value.astype(jnp.float32) for name, value in numbers.items() if value is not None}
+
+
+def with_pictures(render_scenes: RenderScene, config: Config) -> RenderScene:
+    """Render scenes [n], or their shapes and types, with the pixels of their backgrounds' pictures, if they have any.
+
+    Raises ConfigError for an image that is not there, or that cannot be read.
+    """
+    background, digests = render_scenes.paint.background, getattr(config.look.options, "background_images", None)
+    if background.picture is None or digests is None:
+        return render_scenes
+    picture, size = background.picture, (config.video.height, config.video.width)
+    chosen = picture.number, picture.corner, picture.extent
+    if isinstance(picture.number, jax.ShapeDtypeStruct):
+        pixels: Any = jax.ShapeDtypeStruct((*picture.number.shape, *size, 3), np.uint8)
+    else:
+        number, corner, extent = map(np.asarray, chosen)
+        pixels = jax.device_put(crops(digests, number, corner, extent, *size), picture.number.device)
+    background = background._replace(picture=picture._replace(pixels=pixels))
+    return render_scenes._replace(paint=render_scenes.paint._replace(background=background))
 
 
 def camera_columns(view: CameraView) -> dict[str, Array]:

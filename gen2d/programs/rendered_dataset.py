@@ -37,6 +37,7 @@ from gen2d.programs.redraw import (
     render_frames,
     seed_words_of,
 )
+from gen2d.programs.render import with_pictures
 from gen2d.programs.rollout import Rollout
 from gen2d.programs.schema import FRAMES
 from gen2d.programs.shared import cached_jit
@@ -100,7 +101,8 @@ class RenderedDataset(Dataset):
 
         video, image = config.video, config.image
         # Noise depends on the number of the frame, motion blur and some annotations on neighbouring frames.
-        whole = rendered.keys() != {"frames"} or image.exposure > 0 or image.noise.support != (0.0, 0.0)
+        noisy = not {"noise", "shot_noise"}.isdisjoint(image.sensor)
+        whole = rendered.keys() != {"frames"} or image.exposure > 0 or noisy
         every_frame = {"window": None, "stride": 1, "start": "first"} if whole else {}
         self._inputs, self._whole = dataclasses.replace(options, fields=(), window_fields=False, **every_frame), whole
         self._started: _Renderer | None = None
@@ -202,7 +204,8 @@ class _Renderer:
         if self._config.image.exposure:
             with _LOCK:
                 return regenerate(self._ds, self._config, numbers)
-        return self._draw(self._build(columns, self._words, numbers.astype(np.uint32)))
+        scenes = self._build(columns, self._words, numbers.astype(np.uint32))
+        return self._draw(with_pictures(scenes, self._config))
 
 
 Shapes = tuple[tuple[str, tuple[int, ...], str], ...]  # name, shape and dtype of each field

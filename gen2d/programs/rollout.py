@@ -124,6 +124,7 @@ class Rollout:
             simulated = self.programs["simulate"](device, sampled.keys, sampled.scene, sampled.state)
         states, between = simulated.trajectory.states, simulated.trajectory.between
         staged = self.programs["stage"](device, sampled.keys, sampled.scene, states, between)
+        staged = staged._replace(render_scenes=render.with_pictures(staged.render_scenes, self.config))
         return device_batch(self.config, sampled, simulated, staged)
 
     def _accept_on(self, lane: Lane, split: str, numbers: np.ndarray) -> DeviceBatch:
@@ -217,7 +218,8 @@ class Rollout:
                 return run
 
             config = only_sections(self.config, "video", "camera", "image", "look", "storage", pixels=True)
-            args = self.programs["stage"].results.render_scenes, np.int32(0)
+            staged = render.with_pictures(self.programs["stage"].results.render_scenes, self.config)
+            args = staged, np.int32(0)
             self._draws[count] = self._program(config, self.layout, count, draw, args)
         return self._draws[count]
 

@@ -12,6 +12,7 @@ from gen2d import annotations
 from gen2d.captions import caption
 from gen2d.config import quality
 from gen2d.config.config import Config
+from gen2d.config.sections import ImageOptions
 from gen2d.core.enums import JOINT_KINDS
 from gen2d.core.palettes import NAME_BYTES, Palette, palette_of
 from gen2d.core.schema import Field
@@ -121,8 +122,20 @@ class VideoSchema:
             meaning = "name of the material in the look; empty: none"
             longest = max(len(name) for names in found for name in names)
             fields["objects/material_name"] = Field(f"S{longest}", "n K", "", meaning)
+        fields |= {f"image/{name}": self._sensor_field(name) for name in self._sensor_options}
         captioned = self.config.annotations.simulated.captions
         return fields | (caption.fields(self.layout.slots, self.config.video.frames) if captioned else {})
+
+    @property
+    def _sensor_options(self) -> list[str]:
+        """Names of the options of `image` that sample a number of the lens or the sensor in some split."""
+        return sorted({name for config in self._split_configs for name in config.image.sensor})
+
+    @staticmethod
+    def _sensor_field(name: str) -> Field:
+        """The field of a sampled number."""
+        spec = ImageOptions.__dataclass_fields__[name].metadata["option"]
+        return Field("float32", "n", spec.unit, spec.meaning.replace("null: none", "0: none"))
 
     @property
     def _split_configs(self) -> list[Config]:
@@ -145,6 +158,8 @@ class VideoSchema:
             table = np.zeros(NO_MATERIAL + 1, self.host_fields["objects/material_name"].dtype)
             table[: len(names)] = [name.encode() for name in names]
             host_columns |= {"objects/material": material, "objects/material_name": table[material]}
+        for name in (f"image/{name}" for name in self._sensor_options):
+            host_columns[name] = columns.get(name, np.zeros(count, np.float32))
         return host_columns | (
             caption.caption_fields(columns | host_columns, config.video, self.constants)
             if config.annotations.simulated.captions

@@ -35,6 +35,9 @@ class Options:
     spin: Distribution = common.spin("each link at the start", each="links")
     radius: Distribution = common.radius("each bob", [0.2, 0.35], each="links", high=100)
     density: Distribution = common.density("each bob", each="links")
+    rod_radius: float | None = option(
+        None, float, "m", f"radius of a rod; null: {ROD}", above=0, high=10, optional=True, later=True
+    )
     rod_density: Distribution = common.density("the rods", 0.2)
     gravity: tuple[Distribution, ...] = common.gravity()
     color: tuple[Distribution, ...] = common.color("each bob", [[60, 254]] * 3, each="links")
@@ -58,7 +61,12 @@ def layout(options: Options) -> Layout:
     room, widest = n * length + radius, maximum(*map(abs, options.angle.support))
     low = n == 1 and options.spin.support == (0.0, 0.0) and widest < np.pi / 2
     top = maximum(radius - np.cos(widest) * options.length.support[0] if low else room, PIN)
-    return Layout((pin, rods, bobs), (-room, -room, room, top), maximum(length / 2 + ROD, radius), tuple(joints))
+    return Layout(
+        (pin, rods, bobs),
+        (-room, -room, room, top),
+        maximum(length / 2 + (options.rod_radius or ROD), radius),
+        tuple(joints),
+    )
 
 
 def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledScene:
@@ -69,7 +77,8 @@ def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledSc
     ends, end_speeds = jnp.cumsum(links, 0), jnp.cumsum(speeds, 0)
     pin = builder.discs(jnp.zeros((1, 2)), PIN, kind=STATIC, layer=3, collides=False)
     rods = builder.capsules_between(
-        ends - links, ends, ROD, velocity=end_speeds - speeds / 2, spin=factors["spin"], layer=1, collides=False,
+        ends - links, ends, options.rod_radius or ROD, velocity=end_speeds - speeds / 2, spin=factors["spin"],
+        layer=1, collides=False,
         **builder.material(factors, "rod"),
     )  # fmt: skip
     bobs = builder.discs(

@@ -37,6 +37,9 @@ class Options:
     radius: Distribution = common.radius("the ball", [0.4, 0.6], low=1e-2, high=100)
     ball_density: Distribution = common.density("the ball and its chain", 5.0)
     chain_length: Distribution = common.length("distance from the pin to the ball's centre", [3.0, 4.0], low=0.1)
+    link_radius: float | None = option(
+        None, float, "m", f"radius of a link of the chain; null: {LINK}", above=0, high=10, optional=True, later=True
+    )
     angle: Distribution = common.angle("angle of the chain, from hanging down", [0.8, 1.4], low=0, high=1.57)
     ball_height: Distribution = common.fraction("lowest height of the ball's centre, over the tower's", [0.4, 0.8])
     gap: Distribution = common.length("gap between the tower and the ball when lowest", [0.0, 0.2])
@@ -72,7 +75,7 @@ def layout(options: Options) -> Layout:
     tower = most * height
     left = -2 * radius - options.gap.support[1] - chain
     top = maximum(options.ball_height.support[1] * tower + chain + PIN, tower)
-    reach = maximum(chain / n / 2 + LINK, radius, (width**2 + height**2) ** 0.5 / 2)
+    reach = maximum(chain / n / 2 + (options.link_radius or LINK), radius, (width**2 + height**2) ** 0.5 / 2)
     return Layout(groups, (left, 0.0, width + DEBRIS * tower, top), reach, tuple(joints))
 
 
@@ -87,7 +90,7 @@ def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledSc
     chain_vector = chain * jnp.stack([-jnp.sin(angle), -jnp.cos(angle)])
     corners = top + (jnp.arange(n + 1.0) / n)[:, None] * chain_vector
     links = builder.capsules_between(
-        corners[:-1], corners[1:], LINK, density=factors["ball_density"], layer=2, collides=False
+        corners[:-1], corners[1:], options.link_radius or LINK, density=factors["ball_density"], layer=2, collides=False
     )
     ball = builder.discs(corners[-1:], radius, layer=3, **builder.material(factors) | builder.material(factors, "ball"))
     numbers = jnp.arange(most)

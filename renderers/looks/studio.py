@@ -23,6 +23,7 @@ from gen2d.plugin import (
     Surface,
     are_lines,
     are_moving,
+    backdrop,
     line_margin,
     minimum,
     option,
@@ -140,7 +141,7 @@ def paint(scene: Scene, layout: Layout, options: Options, key: Array) -> Paint:
     shadow = Shadow(offset, jnp.float32(1) * blur(options, layout), drawn["shadow"], jnp.asarray(DARK))
     number = material.number.astype(jnp.uint8)
     return base._replace(
-        background=_backdrop(base, options), light=light, surface=surface, shadow=shadow, material=number
+        background=_backdrop(base, layout, options, key), light=light, surface=surface, shadow=shadow, material=number
     )
 
 
@@ -152,13 +153,12 @@ def _materials(options: Options, moving: Array, key: Array) -> Finish:
     return Finish(*jnp.asarray(table)[jnp.where(moving, chosen, 0)].T)
 
 
-def _backdrop(base: Paint, options: Options) -> Background:
+def _backdrop(base: Paint, layout: Layout, options: Options, key: Array) -> Background:
     """The background that is asked for, or the backdrop of the palette: a vertical gradient with darker corners."""
     named = options.named_palette
     if named is None or options.background is not None or options.background_kind != "plain":
         return base.background
-    top, bottom, corners = jnp.asarray(named.ground, jnp.float32)
-    return Background(bottom, top, jnp.float32(np.pi / 2), corners=corners)
+    return backdrop(named, layout, jax.random.fold_in(key, 1))
 
 
 LOOK = Look(options=Options, paint=paint, margin=line_margin, blur=blur)

@@ -68,7 +68,8 @@ VIEWS = {
     ),
     "pendulum": View(
         5, (f"name: studio, palette: dusk, {METALS}", "name: flat, palette: lab"),
-        options=("scene.links=2", "scene.length=[1.2, 1.4]", "scene.radius=[0.42, 0.48]", "scene.angle=[1.6, 2.6]"),
+        options=("scene.links=2", "scene.length=[1.2, 1.4]", "scene.radius=[0.42, 0.48]", "scene.angle=[1.6, 2.6]",
+                 "scene.rod_radius=null"),
     ),
     "chain": View(
         0, (f"name: studio, palette: paper, {METALS}", "name: flat, palette: okabe_ito"),
@@ -76,7 +77,8 @@ VIEWS = {
     ),
     "dominoes": View(
         1, ("name: studio, palette: dusk, material: wood", "name: flat, palette: paper, wall_width: 3"), 0.9,
-        ("scene.dominoes=10", "scene.height=[1.5, 1.8]"),
+        ("scene.dominoes=10", "scene.height=[1.5, 1.8]", "scene.thickness=[0.15, 0.25]", "scene.gap=[0.4, 0.8]",
+         "scene.radius=[0.2, 0.3]", "scene.speed=[2, 4]"),
     ),
     "cradle": View(
         4, (f"name: studio, palette: lab, {METALS}", "name: marked, palette: dusk"), 0.85,
@@ -93,7 +95,7 @@ VIEWS = {
     ),
     "wrecking_ball": View(
         3, (f"name: studio, palette: dusk, {ALL}", "name: textured, palette: paper, wall_width: 3"), 0.9,
-        ("scene.blocks=5", "scene.radius=[0.5, 0.6]"),
+        ("scene.blocks=5", "scene.radius=[0.5, 0.6]", "scene.angle=[0.8, 1.4]", "scene.link_radius=null"),
     ),
     "seesaw": View(
         2, (f"name: studio, palette: lab, {ALL}", "name: flat, palette: okabe_ito, wall_width: 3"), 0.7,
@@ -105,7 +107,8 @@ VIEWS = {
     ),
     "parabola": View(
         3, ("name: studio, palette: dusk", "name: shaded, palette: lab"),
-        options=("scene.radius=[0.9, 1]", "scene.speed=[6, 7]", "scene.angle=[0.9, 1.1]"),
+        options=("scene.radius=[0.9, 1]", "scene.speed=[6, 7]", "scene.angle=[0.9, 1.1]",
+                 "scene.top_distance=[3.5, 5.5]"),
     ),
     "uniform_motion": View(
         4, ("name: studio, palette: lab", "name: marked, palette: paper"),

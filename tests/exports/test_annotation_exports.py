@@ -149,6 +149,61 @@ def test_mot_files_count_from_one(made: Path, fields: dict, tmp_path: Path) -> N
         assert_array_equal(image(folder / "img1" / "000002.png"), fields["frames"][number, 1])
 
 
+@pytest.mark.filterwarnings("ignore:Operation with")  # motmetrics with pandas 3
+def test_motmetrics_reads_boxes_and_follows_the_objects(made: Path, fields: dict, tmp_path: Path) -> None:
+    """MOTChallenge's metrics by motmetrics: the stored boxes, without an error against themselves."""
+    motmetrics = package("motmetrics")
+    out = gen2d.export(made, "mot", tmp_path / "mot").out
+    metrics = ["mota", "idf1", "num_switches", "num_unique_objects", "num_misses"]
+    for number in range(VIDEOS):
+        path = out / f"train-{number:09d}" / "gt" / "gt.txt"
+        truth = motmetrics.io.loadtxt(str(path), fmt=motmetrics.io.Format.MOT16, min_confidence=1)
+        boxes = fields["boxes/amodal"][number]
+        for (frame, object_id), row in truth.iterrows():
+            x0, y0, x1, y1 = boxes[frame - 1, object_id - 1]
+            assert_allclose(row[["X", "Y", "Width", "Height"]].to_numpy(float), [x0, y0, x1 - x0, y1 - y0], atol=2e-3)
+        moving = int((fields["objects/present"][number] & (fields["objects/kind"][number] == 0)).sum())
+        swapped = truth.reset_index()
+        second, ids = swapped["FrameId"] > FRAMES // 2, sorted(swapped["Id"].unique())
+        swapped.loc[second, "Id"] = swapped["Id"][second].map(dict(zip(ids, ids[1:] + ids[:1], strict=True)))
+        for tracked, switches in ((truth, 0), (swapped.set_index(["FrameId", "Id"]), moving)):
+            compared = motmetrics.MOTAccumulator()
+            for frame in range(1, FRAMES + 1):
+                one, other = truth.loc[frame], tracked.loc[frame]
+                corners = [part[["X", "Y"]].to_numpy() for part in (one, other)]
+                distances = np.abs(corners[0][:, None] - corners[1][None]).max(-1)  # px; its own uses NumPy 1
+                compared.update(one.index, other.index, np.where(distances < 1, distances, np.nan), frame)
+            found = motmetrics.metrics.create().compute(compared, metrics=metrics).iloc[0]
+            assert found["num_unique_objects"] == moving
+            assert found["num_switches"] == switches
+            assert found["num_misses"] == 0
+            assert (found["mota"] == found["idf1"] == 1) == (switches == 0)
+
+
+def tap_vid_queries(points: np.ndarray, occluded: np.ndarray) -> np.ndarray:
+    """TAP-Vid's queries [N, 3] (t, y, x), each at the first frame that shows its point, in units of `points`."""
+    first = np.argmax(~occluded, axis=1)
+    x, y = points[np.arange(len(points)), first].T
+    return np.stack([first, y, x], -1)
+
+
+def test_a_reader_of_tap_vid_queries_points_where_their_objects_are_seen(
+    made: Path, fields: dict, tmp_path: Path
+) -> None:
+    """By the data set's description (Doersch et al., arXiv 2211.03726): frames of a fixed size, here twice as wide."""
+    (path,) = gen2d.export(made, "tapvid", tmp_path / "tap").out.glob("*.pkl")
+    for number, video in enumerate(pickle.loads(path.read_bytes()).values()):
+        assert (video["video"].dtype, video["points"].dtype, video["occluded"].dtype) == (np.uint8, np.float32, bool)
+        wide = np.stack([cv2.resize(frame, (2 * WIDTH, HEIGHT)) for frame in video["video"]])
+        points = video["points"] * np.array([wide.shape[2], wide.shape[1]])
+        queries = tap_vid_queries(points, video["occluded"])
+        assert len(queries)
+        t, y, x = np.floor(queries).astype(int).T
+        owners = np.repeat(fields["masks/instance"][number], 2, axis=2)[t, y, x]
+        seen = fields["tracks/visible"][number].any(0) & (fields["tracks/object"][number] >= 0)
+        assert_array_equal(owners, fields["tracks/object"][number][seen] + 1)
+
+
 def test_tap_vid_has_points_first_normalised_and_occluded(made: Path, fields: dict, tmp_path: Path) -> None:
     (path,) = gen2d.export(made, "tapvid", tmp_path / "tap").out.glob("*.pkl")
     content = pickle.loads(path.read_bytes())

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from tiny import CONFIG
-from worlds import world
+from worlds import straight_motion, world
 
 import gen2d
 from gen2d.config.config import load_config
@@ -18,6 +18,7 @@ from gen2d.programs import render
 from gen2d.programs.rollout import Rollout
 from gen2d.records.layout import Layout, SlotGroup
 from gen2d.renderers.color import to_linear
+from gen2d.renderers.compositing import background_image
 from gen2d.renderers.paint import NO_MATERIAL
 
 # To XYZ relative to the white point D65 (IEC 61966-2-1).
@@ -71,6 +72,24 @@ def test_objects_of_a_video_have_distinct_colours_of_the_palette_in_a_random_ord
 def test_a_palette_colours_all_looks_alike():
     one, other = (colors_of("lab", np.ones(5, bool), look=look) for look in ("flat", "studio"))
     np.testing.assert_array_equal(one, other)
+
+
+@pytest.mark.parametrize(("name", "axis"), [("grass", 0), ("chalkboard", 1)])
+def test_the_grain_of_a_backdrop_is_stretched(name, axis):
+    """Blades of grass are upright, and smears of chalk level; the backdrop keeps to the palette's ground."""
+    config = load_config(
+        {"scene": {"name": "uniform_motion"}, "video": {"height": 96, "width": 96, "frames": 1},
+         "look": {"name": "flat", "palette": name, "background_kind": "backdrop"}}
+    )  # fmt: skip
+    scenes, plan, *_ = straight_motion(config, 1)
+    at = jax.tree.map(lambda a: a[:1], jax.tree.map(lambda a: a[0], scenes.instants))
+    image = np.asarray(background_image(jax.tree.map(lambda a: a[0], scenes), at, plan))[0].sum(-1)
+    changes = [np.abs(np.diff(image, axis=i)).mean() for i in (0, 1)]
+    assert 1.5 * changes[axis] < changes[1 - axis]
+    palette = PALETTES[name]
+    assert palette.grain is not None
+    low, high = (end(np.sum([*palette.ground, palette.grain.color], 1)) for end in (np.min, np.max))
+    assert low <= image.min() <= image.max() <= high
 
 
 def test_the_name_of_each_colour_is_stored():

@@ -23,6 +23,7 @@ from gen2d.renderers.compositing import OCCLUDER
 from gen2d.renderers.paint import Background, Paint, Texture
 from gen2d.renderers.plan import FramePlan, Occluders, RenderScene
 from gen2d.renderers.primitives import BodyGeometry, Instants
+from gen2d.renderers.sensor import Sensor
 
 PATCHES, DENSE = (jax.jit(form, static_argnums=1) for form in (rasterizer.draw_tiles, rasterizer.draw_dense))
 SOFT = jax.jit(jax.vmap(rasterizer.draw_soft, in_axes=(0, None)), static_argnums=1)
@@ -119,7 +120,7 @@ def stages(plan, videos, frames, features=(), occluders=0, noise=None, seed=0):
                 exposed,
                 painted(rng, plan.layout, plan, features),
                 some if occluders else None,
-                noise,
+                None if noise is None else Sensor(noise=jnp.float32(noise)),
                 jnp.uint32(video),
             )
         )
@@ -409,7 +410,7 @@ def test_noise_is_as_strong_as_asked_and_another_in_each_frame():
     some = stages(plan, 4, 3, noise=6.0)
     some = some._replace(
         paint=some.paint._replace(drawn=np.zeros((4, 1), bool), background=Background(jnp.full((4, 3), 100.0))),
-        noise=np.asarray([6, 6, 6, 0.8], np.float32),
+        sensor=Sensor(noise=np.asarray([6, 6, 6, 0.8], np.float32)),
         seed=np.asarray([1, 1, 2, 3], np.uint32),
     )
     noise = np.asarray(PATCHES(some, plan)[0]).astype(float) - 100
@@ -449,19 +450,23 @@ def centroids(frames):
 
 
 @pytest.mark.full
-def test_a_moving_ball_is_blurred_along_its_path():
-    blurred, plan, _, _ = straight_motion({**BALL, "image": {"exposure": 1, "exposure_samples": 8}}, 16)
+@pytest.mark.parametrize(("shutter", "exposure", "lag"), [("end", 1, 0.5), ("centre", 0.6, 0.0)])
+def test_a_moving_ball_is_blurred_along_its_path(shutter, exposure, lag):
+    """The centroid of its blur is at the annotated centre, or half an exposure behind it, in all frames."""
+    image = {"exposure": exposure, "exposure_samples": 8, "shutter": shutter}
+    blurred, plan, _, _ = straight_motion({**BALL, "image": image}, 16)
     frames = np.asarray(PATCHES(blurred, plan)[0])
     at = jax.tree.map(np.asarray, blurred.instants)
-    inside = (np.abs(at.position[:, :, 0] - 5) < 5 - 0.8).all((1, 2))  # all of it in all frames, and before
-    before = 2 * at.position[:, 0, 0] - at.position[:, 1, 0]
-    inside &= (np.abs(before - 5) < 5 - 0.8).all(1)
+    inside = (np.abs(at.position[:, :, 0] - 5) < 5 - 0.8).all((1, 2))  # all of it in all frames, before and after
+    step = at.position[:, 1, 0] - at.position[:, 0, 0]  # m/frame
+    for beyond in (at.position[:, 0, 0] - step, at.position[:, -1, 0] + step):
+        inside &= (np.abs(beyond - 5) < 5 - 0.8).all(1)
     assert inside.sum() >= 5
     scale = at.view.scale[..., None]
-    middle = (at.position[:, :, 0] + np.concatenate([before[:, None], at.position[:, :-1, 0]], 1)) / 2
+    middle = at.position[:, :, 0] - lag * exposure * step[:, None]
     expected = np.array([32, 24]) + (middle - 5) * scale * [1, -1]
     off = np.abs(centroids(frames) - expected)[inside].max()
-    print(f"a blurred ball is off by {off:.4f} px from the middle of its path, {inside.sum()} videos")
+    print(f"{shutter}: a blurred ball is off by {off:.4f} px from the middle of its path, {inside.sum()} videos")
     assert off < 0.02
     # The mean of sharp frames at the instants of its exposures.
     assert blurred.exposed is not None
@@ -471,6 +476,21 @@ def test_a_moving_ball_is_blurred_along_its_path():
     )
     drawn, _ = PATCHES(sharp, dataclasses.replace(plan, exposed=0))
     assert_allclose(frames, np.asarray(drawn, float).reshape(*shape[:3], *frames.shape[2:]).mean(2), atol=0.51)
+
+
+def test_a_centred_exposure_is_symmetric_about_its_frame_also_for_the_camera():
+    """Instants before and after a frame; the motion of ball and camera is uniform."""
+    image = {"exposure": 0.5, "exposure_samples": 4, "shutter": "centre"}
+    camera = {"pan": [1.5, -0.5], "turn": 0.7}
+    scenes, _, _, states = straight_motion({**BALL, "image": image, "camera": camera}, 2)
+    assert scenes.exposed is not None
+    apart = np.array([-0.1875, -0.0625, 0.0625, 0.1875]) / BALL["video"]["fps"]  # s
+    time = np.arange(BALL["video"]["frames"])[:, None] / BALL["video"]["fps"] + apart
+    start, velocity = (np.asarray(a)[:, None, None, 0] for a in (states.position[:, :1], states.velocity[:, :1]))
+    assert_allclose(scenes.exposed.position, start + velocity * time[..., None, None], atol=1e-5)
+    center = 5 + np.array(camera["pan"]) * time[..., None]
+    assert_allclose(scenes.exposed.view.center, np.broadcast_to(center, (2, *center.shape)), atol=1e-5)
+    assert_allclose(scenes.exposed.view.angle, np.broadcast_to(camera["turn"] * time, (2, *time.shape)), atol=1e-6)
 
 
 @pytest.mark.full

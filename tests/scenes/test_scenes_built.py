@@ -109,7 +109,8 @@ def test_about_half_of_the_towers_stand():
 
 
 def test_dominoes_fall_in_order_in_a_steady_wave_unless_their_gap_is_too_wide():
-    made = film("dominoes", 8, 3.0, 40, "scene.dominoes=10", "scene.height=1.5", "scene.gap={choice: [0.6, 1.7]}")
+    options = "scene.dominoes=10", "scene.height=1.5", "scene.gap={choice: [0.6, 1.7]}", "scene.speed=[2, 4]"
+    made = film("dominoes", 8, 3.0, 40, *options)
     fallen = made.states.angle[:, :, slots(made, 2)] < -0.3
     wide = made.factors["gap"] > 1.5
     assert 0 < wide.sum() < 8
@@ -216,7 +217,7 @@ def parameter(share: float) -> float:
 
 @pytest.mark.full
 def test_a_wrecking_ball_hits_a_tower_that_stands():
-    made = film("wrecking_ball", 8, 2.0, 30, energy=True)
+    made = film("wrecking_ball", 8, 2.0, 30, "scene.angle=[0.8, 1.4]", energy=True)
     ball = made.states.position[:, :, slots(made, 3)][:, :, 0, 0] + made.factors["radius"][:, None]
     near = np.maximum.accumulate(ball > -0.1 - made.factors["gap"][:, None], axis=1)
     way = moved(made, 4)

@@ -335,6 +335,10 @@ class Reader(SceneReader):
     def counts(self, text: str) -> bool:
         """Whether a list of objects names each of the moving ones once."""
         total = 0
+        others = [s for s in self.moving if self.noun[s] != "link"]
+        words_of = {s: self.full(s) if len(others) <= 4 else f"{self.color[s]} {self.noun[s]}".strip() for s in others}
+        if len({*words_of.values()}) > 10:  # too many for a sentence
+            words_of = {s: self.noun[s] for s in others}
         for item in (item for part in text.split(" and ") for item in part.split(", ")):
             if found := re.fullmatch(r"a chain of (\w+) links", item):
                 total += count_of(found[1])
@@ -342,8 +346,7 @@ class Reader(SceneReader):
             number, _, words = item.partition(" ")
             words = words if number in ("a", "an") else singular(words)
             # The words are all that can be said: an object that has a colour word is not listed without it.
-            slots = [s for s in self.moving if words == self.noun[s] or words == self.full(s)]
-            if count_of(number) != len([s for s in slots if words == self.full(s)]) and count_of(number) != len(slots):
+            if count_of(number) != sum(words == own for own in words_of.values()):
                 return False
             total += count_of(number)
         return total == len(self.moving)

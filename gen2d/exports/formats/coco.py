@@ -112,9 +112,15 @@ def run_lengths(mask: np.ndarray) -> str:
     return "".join(text)
 
 
+def check(source: Source) -> None:
+    """Raise ConfigError for frames with lens distortion."""
+    arrays.check_undistorted(source, "coco")
+
+
 EXPORT = Export(
     fields=("frames", "masks/instance", "objects/*", "states/*", "camera/*", "world/*"),
     write=write,
+    check=check,
     separate=True,
     finish=finish,
     fixed=True,

@@ -8,7 +8,7 @@ import csv
 from pathlib import Path
 from types import SimpleNamespace
 
-from gen2d.plugin import STATIC, Export, Source, caption, facts
+from gen2d.plugin import STATIC, Export, Source, arrays, caption, facts
 
 COLUMNS = ("video", "slot", "class", "color_name", "red", "green", "blue", "static", "x", "y", "radius", "reach")
 MATERIAL = ("mass", "elasticity", "friction")
@@ -34,9 +34,15 @@ def write(target: Path, source: Source) -> None:
             source.advance(1)
 
 
+def check(source: Source) -> None:
+    """Raise ConfigError for frames with lens distortion."""
+    arrays.check_undistorted(source, "objects")
+
+
 EXPORT = Export(
     fields=("objects/*", "states/*", "camera/*", "world/*"),
     write=write,
+    check=check,
     fixed=True,
     suffix=".csv",
     loss="properties of the objects and their places in frame 0 alone",
