@@ -45,7 +45,9 @@ if TYPE_CHECKING:
     from gen2d.renderers.paint import Background, Light, Paint, Pattern, Shadow, Surface, Texture
     from gen2d.renderers.plan import FramePlan, RenderScene, tile_windows
     from gen2d.renderers.primitives import Instants, PixelWindow
-    from gen2d.renderers.rasterizer import alone
+    from gen2d.renderers.rasterizer import alone, draw
+    from gen2d.renderers.relief import SurfacePoints
+    from gen2d.renderers.surfaces import visible_surfaces
     from gen2d.sampling import builder
     from gen2d.sampling.builder import SampledScene
     from gen2d.sampling.placement import CLEARANCE, place, start_position
@@ -82,7 +84,9 @@ _HOMES = {
     "gen2d.renderers.paint": "Background Light Paint Pattern Shadow Surface Texture",
     "gen2d.renderers.plan": "FramePlan RenderScene tile_windows",
     "gen2d.renderers.primitives": "Instants PixelWindow",
-    "gen2d.renderers.rasterizer": "alone",
+    "gen2d.renderers.rasterizer": "alone draw",
+    "gen2d.renderers.relief": "SurfacePoints",
+    "gen2d.renderers.surfaces": "visible_surfaces",
     "gen2d.sampling": "builder",
     "gen2d.sampling.builder": "SampledScene",
     "gen2d.sampling.placement": "CLEARANCE place start_position",
@@ -125,6 +129,7 @@ __all__ = [
     "SlotGroup",
     "Source",
     "Surface",
+    "SurfacePoints",
     "Texture",
     "UserError",
     "alone",
@@ -137,6 +142,7 @@ __all__ = [
     "common",
     "contrasting",
     "dataset",
+    "draw",
     "each_video",
     "extents",
     "facts",
@@ -160,7 +166,8 @@ __all__ = [
     "start_position",
     "tables",
     "tile_windows",
-    "to_pixels"
+    "to_pixels",
+    "visible_surfaces"
 ]  # fmt: skip
 
 __getattr__, __dir__ = attach(__name__, _HOMES)

@@ -112,6 +112,7 @@ class Look(_Contract):
         `LineOptions`.
     - blur(options, layout): largest half width of the soft edges of shadows, in m; 0 for looks without shadows.
     - check(options): raises ValueError if the options are invalid; the message begins with an option's name.
+    - parts: names of parts of `Paint` that `paint` always returns, and that annotations may need: surface, shadow.
     """
 
     options: type
@@ -119,6 +120,7 @@ class Look(_Contract):
     margin: Callable[[Any], float]
     blur: Callable[[Any, Any], float] = _no_blur
     check: Callable[[Any], None] = _nothing
+    parts: tuple[str, ...] = ()
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -134,6 +136,7 @@ class Annotation(_Contract):
     - sizes(plan, value): lengths of further axes, by letter.
     - owners: whether `annotate` needs `owners`; without it `owners` is None, unless another annotation needs it.
     - usual: value with which `gen2d.render` switches the annotation on when its fields are requested.
+    - needs: part of `Paint`, as in `Look.parts`, without which the annotation is refused; "" if it needs none.
     """
 
     options: type | dataclasses.Field
@@ -142,6 +145,7 @@ class Annotation(_Contract):
     sizes: Callable[[Any, Any], Mapping[str, int]] = _no_sizes
     owners: bool = False
     usual: Any = True
+    needs: str = ""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -149,6 +153,11 @@ class Annotation(_Contract):
             raise TypeError(
                 f"Annotation.options is {self.options!r}, but an annotation draws nothing: remove draw=True"
             )
+
+    @property
+    def off(self) -> Any:
+        """Value of a config's options where the annotation is off: the default; None for a dataclass."""
+        return self.options.default if isinstance(self.options, dataclasses.Field) else None
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

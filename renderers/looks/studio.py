@@ -161,4 +161,4 @@ def _backdrop(base: Paint, options: Options) -> Background:
     return Background(bottom, top, jnp.float32(np.pi / 2), corners=corners)
 
 
-LOOK = Look(options=Options, paint=paint, margin=line_margin, blur=blur)
+LOOK = Look(options=Options, paint=paint, margin=line_margin, blur=blur, parts=("surface", "shadow"))

@@ -344,6 +344,38 @@ def moved(video: Video, t: int, to: int, id_: int, pixels: Array, view: View) ->
     return to_pixels(video, to, world, view)
 
 
+class Relief(NamedTuple):
+    """What of the surfaces of objects is not stored."""
+
+    slope: Array  # K, sine of the steepest tilt, at the rim
+    bevel: Array  # K, m, width of the sloping border of polygons
+
+
+def profile(shape: Outline, polygon: bool, points: Array, width: float) -> Array:
+    """Distance [N] px from where a surface is level, over the width that slopes: 1 at the rim, and beyond it."""
+    if not polygon:
+        return np.minimum(distance(shape.core, points) / width, 1)
+    along = np.roll(shape.core, -1, axis=0) - shape.core
+    kept = np.linalg.norm(along, axis=-1) > 1e-9
+    along, corner = along[kept] / np.linalg.norm(along[kept], axis=-1, keepdims=True), shape.core[kept]
+    from_corner = points[:, None] - corner
+    offside = np.abs(along[:, 0] * from_corner[..., 1] - along[:, 1] * from_corner[..., 0]).min(-1)
+    inside = offside * (distance(shape.core, points) == 0) + shape.radius - distance(shape.core, points)
+    return np.clip(1 - inside / width, 0, 1)
+
+
+def height(video: Video, t: int, slot: int, points: Array, relief: Relief, view: View) -> Array:
+    """Height [N] px of an object's surface above its rim, at pixel positions [N, 2]: a cap of a sphere.
+
+    The sphere's radius is such that the cap is as steep at its rim as the surface is.
+    """
+    shape, polygon = outline(video, t, slot, view), video["objects/shape"][slot] == POLYGON
+    bevel = max(float(relief.bevel[slot]) * float(video["camera/scale"][t]), 1.0)
+    width, slope = bevel if polygon else max(shape.radius, 0.5), float(relief.slope[slot])
+    sphere, away = width / slope, width * profile(shape, bool(polygon), points, width)
+    return np.sqrt(sphere**2 - away**2) - math.sqrt(sphere**2 - width**2)
+
+
 def flow(video: Video, t: int, to: int, mask: Array, view: View) -> Array:
     """Flow [H, W, 2] px of every pixel centre of frame t to frame `to`."""
     centers = pixel_centers(view)
