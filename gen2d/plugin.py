@@ -40,6 +40,7 @@ if TYPE_CHECKING:
         mean_color,
         palette_option,
         plain,
+        sampled_options,
     )
     from gen2d.renderers.noise import fraction, hashed
     from gen2d.renderers.paint import Background, Light, Paint, Pattern, Shadow, Surface, Texture
@@ -78,7 +79,7 @@ _HOMES = {
     "gen2d.renderers.compositing": "OCCLUDER",
     "gen2d.renderers.look": (
         "LineOptions PlainOptions are_lines are_moving contrasting line_fields line_margin mean_color palette_option "
-        "plain"
+        "plain sampled_options"
     ),
     "gen2d.renderers.noise": "fraction hashed",
     "gen2d.renderers.paint": "Background Light Paint Pattern Shadow Surface Texture",
@@ -163,6 +164,7 @@ __all__ = [
     "power_of_two",
     "questions",
     "reduce_halves",
+    "sampled_options",
     "start_position",
     "tables",
     "tile_windows",

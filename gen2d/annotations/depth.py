@@ -11,7 +11,7 @@ def annotate(scenes: RenderScene, owners: Array, plan: FramePlan, on: bool) -> d
 
 
 ANNOTATION = Annotation(
-    options=option(False, bool, "", "height of the surface that each pixel shows"),
+    options=option(False, bool, "", "height of the surface that each pixel shows", later=True),
     fields={
         "surface/height": Field(
             "float16",

@@ -22,7 +22,7 @@ def _planes(point: SurfacePoints) -> tuple[Array, Array, Array]:
 
 
 ANNOTATION = Annotation(
-    options=option(False, bool, "", "unit normals of the surface that each pixel shows"),
+    options=option(False, bool, "", "unit normals of the surface that each pixel shows", later=True),
     fields={
         "surface/normal": Field(
             "int8",

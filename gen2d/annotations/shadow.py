@@ -30,7 +30,7 @@ def _white_shadow(paint: Paint) -> Paint:
 
 
 ANNOTATION = Annotation(
-    options=option(False, bool, "", "opacity of the shadow that each pixel shows"),
+    options=option(False, bool, "", "opacity of the shadow that each pixel shows", later=True),
     fields={
         "surface/shadow": Field(
             "uint8",

@@ -108,6 +108,8 @@ class Look(_Contract):
 
     - options: frozen dataclass with fields declared by `option`, often a subclass of `PlainOptions`.
     - paint(scene, layout, options, key): the `Paint` of one video, with one entry per slot (K), traced by jax.
+        `Paint.sampled` holds the values of options with `draw=True`, from `sampled_options`; they are stored as
+        look/NAME.
     - margin(options): largest distance, in px, to which an object is rendered beyond its outline; `line_margin` for
         `LineOptions`.
     - blur(options, layout): largest half width of the soft edges of shadows, in m; 0 for looks without shadows.

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from gen2d import annotations
 from gen2d.config.annotations import Annotations
 from gen2d.config.config import Config
+from gen2d.config.options import drawn_options
 from gen2d.config.sections import ImageOptions
 from gen2d.core.errors import ConfigError
 from gen2d.records.axes import Array, check_shapes
@@ -172,6 +173,32 @@ def material_columns(paint: Paint, scene: Scene) -> dict[str, Array]:
     if paint.material is None:
         return {}
     return {"objects/material": jnp.where(scene.objects.present, paint.material, NO_MATERIAL).astype(jnp.uint8)}
+
+
+def look_columns(paint: Paint, config: Config) -> dict[str, Array]:
+    """Values of the look's sampled options, by stored name.
+
+    Raises ConfigError if the look's paint has other values than its options declare.
+    """
+    declared, sampled = drawn_options(config.look.options), paint.sampled or {}
+    for name in sorted(declared.keys() ^ sampled.keys()):
+        verb = "samples" if name in declared else "does not declare"
+        raise ConfigError(
+            f"look {config.look.name} {verb} the option {name}, but Paint.sampled must hold just the options that it "
+            "samples: the result of sampled_options"
+        )
+    return {f"look/{name}": value for name, value in sampled.items()}
+
+
+def occluder_columns(occluders: Occluders | None, plan: FramePlan) -> dict[str, Array]:
+    """The occluders of a video, by stored name, if it has any."""
+    if occluders is None:
+        return {}
+    return {
+        "occluders/box": occluders.box,
+        "occluders/color": jnp.round(occluders.color).astype(jnp.uint8),
+        "occluders/depth": (occluders.rank + plan.layout.slots - plan.moving).astype(jnp.int16),
+    }
 
 
 def camera_columns(view: CameraView) -> dict[str, Array]:

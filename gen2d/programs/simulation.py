@@ -167,8 +167,10 @@ class Staging:
             key: Array, scene: Scene, states: State, between: State | None
         ) -> tuple[RenderScene, dict[str, Array]]:
             render_scene = render.render_scene(key, self.config, self.plan, scene, states, between=between)
-            colors = {"objects/color": render.painted_colors(render_scene.paint, scene)}
-            return render_scene, colors | render.material_columns(render_scene.paint, scene)
+            columns = {"objects/color": render.painted_colors(render_scene.paint, scene)}
+            columns |= render.material_columns(render_scene.paint, scene)
+            columns |= render.look_columns(render_scene.paint, self.config)
+            return render_scene, columns | render.occluder_columns(render_scene.occluders, self.plan)
 
         render_scenes, columns = jax.vmap(build)(wrapped(keys), scene, states, between)
         return StagedBatch(render_scenes, columns | render.camera_columns(render_scenes.instants.view))

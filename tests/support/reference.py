@@ -2,8 +2,8 @@
 
 It imports nothing of gen2d and shares no method with it. The definitions are those of docs/frames.md and of the
 fields (`meaning` in a dataset's manifest). A video is a mapping from stored names to the arrays of one video, without
-the axis n. What a dataset does not store, the colour of the background, the line width of segments and the places of
-occluders, is passed as a `View`.
+the axis n. What a dataset does not store, the colour of the background and the line width of segments, is passed as a
+`View`, and so are the occluders.
 
 Outlines are polygons whose sides are at most 1e-5 px from the true outline, so coverages are accurate to about 2e-5.
 """
