@@ -56,8 +56,7 @@ class VideoSchema:
         sizes = {"T": video.frames, "K": self.layout.slots, "H": video.height, "W": video.width}
         sizes |= {"C": self.save_at.contacts} if self.save_at.contacts else {}
         sizes |= {"J": len(self.layout.joints)} if self.layout.joints else {}
-        occluders = max(config.image.occluders for config in self._split_configs)
-        sizes |= {"O": occluders} if occluders else {}
+        sizes |= {"O": self._occluders} if self._occluders else {}
         corners = max(group.vertices for group in self.layout.groups)
         sizes |= {"V": corners} if corners else {}
         return annotations.sizes(self.config.annotations, self.plan, sizes | self.sampler.lengths)
@@ -133,7 +132,7 @@ class VideoSchema:
         for config in self._split_configs:
             for name, spec in drawn_options(config.look.options).items():
                 fields[f"look/{name}"] = Field("float32", "n", spec.unit, f"{spec.meaning}; NaN: of another look")
-        fields |= OCCLUDERS if self.sizes.get("O") else {}
+        fields |= OCCLUDERS if self._occluders else {}
         if self.config.annotations.simulated.classes:
             longest, meaning = max(map(len, facts.CLASSES)), "noun of the object; empty: none"
             fields["objects/class_name"] = Field(f"S{longest}", "n K", "", meaning)
@@ -144,6 +143,11 @@ class VideoSchema:
     def _split_configs(self) -> list[Config]:
         """The configs of all splits; the config itself if there are no splits."""
         return [self.config.of_split(split.name) for split in self.config.splits] or [self.config]
+
+    @property
+    def _occluders(self) -> int:
+        """Largest number of occluders of a split."""
+        return max(config.image.occluders for config in self._split_configs)
 
     def host_columns(self, columns: dict[str, np.ndarray], split: str) -> dict[str, np.ndarray]:
         """Values of the host's fields for videos of one split, from their other fields [n, ...]."""

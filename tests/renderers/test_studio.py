@@ -16,6 +16,7 @@ from gen2d.programs import render
 from gen2d.programs.rollout import Rollout
 from gen2d.records.layout import Layout
 from gen2d.renderers import rasterizer
+from gen2d.renderers.looks import studio
 from gen2d.sampling import builder
 
 TILES, DENSE = (jax.jit(form, static_argnums=1) for form in (rasterizer.draw_tiles, rasterizer.draw_dense))
@@ -283,6 +284,17 @@ def test_defaults_are_those_of_the_page():
     assert drawn == [2.1, 0.9, 0.3, 0.3]
     assert [options.stripe, options.gloss.support[0], options.shadow.support[0]] == [0.22, 0.45, 0.4]
     assert options.material == ("rubber",)
+
+
+def test_materials_are_those_of_the_page():
+    found = {name: (m.slope, m.gloss, m.sharpness) for name, m in studio.MATERIALS.items()}
+    assert found == {
+        "rubber": (0.95, 0.8, 25),
+        "wood": (0.9, 0.15, 12),
+        "metal": (0.95, 2.2, 100),
+        "paper": (0.3, 0, 10),
+    }
+    assert (studio.MATERIALS["metal"].mirror, studio.FLATTER) == (0.85, 0.6)
 
 
 def test_light_and_materials_are_drawn_from_distributions():
