@@ -359,6 +359,16 @@ def test_what_the_look_or_the_images_of_a_split_lack_is_stored_as_nothing():
     assert not host["occluders/color"].any()
 
 
+def test_occluders_are_stored_with_the_objects_behind_them():
+    columns, stages, _ = rolled("image.occluders=3", "image.occluder_front=[0,1]", "scene.balls=6")
+    assert_array_equal(columns["occluders/box"], stages.occluders.box)
+    moving = np.isfinite(columns["objects/mass"])
+    behind = columns["objects/depth"][:, None] < columns["occluders/depth"][..., None]
+    assert_array_equal((behind & moving[:, None]).sum(-1), stages.occluders.rank)
+    assert behind[:, :, ~moving[0]].all()
+    assert len(np.unique(stages.occluders.rank)) > 3
+
+
 def test_class_names_are_the_nouns_of_the_objects():
     columns, _, schema = rolled("annotations.classes=true", "scene.balls=[1,3]")
     moving = np.isfinite(columns["objects/mass"])
