@@ -57,8 +57,13 @@ def plan_of(config: Config, layout: Layout) -> FramePlan:
 
 
 def paint_of(key: Array, config: Config, scene: Scene, layout: Layout) -> Paint:
-    """Paint of one video with this key."""
-    return config.look.contract.paint(scene, layout, config.look.options, key_for(key, "look"))
+    """Paint of one video with this key. Raises ConfigError if it lacks a part that the look declares."""
+    contract = config.look.contract
+    paint = contract.paint(scene, layout, config.look.options, key_for(key, "look"))
+    for part in contract.parts:
+        if getattr(paint, part, None) is None:
+            raise ConfigError(f"look {config.look.name} has {part!r} in Look.parts, but its paint has no {part}")
+    return paint
 
 
 def view_of(key: Array, config: Config, layout: Layout, states: State) -> CameraView:

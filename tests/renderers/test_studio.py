@@ -386,6 +386,14 @@ def test_a_look_that_samples_an_option_without_saying_so_is_one_sentence(tmp_pat
     assert "\n" not in str(error.value)
 
 
+def test_a_look_whose_paint_lacks_a_part_that_it_declares_is_one_sentence(tmp_path):
+    path = tmp_path / "bright.py"
+    path.write_text(SILENT.replace("margin=line_margin)", 'margin=line_margin, parts=("surface",))'))
+    config = load_config({"look": str(path), "video": {"frames": 2}})
+    with pytest.raises(ConfigError, match=r"has 'surface' in Look\.parts, but its paint has no surface$"):
+        Rollout(config, jax.devices()[:1]).start("train", np.arange(512))
+
+
 SILENT = '''"""Grey objects."""
 
 import dataclasses
