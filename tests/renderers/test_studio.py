@@ -390,7 +390,7 @@ def test_a_look_whose_paint_lacks_a_part_that_it_declares_is_one_sentence(tmp_pa
     path = tmp_path / "bright.py"
     path.write_text(SILENT.replace("margin=line_margin)", 'margin=line_margin, parts=("surface",))'))
     config = load_config({"look": str(path), "video": {"frames": 2}})
-    with pytest.raises(ConfigError, match=r"has 'surface' in Look\.parts, but its paint has no surface$"):
+    with pytest.raises(ConfigError, match=r"has 'surface' in Look\.parts, but its paint has no surface"):
         Rollout(config, jax.devices()[:1]).start("train", np.arange(512))
 
 
