@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -38,7 +39,7 @@ class Drawn:
     """Fields of the videos of a case, their stages, and what is not stored of their surfaces."""
 
     rollout: Rollout
-    stages: object
+    stages: Any
     columns: dict
     relief: list
 
@@ -58,6 +59,7 @@ def drawn(case):
     (rendered,) = rollout.draw([batch], 0, 2)
     columns = rollout.host_columns([batch])[0] | {name: np.asarray(array) for name, array in rendered.items()}
     surface = batch.render_scenes.paint.surface
+    assert surface is not None
     relief = [Relief(np.asarray(surface.slope[v], float), np.asarray(surface.bevel[v], float)) for v in range(2)]
     return Drawn(rollout, batch.render_scenes, columns, relief)
 

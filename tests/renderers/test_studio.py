@@ -1,6 +1,7 @@
 """Studio: lit frames are those of a supersampled reference in float64, in both forms; shadows own no pixel."""
 
 import functools
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -317,7 +318,7 @@ def test_light_and_materials_are_drawn_from_distributions():
     jax.tree.map(lambda a, b: assert_array_equal(a, b[0]), one, paint)
 
 
-def rolled(*overrides, videos=4):
+def rolled(*overrides, videos=4) -> Any:
     """Fields by name, and stages, of the first videos of a config in the look `studio`."""
     video = ["video.frames=2", "video.height=24", "video.width=24", f"storage.batch_size={videos}"]
     rollout = Rollout(load_config("bouncing.yaml", ["look=studio", *video, *overrides]), jax.devices()[:1])
