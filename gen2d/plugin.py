@@ -41,13 +41,16 @@ if TYPE_CHECKING:
         mean_color,
         palette_option,
         plain,
+        sampled_options,
     )
     from gen2d.renderers.noise import fraction, hashed
     from gen2d.renderers.paint import Background, Light, Paint, Pattern, Shadow, Surface, Texture
     from gen2d.renderers.plan import FramePlan, RenderScene, tile_windows
     from gen2d.renderers.primitives import Instants, PixelWindow
-    from gen2d.renderers.rasterizer import alone
+    from gen2d.renderers.rasterizer import alone, draw
+    from gen2d.renderers.relief import SurfacePoints
     from gen2d.renderers.sensor import distorted_points
+    from gen2d.renderers.surfaces import visible_surfaces
     from gen2d.sampling import builder
     from gen2d.sampling.builder import SampledScene
     from gen2d.sampling.placement import CLEARANCE, place, start_position
@@ -78,14 +81,16 @@ _HOMES = {
     "gen2d.renderers.compositing": "OCCLUDER",
     "gen2d.renderers.look": (
         "LineOptions PlainOptions are_lines are_moving backdrop contrasting line_fields line_margin mean_color "
-        "palette_option plain"
+        "palette_option plain sampled_options"
     ),
     "gen2d.renderers.noise": "fraction hashed",
     "gen2d.renderers.paint": "Background Light Paint Pattern Shadow Surface Texture",
     "gen2d.renderers.plan": "FramePlan RenderScene tile_windows",
     "gen2d.renderers.primitives": "Instants PixelWindow",
-    "gen2d.renderers.rasterizer": "alone",
+    "gen2d.renderers.rasterizer": "alone draw",
+    "gen2d.renderers.relief": "SurfacePoints",
     "gen2d.renderers.sensor": "distorted_points",
+    "gen2d.renderers.surfaces": "visible_surfaces",
     "gen2d.sampling": "builder",
     "gen2d.sampling.builder": "SampledScene",
     "gen2d.sampling.placement": "CLEARANCE place start_position",
@@ -128,6 +133,7 @@ __all__ = [
     "SlotGroup",
     "Source",
     "Surface",
+    "SurfacePoints",
     "Texture",
     "UserError",
     "alone",
@@ -142,6 +148,7 @@ __all__ = [
     "contrasting",
     "dataset",
     "distorted_points",
+    "draw",
     "each_video",
     "extents",
     "facts",
@@ -163,10 +170,12 @@ __all__ = [
     "power_of_two",
     "questions",
     "reduce_halves",
+    "sampled_options",
     "start_position",
     "tables",
     "tile_windows",
-    "to_pixels"
+    "to_pixels",
+    "visible_surfaces"
 ]  # fmt: skip
 
 __getattr__, __dir__ = attach(__name__, _HOMES)

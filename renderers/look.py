@@ -1,13 +1,13 @@
 """Shared parts of looks: options of backgrounds, colours and lines, and the paint of plain shapes."""
 
 import dataclasses
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gen2d.config.options import option
+from gen2d.config.options import drawn_options, option
 from gen2d.core.enums import SHAPES, STATIC
 from gen2d.core.palettes import PALETTES, Palette
 from gen2d.records.axes import Array
@@ -97,6 +97,13 @@ class PlainOptions(LineOptions):
 def line_margin(options: LineOptions) -> float:
     """Largest distance (px) that an object is rendered beyond its own rim: half the line width of segments."""
     return options.wall_width / 2
+
+
+def sampled_options(options: Any, key: Array) -> dict[str, Array]:
+    """Values [] of the options with `draw=True` of one video, by name: `Paint.sampled`, which the dataset stores."""
+    sources = {name: getattr(options, name) for name in drawn_options(options)}
+    keys = jax.random.split(key, max(len(sources), 1))
+    return {name: source.sample(k, ()) for (name, source), k in zip(sources.items(), keys, strict=False)}
 
 
 def plain(scene: Scene, layout: Layout, options: PlainOptions, key: Array) -> Paint:

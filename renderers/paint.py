@@ -97,3 +97,4 @@ class Paint(NamedTuple):
     surface: Surface | None = None
     shadow: Shadow | None = None
     material: Array | None = None  # [K] int, index into `materials` of the look's options, stored as `objects/material`
+    sampled: dict[str, Array] | None = None  # [] each, values of the look's sampled options, stored as `look/NAME`

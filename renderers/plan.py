@@ -23,7 +23,7 @@ class Occluders(NamedTuple):
 
     box: Array  # [O, 4] px: left, top, right, bottom
     color: Array  # [O, 3] sRGB
-    rank: Array  # [O] number of slots of `FramePlan.groups` static_runs them, in drawing order
+    rank: Array  # [O] number of slots of `FramePlan.groups` behind them, in drawing order
 
 
 class RenderScene(NamedTuple):

@@ -6,6 +6,7 @@ are flat with a bevel, which tilts towards the nearest side.
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 
 from gen2d.records.axes import Array
@@ -14,6 +15,7 @@ from gen2d.renderers.paint import Paint
 from gen2d.renderers.primitives import BodyGeometry, ImagePose, Instants, side_normals
 
 MITRE = 0.7  # of a pixel's width, over the difference of the distances of two perpendicular sides
+SHARP = 1e6  # the same where each point has the tilt of its nearest side
 
 
 class Relief(NamedTuple):
@@ -62,33 +64,64 @@ def outline_of(
 
 
 def tilt(
-    relief: Relief, pose: ImagePose, x: Array, y: Array, bevel: Array, cover: Array
+    relief: Relief, pose: ImagePose, x: Array, y: Array, bevel: Array, cover: Array, mitre: float = MITRE
 ) -> tuple[Array, Array, Array | float]:
     """Tilt towards x and towards y [..., rows, columns], from 0 to 1 at the rim, and the part [..., rows, columns] of a
     highlight that shows: half of it where a pixel averages two sides of a polygon.
 
     `x` [..., 1, columns] and `y` [..., rows, 1] are relative to the centre, in px; `bevel` [...] is in m. Where the
-    coverage is c, the tilt is that at the centroid of the covered part, (1 - c) / 2 from the pixel's centre.
+    coverage is c, the tilt is that at the centroid of the covered part, (1 - c) / 2 from the pixel's centre. `mitre` is
+    how sharp the edges between the sides of a polygon are.
     """
     inwards = (1 - cover) / 2
     if relief.normal is not None and relief.distance is not None:
-        width = jnp.maximum(bevel * pose.scale, 1.0)[..., None, None]
+        width = sloping_width(relief, pose, bevel)[..., None, None]
         nx, ny, even = jnp.zeros_like(cover), jnp.zeros_like(cover), jnp.ones_like(cover)
         farthest = jnp.full_like(cover, -jnp.inf)
         for side in range(relief.normal.shape[-2]):
             a, b = (relief.normal[..., side, axis][..., None, None] for axis in (0, 1))
             distance = jnp.minimum(relief.distance[..., side] + relief.radius, 1e6)  # infinite for a side of length 0
             beyond = x * a + (y * b - distance[..., None, None])
-            nearer = jnp.clip((beyond - farthest) * MITRE + 0.5, 0.0, 1.0)  # an edge between sides, a pixel wide
+            nearer = jnp.clip((beyond - farthest) * mitre + 0.5, 0.0, 1.0)  # an edge between sides, a pixel wide
             nx, ny = nx + nearer * (a - nx), ny + nearer * (b - ny)
             even = jnp.where(nearer < 0.5, even, 1.0) * (2 * nearer - 1) ** 2
             farthest = jnp.maximum(farthest, beyond)
         amount = jnp.clip(1 + (farthest - inwards) / width, 0.0, 1.0)
         return nx * amount, ny * amount, (1 + even) / 2
-    radius = jnp.maximum(relief.radius, 0.5)[..., None, None]
+    radius = sloping_width(relief, pose, bevel)[..., None, None]
     if relief.half is not None:
         cos, sin, half = (a[..., None, None] for a in (pose.cos, pose.sin, relief.half))
         along = jnp.clip(x * cos + y * sin, -half, half)
         x, y = x - along * cos, y - along * sin
     part = (1 - inwards / radius) / radius
     return x * part, y * part, 1.0
+
+
+def sloping_width(relief: Relief, pose: ImagePose, bevel: Array) -> Array:
+    """Width [...] px of the part of a surface that slopes: the radius of a dome, or a polygon's bevel."""
+    return jnp.maximum(relief.radius, 0.5) if relief.normal is None else jnp.maximum(bevel * pose.scale, 1.0)
+
+
+class SurfacePoints(NamedTuple):
+    """Surfaces at the centres of pixels [..., rows, columns]."""
+
+    normal_x: Array  # of the unit normal: right
+    normal_y: Array  # down
+    height: Array  # m, above the rim
+
+
+def surface_points(relief: Relief, pose: ImagePose, slope: Array, bevel: Array, x: Array, y: Array) -> SurfacePoints:
+    """Surfaces at points `x` [..., 1, columns] and `y` [..., rows, 1] px from the centre; beyond the rim as at the rim.
+
+    A tilt t from 0 to 1 at the rim is the sine s t of the steepest tilt s. So a dome, of which t is the distance from
+    the core over the radius w, is the cap of a sphere of radius w / s; a bevel of width w has the same profile.
+    """
+    tilt_x, tilt_y, _ = tilt(relief, pose, x, y, bevel, jnp.ones_like(x + y), SHARP)
+    square = tilt_x * tilt_x + tilt_y * tilt_y
+    inside = jax.lax.rsqrt(jnp.maximum(square, 1.0))
+    slope, square = slope[..., None, None], jnp.minimum(square, 1.0)
+    width = (sloping_width(relief, pose, bevel) / pose.scale)[..., None, None]
+    steepest = slope * slope
+    roots = jnp.sqrt(jnp.maximum(1 - steepest * square, 0.0)) + jnp.sqrt(jnp.maximum(1 - steepest, 0.0))
+    height = width * slope * (1 - square) / jnp.maximum(roots, 1e-6)
+    return SurfacePoints(slope * inside * tilt_x, slope * inside * tilt_y, height)

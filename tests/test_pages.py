@@ -117,12 +117,13 @@ def test_pages_name_only_files_that_are_there(page: str):
         assert any((root / name).exists() for root in roots), f"{page} names {name}"
 
 
-EVERY = ("energy", "masks", "amodal", "boxes", "visibility", "flow", "captions", "lyapunov")
+EVERY = ("energy", "masks", "amodal", "boxes", "visibility", "flow", "captions", "lyapunov", "classes", "centers")
+SURFACES = ("depth", "normals", "shadow")
 DESCRIBED = {
     "scene": "bouncing",
     "look": {"name": "studio", "palette": "paper"},
-    "image": {"noise": 2, "jpeg_quality": 80},
-    "annotations": {"contacts": 4, "tracks": 8, **dict.fromkeys(EVERY, True)},
+    "annotations": {"contacts": 4, "tracks": 8, **dict.fromkeys((*EVERY, *SURFACES), True)},
+    "image": {"noise": 2, "jpeg_quality": 80, "occluders": 2},
     "quality": {"min_contacts": 1},
     "splits": {"train": {}, "large": {"factors": {"radius": [1.0, 1.1]}}},
 }

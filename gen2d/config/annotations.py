@@ -33,7 +33,14 @@ class Annotations:
 
     def plain(self) -> dict[str, Any]:
         """The section as plain YAML and JSON values."""
-        return plain_of(self.simulated) | {plugin.name: _plain_value(plugin) for plugin in self.pixels}
+        written = [plugin for plugin in self.pixels if plugin.options or not _is_later(plugin)]
+        return plain_of(self.simulated) | {plugin.name: _plain_value(plugin) for plugin in written}
+
+
+def _is_later(plugin: Plugin) -> bool:
+    """Whether stored configs may lack the annotation: a single option that is younger than they are."""
+    options = plugin.contract.options
+    return isinstance(options, dataclasses.Field) and options.metadata["option"].later
 
 
 def _plain_value(plugin: Plugin) -> Any:

@@ -218,6 +218,7 @@ def from_mapping(values: Any, source: str, name: str = "dataset", copies: Copies
     _check_matched(config, source)
     _check_palettes(config, source)
     _check_distortion(config, source)
+    _check_annotations(config, source)
     return config
 
 
@@ -285,6 +286,20 @@ def _check_distortion(config: Config, source: str) -> None:
             f"{source}: annotations.{straight[0]} is on, but describes frames without image.distortion: one of them "
             f"must be off ({' and '.join(able)} describe distorted frames)"
         )
+
+
+def _check_annotations(config: Config, source: str) -> None:
+    """Raise ConfigError if an annotation needs a part that the look, or that of a split, does not paint."""
+    looks = {f"splits.{split.name}.look": config.of_split(split.name).look for split in config.splits}
+    for where, look in (looks or {"look": config.look}).items():
+        for plugin in config.annotations.wanted:
+            needed = plugin.contract.needs
+            if needed and needed not in look.contract.parts:
+                found = [name for name in plugins.names("look") if needed in plugins.load("look", name).parts]
+                raise ConfigError(
+                    f"{source}: annotations.{plugin.name} is on, but {where} is {look.name}, which paints no {needed}: "
+                    f"it must be off, or the look one of {', '.join(found)}"
+                )
 
 
 def _keys(values: Any) -> list[str]:

@@ -108,10 +108,13 @@ class Look(_Contract):
 
     - options: frozen dataclass with fields declared by `option`, often a subclass of `PlainOptions`.
     - paint(scene, layout, options, key): the `Paint` of one video, with one entry per slot (K), traced by jax.
+        `Paint.sampled` holds the values of options with `draw=True`, from `sampled_options`; they are stored as
+        look/NAME.
     - margin(options): largest distance, in px, to which an object is rendered beyond its outline; `line_margin` for
         `LineOptions`.
     - blur(options, layout): largest half width of the soft edges of shadows, in m; 0 for looks without shadows.
     - check(options): raises ValueError if the options are invalid; the message begins with an option's name.
+    - parts: names of parts of `Paint` that `paint` always returns, and that annotations may need: surface, shadow.
     """
 
     options: type
@@ -119,6 +122,7 @@ class Look(_Contract):
     margin: Callable[[Any], float]
     blur: Callable[[Any, Any], float] = _no_blur
     check: Callable[[Any], None] = _nothing
+    parts: tuple[str, ...] = ()
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -136,6 +140,7 @@ class Annotation(_Contract):
     - distorted: whether it describes frames with lens distortion, too: their owners are given, and `distorted_points`
         gives the places of points. A config with another annotation and `image.distortion` is refused.
     - usual: value with which `gen2d.render` switches the annotation on when its fields are requested.
+    - needs: part of `Paint`, as in `Look.parts`, without which the annotation is refused; "" if it needs none.
     """
 
     options: type | dataclasses.Field
@@ -145,6 +150,7 @@ class Annotation(_Contract):
     owners: bool = False
     distorted: bool = False
     usual: Any = True
+    needs: str = ""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -152,6 +158,11 @@ class Annotation(_Contract):
             raise TypeError(
                 f"Annotation.options is {self.options!r}, but an annotation draws nothing: remove draw=True"
             )
+
+    @property
+    def off(self) -> Any:
+        """Value of a config's options where the annotation is off: the default; None for a dataclass."""
+        return self.options.default if isinstance(self.options, dataclasses.Field) else None
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

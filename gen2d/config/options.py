@@ -151,6 +151,12 @@ def build(cls: type, values: Any, where: str, source: str) -> Any:
     return cls(**filled)
 
 
+def drawn_options(options: Any) -> dict[str, Option]:
+    """Options of a dataclass, or of an instance of it, that are sampled for each video, by name."""
+    specs = {field.name: field.metadata["option"] for field in dataclasses.fields(options)}
+    return {name: spec for name, spec in specs.items() if spec.draw}
+
+
 def coordinates(name: str, value: Any) -> dict[str, Any]:
     """The scalar components of an option's value, by name: `radius`, or `velocity[0]` and `velocity[1]`."""
     return {f"{name}[{i}]": part for i, part in enumerate(value)} if isinstance(value, tuple) else {name: value}
@@ -158,5 +164,4 @@ def coordinates(name: str, value: Any) -> dict[str, Any]:
 
 def factor_options(family: Family) -> dict[str, Option]:
     """Options of a family that are factors, by name."""
-    specs = {field.name: field.metadata["option"] for field in dataclasses.fields(family.options)}
-    return {name: spec for name, spec in specs.items() if spec.draw}
+    return drawn_options(family.options)

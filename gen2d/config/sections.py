@@ -155,6 +155,7 @@ class SimulationAnnotations:
     energy: bool = option(False, bool, "", "energy balance and momentum in each frame")
     captions: bool = option(False, bool, "", "caption and list of events, as text; needs contacts")
     lyapunov: bool = option(False, bool, "", "growth rate of a small perturbation of the initial state")
+    classes: bool = option(False, bool, "", "class name of each object, such as ball or plank", later=True)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -79,3 +79,23 @@ def tracks_overlay(frame: VideoFields) -> np.ndarray:
                 if 0 <= row + down < image.shape[0] and 0 <= column + across < image.shape[1]:
                     image[row + down, column + across] = palette[number % 254 + 1]
     return image
+
+
+def height_overlay(frame: VideoFields) -> np.ndarray:
+    """Heights of a frame, from 0 to 1, as grey values."""
+    return _grey(255 * np.clip(frame["surface/height"].astype(np.float32), 0, 1))
+
+
+def normals_overlay(frame: VideoFields) -> np.ndarray:
+    """Normals of a frame: red to the right, green up, blue towards the viewer."""
+    return (frame["surface/normal"].astype(np.int16) + 128).astype(np.uint8)
+
+
+def shadow_overlay(frame: VideoFields) -> np.ndarray:
+    """Opacity of a frame's shadows as grey values."""
+    return _grey(frame["surface/shadow"])
+
+
+def _grey(values: np.ndarray) -> np.ndarray:
+    """Image [H, W, 3] of values [H, W] from 0 to 255."""
+    return np.repeat(values.astype(np.uint8)[..., None], 3, axis=-1)

@@ -291,13 +291,22 @@ def configs_of(
     """The dataset's config, and the config of the requested frames. Parameters and errors are those of `render`."""
     base = config_of(ds, (), trust)
     size = [f"video.{name}={value}" for name, value in (("height", height), ("width", width)) if value is not None]
-    config = load_config(base, [*overrides, *size, "storage.frames=video"])
+    config = load_config(_without_unneeded(base, fields), [*overrides, *size, "storage.frames=video"])
     changes: dict[str, Any] = {} if look is None else {"look": named(look)}
     if annotation_changes := _annotation_changes(fields, config.annotations):
         changes["annotations"] = config.annotations.plain() | annotation_changes
     if changes:
         config = load_config(config.plain() | changes, copies=config.copies)
     return base, config
+
+
+def _without_unneeded(config: Config, fields: Sequence[str] | None) -> Config:
+    """The config without those annotations that not every look can have and that none of these fields is of."""
+    requested, pixels = set(fields or ()), []
+    for plugin in config.annotations.pixels:
+        kept = not plugin.contract.needs or requested & plugin.contract.fields.keys()
+        pixels.append(plugin if kept else dataclasses.replace(plugin, options=plugin.contract.off))
+    return dataclasses.replace(config, annotations=dataclasses.replace(config.annotations, pixels=tuple(pixels)))
 
 
 def _annotation_changes(fields: Sequence[str] | None, section: Annotations) -> dict[str, Any]:

@@ -12,6 +12,7 @@ import numpy as np
 from gen2d import annotations
 from gen2d.config.annotations import Annotations
 from gen2d.config.config import Config
+from gen2d.config.options import drawn_options
 from gen2d.config.sections import ImageOptions
 from gen2d.core.errors import ConfigError
 from gen2d.media.backgrounds import crops
@@ -62,8 +63,13 @@ def plan_of(config: Config, layout: Layout) -> FramePlan:
 
 
 def paint_of(key: Array, config: Config, scene: Scene, layout: Layout) -> Paint:
-    """Paint of one video with this key."""
-    return config.look.contract.paint(scene, layout, config.look.options, key_for(key, "look"))
+    """Paint of one video with this key. Raises ConfigError if it lacks a part that the look declares."""
+    contract = config.look.contract
+    paint = contract.paint(scene, layout, config.look.options, key_for(key, "look"))
+    for part in contract.parts:
+        if getattr(paint, part, None) is None:
+            raise ConfigError(f"look {config.look.name} has {part!r} in Look.parts, but its paint has no {part}")
+    return paint
 
 
 def view_of(key: Array, config: Config, layout: Layout, states: State) -> CameraView:
@@ -209,6 +215,32 @@ def with_pictures(render_scenes: RenderScene, config: Config) -> RenderScene:
         pixels = jax.device_put(crops(digests, number, corner, extent, *size), picture.number.device)
     background = background._replace(picture=picture._replace(pixels=pixels))
     return render_scenes._replace(paint=render_scenes.paint._replace(background=background))
+
+
+def look_columns(paint: Paint, config: Config) -> dict[str, Array]:
+    """Values of the look's sampled options, by stored name.
+
+    Raises ConfigError if the look's paint has other values than its options declare.
+    """
+    declared, sampled = drawn_options(config.look.options), paint.sampled or {}
+    for name in sorted(declared.keys() ^ sampled.keys()):
+        verb = "samples" if name in declared else "does not declare"
+        raise ConfigError(
+            f"look {config.look.name} {verb} the option {name}, but Paint.sampled must hold just the options that it "
+            "samples: the result of sampled_options"
+        )
+    return {f"look/{name}": value for name, value in sampled.items()}
+
+
+def occluder_columns(occluders: Occluders | None, plan: FramePlan) -> dict[str, Array]:
+    """The occluders of a video, by stored name, if it has any."""
+    if occluders is None:
+        return {}
+    return {
+        "occluders/box": occluders.box,
+        "occluders/color": jnp.round(occluders.color).astype(jnp.uint8),
+        "occluders/depth": (occluders.rank + plan.layout.slots - plan.moving).astype(jnp.int16),
+    }
 
 
 def camera_columns(view: CameraView) -> dict[str, Array]:

@@ -244,9 +244,8 @@ def _with_annotations(config: Config, names: Collection[str]) -> Config:
     """The config with only those pixel annotations that have some of these fields."""
     pixels = []
     for plugin in config.annotations.pixels:
-        off = getattr(plugin.contract.options, "default", None)  # a dataclass of options has none
         wanted = plugin.contract.fields.keys() & names
-        pixels.append(plugin if wanted else dataclasses.replace(plugin, options=off))
+        pixels.append(plugin if wanted else dataclasses.replace(plugin, options=plugin.contract.off))
     return dataclasses.replace(config, annotations=dataclasses.replace(config.annotations, pixels=tuple(pixels)))
 
 

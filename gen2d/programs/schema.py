@@ -9,9 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from gen2d import annotations
-from gen2d.captions import caption
+from gen2d.captions import caption, facts
 from gen2d.config import quality
 from gen2d.config.config import Config
+from gen2d.config.options import drawn_options
 from gen2d.config.sections import ImageOptions
 from gen2d.core.enums import JOINT_KINDS
 from gen2d.core.palettes import NAME_BYTES, Palette, palette_of
@@ -25,6 +26,12 @@ from gen2d.renderers.plan import FramePlan
 from gen2d.sampling import rejection, sampler
 from gen2d.sampling.matched import sets
 
+FACTS = "objects/", "states/", "camera/", "world/", "contacts/", "joints/"  # what nouns depend on
+OCCLUDERS = {
+    "occluders/box": Field("float32", "n O 4", "px", "x0 y0 x1 y1 of each occluder, back to front; 0: none"),
+    "occluders/color": Field("uint8", "n O 3", "sRGB", "color of each occluder"),
+    "occluders/depth": Field("int16", "n O", "1", "objects whose objects/depth is below this are behind the occluder"),
+}
 FRAMES = Field("uint8", "n T H W 3", "sRGB", "frames of the video")
 CAMERA = (
     ("center", "n T 2", "m", "world point at the centre of the frame"),
@@ -50,6 +57,7 @@ class VideoSchema:
         sizes = {"T": video.frames, "K": self.layout.slots, "H": video.height, "W": video.width}
         sizes |= {"C": self.save_at.contacts} if self.save_at.contacts else {}
         sizes |= {"J": len(self.layout.joints)} if self.layout.joints else {}
+        sizes |= {"O": self._occluders} if self._occluders else {}
         corners = max(group.vertices for group in self.layout.groups)
         sizes |= {"V": corners} if corners else {}
         return annotations.sizes(self.config.annotations, self.plan, sizes | self.sampler.lengths)
@@ -123,6 +131,13 @@ class VideoSchema:
             longest = max(len(name) for names in found for name in names)
             fields["objects/material_name"] = Field(f"S{longest}", "n K", "", meaning)
         fields |= {f"image/{name}": self._sensor_field(name) for name in self._sensor_options}
+        for config in self._split_configs:
+            for name, spec in drawn_options(config.look.options).items():
+                fields[f"look/{name}"] = Field("float32", "n", spec.unit, f"{spec.meaning}; NaN: of another look")
+        fields |= OCCLUDERS if self._occluders else {}
+        if self.config.annotations.simulated.classes:
+            longest, meaning = max(map(len, facts.CLASSES)), "noun of the object; empty: none"
+            fields["objects/class_name"] = Field(f"S{longest}", "n K", "", meaning)
         captioned = self.config.annotations.simulated.captions
         return fields | (caption.fields(self.layout.slots, self.config.video.frames) if captioned else {})
 
@@ -142,6 +157,11 @@ class VideoSchema:
         """The configs of all splits; the config itself if there are no splits."""
         return [self.config.of_split(split.name) for split in self.config.splits] or [self.config]
 
+    @property
+    def _occluders(self) -> int:
+        """Largest number of occluders of a split."""
+        return max(config.image.occluders for config in self._split_configs)
+
     def host_columns(self, columns: dict[str, np.ndarray], split: str) -> dict[str, np.ndarray]:
         """Values of the host's fields for videos of one split, from their other fields [n, ...]."""
         count, config = len(columns["objects/present"]), self.config
@@ -160,11 +180,35 @@ class VideoSchema:
             host_columns |= {"objects/material": material, "objects/material_name": table[material]}
         for name in (f"image/{name}" for name in self._sensor_options):
             host_columns[name] = columns.get(name, np.zeros(count, np.float32))
+        host_columns |= self._padded_columns(columns)
+        if "objects/class_name" in self.host_fields:
+            host_columns["objects/class_name"] = self._class_names(columns)
         return host_columns | (
             caption.caption_fields(columns | host_columns, config.video, self.constants)
             if config.annotations.simulated.captions
             else {}
         )
+
+    def _padded_columns(self, columns: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+        """Values of the look and occluders; NaN and 0 for those that the look or the images of a split do not have."""
+        count, padded = len(columns["objects/present"]), {}
+        for name, field in self.host_fields.items():
+            if name.startswith("look/"):
+                padded[name] = columns.get(name, np.full(count, np.nan, np.float32))
+            elif name.startswith("occluders/"):
+                padded[name] = np.zeros((count, *field.shape(self.sizes)), field.dtype)
+                if name in columns:
+                    padded[name][:, : columns[name].shape[1]] = columns[name]
+        return padded
+
+    def _class_names(self, columns: dict[str, np.ndarray]) -> np.ndarray:
+        """Nouns [n, K] of the objects; empty where there is none."""
+        names = np.zeros(columns["objects/present"].shape, self.host_fields["objects/class_name"].dtype)
+        for row in range(len(names)):
+            video = {name: values[row] for name, values in columns.items() if name.startswith(FACTS)}
+            for slot, noun in facts.VideoFacts(video | self.constants, self.config.video).nouns.items():
+                names[row, slot] = noun.encode()
+        return names
 
 
 def materials_of(options: Any) -> tuple[str, ...]:

@@ -167,9 +167,11 @@ class Staging:
             key: Array, scene: Scene, states: State, between: State | None
         ) -> tuple[RenderScene, dict[str, Array]]:
             render_scene = render.render_scene(key, self.config, self.plan, scene, states, between=between)
-            colors = {"objects/color": render.painted_colors(render_scene.paint, scene)}
-            sensor = render.sensor_columns(render_scene.sensor)
-            return render_scene, colors | render.material_columns(render_scene.paint, scene) | sensor
+            columns = {"objects/color": render.painted_colors(render_scene.paint, scene)}
+            columns |= render.material_columns(render_scene.paint, scene)
+            columns |= render.look_columns(render_scene.paint, self.config)
+            columns |= render.sensor_columns(render_scene.sensor)
+            return render_scene, columns | render.occluder_columns(render_scene.occluders, self.plan)
 
         render_scenes, columns = jax.vmap(build)(wrapped(keys), scene, states, between)
         return StagedBatch(render_scenes, columns | render.camera_columns(render_scenes.instants.view))

@@ -5,7 +5,7 @@ The videos of a config are first generated without frames in a temporary folder,
 
 import contextlib
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,17 @@ from gen2d.loading.dataset import open as open_dataset
 from gen2d.media.contact_sheet import contact_sheet, resized, sheet_frames
 from gen2d.media.drawing import label
 from gen2d.media.images import check_folder, write, writing
-from gen2d.media.overlays import amodal_overlay, boxes_overlay, flow_overlay, masks_overlay, tracks_overlay
+from gen2d.media.overlays import (
+    VideoFields,
+    amodal_overlay,
+    boxes_overlay,
+    flow_overlay,
+    height_overlay,
+    masks_overlay,
+    normals_overlay,
+    shadow_overlay,
+    tracks_overlay,
+)
 from gen2d.programs.recipe import config_of
 from gen2d.programs.redraw import render
 from gen2d.storage.sealed import sha256
@@ -145,13 +155,20 @@ def _annotation_rows(ds: Dataset, numbers: Sequence[int], overrides: Sequence[st
     overrides = [*overrides, f"annotations.tracks={TRACKS}"]
     fields = ["masks/instance", "masks/amodal", "boxes/visible", "boxes/amodal", "flow/forward", "tracks/points"]
     fields += ["tracks/visible", "frames"]
-    batch = render(ds, numbers, look="flat", overrides=overrides, fields=fields, trust=trust)
+    yield from _overlaid(render(ds, numbers, look="flat", overrides=overrides, fields=fields, trust=trust), OVERLAYS)
+    fields = ["surface/height", "surface/normal", "surface/shadow", "frames"]
+    yield from _overlaid(render(ds, numbers, look="studio", overrides=overrides, fields=fields, trust=trust), SURFACES)
+
+
+def _overlaid(batch: Mapping[str, Any], overlays: Mapping[str, Callable[[VideoFields], np.ndarray]]) -> Rows:
+    """Names of overlays, and frames [n, T, H, W, 3] of rendered fields that show them."""
     times = sheet_frames(batch["frames"].shape[1])
     columns = {name: np.asarray(array[:, times]) for name, array in batch.items()}
-    fastest = np.abs(columns["flow/forward"].astype(np.float32)).max()
-    columns["flow/forward"] = columns["flow/forward"] / max(fastest, 1e-3)
+    for name in columns.keys() & {"flow/forward", "surface/height"}:  # in parts of the largest value
+        largest = np.abs(columns[name].astype(np.float32)).max()
+        columns[name] = columns[name] / max(largest, 1e-3)
     videos, frames = columns["frames"].shape[:2]
-    for name, overlay in OVERLAYS.items():
+    for name, overlay in overlays.items():
         drawn = [
             [overlay({field: array[video, t] for field, array in columns.items()}) for t in range(frames)]
             for video in range(videos)
@@ -159,6 +176,7 @@ def _annotation_rows(ds: Dataset, numbers: Sequence[int], overrides: Sequence[st
         yield name, np.array(drawn)
 
 
+SURFACES = {"depth": height_overlay, "normals": normals_overlay, "shadow": shadow_overlay}
 OVERLAYS = {
     "masks": masks_overlay,
     "amodal": amodal_overlay,

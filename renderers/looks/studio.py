@@ -29,6 +29,7 @@ from gen2d.plugin import (
     option,
     palette_option,
     plain,
+    sampled_options,
 )
 
 LIFT = 0.3  # height of the bodies above the background, over the size of a typical one
@@ -72,6 +73,10 @@ class Options(PlainOptions):
         ("rubber",), str, "", "material of the objects; from a list, one for each object", choices=(*MATERIALS,),
         several=True,
     )  # fmt: skip
+    material_by: str = option(
+        "random", str, "", "whether materials are random, or in equal parts of an object's property from 0 to 1",
+        choices=("random", "elasticity", "friction"), later=True,
+    )  # fmt: skip
     stripe: float = option(0.22, float, "1", "half width of the stripe of rubber discs, over the radius", low=0, high=1)
     azimuth: Distribution = option(
         2.1, float, "rad", "direction of the light, counter-clockwise from the right",
@@ -114,14 +119,12 @@ def paint(scene: Scene, layout: Layout, options: Options, key: Array) -> Paint:
     """Paint of one video; static objects are of the first material, without a stripe."""
     base = plain(scene, layout, options, key)
     light_key, material_key, seed_key = jax.random.split(jax.random.fold_in(key, 4), 3)
-    names = ("azimuth", "elevation", "softness", "ambient", "gloss", "shadow")
-    keys = jax.random.split(light_key, len(names))
-    drawn = {name: getattr(options, name).sample(k, ()) for name, k in zip(names, keys, strict=True)}
+    drawn = sampled_options(options, light_key)
     flat, high = jnp.cos(drawn["elevation"]), jnp.sin(drawn["elevation"])
     direction = jnp.stack([flat * jnp.cos(drawn["azimuth"]), flat * jnp.sin(drawn["azimuth"]), high])
     light = Light(direction, drawn["softness"], drawn["ambient"], jnp.asarray(WHITE))
     moving = jnp.asarray(are_moving(layout))
-    material = _materials(options, moving, material_key)
+    material = _materials(options, scene, moving, material_key)
     gloss = drawn["gloss"] * material.gloss * jnp.where(are_lines(scene), 0.3, 1.0)
     flatter = are_lines(scene) | (scene.objects.shape == POLYGON)
     slope = material.slope * jnp.where(flatter, FLATTER, 1.0)
@@ -141,15 +144,20 @@ def paint(scene: Scene, layout: Layout, options: Options, key: Array) -> Paint:
     shadow = Shadow(offset, jnp.float32(1) * blur(options, layout), drawn["shadow"], jnp.asarray(DARK))
     number = material.number.astype(jnp.uint8)
     return base._replace(
-        background=_backdrop(base, layout, options, key), light=light, surface=surface, shadow=shadow, material=number
-    )
+        background=_backdrop(base, layout, options, key), light=light, surface=surface, shadow=shadow, material=number,
+        sampled=drawn,
+    )  # fmt: skip
 
 
-def _materials(options: Options, moving: Array, key: Array) -> Finish:
-    """Materials of the slots; arrays [K]."""
+def _materials(options: Options, scene: Scene, moving: Array, key: Array) -> Finish:
+    """Materials of the slots, at random or by a property of the objects; arrays [K]."""
     finishes = [MATERIALS[name]._replace(number=options.materials.index(name)) for name in options.material]
     table = np.asarray(finishes, np.float32)
-    chosen = jax.random.randint(key, moving.shape, 0, len(table))
+    if options.material_by == "random":
+        chosen = jax.random.randint(key, moving.shape, 0, len(table))
+    else:
+        share = jnp.clip(getattr(scene.objects, options.material_by), 0.0, 1.0)
+        chosen = jnp.minimum((share * len(table)).astype(jnp.int32), len(table) - 1)
     return Finish(*jnp.asarray(table)[jnp.where(moving, chosen, 0)].T)
 
 
@@ -161,4 +169,4 @@ def _backdrop(base: Paint, layout: Layout, options: Options, key: Array) -> Back
     return backdrop(named, layout, jax.random.fold_in(key, 1))
 
 
-LOOK = Look(options=Options, paint=paint, margin=line_margin, blur=blur)
+LOOK = Look(options=Options, paint=paint, margin=line_margin, blur=blur, parts=("surface", "shadow"))

@@ -24,7 +24,8 @@ from gen2d.records import scene as scene_module
 from gen2d.records.layout import Layout, SlotGroup
 from gen2d.renderers.primitives import BodyGeometry
 
-ALL = [f"annotations.{name}={plugins.load('annotation', name).usual}" for name in plugins.names("annotation")]
+CONTRACTS = {name: plugins.load("annotation", name) for name in plugins.names("annotation")}
+ALL = [f"annotations.{name}={contract.usual}" for name, contract in CONTRACTS.items() if not contract.needs]
 SMALL = [
     "storage.batch_size=4",
     "video.frames=12",

@@ -24,7 +24,7 @@ from gen2d.programs import render
 from gen2d.programs.rollout import Rollout
 
 ANNOTATED = [
-    *(f"annotations.{name}=true" for name in ("masks", "amodal", "boxes", "visibility", "flow")),
+    *(f"annotations.{name}=true" for name in ("masks", "amodal", "boxes", "centers", "visibility", "flow")),
     "annotations.tracks=3",
 ]
 CAMERAS = {
@@ -117,10 +117,8 @@ def fields(case: Case) -> tuple[list[tuple[dict[str, np.ndarray], View]], list[d
     look, rendered = config.look.options, []
     for v in range(case.videos):
         occluders = ()
-        if batch.render_scenes.occluders is not None:  # a dataset does not store them
-            boxes, colors, ranks = (np.asarray(array)[v] for array in batch.render_scenes.occluders)
-            behind = ranks + rollout.layout.slots - rollout.plan.moving  # of a still camera's static slots, all
-            occluders = tuple(map(Occluder, boxes, colors, behind))
+        if config.image.occluders:
+            occluders = tuple(map(Occluder, *(columns[f"occluders/{name}"][v] for name in ("box", "color", "depth"))))
         background = look.grounds[0] if hasattr(look, "grounds") else (255, 255, 255)
         linear = config.image.blending == "linear"
         view = View(height, width, background, look.wall_width, linear, occluders)
@@ -448,6 +446,25 @@ def test_tracked_points_are_uniform_in_their_objects(rendered):
                 within += [*(away / radius) ** 2]  # share of the area that is nearer to the centre
     if within:
         assert abs(np.mean(within) - 0.5) < 5 / np.sqrt(12 * len(within))
+
+
+def test_centres_are_the_places_of_the_objects_and_are_seen_where_the_mask_shows_them(rendered):
+    worst = 0.0
+    for one, frame in each_frame(rendered):
+        points, seen = (one.video[f"centers/{name}"][frame.number] for name in ("points", "visible"))
+        for slot in range(one.slots):
+            if slot not in drawn(one):
+                assert not points[slot].any()
+                assert not seen[slot]
+                continue
+            place = reference.double(one.video["states/position"][frame.number, slot])
+            expected = reference.to_pixels(one.video, frame.number, place, one.view)
+            worst = max(worst, np.abs(points[slot] - expected).max())
+            column, row = np.floor(points[slot]).astype(int)
+            inside = 0 <= row < one.view.height and 0 <= column < one.view.width
+            assert seen[slot] == (inside and frame.mask[row, column] == slot + 1)
+    print(f"centres: {worst:.1e} px")
+    assert worst <= 2e-4
 
 
 SIZE, WINDOW = 4096, 64  # px

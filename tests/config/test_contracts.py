@@ -20,7 +20,10 @@ IN_A_CONFIG = [(kind, name) for kind, name in ALL if kind != "export"]
 
 def asking(kind: str, name: str) -> dict[str, Any]:
     """A config that asks for a plug-in."""
-    return {"annotations": {name: plugins.load(kind, name).usual}} if kind == "annotation" else {kind: name}
+    if kind != "annotation":
+        return {kind: name}
+    contract = plugins.load(kind, name)
+    return {"annotations": {name: contract.usual}} | ({"look": "studio"} if contract.needs else {})
 
 
 @pytest.mark.parametrize(("kind", "name"), ALL)

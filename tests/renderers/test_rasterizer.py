@@ -410,7 +410,7 @@ def test_noise_is_as_strong_as_asked_and_another_in_each_frame():
     some = stages(plan, 4, 3, noise=6.0)
     some = some._replace(
         paint=some.paint._replace(drawn=np.zeros((4, 1), bool), background=Background(jnp.full((4, 3), 100.0))),
-        sensor=Sensor(noise=np.asarray([6, 6, 6, 0.8], np.float32)),
+        sensor=Sensor(noise=jnp.float32([6, 6, 6, 0.8])),
         seed=np.asarray([1, 1, 2, 3], np.uint32),
     )
     noise = np.asarray(PATCHES(some, plan)[0]).astype(float) - 100

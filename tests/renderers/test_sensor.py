@@ -32,12 +32,14 @@ def recorded(frames, seed=0, **numbers) -> np.ndarray:
     """One video's frames [T, H, W, 3] as a sensor of these numbers records them."""
     sensor = Sensor(**{name: jnp.float32([value]) for name, value in numbers.items()})
     frames = jnp.asarray(np.asarray(frames, np.uint8))[None]
-    return np.asarray(sensor_module.record(sensor, jnp.uint32([seed]), frames, None, *frames.shape[2:4])[0][0])
+    new, _ = sensor_module.record(sensor, jnp.uint32([seed]), frames, None, *frames.shape[2:4])
+    assert new is not None, "frames are given"
+    return np.asarray(new[0])
 
 
 def light(frames) -> np.ndarray:
     """Linear light of frames, in float64."""
-    return np.asarray(to_linear(np.asarray(frames, np.float64)), np.float64)
+    return np.asarray(to_linear(jnp.asarray(frames, float)), np.float64)
 
 
 def grey(value=GREY, frames=1) -> np.ndarray:
@@ -114,7 +116,7 @@ def test_distorted_frames_show_nothing_from_beyond_the_frame_and_touch_its_borde
     else:
         assert_allclose(row[0, 32], 0.5, atol=0.1)
     drawn = np.stack([column, row], -1).astype(np.float32)  # and points are distorted as pixels are
-    there = np.asarray(sensor_module.distorted_points(drawn, jnp.float32(distortion), height, width))
+    there = np.asarray(sensor_module.distorted_points(jnp.asarray(drawn), jnp.float32(distortion), height, width))
     centers = np.stack(np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), -1)
     assert_allclose(there, centers, atol=2e-3)
 
@@ -194,7 +196,9 @@ def exact_round_trip(image, quality) -> np.ndarray:
         blocks = plane.reshape(len(plane) // 8, 8, -1, 8).swapaxes(1, 2)
         sizes = np.round(dctn(blocks, axes=(2, 3), norm="ortho") / divisors) * divisors
         plane[:] = (
-            np.clip(np.round(idctn(sizes, axes=(2, 3), norm="ortho")), -128, 127).swapaxes(1, 2).reshape(plane.shape)
+            np.clip(np.round(np.asarray(idctn(sizes, axes=(2, 3), norm="ortho"))), -128, 127)
+            .swapaxes(1, 2)
+            .reshape(plane.shape)
         )
     rgb = (planes + np.array([128, 0, 0])) @ np.linalg.inv(to_ycc).T
     return np.clip(np.round(rgb), 0, 255)[:height, :width]

@@ -1,6 +1,7 @@
 """Studio: lit frames are those of a supersampled reference in float64, in both forms; shadows own no pixel."""
 
 import functools
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -11,9 +12,12 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from gen2d.config.config import load_config
 from gen2d.core.enums import CIRCLE, POLYGON
+from gen2d.core.errors import ConfigError
 from gen2d.programs import render
+from gen2d.programs.rollout import Rollout
 from gen2d.records.layout import Layout
 from gen2d.renderers import rasterizer
+from gen2d.renderers.looks import studio
 from gen2d.sampling import builder
 
 TILES, DENSE = (jax.jit(form, static_argnums=1) for form in (rasterizer.draw_tiles, rasterizer.draw_dense))
@@ -283,6 +287,17 @@ def test_defaults_are_those_of_the_page():
     assert options.material == ("rubber",)
 
 
+def test_materials_are_those_of_the_page():
+    found = {name: (m.slope, m.gloss, m.sharpness) for name, m in studio.MATERIALS.items()}
+    assert found == {
+        "rubber": (0.95, 0.8, 25),
+        "wood": (0.9, 0.15, 12),
+        "metal": (0.95, 2.2, 100),
+        "paper": (0.3, 0, 10),
+    }
+    assert (studio.MATERIALS["metal"].mirror, studio.FLATTER) == (0.85, 0.6)
+
+
 def test_light_and_materials_are_drawn_from_distributions():
     look = {"name": "studio", "azimuth": [0, 6], "elevation": [0.4, 1.2], "material": ["wood", "metal", "rubber"]}
     config, (scene, plan, _) = load_config({"look": look}), staged((), 88)
@@ -301,3 +316,101 @@ def test_light_and_materials_are_drawn_from_distributions():
     assert len(np.unique(surface.sharpness[:, ~moving])) == 1
     one = render.paint_of(keys[0], config, scene, plan.layout)
     jax.tree.map(lambda a, b: assert_array_equal(a, b[0]), one, paint)
+
+
+def rolled(*overrides, videos=4) -> Any:
+    """Fields by name, and stages, of the first videos of a config in the look `studio`."""
+    video = ["video.frames=2", "video.height=24", "video.width=24", f"storage.batch_size={videos}"]
+    rollout = Rollout(load_config("bouncing.yaml", ["look=studio", *video, *overrides]), jax.devices()[:1])
+    (batch,) = rollout.start("train", np.arange(videos))
+    columns = rollout.host_columns([batch])[0]
+    return columns | rollout.schema.host_columns(columns, "train"), batch.render_scenes, rollout.schema
+
+
+def test_the_light_and_the_materials_of_each_video_are_stored():
+    drawn = ("look.azimuth=[0,3]", "look.elevation=[0.4,1.2]", "look.shadow=[0.2,0.5]")
+    material = ("look.material=[paper,wood,metal]", "look.material_by=elasticity")
+    columns, stages, schema = rolled(*drawn, *material, "scene.elasticity=[0,1]", videos=8)
+    x, y, z = np.asarray(stages.paint.light.direction, float).T
+    assert_allclose(columns["look/azimuth"], np.arctan2(y, x), atol=1e-6)
+    assert_allclose(columns["look/elevation"], np.arcsin(z), atol=1e-6)
+    for name, used in (("shadow", stages.paint.shadow.opacity), ("ambient", stages.paint.light.ambient)):
+        assert_array_equal(columns[f"look/{name}"], used)
+    assert len(np.unique(columns["look/azimuth"])) == 8
+    assert {name for name in schema.fields if name.startswith("look/")} == {
+        f"look/{name}" for name in ("azimuth", "elevation", "softness", "ambient", "gloss", "shadow")
+    }
+    present = columns["objects/present"] & np.isfinite(columns["objects/mass"])
+    third = np.minimum(columns["objects/elasticity"] * 3, 2).astype(int)
+    expected = np.array([b"paper", b"wood", b"metal"])[third]
+    assert_array_equal(columns["objects/material_name"][present], expected[present])
+    assert len(np.unique(expected[present])) == 3
+
+
+def test_what_the_look_or_the_images_of_a_split_lack_is_stored_as_nothing():
+    splits = {"train": {}, "test": {"look": "flat", "image": {"occluders": 1}}}
+    config = load_config({"look": "studio", "video": {"frames": 2}, "image": {"occluders": 2}, "splits": splits})
+    schema = Rollout(config, jax.devices()[:1]).schema
+    assert schema.fields["occluders/box"].shape(schema.sizes) == (2, 4)
+    objects = {"objects/present": np.ones((3, 4), bool), "objects/color": np.zeros((3, 4, 3), np.uint8)}
+    box = np.ones((3, 1, 4), np.float32)
+    host = schema.host_columns({**objects, "occluders/box": box}, "test")
+    assert np.isnan(host["look/azimuth"]).all()
+    assert_array_equal(host["occluders/box"], np.concatenate([box, 0 * box], 1))
+    assert not host["occluders/color"].any()
+
+
+def test_occluders_are_stored_with_the_objects_behind_them():
+    columns, stages, _ = rolled("image.occluders=3", "image.occluder_front=[0,1]", "scene.balls=6")
+    assert_array_equal(columns["occluders/box"], stages.occluders.box)
+    moving = np.isfinite(columns["objects/mass"])
+    behind = columns["objects/depth"][:, None] < columns["occluders/depth"][..., None]
+    assert_array_equal((behind & moving[:, None]).sum(-1), stages.occluders.rank)
+    assert behind[:, :, ~moving[0]].all()
+    assert len(np.unique(stages.occluders.rank)) > 3
+
+
+def test_class_names_are_the_nouns_of_the_objects():
+    columns, _, schema = rolled("annotations.classes=true", "scene.balls=[1,3]")
+    moving = np.isfinite(columns["objects/mass"])
+    names = np.where(moving, b"ball", b"wall").astype(schema.fields["objects/class_name"].dtype)
+    assert_array_equal(columns["objects/class_name"], np.where(columns["objects/present"], names, b""))
+    assert not columns["objects/present"].all()
+
+
+def test_a_look_that_samples_an_option_without_saying_so_is_one_sentence(tmp_path):
+    path = tmp_path / "bright.py"
+    path.write_text(SILENT)
+    config = load_config({"look": str(path), "video": {"frames": 2}})
+    with pytest.raises(ConfigError, match=r"samples the option level, but Paint\.sampled must hold") as error:
+        Rollout(config, jax.devices()[:1]).start("train", np.arange(512))
+    assert "\n" not in str(error.value)
+
+
+def test_a_look_whose_paint_lacks_a_part_that_it_declares_is_one_sentence(tmp_path):
+    path = tmp_path / "bright.py"
+    path.write_text(SILENT.replace("margin=line_margin)", 'margin=line_margin, parts=("surface",))'))
+    config = load_config({"look": str(path), "video": {"frames": 2}})
+    with pytest.raises(ConfigError, match=r"has 'surface' in Look\.parts, but its paint has no surface"):
+        Rollout(config, jax.devices()[:1]).start("train", np.arange(512))
+
+
+SILENT = '''"""Grey objects."""
+
+import dataclasses
+
+from gen2d.plugin import Distribution, Look, PlainOptions, line_margin, option, plain
+
+
+@dataclasses.dataclass(frozen=True)
+class Options(PlainOptions):
+    level: Distribution = option([0, 255], float, "sRGB", "level of all objects", low=0, high=255, draw=True)
+
+
+def paint(scene, layout, options, key):
+    base = plain(scene, layout, options, key)
+    return base._replace(color=0 * base.color + options.level.sample(key, ()))
+
+
+LOOK = Look(options=Options, paint=paint, margin=line_margin)
+'''

@@ -2,8 +2,8 @@
 
 It imports nothing of gen2d and shares no method with it. The definitions are those of docs/frames.md and of the
 fields (`meaning` in a dataset's manifest). A video is a mapping from stored names to the arrays of one video, without
-the axis n. What a dataset does not store, the colour of the background, the line width of segments and the places of
-occluders, is passed as a `View`.
+the axis n. What a dataset does not store, the colour of the background and the line width of segments, is passed as a
+`View`, and so are the occluders.
 
 Outlines are polygons whose sides are at most 1e-5 px from the true outline, so coverages are accurate to about 2e-5.
 """
@@ -342,6 +342,38 @@ def moved(video: Video, t: int, to: int, id_: int, pixels: Array, view: View) ->
     if id_:
         world = from_body(video, to, id_ - 1, to_body(video, t, id_ - 1, world))
     return to_pixels(video, to, world, view)
+
+
+class Relief(NamedTuple):
+    """What of the surfaces of objects is not stored."""
+
+    slope: Array  # K, sine of the steepest tilt, at the rim
+    bevel: Array  # K, m, width of the sloping border of polygons
+
+
+def profile(shape: Outline, polygon: bool, points: Array, width: float) -> Array:
+    """Distance [N] px from where a surface is level, over the width that slopes: 1 at the rim, and beyond it."""
+    if not polygon:
+        return np.minimum(distance(shape.core, points) / width, 1)
+    along = np.roll(shape.core, -1, axis=0) - shape.core
+    kept = np.linalg.norm(along, axis=-1) > 1e-9
+    along, corner = along[kept] / np.linalg.norm(along[kept], axis=-1, keepdims=True), shape.core[kept]
+    from_corner = points[:, None] - corner
+    offside = np.abs(along[:, 0] * from_corner[..., 1] - along[:, 1] * from_corner[..., 0]).min(-1)
+    inside = offside * (distance(shape.core, points) == 0) + shape.radius - distance(shape.core, points)
+    return np.clip(1 - inside / width, 0, 1)
+
+
+def height(video: Video, t: int, slot: int, points: Array, relief: Relief, view: View) -> Array:
+    """Height [N] px of an object's surface above its rim, at pixel positions [N, 2]: a cap of a sphere.
+
+    The sphere's radius is such that the cap is as steep at its rim as the surface is.
+    """
+    shape, polygon = outline(video, t, slot, view), video["objects/shape"][slot] == POLYGON
+    bevel = max(float(relief.bevel[slot]) * float(video["camera/scale"][t]), 1.0)
+    width, slope = bevel if polygon else max(shape.radius, 0.5), float(relief.slope[slot])
+    sphere, away = width / slope, width * profile(shape, bool(polygon), points, width)
+    return np.sqrt(sphere**2 - away**2) - math.sqrt(sphere**2 - width**2)
 
 
 def flow(video: Video, t: int, to: int, mask: Array, view: View) -> Array:
