@@ -13,7 +13,7 @@ from gen2d.plugin import Annotation, Array, Background, Field, FramePlan, Paint,
 def annotate(scenes: RenderScene, owners: Array | None, plan: FramePlan, on: bool) -> dict[str, Array]:
     """Opacities of shadows, 0 to 255."""
     bare = dataclasses.replace(plan, frames=True, owners=False, exposed=0, linear=False)
-    masked = scenes._replace(paint=_white_shadow(scenes.paint), exposed=None, noise=None)
+    masked = scenes._replace(paint=_white_shadow(scenes.paint), exposed=None, sensor=None)
     if masked.occluders is not None:
         masked = masked._replace(occluders=masked.occluders._replace(color=jnp.zeros_like(masked.occluders.color)))
     image, _ = draw(masked, bare)
