@@ -22,7 +22,7 @@ def resolved(config: Config) -> dict[str, Any]:
         plain[section] = _filled(plain[section], fields)
     for plugin in config.annotations.wanted:
         if dataclasses.is_dataclass(plugin.contract.options):
-            fields = _fields(plugin.contract.options)  # pyright: ignore[reportArgumentType]
+            fields = fields_of(plugin.contract.options)  # pyright: ignore[reportArgumentType]
             plain["annotations"][plugin.name] = _filled(plain["annotations"][plugin.name], fields)
     return plain
 
@@ -56,17 +56,18 @@ def _with_comment(text: str, spec: Option | None) -> list[str]:
 
 def _sections(config: Config) -> dict[str, Fields]:
     """Fields of the options of each section, by section and name."""
-    plugs = {kind: _fields(getattr(config, kind).contract.options) for kind in DEFAULT_PLUGINS}
+    plugs = {kind: fields_of(getattr(config, kind).contract.options) for kind in DEFAULT_PLUGINS}
     pixels = {
         plugin.name: plugin.contract.options
         for plugin in config.annotations.pixels
         if isinstance(plugin.contract.options, dataclasses.Field)
     }
-    sections: dict[str, Fields] = {section: _fields(options) for section, options in SECTIONS.items()}
-    return {**sections, **plugs, "annotations": {**_fields(SimulationAnnotations), **pixels}}
+    sections: dict[str, Fields] = {section: fields_of(options) for section, options in SECTIONS.items()}
+    return {**sections, **plugs, "annotations": {**fields_of(SimulationAnnotations), **pixels}}
 
 
-def _fields(options: type) -> dict[str, dataclasses.Field[Any]]:
+def fields_of(options: type) -> dict[str, dataclasses.Field[Any]]:
+    """Fields of a class of options, by name."""
     return {field.name: field for field in dataclasses.fields(options)}
 
 

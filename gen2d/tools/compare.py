@@ -13,7 +13,8 @@ from gen2d.config.config import DEFAULT_PLUGINS, SECTIONS, load_config
 from gen2d.config.distribution_syntax import COMPOSED, KINDS
 from gen2d.config.options import plain_value
 from gen2d.config.reading import YAML_BYTES, parse_yaml
-from gen2d.config.resolved import resolved
+from gen2d.config.resolved import fields_of, resolved
+from gen2d.config.sections import SimulationAnnotations
 from gen2d.core.errors import one_line
 from gen2d.dataset.manifest import Manifest, read_manifest
 from gen2d.storage.paths import Url, place
@@ -86,9 +87,9 @@ def _describe(source: str, network: Network) -> _Description:
 def _describe_dataset(manifest: Manifest) -> _Description:
     options = {**manifest.config, "seed": manifest.seed}
     for section, values in options.items():
-        fields = _declared(section, values)
-        if fields:
-            options[section] = {**{f.name: plain_value(f.default) for f in fields}, **values}
+        declared = _declared(section, values)
+        if declared:
+            options[section] = {**{name: plain_value(field.default) for name, field in declared.items()}, **values}
     fields = {name: f"{f.dtype} [{f.axes}] {f.unit}".rstrip() for name, f in manifest.fields.items()}
     producer = {key: value for key, value in manifest.producer.items() if isinstance(value, str)}
     machine = {key: value for key, value in manifest.fingerprint.items() if key not in ("programs", *producer)}
@@ -108,15 +109,19 @@ def _describe_dataset(manifest: Manifest) -> _Description:
     )
 
 
-def _declared(section: str, values: Any) -> tuple[dataclasses.Field[Any], ...]:
-    """Fields of a stored section's options, whose defaults it may lack; none for a user's own plug-in."""
+def _declared(section: str, values: Any) -> Mapping[str, dataclasses.Field[Any]]:
+    """Fields of a stored section's options by name, whose defaults it may lack; none of a user's own plug-in."""
     if not isinstance(values, Mapping):
-        return ()
+        return {}
     if section in SECTIONS:
-        return dataclasses.fields(SECTIONS[section])
+        return fields_of(SECTIONS[section])
+    if section == "annotations":
+        pixels = {name: plugins.load("annotation", name).options for name in plugins.names("annotation")}
+        single = {name: field for name, field in pixels.items() if isinstance(field, dataclasses.Field)}
+        return {**fields_of(SimulationAnnotations), **single}
     if section in DEFAULT_PLUGINS and (name := values.get("name")) in plugins.names(section):
-        return dataclasses.fields(plugins.load(section, str(name)).options)
-    return ()
+        return fields_of(plugins.load(section, str(name)).options)
+    return {}
 
 
 def _mapping(value: Any) -> Mapping[str, Any]:
