@@ -48,7 +48,7 @@ def ends(video: Video, number: int, half: float) -> np.ndarray:
 def test_a_bob_on_a_rod_that_strikes_a_wall_gains_no_energy():
     """The rod is nearly perpendicular to the wall when the bob strikes, so it takes nearly all of each impact."""
     space, gravity = Space(gravity=(0, -9.81)), 9.81
-    space.add_segment((2.2, -5), (2.2, 5), friction=0.0)
+    space.add_segment((2.2, -5), (2.2, 5), elasticity=1.0, friction=0.0)
     bob = space.add_circle((2 * np.cos(1), 2 * np.sin(1)), 0.3, elasticity=0.8, friction=0.0)
     space.add_joint("distance", bob, anchor_b=(0, 0))
     video = space.simulate(4, fps=60, contacts=0)

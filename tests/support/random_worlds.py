@@ -25,7 +25,7 @@ from gen2d.records.trajectory import Contacts
 HALF, SIDES = 5.0, 4  # m: half the side of the box; its number of walls
 GRAVITY = 9.81  # m/s^2
 FRAMES = 361  # 1.5 s
-ROWS = 4000  # of contacts in a world
+ROWS = 8000  # of contacts in a world
 MIXING = {
     "product": np.multiply,
     "mean": lambda a, b: (a + b) / 2,
