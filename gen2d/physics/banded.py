@@ -38,6 +38,23 @@ def factor(bands: list[Array]) -> BandFactors:
     return jax.lax.scan(row, start, bands, unroll=UNROLL)[1]
 
 
+def inverse_band(factors: BandFactors) -> list[Array]:
+    """Diagonals [R, ...] of the inverse of L D L^T, as many as the factors have, the main one first.
+
+    Source: K. Takahashi, J. Fagan and M.-S. Chin (1973): the band of the inverse needs no entry outside it.
+    """
+    ahead, zero = len(factors.below), jnp.zeros_like(factors.inverse[0])
+
+    def row(later: list[list[Array]], of: BandFactors) -> tuple[list[list[Array]], list[Array]]:
+        """Entries of the inverse at the next rows, and this row's."""
+        beyond = [-sum((f * x for f, x in zip(of.below, column, strict=True)), zero) for column in later]
+        own = [of.inverse - sum((f * x for f, x in zip(of.below, beyond, strict=True)), zero), *beyond]
+        rows = [own, *([x, *older] for x, older in zip(beyond, later, strict=True))]
+        return [entries[:ahead] for entries in rows[:ahead]], own
+
+    return jax.lax.scan(row, [[zero] * ahead] * ahead, factors, reverse=True, unroll=UNROLL)[1]
+
+
 def solve_factored(factors: BandFactors, b: Array) -> Array:
     """Solution x [R, ...] of L D L^T x = b."""
     start = [jnp.zeros_like(b[0])] * len(factors.below)

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from gen2d.physics.collision import FAR, ManifoldPoint, dot, perpendicular
 from gen2d.physics.params import SolverParams
 from gen2d.physics.segment_lines import Neighbours
+from gen2d.physics.symmetric import product
 from gen2d.records.axes import Array
 
 
@@ -61,6 +62,8 @@ class ContactConstraint(NamedTuple):
     frame: ContactFrame | None  # of two discs, or a disc on a static body at rest; else it changes from step to step
     static: bool  # against a static or kinematic body: twice as stiff
     neighbours: Neighbours | None = None  # of a static segment
+    taken_a: Array | None = None  # [6, pairs, ...] what rigid joints take from the inverse mass (jointed.py)
+    taken_b: Array | None = None
 
 
 class CoreOffset(NamedTuple):
@@ -172,11 +175,20 @@ def apply_impulse(
     parts = [p * d for p, d in zip(impulse, directions, strict=True) if p is not None]
     linear = sum(parts[1:], parts[0])
     angular = _angular((frame.normal_b, frame.tangent_b), impulse)
-    b = Motion(b.velocity + constraint.b.mass * linear, b.spin + constraint.b.moment * angular)
+    b = _pushed(b, constraint.b, constraint.taken_b, linear, angular)
     if constraint.a is None or a is None:
         return a, b
     angular = _angular((frame.normal_a, frame.tangent_a), impulse)
-    return Motion(a.velocity - constraint.a.mass * linear, a.spin - constraint.a.moment * angular), b
+    return _pushed(a, constraint.a, constraint.taken_a, -linear, -angular), b
+
+
+def _pushed(motion: Motion, inverse: Inertia, taken: Array | None, linear: Array, angular: Array | float) -> Motion:
+    """Motion after an impulse, N s [2, ...] and N m s."""
+    new = Motion(motion.velocity + inverse.mass * linear, motion.spin + inverse.moment * angular)
+    if taken is None:
+        return new
+    velocity, spin = product(taken, (linear, None if isinstance(angular, float) else angular))
+    return Motion(new.velocity - velocity, new.spin - spin)
 
 
 def impulse_change(new: Impulse, old: Impulse) -> Impulse:

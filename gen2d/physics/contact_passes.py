@@ -29,9 +29,10 @@ from gen2d.physics.contact_points import (
     impact_times,
 )
 from gen2d.physics.contact_state import BodySide, PassSetup, SolvedPair, WarmStart
-from gen2d.physics.energy import add_disc_dissipation, add_dissipation
+from gen2d.physics.energy import MotionPair, add_disc_dissipation, add_dissipation
 from gen2d.physics.friction import apply_angular_impulse, friction_impulse, rolling_impulse
 from gen2d.physics.impact_order import after_impact, in_order, later_impact, takes_part, with_first
+from gen2d.physics.jointed import free_motion, jointed_frame, with_change, with_joints
 from gen2d.physics.normal_impulse import (
     NormalTarget,
     TargetOf,
@@ -128,14 +129,14 @@ def _apply_pass(
 ) -> tuple[BodySide, BodySide, SolvedPair]:
     """Both sides and the pair after normal impulses, friction and rolling resistance."""
     assert b.motion is not None, "only static bodies lack a motion"
-    before, roll, impulses = (a.motion, b.motion), pair.roll, []
+    before, roll, impulses, jointed = (a.motion, b.motion), pair.roll, [], b.change is not None
     speeds, slips = zip(*(relative_speed(c.frame, c.normal, *before) for c in pair.contacts), strict=True)
     seen = _seen_pair(constraint, pair, target_of, list(speeds), a, b)
     targets = seen.targets
     normals = materialize(solve_normals(constraint, seen.contacts, seen.speeds, pair.impulses, targets, seen.taken))
     if seen.supported is not None:
         a, b = _with_pushes(seen, pair, normals, a, b)
-    if constraint.frame is not None and roll is None:
+    if constraint.frame is not None and roll is None and not jointed:
         # The normal impulse between two discs adds no slip, so both impulses follow from the same velocities.
         (contact,), (old,), (normal,), (target,) = pair.contacts, pair.impulses, normals, targets
         (speed,), (slip,) = speeds, slips
@@ -161,9 +162,29 @@ def _apply_pass(
             motions = apply_angular_impulse(constraint, roll - pair.roll, *motions)
         changes = [impulse_change(new, old) for new, old in zip(impulses, pair.impulses, strict=True)]
         twist = None if roll is None or pair.roll is None else roll - pair.roll
-        work = add_dissipation(b.work, constraint, pair.contacts, changes, twist, before, motions)
+        free = before, motions
+        if jointed:
+            free = _free_motions(constraint, pair.contacts, changes, twist, a, b)
+            a, b = (with_change(*of) for of in zip((a, b), motions, free[1], strict=True))
+        work = add_dissipation(b.work, constraint, pair.contacts, changes, twist, *free)
     solved = SolvedPair(pair.contacts, impulses, roll)
     return a._replace(motion=motions[0]), b._replace(motion=motions[1], work=work), solved
+
+
+def _free_motions(
+    constraint: ContactConstraint,
+    contacts: list[ActiveContact],
+    changes: list[Impulse],
+    twist: Array | None,
+    a: BodySide,
+    b: BodySide,
+) -> tuple[MotionPair, MotionPair]:
+    """Motions before and after the impulses, without what the joints take from them."""
+    constraint = constraint._replace(taken_a=None, taken_b=None)
+    before = after = free_motion(a), free_motion(b)
+    for contact, change in zip(contacts, changes, strict=True):
+        after = apply_impulse(constraint, contact, change, *after)
+    return before, after if twist is None else apply_angular_impulse(constraint, twist, *after)
 
 
 def warm_start(
@@ -223,16 +244,22 @@ def _update_drift(old: BodySide, new: BodySide, time: Array, push: Array | None)
     assert old.motion, "only moving bodies drift"
     assert new.motion, "only moving bodies drift"
     assert old.drift, "only moving bodies drift"
-    velocity = old.drift.velocity - time * (new.motion.velocity - old.motion.velocity)
-    spin = old.drift.spin - time * (new.motion.spin - old.motion.spin)
-    return new._replace(drift=Motion(velocity, spin), push=new.push if push is None else jnp.maximum(new.push, push))
+    new = new._replace(drift=_less(old.drift, time, new.motion, old.motion))
+    if old.late is not None and new.change is not None and old.change is not None:
+        new = new._replace(late=_less(old.late, time, new.change, old.change))
+    return new._replace(push=new.push if push is None else jnp.maximum(new.push, push))
+
+
+def _less(drift: Motion, time: Array, new: Motion, old: Motion) -> Motion:
+    """Drift reduced by the time of an impulse times a change of motion."""
+    return Motion(drift.velocity - time * (new.velocity - old.velocity), drift.spin - time * (new.spin - old.spin))
 
 
 def _with_shock(old: BodySide, new: BodySide, bounces: Array) -> BodySide:
     """The side with its change of velocity added to its shock where a contact bounces."""
-    if old.shock is None or old.motion is None or new.motion is None:
+    if old.shock is None:
         return new
-    of = zip(old.shock, old.motion, new.motion, strict=True)
+    of = zip(old.shock, free_motion(old), free_motion(new), strict=True)
     return new._replace(shock=Motion(*(shock + jnp.where(bounces, y - x, 0.0) for shock, x, y in of)))
 
 
@@ -263,6 +290,7 @@ def solve(
     params: SolverParams,
 ) -> tuple[BodySide, BodySide, SolvedPair]:
     """Both sides and the pair after the biased solve, bounces included."""
+    constraint = with_joints(constraint, a, b)
     taus = impact_times(points, a, b, setup, params.step)
     if takes_part(points, b):
         taus = [in_order(points[0], taus[0], a, b)]
@@ -291,6 +319,7 @@ def solve_impact(
     params: SolverParams,
 ) -> tuple[BodySide, BodySide, SolvedPair]:
     """Both sides and the pair after an impact that follows another one of their bodies, if it is their next."""
+    constraint = with_joints(constraint, a, b)
     tau = in_order(point, later_impact(point, solved.contacts[0], a, b, setup, params.step), a, b)
     contacts, time = active_contacts(constraint, [point], [tau], a, b, params.step)
     happens = tau >= 0
@@ -363,7 +392,11 @@ def relax(
     """Both sides and the pair after the relaxing solve at the end of the step, and the impulses for the next step."""
     assert b.displacement is not None, "only static bodies lack a displacement"
     moved = zip(solved.contacts, displaced_points(constraint, points, a.displacement, b.displacement), strict=True)
-    contacts = [contact._replace(frame=end.frame, normal=end.normal) for contact, end in moved]
+    constraint = with_joints(constraint, a, b)
+    contacts = [
+        contact._replace(frame=jointed_frame(constraint, end.frame, end.normal), normal=end.normal)
+        for contact, end in moved
+    ]
     bounced = []
 
     def target_of(contact: ActiveContact, speed: Array, old: Impulse) -> NormalTarget:

@@ -29,6 +29,7 @@ from gen2d.physics.constraint import (
     relative_velocity,
 )
 from gen2d.physics.contact_state import BodySide, PassSetup
+from gen2d.physics.jointed import jointed_frame
 from gen2d.physics.segment_lines import admissible, onward, whole_line
 from gen2d.physics.time_of_impact import (
     ApproachPath,
@@ -177,6 +178,7 @@ def active_contacts(
     contacts = []
     for point, tau in zip(points, taus, strict=True):
         frame, normal = materialize(_displaced_point(constraint, point, shift + time * velocity)[:2])
+        frame = jointed_frame(constraint, frame, normal)
         speed, _ = relative_speed(frame, normal, a.motion, b.motion)
         fall = _pull(point, normal) * (h - tau)
         position = point.position

@@ -14,12 +14,12 @@ import jax.numpy as jnp
 from gen2d.physics.constraint import (
     ActiveContact,
     ContactConstraint,
-    ContactFrame,
     Impulse,
     Inertia,
     reciprocal,
     softness,
 )
+from gen2d.physics.jointed import joint_coupling
 from gen2d.physics.params import SolverParams
 from gen2d.physics.time_of_impact import MISSES
 from gen2d.records.axes import Array
@@ -158,7 +158,7 @@ def solve_normals(
     if len(rows) == 1:
         return [rows[0].impulse(0.0)]
     p, q = rows
-    k = _coupling(constraint, *(contact.frame for contact in contacts)) - taken
+    k = _coupling(constraint, *contacts) - taken
     det = p.k * q.k - k * k
     regular = det > REGULAR * p.k * q.k
     inverse = 1 / jnp.where(regular, det, 1.0)
@@ -176,13 +176,13 @@ def solve_normals(
     return [jnp.where(mixed, first, together_p), jnp.where(mixed, after, together_q)]
 
 
-def _coupling(constraint: ContactConstraint, p: ContactFrame, q: ContactFrame) -> Array:
+def _coupling(constraint: ContactConstraint, p: ActiveContact, q: ActiveContact) -> Array:
     """Speed at one point that a unit impulse at the other causes, 1/kg."""
 
     def turning(inertia: Inertia, lever: Array | None, other: Array | None) -> Array | float:
         return 0.0 if lever is None or other is None else inertia.moment * lever * other
 
-    k = constraint.b.mass + turning(constraint.b, p.normal_b, q.normal_b)
-    if constraint.a is None:
-        return k
-    return k + constraint.a.mass + turning(constraint.a, p.normal_a, q.normal_a)
+    k = constraint.b.mass + turning(constraint.b, p.frame.normal_b, q.frame.normal_b)
+    if constraint.a is not None:
+        k = k + constraint.a.mass + turning(constraint.a, p.frame.normal_a, q.frame.normal_a)
+    return k - joint_coupling(constraint, p, q)

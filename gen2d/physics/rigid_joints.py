@@ -19,7 +19,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gen2d.physics.banded import factor, solve_factored
+from gen2d.physics.banded import factor, inverse_band, solve_factored
 from gen2d.physics.collision import dot, perpendicular
 from gen2d.physics.constraint import Inertia, Motion
 from gen2d.physics.energy import Work
@@ -32,6 +32,7 @@ from gen2d.physics.springs_limits_motors import (
     table_of,
     take_rows,
 )
+from gen2d.physics.symmetric import outer
 from gen2d.records.axes import Array
 from gen2d.records.layout import JointSpec
 from gen2d.xla import materialize
@@ -79,10 +80,14 @@ class JointSystemPlan:
 
     def rows_of_bodies(self) -> np.ndarray:
         """Rows of each moving body, those of side 0 before those of side 1, padded with 2 R."""
-        rows, ends = len(self.joint), self.ends
-        places = [np.flatnonzero(ends.reshape(-1) == body) for body in range(self.moving)]
-        most = max(map(len, places))
-        return np.stack([np.pad(p, (0, most - len(p)), constant_values=2 * rows) for p in places], axis=1)
+        return places_of_bodies(self.ends.reshape(-1), self.moving)
+
+
+def places_of_bodies(bodies: np.ndarray, moving: int) -> np.ndarray:
+    """Places of each body in a list of bodies, [most, N], padded with the list's length."""
+    places = [np.flatnonzero(bodies == body) for body in range(moving)]
+    most = max(map(len, places))
+    return np.stack([np.pad(p, (0, most - len(p)), constant_values=len(bodies)) for p in places], axis=1)
 
 
 def joint_system_plan(joints: Sequence[JointSpec], moving: int) -> JointSystemPlan:
@@ -134,6 +139,14 @@ class JointRows(NamedTuple):
 def zero_impulses(system: JointSystem) -> Array:
     """Impulses of the rows before the first step, N s [R, ...]."""
     return jnp.zeros_like(system.rest[..., system.plan.joint, :])
+
+
+class Solved(NamedTuple):
+    """Motions of the groups after the joints, the accumulated impulses of the rows, and the work."""
+
+    motions: list[Motion]
+    impulses: Array
+    work: Work
 
 
 class Anchors(NamedTuple):
@@ -240,56 +253,91 @@ def warm_start(
     return anchors, groups_of(now, motions), work
 
 
-def solve(
-    system: JointSystem,
-    anchors: Anchors,
-    motions: list[Motion],
-    drifts: list[Motion],
-    shocks: list[Motion],
-    statics: list[Any],
-    impulses: Array,
-    h: float,
-) -> tuple[list[Motion], Array, Array, Work]:
-    """Motions with which the anchors meet after a step of h seconds, the accumulated impulses, those of them that
-    answer the impacts, and the work.
+class FactoredSystem:
+    """The rows of the joints, factored: at the start of a step, or after displacements of all bodies."""
 
-    A body's displacement is h times its motion plus its drift; impacts changed its motion by its shock.
-    """
-    still = [body.motion for body in statics]
-    now, drift = table_of(motions, still), table_of(drifts, [jax.tree.map(jnp.zeros_like, m) for m in still])
-    rows, works = _rows(system, anchors), []
-    error = _error(system, rows, anchors.offset)
-    remaining = error - jnp.clip(error, -h * FASTEST, h * FASTEST)
-    factored = _FactoredSystem(system, rows)
-    for _ in range(NEWTON_ITERATIONS):
-        displacement = jax.tree.map(lambda x, y: h * x + y, now, drift)
-        error = _error(system, rows, _displace(system, anchors, displacement).offset)
-        impulses, now, work = factored.solve(now, impulses, (error - remaining) / h)
-        works.append(work)
-    to_shocks = factored.response(table_of(shocks, [jax.tree.map(jnp.zeros_like, m) for m in still]))
-    return groups_of(now, motions), impulses, to_shocks, jax.tree.map(lambda *x: sum(x), *works)
+    def __init__(self, system: JointSystem, anchors: Anchors, displacements: Motion | None = None) -> None:
+        self._system, self._anchors = system, anchors
+        if displacements is not None:
+            anchors = _displace(system, anchors, displacements)
+        self._rows = _rows(system, anchors)
+        bands = _bands(system, self._rows)
+        self._compliance = jnp.where(jnp.isfinite(bands[0]), COMPLIANCE * bands[0], 0.0)
+        self._factors = factor(bands)
 
+    def _table(self, changes: list[Motion]) -> Motion:
+        """Table of changes of the moving bodies, with zeros for the static ones."""
+        moving, rows = self._system.plan.moving, len(self._system.inertia.mass)
+        table = table_of(changes, [])
+        return jax.tree.map(lambda x: jnp.pad(x, [*[(0, 0)] * (x.ndim - 2), (0, rows - moving), (0, 0)]), table)
 
-def relax(
-    system: JointSystem,
-    anchors: Anchors,
-    motions: list[Motion],
-    displacements: list[Motion],
-    shocks: list[Motion],
-    statics: list[Any],
-    impulses: Array,
-    h: float,
-) -> tuple[list[Motion], Array, Array, Work]:
-    """Motions with which the anchors stay together after the displacements, the accumulated impulses, those of them
-    that answer the impacts of the pass, and the work."""
-    still = [body.motion for body in statics]
-    now = table_of(motions, still)
-    displacement = table_of(displacements, [jax.tree.map(lambda x: h * x, m) for m in still])
-    rows = _rows(system, _displace(system, anchors, displacement))
-    factored = _FactoredSystem(system, rows)
-    impulses, now, work = factored.solve(now, impulses, _speeds(system, rows, now))
-    to_shocks = factored.response(table_of(shocks, [jax.tree.map(jnp.zeros_like, m) for m in still]))
-    return groups_of(now, motions), impulses, to_shocks, work
+    def meet(
+        self, motions: list[Motion], drifts: list[Motion], fixed: list[Motion], impulses: Array, h: float
+    ) -> Solved:
+        """Motions with which the anchors meet after a step of h seconds.
+
+        A body's displacement is h times its motion plus its drift.
+        """
+        system, anchors, now, drift, works = (
+            self._system,
+            self._anchors,
+            table_of(motions, fixed),
+            self._table(drifts),
+            [],
+        )
+        error = _error(system, self._rows, anchors.offset)
+        remaining = error - jnp.clip(error, -h * FASTEST, h * FASTEST)
+        for _ in range(NEWTON_ITERATIONS):
+            displacement = jax.tree.map(lambda x, y: h * x + y, now, drift)
+            error = _error(system, self._rows, _displace(system, anchors, displacement).offset)
+            impulses, now, work = self._solve(now, impulses, (error - remaining) / h)
+            works.append(work)
+        return Solved(groups_of(now, motions), impulses, jax.tree.map(lambda *x: sum(x), *works))
+
+    def hold(self, motions: list[Motion], fixed: list[Motion], impulses: Array) -> Solved:
+        """Motions with which the anchors stay together."""
+        now = table_of(motions, fixed)
+        impulses, now, work = self._solve(now, impulses, _speeds(self._system, self._rows, now))
+        return Solved(groups_of(now, motions), impulses, work)
+
+    def _solve(self, now: Motion, impulses: Array, speeds: Array) -> tuple[Array, Motion, Work]:
+        """Accumulated impulses that cancel the speeds of the rows, motions with them, and the work done."""
+        more = self._impulses(speeds + self._compliance * impulses)
+        return impulses + more, *_apply(self._system, self._rows, now, more)
+
+    def response(self, changes: list[Motion]) -> Array:
+        """Impulses that cancel the speeds of the rows that changes of the motions cause."""
+        return self._impulses(_speeds(self._system, self._rows, self._table(changes)))
+
+    def _impulses(self, speeds: Array) -> Array:
+        return -materialize(solve_factored(self._factors, materialize(speeds)))
+
+    def taken(self, groups: list[Motion]) -> list[Array]:
+        """What the joints take from the inverse mass of each body, [6, N, ...] of x, y and angle, by group.
+
+        It is the Schur complement of the rows: the change of a body's motion by a unit impulse on it that the joints
+        cancel.
+        """
+        plan, parts, bodies = self._system.plan, [], []
+        inverse = inverse_band(self._factors)
+        for offset in range(plan.width):
+            for a, b, sign in plan.shared(offset):
+                rows = np.flatnonzero(sign)
+                share = jnp.asarray(sign[rows], inverse[0].dtype)[:, None] * inverse[offset][rows]
+                p, q = self._pushes(a, rows), self._pushes(b, rows + offset)
+                parts.append((share if offset == 0 else 2 * share) * outer(p, q))
+                bodies.append(plan.ends[a, rows])
+        parts, bodies = jnp.concatenate(parts, axis=-2), np.concatenate(bodies)
+        parts = materialize(jnp.concatenate([parts, jnp.zeros_like(parts[:, :1])], axis=-2))
+        each = (take_rows(parts, places) for places in places_of_bodies(bodies, plan.moving))
+        return groups_of(functools.reduce(jnp.add, each), groups)
+
+    def _pushes(self, side: int, rows: np.ndarray) -> tuple[Array, Array, Array]:
+        """Change of the motion (x, y, angle) of the bodies on a side of some rows by unit impulses."""
+        system = self._system
+        mass, moment = take_rows((system.a, system.b)[side].inertia, system.plan.joint[rows])
+        x, y = take_rows(self._rows.direction, rows)
+        return mass * x, mass * y, moment * take_rows(self._rows.levers[side], rows)
 
 
 def _displace(system: JointSystem, anchors: Anchors, displacement: Motion) -> Anchors:
@@ -301,25 +349,3 @@ def _displace(system: JointSystem, anchors: Anchors, displacement: Motion) -> An
         arms.append(materialize(arm + more))
         offset = offset + sign * (own.velocity + more)
     return Anchors(arms[0], arms[1], offset)
-
-
-class _FactoredSystem:
-    """Factored system of the rows."""
-
-    def __init__(self, system: JointSystem, rows: JointRows) -> None:
-        bands = _bands(system, rows)
-        self._system, self._rows = system, rows
-        self._compliance = jnp.where(jnp.isfinite(bands[0]), COMPLIANCE * bands[0], 0.0)
-        self._factors = factor(bands)
-
-    def solve(self, now: Motion, impulses: Array, speeds: Array) -> tuple[Array, Motion, Work]:
-        """Accumulated impulses that cancel the speeds of the rows, motions with them, and the work done."""
-        more = self._impulses(speeds + self._compliance * impulses)
-        return impulses + more, *_apply(self._system, self._rows, now, more)
-
-    def response(self, change: Motion) -> Array:
-        """Impulses that cancel the speeds of the rows that a change of motion causes."""
-        return self._impulses(_speeds(self._system, self._rows, change))
-
-    def _impulses(self, speeds: Array) -> Array:
-        return -materialize(solve_factored(self._factors, materialize(speeds)))

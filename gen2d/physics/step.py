@@ -27,7 +27,6 @@ for the time of impact in gradients.
 """
 
 import math
-from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -37,8 +36,10 @@ from gen2d.physics.constraint import Motion
 from gen2d.physics.contact_state import BodySide
 from gen2d.physics.energy import Ledger, accumulate, record_energy
 from gen2d.physics.impact_order import not_hit
+from gen2d.physics.jointed import hold, release
 from gen2d.physics.params import SolverParams
 from gen2d.physics.shapes import to_world
+from gen2d.physics.springs_limits_motors import table_of
 from gen2d.physics.state import BodyState, Model, WorldState
 from gen2d.physics.support import no_support
 from gen2d.physics.tunnelling import clamp_displacement
@@ -98,6 +99,7 @@ class _RigidJoints:
         self, system: rigid_joints.JointSystem | None, world: WorldState, statics: list[BodyState], h: float
     ) -> None:
         self._system, self._world, self._statics, self._h = system, world, statics, h
+        self._fixed = [body.motion for body in statics]
         self.impulses, self.works = world.joint_system, []
         self._to_shocks: list[Array] = []
 
@@ -112,18 +114,50 @@ class _RigidJoints:
         self.works.append(work)
         return motions
 
-    def run(self, solver: Callable, sides: list[BodySide], displacements: list[Motion]) -> list[Motion]:
-        """Motions after `rigid_joints.solve`, with drifts, or `rigid_joints.relax`, with displacements."""
-        motions = _motions(sides)
+    def hold(self, sides: list[BodySide]) -> list[BodySide]:
+        """Sides of the biased pass, whose contacts see the joints."""
         if self._system is None:
-            return motions
+            return sides
+        self._factored = rigid_joints.FactoredSystem(self._system, self._anchors)
+        return self._held(sides)
+
+    def meet(self, sides: list[BodySide], drifts: list[Motion]) -> tuple[list[Motion], list[Motion]]:
+        """Motions with which the anchors meet at the end of the step, and the drifts: those of the sides and these."""
+        sides = [release(side) for side in sides]
+        drifts = [jax.tree.map(jnp.add, side.drift, more) for side, more in zip(sides, drifts, strict=True)]
+        if self._system is None:
+            return _motions(sides), drifts
+        return self._solved(
+            sides, self._factored.meet(_motions(sides), drifts, self._fixed, self.impulses, self._h)
+        ), drifts
+
+    def hold_at_end(self, sides: list[BodySide], displacements: list[Motion]) -> list[BodySide]:
+        """Sides of the relaxing pass, whose anchors stay together after the displacements."""
+        if self._system is None:
+            return sides
+        moved = table_of(displacements, [_scaled(motion, self._h) for motion in self._fixed])
+        self._factored = rigid_joints.FactoredSystem(self._system, self._anchors, moved)
+        motions = self.stay(sides)
+        return self._held([side._replace(motion=motion) for side, motion in zip(sides, motions, strict=True)])
+
+    def stay(self, sides: list[BodySide]) -> list[Motion]:
+        """Motions with which the anchors stay together."""
+        sides = [release(side) for side in sides]
+        if self._system is None:
+            return _motions(sides)
+        return self._solved(sides, self._factored.hold(_motions(sides), self._fixed, self.impulses))
+
+    def _held(self, sides: list[BodySide]) -> list[BodySide]:
+        taken = self._factored.taken(_motions(sides))
+        return [hold(*of) for of in zip(sides, taken, strict=True)]
+
+    def _solved(self, sides: list[BodySide], solved: rigid_joints.Solved) -> list[Motion]:
+        self.impulses = solved.impulses
+        self.works.append(solved.work)
         shocks = [side.shock for side in sides if side.shock is not None]
-        motions, self.impulses, to_shocks, work = solver(
-            self._system, self._anchors, motions, displacements, shocks, self._statics, self.impulses, self._h
-        )
-        self._to_shocks.append(to_shocks)
-        self.works.append(work)
-        return motions
+        if shocks:
+            self._to_shocks.append(self._factored.response(shocks))
+        return solved.motions
 
     def next_impulses(self) -> Array | None:
         """Impulses that the next step starts with: those that impacts did not cause, as they act once."""
@@ -132,13 +166,6 @@ class _RigidJoints:
 
 def _motions(sides: list[BodySide]) -> list[Motion]:
     return [side.motion for side in sides if side.motion is not None]
-
-
-def _with_shocks(sides: list[BodySide], shocks: list[Motion] | None) -> list[BodySide]:
-    """Sides with these shocks; as they are without rigid joints."""
-    if shocks is None:
-        return sides
-    return [side._replace(shock=shock) for side, shock in zip(sides, shocks, strict=True)]
 
 
 def step(world: WorldState, model: Model, params: SolverParams) -> WorldState:
@@ -190,12 +217,9 @@ def step(world: WorldState, model: Model, params: SolverParams) -> WorldState:
     ]
     if params.by_time:
         sides = [side._replace(clock=jnp.zeros_like(side.push)) for side in sides]
-    still = None if model.joint_system is None else [_scaled(motion, 0.0) for motion in motions]
-    sides = _with_shocks(sides, still)
     statics = [BodySide(motion=side.motion) for side in statics]
-    sides, solved = solver.solve(carry, contacts, sides, statics)
-    drifts = [jax.tree.map(jnp.add, side.drift, free) for side, free in zip(sides, free_drifts, strict=True)]
-    motions = rigid.run(rigid_joints.solve, sides, drifts)
+    sides, solved = solver.solve(carry, contacts, rigid.hold(sides), statics)
+    motions, drifts = rigid.meet(sides, free_drifts)
 
     displacements = [jax.tree.map(lambda x, y: h * x + y, *of) for of in zip(motions, drifts, strict=True)]
     solid = [s if g.collides else None for s, g in zip(shapes, groups, strict=True)]
@@ -210,8 +234,8 @@ def step(world: WorldState, model: Model, params: SolverParams) -> WorldState:
         BodySide(motion=m, displacement=moved, push=side.push, work=side.work, support=side.support)
         for side, m, moved in of_groups
     ]
-    sides, carry = solver.relax(carry, solved, _with_shocks(sides, still), statics, world.time)
-    motions = rigid.run(rigid_joints.relax, sides, displacements)
+    sides, carry = solver.relax(carry, solved, rigid.hold_at_end(sides, displacements), statics, world.time)
+    motions = rigid.stay(sides)
     if ledger is not None:
         olds, works = [body.motion for body in world.bodies], [side.work for side in sides]
         done = zip(works, groups, olds, free, free_drifts, displacements, accelerations, spin_ups, strict=True)

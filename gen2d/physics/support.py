@@ -27,9 +27,9 @@ from gen2d.physics.constraint import (
     Motion,
     reciprocal,
 )
+from gen2d.physics.symmetric import Direction, product
 from gen2d.records.axes import Array
 
-Direction: TypeAlias = tuple[Array, Array | None]  # of an impulse: a unit vector [2, ...], and its lever in m (None: 0)
 Motions: TypeAlias = tuple[Motion | None, Motion]  # of both bodies of a pair
 
 REGULAR = 1e-3  # share of its compliance that a contact must keep beside others to take more from a body
@@ -49,13 +49,6 @@ def no_support(velocity: Array) -> Support:
     return Support(jnp.zeros_like(velocity), jnp.zeros((6, *velocity.shape[1:]), velocity.dtype))
 
 
-def _product(support: Support, direction: Direction) -> tuple[Array, Array]:
-    """The matrix times a direction."""
-    (xx, xy, yy, xt, yt, tt), ((x, y), lever) = support.matrix, direction
-    turn = jnp.zeros_like(x) if lever is None else lever
-    return jnp.stack([xx * x + xy * y + xt * turn, xy * x + yy * y + yt * turn]), xt * x + yt * y + tt * turn
-
-
 def _dot(p: Direction, q: Direction) -> Array:
     k = dot(p[0], q[0])
     return k if p[1] is None or q[1] is None else k + p[1] * q[1]
@@ -63,7 +56,7 @@ def _dot(p: Direction, q: Direction) -> Array:
 
 def _with_row(support: Support, inverse: Inertia, direction: Direction, k: Array, acts: Array) -> Support:
     """Support with another direction in which the body cannot move, where it `acts`; k is its compliance alone."""
-    (linear, turn), (unit, lever) = _product(support, direction), direction
+    (linear, turn), (unit, lever) = product(support.matrix, direction), direction
     linear = inverse.mass * unit - linear
     turn = -turn if lever is None else inverse.moment * lever - turn
     left = _dot(direction, (linear, turn))
@@ -103,12 +96,12 @@ class SupportedPair(NamedTuple):
             assert motion is not None, "both bodies move"
             mass, moment = (reciprocal(x, x > 0) for x in inertia)
             momentum = mass * motion.velocity, moment * motion.spin
-            taken.append(jnp.where(pressed, _dot(direction, _product(support, momentum)), 0.0))
+            taken.append(jnp.where(pressed, _dot(direction, product(support.matrix, momentum)), 0.0))
         return speed - (taken[1] - taken[0])
 
     def _compliance(self, p: tuple[Direction, Direction], q: tuple[Direction, Direction]) -> Array:
         """What the support takes from the speed along q that a unit impulse along p causes, 1/kg."""
-        of_a, of_b = (_dot(y, _product(support, x)) for support, x, y in zip(self.supports, p, q, strict=True))
+        of_a, of_b = (_dot(y, product(support.matrix, x)) for support, x, y in zip(self.supports, p, q, strict=True))
         return jnp.where(self.pressed[0], of_a, 0.0) + jnp.where(self.pressed[1], of_b, 0.0)
 
     def frame(self, contact: ActiveContact, rests: Array) -> ContactFrame:
