@@ -22,9 +22,9 @@ from gen2d.records.axes import Array
 LEAST = 0.01  # share of a contact's compliance that joints leave at least, as the rest would be rounding
 
 
-def hold(side: BodySide, taken: Array | None) -> BodySide:
-    """The side with what joints take from its inverse mass, at the start of a pass; as it is without joints."""
-    if taken is None or side.motion is None:
+def hold(side: BodySide, taken: Array) -> BodySide:
+    """The side with what joints take from its inverse mass, at the start of a pass."""
+    if side.motion is None:
         return side
     zero = jax.tree.map(jnp.zeros_like, side.motion)
     return side._replace(taken=taken, change=zero, shock=zero, late=None if side.drift is None else zero)

@@ -114,12 +114,21 @@ class _RigidJoints:
         self.works.append(work)
         return motions
 
-    def hold(self, sides: list[BodySide]) -> list[BodySide]:
-        """Sides of the biased pass, whose contacts see the joints."""
+    def hold(self, sides: list[BodySide], displacements: list[Motion] | None = None) -> list[BodySide]:
+        """Sides of a pass at the start of the step, or after displacements, whose contacts see the joints.
+
+        Their anchors stay together. A contact would take a speed along a rod for an approach, and answer it with the
+        little that the rod leaves of the inverse mass.
+        """
         if self._system is None:
             return sides
-        self._factored = rigid_joints.FactoredSystem(self._system, self._anchors)
-        return self._held(sides)
+        moved = None
+        if displacements is not None:
+            moved = table_of(displacements, [_scaled(motion, self._h) for motion in self._fixed])
+        self._factored = rigid_joints.FactoredSystem(self._system, self._anchors, moved)
+        motions = self.stay(sides)
+        of = zip(sides, motions, self._factored.taken(motions), strict=True)
+        return [hold(side._replace(motion=motion), taken) for side, motion, taken in of]
 
     def meet(self, sides: list[BodySide], drifts: list[Motion]) -> tuple[list[Motion], list[Motion]]:
         """Motions with which the anchors meet at the end of the step, and the drifts: those of the sides and these."""
@@ -131,25 +140,12 @@ class _RigidJoints:
             sides, self._factored.meet(_motions(sides), drifts, self._fixed, self.impulses, self._h)
         ), drifts
 
-    def hold_at_end(self, sides: list[BodySide], displacements: list[Motion]) -> list[BodySide]:
-        """Sides of the relaxing pass, whose anchors stay together after the displacements."""
-        if self._system is None:
-            return sides
-        moved = table_of(displacements, [_scaled(motion, self._h) for motion in self._fixed])
-        self._factored = rigid_joints.FactoredSystem(self._system, self._anchors, moved)
-        motions = self.stay(sides)
-        return self._held([side._replace(motion=motion) for side, motion in zip(sides, motions, strict=True)])
-
     def stay(self, sides: list[BodySide]) -> list[Motion]:
         """Motions with which the anchors stay together."""
         sides = [release(side) for side in sides]
         if self._system is None:
             return _motions(sides)
         return self._solved(sides, self._factored.hold(_motions(sides), self._fixed, self.impulses))
-
-    def _held(self, sides: list[BodySide]) -> list[BodySide]:
-        taken = self._factored.taken(_motions(sides))
-        return [hold(*of) for of in zip(sides, taken, strict=True)]
 
     def _solved(self, sides: list[BodySide], solved: rigid_joints.Solved) -> list[Motion]:
         self.impulses = solved.impulses
@@ -234,7 +230,7 @@ def step(world: WorldState, model: Model, params: SolverParams) -> WorldState:
         BodySide(motion=m, displacement=moved, push=side.push, work=side.work, support=side.support)
         for side, m, moved in of_groups
     ]
-    sides, carry = solver.relax(carry, solved, rigid.hold_at_end(sides, displacements), statics, world.time)
+    sides, carry = solver.relax(carry, solved, rigid.hold(sides, displacements), statics, world.time)
     motions = rigid.stay(sides)
     if ledger is not None:
         olds, works = [body.motion for body in world.bodies], [side.work for side in sides]
