@@ -187,7 +187,7 @@ def _pushed(motion: Motion, inverse: Inertia, taken: Array | None, linear: Array
     new = Motion(motion.velocity + inverse.mass * linear, motion.spin + inverse.moment * angular)
     if taken is None:
         return new
-    velocity, spin = product(taken, (linear, None if isinstance(angular, float) else angular))
+    velocity, spin = product(taken, (linear, angular + jnp.zeros_like(motion.spin)))
     return Motion(new.velocity - velocity, new.spin - spin)
 
 

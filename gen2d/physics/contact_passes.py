@@ -32,7 +32,7 @@ from gen2d.physics.contact_state import BodySide, PassSetup, SolvedPair, WarmSta
 from gen2d.physics.energy import MotionPair, add_disc_dissipation, add_dissipation
 from gen2d.physics.friction import apply_angular_impulse, friction_impulse, rolling_impulse
 from gen2d.physics.impact_order import after_impact, in_order, later_impact, takes_part, with_first
-from gen2d.physics.jointed import free_motion, jointed_frame, with_change, with_joints
+from gen2d.physics.jointed import free_motion, jointed_frame, with_free_motion, with_joints
 from gen2d.physics.normal_impulse import (
     NormalTarget,
     TargetOf,
@@ -162,11 +162,9 @@ def _apply_pass(
             motions = apply_angular_impulse(constraint, roll - pair.roll, *motions)
         changes = [impulse_change(new, old) for new, old in zip(impulses, pair.impulses, strict=True)]
         twist = None if roll is None or pair.roll is None else roll - pair.roll
-        free = before, motions
-        if jointed:
-            free = _free_motions(constraint, pair.contacts, changes, twist, a, b)
-            a, b = (with_change(*of) for of in zip((a, b), motions, free[1], strict=True))
+        free = _free_motions(constraint, pair.contacts, changes, twist, a, b) if jointed else (before, motions)
         work = add_dissipation(b.work, constraint, pair.contacts, changes, twist, *free)
+        a, b = (with_free_motion(*of) for of in zip((a, b), motions, free[1], strict=True))
     solved = SolvedPair(pair.contacts, impulses, roll)
     return a._replace(motion=motions[0]), b._replace(motion=motions[1], work=work), solved
 
@@ -181,7 +179,9 @@ def _free_motions(
 ) -> tuple[MotionPair, MotionPair]:
     """Motions before and after the impulses, without what the joints take from them."""
     constraint = constraint._replace(taken_a=None, taken_b=None)
-    before = after = free_motion(a), free_motion(b)
+    free_a, free_b = free_motion(a), free_motion(b)
+    assert free_b is not None, "only static bodies lack a motion"
+    before = after = free_a, free_b
     for contact, change in zip(contacts, changes, strict=True):
         after = apply_impulse(constraint, contact, change, *after)
     return before, after if twist is None else apply_angular_impulse(constraint, twist, *after)
@@ -257,9 +257,10 @@ def _less(drift: Motion, time: Array, new: Motion, old: Motion) -> Motion:
 
 def _with_shock(old: BodySide, new: BodySide, bounces: Array) -> BodySide:
     """The side with its change of velocity added to its shock where a contact bounces."""
-    if old.shock is None:
+    before, after = free_motion(old), free_motion(new)
+    if old.shock is None or before is None or after is None:
         return new
-    of = zip(old.shock, free_motion(old), free_motion(new), strict=True)
+    of = zip(old.shock, before, after, strict=True)
     return new._replace(shock=Motion(*(shock + jnp.where(bounces, y - x, 0.0) for shock, x, y in of)))
 
 

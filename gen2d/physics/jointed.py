@@ -39,9 +39,11 @@ def release(side: BodySide) -> BodySide:
     return side._replace(motion=motion, drift=drift, taken=None, change=None, late=None)
 
 
-def with_change(side: BodySide, motion: Motion | None, free: Motion | None) -> BodySide:
-    """The side with what joints take from its motion, from that with and without them; as it is at rest."""
-    return side if motion is None else side._replace(change=jax.tree.map(jnp.subtract, free, motion))
+def with_free_motion(side: BodySide, motion: Motion | None, free: Motion | None) -> BodySide:
+    """The side with a motion, and with that which its contacts alone gave it."""
+    if motion is None or side.change is None:
+        return side._replace(motion=motion)
+    return side._replace(motion=motion, change=jax.tree.map(jnp.subtract, free, motion))
 
 
 def free_motion(side: BodySide) -> Motion | None:

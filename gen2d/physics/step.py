@@ -134,16 +134,15 @@ class _RigidJoints:
         """Motions with which the anchors meet at the end of the step, and the drifts: those of the sides and these."""
         sides = [release(side) for side in sides]
         drifts = [jax.tree.map(jnp.add, side.drift, more) for side, more in zip(sides, drifts, strict=True)]
-        if self._system is None:
+        if self._system is None or self.impulses is None:
             return _motions(sides), drifts
-        return self._solved(
-            sides, self._factored.meet(_motions(sides), drifts, self._fixed, self.impulses, self._h)
-        ), drifts
+        solved = self._factored.meet(_motions(sides), drifts, self._fixed, self.impulses, self._h)
+        return self._solved(sides, solved), drifts
 
     def stay(self, sides: list[BodySide]) -> list[Motion]:
         """Motions with which the anchors stay together."""
         sides = [release(side) for side in sides]
-        if self._system is None:
+        if self._system is None or self.impulses is None:
             return _motions(sides)
         return self._solved(sides, self._factored.hold(_motions(sides), self._fixed, self.impulses))
 

@@ -1,0 +1,69 @@
+"""Impacts on bodies that rigid joints hold: closed forms of one impact, and the matrices that the joints take."""
+
+import numpy as np
+import pytest
+from laws import holds
+from numpy.testing import assert_allclose
+
+from gen2d import Space
+from gen2d.physics.banded import factor, inverse_band
+
+
+@pytest.mark.parametrize(("rows", "width"), [(1, 1), (7, 3), (20, 4)])
+def test_band_of_an_inverse_is_that_of_the_whole_inverse(rows, width):
+    random = np.random.default_rng(rows)
+    i, j = np.indices((rows, rows))
+    half = random.normal(size=(rows, rows)) * (i >= j) * (i - j < width) + 5 * np.eye(rows)
+    matrix = half @ half.T
+    bands = [np.pad(np.diagonal(matrix, o), (0, o)).astype(np.float32)[:, None] for o in range(width)]
+    inverse = np.linalg.inv(matrix)
+    for offset, diagonal in enumerate(inverse_band(factor(bands))):
+        expected = np.diagonal(inverse, offset)
+        assert_allclose(np.asarray(diagonal)[: rows - offset, 0], expected, rtol=1e-4, atol=1e-6)
+
+
+@pytest.mark.parametrize("elasticity", [0.0, 0.5, 1.0])
+def test_disc_that_strikes_a_hinged_plank_bounces_as_the_closed_form_says(elasticity):
+    """The plank turns about its hinge at one end: the disc meets the moment about the hinge over the arm squared."""
+    space, length, arm, speed = Space(gravity=(0, 0)), 4.0, 3.0, 2.0
+    own = elasticity**0.5  # of a pair: the product
+    plank = space.add_box((length / 2, 0), length, 0.2, mass=3.0, elasticity=own, friction=0.0)
+    space.add_joint("revolute", plank, anchor_a=(0, 0))
+    disc = space.add_circle((arm, 0.5), 0.3, mass=0.7, velocity=(0, -speed), elasticity=own, friction=0.0)
+    video = space.simulate(0.2, fps=240, contacts=0)
+    moment = space.bodies[plank].moment + 3.0 * (length / 2) ** 2
+    impulse = (1 + elasticity) * speed / (1 / 0.7 + arm**2 / moment)
+    last = len(video.position) - 1
+    holds("hinged plank: speed of the disc", video.velocity[last, disc, 1] - (impulse / 0.7 - speed), 2e-3 * speed)
+    holds("hinged plank: spin", video.angular_velocity[last, plank] + arm * impulse / moment, 2e-3 * speed / arm)
+
+
+@pytest.mark.parametrize("angle", [0.3, 0.8, 1.3])
+def test_bob_on_a_rod_that_strikes_a_wall_at_an_angle_keeps_its_speed(angle):
+    """The wall can only turn the bob back on its circle: an elastic one with its whole speed."""
+    space, speed = Space(gravity=(0, 0)), 2.0
+    wall = 2 * np.cos(angle) + 0.3
+    space.add_segment((wall, -5), (wall, 5), elasticity=1.0, friction=0.0)
+    start = angle + 0.1
+    place, way = np.array([np.cos(start), np.sin(start)]), np.array([np.sin(start), -np.cos(start)])
+    bob = space.add_circle(2 * place, 0.3, velocity=speed * way, elasticity=1.0, friction=0.0)
+    space.add_joint("distance", bob, anchor_b=(0, 0))
+    video = space.simulate(0.3, fps=240, contacts=0)
+    turned = np.hypot(*video.velocity[-1, bob])
+    assert video.velocity[-1, bob] @ way < 0, "the bob went on"
+    # The direction of the rod is that at the start of the step, in which it turns by 1/240 rad.
+    holds(f"bob that strikes at {angle} rad: speed", turned / speed - 1, 2 / 240 / np.tan(angle))
+
+
+def test_friction_acts_on_the_mass_that_a_hinge_leaves():
+    """A disc held by a hinge at its centre can only spin: a rough inelastic plank under it stops its rim."""
+    space = Space(gravity=(0, 0))
+    wheel = space.add_circle((0, 0), 0.5, mass=1.0, spin=6.0, elasticity=0.0, friction=1.0)
+    space.add_joint("revolute", wheel, anchor_a=(0, 0))
+    plank = space.add_box((0, -0.7), 3.0, 0.2, mass=2.0, velocity=(0, 6.0), elasticity=0.0, friction=1.0)
+    video = space.simulate(0.1, fps=240, contacts=0)
+    rim = 0.5 * video.angular_velocity[-1, wheel]
+    along = video.velocity[-1, plank, 0] + 0.1 * video.angular_velocity[-1, plank]
+    holds("wheel on a plank: slip of the rim, m/s", rim - along, 2e-2)
+    holds("wheel: speed of its hinge, m/s", video.velocity[:, wheel], 5e-4)
+    assert abs(rim) < 2.9
