@@ -27,7 +27,7 @@ def hold(side: BodySide, taken: Array) -> BodySide:
     if side.motion is None:
         return side
     zero = jax.tree.map(jnp.zeros_like, side.motion)
-    return side._replace(taken=taken, change=zero, shock=zero, late=None if side.drift is None else zero)
+    return side._replace(taken=taken, change=zero, late=None if side.drift is None else zero)
 
 
 def release(side: BodySide) -> BodySide:

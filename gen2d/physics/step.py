@@ -101,7 +101,7 @@ class _RigidJoints:
         self._system, self._world, self._statics, self._h = system, world, statics, h
         self._fixed = [body.motion for body in statics]
         self.impulses, self.works = world.joint_system, []
-        self._to_shocks: list[Array] = []
+        self._taken: list[Array] = []
 
     def warm_start(self, motions: list[Motion]) -> list[Motion]:
         """Motions with the impulses of the last step."""
@@ -114,20 +114,30 @@ class _RigidJoints:
         self.works.append(work)
         return motions
 
-    def hold(self, sides: list[BodySide], displacements: list[Motion] | None = None) -> list[BodySide]:
-        """Sides of a pass at the start of the step, or after displacements, whose contacts see the joints.
-
-        Their anchors stay together. A contact would take a speed along a rod for an approach, and answer it with the
-        little that the rod leaves of the inverse mass.
-        """
+    def hold(self, sides: list[BodySide]) -> list[BodySide]:
+        """Sides of the biased pass, whose contacts see the joints at the start of the step."""
         if self._system is None:
             return sides
-        moved = None
-        if displacements is not None:
-            moved = table_of(displacements, [_scaled(motion, self._h) for motion in self._fixed])
+        self._factored = rigid_joints.FactoredSystem(self._system, self._anchors)
+        self._taken = self._factored.taken(_motions(sides))
+        still = [_scaled(motion, 0.0) for motion in _motions(sides)]
+        return self._held([side._replace(shock=shock) for side, shock in zip(sides, still, strict=True)])
+
+    def hold_again(self, sides: list[BodySide], displacements: list[Motion]) -> list[BodySide]:
+        """Sides of the relaxing pass, after displacements."""
+        if self._system is None:
+            return sides
+        moved = table_of(displacements, [_scaled(motion, self._h) for motion in self._fixed])
         self._factored = rigid_joints.FactoredSystem(self._system, self._anchors, moved)
-        motions = self.stay(sides)
-        of = zip(sides, motions, self._factored.taken(motions), strict=True)
+        return self._held(sides)
+
+    def _held(self, sides: list[BodySide]) -> list[BodySide]:
+        """Sides of a pass, whose anchors stay together.
+
+        A contact would take a speed along a rod for an approach, and answer it with the little that the rod leaves of
+        the inverse mass.
+        """
+        of = zip(sides, self.stay(sides), self._taken, strict=True)
         return [hold(side._replace(motion=motion), taken) for side, motion, taken in of]
 
     def meet(self, sides: list[BodySide], drifts: list[Motion]) -> tuple[list[Motion], list[Motion]]:
@@ -137,26 +147,25 @@ class _RigidJoints:
         if self._system is None or self.impulses is None:
             return _motions(sides), drifts
         solved = self._factored.meet(_motions(sides), drifts, self._fixed, self.impulses, self._h)
-        return self._solved(sides, solved), drifts
+        return self._solved(solved), drifts
 
     def stay(self, sides: list[BodySide]) -> list[Motion]:
         """Motions with which the anchors stay together."""
         sides = [release(side) for side in sides]
         if self._system is None or self.impulses is None:
             return _motions(sides)
-        return self._solved(sides, self._factored.hold(_motions(sides), self._fixed, self.impulses))
+        return self._solved(self._factored.hold(_motions(sides), self._fixed, self.impulses))
 
-    def _solved(self, sides: list[BodySide], solved: rigid_joints.Solved) -> list[Motion]:
+    def _solved(self, solved: rigid_joints.Solved) -> list[Motion]:
         self.impulses = solved.impulses
         self.works.append(solved.work)
-        shocks = [side.shock for side in sides if side.shock is not None]
-        if shocks:
-            self._to_shocks.append(self._factored.response(shocks))
         return solved.motions
 
-    def next_impulses(self) -> Array | None:
+    def next_impulses(self, sides: list[BodySide]) -> Array | None:
         """Impulses that the next step starts with: those that impacts did not cause, as they act once."""
-        return self.impulses if self.impulses is None else self.impulses - sum(self._to_shocks)
+        if self.impulses is None:
+            return None
+        return self.impulses - self._factored.response([side.shock for side in sides if side.shock is not None])
 
 
 def _motions(sides: list[BodySide]) -> list[Motion]:
@@ -226,10 +235,10 @@ def step(world: WorldState, model: Model, params: SolverParams) -> WorldState:
     )
     of_groups = zip(sides, motions, displacements, strict=True)
     sides = [
-        BodySide(motion=m, displacement=moved, push=side.push, work=side.work, support=side.support)
+        BodySide(motion=m, displacement=moved, push=side.push, shock=side.shock, work=side.work, support=side.support)
         for side, m, moved in of_groups
     ]
-    sides, carry = solver.relax(carry, solved, rigid.hold(sides, displacements), statics, world.time)
+    sides, carry = solver.relax(carry, solved, rigid.hold_again(sides, displacements), statics, world.time)
     motions = rigid.stay(sides)
     if ledger is not None:
         olds, works = [body.motion for body in world.bodies], [side.work for side in sides]
@@ -241,6 +250,6 @@ def step(world: WorldState, model: Model, params: SolverParams) -> WorldState:
         time=world.time + h,
         contacts=carry,
         joints=[joint.impulses for joint in joints],
-        joint_system=rigid.next_impulses(),
+        joint_system=rigid.next_impulses(sides),
         ledger=ledger,
     )
