@@ -5,6 +5,7 @@ disc, and a radius around it. Two cores that intersect overlap by the least of t
 edges, as these are the edges of their Minkowski difference; others are as far apart as a corner is from an edge.
 """
 
+import jax
 import numpy as np
 
 from gen2d.core.enums import DYNAMIC
@@ -61,7 +62,7 @@ def deepest(objects: Objects, position: np.ndarray, angle: np.ndarray) -> np.nda
 
     -inf where there is no pair.
     """
-    expanded = Objects(**{name: None if x is None else np.asarray(x)[:, None] for name, x in vars(objects).items()})
+    expanded = jax.tree.map(lambda x: np.asarray(x)[:, None], objects)
     corners, radius = cores(expanded, np.asarray(position, float), np.asarray(angle, float))
     present, kind = np.asarray(objects.present), np.asarray(objects.kind)
     deepest = np.full(radius.shape[:2], -np.inf)
