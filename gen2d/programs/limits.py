@@ -108,6 +108,8 @@ def _of_speeds(
     for name, kind in kinds.items():
         smallest = min(kinds, key=lambda each: kinds[each].radius)
         safe, speed = SAFE_DISPLACEMENT * kinds[smallest].radius, math.sqrt(kind.speed**2 + fall)
+        if not speed:
+            continue
         causes = [f"scene.{option}" for option in bodies[name].speed] + ["scene.gravity"] * (fall > 0)
         yield (
             speed * step / safe if safe > 0 else math.inf,

@@ -75,6 +75,7 @@ def test_speeds_that_are_too_large_for_the_step_are_named_with_a_step_that_is_sa
     assert sentence.endswith("physics.max_step=0.0021 or less is short enough")
     assert limits("bouncing", "scene.velocity=[[-59, 59], 0]", still) == []
     assert len(limits("bouncing", "scene.velocity=[{mixture: [[0, 1], [60, 61]]}, 0]", still)) == 1
+    assert limits("bouncing", "scene.velocity=[0, 0]", still) == []  # nothing moves
     falling = math.sqrt(2 * 9.8 * 10)
     (sentence,) = limits("bouncing", "scene.velocity=[0, 0]", "scene.radius=0.05")
     assert f"allow balls of {falling:.3g} m/s" in sentence
