@@ -10,7 +10,7 @@ from gen2d.core.lazy import attach
 if TYPE_CHECKING:
     from gen2d.captions import caption, facts, questions
     from gen2d.config import common
-    from gen2d.config.contracts import Annotation, Export, Family, Look
+    from gen2d.config.contracts import Annotation, Bodies, Export, Family, Look
     from gen2d.config.distributions import Distribution
     from gen2d.config.options import option
     from gen2d.core.enums import CIRCLE, DYNAMIC, KINEMATIC, POLYGON, STATIC
@@ -60,7 +60,7 @@ if TYPE_CHECKING:
 _HOMES = {
     "gen2d.captions": "caption facts questions",
     "gen2d.config": "common",
-    "gen2d.config.contracts": "Annotation Export Family Look",
+    "gen2d.config.contracts": "Annotation Bodies Export Family Look",
     "gen2d.config.distributions": "Distribution",
     "gen2d.config.options": "option",
     "gen2d.core.enums": "CIRCLE DYNAMIC KINEMATIC POLYGON STATIC",
@@ -110,6 +110,7 @@ __all__ = [
     "Array",
     "Background",
     "Batch",
+    "Bodies",
     "ConfigError",
     "Distribution",
     "Export",

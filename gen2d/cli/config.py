@@ -15,8 +15,9 @@ def add_arguments(parser: Parser) -> None:
     parser.add_argument(
         "action",
         metavar="ACTION",
-        help="show: one config with all its options, as YAML that runs again; check: a line for each config, and exit "
-        "code 2 if one is invalid; schema: the JSON Schema of configs, or of those of one scene family",
+        help="show: one config with all its options, as YAML that runs again; check: a line for each config, with the "
+        "limits of the solver that it exceeds, and exit code 2 if one is invalid; schema: the JSON Schema of configs, "
+        "or of those of one scene family",
     )
     parser.add_argument(
         "names", nargs="*", metavar="NAME", help="the config (show), configs (check) or scene family (schema)"
@@ -52,16 +53,19 @@ def run(options: argparse.Namespace) -> int:
         text = json.dumps(resolved(config)) if options.json else resolved_text(config, options.comments)
         print(text.rstrip("\n"))
         return 0
+    from gen2d.programs.limits import exceeded_limits
+
     problems: dict[str, str | None] = {}
     for name in names:
+        warnings = list[str]()
         try:
-            load_config(name, options.overrides)
+            warnings = exceeded_limits(load_config(name, options.overrides))
             problems[name] = None
         except ConfigError as error:
             problems[name] = str(error)
         if options.json:
             values = {"config": name, "valid": problems[name] is None, "problem": problems[name]}
-            print(json.dumps(values))
+            print(json.dumps(values | {"warnings": warnings}))
         else:
-            print(problems[name] or one_line(f"{name}: valid"))
+            print(problems[name] or one_line("; ".join([f"{name}: valid", *warnings])))
     return 2 if any(problems.values()) else 0

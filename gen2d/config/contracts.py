@@ -73,6 +73,25 @@ def _no_sizes(*_: Any) -> dict[str, int]:
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
+class Bodies:
+    """Moving bodies of one kind in a family, from which the limits of a config are computed (programs/limits.py).
+
+    - shape: circle, capsule or box.
+    - size: names of options, m: radius of a circle, radius and half length of a capsule, width and height of a box. An
+        option may have both.
+    - density: name of the option of their density, kg/m^2.
+    - speed: names of options of their speed or velocity at the start, m/s.
+    - bears: names of the bodies that may rest on one of these.
+    """
+
+    shape: str
+    size: tuple[str, ...]
+    density: str = "density"
+    speed: tuple[str, ...] = ()
+    bears: tuple[str, ...] = ()
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
 class Family(_Contract):
     """A scene family: `FAMILY = Family(options=Options, layout=layout, sample=sample)` in gen2d/scenes/NAME.py.
 
@@ -90,6 +109,8 @@ class Family(_Contract):
         values.
     - crowded_by: options to name in the error when an object finds no free position.
     - begins_outside: whether moving objects may start outside the layout's bounds.
+    - bodies: `Bodies` by name, such as balls. A config whose ranges allow masses or speeds that the solver cannot
+        simulate well is warned of; the bodies that are not listed are not checked.
     """
 
     options: type
@@ -100,6 +121,7 @@ class Family(_Contract):
     derived: Mapping[str, Field] = dataclasses.field(default_factory=dict[str, Field])
     crowded_by: tuple[str, ...] = ()
     begins_outside: bool = False
+    bodies: Mapping[str, Bodies] = dataclasses.field(default_factory=dict[str, Bodies])
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -21,6 +21,7 @@ from gen2d.engines.protocol import Engine, Workers
 from gen2d.generation.complete import complete
 from gen2d.generation.warm_up import check_disk
 from gen2d.generation.worker import SEEN, GenerationJob
+from gen2d.programs.limits import exceeded_limits
 from gen2d.records.keys import MAX_VIDEOS
 from gen2d.storage.atomic import sweep
 from gen2d.storage.codecs import check_installed
@@ -132,7 +133,7 @@ def generate(
             f"{argument('worker')} and {argument('engine')} cannot go together: the engine divides the work"
         )
     counts = _counts(config, _check_run(n, split, worker, overwrite), split)
-    for sentence in _incomplete_sets(config, counts):
+    for sentence in [*exceeded_limits(config), *_incomplete_sets(config, counts)]:
         log(sentence)
     check_installed(config.storage.codec)
     network = Network(timeout, deadline)

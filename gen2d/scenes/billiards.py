@@ -9,7 +9,19 @@ import math
 import jax.numpy as jnp
 import numpy as np
 
-from gen2d.plugin import STATIC, Array, Distribution, Family, Layout, SampledScene, SlotGroup, builder, common, option
+from gen2d.plugin import (
+    STATIC,
+    Array,
+    Bodies,
+    Distribution,
+    Family,
+    Layout,
+    SampledScene,
+    SlotGroup,
+    builder,
+    common,
+    option,
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -95,4 +107,11 @@ def _triangle(rows: int) -> np.ndarray:
     return np.array([[math.sqrt(0.75) * row, k - row / 2] for row in range(rows) for k in range(row + 1)], np.float32)
 
 
-FAMILY = Family(options=Options, layout=layout, sample=sample, check=check, sizes=sizes)
+FAMILY = Family(
+    options=Options,
+    layout=layout,
+    sample=sample,
+    check=check,
+    sizes=sizes,
+    bodies={"balls": Bodies("circle", ("radius",), speed=("speed",))},
+)

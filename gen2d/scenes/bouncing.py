@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from gen2d.plugin import (
     STATIC,
     Array,
+    Bodies,
     Distribution,
     Family,
     Layout,
@@ -70,5 +71,10 @@ def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledSc
 
 
 FAMILY = Family(
-    options=Options, layout=layout, sample=sample, check=check, crowded_by=("balls", "radius", "width", "height")
+    options=Options,
+    layout=layout,
+    sample=sample,
+    check=check,
+    crowded_by=("balls", "radius", "width", "height"),
+    bodies={"balls": Bodies("circle", ("radius",), speed=("velocity",), bears=("balls",))},
 )

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 from gen2d.plugin import (
     CLEARANCE,
     Array,
+    Bodies,
     Distribution,
     Family,
     Field,
@@ -116,6 +117,10 @@ FAMILY = Family(
     layout=layout,
     sample=sample,
     check=check,
+    bodies={
+        "the first ball": Bodies("circle", ("radius_1",), speed=("speed_1",)),
+        "the second ball": Bodies("circle", ("radius_2",), speed=("speed_2",)),
+    },
     sizes=sizes,
     derived={
         "contact_frame": Field(

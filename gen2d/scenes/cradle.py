@@ -4,7 +4,7 @@ import dataclasses
 
 import jax.numpy as jnp
 
-from gen2d.plugin import Array, Distribution, Family, Field, Layout, SampledScene, SlotGroup, builder, common
+from gen2d.plugin import Array, Bodies, Distribution, Family, Field, Layout, SampledScene, SlotGroup, builder, common
 
 
 @dataclasses.dataclass(frozen=True)
@@ -68,6 +68,7 @@ FAMILY = Family(
     layout=layout,
     sample=sample,
     check=check,
+    bodies={"balls": Bodies("circle", ("radius",), speed=("speed",))},
     derived={
         "contact_time": Field("float32", "n", "s", "time of the first contact between a moving and a resting ball")
     },

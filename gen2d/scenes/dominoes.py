@@ -4,7 +4,19 @@ import dataclasses
 
 import jax.numpy as jnp
 
-from gen2d.plugin import STATIC, Array, Distribution, Family, Layout, SampledScene, SlotGroup, builder, common, maximum
+from gen2d.plugin import (
+    STATIC,
+    Array,
+    Bodies,
+    Distribution,
+    Family,
+    Layout,
+    SampledScene,
+    SlotGroup,
+    builder,
+    common,
+    maximum,
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -78,4 +90,13 @@ def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledSc
     return SampledScene(*builder.assemble(scene_layout, [ground, ball, row], factors["gravity"]))
 
 
-FAMILY = Family(options=Options, layout=layout, sample=sample, check=check)
+FAMILY = Family(
+    options=Options,
+    layout=layout,
+    sample=sample,
+    check=check,
+    bodies={
+        "dominoes": Bodies("box", ("thickness", "height"), bears=("dominoes",)),
+        "ball": Bodies("circle", ("radius",), speed=("speed",)),
+    },
+)

@@ -6,7 +6,19 @@ import math
 import jax
 import jax.numpy as jnp
 
-from gen2d.plugin import STATIC, Array, Distribution, Family, Layout, SampledScene, SlotGroup, builder, common, place
+from gen2d.plugin import (
+    STATIC,
+    Array,
+    Bodies,
+    Distribution,
+    Family,
+    Layout,
+    SampledScene,
+    SlotGroup,
+    builder,
+    common,
+    place,
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -78,4 +90,5 @@ FAMILY = Family(
     sample=sample,
     check=check,
     crowded_by=("balls", "radius", "width", "height", "neck_height", "angle", "gap"),
+    bodies={"balls": Bodies("circle", ("radius",), bears=("balls",))},
 )

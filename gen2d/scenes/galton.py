@@ -5,7 +5,19 @@ import math
 
 import jax.numpy as jnp
 
-from gen2d.plugin import STATIC, Array, Distribution, Family, Layout, SampledScene, SlotGroup, builder, common, option
+from gen2d.plugin import (
+    STATIC,
+    Array,
+    Bodies,
+    Distribution,
+    Family,
+    Layout,
+    SampledScene,
+    SlotGroup,
+    builder,
+    common,
+    option,
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -104,4 +116,10 @@ def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledSc
     return SampledScene(*builder.assemble(scene_layout, parts, factors["gravity"]))
 
 
-FAMILY = Family(options=Options, layout=layout, sample=sample, check=check)
+FAMILY = Family(
+    options=Options,
+    layout=layout,
+    sample=sample,
+    check=check,
+    bodies={"balls": Bodies("circle", ("radius",), bears=("balls",))},
+)

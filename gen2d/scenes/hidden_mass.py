@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from gen2d.plugin import (
     STATIC,
     Array,
+    Bodies,
     Distribution,
     Family,
     Field,
@@ -111,6 +112,7 @@ FAMILY = Family(
     layout=layout,
     sample=sample,
     check=check,
+    bodies={"balls": Bodies("circle", ("radius",), speed=("speed",))},
     derived={
         "contact_time": Field(
             "float32", "n pairs", "s", "time at which the balls of a pair meet, if nothing else hits them before"

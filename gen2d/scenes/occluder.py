@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from gen2d.plugin import (
     STATIC,
     Array,
+    Bodies,
     Distribution,
     Family,
     Field,
@@ -117,6 +118,7 @@ FAMILY = Family(
     layout=layout,
     sample=sample,
     check=check,
+    bodies={"balls": Bodies("circle", ("radius",), speed=("speed",), bears=("balls",))},
     derived={
         "hidden_from": Field(
             "float32", "n balls", "s", "time at which the ball is first wholly behind the screen, if nothing hits it"

@@ -10,6 +10,7 @@ import numpy as np
 from gen2d.plugin import (
     STATIC,
     Array,
+    Bodies,
     Distribution,
     Family,
     Layout,
@@ -23,6 +24,7 @@ from gen2d.plugin import (
 )
 
 TURN = [-math.pi, math.pi]
+KINDS = ("discs", "boxes", "capsules")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -113,5 +115,10 @@ FAMILY = Family(
     layout=layout,
     sample=sample,
     check=check,
+    bodies={
+        "discs": Bodies("circle", ("disc_radius",), bears=KINDS),
+        "boxes": Bodies("box", ("box_size",), bears=KINDS),
+        "capsules": Bodies("capsule", ("capsule_radius", "capsule_half_length"), bears=KINDS),
+    },
     crowded_by=("discs", "boxes", "capsules", "disc_radius", "box_size", "capsule_half_length", "width", "height"),
 )

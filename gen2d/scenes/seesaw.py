@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from gen2d.plugin import (
     STATIC,
     Array,
+    Bodies,
     Distribution,
     Family,
     Field,
@@ -104,5 +105,9 @@ FAMILY = Family(
     layout=layout,
     sample=sample,
     check=check,
+    bodies={
+        "plank": Bodies("box", ("length", "thickness"), "plank_density", bears=("weights",)),
+        "weights": Bodies("box", ("width", "height")),
+    },
     derived={"torque": Field("float32", "n", "N m", "torque of all weights about the pivot while the plank is level")},
 )

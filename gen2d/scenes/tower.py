@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from gen2d.plugin import (
     STATIC,
     Array,
+    Bodies,
     Distribution,
     Family,
     Field,
@@ -84,6 +85,7 @@ FAMILY = Family(
     options=Options,
     layout=layout,
     sample=sample,
+    bodies={"blocks": Bodies("box", ("width", "height"), bears=("blocks",))},
     derived={
         "stable": Field("float32", "n", "1", "static stability of the tower; 1: stable, 0: unstable"),
         "margin": Field(

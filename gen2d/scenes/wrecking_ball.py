@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from gen2d.plugin import (
     STATIC,
     Array,
+    Bodies,
     Distribution,
     Family,
     JointSpec,
@@ -100,4 +101,13 @@ def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledSc
     return SampledScene(*builder.assemble(scene_layout, parts, factors["gravity"], joints))
 
 
-FAMILY = Family(options=Options, layout=layout, sample=sample, check=check)
+FAMILY = Family(
+    options=Options,
+    layout=layout,
+    sample=sample,
+    check=check,
+    bodies={
+        "blocks": Bodies("box", ("width", "height"), bears=("blocks",)),
+        "ball": Bodies("circle", ("radius",), "ball_density"),
+    },
+)

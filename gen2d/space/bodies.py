@@ -67,6 +67,21 @@ class Joint:
     numbers: dict[str, float]
 
 
+def hinge_gap(joints: Sequence[Joint], position: np.ndarray, angle: np.ndarray) -> float:
+    """Largest distance in m of the anchors of a hinge, of bodies at `position` [T, K, 2] and `angle` [T, K]."""
+
+    def anchor(body: int, point: np.ndarray) -> np.ndarray:
+        if body < 0:
+            return np.broadcast_to(point, position[:, 0].shape)
+        cos, sin = np.cos(angle[:, body]), np.sin(angle[:, body])
+        turned = np.stack([cos * point[0] - sin * point[1], sin * point[0] + cos * point[1]], axis=-1)
+        return position[:, body] + turned
+
+    hinges = [joint for joint in joints if joint.kind == "revolute"]
+    gaps = [anchor(joint.a, joint.anchor_a) - anchor(joint.b, joint.anchor_b) for joint in hinges]
+    return float(np.max(np.linalg.norm(gaps, axis=-1))) if gaps else 0.0
+
+
 class Overlaps(NamedTuple):
     """Overlaps of bodies, a row for each of R points, ordered by frame."""
 

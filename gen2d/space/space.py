@@ -46,11 +46,12 @@ from gen2d.space.arrange import (
     slots_of_span,
     world_anchor,
 )
-from gen2d.space.bodies import KINDS, Body, BodyOptions, Joint, Overlaps, Pair, Poses
+from gen2d.space.bodies import KINDS, Body, BodyOptions, Joint, Overlaps, Pair, Poses, hinge_gap
 from gen2d.space.checks import checked_color, checked_corners, checked_number, checked_pair, rotate
 from gen2d.space.video import Video
 
 _log = logging.getLogger(__name__)
+TORN = 0.1  # of the longest arm: larger gaps of hinges are warned of; they are 1e-3 at most where the solver holds
 SAFE_RATIO = 10  # of two masses, without shock propagation: the heavier one sinks in by 2 mm
 
 
@@ -520,7 +521,7 @@ class Space:
 
         The first call compiles a program, which takes seconds. Another space with as many bodies of each shape and the
         same joints reuses it. Logs a warning if masses differ more than contacts at rest bear: by a factor of 10, or of
-        3000 with `shock_propagation`.
+        3000 with `shock_propagation`, and if hinges come apart.
 
         Parameters
         ----------
@@ -575,6 +576,7 @@ class Space:
         trajectory = program(*jax.tree.map(lambda x: x[None], (scene, state)))
         trajectory = jax.tree.map(lambda x: np.asarray(x)[0], trajectory)
         states = trajectory.states
+        self._warn_of_gaps(states.position[:, slots], states.angle[:, slots], 1 / (fps * steps))
         return Video(
             bodies=tuple(self.bodies),
             joints=tuple(self.joints),
@@ -598,6 +600,19 @@ class Space:
                 "1/%g of its mass sinks in%s",
                 *(min(masses), max(masses), max(masses) / min(masses), safe),
                 "" if self.physics.shock_propagation else f"; shock_propagation=True holds up to {LARGEST_RATIO:g}",
+            )
+
+    def _warn_of_gaps(self, position: np.ndarray, angle: np.ndarray, step: float) -> None:
+        """Log a warning if hinges come apart, as the tension in a chain is too large for steps of `step` s."""
+        later = slice(len(position) // 2, None)  # anchors that are apart at the start have met by then
+        gap = hinge_gap(self.joints, position[later], angle[later])
+        ends = [end for joint in self.joints for end in ((joint.a, joint.anchor_a), (joint.b, joint.anchor_b))]
+        arms = [math.hypot(*anchor) for body, anchor in ends if body >= 0]
+        if not gap <= TORN * max(arms, default=0.0):
+            _log.warning(
+                "Space: hinges come apart by %.3g m: a link of mass m and length l under a tension T needs steps below "
+                "sqrt(m l / 3 T), and max_step is %.3g s: ask for a fraction of it, or give a taut chain some slack",
+                *(gap, step),
             )
 
     def _solver_params(self, fps: float, asked: int | None) -> tuple[SolverParams, int]:

@@ -27,6 +27,7 @@ from gen2d.physics.inertia import polygon_mass
 from gen2d.physics.params import solver_params
 from gen2d.physics.simulate import SaveAt, simulate
 from gen2d.records import axes
+from gen2d.space.bodies import hinge_gap
 from gen2d.space.space import Space
 
 with warnings.catch_warnings():  # raised by types of SWIG
@@ -288,24 +289,10 @@ def measures(demo: Demo, space: Space, run: Run) -> tuple[str, ...]:
     return (
         f"{drift:.2g}" if demo.rests else "",
         f"{overlap:.2g}" if overlap else "0",
-        f"{joint_gap(space, run):.2g}" if space.joints else "",
+        f"{hinge_gap(space.joints, run.position, run.angle):.2g}" if space.joints else "",
         "" if demo.driven else f"{gain:.1g}",
         f"{1e3 * run.cost:.2g}",
     )
-
-
-def joint_gap(space: Space, run: Run) -> float:
-    """Largest distance of the two anchors of a joint, m."""
-
-    def anchor(number: int, point: np.ndarray) -> np.ndarray:
-        if number < 0:
-            return np.broadcast_to(point, run.position[:, 0].shape)
-        cos, sin = np.cos(run.angle[:, number]), np.sin(run.angle[:, number])
-        turned = np.stack([cos * point[0] - sin * point[1], sin * point[0] + cos * point[1]], axis=-1)
-        return run.position[:, number] + turned
-
-    gaps = [anchor(joint.a, joint.anchor_a) - anchor(joint.b, joint.anchor_b) for joint in space.joints]
-    return float(np.linalg.norm(gaps, axis=-1).max())
 
 
 def rows(demo: Demo) -> Iterator[tuple[str, ...]]:

@@ -13,6 +13,7 @@ from gen2d import Space
 from gen2d.physics.banded import factor, solve_factored
 from gen2d.physics.rigid_joints import joint_system_plan
 from gen2d.records.layout import JointSpec
+from gen2d.space.bodies import hinge_gap
 from gen2d.space.video import Video
 
 
@@ -118,3 +119,15 @@ def test_a_level_bridge_between_two_cliffs_hangs(planks):
     height = space.simulate(4, fps=60, contacts=0).position[..., 1]
     assert -0.01 * planks < height.min() < -0.001 * planks
     assert height.max() < 0.01
+
+
+@pytest.mark.full
+@pytest.mark.parametrize(("planks", "max_step", "warned"), [(20, 1 / 240, 0), (40, 1 / 240, 1), (40, 1 / 960, 0)])
+def test_hinges_that_come_apart_are_warned_of(planks, max_step, warned, caplog):
+    space = Space(gravity=(0, -9.81), max_step=max_step)
+    bridge(space, planks)
+    video = space.simulate(2, fps=60, contacts=0)
+    messages = [record.getMessage() for record in caplog.records if "hinges come apart" in record.getMessage()]
+    assert len(messages) == warned
+    assert all("max_step is 0.00417 s" in message for message in messages)
+    assert (hinge_gap(space.joints, video.position, video.angle) > 1) == bool(warned)

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
+from overlap import deepest
 from worlds import rules, run
 
 from gen2d.core.enums import DYNAMIC, END, NO_CONTACT, STATIC
@@ -25,6 +26,7 @@ from gen2d.records.trajectory import Contacts
 HALF, SIDES = 5.0, 4  # m: half the side of the box; its number of walls
 GRAVITY = 9.81  # m/s^2
 FRAMES = 361  # 1.5 s
+MARKS = slice(120, None, 120)  # frames at each half second, at 240 Hz
 ROWS = 8000  # of contacts in a world
 MIXING = {
     "product": np.multiply,
@@ -300,6 +302,7 @@ class Measures(NamedTuple):
     outside: np.ndarray  # [n] m: largest distance of a centre beyond a wall; negative inside
     contacts: Contacts
     friction: np.ndarray  # [n, C] of the pair of each row
+    overlap: np.ndarray  # [n, M] m: deepest overlap of a moving body at each mark
 
     @property
     def gain_in_step(self) -> np.ndarray:
@@ -375,6 +378,7 @@ def _measures(arena: Arena, scene: Scene, states: State, contacts: Contacts, mix
         outside=np.where(present, np.nan_to_num(np.abs(x).max(-1) - HALF, nan=np.inf), -HALF).max((1, 2)),
         contacts=contacts,
         friction=MIXING[mixing](*frictions),
+        overlap=deepest(objects, np.asarray(states.position)[:, MARKS], np.asarray(states.angle)[:, MARKS]),
     )
 
 

@@ -1,0 +1,100 @@
+"""Limits of the solver that a config exceeds: what is warned of, with which numbers, and that they are measured."""
+
+import math
+
+import pytest
+from laws import holds
+from tiny import CONFIG, run_main
+
+from gen2d import Space, generate
+from gen2d.config import plugins
+from gen2d.config.config import load_config
+from gen2d.programs.limits import exceeded_limits, safe_ratio, sinking
+
+G, DENSITIES = 9.81, "scene.density={log_uniform: [0.001, 1000]}"
+
+
+def limits(config: str, *overrides: str) -> list[str]:
+    return exceeded_limits(load_config(config, overrides))
+
+
+@pytest.mark.parametrize("hertz", [30.0, pytest.param(7.5, marks=pytest.mark.full)])
+def test_a_heavy_box_sinks_as_deep_as_the_law_says(hertz: float) -> None:
+    ratios = 3.0, 30.0, 100.0
+    space = Space(gravity=(0, -G), max_step=0.125 / hertz if hertz < 30 else 1 / 240)
+    space.add_segment((-5, 0), (15, 0))
+    for place, ratio in enumerate(ratios):
+        space.add_box((5.0 * place, 0.5), 1, 1, density=1)
+        space.add_box((5.0 * place, 1.5), 1, 1, density=ratio)
+    heights = space.simulate(4, fps=60, energy=False, contacts=0).position[-1, 1:, 1]
+    depth = 1 - (heights[1::2] - heights[::2])
+    for found, ratio in zip(depth[: 3 if hertz == 30 else 2], ratios, strict=False):
+        holds(f"sinking at {ratio:g}:1 over that of the law, less 1", found / sinking(ratio, G, hertz) - 1, 0.05)
+
+
+@pytest.mark.parametrize("ratio", [2.0, 29.0, 31.0, 500.0])
+def test_the_safe_ratio_sinks_as_deep_as_is_safe(ratio: float) -> None:
+    assert math.isclose(safe_ratio(sinking(ratio, G, 30.0), G, 30.0), ratio, rel_tol=1e-9)
+
+
+@pytest.mark.parametrize("name", plugins.config_names())
+def test_no_config_that_comes_with_gen2d_is_warned_of(name: str) -> None:
+    assert limits(name) == []
+
+
+@pytest.mark.parametrize("name", plugins.names("scene"))
+def test_no_family_with_its_defaults_is_warned_of(name: str) -> None:
+    assert exceeded_limits(load_config({"scene": name})) == []
+
+
+def test_masses_that_differ_too_much_are_named_with_what_is_safe() -> None:
+    (sentence,) = limits("bouncing", DENSITIES)
+    lightest, heaviest = 0.001 * math.pi * 0.25, 1000 * math.pi
+    assert "scene.density and scene.radius" in sentence
+    assert f"balls of {heaviest:.3g} kg on balls of {lightest:.3g} kg" in sentence
+    safe = safe_ratio(0.005, 9.8, 30.0)  # of a thickness of 1 m
+    assert f"ratios up to {safe:.4g} are" in sentence
+    (propagated,) = limits("bouncing", DENSITIES, "physics.shock_propagation=true")
+    assert "ratios up to 3000 are safe" in propagated
+    narrow = f"scene.density=[1, {safe / 4 * 0.99}]"  # the radii make a factor of 4
+    assert limits("bouncing", narrow) == []
+    assert len(limits("bouncing", narrow, f"scene.density=[1, {safe / 4 * 1.01}]")) == 1
+    assert limits("bouncing", DENSITIES, "scene.gravity=[0, 0]") == []  # nothing rests on anything
+    assert limits("pile", DENSITIES) == []  # all objects of a video have the same density
+
+
+def test_a_step_that_makes_contacts_soft_is_the_cause() -> None:
+    soft = limits("tower", "physics.max_step=0.05")
+    assert "physics.contact_hertz=3 (limited by the step), not even equal masses are safe" in soft[0]
+
+
+def test_speeds_that_are_too_large_for_the_step_are_named_with_a_step_that_is_safe() -> None:
+    still = "scene.gravity=[0, 0]"
+    (sentence,) = limits("bouncing", "scene.velocity=[{normal: [0, 30]}, 0]", still)
+    assert "scene.velocity allow balls of 120 m/s, which move by 0.5 m in a step of 0.00417 s" in sentence
+    assert sentence.endswith("physics.max_step=0.0021 or less is short enough")
+    assert limits("bouncing", "scene.velocity=[[-59, 59], 0]", still) == []
+    assert len(limits("bouncing", "scene.velocity=[{mixture: [[0, 1], [60, 61]]}, 0]", still)) == 1
+    assert limits("bouncing", "scene.velocity=[0, 0]", still) == []  # nothing moves
+    falling = math.sqrt(2 * 9.8 * 10)
+    (sentence,) = limits("bouncing", "scene.velocity=[0, 0]", "scene.radius=0.05")
+    assert f"allow balls of {falling:.3g} m/s" in sentence
+
+
+def test_ranges_and_physics_of_splits_count() -> None:
+    base = {"scene": {"name": "bouncing", "gravity": [0, -9.8]}}
+    heavy = {"heavy": {"factors": {"density": [2, 1000]}}}
+    assert len(exceeded_limits(load_config(base | {"splits": {"train": {}, **heavy}}))) == 1
+    coarse = {"coarse": {"physics": {"max_step": 0.1}}}
+    assert len(exceeded_limits(load_config(base | {"splits": {"train": {}, **coarse}}))) == 2
+
+
+def test_a_run_says_so_once_and_check_says_it_too(tmp_path) -> None:
+    lines: list[str] = []
+    config = CONFIG | {"scene": CONFIG["scene"] | {"density": [1, 1000]}}
+    (expected,) = exceeded_limits(load_config(config))
+    generate(config, 4, tmp_path / "videos", log=lines.append)
+    assert [str(line) for line in lines].count(expected) == 1
+    done = run_main("config", "check", "bouncing", "--set", DENSITIES)
+    (sentence,) = limits("bouncing", DENSITIES)
+    assert (done.returncode, done.stdout) == (0, f"bouncing: valid; {sentence}\n")
