@@ -255,15 +255,6 @@ def _less(drift: Motion, time: Array, new: Motion, old: Motion) -> Motion:
     return Motion(drift.velocity - time * (new.velocity - old.velocity), drift.spin - time * (new.spin - old.spin))
 
 
-def _with_shock(old: BodySide, new: BodySide, bounces: Array) -> BodySide:
-    """The side with its change of velocity added to its shock where a contact bounces."""
-    before, after = free_motion(old), free_motion(new)
-    if old.shock is None or before is None or after is None:
-        return new
-    of = zip(old.shock, before, after, strict=True)
-    return new._replace(shock=Motion(*(shock + jnp.where(bounces, y - x, 0.0) for shock, x, y in of)))
-
-
 def _after_impulses(
     constraint: ContactConstraint,
     old: tuple[BodySide, BodySide],
@@ -272,12 +263,11 @@ def _after_impulses(
     time: Array,
     push: Array | None,
 ) -> tuple[BodySide, BodySide]:
-    """Both sides with the drift, the push, the shock and the clock after impulses at this time, s."""
+    """Both sides with the drift, the push and the clock after impulses at this time, s."""
     (a, b), (new_a, new_b) = old, new
     new_b = _update_drift(b, new_b, time, push)
     if constraint.a is not None and a.drift is not None:
         new_a = _update_drift(a, new_a, time, push)
-    new_a, new_b = _with_shock(a, new_a, bounces), _with_shock(b, new_b, bounces)
     return after_impact(new_a, new_b, bounces, time)
 
 
@@ -407,8 +397,6 @@ def relax(
         return relaxed_target(constraint, contact, speed, old, threshold)
 
     new_a, new_b, last = _apply_pass(constraint, solved._replace(contacts=contacts), target_of, a, b)
-    again = functools.reduce(jnp.logical_or, bounced)
-    new_a, new_b = _with_shock(a, new_a, again), _with_shock(b, new_b, again)
     of = zip(last.contacts, bounced, last.impulses, memory.impulses, strict=True)
     impulses = materialize(
         [_next_impulse(constraint, c, (c.tau >= 0) | bounce, new, old, setup) for c, bounce, new, old in of]

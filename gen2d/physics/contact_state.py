@@ -26,7 +26,6 @@ class BodySide(NamedTuple):
     drift: Motion | None = None  # m, rad: displacement beyond h times the new velocity, as impulses act at their time
     displacement: Motion | None = None  # m, rad: where the impulses of a pass act; None: of static bodies
     push: Any = None  # [N, ...] m/s: bound on the speed from pushing overlaps apart; 0: no contact; None: static
-    shock: Motion | None = None  # m/s, rad/s: change by the impacts of a pass; None: static, and without rigid joints
     work: Work | None = None
     taken: Array | None = None  # [6, N, ...] what rigid joints take from the inverse mass (jointed.py)
     change: Motion | None = None  # m/s, rad/s: what they take from the motion in a pass

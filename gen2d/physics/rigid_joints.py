@@ -305,10 +305,6 @@ class FactoredSystem:
         more = self._impulses(speeds + self._compliance * impulses)
         return impulses + more, *_apply(self._system, self._rows, now, more)
 
-    def response(self, changes: list[Motion]) -> Array:
-        """Impulses that cancel the speeds of the rows that changes of the motions cause."""
-        return self._impulses(_speeds(self._system, self._rows, self._table(changes)))
-
     def _impulses(self, speeds: Array) -> Array:
         return -materialize(solve_factored(self._factors, materialize(speeds)))
 

@@ -120,8 +120,7 @@ class _RigidJoints:
             return sides
         self._factored = rigid_joints.FactoredSystem(self._system, self._anchors)
         self._taken = self._factored.taken(_motions(sides))
-        still = [_scaled(motion, 0.0) for motion in _motions(sides)]
-        return self._held([side._replace(shock=shock) for side, shock in zip(sides, still, strict=True)])
+        return self._held(sides)
 
     def hold_again(self, sides: list[BodySide], displacements: list[Motion]) -> list[BodySide]:
         """Sides of the relaxing pass, after displacements."""
@@ -160,12 +159,6 @@ class _RigidJoints:
         self.impulses = solved.impulses
         self.works.append(solved.work)
         return solved.motions
-
-    def next_impulses(self, sides: list[BodySide]) -> Array | None:
-        """Impulses that the next step starts with: those that impacts did not cause, as they act once."""
-        if self.impulses is None:
-            return None
-        return self.impulses - self._factored.response([side.shock for side in sides if side.shock is not None])
 
 
 def _motions(sides: list[BodySide]) -> list[Motion]:
@@ -235,7 +228,7 @@ def step(world: WorldState, model: Model, params: SolverParams) -> WorldState:
     )
     of_groups = zip(sides, motions, displacements, strict=True)
     sides = [
-        BodySide(motion=m, displacement=moved, push=side.push, shock=side.shock, work=side.work, support=side.support)
+        BodySide(motion=m, displacement=moved, push=side.push, work=side.work, support=side.support)
         for side, m, moved in of_groups
     ]
     sides, carry = solver.relax(carry, solved, rigid.hold_again(sides, displacements), statics, world.time)
@@ -250,6 +243,6 @@ def step(world: WorldState, model: Model, params: SolverParams) -> WorldState:
         time=world.time + h,
         contacts=carry,
         joints=[joint.impulses for joint in joints],
-        joint_system=rigid.next_impulses(sides),
+        joint_system=rigid.impulses,
         ledger=ledger,
     )
