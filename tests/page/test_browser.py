@@ -20,7 +20,7 @@ from gen2d.tools.view import DETAIL, Library, serving
 
 pytestmark = pytest.mark.full
 ONSET = 6  # frames that the videos of a set share, at least
-OVERLAYS = ("Outlines", "Velocities", "Trails", "Boxes", "Masks", "Numbers", "Flow")
+OVERLAYS = ("Outlines", "Velocities", "Trails", "Boxes", "Masks", "Numbers", "Flow", "Depth", "Normals", "Shadow")
 PIXELS = "JSON.stringify([...document.querySelectorAll('#views canvas')].map((canvas) => canvas.toDataURL()))"
 
 # Mean difference of the pixels of two shown videos, in grey levels.
@@ -50,7 +50,8 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
     config = tiny.tiny_config(
         video={"frames": 24, "height": 48, "width": 60},
         matched={"change": ["teleport"], "onset": 0.5, "distance": [1, 2]},
-        annotations={"masks": True, "boxes": True, "flow": True},
+        look={"name": "studio", "palette": "scene"},
+        annotations=dict.fromkeys(("masks", "boxes", "flow", "depth", "normals", "shadow"), True),
     )
     folder = tmp_path_factory.mktemp("browser") / "twins"
     gen2d.generate(config, n=30, out=folder)
@@ -101,7 +102,7 @@ def test_an_overlay_changes_pixels(opened: Tab, name: str) -> None:
     before = opened.evaluate(PIXELS)
     opened.evaluate(f"$('show-{name}').click()")
     assert opened.evaluate(PIXELS) != before
-    opened.press(str(1 + opened.evaluate(f"OVERLAYS.indexOf('{name}')")))
+    opened.press(opened.evaluate(f"KEYS[Object.keys(OVERLAYS).indexOf('{name}')]"))
     assert opened.evaluate(PIXELS) == before
 
 
