@@ -175,6 +175,24 @@ def test_colours_of_a_palette_are_shown_instead_of_the_scenes(opened: Tab) -> No
     assert chips == [", ".join(map(str, color)) for color in moving]
 
 
+def test_occluders_are_drawn_before_the_objects_behind_them(opened: Tab) -> None:
+    """Without frames: an occluder of the whole picture, behind the first moving ball and before it."""
+    pixel = """(depth) => {
+      const video = { ...state.shown[0], sprite: null, occluders: [[0, 0, 60, 48, 1, 2, 3, depth]] };
+      const k = video.objects.slot.findIndex((_, k) => !fixed(video.objects, k));
+      const canvas = document.createElement("canvas");
+      [canvas.width, canvas.height] = [60, 48];
+      drawFrame(canvas, video, 0, new Set());
+      const position = video.arrays["states/position"];
+      const [x, y] = camera(video, 0).point(at(position, 0, k, 0, 2), at(position, 0, k, 1, 2));
+      const seen = [...canvas.getContext("2d").getImageData(x, y, 1, 1).data].slice(0, 3);
+      return [seen, video.objects.color[k], video.objects["objects/depth"][k]];
+    }"""
+    _, color, depth = opened.evaluate(f"({pixel})(0)")
+    assert opened.evaluate(f"({pixel})({depth})")[0] == color
+    assert opened.evaluate(f"({pixel})({depth + 1})")[0] == [1, 2, 3]
+
+
 def test_hostile_strings_are_shown_and_do_nothing(tab: Tab, root: Path, tmp_path: Path) -> None:
     manifest = hostile(read_manifest(root))
     video = Videos(root, read_manifest(root), "train").video(0, DETAIL)
