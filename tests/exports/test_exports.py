@@ -30,6 +30,7 @@ from gen2d.exports import export
 from gen2d.exports import parts as parts_module
 from gen2d.exports import source as source_module
 from gen2d.exports.partial import PartialExport
+from gen2d.loading.dataset import RenderOptions
 from gen2d.media import films
 
 SIZES = {"T": 6, "H": 64, "W": 48, "K": 3}
@@ -569,7 +570,7 @@ TIERED = [pytest.param(name, marks=[pytest.mark.full] * (name in SURFACES)) for 
 @pytest.mark.parametrize("name", TIERED)
 def test_every_format_keeps_the_contract(name: str, balls: Path, tmp_path: Path) -> None:
     """It makes the folder or the file that it declares, and tells what is lost."""
-    form, look = plugins.load("export", name), {"look": "studio"} if name in SURFACES else None
+    form, look = plugins.load("export", name), RenderOptions(look="studio") if name in SURFACES else None
     done = gen2d.export(balls, name, tmp_path / f"out{form.suffix}", render=look)
     assert done.loss.endswith(form.loss)
     assert form.codecs or done.loss == form.loss
