@@ -126,7 +126,7 @@ class References:
             program = base
             for name in names:
                 program = (*program, words[name], f"filter_{name}")
-            order = [name for name in ("size", "material", "color") if name in names]
+            order = [name for name in ("size", "color", "material") if name in names]  # as in English
             text = " ".join([*(words[name] for name in order), noun])
             return text, program, self.alike(slot, **dict.fromkeys(names, True))
 

@@ -126,8 +126,8 @@ class Story:
             things.append(f"a chain of {number_word(len(chain))} links{held}")
         others = [slot for slot in moving if facts.nouns[slot] != "link"]
         colors, sizes, materials = self.references.colors, self.references.sizes, self.references.materials
-        words = [[sizes[s], materials[s], colors[s], facts.nouns[s]] for s in others]
-        words = words if len(others) <= MAX_LISTED else [row[2:] for row in words]
+        words = [[sizes[s], colors[s], materials[s], facts.nouns[s]] for s in others]
+        words = words if len(others) <= MAX_LISTED else [[color, noun] for _, color, _, noun in words]
         phrases = Counter(" ".join(word for word in row if word) for row in words)
         if len(phrases) > MAX_PHRASES:
             phrases = Counter(facts.nouns[slot] for slot in others)

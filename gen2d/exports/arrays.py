@@ -1,8 +1,8 @@
-"""Files that several formats write: NumPy archives, and films with archives beside them."""
+"""Files that several formats write: NumPy archives, films with archives beside them, and images of every frame."""
 
 import io
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +10,7 @@ import numpy as np
 from gen2d.core.errors import ConfigError, argument
 from gen2d.exports.source import Source
 from gen2d.loading.protocols import Batch
+from gen2d.media import images
 from gen2d.media.films import Codec
 
 
@@ -35,6 +36,22 @@ def write_films(target: Path, source: Source, codec: Codec) -> None:
             (target / f"{key}.npz").write_bytes(archive({**others, "time": source.ds.time}))
 
     source.each(write_film)
+
+
+def write_images(
+    target: Path, source: Source, folder: str, field: str, encode: Callable[[np.ndarray], np.ndarray]
+) -> None:
+    """Write images/KEY-0000.png of each frame, and FOLDER/KEY-0000.png of `encode(values)` of a field of the frame."""
+    for name in ("images", folder):
+        (target / name).mkdir()
+
+    def write_video(key: str, video: Batch) -> None:
+        for frame, (image, values) in enumerate(zip(video["frames"], video[field], strict=True)):
+            name = f"{key}-{frame:04d}.png"
+            (target / "images" / name).write_bytes(images.png(image))
+            (target / folder / name).write_bytes(images.png(encode(values)))
+
+    source.each(write_video)
 
 
 def check_films(source: Source, name: str, codec: Codec) -> None:

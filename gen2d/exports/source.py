@@ -16,10 +16,10 @@ from gen2d.core.schema import Field
 from gen2d.dataset.block import stored_bytes
 from gen2d.loading import dataset as loader
 from gen2d.loading.dataset import Dataset, RenderOptions
+from gen2d.loading.fields import RENDERED
 from gen2d.loading.protocols import Batch, unbatch
 from gen2d.storage.paths import Place
 
-DRAWN = ("frames", "masks/", "boxes/", "visibility/", "flow/", "tracks/")  # what can be rendered from states
 BATCH_BYTES = 2**26  # of videos that are read, or rendered, at once
 Result = TypeVar("Result")
 
@@ -133,7 +133,9 @@ def source_of(
     """
     ds = loader.open(root, split, fields=())
     if any(fnmatch.fnmatch("frames", pattern) for pattern in patterns):
-        missing = [name for name in ("frames", *patterns) if name.startswith(DRAWN) and name not in ds.manifest.fields]
+        missing = [
+            name for name in ("frames", *patterns) if name.startswith(RENDERED) and name not in ds.manifest.fields
+        ]
         if render is not None or missing:
             render, patterns = {"trust": trust, **(render or {})}, ["frames", *patterns]
     elif render is not None:

@@ -13,6 +13,11 @@ _MADE = {
     "annotations.visibility=true": "visibility/fraction visibility/pixels quality/min_visibility",
     "annotations.flow=true": "flow/forward flow/forward_valid flow/backward flow/backward_valid",
     "annotations.tracks=8": "tracks/points tracks/visible tracks/object",
+    "annotations.centers=true": "centers/points centers/visible",
+    "annotations.depth=true": "surface/height",
+    "annotations.normals=true": "surface/normal",
+    "annotations.shadow=true": "surface/shadow",
+    "annotations.classes=true": "objects/class_name",
     "annotations.contacts=4": (
         "contacts/a contacts/b contacts/count contacts/time contacts/frame contacts/point contacts/normal "
         "contacts/kind contacts/normal_impulse contacts/tangent_impulse contacts/approach_speed "
@@ -29,7 +34,8 @@ _MADE = {
     ),
 }
 MAKERS = {name: option for option, names in _MADE.items() for name in names.split()}
-RENDERED = "frames", "masks/", "boxes/", "visibility/", "flow/", "tracks/"  # what can be rendered from states
+# What can be rendered from states.
+RENDERED = "frames", "masks/", "boxes/", "visibility/", "flow/", "tracks/", "centers/", "surface/"
 CLOSE = 0.6  # of difflib
 MOST = 12  # names in a list
 

@@ -58,7 +58,7 @@ def write(path: Path, image: np.ndarray) -> None:
 
 
 def png(image: np.ndarray) -> bytes:
-    """The bytes of a PNG file that holds a picture [H, W, 3] of RGB, uint8 or uint16."""
+    """The bytes of a PNG file that holds a picture, [H, W, 3] of RGB or [H, W] of grey levels, uint8 or uint16."""
     if image.dtype == np.uint16:
         return _png16(image)
     content = io.BytesIO()
@@ -67,12 +67,13 @@ def png(image: np.ndarray) -> bytes:
 
 
 def _png16(image: np.ndarray) -> bytes:
-    """PNG of 16 bits a channel, which Pillow does not write; each row is stored as it is (filter 0)."""
+    """PNG of 16 bits a channel, which Pillow writes of grey levels only; each row is stored as it is (filter 0)."""
     height, width = image.shape[:2]
     pixels = np.ascontiguousarray(image, ">u2").reshape(height, -1).view(np.uint8)
     rows = np.concatenate([np.zeros((height, 1), np.uint8), pixels], axis=1)
-    header = struct.pack(">IIBBBBB", width, height, 16, 2, 0, 0, 0)  # 2: RGB
+    kind = 2 if image.ndim == 3 else 0  # RGB, or grey levels
+    header = struct.pack(">IIBBBBB", width, height, 16, kind, 0, 0, 0)
     chunks = (b"IHDR", header), (b"IDAT", zlib.compress(rows.tobytes())), (b"IEND", b"")
     return b"\x89PNG\r\n\x1a\n" + b"".join(
-        struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data)) for kind, data in chunks
+        struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data)) for name, data in chunks
     )

@@ -83,7 +83,7 @@ def tracks_overlay(frame: VideoFields) -> np.ndarray:
 
 def height_overlay(frame: VideoFields) -> np.ndarray:
     """Heights of a frame, from 0 to 1, as grey values."""
-    return _grey(255 * np.clip(frame["surface/height"].astype(np.float32), 0, 1))
+    return grey_levels(255 * frame["surface/height"].astype(np.float32))
 
 
 def normals_overlay(frame: VideoFields) -> np.ndarray:
@@ -93,9 +93,9 @@ def normals_overlay(frame: VideoFields) -> np.ndarray:
 
 def shadow_overlay(frame: VideoFields) -> np.ndarray:
     """Opacity of a frame's shadows as grey values."""
-    return _grey(frame["surface/shadow"])
+    return grey_levels(frame["surface/shadow"])
 
 
-def _grey(values: np.ndarray) -> np.ndarray:
-    """Image [H, W, 3] of values [H, W] from 0 to 255."""
-    return np.repeat(values.astype(np.uint8)[..., None], 3, axis=-1)
+def grey_levels(values: np.ndarray) -> np.ndarray:
+    """Grey image [..., 3], uint8, of values [...] from 0 to 255."""
+    return np.repeat(np.clip(values, 0, 255).astype(np.uint8)[..., None], 3, axis=-1)

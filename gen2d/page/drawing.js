@@ -46,7 +46,16 @@ function drawScene(context, video, t, view, unit) {
   const order = video.objects.slot.map((_, k) => k);
   const depth = video.objects["objects/depth"];
   if (depth) order.sort((a, b) => depth[a] - depth[b]);
+  const occluders = [...(video.occluders || [])];
+  const drawOccluders = (before) => {
+    while (occluders.length && occluders[0][7] <= before) {
+      const [left, top, right, bottom, ...paint] = occluders.shift();
+      context.fillStyle = `rgb(${paint.slice(0, 3).join(" ")})`;
+      context.fillRect(left, top, right - left, bottom - top);
+    }
+  };
   for (const k of order) {
+    if (depth) drawOccluders(depth[k]);
     const [x, y] = view.point(at(position, t, k, 0, 2), at(position, t, k, 1, 2));
     outline(context, video.objects, k, x, y, angleOf(video, t, k) - view.angle, view.scale);
     context.fillStyle = context.strokeStyle = color(video.objects, k);
@@ -54,6 +63,7 @@ function drawScene(context, video, t, view, unit) {
     context.fill();
     context.stroke();
   }
+  drawOccluders(Infinity);
 }
 
 function angleOf(video, t, k) {
@@ -186,6 +196,9 @@ function drawFrame(canvas, video, t, overlays) {
     context.clearRect(0, 0, video.width, video.height);
     if (video.objects) drawScene(context, video, t, view, unit);
   }
+  for (const name of ["Depth", "Normals", "Shadow"]) {
+    if (overlays.has(name) && video[LAYERS[name]]) drawSprite(context, video, video[LAYERS[name]], t);
+  }
   if (overlays.has("Masks") && video.masks) {
     context.globalAlpha = 0.75;
     drawSprite(context, video, video.masks, t);
@@ -211,10 +224,8 @@ function drawFrame(canvas, video, t, overlays) {
 
 // What a video of this dataset has to be shown over its frames.
 function available(name, video) {
-  const needs = { Boxes: "boxes/visible", Velocities: "states/velocity" };
   if (name === "Contacts") return Boolean(video.contacts?.length);
-  if (name === "Masks") return Boolean(video.masks);
-  if (name === "Flow") return Boolean(video.flow);
+  if (name in LAYERS) return Boolean(video[LAYERS[name]]);
   const seen = video.objects && "states/position" in video.arrays && "camera/scale" in video.arrays;
-  return Boolean(video.objects && (needs[name] ? needs[name] in video.arrays : true) && (name === "Boxes" || seen));
+  return Boolean(video.objects && (!OVERLAYS[name] || OVERLAYS[name] in video.arrays) && (name === "Boxes" || seen));
 }

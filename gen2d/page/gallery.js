@@ -146,7 +146,7 @@ document.addEventListener("keydown", (event) => {
     k: () => neighbour(-1),
   };
   if (event.key === " " && !onButton) actions[" "] = () => play(!state.playing);
-  OVERLAYS.forEach((name, i) => (actions[i + 1] = () => $(`show-${name}`).click()));
+  Object.keys(OVERLAYS).forEach((name, i) => (actions[KEYS[i]] = () => $(`show-${name}`).click()));
   const action = actions[event.key] || actions[event.key.toLowerCase()];
   if (!action) return;
   event.preventDefault();
@@ -167,14 +167,17 @@ async function start() {
   const isDark = matchMedia("(prefers-color-scheme: dark)").matches;
   $("theme").textContent = isDark ? "Light" : "Dark";
   $("theme").addEventListener("click", () => themed($("theme").textContent === "Dark"));
-  for (const name of OVERLAYS) {
-    const box = element("input", { type: "checkbox", id: `show-${name}` });
+  for (const [i, [name, field]] of Object.entries(OVERLAYS).entries()) {
+    const key = KEYS[i];
+    const box = element("input", { type: "checkbox", id: `show-${name}`, "aria-keyshortcuts": key });
     box.addEventListener("change", () => {
       if (box.checked) shows.add(name);
       else shows.delete(name);
       draw();
     });
-    $("overlays").append(element("label", {}, box, ` ${name}`));
+    const choice = element("label", { title: `key ${key}` }, box, ` ${name}`);
+    choice.hidden = Boolean(field) && !(field in data.fields);
+    $("overlays").append(choice);
   }
   const splits = Object.keys(data.splits);
   const all = data.server ? [] : [element("option", { value: "" }, "all")];

@@ -4,7 +4,14 @@ let data; // see page() in gen2d/page/page.py
 const $ = (id) => document.getElementById(id);
 const TRAIL = 14; // frames
 const FLASH = 0.25; // s that a contact is shown
-const OVERLAYS = ["Outlines", "Velocities", "Contacts", "Trails", "Boxes", "Masks", "Numbers", "Flow"];
+// What can be shown over the frames, and the field that it needs, if any.
+const OVERLAYS = {
+  Outlines: "", Velocities: "states/velocity", Contacts: "contacts/point", Trails: "", Boxes: "boxes/visible",
+  Masks: "masks/instance", Numbers: "", Flow: "flow/forward", Depth: "surface/height", Normals: "surface/normal",
+  Shadow: "surface/shadow",
+};
+const LAYERS = { Masks: "masks", Flow: "flow", Depth: "depth", Normals: "normals", Shadow: "shadow" }; // pictures
+const KEYS = "1234567890-"; // of the overlays
 const CURVES = ["#2a93a6", "#d1495b", "#edae49", "#8d6a9f", "#66a182", "#4a86b8", "#e07a5f"];
 const state = { shown: [], step: 0, time: 0, playing: false, focus: 0, serial: 0, offset: 0 };
 const shows = new Set();
@@ -64,7 +71,7 @@ async function unpacked(packed) {
 async function opened(video) {
   const found = { ...video, count: Math.ceil(video.frames / video.stride) || 1 };
   found.arrays = await unpacked(video.arrays);
-  for (const name of ["sprite", "masks", "flow"]) {
+  for (const name of ["sprite", ...Object.values(LAYERS)]) {
     if (!video[name]) continue;
     const image = new Image();
     image.src = `data:image/webp;base64,${video[name].content}`;

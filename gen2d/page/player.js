@@ -92,7 +92,7 @@ async function select(split, number) {
   $("views").replaceChildren(...views.map(([, figure]) => figure));
   $("title").textContent = whole ? `Set ${first / data.members} of ${split}` : `Video ${number} of ${split}`;
   $("scrubber").max = clock().count - 1;
-  for (const name of OVERLAYS) {
+  for (const name of Object.keys(OVERLAYS)) {
     const box = $(`show-${name}`);
     box.disabled = !state.shown.some((video) => available(name, video));
   }

@@ -24,6 +24,9 @@ ANNOTATIONS: Mapping[str, tuple[Overlay, Mapping[str, str]]] = {
     "masks": (overlays.masks_overlay, {"masks/instance": "n T H W"}),
     "boxes": (overlays.boxes_overlay, {"boxes/visible": "n T K 4", "boxes/amodal": "n T K 4"}),
     "flow": (overlays.flow_overlay, {"flow/forward": "n T H W 2"}),
+    "depth": (overlays.height_overlay, {"surface/height": "n T H W"}),
+    "normals": (overlays.normals_overlay, {"surface/normal": "n T H W 3"}),
+    "shadow": (overlays.shadow_overlay, {"surface/shadow": "n T H W"}),
 }
 
 
@@ -101,7 +104,7 @@ def _annotated(
         columns = {field: video[field][times] for field in ("frames", *needed)}
         for field in needed.keys() - {"masks/instance"}:  # a stranger's numbers may be any
             columns[field] = np.clip(np.nan_to_num(columns[field].astype(np.float32)), -1e4, 1e4)
-        if name == "flow":
-            columns["flow/forward"] /= max(float(np.abs(columns["flow/forward"]).max()), 1e-3)
+        for field in {"flow/forward", "surface/height"} & columns.keys():  # in parts of the largest value
+            columns[field] /= max(float(np.abs(columns[field]).max()), 1e-3)
         frames = [ANNOTATIONS[name][0]({field: own[t] for field, own in columns.items()}) for t in range(len(times))]
         yield name, downsample(np.stack(frames))

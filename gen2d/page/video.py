@@ -3,7 +3,7 @@
 import base64
 import dataclasses
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -13,7 +13,7 @@ from gen2d.core.schema import Field
 from gen2d.dataset.manifest import Manifest
 from gen2d.loading.dataset import Dataset, ViewOptions
 from gen2d.media.drawing import rgb_of
-from gen2d.media.overlays import colors, directions
+from gen2d.media.overlays import colors, directions, grey_levels, normals_overlay
 from gen2d.media.sprites import reduced, sprite_rows, sprite_sheet
 from gen2d.page.arrays import packed
 from gen2d.storage.paths import Place
@@ -23,6 +23,9 @@ DRAWN = {
     "frames": "n T H W 3",
     "masks/instance": "n T H W",
     "flow/forward": "n T H W 2",
+    "surface/height": "n T H W",
+    "surface/normal": "n T H W 3",
+    "surface/shadow": "n T H W",
     "boxes/visible": "n T K 4",
     "states/position": "n T K 2",
     "states/angle": "n T K",
@@ -35,6 +38,9 @@ DRAWN = {
     "objects/present": "n K",
     "objects/color": "n K 3",
     "objects/vertices": "n K V 2",
+    "occluders/box": "n O 4",
+    "occluders/color": "n O 3",
+    "occluders/depth": "n O",
     "world/gravity": "n 2",
 }
 CONTACT_CODES = ("frame", "a", "b", "kind")
@@ -89,16 +95,15 @@ class Videos:
         if "frames" in values:
             frames = reduced(values["frames"][::stride], detail.side)
             video["sprite"] = _sprite(sprite_sheet(frames, detail.quality), frames)
-        if "masks/instance" in values:
-            height, width = values["masks/instance"].shape[1:3]
-            step = math.ceil(math.sqrt(height * width) / detail.mask_side)
-            masks = _false_colors()[values["masks/instance"][::stride, ::step, ::step]]
-            video["masks"] = _sprite(sprite_sheet(masks, None), masks)
-        if "flow/forward" in values:
-            height, width = values["flow/forward"].shape[1:3]
-            step = math.ceil(math.sqrt(height * width) / detail.mask_side)
-            flow = flow_colors(values["flow/forward"][::stride, ::step, ::step])
-            video["flow"] = _sprite(sprite_sheet(flow, None), flow)
+        for name, (field, paint) in LAYERS.items():
+            if field in values:
+                height, width = values[field].shape[1:3]
+                step = math.ceil(math.sqrt(height * width) / detail.mask_side)
+                layer = paint(values[field][::stride, ::step, ::step])
+                quality = None if layer.shape[-1] == 4 else detail.quality  # ids and hues are exact
+                video[name] = _sprite(sprite_sheet(layer, quality), layer)
+        if "frames" not in values:
+            video["occluders"] = _occluders(values)
         if "sprite" in video and np.any(values.get("image/distortion", 0)):
             # Outlines would not lie on what the frames show.
             values = {name: value for name, value in values.items() if not name.startswith("camera/")}
@@ -171,15 +176,27 @@ def energies(values: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     return found
 
 
+def _occluders(values: Mapping[str, np.ndarray]) -> list[list[float]]:
+    """Occluders, back to front: x0 y0 x1 y1 in px, red, green, blue, and the depth behind which objects are hidden."""
+    if any(f"occluders/{name}" not in values for name in ("box", "color", "depth")):
+        return []
+    boxes = np.nan_to_num(values["occluders/box"].astype(np.float64))
+    depths = values["occluders/depth"].astype(np.float64)
+    rows = np.concatenate([boxes, values["occluders/color"], depths[:, None]], axis=1)
+    return rows[(boxes[:, 2] > boxes[:, 0]) & (boxes[:, 3] > boxes[:, 1])].tolist()
+
+
 def _is_drawn(name: str, field: Field | None, axes: str) -> bool:
     """Whether a dataset has this field, as gen2d stores it."""
     if field is None or field.axes != axes or field.is_text:
         return False
-    if name in ("frames", "masks/instance", "objects/color"):
+    if name in ("frames", "masks/instance", "surface/shadow", "objects/color", "occluders/color"):
         return field.dtype == "uint8"
-    if name == "flow/forward":
+    if name == "surface/normal":
+        return field.dtype == "int8"
+    if name in ("flow/forward", "surface/height"):
         return field.dtype in ("float16", "float32")
-    if name.removeprefix("contacts/") in CONTACT_CODES:
+    if name.removeprefix("contacts/") in CONTACT_CODES or name == "occluders/depth":
         return np.issubdtype(field.dtype, np.integer)
     return field.dtype != "bool" or name == "objects/present"
 
@@ -188,7 +205,7 @@ def is_value(name: str, field: Field, manifest: Manifest) -> bool:
     """Whether the value of a field is shown in tables: it has neither frames nor slots, and few numbers."""
     if name in DRAWN and name != "world/gravity":
         return False
-    if not field.per_video or field.unit == "JSON" or {*field.axes.split()} & {*"TKHWCJV"}:
+    if not field.per_video or field.unit == "JSON" or {*field.axes.split()} & {*"TKHWCJVO"}:
         return False
     return int(np.prod(field.shape(manifest.sizes), dtype=np.float64)) <= MAX_VALUES
 
@@ -221,11 +238,27 @@ def flow_colors(flow: np.ndarray) -> np.ndarray:
     return np.where(level[..., None] > 0, rgba, 0).astype(np.uint8)
 
 
+def relative_grey(values: np.ndarray) -> np.ndarray:
+    """Values [T, H, W] from 0 on, such as heights, as grey levels [T, H, W, 3], uint8: the largest one is white."""
+    finite = np.nan_to_num(values.astype(np.float32), posinf=0, neginf=0)
+    return grey_levels(255 * (finite / max(float(finite.max(initial=0)), 1e-6)))
+
+
 def _sprite(content: bytes, frames: np.ndarray) -> dict[str, Any]:
     """A sprite sheet with the size of a frame in it."""
     height, width = frames.shape[1:3]
     rows = sprite_rows(len(frames), height)
     return {"content": base64.b64encode(content).decode(), "height": height, "width": width, "rows": rows}
+
+
+# Pictures over the frames: their field, and their colours [T, H, W, 3 or 4].
+LAYERS: Mapping[str, tuple[str, Callable[[np.ndarray], np.ndarray]]] = {
+    "masks": ("masks/instance", lambda values: _false_colors()[values]),
+    "flow": ("flow/forward", flow_colors),
+    "depth": ("surface/height", relative_grey),
+    "normals": ("surface/normal", lambda values: normals_overlay({"surface/normal": values})),
+    "shadow": ("surface/shadow", relative_grey),
+}
 
 
 def _codes(values: np.ndarray) -> list[int]:

@@ -387,6 +387,18 @@ def test_objects_are_told_apart_by_the_shortest_phrase_that_fits_one(changes: di
     assert [story.references.all[slot].unique for slot in range(BALLS)] == ["one of" not in name for name in names]
 
 
+def test_materials_tell_apart_what_has_one_colour_and_follow_it() -> None:
+    made = still() | {"objects/material_name": np.array([b"rubber", b"metal", b"rubber", *[b"wood"] * 4])}
+    made["objects/color"][:BALLS] = [[214, 32, 38], [214, 32, 38], [38, 84, 220]]
+    story = caption.story_of(made, VIDEO)
+    assert [story.references.all[slot].text for slot in range(BALLS)] == [
+        "the red rubber ball", "the metal ball", "the blue ball",
+    ]  # fmt: skip
+    assert long(made).startswith(
+        ("A red rubber ball, a red metal ball", "There are a red rubber ball, a red metal ball")
+    )
+
+
 def test_colors_that_look_alike_do_not_tell_apart_although_their_words_differ() -> None:
     made = still()
     coral, salmon = (np.array(colors.COLORS[word], float) for word in ("coral", "salmon"))

@@ -30,8 +30,11 @@ OVERRIDES = [
 ]
 
 
-def check(family: str, count: int) -> None:
-    config = load_config(f"{family}.yaml", OVERRIDES)
+MATERIALS = ("look=studio", "look.material=[rubber,wood,metal,paper]")  # named in captions, too
+
+
+def check(family: str, count: int, *overrides: str) -> None:
+    config = load_config(f"{family}.yaml", [*OVERRIDES, *overrides])
     source = VideoSource(config, jax.devices()[:1])
     videos = source.videos("train", np.arange(count))
     constants = {name: values for name, values in source.schema.constants.items() if name.startswith("joints/")}
@@ -60,6 +63,17 @@ def check(family: str, count: int) -> None:
 @pytest.mark.parametrize("family", [x if x in QUICK else pytest.param(x, marks=pytest.mark.full) for x in FAMILIES])
 def test_what_captions_and_answers_say_is_true(family: str) -> None:
     check(family, FEW)
+
+
+@pytest.mark.full
+def test_what_captions_and_answers_say_of_materials_is_true() -> None:
+    check("bouncing", FEW, *MATERIALS)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("family", ["bouncing", "tower"])
+def test_what_many_captions_and_answers_say_of_materials_is_true(family: str) -> None:
+    check(family, MANY, *MATERIALS)
 
 
 @pytest.mark.slow

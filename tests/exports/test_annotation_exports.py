@@ -8,11 +8,13 @@ import pickle
 import re
 import sys
 from collections import Counter
+from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
 
 import cv2
 import numpy as np
+import PIL.Image
 import pytest
 import tiny
 from caption_reader import Reader
@@ -23,6 +25,7 @@ import gen2d
 from gen2d.captions.colors import COLORS
 from gen2d.captions.questions import Question
 from gen2d.config import plugins
+from gen2d.core.errors import ConfigError
 from gen2d.exports.formats.coco import run_lengths
 from gen2d.exports.formats.questions import Balance
 from gen2d.exports.source import Source
@@ -31,10 +34,24 @@ VIDEOS, FRAMES, HEIGHT, WIDTH = 3, 6, 40, 48  # as many frames as in test_lerobo
 CONFIG = tiny.tiny_config(
     video={"frames": FRAMES, "height": HEIGHT, "width": WIDTH},
     scene={"balls": [2, 3], "gravity": [0, -9.8]},
+    look={"name": "studio"},
     image={"occluders": 1},
-    annotations={"masks": True, "boxes": True, "visibility": True, "flow": True, "tracks": 4, "contacts": 4},
+    annotations={"masks": True, "boxes": True, "visibility": True, "flow": True, "tracks": 4, "contacts": 4}
+    | {"depth": True, "normals": True, "shadow": True},
 )
-ANNOTATED = ("coco", "panoptic", "mot", "tapvid", "flo", "kitti_flow", "objects", "questions")
+ANNOTATED = (
+    "coco",
+    "panoptic",
+    "mot",
+    "tapvid",
+    "flo",
+    "kitti_flow",
+    "depth",
+    "normals",
+    "shadow",
+    "objects",
+    "questions",
+)
 
 
 @pytest.fixture(scope="module")
@@ -50,10 +67,10 @@ def fields(made: Path) -> dict[str, np.ndarray]:
 
 
 def image(path: Path) -> np.ndarray:
-    """RGB of an image file."""
+    """RGB, or grey levels, of an image file."""
     stored = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
     assert stored is not None
-    return stored[..., ::-1]
+    return stored[..., ::-1] if stored.ndim == 3 else stored
 
 
 @pytest.mark.filterwarnings("ignore:__array__ implementation:DeprecationWarning")  # pycocotools with NumPy 2
@@ -233,6 +250,63 @@ def test_opencv_reads_flow(made: Path, fields: dict, tmp_path: Path) -> None:
             assert_allclose(((coded[..., :2] - 2**15) / 64)[valid], stored[valid], atol=1 / 128)
 
 
+def each_surface(folder: Path, fields: dict, name: str) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Image of every frame, as Pillow and OpenCV read it, beside the stored field; frames are there, too."""
+    for number in range(VIDEOS):
+        for frame in range(FRAMES):
+            file = f"train-{number:09d}-{frame:04d}.png"
+            shown = np.asarray(PIL.Image.open(folder / folder.name / file))
+            assert_array_equal(shown, image(folder / folder.name / file))
+            assert_array_equal(image(folder / "images" / file), fields["frames"][number, frame])
+            yield shown, fields[name][number, frame]
+    assert len(list((folder / folder.name).iterdir())) == VIDEOS * FRAMES
+
+
+def test_depth_is_in_tenths_of_millimetres(made: Path, fields: dict, tmp_path: Path) -> None:
+    out = gen2d.export(made, "depth", tmp_path / "depth").out
+    for shown, height in each_surface(out, fields, "surface/height"):
+        assert shown.dtype == np.uint16
+        assert_allclose(shown / 1e4, height.astype(float), atol=0.5001e-4)
+        assert shown.max() > 1e3  # a ball is higher than .1 m
+
+
+def test_surfaces_too_high_for_depth_are_refused(made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    module = sys.modules["gen2d.exports.formats.depth"]
+    monkeypatch.setattr(module, "LARGEST", 1000)
+    with pytest.raises(ConfigError, match=r"m high, but depth holds at most 0\.1 m: choose npz"):
+        gen2d.export(made, "depth", tmp_path / "depth")
+
+
+def test_normals_are_red_to_the_right_and_green_up(made: Path, fields: dict, tmp_path: Path) -> None:
+    """Unit vectors; on the side of a ball that is right of its centre, red exceeds 128, and above it, green does."""
+    out = gen2d.export(made, "normals", tmp_path / "normals").out
+    for shown, normal in each_surface(out, fields, "surface/normal"):
+        found = shown / 255 * 2 - 1
+        assert_allclose(found, normal / 127, atol=1.001 / 255)
+        assert_allclose(np.linalg.norm(found, axis=-1), 1, atol=0.02)
+        assert (shown != [128, 128, 255]).any()
+    video, scale = {name: values[0] for name, values in fields.items()}, fields["camera/scale"][0, 0]
+    ball = int(np.flatnonzero(video["objects/present"] & (video["objects/shape"] == 0))[0])
+    rows, columns = np.nonzero(video["masks/instance"][0] == ball + 1)
+    east, north = (video["states/position"][0, ball] - video["camera/center"][0]) * scale
+    first = image(out / "normals" / "train-000000000-0000.png")[rows, columns].astype(float)
+    right, above = columns + 0.5 - (WIDTH / 2 + east), HEIGHT / 2 - north - (rows + 0.5)
+    assert (first[right > 1, 0] >= 128).all()
+    assert (first[right < -1, 0] <= 128).all()
+    assert (first[above > 1, 1] >= 128).all()
+    assert (first[above < -1, 1] <= 128).all()
+    assert np.ptp(first[:, 0]) > 50
+    assert np.ptp(first[:, 1]) > 50
+
+
+def test_shadows_are_grey_levels(made: Path, fields: dict, tmp_path: Path) -> None:
+    out = gen2d.export(made, "shadow", tmp_path / "shadow").out
+    for shown, shadow in each_surface(out, fields, "surface/shadow"):
+        assert shown.dtype == np.uint8
+        assert_array_equal(shown, shadow)
+        assert shown.max() > 0
+
+
 def test_the_table_of_objects_has_their_classes(made: Path, fields: dict, tmp_path: Path) -> None:
     out = gen2d.export(made, "objects", tmp_path / "objects.csv").out
     with out.open(newline="") as file:
@@ -386,8 +460,11 @@ def test_annotations_that_are_not_stored_are_drawn(made: Path, tmp_path: Path) -
     """Of a dataset with frames and without masks: the same files as where the masks are stored."""
     plain = {**CONFIG, "annotations": {"contacts": 4}}
     gen2d.generate(plain, VIDEOS, tmp_path / "tiny", seed=2, device="cpu")
-    trees = []
-    for root, out in ((made, tmp_path / "stored"), (tmp_path / "tiny", tmp_path / "drawn")):
-        files = gen2d.export(root, "panoptic", out).out.rglob("*.png")
-        trees.append({path.relative_to(out): path.read_bytes() for path in files})
-    assert trees[0] == trees[1]
+    for to in ("panoptic", "depth", "shadow"):
+        trees = []
+        for root, out in ((made, tmp_path / f"stored-{to}"), (tmp_path / "tiny", tmp_path / f"drawn-{to}")):
+            files = gen2d.export(root, to, out).out.rglob("*.png")
+            trees.append({path.relative_to(out): path.read_bytes() for path in files})
+        assert trees[0] == trees[1]
+    with pytest.raises(ConfigError, match=r"annotations.depth is on, but look is flat"):
+        gen2d.export(tmp_path / "tiny", "depth", tmp_path / "flat", render={"look": "flat"})

@@ -30,6 +30,7 @@ from gen2d.exports import export
 from gen2d.exports import parts as parts_module
 from gen2d.exports import source as source_module
 from gen2d.exports.partial import PartialExport
+from gen2d.loading.dataset import RenderOptions
 from gen2d.media import films
 
 SIZES = {"T": 6, "H": 64, "W": 48, "K": 3}
@@ -562,11 +563,15 @@ def test_a_file_is_replaced_only_when_asked(balls: Path, tmp_path: Path) -> None
 # ---- Bad input
 
 
-@pytest.mark.parametrize("name", plugins.names("export"))
+SURFACES = "depth", "normals", "shadow"  # of one look, with which frames are rendered again
+TIERED = [pytest.param(name, marks=[pytest.mark.full] * (name in SURFACES)) for name in plugins.names("export")]
+
+
+@pytest.mark.parametrize("name", TIERED)
 def test_every_format_keeps_the_contract(name: str, balls: Path, tmp_path: Path) -> None:
     """It makes the folder or the file that it declares, and tells what is lost."""
-    form = plugins.load("export", name)
-    done = gen2d.export(balls, name, tmp_path / f"out{form.suffix}")
+    form, look = plugins.load("export", name), RenderOptions(look="studio") if name in SURFACES else None
+    done = gen2d.export(balls, name, tmp_path / f"out{form.suffix}", render=look)
     assert done.loss.endswith(form.loss)
     assert form.codecs or done.loss == form.loss
     assert done.out.is_file() == bool(form.suffix)
@@ -579,7 +584,7 @@ def test_every_format_keeps_the_contract(name: str, balls: Path, tmp_path: Path)
     [
         (
             ["--to", "mp3"],
-            "--to is 'mp3', but must be one of av1, coco, ffv1, flo, h264, kitti_flow, lerobot, mot, mp4, npz, objects",
+            "--to is 'mp3', but must be one of av1, coco, depth, ffv1, flo, h264, kitti_flow, lerobot, mot, mp4, n",
         ),
         ([], "required: --to"),
         (["--to", "npz", "--split", "tran"], "has no split 'tran': did you mean 'train'?"),

@@ -25,6 +25,8 @@ def test_the_option_that_is_named_makes_the_field(option: str) -> None:
     extra = ["annotations.contacts=4"] if "captions" in option else []
     if "matched" in option:
         extra = ["scene.gravity=[0, [-20, 0]]"]
+    if option.removeprefix("annotations.").removesuffix("=true") in ("depth", "normals", "shadow"):
+        extra = ["look=studio"]
     choice = f"{option}=gravity" if "matched" in option else option
     plain, made = fields_of(*extra), fields_of(choice, *extra)
     new = [name for name in made if name not in plain]

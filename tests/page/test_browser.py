@@ -20,7 +20,7 @@ from gen2d.tools.view import DETAIL, Library, serving
 
 pytestmark = pytest.mark.full
 ONSET = 6  # frames that the videos of a set share, at least
-OVERLAYS = ("Outlines", "Velocities", "Trails", "Boxes", "Masks", "Numbers", "Flow")
+OVERLAYS = ("Outlines", "Velocities", "Trails", "Boxes", "Masks", "Numbers", "Flow", "Depth", "Normals", "Shadow")
 PIXELS = "JSON.stringify([...document.querySelectorAll('#views canvas')].map((canvas) => canvas.toDataURL()))"
 
 # Mean difference of the pixels of two shown videos, in grey levels.
@@ -50,7 +50,8 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
     config = tiny.tiny_config(
         video={"frames": 24, "height": 48, "width": 60},
         matched={"change": ["teleport"], "onset": 0.5, "distance": [1, 2]},
-        annotations={"masks": True, "boxes": True, "flow": True},
+        look={"name": "studio", "palette": "scene"},
+        annotations=dict.fromkeys(("masks", "boxes", "flow", "depth", "normals", "shadow"), True),
     )
     folder = tmp_path_factory.mktemp("browser") / "twins"
     gen2d.generate(config, n=30, out=folder)
@@ -101,7 +102,7 @@ def test_an_overlay_changes_pixels(opened: Tab, name: str) -> None:
     before = opened.evaluate(PIXELS)
     opened.evaluate(f"$('show-{name}').click()")
     assert opened.evaluate(PIXELS) != before
-    opened.press(str(1 + opened.evaluate(f"OVERLAYS.indexOf('{name}')")))
+    opened.press(opened.evaluate(f"KEYS[Object.keys(OVERLAYS).indexOf('{name}')]"))
     assert opened.evaluate(PIXELS) == before
 
 
@@ -172,6 +173,24 @@ def test_colours_of_a_palette_are_shown_instead_of_the_scenes(opened: Tab) -> No
     chips = opened.evaluate("[...$('values').querySelectorAll('.chip')].map((chip) => chip.title)")
     moving = opened.evaluate("state.shown.flatMap(({ objects }) => objects.color.filter((_, k) => !fixed(objects, k)))")
     assert chips == [", ".join(map(str, color)) for color in moving]
+
+
+def test_occluders_are_drawn_before_the_objects_behind_them(opened: Tab) -> None:
+    """Without frames: an occluder of the whole picture, behind the first moving ball and before it."""
+    pixel = """(depth) => {
+      const video = { ...state.shown[0], sprite: null, occluders: [[0, 0, 60, 48, 1, 2, 3, depth]] };
+      const k = video.objects.slot.findIndex((_, k) => !fixed(video.objects, k));
+      const canvas = document.createElement("canvas");
+      [canvas.width, canvas.height] = [60, 48];
+      drawFrame(canvas, video, 0, new Set());
+      const position = video.arrays["states/position"];
+      const [x, y] = camera(video, 0).point(at(position, 0, k, 0, 2), at(position, 0, k, 1, 2));
+      const seen = [...canvas.getContext("2d").getImageData(x, y, 1, 1).data].slice(0, 3);
+      return [seen, video.objects.color[k], video.objects["objects/depth"][k]];
+    }"""
+    _, color, depth = opened.evaluate(f"({pixel})(0)")
+    assert opened.evaluate(f"({pixel})({depth})")[0] == color
+    assert opened.evaluate(f"({pixel})({depth + 1})")[0] == [1, 2, 3]
 
 
 def test_hostile_strings_are_shown_and_do_nothing(tab: Tab, root: Path, tmp_path: Path) -> None:

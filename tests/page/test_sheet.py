@@ -7,11 +7,13 @@ import numpy as np
 import pytest
 import synthetic
 from numpy.testing import assert_array_equal
+from test_page import pictures
 
 from gen2d.core.schema import Field
 from gen2d.dataset.manifest import read_manifest
 from gen2d.media.overlays import masks_overlay
 from gen2d.page.sheet import LABEL, dataset_sheet, first_videos, video_label
+from gen2d.page.video import Detail, Videos
 
 MATCHED = {
     "matched/kind": Field("uint8", "n", "1", "code of the change: 1 teleport, 2 identity_swap"),
@@ -58,6 +60,31 @@ def test_a_sheet_ends_with_the_annotations_of_the_first_video(tmp_path: Path) ->
         expected = masks_overlay({"masks/instance": video["masks/instance"][t]})
         assert_array_equal(tile[2:-2, 2:-2][::12, ::12], expected)
     assert (sheet[:side, :LABEL] < 128).any()  # a name
+
+
+def test_surfaces_are_on_a_sheet_and_on_the_page(tmp_path: Path) -> None:
+    """Heights in parts of the largest one, of the page shadows too, and normals as a normal map."""
+    fields = {
+        "surface/height": Field("float16", "n T H W", "m", "a height"),
+        "surface/normal": Field("int8", "n T H W 3", "1/127", "a normal"),
+        "surface/shadow": Field("uint8", "n T H W", "1/255", "an opacity"),
+    }
+    made = synthetic.make(synthetic.dataset(tmp_path, fields={**synthetic.FIELDS, **fields}))
+    sheet = dataset_sheet(tmp_path, read_manifest(tmp_path), "train", range(1))
+    side = 8 * 12 + 4
+    assert sheet.shape[0] == (1 + 2 + 3) * side + 8  # frames; masks and flow; depth, normals and shadow
+    video, last = synthetic.video(made, "train", 0), slice(LABEL + 4 * side + 2, LABEL + 5 * side - 2)
+    tiles = [sheet[8 + row * side + 2 : 8 + (row + 1) * side - 2, last][::12, ::12].astype(float) for row in (3, 4, 5)]
+    for tile, name in ((tiles[0], "surface/height"), (tiles[2], "surface/shadow")):
+        values = video[name].astype(float)
+        expected = 255 * values[4] / (values.max() if name == "surface/height" else 255)
+        assert abs(tile - expected[..., None]).max() <= 1
+    assert abs(tiles[1] - (video["surface/normal"][4] + 128.0)).max() == 0
+    page = Videos(tmp_path, read_manifest(tmp_path), "train").video(0, Detail(5, 64, 64, None, 9, 9))
+    for name, field in (("depth", "surface/height"), ("shadow", "surface/shadow")):
+        values = video[field].astype(float)
+        assert abs(pictures(page[name], 5) - (255 * values / values.max())[..., None]).max() <= 1
+    assert_array_equal(pictures(page["normals"], 5), video["surface/normal"].astype(int) + 128)
 
 
 def test_numbers_that_are_not_finite_are_drawn(tmp_path: Path) -> None:

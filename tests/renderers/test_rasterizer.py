@@ -479,9 +479,9 @@ def test_a_moving_ball_is_blurred_along_its_path(shutter, exposure, lag):
 
 
 def test_a_centred_exposure_is_symmetric_about_its_frame_also_for_the_camera():
-    """Instants before and after a frame; the motion of ball and camera is uniform."""
+    """Instants before and after a frame; the motion of ball and camera is uniform, and its zoom linear in between."""
     image = {"exposure": 0.5, "exposure_samples": 4, "shutter": "centre"}
-    camera = {"pan": [1.5, -0.5], "turn": 0.7}
+    camera = {"pan": [1.5, -0.5], "turn": 0.7, "zoom": 3}
     scenes, _, _, states = straight_motion({**BALL, "image": image, "camera": camera}, 2)
     assert scenes.exposed is not None
     apart = np.array([-0.1875, -0.0625, 0.0625, 0.1875]) / BALL["video"]["fps"]  # s
@@ -491,6 +491,10 @@ def test_a_centred_exposure_is_symmetric_about_its_frame_also_for_the_camera():
     center = 5 + np.array(camera["pan"]) * time[..., None]
     assert_allclose(scenes.exposed.view.center, np.broadcast_to(center, (2, *center.shape)), atol=1e-5)
     assert_allclose(scenes.exposed.view.angle, np.broadcast_to(camera["turn"] * time, (2, *time.shape)), atol=1e-6)
+    scale = np.asarray(scenes.instants.view.scale, float)
+    scale = np.concatenate([2 * scale[:, :1] - scale[:, 1:2], scale, 2 * scale[:, -1:] - scale[:, -2:-1]], 1)
+    frames = np.arange(-1, scale.shape[1] - 1) / BALL["video"]["fps"]
+    assert_allclose(scenes.exposed.view.scale, [np.interp(time, frames, own) for own in scale], rtol=1e-5)
 
 
 @pytest.mark.full

@@ -352,7 +352,7 @@ class Reader(SceneReader):
         return total == len(self.moving)
 
     def full(self, s: int) -> str:
-        return " ".join(word for word in (self.size[s], self.color[s], self.noun[s]) if word)
+        return " ".join(word for word in (self.size[s], self.color[s], self.material[s], self.noun[s]) if word)
 
     # ---- Questions
 

@@ -12,6 +12,7 @@ ORDINALS = ["", "second", "third", "fourth", "fifth", "sixth", "seventh", "eight
 EXTREMES = {"leftmost": "left", "rightmost": "right", "highest": "top", "lowest": "bottom"}
 PLACES = {"on the left": "left", "on the right": "right", "at the top": "top", "at the bottom": "bottom"}
 TURNS = ["right", "up right", "up", "up left", "left", "down left", "down", "down right"]
+MATERIALS = {"rubber": "rubber", "wood": "wooden", "metal": "metal", "paper": "paper"}  # adjective of each
 VIEW_SIDES = ["left", "right", "top", "bottom"]
 
 
@@ -66,6 +67,7 @@ class SceneReader:
         self.name = {**self.noun, **self._wall_names()}
         self.color = {s: self._color(s) for s in self.moving}
         self.near_words = {s: self._near_words(s) for s in self.moving}
+        self.material = {s: self._material(s) for s in self.moving}
         self.size = {s: self._size(s) for s in self.moving}
         self.pixels = self._pixels(0)
         self.hits = self._hits()
@@ -161,6 +163,10 @@ class SceneReader:
         near = (away <= away.min() + EPSILON) & (away <= 10 + EPSILON + 0.11 * chroma)
         return {word for word, is_near in zip(self.words, near, strict=True) if is_near} | {self.color[s]}
 
+    def _material(self, s: int) -> str:
+        name = bytes(self.f["objects/material_name"][s]).decode() if "objects/material_name" in self.f else ""
+        return MATERIALS.get(name, "")
+
     def _size(self, s: int) -> str:
         sizes = [self.reach[o] for o in self.moving if self.noun[o] == self.noun[s]]
         if max(sizes) < 1.5 * min(sizes):
@@ -215,11 +221,15 @@ class SceneReader:
         return order[rank[0] : rank[0] + 1]
 
     def fits(self, s: int, words: str) -> bool:
-        """Whether a moving object is as these words say: size, colour, noun, the first two of which may be missing."""
+        """Whether a moving object is as these words say: size, colour, material and noun, of which but the last may be
+        missing."""
         size, _, rest = words.partition(" ")
         size, rest = (size, rest) if size in ("small", "large") else ("", words)
-        color, _, noun = rest.rpartition(" ")
-        return noun == self.noun[s] and size in ("", self.size[s]) and (not color or color in self.near_words[s])
+        before, _, noun = rest.rpartition(" ")
+        color, _, material = before.rpartition(" ")
+        color, material = (color, material) if material in MATERIALS.values() else (before, "")
+        alike = size in ("", self.size[s]) and material in ("", self.material[s])
+        return noun == self.noun[s] and alike and (not color or color in self.near_words[s])
 
     def on_side(self, s: int, side: str, pool: Sequence[int]) -> bool:
         axis = VIEW_SIDES.index(side) // 2
