@@ -179,13 +179,15 @@ def reference(scene, plan, stage):
 
 
 def backdrop(stage, plan, points):
-    """Vertical gradient over the first view, and its corners."""
+    """Gradient towards the light over the first view, and its corners."""
     background = jax.tree.map(lambda a: np.asarray(a, float), stage.paint.background)
     angle = float(stage.instants.view.angle[0])
     centered = points - np.array([plan.width, plan.height]) / 2
     world = centered @ np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
     share = world / (np.array([plan.width, plan.height]) / 2)
-    image = background.color + np.clip((share[..., 1:] + 1) / 2, 0, 1) * (background.to_color - background.color)
+    way = np.array([np.cos(stage.paint.sampled["azimuth"]), np.sin(stage.paint.sampled["azimuth"])], float)
+    along = world @ way / (np.abs(way) @ np.array([plan.width, plan.height]) / 2)
+    image = background.color + np.clip((along[..., None] + 1) / 2, 0, 1) * (background.to_color - background.color)
     return image + np.clip((share**2).sum(-1) / 2, 0, 1)[..., None] * (background.corners - image)
 
 
