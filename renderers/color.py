@@ -68,7 +68,8 @@ LAST_DARK = 255 * 0.04045  # up to which sRGB values are proportional to light
 
 
 def _polynomial(x: Array, *coefficients: float) -> Array:
-    return functools.reduce(lambda total, c: total * x + c, coefficients[::-1])
+    *others, highest = coefficients
+    return functools.reduce(lambda total, c: total * x + c, others[::-1], jnp.float32(highest))
 
 
 def light_of(color: Array) -> Array:

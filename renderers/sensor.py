@@ -66,22 +66,15 @@ def record(
     if on_cpu():
         chunk = divisor(chunk, max(1, CHUNK // (height * width)))
     # Values of a frame come last, so that each operation runs over many of them.
-    frames = frames.reshape(len(frames), -1, chunk, height * width * 3)
+    frames = frames.reshape(-1, chunk, height * width * 3)
     if any(stage is not None for stage in sensors[: Sensor._fields.index("jpeg_quality")]):
-        frames = jax.lax.map(lambda entry: _record_video(*entry, height, width), (sensors, seeds, frames))
+        frames = _record_frames(sensors, seeds, frames, height, width)
     if sensors.jpeg_quality is not None:
         # In a loop of its own, or the compiler would compute all other stages again for each product of the codec.
-        frames = jax.lax.map(lambda entry: _coded_video(*entry, height, width), (frames, sensors.jpeg_quality))
+        qualities = jnp.repeat(sensors.jpeg_quality, len(frames) // len(seeds))
+        coded = jax.lax.map(lambda part: round_trip(*part), (frames.reshape(-1, chunk, height, width, 3), qualities))
+        return coded.reshape(shape), owners
     return frames.reshape(shape), owners
-
-
-def _coded_video(frames: Array, quality: Array, height: int, width: int) -> Array:
-    """Frames of one video, in chunks [C, t, H * W * 3] uint8, after the codec."""
-
-    def some(chunk: Array) -> Array:
-        return round_trip(chunk.reshape(-1, height, width, 3), quality).reshape(chunk.shape)
-
-    return jax.lax.map(some, frames)
 
 
 class _Grid(NamedTuple):
@@ -96,25 +89,28 @@ class _Grid(NamedTuple):
     taps: "Taps | None"
 
 
-def _record_video(sensor: Sensor, seed: Array, frames: Array, height: int, width: int) -> Array:
-    """Frames of one video, in chunks [C, t, H * W * 3] uint8, as its sensor records them, before the codec."""
+def _record_frames(sensors: Sensor, seeds: Array, frames: Array, height: int, width: int) -> Array:
+    """Frames of n videos, in chunks [n * C, t, H * W * 3] uint8, as their sensors record them, before the codec."""
     count, chunk, size = frames.shape
-    grid, numbers = _grid(sensor, chunk, height, width), jnp.arange(count * chunk).reshape(count, chunk)
-    states = hashed(seed, SHOT, numbers), hashed(seed, numbers)
+    each = count // len(seeds)  # chunks of a video
+    grids = jax.lax.map(lambda sensor: _grid(sensor, chunk, height, width), sensors)
+    numbers = jnp.arange(each * chunk)
+    states = [hashed(seeds[:, None], *stage, numbers).reshape(count, chunk) for stage in ((SHOT,), ())]
 
-    def some(entry: tuple[Array, Array, Array]) -> Array:
-        values, *states = entry
+    def some(entry: tuple[Array, Array, list[Array]]) -> Array:
+        i, values, states = entry
+        sensor, grid = jax.tree.map(lambda a: a[i // each], (sensors, grids))
         states = [state[:, None] if grid.taps is None else jnp.repeat(state, 3) for state in states]
         values = _developed(sensor, grid, values.astype(jnp.int32).astype(jnp.float32), states[0])
         if sensor.noise is not None:
             values = values + _gaussian(sensor.noise, states[1], grid.number)
         return (jnp.clip(values, 0.0, 255.0) + 0.5).astype(jnp.int32).astype(jnp.uint8)
 
-    if grid.taps is None:
-        return jax.lax.map(some, (frames, *states))
+    if grids.taps is None:
+        return jax.lax.map(some, (jnp.arange(count), frames, states))
     # In loops of their own, or the compiler would compute values in the order of the transposed ones.
     rows = jax.lax.map(lambda part: part.reshape(chunk, -1, 3).swapaxes(0, 1).reshape(-1, chunk * 3), frames)
-    rows = jax.lax.map(some, (rows, *states))
+    rows = jax.lax.map(some, (jnp.arange(count), rows, states))
     return jax.lax.map(lambda part: part.reshape(-1, chunk, 3).swapaxes(0, 1).reshape(chunk, size), rows)
 
 
@@ -127,18 +123,20 @@ def _grid(sensor: Sensor, chunk: int, height: int, width: int) -> _Grid:
         pixels = jnp.broadcast_to(pixels, (height, width, 3)).reshape(-1, 3)
         return pixels.reshape(-1) if taps is None else jnp.tile(pixels, (1, chunk))
 
-    lens, balance = jnp.ones((1, 1, 1)), None
+    factors, balance = [], None
     if sensor.vignette is not None:
         x, y = _from_middle(height, width)
-        lens = lens * jnp.maximum(1 - sensor.vignette * (x * x + y * y), 0.0)[..., None] ** power
+        factors.append(jnp.maximum(1 - sensor.vignette * (x * x + y * y), 0.0)[..., None] ** power)
     if sensor.exposure_gain is not None:
-        lens = lens * jnp.exp2(sensor.exposure_gain * power)
+        factors.append(jnp.exp2(sensor.exposure_gain * power))
     if sensor.white_balance is not None:
         balance = jnp.exp2(sensor.white_balance * power * jnp.asarray([0.5, 0.0, -0.5]))
     if balance is not None and not _in_light(sensor):
-        lens, balance = lens * balance, None
+        factors.append(balance)
+        balance = None
+    lens = spread(functools.reduce(jnp.multiply, factors)) if factors else None
     number = jnp.arange(height * width * 3, dtype=jnp.uint32).reshape(height, width, 3)
-    return _Grid(spread(number), spread(lens), None if balance is None else spread(balance), taps)
+    return _Grid(spread(number), lens, None if balance is None else spread(balance), taps)
 
 
 def _in_light(sensor: Sensor) -> bool:
@@ -149,14 +147,13 @@ def _in_light(sensor: Sensor) -> bool:
 def _developed(sensor: Sensor, grid: _Grid, values: Array, state: Array) -> Array:
     """sRGB values, at most 255, of sRGB values after stages 1 and 2; `state` is that of the shot noise."""
     if not _in_light(sensor):
-        factors = sensor.vignette, sensor.exposure_gain, sensor.white_balance
-        changed = any(factor is not None for factor in factors)
-        return jnp.minimum(scaled_values(values, grid.lens), 255.0) if changed else values
+        return values if grid.lens is None else jnp.minimum(scaled_values(values, grid.lens), 255.0)
     light = light_of(values)
     if grid.taps is not None:
         rows = [light.at[pixel].get(mode="promise_in_bounds") for pixel in grid.taps.pixel]
         light = functools.reduce(jnp.add, [row * w[:, None] for row, w in zip(rows, grid.taps.weight, strict=True)])
-    light = light * grid.lens
+    if grid.lens is not None:
+        light = light * grid.lens
     if sensor.shot_noise is not None:
         light = light + jnp.sqrt(light) * _gaussian(sensor.shot_noise, state, grid.number)
     if grid.balance is not None:

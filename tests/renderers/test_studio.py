@@ -349,6 +349,16 @@ def test_the_light_and_the_materials_of_each_video_are_stored():
     assert len(np.unique(expected[present])) == 3
 
 
+def test_materials_by_two_properties_are_two_programs():
+    """They differ in the input that they read alone, of the same shape."""
+    hashes = set()
+    for by in ("elasticity", "friction"):
+        look = {"name": "studio", "material": ["paper", "wood"], "material_by": by}
+        config = load_config({"look": look, "video": {"frames": 2}, "storage": {"batch_size": 2}})
+        hashes.add(Rollout(config, jax.devices()[:1]).programs["stage"].sha256)
+    assert len(hashes) == 2
+
+
 def test_what_the_look_or_the_images_of_a_split_lack_is_stored_as_nothing():
     splits = {"train": {}, "test": {"look": "flat", "image": {"occluders": 1}}}
     config = load_config({"look": "studio", "video": {"frames": 2}, "image": {"occluders": 2}, "splits": splits})
