@@ -1,5 +1,7 @@
 """Colours: random palettes, perceptual contrast, sRGB and linear light."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -57,6 +59,42 @@ def to_srgb(light: Array) -> Array:
     """sRGB values, 0 to 255, of linear light, 0 to 1."""
     bright = 1.055 * jnp.maximum(light, 0.0031308) ** (1 / 2.4) - 0.055
     return 255 * jnp.where(light <= 0.0031308, 12.92 * light, bright)
+
+
+# ---- The same by polynomials, which compilers vectorize: within 0.03 sRGB values
+
+OFFSET = 255 * 0.055  # of the curve's power, in sRGB values
+LAST_DARK = 255 * 0.04045  # up to which sRGB values are proportional to light
+
+
+def _polynomial(x: Array, *coefficients: float) -> Array:
+    *others, highest = coefficients
+    return functools.reduce(lambda total, c: total * x + c, others[::-1], jnp.float32(highest))
+
+
+def light_of(color: Array) -> Array:
+    """Linear light, 0 to 1, of whole sRGB values, 0 to 255, in floats."""
+    power = 9.242264e-4, 1.2773246e-4, 8.0064153e-6, 4.0026888e-8, -7.1732873e-11, 7.9386779e-14
+    return jnp.where(color <= LAST_DARK, color * (1 / (255 * 12.92)), _polynomial(color, *power))
+
+
+def values_of(light: Array) -> Array:
+    """sRGB values of linear light, 0 to 1."""
+    power = -7.5172851, 359.16623, -239.94885, 285.59000, -200.60767, 58.395650
+    root = jnp.sqrt(jnp.maximum(light - 0.0005, 0.0))
+    return jnp.where(light <= 0.0031308, 255 * 12.92 * light, _polynomial(root, *power))
+
+
+def scaled_values(color: Array, factor: Array) -> Array:
+    """sRGB values, which may exceed 255, of the light of whole sRGB values, 0 to 255, times `factor` ** 2.4.
+
+    Beyond the dark values the curve is a power, so they are scaled as they are.
+    """
+    root = jnp.sqrt(color)
+    dark = root * _polynomial(root, 11.118138, -2.5347757, 0.68771856, -0.075406760)
+    scaled = jnp.where(color <= LAST_DARK, dark, color + OFFSET) * factor
+    bright = scaled * scaled * _polynomial(scaled, 6.7438438e-3, 6.1204176e-4, -7.1680147e-6)
+    return jnp.where(scaled <= LAST_DARK + OFFSET, bright, scaled - OFFSET)
 
 
 LINEAR = np.asarray(

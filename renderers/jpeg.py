@@ -6,9 +6,6 @@ whose sides are no multiples of 8 is continued by its last rows and columns. All
 gives the same bits.
 """
 
-import functools
-
-import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -18,6 +15,8 @@ SIDE = 8
 BASIS_BITS, DROPPED = 12, 5  # bits of the cosines, and those dropped after the transform of columns
 BITS = 2 * BASIS_BITS - DROPPED
 HALF = 1 << 15  # of the coefficients of colours, which have 16 bits
+TO_YCC = np.array([[19595, 38470, 7471], [-11059, -21709, 32768], [32768, -27439, -5329]], np.int32)
+TO_RGB = np.array([[1 << 16, 0, 91881], [1 << 16, -22554, -46802], [1 << 16, 116130, 0]], np.int32)
 _ROWS, _COLUMNS = np.mgrid[:SIDE, :SIDE]
 _COSINES = np.cos((2 * _COLUMNS + 1) * _ROWS * np.pi / (2 * SIDE)) * np.where(_ROWS, 0.5, 0.5**1.5)
 BASIS = np.round(_COSINES * 2**BASIS_BITS).astype(np.int32)  # [frequency, pixel]; its rows have a length of 2^12
@@ -34,15 +33,19 @@ def round_trip(frames: Array, quality: Array) -> Array:
     """Frames [T, H, W, 3] uint8 after a round trip of this quality, from 1 to 100."""
     count, height, width = frames.shape[:3]
     padding = [(0, 0), (0, -height % SIDE), (0, -width % SIDE), (0, 0)]
-    planes = _ycc(jnp.pad(frames.astype(jnp.int32), padding, mode="edge"))
-    rows, columns = (size // SIDE for size in planes.shape[2:])
+    padded = jnp.pad(frames, padding, mode="edge")
+    rows, columns = (size // SIDE for size in padded.shape[1:3])
     # The blocks come last, so that each operation runs over many of them.
-    blocks = planes.reshape(3, count, rows, SIDE, columns, SIDE).transpose(0, 3, 5, 1, 2, 4).reshape(3, SIDE, SIDE, -1)
-    # Two loops, or the compiler would divide again for each product that a coefficient is in.
-    sizes, tables = jax.lax.map(_encoded, (blocks, _scaled_tables(quality)[..., None]))
-    blocks = jax.lax.map(_decoded, (sizes, tables))
-    planes = blocks.reshape(3, SIDE, SIDE, count, rows, columns).transpose(0, 3, 4, 1, 5, 2).reshape(planes.shape)
-    return _rgb(planes)[:, :height, :width]
+    blocks = padded.reshape(count, rows, SIDE, columns, SIDE, 3).transpose(5, 2, 4, 0, 1, 3).reshape(3, SIDE, SIDE, -1)
+    tables = _scaled_tables(quality)[..., None]
+    coefficients = _row_products(_column_products(_ycc(blocks), BASIS), BASIS)
+    scaled = tables << BITS
+    sizes = _quotient(jnp.abs(coefficients) + (scaled >> 1), scaled)  # halves away from zero
+    values = _row_products(_column_products(jnp.sign(coefficients) * sizes * tables, BASIS.T), BASIS.T)
+    planes = jnp.clip((values + (1 << (BITS - 1))) >> BITS, -128, 127)
+    blocks = _rgb(planes).reshape(3, SIDE, SIDE, count, rows, columns)
+    frames = blocks.transpose(3, 4, 1, 5, 2, 0).reshape(padded.shape)
+    return frames[:, :height, :width]
 
 
 def _scaled_tables(quality: Array) -> Array:
@@ -52,45 +55,32 @@ def _scaled_tables(quality: Array) -> Array:
     return jnp.clip((jnp.asarray(TABLES) * scale + 50) // 100, 1, 255)
 
 
-def _encoded(plane: tuple[Array, Array]) -> tuple[Array, Array]:
-    """Coefficients [8, 8, N] of blocks [8, 8, N] from -128 to 127 over divisors [8, 8, 1], rounded; the divisors."""
-    blocks, divisors = plane
-    coefficients, scaled = _transformed(blocks, BASIS), divisors << BITS
-    sizes = (jnp.abs(coefficients) + (scaled >> 1)) // scaled  # halves away from zero
-    return jnp.sign(coefficients) * sizes, divisors
+def _quotient(number: Array, divisor: Array) -> Array:
+    """Whole quotients of positive numbers. The estimate in floats is off by one at most, whatever their rounding."""
+    estimate = (number.astype(jnp.float32) * (1 / divisor.astype(jnp.float32))).astype(jnp.int32)
+    rest = number - estimate * divisor
+    return estimate + (rest >= divisor).astype(jnp.int32) - (rest < 0).astype(jnp.int32)
 
 
-def _decoded(plane: tuple[Array, Array]) -> Array:
-    """Blocks [8, 8, N] from -128 to 127 of what `_encoded` returns."""
-    sizes, divisors = plane
-    values = _transformed(sizes * divisors, BASIS.T)
-    return jnp.clip((values + (1 << (BITS - 1))) >> BITS, -128, 127)
+def _column_products(blocks: Array, basis: np.ndarray) -> Array:
+    """Products of a basis [8, 8] with the columns of blocks [3, 8, 8, N], times 2^(BASIS_BITS - DROPPED), rounded."""
+    products = jnp.einsum("ij,kjcn->kicn", jnp.asarray(basis), blocks)
+    return (products + (1 << (DROPPED - 1))) >> DROPPED
 
 
-def _transformed(blocks: Array, basis: np.ndarray) -> Array:
-    """Products of a basis [8, 8] with the rows and the columns of blocks [8, 8, ...], times 2^BITS."""
-    columns = (_products(blocks, basis) + (1 << (DROPPED - 1))) >> DROPPED
-    return jnp.swapaxes(_products(jnp.swapaxes(columns, 0, 1), basis), 0, 1)
+def _row_products(blocks: Array, basis: np.ndarray) -> Array:
+    """Products of a basis [8, 8] with the rows of blocks [3, 8, 8, N], times 2^BASIS_BITS."""
+    return jnp.einsum("ij,krjn->krin", jnp.asarray(basis), blocks)
 
 
-def _products(blocks: Array, basis: np.ndarray) -> Array:
-    """Products of a basis [8, 8] with the columns of blocks [8, ...]; sums of whole rows, which vectorize."""
-    return jnp.stack([functools.reduce(jnp.add, map(jnp.multiply, row.tolist(), blocks)) for row in basis])
-
-
-def _ycc(frames: Array) -> Array:
-    """Planes Y, Cb and Cr [3, T, H, W], each less 128, of frames [T, H, W, 3] from 0 to 255."""
-    red, green, blue = jnp.moveaxis(frames, -1, 0)
-    light = (19595 * red + 38470 * green + 7471 * blue + HALF) >> 16
-    blueness = (-11059 * red - 21709 * green + 32768 * blue + HALF - 1) >> 16
-    redness = (32768 * red - 27439 * green - 5329 * blue + HALF - 1) >> 16
-    return jnp.stack([light - 128, blueness, redness])
+def _ycc(colors: Array) -> Array:
+    """Y, Cb and Cr [3, ...], each less 128, of colours [3, ...] uint8."""
+    sums = jnp.einsum("kc,c...->k...", jnp.asarray(TO_YCC), colors.astype(jnp.int32))
+    half = jnp.asarray([HALF - (128 << 16), HALF - 1, HALF - 1])
+    return (sums + half.reshape(3, *[1] * (colors.ndim - 1))) >> 16
 
 
 def _rgb(planes: Array) -> Array:
-    """Frames [T, H, W, 3] uint8 of three planes as in `_ycc`."""
-    light, blueness, redness = planes
-    red = light + ((91881 * redness + HALF) >> 16)
-    green = light + ((-22554 * blueness - 46802 * redness + HALF) >> 16)
-    blue = light + ((116130 * blueness + HALF) >> 16)
-    return jnp.clip(jnp.stack([red, green, blue], -1) + 128, 0, 255).astype(jnp.uint8)
+    """Colours [3, ...] uint8 of planes as in `_ycc`."""
+    sums = (jnp.einsum("kc,c...->k...", jnp.asarray(TO_RGB), planes) + HALF) >> 16
+    return jnp.clip(sums + 128, 0, 255).astype(jnp.uint8)

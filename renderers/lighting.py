@@ -76,7 +76,7 @@ def lit_color(
     irradiance = strength * (cosine + jnp.sqrt(cosine * cosine + square)) + ambient * (1 - FROM_ABOVE * ny)
     # In pixels: the length over which the surface tilts, for averages over a pixel.
     radius = jnp.maximum(relief.radius if relief.normal is None else surface.bevel * pose.scale, 0.5)[..., None, None]
-    toward = along / jnp.maximum(jnp.sqrt(lx * lx + ly * ly), 1e-6)
+    toward = along * (1 / jnp.maximum(jnp.sqrt(lx * lx + ly * ly), 1e-6))
     mirror = None if surface.mirror is None else surface.mirror[..., None, None]
     if mirror is not None:
         irradiance = irradiance + mirror * (_room(toward, slope / radius) - irradiance)

@@ -17,9 +17,12 @@ def _hash_word(x: Array) -> Array:
     return x ^ (x >> 16)
 
 
-def hashed(*words: Any) -> Array:
-    """Random 32-bit words, uint32, of combinations of integers; the arguments are broadcast."""
-    state = jnp.uint32(0x9E3779B9)
+def hashed(*words: Any, state: Array | int = 0x9E3779B9) -> Array:
+    """Random 32-bit words, uint32, of combinations of integers; the arguments are broadcast.
+
+    `state` is the result for the words before these, if they were hashed before.
+    """
+    state = jnp.asarray(state, jnp.uint32)
     for word in words:
         state = _hash_word(state ^ jnp.asarray(word).astype(jnp.uint32))
     return state

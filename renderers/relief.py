@@ -86,14 +86,15 @@ def tilt(
             nx, ny = nx + nearer * (a - nx), ny + nearer * (b - ny)
             even = jnp.where(nearer < 0.5, even, 1.0) * (2 * nearer - 1) ** 2
             farthest = jnp.maximum(farthest, beyond)
-        amount = jnp.clip(1 + (farthest - inwards) / width, 0.0, 1.0)
+        amount = jnp.clip(1 + (farthest - inwards) * (1 / width), 0.0, 1.0)
         return nx * amount, ny * amount, (1 + even) / 2
     radius = sloping_width(relief, pose, bevel)[..., None, None]
     if relief.half is not None:
         cos, sin, half = (a[..., None, None] for a in (pose.cos, pose.sin, relief.half))
         along = jnp.clip(x * cos + y * sin, -half, half)
         x, y = x - along * cos, y - along * sin
-    part = (1 - inwards / radius) / radius
+    inverse = 1 / radius  # of a slot, and not of each pixel
+    part = (1 - inwards * inverse) * inverse
     return x * part, y * part, 1.0
 
 

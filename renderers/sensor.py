@@ -19,17 +19,20 @@ distortion of lenses', 1966, whose first radial coefficient is k).
 
 import functools
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from gen2d.core.sizes import divisor
 from gen2d.records.axes import Array
-from gen2d.renderers.color import LINEAR, to_srgb
+from gen2d.renderers.color import light_of, scaled_values, values_of
 from gen2d.renderers.jpeg import round_trip
 from gen2d.renderers.noise import hashed
+from gen2d.xla import on_cpu
 
+CHUNK = 2**15  # px that are recorded at once on a CPU, in whole frames
 SHOT = 1  # word that tells the hashes of shot noise from those of sensor noise
 FAR, STEPS = 2.0, 8  # largest distance of a distorted point, and steps of Newton's method
 
@@ -55,60 +58,117 @@ def record(
     """
     if sensors is None:
         return frames, owners
-
-    def video(entry: tuple[Any, ...]) -> tuple[Array | None, Array | None]:
-        sensor, seed, frames, owners = entry
-        if owners is not None and sensor.distortion is not None:
-            column, row = undistorted_centers(sensor.distortion, height, width)
-            pixel = jnp.floor(row).astype(jnp.int32) * width + jnp.floor(column).astype(jnp.int32)
-            owners = owners.reshape(len(owners), -1)[:, pixel.ravel()].reshape(owners.shape)
-        return None if frames is None else _record_frames(sensor, seed, frames), owners
-
-    frames, owners = jax.lax.map(video, (sensors, seeds, frames, owners))
-    if frames is not None and sensors.jpeg_quality is not None:
+    if owners is not None and sensors.distortion is not None:
+        owners = jax.lax.map(lambda entry: _distorted_owners(*entry), (owners, sensors.distortion))
+    if frames is None:
+        return frames, owners
+    shape, chunk = frames.shape, frames.shape[1]
+    if on_cpu():
+        chunk = divisor(chunk, max(1, CHUNK // (height * width)))
+    # Values of a frame come last, so that each operation runs over many of them.
+    frames = frames.reshape(-1, chunk, height * width * 3)
+    if any(stage is not None for stage in sensors[: Sensor._fields.index("jpeg_quality")]):
+        frames = _record_frames(sensors, seeds, frames, height, width)
+    if sensors.jpeg_quality is not None:
         # In a loop of its own, or the compiler would compute all other stages again for each product of the codec.
-        frames = jax.lax.map(lambda entry: round_trip(*entry), (frames, sensors.jpeg_quality))
-    return frames, owners
+        qualities = jnp.repeat(sensors.jpeg_quality, len(frames) // len(seeds))
+        coded = jax.lax.map(lambda part: round_trip(*part), (frames.reshape(-1, chunk, height, width, 3), qualities))
+        return coded.reshape(shape), owners
+    return frames.reshape(shape), owners
 
 
-def _record_frames(sensor: Sensor, seed: Array, frames: Array) -> Array:
-    """Frames [T, H, W, 3] uint8 of one video as its sensor records them, before the codec."""
-    numbers, values = jnp.arange(len(frames)), frames
-    if any(stage is not None for stage in sensor[: Sensor._fields.index("noise")]):
-        values = to_srgb(jnp.clip(_light(sensor, seed, numbers, frames), 0.0, 1.0))
-    if sensor.noise is not None:
-        values = values.astype(jnp.float32) + _gaussian(sensor.noise, values.shape, seed, numbers)
-    if values is not frames:
-        values = jnp.clip(jnp.floor(values + 0.5), 0, 255).astype(jnp.uint8)
-    return values
+class _Grid(NamedTuple):
+    """What is known of the values of t frames before they are rendered: arrays that broadcast to those values.
+
+    The values are [t, H * W * 3], or [H * W, t * 3] if there are taps, each of which then is a whole row of values.
+    """
+
+    number: Array  # of a value in its frame
+    lens: Array | None  # gains of the light before shot noise; None: 1
+    balance: Array | None  # and after it
+    taps: "Taps | None"
 
 
-def _light(sensor: Sensor, seed: Array, numbers: Array, frames: Array) -> Array:
-    """Light [T, H, W, 3] after stages 1 and 2."""
-    height, width = frames.shape[1:3]
-    light = jnp.asarray(LINEAR)[frames.astype(jnp.int32)]
-    if sensor.distortion is not None:
-        light = _distorted(light, sensor.distortion)
+def _record_frames(sensors: Sensor, seeds: Array, frames: Array, height: int, width: int) -> Array:
+    """Frames of n videos, in chunks [n * C, t, H * W * 3] uint8, as their sensors record them, before the codec."""
+    count, chunk, size = frames.shape
+    each = count // len(seeds)  # chunks of a video
+    grids = jax.lax.map(lambda sensor: _grid(sensor, chunk, height, width), sensors)
+    numbers = jnp.arange(each * chunk)
+    states = [hashed(seeds[:, None], *stage, numbers).reshape(count, chunk) for stage in ((SHOT,), ())]
+
+    def some(entry: tuple[Array, Array, list[Array]]) -> Array:
+        i, values, states = entry
+        sensor, grid = jax.tree.map(lambda a: a[i // each], (sensors, grids))
+        states = [state[:, None] if grid.taps is None else jnp.repeat(state, 3) for state in states]
+        values = _developed(sensor, grid, values.astype(jnp.int32).astype(jnp.float32), states[0])
+        if sensor.noise is not None:
+            values = values + _gaussian(sensor.noise, states[1], grid.number)
+        return (jnp.clip(values, 0.0, 255.0) + 0.5).astype(jnp.int32).astype(jnp.uint8)
+
+    if grids.taps is None:
+        return jax.lax.map(some, (jnp.arange(count), frames, states))
+    # In loops of their own, or the compiler would compute values in the order of the transposed ones.
+    rows = jax.lax.map(lambda part: part.reshape(chunk, -1, 3).swapaxes(0, 1).reshape(-1, chunk * 3), frames)
+    rows = jax.lax.map(some, (jnp.arange(count), rows, states))
+    return jax.lax.map(lambda part: part.reshape(-1, chunk, 3).swapaxes(0, 1).reshape(chunk, size), rows)
+
+
+def _grid(sensor: Sensor, chunk: int, height: int, width: int) -> _Grid:
+    """Grid of a video in chunks of so many frames. Gains that scale display values are those of all stages."""
+    power = 1.0 if _in_light(sensor) else 1 / 2.4
+    taps = None if sensor.distortion is None else _taps(sensor.distortion, height, width)
+
+    def spread(pixels: Array) -> Array:
+        pixels = jnp.broadcast_to(pixels, (height, width, 3)).reshape(-1, 3)
+        return pixels.reshape(-1) if taps is None else jnp.tile(pixels, (1, chunk))
+
+    factors, balance = [], None
     if sensor.vignette is not None:
         x, y = _from_middle(height, width)
-        light = light * (1 - sensor.vignette * (x * x + y * y))[..., None]
+        factors.append(jnp.maximum(1 - sensor.vignette * (x * x + y * y), 0.0)[..., None] ** power)
     if sensor.exposure_gain is not None:
-        light = light * jnp.exp2(sensor.exposure_gain)
-    if sensor.shot_noise is not None:
-        light = light + jnp.sqrt(light) * _gaussian(sensor.shot_noise, frames.shape, seed, numbers, SHOT)
+        factors.append(jnp.exp2(sensor.exposure_gain * power))
     if sensor.white_balance is not None:
-        light = light * jnp.exp2(sensor.white_balance * jnp.asarray([0.5, 0.0, -0.5]))
-    return light
+        balance = jnp.exp2(sensor.white_balance * power * jnp.asarray([0.5, 0.0, -0.5]))
+    if balance is not None and not _in_light(sensor):
+        factors.append(balance)
+        balance = None
+    lens = spread(functools.reduce(jnp.multiply, factors)) if factors else None
+    number = jnp.arange(height * width * 3, dtype=jnp.uint32).reshape(height, width, 3)
+    return _Grid(spread(number), lens, None if balance is None else spread(balance), taps)
 
 
-def _gaussian(deviation: Array, shape: tuple[int, ...], seed: Array, numbers: Array, *stage: int) -> Array:
-    """Approximately Gaussian noise [T, H, W, 3] of standard deviation `deviation`, seeded by frame number.
+def _in_light(sensor: Sensor) -> bool:
+    """Whether a stage is more than a factor of the light."""
+    return sensor.distortion is not None or sensor.shot_noise is not None
+
+
+def _developed(sensor: Sensor, grid: _Grid, values: Array, state: Array) -> Array:
+    """sRGB values, at most 255, of sRGB values after stages 1 and 2; `state` is that of the shot noise."""
+    if not _in_light(sensor):
+        return values if grid.lens is None else jnp.minimum(scaled_values(values, grid.lens), 255.0)
+    light = light_of(values)
+    if grid.taps is not None:
+        rows = [light.at[pixel].get(mode="promise_in_bounds") for pixel in grid.taps.pixel]
+        light = functools.reduce(jnp.add, [row * w[:, None] for row, w in zip(rows, grid.taps.weight, strict=True)])
+    if grid.lens is not None:
+        light = light * grid.lens
+    if sensor.shot_noise is not None:
+        light = light + jnp.sqrt(light) * _gaussian(sensor.shot_noise, state, grid.number)
+    if grid.balance is not None:
+        light = light * grid.balance
+    return values_of(jnp.clip(light, 0.0, 1.0))
+
+
+def _gaussian(deviation: Array, state: Array, number: Array) -> Array:
+    """Approximately Gaussian noise of standard deviation `deviation`, seeded by a state and the number of a value.
 
     The noise of a value is the sum of four random bytes, which has a variance of (256^2 - 1) / 3.
     """
-    pixels = jnp.arange(math.prod(shape[1:]), dtype=jnp.uint32).reshape(shape[1:])
-    words = hashed(seed, numbers[:, None, None, None], pixels, *stage)
-    sums = functools.reduce(jnp.add, [((words >> shift) & 255).astype(jnp.int32) for shift in (0, 8, 16, 24)])
+    words = hashed(number, state=state)
+    pairs = (words & 0x00FF00FF) + ((words >> 8) & 0x00FF00FF)
+    sums = ((pairs + (pairs >> 16)) & 0xFFFF).astype(jnp.int32)
     return (sums - 510).astype(jnp.float32) * (deviation / math.sqrt((256**2 - 1) / 3))
 
 
@@ -137,22 +197,30 @@ def undistorted_centers(distortion: Array, height: int, width: int) -> tuple[Arr
     return jnp.clip(column, 0.0, width - 1e-3), jnp.clip(row, 0.0, height - 1e-3)
 
 
-def _distorted(light: Array, distortion: Array) -> Array:
-    """Images [T, H, W, 3] of light, distorted, by bilinear interpolation between centres of pixels."""
-    frames, height, width, _ = light.shape
+class Taps(NamedTuple):
+    """Pixels [4, H * W] between whose centres the centres of distorted pixels lie, and their weights."""
+
+    pixel: Array
+    weight: Array
+
+
+def _taps(distortion: Array, height: int, width: int) -> Taps:
+    """Taps of bilinear interpolation between centres of pixels."""
     column, row = undistorted_centers(distortion, height, width)
     column, row = (jnp.clip(a - 0.5, 0.0, size - 1.0) for a, size in ((column, width), (row, height)))
     left, top = (jnp.floor(a).astype(jnp.int32) for a in (column, row))
     right, bottom = jnp.minimum(left + 1, width - 1), jnp.minimum(top + 1, height - 1)
-    across, down = (column - left)[..., None], (row - top)[..., None]
-    flat = light.reshape(frames, -1, 3)
+    across, down = column - left, row - top
+    pixels = [y * width + x for y in (top, bottom) for x in (left, right)]
+    weights = [v * u for v in (1 - down, down) for u in (1 - across, across)]
+    return Taps(jnp.stack(pixels).reshape(4, -1), jnp.stack(weights).reshape(4, -1))
 
-    def at(rows: Array, columns: Array) -> Array:
-        return flat[:, (rows * width + columns).ravel()].reshape(light.shape)
 
-    upper = at(top, left) * (1 - across) + at(top, right) * across
-    lower = at(bottom, left) * (1 - across) + at(bottom, right) * across
-    return upper * (1 - down) + lower * down
+def _distorted_owners(owners: Array, distortion: Array) -> Array:
+    """Owners [T, H, W] at the centres of distorted pixels."""
+    column, row = undistorted_centers(distortion, *owners.shape[1:])
+    pixel = jnp.floor(row).astype(jnp.int32) * owners.shape[2] + jnp.floor(column).astype(jnp.int32)
+    return owners.reshape(len(owners), -1)[:, pixel.ravel()].reshape(owners.shape)
 
 
 def distorted_points(points: Array, distortion: Array, height: int, width: int) -> Array:

@@ -66,14 +66,14 @@ def shadow_cover(terms: ShadowTerms, window: PixelWindow) -> Array:
         for side in range(terms.normal.shape[-2]):
             a, b = (terms.normal[..., side, axis][..., None, None] for axis in (0, 1))
             distance = (terms.distance[..., side] + terms.radius)[..., None, None]
-            cover = cover - _smooth((x * a + (y * b - distance) + blur) / (2 * blur))
+            cover = cover - _smooth((x * a + (y * b - distance) + blur) * (0.5 / blur))
         return opacity * jnp.maximum(cover, 0.0)
     if terms.half is not None:
         cos, sin, half = (a[..., None, None] for a in (terms.cos, terms.sin, terms.half))
         along = jnp.clip(x * cos + y * sin, -half, half)
         x, y = x - along * cos, y - along * sin
     inner, outer = jnp.maximum(radius - blur, 0.0), radius + blur
-    return opacity * _smooth((outer**2 - (x * x + y * y)) / (outer**2 - inner**2))
+    return opacity * _smooth((outer**2 - (x * x + y * y)) * (1 / (outer**2 - inner**2)))
 
 
 def _smooth(value: Array) -> Array:

@@ -68,7 +68,7 @@ PALETTES = {
         light="fffaf0",
     ),
     "dusk": _palette(
-        "80635c 4a3f63 2b2d42",
+        "8f6a58 544668 363450",
         "lilac",
         "9a87b8",
         {

@@ -9,12 +9,13 @@ import numpy as np
 from gen2d.core.errors import FolderError, UserError, argument
 from gen2d.core.humanize import in_bytes, in_time, with_noun
 from gen2d.core.progress import waiting
+from gen2d.core.sizes import divisor
 from gen2d.dataset import folder as shards
 from gen2d.dataset.block import Block
 from gen2d.dataset.spec import DatasetSpec
 from gen2d.generation.encoder import Encoder, threads_for
 from gen2d.programs import devices
-from gen2d.programs.rollout import DeviceBatch, Rollout, divisor
+from gen2d.programs.rollout import DeviceBatch, Rollout
 from gen2d.programs.source import Request, VideoRange, VideoSlice, VideoSource
 from gen2d.storage.paths import Place
 

@@ -20,7 +20,7 @@ from gen2d.config import quality
 from gen2d.config.config import Config
 from gen2d.config.parameters import only_sections
 from gen2d.core import enums
-from gen2d.core.sizes import power_of_two
+from gen2d.core.sizes import divisor, power_of_two
 from gen2d.programs import render
 from gen2d.programs.devices import Device
 from gen2d.programs.schema import VideoSchema
@@ -47,11 +47,6 @@ SHARD_BYTES = 2**30  # of raw frames in a shard
 SHARD_VIDEOS = 1024  # largest default number of videos in a shard
 # Limits of a default batch: videos, and pairs of their bodies, which take 300 bytes each.
 BATCH_SIZE, PAIRS = 512, 2**20
-
-
-def divisor(number: int, limit: int) -> int:
-    """Largest divisor of a number that does not exceed the limit."""
-    return next(d for d in range(min(number, limit), 0, -1) if number % d == 0)
 
 
 class Lane(NamedTuple):

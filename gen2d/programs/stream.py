@@ -23,12 +23,13 @@ from gen2d.config.config import Config, checked_seed, load_config
 from gen2d.core.errors import ConfigError
 from gen2d.core.progress import waiting
 from gen2d.core.schema import Field
+from gen2d.core.sizes import divisor
 from gen2d.loading.column import LAYOUTS
 from gen2d.loading.dataloader import without_text
 from gen2d.loading.dataset import ViewOptions, select_fields, window_fields
 from gen2d.loading.epochs import EpochSampler, GlobalBatch, check_one_of, epoch_indices
 from gen2d.programs import devices
-from gen2d.programs.rollout import DeviceBatch, divisor
+from gen2d.programs.rollout import DeviceBatch
 from gen2d.programs.source import Request, VideoSource
 from gen2d.records.axes import Array
 from gen2d.records.keys import MAX_VIDEOS

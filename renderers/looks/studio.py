@@ -143,8 +143,9 @@ def paint(scene: Scene, layout: Layout, options: Options, key: Array) -> Paint:
     offset = -direction[:2] / high * (LIFT * _size(layout))
     shadow = Shadow(offset, jnp.float32(1) * blur(options, layout), drawn["shadow"], jnp.asarray(DARK))
     number = material.number.astype(jnp.uint8)
+    background = _backdrop(base, layout, options, key, drawn["azimuth"])
     return base._replace(
-        background=_backdrop(base, layout, options, key), light=light, surface=surface, shadow=shadow, material=number,
+        background=background, light=light, surface=surface, shadow=shadow, material=number,
         sampled=drawn,
     )  # fmt: skip
 
@@ -161,12 +162,12 @@ def _materials(options: Options, scene: Scene, moving: Array, key: Array) -> Fin
     return Finish(*jnp.asarray(table)[jnp.where(moving, chosen, 0)].T)
 
 
-def _backdrop(base: Paint, layout: Layout, options: Options, key: Array) -> Background:
-    """The background that is asked for, or the backdrop of the palette: a vertical gradient with darker corners."""
+def _backdrop(base: Paint, layout: Layout, options: Options, key: Array, azimuth: Array) -> Background:
+    """The background that is asked for, or the backdrop of the palette: a gradient towards the light, and corners."""
     named = options.named_palette
     if named is None or options.background is not None or options.background_kind != "plain":
         return base.background
-    return backdrop(named, layout, jax.random.fold_in(key, 1))
+    return backdrop(named, layout, jax.random.fold_in(key, 1))._replace(direction=azimuth)
 
 
 LOOK = Look(options=Options, paint=paint, margin=line_margin, blur=blur, parts=("surface", "shadow"))

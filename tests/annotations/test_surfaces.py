@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import reference
 from numpy.testing import assert_allclose, assert_array_equal
-from reference import Relief, View
+from reference import View
 
 import gen2d
 from gen2d.config.config import load_config
@@ -18,6 +18,9 @@ from gen2d.core.enums import CIRCLE
 from gen2d.core.errors import ConfigError
 from gen2d.programs.rollout import Rollout
 from gen2d.renderers import rasterizer, surfaces
+from gen2d.renderers import relief as relief_module
+from gen2d.renderers.primitives import ImagePose
+from gen2d.renderers.relief import Relief
 
 HEIGHT, WIDTH = 60, 68
 NAMES = ("masks", "depth", "normals", "shadow")
@@ -60,7 +63,9 @@ def drawn(case):
     columns = rollout.host_columns([batch])[0] | {name: np.asarray(array) for name, array in rendered.items()}
     surface = batch.render_scenes.paint.surface
     assert surface is not None
-    relief = [Relief(np.asarray(surface.slope[v], float), np.asarray(surface.bevel[v], float)) for v in range(2)]
+    relief = [
+        reference.Relief(np.asarray(surface.slope[v], float), np.asarray(surface.bevel[v], float)) for v in range(2)
+    ]
     return Drawn(rollout, batch.render_scenes, columns, relief)
 
 
@@ -130,6 +135,26 @@ def test_the_depth_of_a_ball_is_its_dome():
             square = np.minimum(((x - column) ** 2 + (y - row) ** 2)[here] / scale**2, r**2)
             dome = np.sqrt((r / steepest) ** 2 - square) - r / steepest * np.sqrt(1 - steepest**2)
             assert_allclose(video["surface/height"][t][here], dome, atol=1e-3, rtol=1e-3)
+
+
+def test_surfaces_beyond_a_rim_are_as_at_it():
+    """Of a disc, and beside the core of a capsule; pixels own such points where three objects meet."""
+    one, steepest = jnp.ones(1), 0.9
+    pose = ImagePose(0 * one, 0 * one, one, 0 * one, 10 * one, 5 * one)
+    way = np.linspace(0, 2 * np.pi, 12, endpoint=False)
+    for half in (None, 0 * one):
+        relief = Relief(5 * one, half, None, None, jnp.zeros((1, 2)))
+        for x, y in 5 * np.stack([np.cos(way), np.sin(way)], -1):
+            at_rim, beyond = (
+                relief_module.surface_points(relief, pose, steepest * one, one, *_point(far * x, far * y))
+                for far in (1 - 1e-6, 1.3)
+            )
+            assert_allclose(np.hypot(beyond.normal_x, beyond.normal_y), steepest, rtol=1e-4)
+            jax.tree.map(lambda a, b: assert_allclose(a, b, atol=1e-4), at_rim, beyond)
+
+
+def _point(x, y):
+    return jnp.full((1, 1, 1), x, jnp.float32), jnp.full((1, 1, 1), y, jnp.float32)
 
 
 @pytest.mark.parametrize("case", TIERED)

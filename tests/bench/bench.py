@@ -257,9 +257,45 @@ def render(folder: Path, case: str, turns: int) -> Turns:
 
 def looks(folder: Path, case: str, turns: int) -> Turns:
     """CPU seconds per frame in each look, of discs between walls."""
-    overrides = bench_render.CASES[case].overrides
-    rollouts = {name: source_of((*overrides, option)).rollout for name, option in bench_render.LOOKS.items()}
-    return in_turns(bench_render.look_works(rollouts), turns)
+    return _frames(case, {name: (option,) for name, option in bench_render.LOOKS.items()}, turns)
+
+
+def sensors(folder: Path, case: str, turns: int) -> Turns:
+    """CPU seconds per frame with the stages of the sensor."""
+    stages = {name: [f"image.{option}" for option in options] for name, options in bench_render.SENSORS.items()}
+    return _frames(case, stages, turns)
+
+
+def surfaces(folder: Path, case: str, turns: int) -> Turns:
+    """CPU seconds per frame of lit objects with annotations of their surfaces."""
+    look, added = bench_render.LOOKS["studio"], bench_render.SURFACES
+    return _frames(
+        case, {name: (look, *(f"annotations.{option}" for option in options)) for name, options in added.items()}, turns
+    )
+
+
+def _frames(case: str, overrides: Mapping[str, Sequence[str]], turns: int) -> Turns:
+    """CPU seconds per frame of a case with overrides of its config, by name."""
+    common = bench_render.CASES[case].overrides
+    rollouts = {name: source_of((*common, *more)).rollout for name, more in overrides.items()}
+    return in_turns(bench_render.frame_works(rollouts), turns)
+
+
+def lit(folder: Path, videos: int = 512, turns: int = 5) -> Turns:
+    """CPU seconds per video to make datasets of bouncing.yaml in each look, and their bytes per video."""
+    works: dict[str, Callable[[], float]] = {}
+    sizes: dict[str, list[float]] = {}
+    for look in bench_render.LOOKS:
+        source, root = source_of([f"look.name={look}"], "bouncing.yaml"), folder / look
+        make(source, videos, root)
+        sizes[f"bytes {look}"] = [sum(path.stat().st_size for path in root.rglob("*") if path.is_file()) / videos]
+
+        def remake(source: Any = source) -> None:
+            with tempfile.TemporaryDirectory(dir=folder) as out:
+                make(source, videos, Path(out))
+
+        works[look] = timed(remake, videos)
+    return in_turns(works, turns) | sizes
 
 
 def annotated(folder: Path, turns: int) -> Turns:
@@ -312,7 +348,10 @@ def states(folder: Path, videos: int = 512, turns: int = 7, window: int = 16, ov
     return in_turns(works, turns) | sizes
 
 
-MEASURED = (stages, steady, bounds, physics, precisions, render, annotated, family, storage, states)
+MEASURED = (
+    stages, steady, bounds, physics, precisions, render, looks, sensors, surfaces, lit, annotated, family, storage,
+    states,
+)  # fmt: skip
 MEASUREMENTS = {work.__name__: work for work in MEASURED}
 
 
@@ -551,6 +590,19 @@ def render_section(folder: Path, quick: bool) -> Results:
     for name, limit in zip(bench_render.LIT, (3, 4), strict=True):
         turns = measure(looks, folder, CORES[:1], case=name, turns=repeats)
         yield Promise(f"studio against flat, {name}", _ratio(turns["studio"], turns["flat"]), target=limit, most=True)
+    turns = measure(lit, folder, CORES[:1], turns=3 if quick else 5)
+    yield Promise("studio against flat, end to end", _ratio(turns["studio"], turns["flat"]), target=1.5, most=True)
+    size = _ratio(turns["bytes studio"], turns["bytes flat"])
+    yield Promise("studio against flat, bytes", size, target=1.6, most=True)
+    limits = {"vignette, exposure, white balance": 2, "jpeg": 5}
+    turns = measure(sensors, folder, CORES[:1], case=bench_render.LIT[0], turns=repeats)
+    for name in list(turns)[1:]:
+        ratio = _ratio(turns[name], turns["no sensor"])
+        yield Promise(f"render with {name}", ratio, target=limits.get(name), most=True, note=ALONE)
+    turns = measure(surfaces, folder, CORES[:1], case=bench_render.LIT[0], turns=repeats)
+    for name in list(turns)[1:]:
+        ratio = _ratio(turns[name], turns["studio"])
+        yield Promise(f"studio with {name}", ratio, target=None, most=True, note=ALONE)
     yield from annotation_results(measure(annotated, folder, CORES[:1], turns=repeats))
 
 

@@ -56,6 +56,22 @@ CASES = {case.name: case for case in (Case(px, n, videos) for px, videos in SIZE
 COPIED = "256 px, 8 discs"  # case that is compared with a copy
 LIT = [f"{pixels} px, 8 discs" for pixels in (64, 256)]  # cases in which looks are compared, and the looks
 LOOKS = {name: f"look={{name: {name}, wall_width: 3}}" for name in ("flat", "studio")}
+SENSORS = {
+    "no sensor": (),
+    "vignette, exposure, white balance": ("vignette=0.3", "exposure_gain=0.5", "white_balance=0.3"),
+    "noise": ("noise=2",),
+    "shot noise": ("shot_noise=0.02",),
+    "distortion": ("distortion=0.2",),
+    "jpeg": ("jpeg_quality=75",),
+}  # options of the section `image`, by name
+SENSORS["all of them"] = tuple(option for options in SENSORS.values() for option in options)
+SURFACES = {
+    "studio": (),
+    "masks": ("masks=true",),
+    "masks, depth": ("masks=true", "depth=true"),
+    "masks, normals": ("masks=true", "normals=true"),
+    "shadow": ("shadow=true",),
+}  # annotations of lit objects
 ANNOTATED = Case(64, 8, 64)  # case in which annotations are measured
 ANNOTATIONS = {
     "frames": (),
@@ -101,8 +117,8 @@ def annotation_works(rollouts: Mapping[str, Any]) -> tuple[dict[str, Callable[[]
     return works_by_name, sizes
 
 
-def look_works(rollouts: Mapping[str, Any]) -> dict[str, Callable[[], float]]:
-    """Functions by look that render all frames of a batch and return the CPU seconds per frame."""
+def frame_works(rollouts: Mapping[str, Any]) -> dict[str, Callable[[], float]]:
+    """Functions by name that render all frames of a batch and return the CPU seconds per frame."""
     each = {name: (rollout, rollout.batch_size * rollout.config.video.frames) for name, rollout in rollouts.items()}
     return {name: timed(_render_all(rollout, first_batch(rollout)), frames) for name, (rollout, frames) in each.items()}
 

@@ -194,6 +194,16 @@ def test_every_look_is_timed(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) ->
 
 
 @pytest.mark.full
+def test_sensors_and_surfaces_are_timed_by_name(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setitem(bench_render.CASES, SMALL.name, SMALL)
+    monkeypatch.setattr(bench_render, "SENSORS", {"no sensor": (), "noise": ("noise=2",)})
+    monkeypatch.setattr(bench_render, "SURFACES", {"studio": (), "shadow": ("shadow=true",)})
+    assert bench.sensors(tmp_path, SMALL.name, turns=1).keys() == {"no sensor", "noise"}
+    assert bench.surfaces(tmp_path, SMALL.name, turns=1).keys() == {"studio", "shadow"}
+    assert {"looks", "sensors", "surfaces", "lit"} <= bench.MEASUREMENTS.keys()
+
+
+@pytest.mark.full
 def test_what_annotations_add_is_timed_and_weighed(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(bench_render, "ANNOTATED", SMALL)
     monkeypatch.setattr(bench_render, "ANNOTATIONS", {"frames": (), "flow": ("flow=true",)})

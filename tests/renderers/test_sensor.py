@@ -19,8 +19,9 @@ from gen2d.core.errors import ConfigError
 from gen2d.generation.run import generate
 from gen2d.page.video import Detail, Videos
 from gen2d.programs.render import render_frames
+from gen2d.renderers import jpeg
 from gen2d.renderers import sensor as sensor_module
-from gen2d.renderers.color import to_linear
+from gen2d.renderers.color import light_of, scaled_values, to_linear, values_of
 from gen2d.renderers.jpeg import TABLES, round_trip
 from gen2d.renderers.sensor import Sensor
 
@@ -71,6 +72,18 @@ def test_each_stop_doubles_the_light_until_it_is_white(stops):
 def _encoded(linear):
     """sRGB from 0 to 1 of linear light (IEC 61966-2-1)."""
     return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 0.0031308) ** (1 / 2.4) - 0.055)
+
+
+def test_the_curves_of_the_sensor_are_those_of_the_standard():
+    """Within 0.03 display values; all bytes, and light scaled from 1/16 to 4."""
+    values, scale = np.arange(256), 2.0 ** np.arange(-4, 2.1, 0.25)[:, None]
+    slope = np.gradient(light(np.linspace(0, 255, 25501)), 0.01)[::100]
+    assert (np.abs(np.asarray(light_of(jnp.float32(values))) - light(values)) < 0.03 * slope).all()
+    shades = np.linspace(0, 1, 100_001)
+    assert np.abs(np.asarray(values_of(jnp.float32(shades))) - 255 * _encoded(shades)).max() < 0.03
+    scaled = np.asarray(scaled_values(jnp.float32(values), jnp.float32(scale ** (1 / 2.4))))
+    exact = 255 * _encoded(light(values) * scale)
+    assert np.abs(scaled - exact)[exact < 255].max() < 0.03
 
 
 def test_white_balance_is_the_ratio_of_red_to_blue_and_leaves_green():
@@ -223,6 +236,16 @@ def test_a_jpeg_round_trip_loses_what_a_codec_loses(quality):
     error, loss = np.abs(own - np.asarray(Image.open(file), float)), np.abs(own - image).mean()
     print(f"quality {quality}: loses {loss:.2f} levels; off by {error.mean():.3f} of those of a codec")
     assert error.mean() < 0.25 * loss
+
+
+def test_quotients_are_those_of_whole_numbers():
+    rng = np.random.default_rng(0)
+    divisors = rng.integers(1, 256, 100_000) << 19
+    numbers = rng.integers(0, 2**31 - 1, 100_000) // rng.choice([1, 7, 900], 100_000)
+    numbers[::2] = numbers[::2] // divisors[::2] * divisors[::2] - rng.integers(0, 2, 50_000)
+    numbers = np.maximum(numbers, 0)
+    own = jpeg._quotient(jnp.asarray(numbers, jnp.int32), jnp.asarray(divisors, jnp.int32))
+    assert_array_equal(own, numbers // divisors)
 
 
 def test_a_jpeg_round_trip_is_the_last_stage():

@@ -179,13 +179,15 @@ def reference(scene, plan, stage):
 
 
 def backdrop(stage, plan, points):
-    """Vertical gradient over the first view, and its corners."""
+    """Gradient towards the light over the first view, and its corners."""
     background = jax.tree.map(lambda a: np.asarray(a, float), stage.paint.background)
     angle = float(stage.instants.view.angle[0])
     centered = points - np.array([plan.width, plan.height]) / 2
     world = centered @ np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
     share = world / (np.array([plan.width, plan.height]) / 2)
-    image = background.color + np.clip((share[..., 1:] + 1) / 2, 0, 1) * (background.to_color - background.color)
+    way = np.array([np.cos(stage.paint.sampled["azimuth"]), np.sin(stage.paint.sampled["azimuth"])], float)
+    along = world @ way / (np.abs(way) @ np.array([plan.width, plan.height]) / 2)
+    image = background.color + np.clip((along[..., None] + 1) / 2, 0, 1) * (background.to_color - background.color)
     return image + np.clip((share**2).sum(-1) / 2, 0, 1)[..., None] * (background.corners - image)
 
 
@@ -345,6 +347,16 @@ def test_the_light_and_the_materials_of_each_video_are_stored():
     expected = np.array([b"paper", b"wood", b"metal"])[third]
     assert_array_equal(columns["objects/material_name"][present], expected[present])
     assert len(np.unique(expected[present])) == 3
+
+
+def test_materials_by_two_properties_are_two_programs():
+    """They differ in the input that they read alone, of the same shape."""
+    hashes = set()
+    for by in ("elasticity", "friction"):
+        look = {"name": "studio", "material": ["paper", "wood"], "material_by": by}
+        config = load_config({"look": look, "video": {"frames": 2}, "storage": {"batch_size": 2}})
+        hashes.add(Rollout(config, jax.devices()[:1]).programs["stage"].sha256)
+    assert len(hashes) == 2
 
 
 def test_what_the_look_or_the_images_of_a_split_lack_is_stored_as_nothing():
