@@ -1,5 +1,6 @@
 """Impacts on bodies that rigid joints hold: closed forms of one impact, and the matrices that the joints take."""
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from laws import holds
@@ -15,7 +16,7 @@ def test_band_of_an_inverse_is_that_of_the_whole_inverse(rows, width):
     i, j = np.indices((rows, rows))
     half = random.normal(size=(rows, rows)) * (i >= j) * (i - j < width) + 5 * np.eye(rows)
     matrix = half @ half.T
-    bands = [np.pad(np.diagonal(matrix, o), (0, o)).astype(np.float32)[:, None] for o in range(width)]
+    bands = [jnp.asarray(np.pad(np.diagonal(matrix, o), (0, o))[:, None], jnp.float32) for o in range(width)]
     inverse = np.linalg.inv(matrix)
     for offset, diagonal in enumerate(inverse_band(factor(bands))):
         expected = np.diagonal(inverse, offset)
