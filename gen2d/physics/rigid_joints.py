@@ -7,7 +7,7 @@ diagonals for a chain of any length, and its L D L^T factors take one loop over 
 
 The two passes make a step RATTLE (H. C. Andersen, 1983), which keeps a pendulum's energy: the first makes the anchors
 meet at the end of the step, with arms that have turned by then, the second removes the speed with which they would part
-there. Contacts are solved before.
+there. Contacts are solved between, and see the joints (jointed.py).
 """
 
 import dataclasses

@@ -10,7 +10,8 @@ A step of h seconds:
 
 Pairs are solved in rounds of disjoint pairs (schedule.py), all of them (all_pairs.py) or those that are near
 (nearby_pairs.py), each round from the result of the last. Springs, limits and motors come before the contacts
-(springs_limits_motors.py), static bodies last of all pairs, and rigid joints (rigid_joints.py) after the contacts.
+(springs_limits_motors.py), static bodies last of all pairs. Rigid joints (rigid_joints.py) are solved before the
+contacts, which see what the joints leave of their bodies' masses (jointed.py), and after them.
 
 Restitution. A contact that closes within the step bounces: Newton's law is applied to the velocities that it finds, so
 impacts follow one another and never add energy. The impulse P acts at the time of impact tau, not at the start of the
