@@ -43,7 +43,7 @@ class Trace:
     """All that is known of a traced program but its code."""
 
     tape: Tape
-    digest: str  # sha256 of the program's text
+    digest: str  # sha256 of the text and the inputs of the program
     results: Any  # tree of jax.ShapeDtypeStruct
 
 

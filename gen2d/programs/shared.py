@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 from jax.core import Tracer
+from jax.interpreters import partial_eval
 from jax.sharding import SingleDeviceSharding
 
 from gen2d.config.config import Config
@@ -260,10 +261,14 @@ def _traced(request: _Request) -> Program:
     run.__name__ = request.name.rpartition(".")[2]
     numbers = jax.ShapeDtypeStruct((SIZE,), np.uint32)
     shapes = [jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=one) for x in (numbers, *request.types)]
-    # With unused inputs, or programs that read another input of the same type would be taken for one.
-    lowered = jax.jit(run, keep_unused=True).lower(*shapes)
+    traced = jax.jit(run).trace(*shapes)
+    lowered = traced.lower()
     results = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), results)
-    trace = Trace(tape, sha256(canonical(lowered.as_text()).encode()), results)
+    # jax leaves inputs that are not used out of the text, so programs that read another input of a type have one text.
+    jaxpr = traced.jaxpr.jaxpr
+    _, used = partial_eval.dce_jaxpr(jaxpr, [True] * len(jaxpr.outvars))
+    inputs = [f"{x.dtype}{x.shape}{'' if read else ' unused'}" for x, read in zip(shapes, used, strict=True)]
+    trace = Trace(tape, sha256(as_json([canonical(lowered.as_text()), inputs])), results)
     return _loadable(trace, device, request.x64) or Program(trace, device, request.x64, lowered)
 
 
