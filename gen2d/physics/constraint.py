@@ -62,8 +62,8 @@ class ContactConstraint(NamedTuple):
     frame: ContactFrame | None  # of two discs, or a disc on a static body at rest; else it changes from step to step
     static: bool  # against a static or kinematic body: twice as stiff
     neighbours: Neighbours | None = None  # of a static segment
-    taken_a: Array | None = None  # [6, pairs, ...] what rigid joints take from the inverse mass (jointed.py)
-    taken_b: Array | None = None
+    schur_a: Array | None = None  # [6, pairs, ...] what rigid joints take from the inverse mass (jointed.py)
+    schur_b: Array | None = None
 
 
 class CoreOffset(NamedTuple):
@@ -175,19 +175,21 @@ def apply_impulse(
     parts = [p * d for p, d in zip(impulse, directions, strict=True) if p is not None]
     linear = sum(parts[1:], parts[0])
     angular = _angular((frame.normal_b, frame.tangent_b), impulse)
-    b = _pushed(b, constraint.b, constraint.taken_b, linear, angular)
+    b = _after_impulse(b, constraint.b, constraint.schur_b, linear, angular)
     if constraint.a is None or a is None:
         return a, b
     angular = _angular((frame.normal_a, frame.tangent_a), impulse)
-    return _pushed(a, constraint.a, constraint.taken_a, -linear, -angular), b
+    return _after_impulse(a, constraint.a, constraint.schur_a, -linear, -angular), b
 
 
-def _pushed(motion: Motion, inverse: Inertia, taken: Array | None, linear: Array, angular: Array | float) -> Motion:
+def _after_impulse(
+    motion: Motion, inverse: Inertia, schur: Array | None, linear: Array, angular: Array | float
+) -> Motion:
     """Motion after an impulse, N s [2, ...] and N m s."""
     new = Motion(motion.velocity + inverse.mass * linear, motion.spin + inverse.moment * angular)
-    if taken is None:
+    if schur is None:
         return new
-    velocity, spin = product(taken, (linear, angular + jnp.zeros_like(motion.spin)))
+    velocity, spin = product(schur, (linear, angular + jnp.zeros_like(motion.spin)))
     return Motion(new.velocity - velocity, new.spin - spin)
 
 

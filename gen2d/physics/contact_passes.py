@@ -32,7 +32,7 @@ from gen2d.physics.contact_state import BodySide, PassSetup, SolvedPair, WarmSta
 from gen2d.physics.energy import MotionPair, add_disc_dissipation, add_dissipation
 from gen2d.physics.friction import apply_angular_impulse, friction_impulse, rolling_impulse
 from gen2d.physics.impact_order import after_impact, in_order, later_impact, takes_part, with_first
-from gen2d.physics.jointed import free_motion, jointed_frame, with_free_motion, with_joints
+from gen2d.physics.jointed import free_motion, jointed_frame, with_joints, with_motions
 from gen2d.physics.normal_impulse import (
     NormalTarget,
     TargetOf,
@@ -129,7 +129,7 @@ def _apply_pass(
 ) -> tuple[BodySide, BodySide, SolvedPair]:
     """Both sides and the pair after normal impulses, friction and rolling resistance."""
     assert b.motion is not None, "only static bodies lack a motion"
-    before, roll, impulses, jointed = (a.motion, b.motion), pair.roll, [], b.change is not None
+    before, roll, impulses, jointed = (a.motion, b.motion), pair.roll, [], b.joint_motion is not None
     speeds, slips = zip(*(relative_speed(c.frame, c.normal, *before) for c in pair.contacts), strict=True)
     seen = _seen_pair(constraint, pair, target_of, list(speeds), a, b)
     targets = seen.targets
@@ -164,7 +164,7 @@ def _apply_pass(
         twist = None if roll is None or pair.roll is None else roll - pair.roll
         free = _free_motions(constraint, pair.contacts, changes, twist, a, b) if jointed else (before, motions)
         work = add_dissipation(b.work, constraint, pair.contacts, changes, twist, *free)
-        a, b = (with_free_motion(*of) for of in zip((a, b), motions, free[1], strict=True))
+        a, b = (with_motions(*of) for of in zip((a, b), motions, free[1], strict=True))
     solved = SolvedPair(pair.contacts, impulses, roll)
     return a._replace(motion=motions[0]), b._replace(motion=motions[1], work=work), solved
 
@@ -178,7 +178,7 @@ def _free_motions(
     b: BodySide,
 ) -> tuple[MotionPair, MotionPair]:
     """Motions before and after the impulses, without what the joints take from them."""
-    constraint = constraint._replace(taken_a=None, taken_b=None)
+    constraint = constraint._replace(schur_a=None, schur_b=None)
     free_a, free_b = free_motion(a), free_motion(b)
     assert free_b is not None, "only static bodies lack a motion"
     before = after = free_a, free_b
@@ -244,13 +244,13 @@ def _update_drift(old: BodySide, new: BodySide, time: Array, push: Array | None)
     assert old.motion, "only moving bodies drift"
     assert new.motion, "only moving bodies drift"
     assert old.drift, "only moving bodies drift"
-    new = new._replace(drift=_less(old.drift, time, new.motion, old.motion))
-    if old.late is not None and new.change is not None and old.change is not None:
-        new = new._replace(late=_less(old.late, time, new.change, old.change))
+    new = new._replace(drift=_reduced_drift(old.drift, time, new.motion, old.motion))
+    if old.joint_drift is not None and new.joint_motion is not None and old.joint_motion is not None:
+        new = new._replace(joint_drift=_reduced_drift(old.joint_drift, time, new.joint_motion, old.joint_motion))
     return new._replace(push=new.push if push is None else jnp.maximum(new.push, push))
 
 
-def _less(drift: Motion, time: Array, new: Motion, old: Motion) -> Motion:
+def _reduced_drift(drift: Motion, time: Array, new: Motion, old: Motion) -> Motion:
     """Drift reduced by the time of an impulse times a change of motion."""
     return Motion(drift.velocity - time * (new.velocity - old.velocity), drift.spin - time * (new.spin - old.spin))
 

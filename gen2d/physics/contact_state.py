@@ -27,9 +27,9 @@ class BodySide(NamedTuple):
     displacement: Motion | None = None  # m, rad: where the impulses of a pass act; None: of static bodies
     push: Any = None  # [N, ...] m/s: bound on the speed from pushing overlaps apart; 0: no contact; None: static
     work: Work | None = None
-    taken: Array | None = None  # [6, N, ...] what rigid joints take from the inverse mass (jointed.py)
-    change: Motion | None = None  # m/s, rad/s: what they take from the motion in a pass
-    late: Motion | None = None  # m, rad: what they take from the drift
+    schur: Array | None = None  # [6, N, ...] what rigid joints take from the inverse mass (jointed.py)
+    joint_motion: Motion | None = None  # m/s, rad/s: what they take from the motion in a pass
+    joint_drift: Motion | None = None  # m, rad: what they take from the drift
     support: Support | None = None  # None: static bodies, and without shock propagation
     first: Array | None = None  # [N, ...] s: least time of impact of a body in the step; infinite without one
     clock: Array | None = None  # [N, ...] s: of a body's last impact in the step so far; 0 without one

@@ -35,17 +35,17 @@ def apply_angular_impulse(
     constraint: ContactConstraint, roll: Array, a: Motion | None, b: Motion
 ) -> tuple[Motion | None, Motion]:
     """Both motions after an angular impulse on b and its reaction on a."""
-    b = _turned(b, constraint.b.moment, constraint.taken_b, roll)
+    b = _after_twist(b, constraint.b.moment, constraint.schur_b, roll)
     if constraint.a is None or a is None:
         return a, b
-    return _turned(a, constraint.a.moment, constraint.taken_a, -roll), b
+    return _after_twist(a, constraint.a.moment, constraint.schur_a, -roll), b
 
 
-def _turned(motion: Motion, moment: Array, taken: Array | None, roll: Array) -> Motion:
+def _after_twist(motion: Motion, moment: Array, schur: Array | None, roll: Array) -> Motion:
     """Motion after an angular impulse, N m s."""
-    if taken is None:
+    if schur is None:
         return motion._replace(spin=motion.spin + moment * roll)
-    xt, yt, tt = taken[3:]
+    xt, yt, tt = schur[3:]
     return Motion(motion.velocity - jnp.stack([xt, yt]) * roll, motion.spin + (moment - tt) * roll)
 
 
@@ -60,8 +60,8 @@ def rolling_impulse(
     """Accumulated angular impulse that stops rolling, within its bound by the normal impulse."""
     assert constraint.rolling is not None, "the constraint has no rolling resistance"
     k = constraint.b.moment if constraint.a is None else constraint.a.moment + constraint.b.moment
-    for taken in (constraint.taken_a, constraint.taken_b):
-        k = k if taken is None else k - taken[-1]
+    for schur in (constraint.schur_a, constraint.schur_b):
+        k = k if schur is None else k - schur[-1]
     mass = reciprocal(k, constraint.present & (k > 0))
     bound = constraint.rolling * normal_impulse
     return jnp.clip(old - mass * relative_spin(a, b), -bound, bound)

@@ -13,59 +13,59 @@ Contacts of two bodies that the same joints hold see the matrix of each alone.
 import jax
 import jax.numpy as jnp
 
-from gen2d.physics.collision import dot, perpendicular
+from gen2d.physics.collision import perpendicular
 from gen2d.physics.constraint import ActiveContact, ContactConstraint, ContactFrame, Motion, reciprocal
 from gen2d.physics.contact_state import BodySide
-from gen2d.physics.symmetric import Direction, product
+from gen2d.physics.symmetric import Direction, inner, product
 from gen2d.records.axes import Array
 
 LEAST = 0.01  # share of a contact's compliance that joints leave at least, as the rest would be rounding
 
 
-def hold(side: BodySide, taken: Array) -> BodySide:
+def hold(side: BodySide, schur: Array) -> BodySide:
     """The side with what joints take from its inverse mass, at the start of a pass."""
     if side.motion is None:
         return side
     zero = jax.tree.map(jnp.zeros_like, side.motion)
-    return side._replace(taken=taken, change=zero, late=None if side.drift is None else zero)
+    return side._replace(schur=schur, joint_motion=zero, joint_drift=None if side.drift is None else zero)
 
 
 def release(side: BodySide) -> BodySide:
     """The side with the motion that its contacts alone gave it, at the end of a pass."""
-    if side.change is None:
+    if side.joint_motion is None:
         return side
-    drift = None if side.drift is None or side.late is None else jax.tree.map(jnp.add, side.drift, side.late)
-    motion = jax.tree.map(jnp.add, side.motion, side.change)
-    return side._replace(motion=motion, drift=drift, taken=None, change=None, late=None)
+    drift = (
+        None if side.drift is None or side.joint_drift is None else jax.tree.map(jnp.add, side.drift, side.joint_drift)
+    )
+    return side._replace(motion=free_motion(side), drift=drift, schur=None, joint_motion=None, joint_drift=None)
 
 
-def with_free_motion(side: BodySide, motion: Motion | None, free: Motion | None) -> BodySide:
-    """The side with a motion, and with that which its contacts alone gave it."""
-    if motion is None or side.change is None:
-        return side._replace(motion=motion)
-    return side._replace(motion=motion, change=jax.tree.map(jnp.subtract, free, motion))
+def with_motions(side: BodySide, motion: Motion | None, free: Motion | None) -> BodySide:
+    """The side with a motion, and, on a joint, with that which its contacts alone gave it."""
+    joint_motion = None if side.joint_motion is None else jax.tree.map(jnp.subtract, free, motion)
+    return side._replace(motion=motion, joint_motion=joint_motion)
 
 
 def free_motion(side: BodySide) -> Motion | None:
     """Motion of a side that its contacts alone gave it."""
-    return side.motion if side.change is None else jax.tree.map(jnp.add, side.motion, side.change)
+    return side.motion if side.joint_motion is None else jax.tree.map(jnp.add, side.motion, side.joint_motion)
 
 
 def with_joints(constraint: ContactConstraint, a: BodySide, b: BodySide) -> ContactConstraint:
     """Constraint of bodies with what joints take from their inverse masses."""
-    return constraint._replace(taken_a=a.taken, taken_b=b.taken)
+    return constraint._replace(schur_a=a.schur, schur_b=b.schur)
 
 
 def jointed_frame(constraint: ContactConstraint, frame: ContactFrame, normal: Array) -> ContactFrame:
     """Frame with the effective masses that the joints leave."""
-    if constraint.taken_a is None and constraint.taken_b is None:
+    if constraint.schur_a is None and constraint.schur_b is None:
         return frame
     near, unit = frame.normal_mass > 0, perpendicular(normal)
     normals = _directions(frame.normal_a, frame.normal_b, normal)
     tangents = _directions(frame.tangent_a, frame.tangent_b, unit)
 
     def left(k: Array, directions: tuple[Direction, Direction]) -> Array:
-        return jnp.maximum(k - _taken(constraint, directions, directions), LEAST * k)
+        return jnp.maximum(k - _schur_complement(constraint, directions, directions), LEAST * k)
 
     ks = left(frame.k_normal, normals), left(frame.k_tangent, tangents)
     levers = frame.normal_a, frame.normal_b, frame.tangent_a, frame.tangent_b
@@ -74,20 +74,21 @@ def jointed_frame(constraint: ContactConstraint, frame: ContactFrame, normal: Ar
 
 def joint_coupling(constraint: ContactConstraint, p: ActiveContact, q: ActiveContact) -> Array | float:
     """What joints take from the normal speed at one point that a unit impulse at another causes, 1/kg."""
-    return _taken(constraint, *(_directions(of.frame.normal_a, of.frame.normal_b, of.normal) for of in (p, q)))
+    return _schur_complement(
+        constraint, *(_directions(of.frame.normal_a, of.frame.normal_b, of.normal) for of in (p, q))
+    )
 
 
 def _directions(lever_a: Array | None, lever_b: Array | None, unit: Array) -> tuple[Direction, Direction]:
     return (unit, lever_a), (unit, lever_b)
 
 
-def _taken(
+def _schur_complement(
     constraint: ContactConstraint, p: tuple[Direction, Direction], q: tuple[Direction, Direction]
 ) -> Array | float:
     """What joints take from the speed along q that a unit impulse along p causes, 1/kg."""
     taken = 0.0
-    for matrix, one, (unit, lever) in zip((constraint.taken_a, constraint.taken_b), p, q, strict=True):
+    for matrix, one, other in zip((constraint.schur_a, constraint.schur_b), p, q, strict=True):
         if matrix is not None:
-            linear, turn = product(matrix, one)
-            taken = taken + dot(linear, unit) + (0.0 if lever is None else turn * lever)
+            taken = taken + inner(other, product(matrix, one))
     return taken

@@ -55,7 +55,7 @@ from gen2d.records.axes import Array
 from gen2d.records.trajectory import Contacts
 from gen2d.xla import materialize, max_bodies
 
-CONSTANTS = ("shape", "acceleration", "displacement", "taken")  # of a `BodySide`: a pass does not change them
+CONSTANTS = ("shape", "acceleration", "displacement", "schur")  # of a `BodySide`: a pass does not change them
 NEVER = -2  # the step of an event that has not happened
 
 

@@ -308,7 +308,7 @@ class FactoredSystem:
     def _impulses(self, speeds: Array) -> Array:
         return -materialize(solve_factored(self._factors, materialize(speeds)))
 
-    def taken(self, groups: list[Motion]) -> list[Array]:
+    def schur_complements(self, groups: list[Motion]) -> list[Array]:
         """What the joints take from the inverse mass of each body, [6, N, ...] of x, y and angle, by group.
 
         It is the Schur complement of the rows: the change of a body's motion by a unit impulse on it that the joints

@@ -102,7 +102,7 @@ class _RigidJoints:
         self._system, self._world, self._statics, self._h = system, world, statics, h
         self._fixed = [body.motion for body in statics]
         self.impulses, self.works = world.joint_system, []
-        self._taken: list[Array] = []
+        self._schur: list[Array] = []
 
     def warm_start(self, motions: list[Motion]) -> list[Motion]:
         """Motions with the impulses of the last step."""
@@ -120,7 +120,7 @@ class _RigidJoints:
         if self._system is None:
             return sides
         self._factored = rigid_joints.FactoredSystem(self._system, self._anchors)
-        self._taken = self._factored.taken(_motions(sides))
+        self._schur = self._factored.schur_complements(_motions(sides))
         return self._held(sides)
 
     def hold_again(self, sides: list[BodySide], displacements: list[Motion]) -> list[BodySide]:
@@ -137,8 +137,8 @@ class _RigidJoints:
         A contact would take a speed along a rod for an approach, and answer it with the little that the rod leaves of
         the inverse mass.
         """
-        of = zip(sides, self.stay(sides), self._taken, strict=True)
-        return [hold(side._replace(motion=motion), taken) for side, motion, taken in of]
+        of = zip(sides, self.stay(sides), self._schur, strict=True)
+        return [hold(side._replace(motion=motion), schur) for side, motion, schur in of]
 
     def meet(self, sides: list[BodySide], drifts: list[Motion]) -> tuple[list[Motion], list[Motion]]:
         """Motions with which the anchors meet at the end of the step, and the drifts: those of the sides and these."""

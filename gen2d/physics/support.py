@@ -27,7 +27,7 @@ from gen2d.physics.constraint import (
     Motion,
     reciprocal,
 )
-from gen2d.physics.symmetric import Direction, product
+from gen2d.physics.symmetric import Direction, inner, outer, product
 from gen2d.records.axes import Array
 
 Motions: TypeAlias = tuple[Motion | None, Motion]  # of both bodies of a pair
@@ -49,20 +49,14 @@ def no_support(velocity: Array) -> Support:
     return Support(jnp.zeros_like(velocity), jnp.zeros((6, *velocity.shape[1:]), velocity.dtype))
 
 
-def _dot(p: Direction, q: Direction) -> Array:
-    k = dot(p[0], q[0])
-    return k if p[1] is None or q[1] is None else k + p[1] * q[1]
-
-
 def _with_row(support: Support, inverse: Inertia, direction: Direction, k: Array, acts: Array) -> Support:
     """Support with another direction in which the body cannot move, where it `acts`; k is its compliance alone."""
     (linear, turn), (unit, lever) = product(support.matrix, direction), direction
     linear = inverse.mass * unit - linear
     turn = -turn if lever is None else inverse.moment * lever - turn
-    left = _dot(direction, (linear, turn))
-    share, (x, y) = reciprocal(left, acts & (left > REGULAR * k)), linear
-    row = jnp.stack([x * x, x * y, y * y, x * turn, y * turn, turn * turn])
-    return support._replace(matrix=support.matrix + share * row)
+    left = inner(direction, (linear, turn))
+    share, row = reciprocal(left, acts & (left > REGULAR * k)), (*linear, turn)
+    return support._replace(matrix=support.matrix + share * outer(row, row))
 
 
 def add_support(
@@ -96,12 +90,12 @@ class SupportedPair(NamedTuple):
             assert motion is not None, "both bodies move"
             mass, moment = (reciprocal(x, x > 0) for x in inertia)
             momentum = mass * motion.velocity, moment * motion.spin
-            taken.append(jnp.where(pressed, _dot(direction, product(support.matrix, momentum)), 0.0))
+            taken.append(jnp.where(pressed, inner(direction, product(support.matrix, momentum)), 0.0))
         return speed - (taken[1] - taken[0])
 
     def _compliance(self, p: tuple[Direction, Direction], q: tuple[Direction, Direction]) -> Array:
         """What the support takes from the speed along q that a unit impulse along p causes, 1/kg."""
-        of_a, of_b = (_dot(y, product(support.matrix, x)) for support, x, y in zip(self.supports, p, q, strict=True))
+        of_a, of_b = (inner(y, product(support.matrix, x)) for support, x, y in zip(self.supports, p, q, strict=True))
         return jnp.where(self.pressed[0], of_a, 0.0) + jnp.where(self.pressed[1], of_b, 0.0)
 
     def frame(self, contact: ActiveContact, rests: Array) -> ContactFrame:

@@ -4,6 +4,7 @@ from typing import TypeAlias
 
 import jax.numpy as jnp
 
+from gen2d.physics.collision import dot
 from gen2d.records.axes import Array
 
 Direction: TypeAlias = tuple[Array, Array | None]  # of an impulse: a vector [2, ...], and its lever in m (None: 0)
@@ -14,6 +15,12 @@ def product(matrix: Array, direction: Direction) -> tuple[Array, Array]:
     (xx, xy, yy, xt, yt, tt), ((x, y), lever) = matrix, direction
     turn = jnp.zeros_like(x) if lever is None else lever
     return jnp.stack([xx * x + xy * y + xt * turn, xy * x + yy * y + yt * turn]), xt * x + yt * y + tt * turn
+
+
+def inner(p: Direction, q: Direction) -> Array:
+    """Inner product of two directions."""
+    k = dot(p[0], q[0])
+    return k if p[1] is None or q[1] is None else k + p[1] * q[1]
 
 
 def outer(p: tuple[Array, ...], q: tuple[Array, ...]) -> Array:
