@@ -51,7 +51,7 @@ from gen2d.space.checks import checked_color, checked_corners, checked_number, c
 from gen2d.space.video import Video
 
 _log = logging.getLogger(__name__)
-TORN = 0.1  # of the longest arm: larger gaps of hinges are warned of; they are 1e-3 at most where the solver holds
+TORN = 0.1  # of the longest arm or radius of gyration: larger gaps of hinges are warned of; usual ones are under 1e-3
 SAFE_RATIO = 10  # of two masses, without shock propagation: the heavier one sinks in by 2 mm
 
 
@@ -608,7 +608,9 @@ class Space:
         gap = hinge_gap(self.joints, position[later], angle[later])
         ends = [end for joint in self.joints for end in ((joint.a, joint.anchor_a), (joint.b, joint.anchor_b))]
         arms = [math.hypot(*anchor) for body, anchor in ends if body >= 0]
-        if not gap <= TORN * max(arms, default=0.0):
+        held = [self.bodies[body] for body, _ in ends if body >= 0 and self.bodies[body].kind == DYNAMIC]
+        radii = [math.sqrt(body.moment / body.mass) for body in held]  # of gyration: a wheel's hinge has no arm
+        if not gap <= TORN * max([*arms, *radii], default=0.0):
             _log.warning(
                 "Space: hinges come apart by %.3g m: a link of mass m and length l under a tension T needs steps below "
                 "sqrt(m l / 3 T), and max_step is %.3g s: ask for a fraction of it, or give a taut chain some slack",

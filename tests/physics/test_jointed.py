@@ -55,6 +55,33 @@ def test_disc_that_strikes_a_hinged_plank_bounces_as_the_closed_form_says(elasti
     holds("hinged plank: spin", video.angular_velocity[last, plank] + arm * impulse / moment, 2e-4)
 
 
+def test_disc_that_strikes_one_end_of_a_rod_moves_both_as_the_closed_form_says():
+    """The rod leaves 3/4 of the inverse mass of the struck disc at 45 degrees, and passes momentum on to the other."""
+    space, speed = Space(gravity=(0, 0)), 2.0
+    one = space.add_circle((0, 0), 0.3, mass=1.5, elasticity=1.0, friction=0.0)
+    other = space.add_circle((1, 1), 0.3, mass=1.5, elasticity=1.0, friction=0.0)
+    space.add_joint("distance", one, other)
+    disc = space.add_circle((0, -0.7), 0.3, mass=0.7, velocity=(0, speed), elasticity=1.0, friction=0.0)
+    video = space.simulate(15 / 240, fps=240, contacts=0)  # the disc strikes after .05 s
+    impulse = 2 * speed / (1 / 0.7 + 0.75 / 1.5)
+    holds("rod of two discs: speed of the striking one", video.velocity[-1, disc, 1] - (speed - impulse / 0.7), 2e-4)
+    momentum = 1.5 * (video.velocity[-1, one] + video.velocity[-1, other]) - (0, impulse)
+    holds("rod of two discs: momentum of both, kg m/s", momentum, 2e-4)
+
+
+def test_box_that_lands_flat_above_a_hinge_bounces_as_on_a_fixed_plank(caplog):
+    """Both of its points press at once, on a plank that can only turn about its middle, and does not."""
+    space, speed = Space(gravity=(0, 0)), 2.0
+    own = 0.5**0.5  # of a pair: the product
+    plank = space.add_box((0, 0), 4.0, 0.2, mass=0.5, elasticity=own, friction=0.0)
+    space.add_joint("revolute", plank, anchor_a=(0, 0))
+    box = space.add_box((0, 0.7), 1.0, 1.0, mass=2.0, velocity=(0, -speed), elasticity=own, friction=0.0)
+    video = space.simulate(16 / 240, fps=240, contacts=0)  # the box lands after .05 s
+    holds("box above a hinge: speed after the bounce", video.velocity[-1, box, 1] - 0.5 * speed, 5e-4)
+    holds("box above a hinge: spins", video.angular_velocity[-1], 2e-4)
+    assert "come apart" not in caplog.text, "the hinge has no arm, and holds"
+
+
 @pytest.mark.parametrize("angle", [0.3, 0.8, 1.3])
 def test_bob_on_a_rod_that_strikes_a_wall_at_an_angle_keeps_its_speed(angle):
     """The wall can only turn the bob back on its circle: an elastic one with its whole speed."""
