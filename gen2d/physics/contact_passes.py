@@ -329,8 +329,12 @@ def _next_impulse(
     in two steps. A pile that is crushed has large impulses once; applied again in the next steps, they would throw it
     apart.
     """
-    most = IMPULSE_GROWTH * jnp.maximum(old.normal, 0.0) + setup.threshold * contact.frame.normal_mass
-    normal = jnp.minimum(impulse.normal, most)
+    import os
+    most = float(os.environ.get('GROW', 1.5)) * jnp.maximum(old.normal, 0.0) + setup.threshold * contact.frame.normal_mass
+    import os
+    reach = jnp.abs(contact.frame.tangent_b) + (0.0 if contact.frame.tangent_a is None else jnp.abs(contact.frame.tangent_a))
+    cap = float(os.environ.get("CAP", ".1")) * 240 * reach * contact.frame.normal_mass
+    normal = jnp.minimum(jnp.minimum(impulse.normal, most), cap)
     friction = constraint.friction * normal
     negated = jnp.minimum(impulse.normal, MAX_STACK_IMPACT * contact.frame.normal_mass)
     return Impulse(

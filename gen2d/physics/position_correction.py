@@ -77,13 +77,6 @@ def _pushed(
         drifts = apply_impulse(constraint, contact, (push, None), *drifts)
     new_a, new_b = a._replace(drift=drifts[0]), b._replace(drift=drifts[1])
     if b.joint_drift is not None:
-        frees = tuple(None if s.drift is None else jax.tree.map(jnp.add, s.drift, s.joint_drift) for s in (a, b))
-        without = constraint._replace(schur_a=None, schur_b=None)
-        for contact, push in zip(contacts, pushes, strict=True):
-            frees = apply_impulse(without, contact, (push, None), *frees)
-        new_b = new_b._replace(joint_drift=jax.tree.map(jnp.subtract, frees[1], drifts[1]))
-        if frees[0] is not None:
-            new_a = new_a._replace(joint_drift=jax.tree.map(jnp.subtract, frees[0], drifts[0]))
         return new_a, new_b
     if constraint.a is None or a.motion is None or constraint.static:
         return new_a, new_b
