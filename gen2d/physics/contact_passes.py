@@ -1,4 +1,4 @@
-"""The three passes over a batch of contacts: warm start, biased solve, relaxing solve.
+"""The three passes over a batch of contacts: warm start, first pass, relaxing pass.
 
 A batch holds any number of pairs: all pairs of a round (all_pairs.py) or a chunk of near ones (nearby_pairs.py).
 """
@@ -262,7 +262,7 @@ def solve(
     setup: PassSetup,
     params: SolverParams,
 ) -> tuple[BodySide, BodySide, SolvedPair]:
-    """Both sides and the pair after the biased solve, bounces included."""
+    """Both sides and the pair after the first pass: impulses, bounces and the correction of overlaps."""
     constraint = with_joints(constraint, a, b)
     taus = impact_times(points, a, b, setup, params.step)
     if takes_part(points, b):
@@ -270,13 +270,13 @@ def solve(
     contacts, time = active_contacts(constraint, points, taus, a, b, params.step)
 
     def target_of(contact: ActiveContact, speed: Array, old: Impulse) -> NormalTarget:
-        return step_target(constraint, contact, speed, old, params)
+        return step_target(constraint, contact, speed, old, params.step)
 
     pair = SolvedPair(contacts, warm_start_impulses(constraint, points, memory.impulses), memory.roll)
     new_a, new_b, solved = _apply_pass(constraint, pair, target_of, a, b)
     bounces = functools.reduce(jnp.logical_or, [tau >= 0 for tau in taus])
     new_a, new_b = _after_impulses(constraint, (a, b), (new_a, new_b), bounces, time)
-    new_a, new_b = correct_positions(constraint, contacts, points[0].acceleration, new_a, new_b, params, setup.threshold)
+    new_a, new_b = correct_positions(constraint, contacts, points[0].acceleration, new_a, new_b, setup, params)
     if constraint.static:
         new_b = materialize(new_b._replace(work=None))._replace(work=new_b.work)
     return new_a, new_b, solved
@@ -308,7 +308,7 @@ def solve_impact(
 MAX_STACK_IMPACT = 1.0  # m/s: faster contacts count as impacts even inside a stack
 
 
-IMPULSE_GROWTH = 1.5  # from step to step, of the impulse that a resting contact starts with
+LARGEST_SHIFT = 0.5  # of the distance of a contact from the centres of its bodies, by a resting impulse in a step
 
 
 def _next_impulse(
@@ -316,8 +316,7 @@ def _next_impulse(
     contact: ActiveContact,
     bounced: Array,
     impulse: Impulse,
-    old: Impulse,
-    setup: PassSetup,
+    h: float,
 ) -> Impulse:
     """Impulse that the next step starts with.
 
@@ -325,18 +324,14 @@ def _next_impulse(
     negated when the bodies were already touching, so that a resting pile mistaken for an impact recovers in the next
     step.
 
-    The impulse of a contact that rests is at most that of the last step times `IMPULSE_GROWTH`, and what gravity adds
-    in two steps. A pile that is crushed has large impulses once; applied again in the next steps, they would throw it
-    apart.
+    The impulse of a contact that rests would alone shift its bodies by no more than `LARGEST_SHIFT` in the next step. A
+    light body that a heavy one crushes has a larger one; applied again where the body has turned, it would throw both.
     """
-    import os
-    most = float(os.environ.get('GROW', 1.5)) * jnp.maximum(old.normal, 0.0) + setup.threshold * contact.frame.normal_mass
-    import os
-    reach = jnp.abs(contact.frame.tangent_b) + (0.0 if contact.frame.tangent_a is None else jnp.abs(contact.frame.tangent_a))
-    cap = float(os.environ.get("CAP", ".1")) * 240 * reach * contact.frame.normal_mass
-    normal = jnp.minimum(jnp.minimum(impulse.normal, most), cap)
+    frame = contact.frame
+    reach = jnp.abs(frame.tangent_b) + (0.0 if frame.tangent_a is None else jnp.abs(frame.tangent_a))
+    normal = jnp.minimum(impulse.normal, LARGEST_SHIFT / h * reach * frame.normal_mass)
     friction = constraint.friction * normal
-    negated = jnp.minimum(impulse.normal, MAX_STACK_IMPACT * contact.frame.normal_mass)
+    negated = jnp.minimum(impulse.normal, MAX_STACK_IMPACT * frame.normal_mass)
     return Impulse(
         jnp.where(bounced, jnp.where(contact.gap <= 0, -negated, 0.0), normal),
         jnp.where(bounced, 0.0, jnp.clip(impulse.tangent, -friction, friction)),
@@ -359,12 +354,12 @@ def warm_start_impulses(
 
 def relax(
     constraint: ContactConstraint,
-    memory: WarmStart,
     points: list[ContactPoint],
     solved: SolvedPair,
     a: BodySide,
     b: BodySide,
     setup: PassSetup,
+    params: SolverParams,
 ) -> tuple[BodySide, BodySide, tuple[SolvedPair, WarmStart]]:
     """Both sides and the pair after the relaxing solve at the end of the step, and the impulses for the next step."""
     assert b.displacement is not None, "only static bodies lack a displacement"
@@ -383,9 +378,9 @@ def relax(
         return relaxed_target(constraint, contact, speed, old, threshold)
 
     new_a, new_b, last = _apply_pass(constraint, solved._replace(contacts=contacts), target_of, a, b)
-    of = zip(last.contacts, bounced, last.impulses, memory.impulses, strict=True)
+    of = zip(last.contacts, bounced, last.impulses, strict=True)
     impulses = materialize(
-        [_next_impulse(constraint, c, (c.tau >= 0) | bounce, new, old, setup) for c, bounce, new, old in of]
+        [_next_impulse(constraint, c, (c.tau >= 0) | bounce, new, params.step) for c, bounce, new in of]
     )
     if constraint.static:
         new_b = new_b._replace(motion=materialize(new_b.motion))
@@ -393,7 +388,7 @@ def relax(
 
 
 def touching(solved: SolvedPair, last: SolvedPair) -> Array:
-    """Whether a normal impulse acted in the biased or in the relaxing pass."""
+    """Whether a normal impulse acted in the first or in the relaxing pass."""
     pressed = [i.normal > 0 for pair in (solved, last) for i in pair.impulses]
     return functools.reduce(jnp.logical_or, pressed)
 

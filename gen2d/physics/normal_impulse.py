@@ -13,7 +13,6 @@ import jax.numpy as jnp
 
 from gen2d.physics.constraint import ActiveContact, ContactConstraint, Impulse, Inertia
 from gen2d.physics.jointed import joint_coupling
-from gen2d.physics.params import SolverParams
 from gen2d.physics.time_of_impact import MISSES
 from gen2d.records.axes import Array
 
@@ -43,23 +42,21 @@ def bounce_speed(constraint: ContactConstraint, contact: ActiveContact, speed: A
 
 
 def step_target(
-    constraint: ContactConstraint, contact: ActiveContact, speed: Array, old: Impulse, params: SolverParams
+    constraint: ContactConstraint, contact: ActiveContact, speed: Array, old: Impulse, h: float
 ) -> NormalTarget:
-    """Target of the first solve of a step.
+    """Target of the first pass.
 
     A separated contact may close its gap, a touching one does not approach, and a bounce reaches its target speed. A
     fast approach that misses in this step gets no impulse, as the straight line of a contact at rest would stop a body
     that only grazes the other or arrives a step later.
     """
-    import os
-    leak = float(os.environ.get("LEAK", "0"))
     bounces = contact.tau >= 0
     bounce = bounce_speed(constraint, contact, speed)
     touches = contact.frame.normal_mass > 0
     active = touches & jnp.where(bounces, bounce > speed, contact.tau > MISSES)
     return NormalTarget(
         active=active,
-        speed=jnp.where(bounces, bounce, -jnp.maximum(contact.gap, 0.0) / params.step - leak * contact.frame.k_normal * old.normal),
+        speed=jnp.where(bounces, bounce, -jnp.maximum(contact.gap, 0.0) / h),
         idle=jnp.where(touches & bounces, old.normal, 0.0),
         bounces=bounces,
     )
@@ -82,7 +79,7 @@ def bounces_again(contact: ActiveContact, speed: Array, threshold: Array) -> Arr
 def relaxed_target(
     constraint: ContactConstraint, contact: ActiveContact, speed: Array, old: Impulse, threshold: Array
 ) -> NormalTarget:
-    """Target of the relaxing solve, without bias.
+    """Target of the relaxing pass.
 
     Leave unchanged: contacts that bounced and are separating; separated contacts that carried no impulse, which would
     brake a body one step before its impact; and gaps that a neighbour is closing, which bounce in a later step.

@@ -1,13 +1,17 @@
-"""Overlaps pushed apart by displacements of their own, which leave no velocity behind.
+"""Overlaps corrected by displacements of their own (split impulses), which leave no velocity.
 
-A pair that overlaps at the start of a step is moved apart within it: by a share of the overlap that a damped spring of
-the frequency and damping ratio of contacts would take, and at most at `push_speed`. The displacements are those of an
-impulse at the contact, without its velocity. So a body that is pushed out of another one does not strike a third, and
-the impulse of a contact is its load alone.
+A pair that overlaps at the start of a step is pushed apart in it by the share of the overlap that a damped spring would
+correct, at most at `push_speed`. A push is the displacement of an impulse at the contact, without its velocity. So a
+body that is pushed out of another one does not strike a third, and the impulse of a contact at rest is its load alone,
+which neither leaks nor grows.
 
-A displacement P / m across a velocity would change the angular momentum of two moving bodies. As a central force would,
-a pair of impulses at both centres of mass makes up for it.
+Two bodies that are pushed apart while they slide past each other would gain angular momentum. As under a central force,
+their relative velocity across the contact falls as their distance grows.
+
+Source: E. Guendelman, R. Bridson and R. Fedkiw (2003) and E. Catto (2006) for corrections without velocities.
 """
+
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -17,25 +21,20 @@ from gen2d.physics.constraint import (
     ActiveContact,
     ContactConstraint,
     Impulse,
+    Inertia,
     Motion,
     apply_impulse,
     relative_speed,
     relative_velocity,
     softness,
 )
-from gen2d.physics.contact_state import BodySide
+from gen2d.physics.contact_state import BodySide, PassSetup
+from gen2d.physics.energy import Work
 from gen2d.physics.normal_impulse import NormalTarget, solve_normals
 from gen2d.physics.params import SolverParams
+from gen2d.physics.time_of_impact import SLOWEST
 from gen2d.records.axes import Array
 from gen2d.xla import materialize
-
-
-def _displacement(side: BodySide, h: float) -> Motion | None:
-    """Displacement of bodies in the step, m and rad; None: static bodies at rest."""
-    if side.motion is None:
-        return None
-    moved = jax.tree.map(lambda x: h * x, side.motion)
-    return moved if side.drift is None else jax.tree.map(jnp.add, moved, side.drift)
 
 
 def correct_positions(
@@ -44,57 +43,57 @@ def correct_positions(
     acceleration: Array | None,
     a: BodySide,
     b: BodySide,
+    setup: PassSetup,
     params: SolverParams,
-    threshold: Array,
 ) -> tuple[BodySide, BodySide]:
-    """Both sides with drifts that push the pair apart where it overlaps."""
-    h, (rate, *_) = params.step, softness(constraint, params)
-    import os
-    slop, rate = float(os.environ.get("SLOP","1"))*h*threshold, float(os.environ.get("RATE", rate))
-    moved_a, moved_b = _displacement(a, h), _displacement(b, h)
-    assert moved_b is not None, "only static bodies lack a motion"
-    zero = jnp.zeros_like(contacts[0].gap)
-    none, gaps, targets = Impulse(zero, zero), [], []
-    fall = 0.0 if acceleration is None else 0.5 * h**2 * acceleration
-    for contact in contacts:
-        gap = contact.gap - (0.0 if acceleration is None else dot(contact.normal, fall))
-        gap = gap + relative_speed(contact.frame, contact.normal, moved_a, moved_b)[0]
-        wanted = contact.gap + jnp.minimum(-h * rate * (contact.gap + slop), h * params.push_speed)
-        overlaps = (contact.gap < -slop) & (contact.frame.normal_mass > 0)
-        gaps.append(gap)
-        targets.append(NormalTarget(overlaps, wanted, zero, jnp.zeros_like(overlaps)))
-    pushes = materialize(solve_normals(constraint, contacts, gaps, [none] * len(contacts), targets))
-    return _pushed(constraint, contacts, pushes, a, b)
+    """Both sides with drifts that push the pair apart where it overlaps.
 
-
-def _pushed(
-    constraint: ContactConstraint, contacts: list[ActiveContact], pushes: list[Array], a: BodySide, b: BodySide
-) -> tuple[BodySide, BodySide]:
-    """Both sides after pushes, kg m."""
+    `acceleration` is that of b relative to a. An overlap that speeds below the bounce threshold cause in one step
+    stays, so that contacts at rest do not part.
+    """
     assert b.drift is not None, "only static bodies lack a drift"
+    h, (rate, *_), allowed = params.step, softness(constraint, params), 0.5 * params.step * setup.threshold
+    zero, gaps, targets = jnp.zeros_like(contacts[0].gap), [], []
+    for contact in contacts:
+        moved, _ = relative_speed(contact.frame, contact.normal, None if a.motion is None else _end(a, h), _end(b, h))
+        fall = 0.0 if acceleration is None else -0.5 * h**2 * dot(contact.normal, acceleration)
+        gaps.append(contact.gap + moved + fall)
+        deep = jnp.maximum(-contact.gap - allowed, 0.0)
+        wanted = contact.gap + jnp.minimum(h * rate * deep, h * params.push_speed)
+        overlaps = (deep > 0) & (contact.frame.normal_mass > 0)
+        targets.append(NormalTarget(overlaps, wanted, zero, jnp.zeros_like(overlaps)))
+    nothing = [Impulse(zero, zero)] * len(contacts)
+    pushes = materialize(solve_normals(constraint, contacts, gaps, nothing, targets))  # kg m
     drifts = a.drift, b.drift
     for contact, push in zip(contacts, pushes, strict=True):
         drifts = apply_impulse(constraint, contact, (push, None), *drifts)
     new_a, new_b = a._replace(drift=drifts[0]), b._replace(drift=drifts[1])
-    if b.joint_drift is not None:
+    if constraint.a is None or a.motion is None or constraint.static or b.joint_motion is not None:
         return new_a, new_b
-    if constraint.a is None or a.motion is None or constraint.static:
-        return new_a, new_b
-    return _central(constraint, contacts[0], sum(pushes[1:], pushes[0]), new_a, new_b)
+    assert b.motion is not None, "only static bodies lack a motion"
+    push = functools.reduce(jnp.add, pushes)
+    work, of_a, of_b = _slowed((constraint.a, constraint.b), contacts[0], push, a.motion, b.motion, b.work)
+    return new_a._replace(motion=of_a), new_b._replace(motion=of_b, work=work)
 
 
-def _central(
-    constraint: ContactConstraint, contact: ActiveContact, push: Array, a: BodySide, b: BodySide
-) -> tuple[BodySide, BodySide]:
-    """Both sides with the angular momentum before the push."""
-    assert a.motion is not None and b.motion is not None and constraint.a is not None
-    frame, unit = contact.frame, perpendicular(contact.normal)
-    distance = frame.tangent_a - frame.tangent_b
-    slip = dot(unit, relative_velocity(a.motion, b.motion))
-    impulse = jnp.where(distance > 1e-6, -push * slip / jnp.maximum(distance, 1e-6), 0.0)
-    of_a = a.motion._replace(velocity=a.motion.velocity - constraint.a.mass * impulse * unit)
-    of_b = b.motion._replace(velocity=b.motion.velocity + constraint.b.mass * impulse * unit)
-    work = b.work
+def _end(side: BodySide, h: float) -> Motion:
+    """Displacement of bodies in the step, m and rad."""
+    assert side.motion is not None, "only static bodies lack a motion"
+    moved = jax.tree.map(lambda x: h * x, side.motion)
+    return moved if side.drift is None else jax.tree.map(jnp.add, moved, side.drift)
+
+
+def _slowed(
+    inertia: tuple[Inertia, Inertia], contact: ActiveContact, push: Array, a: Motion, b: Motion, work: Work | None
+) -> tuple[Work | None, Motion, Motion]:
+    """Work and motions of two bodies after impulses at their centres that keep the angular momentum before a push."""
+    unit = perpendicular(contact.normal)
+    assert contact.frame.tangent_a is not None, "both bodies move"
+    distance = contact.frame.tangent_a - contact.frame.tangent_b  # of the centres, along the normal
+    speed = dot(unit, relative_velocity(a, b))
+    impulse = jnp.where(distance > SLOWEST, -push * speed / jnp.maximum(distance, SLOWEST), 0.0)
+    (mass_a, _), (mass_b, _) = inertia
     if work is not None:
-        work = work._replace(lost=work.lost - impulse * (slip + 0.5 * (constraint.a.mass + constraint.b.mass) * impulse))
-    return a._replace(motion=of_a), b._replace(motion=of_b, work=work)
+        work = work._replace(lost=work.lost - impulse * (speed + 0.5 * (mass_a + mass_b) * impulse))
+    new_a, new_b = a.velocity - mass_a * impulse * unit, b.velocity + mass_b * impulse * unit
+    return work, a._replace(velocity=new_a), b._replace(velocity=new_b)
