@@ -120,19 +120,8 @@ def displaced_points(
     return [_displaced_point(constraint, point, shift) for point in points]
 
 
-def _limited(shift: Array, most: Array) -> Array:
-    """A displacement [2, ...] of at most so many metres."""
-    squared = dot(shift, shift)
-    return jnp.where(squared > most**2, most / _root_of(squared) * shift, shift)
-
-
-def _root_of(x):
-    return jnp.sqrt(jnp.where(x > 0, x, 1.0))
-
-
 def _displaced_point(constraint: ContactConstraint, point: ContactPoint, shift: Array) -> ContactPoint:
     if point.core is not None:
-        shift = _limited(shift, 0.5 * point.core.reach)
         offset = point.core.offset + shift
         inverse = inverse_length(offset)
         normal = offset * inverse
@@ -142,11 +131,10 @@ def _displaced_point(constraint: ContactConstraint, point: ContactPoint, shift: 
         return point._replace(frame=frame, normal=normal)
     if constraint.static or constraint.a is None:
         return point
-    frame, (nx, ny) = point.frame, point.normal
+    frame, (nx, ny), (x, y) = point.frame, point.normal, shift
     assert frame.normal_a is not None, "a body with corners has levers"
     assert frame.tangent_a is not None, "a body with corners has levers"
     assert frame.normal_b is not None, "a body with corners has levers"
-    x, y = _limited(shift, 0.5 * jnp.abs(frame.tangent_a - frame.tangent_b))
     across, along = x * ny - y * nx, x * nx + y * ny
     if point.moves_with_a:
         levers = frame.normal_a, frame.normal_b - across, frame.tangent_a, frame.tangent_b - along
