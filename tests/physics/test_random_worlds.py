@@ -170,6 +170,13 @@ def test_many_worlds_keep_the_laws(name):
 
 
 @pytest.mark.slow
+def test_a_light_body_in_a_corner_does_not_throw_the_heavy_one_that_crushes_it():
+    """A capsule of a thousandth of the mass: the impulses that it carries grew by half in each step."""
+    (of,) = measure(LARGE, [RECIPES["fast, mass ratios up to 1e6, e = 0.5"]], 1, first=75)
+    holds("heavy polygon on a light capsule in a corner: energy gained in a step, relative", of.gain_in_step, 1e-3)
+
+
+@pytest.mark.slow
 def test_discs_that_move_by_half_a_radius_in_a_step_do_not_overlap():
     parts = [measure(LARGE, [HALF_A_RADIUS], MANY, first=k * MANY)[0].overlap for k in range(BATCHES)]
     holds("overlap of discs that move by half a radius in a step, over the radius", np.maximum(parts, 0) / 0.45, 0.1)
