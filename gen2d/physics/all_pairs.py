@@ -155,7 +155,7 @@ class AllPairs(ContactSolver):
         time: Array,
     ) -> tuple[list[BodySide], AllPairsCarry]:
         def play(k: int, a: BodySide, b: BodySide) -> tuple[BodySide, BodySide, tuple[SolvedPair, WarmStart]]:
-            of = self.constraints[k], solved.points[k], solved.pairs[k]
+            of = self.constraints[k], carry.warm[k], solved.points[k], solved.pairs[k]
             return contact_passes.relax(*of, a, b, self.setup, self.params)
 
         sides, relaxed = run_schedule(sides, statics, self.order, play)

@@ -308,7 +308,8 @@ def solve_impact(
 MAX_STACK_IMPACT = 1.0  # m/s: faster contacts count as impacts even inside a stack
 
 
-LARGEST_SHIFT = 0.5  # of the distance of a contact from the centres of its bodies, by a resting impulse in a step
+IMPULSE_GROWTH = 1.5  # from step to step, of the impulse that a resting contact starts with
+LARGEST_SHIFT = 5.0  # in a step by that impulse alone, over the distance of the contact from the centres of its bodies
 
 
 def _next_impulse(
@@ -316,6 +317,8 @@ def _next_impulse(
     contact: ActiveContact,
     bounced: Array,
     impulse: Impulse,
+    old: Impulse,
+    setup: PassSetup,
     h: float,
 ) -> Impulse:
     """Impulse that the next step starts with.
@@ -324,12 +327,15 @@ def _next_impulse(
     negated when the bodies were already touching, so that a resting pile mistaken for an impact recovers in the next
     step.
 
-    The impulse of a contact that rests would alone shift its bodies by no more than `LARGEST_SHIFT` in the next step. A
-    light body that a heavy one crushes has a larger one; applied again where the body has turned, it would throw both.
+    The impulse of a contact that rests is at most that of the last step times `IMPULSE_GROWTH`, and what gravity adds
+    in two steps. A pile that is crushed has large impulses once; applied again in the next steps, they would throw it
+    apart. Nor would the impulse alone shift its bodies by more than `LARGEST_SHIFT` in a step. It could where a heavy
+    body crushes a light one, and would throw both if it were applied again where the light one has turned.
     """
     frame = contact.frame
+    most = IMPULSE_GROWTH * jnp.maximum(old.normal, 0.0) + setup.threshold * frame.normal_mass
     reach = jnp.abs(frame.tangent_b) + (0.0 if frame.tangent_a is None else jnp.abs(frame.tangent_a))
-    normal = jnp.minimum(impulse.normal, LARGEST_SHIFT / h * reach * frame.normal_mass)
+    normal = jnp.minimum(jnp.minimum(impulse.normal, most), LARGEST_SHIFT / h * reach * frame.normal_mass)
     friction = constraint.friction * normal
     negated = jnp.minimum(impulse.normal, MAX_STACK_IMPACT * frame.normal_mass)
     return Impulse(
@@ -354,6 +360,7 @@ def warm_start_impulses(
 
 def relax(
     constraint: ContactConstraint,
+    memory: WarmStart,
     points: list[ContactPoint],
     solved: SolvedPair,
     a: BodySide,
@@ -378,9 +385,9 @@ def relax(
         return relaxed_target(constraint, contact, speed, old, threshold)
 
     new_a, new_b, last = _apply_pass(constraint, solved._replace(contacts=contacts), target_of, a, b)
-    of = zip(last.contacts, bounced, last.impulses, strict=True)
+    of = zip(last.contacts, bounced, last.impulses, memory.impulses, strict=True)
     impulses = materialize(
-        [_next_impulse(constraint, c, (c.tau >= 0) | bounce, new, params.step) for c, bounce, new in of]
+        [_next_impulse(constraint, c, (c.tau >= 0) | b, new, old, setup, params.step) for c, b, new, old in of]
     )
     if constraint.static:
         new_b = new_b._replace(motion=materialize(new_b.motion))

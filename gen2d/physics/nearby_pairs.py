@@ -550,9 +550,9 @@ class NearbyPairs(ContactSolver):
 
         def play(i: int, k: Array, indices: GatherIndices, a: BodySide, b: BodySide, carried: tuple) -> tuple:
             cache, touch = caches[i]._replace(rows=carried[0]), carried[1]
-            constraint, _, points, setup = self._unpack_contacts(listed, i, k)
+            constraint, memory, points, setup = self._unpack_contacts(listed, i, k)
             pair = unpack(list(solved.packed[i][k]), solved.specs[i])
-            a, b, (last, warm) = contact_passes.relax(constraint, points, pair, a, b, setup, self.params)
+            a, b, (last, warm) = contact_passes.relax(constraint, memory, points, pair, a, b, setup, self.params)
             new = CachedConstraint(warm, jnp.full(self.chunk, carry.step, self._dtype), None, None)
             if self.setup.log:
                 event = record_event(self._event_so_far(carry, cache.at(indices.pair)), pair, last, time)
