@@ -36,7 +36,7 @@ class PhysicsOptions:
     contact_hertz: float = option(
         30.0, float, "Hz", "natural frequency of a contact, at most 1/8 of the step rate", above=0
     )
-    contact_damping_ratio: float = option(10.0, float, "1", "damping ratio of a contact", above=0)
+    contact_damping_ratio: float = option(2.0, float, "1", "damping ratio of a contact", above=0)
     push_speed: float = option(3.0, float, "m/s", "largest speed at which an overlap is resolved", above=0)
     precision: str = option(
         "float32",

@@ -48,7 +48,7 @@ class AllPairsCarry(NamedTuple):
 
 
 class SolvedRounds(NamedTuple):
-    """Pairs of each round after the biased pass, and their contact points at the start of the step."""
+    """Pairs of each round after the first pass, and their contact points at the start of the step."""
 
     points: list[list[ContactPoint]]
     pairs: list[SolvedPair]
@@ -156,7 +156,7 @@ class AllPairs(ContactSolver):
     ) -> tuple[list[BodySide], AllPairsCarry]:
         def play(k: int, a: BodySide, b: BodySide) -> tuple[BodySide, BodySide, tuple[SolvedPair, WarmStart]]:
             of = self.constraints[k], carry.warm[k], solved.points[k], solved.pairs[k]
-            return contact_passes.relax(*of, a, b, self.setup)
+            return contact_passes.relax(*of, a, b, self.setup, self.params)
 
         sides, relaxed = run_schedule(sides, statics, self.order, play)
         events, observed = carry.events, dict(carry.observed)

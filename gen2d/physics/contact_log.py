@@ -59,9 +59,9 @@ def _impulse_of_step(solved: SolvedPair, relaxed: SolvedPair) -> tuple[Array, Ar
 
 
 def record_event(event: ContactEvent, solved: SolvedPair, relaxed: SolvedPair, start: Array) -> ContactEvent:
-    """Event after one more step, which began at `start`, from the pair after the biased and the relaxing solve."""
+    """Event after one more step, which began at `start`, from the pair after the first and the relaxing pass."""
     points = list(zip(solved.contacts, solved.impulses, relaxed.impulses, strict=True))
-    touching = [(biased.normal > 0) | (last.normal > 0) for _, biased, last in points]
+    touching = [(first.normal > 0) | (last.normal > 0) for _, first, last in points]
     contact, on = points[0][0]._replace(frame=None), touching[0]
     bounced = on & (contact.tau >= 0)
     if len(points) == 2:  # the second counts where the first does not touch

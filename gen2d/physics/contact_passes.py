@@ -1,4 +1,4 @@
-"""The three passes over a batch of contacts: warm start, biased solve, relaxing solve.
+"""The three passes over a batch of contacts: warm start, first pass, relaxing pass.
 
 A batch holds any number of pairs: all pairs of a round (all_pairs.py) or a chunk of near ones (nearby_pairs.py).
 """
@@ -19,7 +19,6 @@ from gen2d.physics.constraint import (
     apply_impulse,
     impulse_change,
     relative_speed,
-    softness,
 )
 from gen2d.physics.contact_points import (
     active_contacts,
@@ -36,13 +35,14 @@ from gen2d.physics.jointed import free_motion, jointed_frame, with_joints, with_
 from gen2d.physics.normal_impulse import (
     NormalTarget,
     TargetOf,
-    biased_target,
     bounces_again,
     impact_target,
     relaxed_target,
     solve_normals,
+    step_target,
 )
 from gen2d.physics.params import SolverParams
+from gen2d.physics.position_correction import correct_positions
 from gen2d.physics.support import SupportedPair, add_support, supported_pair
 from gen2d.records.axes import Array
 from gen2d.xla import materialize
@@ -222,24 +222,7 @@ def warm_start(
     return a, b, points
 
 
-MIN_PUSH = 1e-9  # m/s: marks a contact that holds its bodies without pushing them apart
-
-
-def _push_bound(
-    constraint: ContactConstraint, solved: SolvedPair, a: BodySide, b: BodySide, params: SolverParams
-) -> Array:
-    """Bound on the speed, m/s, that the contact adds to its bodies or passes on between them; 0 without a resting
-    contact."""
-    rate, *_ = softness(constraint, params)
-    largest = b.push if a.push is None else jnp.maximum(a.push, b.push)
-    push = jnp.zeros_like(largest)
-    for contact, impulse in zip(solved.contacts, solved.impulses, strict=True):
-        own = jnp.maximum(largest, jnp.clip(-rate * contact.gap, MIN_PUSH, params.push_speed))
-        push = jnp.maximum(push, jnp.where((contact.tau < 0) & (impulse.normal > 0), own, 0.0))
-    return push
-
-
-def _update_drift(old: BodySide, new: BodySide, time: Array, push: Array | None) -> BodySide:
+def _update_drift(old: BodySide, new: BodySide, time: Array) -> BodySide:
     """The side with its drift reduced by the time of the impulses times the change of velocity."""
     assert old.motion, "only moving bodies drift"
     assert new.motion, "only moving bodies drift"
@@ -247,7 +230,7 @@ def _update_drift(old: BodySide, new: BodySide, time: Array, push: Array | None)
     new = new._replace(drift=_reduced_drift(old.drift, time, new.motion, old.motion))
     if old.joint_drift is not None and new.joint_motion is not None and old.joint_motion is not None:
         new = new._replace(joint_drift=_reduced_drift(old.joint_drift, time, new.joint_motion, old.joint_motion))
-    return new._replace(push=new.push if push is None else jnp.maximum(new.push, push))
+    return new
 
 
 def _reduced_drift(drift: Motion, time: Array, new: Motion, old: Motion) -> Motion:
@@ -261,13 +244,12 @@ def _after_impulses(
     new: tuple[BodySide, BodySide],
     bounces: Array,
     time: Array,
-    push: Array | None,
 ) -> tuple[BodySide, BodySide]:
-    """Both sides with the drift, the push and the clock after impulses at this time, s."""
+    """Both sides with the drift and the clock after impulses at this time, s."""
     (a, b), (new_a, new_b) = old, new
-    new_b = _update_drift(b, new_b, time, push)
+    new_b = _update_drift(b, new_b, time)
     if constraint.a is not None and a.drift is not None:
-        new_a = _update_drift(a, new_a, time, push)
+        new_a = _update_drift(a, new_a, time)
     return after_impact(new_a, new_b, bounces, time)
 
 
@@ -280,7 +262,7 @@ def solve(
     setup: PassSetup,
     params: SolverParams,
 ) -> tuple[BodySide, BodySide, SolvedPair]:
-    """Both sides and the pair after the biased solve, bounces included."""
+    """Both sides and the pair after the first pass: impulses, bounces and the correction of overlaps."""
     constraint = with_joints(constraint, a, b)
     taus = impact_times(points, a, b, setup, params.step)
     if takes_part(points, b):
@@ -288,13 +270,13 @@ def solve(
     contacts, time = active_contacts(constraint, points, taus, a, b, params.step)
 
     def target_of(contact: ActiveContact, speed: Array, old: Impulse) -> NormalTarget:
-        return biased_target(constraint, contact, speed, old, params)
+        return step_target(constraint, contact, speed, old, params.step)
 
     pair = SolvedPair(contacts, warm_start_impulses(constraint, points, memory.impulses), memory.roll)
     new_a, new_b, solved = _apply_pass(constraint, pair, target_of, a, b)
-    push = _push_bound(constraint, solved, a, b, params)
     bounces = functools.reduce(jnp.logical_or, [tau >= 0 for tau in taus])
-    new_a, new_b = _after_impulses(constraint, (a, b), (new_a, new_b), bounces, time, push)
+    new_a, new_b = _after_impulses(constraint, (a, b), (new_a, new_b), bounces, time)
+    new_a, new_b = correct_positions(constraint, contacts, points[0].acceleration, new_a, new_b, setup, params)
     if constraint.static:
         new_b = materialize(new_b._replace(work=None))._replace(work=new_b.work)
     return new_a, new_b, solved
@@ -319,7 +301,7 @@ def solve_impact(
         return impact_target(constraint, contact, speed, old, happens)
 
     new_a, new_b, new = _apply_pass(constraint, solved._replace(contacts=contacts), target_of, a, b)
-    new_a, new_b = _after_impulses(constraint, (a, b), (new_a, new_b), happens, time, None)
+    new_a, new_b = _after_impulses(constraint, (a, b), (new_a, new_b), happens, time)
     return jax.tree.map(lambda x, y: jnp.where(happens, x, y), (new_a, new_b, new), (a, b, solved))
 
 
@@ -327,6 +309,7 @@ MAX_STACK_IMPACT = 1.0  # m/s: faster contacts count as impacts even inside a st
 
 
 IMPULSE_GROWTH = 1.5  # from step to step, of the impulse that a resting contact starts with
+LARGEST_SHIFT = 5.0  # in a step by that impulse alone, over the distance of the contact from the centres of its bodies
 
 
 def _next_impulse(
@@ -336,6 +319,7 @@ def _next_impulse(
     impulse: Impulse,
     old: Impulse,
     setup: PassSetup,
+    h: float,
 ) -> Impulse:
     """Impulse that the next step starts with.
 
@@ -345,12 +329,15 @@ def _next_impulse(
 
     The impulse of a contact that rests is at most that of the last step times `IMPULSE_GROWTH`, and what gravity adds
     in two steps. A pile that is crushed has large impulses once; applied again in the next steps, they would throw it
-    apart.
+    apart. Nor would the impulse alone shift its bodies by more than `LARGEST_SHIFT` in a step. It could where a heavy
+    body crushes a light one, and would throw both if it were applied again where the light one has turned.
     """
-    most = IMPULSE_GROWTH * jnp.maximum(old.normal, 0.0) + setup.threshold * contact.frame.normal_mass
-    normal = jnp.minimum(impulse.normal, most)
+    frame = contact.frame
+    most = IMPULSE_GROWTH * jnp.maximum(old.normal, 0.0) + setup.threshold * frame.normal_mass
+    reach = jnp.abs(frame.tangent_b) + (0.0 if frame.tangent_a is None else jnp.abs(frame.tangent_a))
+    normal = jnp.minimum(jnp.minimum(impulse.normal, most), LARGEST_SHIFT / h * reach * frame.normal_mass)
     friction = constraint.friction * normal
-    negated = jnp.minimum(impulse.normal, MAX_STACK_IMPACT * contact.frame.normal_mass)
+    negated = jnp.minimum(impulse.normal, MAX_STACK_IMPACT * frame.normal_mass)
     return Impulse(
         jnp.where(bounced, jnp.where(contact.gap <= 0, -negated, 0.0), normal),
         jnp.where(bounced, 0.0, jnp.clip(impulse.tangent, -friction, friction)),
@@ -379,6 +366,7 @@ def relax(
     a: BodySide,
     b: BodySide,
     setup: PassSetup,
+    params: SolverParams,
 ) -> tuple[BodySide, BodySide, tuple[SolvedPair, WarmStart]]:
     """Both sides and the pair after the relaxing solve at the end of the step, and the impulses for the next step."""
     assert b.displacement is not None, "only static bodies lack a displacement"
@@ -399,7 +387,7 @@ def relax(
     new_a, new_b, last = _apply_pass(constraint, solved._replace(contacts=contacts), target_of, a, b)
     of = zip(last.contacts, bounced, last.impulses, memory.impulses, strict=True)
     impulses = materialize(
-        [_next_impulse(constraint, c, (c.tau >= 0) | bounce, new, old, setup) for c, bounce, new, old in of]
+        [_next_impulse(constraint, c, (c.tau >= 0) | b, new, old, setup, params.step) for c, b, new, old in of]
     )
     if constraint.static:
         new_b = new_b._replace(motion=materialize(new_b.motion))
@@ -407,7 +395,7 @@ def relax(
 
 
 def touching(solved: SolvedPair, last: SolvedPair) -> Array:
-    """Whether a normal impulse acted in the biased or in the relaxing pass."""
+    """Whether a normal impulse acted in the first or in the relaxing pass."""
     pressed = [i.normal > 0 for pair in (solved, last) for i in pair.impulses]
     return functools.reduce(jnp.logical_or, pressed)
 

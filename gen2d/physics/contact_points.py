@@ -246,8 +246,8 @@ def bounce_threshold(
 ) -> Array:
     """Approach speed above which a contact bounces, m/s.
 
-    It exceeds what pushing overlaps apart may add and what the pair's last normal impulse causes in a step; otherwise
-    a pile would bounce on itself.
+    It exceeds what warm starting may have added and what the pair's last normal impulse causes in a step; otherwise a
+    pile would bounce on itself.
     """
     push = 0.0 if b.push is None else b.push if a.push is None else a.push + b.push
     return setup.threshold + push + point.frame.k_normal * normal

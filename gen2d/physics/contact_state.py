@@ -25,7 +25,7 @@ class BodySide(NamedTuple):
     acceleration: Array | None = None  # [2, N, ...] m/s^2; None: gravity's
     drift: Motion | None = None  # m, rad: displacement beyond h times the new velocity, as impulses act at their time
     displacement: Motion | None = None  # m, rad: where the impulses of a pass act; None: of static bodies
-    push: Any = None  # [N, ...] m/s: bound on the speed from pushing overlaps apart; 0: no contact; None: static
+    push: Any = None  # [N, ...] m/s: bound on the speed that warm starting added; None: static
     work: Work | None = None
     schur: Array | None = None  # [6, N, ...] what rigid joints take from the inverse mass (jointed.py)
     joint_motion: Motion | None = None  # m/s, rad/s: what they take from the motion in a pass

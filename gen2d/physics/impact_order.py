@@ -1,7 +1,7 @@
 """Impacts of one step in the order of their times.
 
 A disc that is hit twice in a step takes the first impact first. The warm start finds the first impact of each body on
-its path at the start of the step. In the biased pass an impact acts if it is the next one of both its bodies, and waits
+its path at the start of the step. In the first pass an impact acts if it is the next one of both its bodies, and waits
 otherwise. Then turns follow until nothing waits: the impacts of all bodies that an impact has moved are found anew, and
 those act that come next. Two discs, and a disc and a static segment, take part. A contact with corners, whose path is
 linear within a step, acts in the order of the pass, as do bodies that touch from the start of the step.
@@ -17,7 +17,7 @@ from gen2d.physics.time_of_impact import NONE, WAITS
 from gen2d.records.axes import Array
 
 SAME_TIME = 1e-4  # relative difference of times of impact that are one, as they are computed twice
-TURNS = 8  # after the biased pass; a longer sequence of impacts goes on in the next step
+TURNS = 8  # after the first pass; a longer sequence of impacts goes on in the next step
 
 
 def takes_part(points: list[ContactPoint], b: BodySide) -> bool:

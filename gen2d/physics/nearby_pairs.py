@@ -132,7 +132,7 @@ class ListedPairs(NamedTuple):
 
 
 class SolvedChunk(NamedTuple):
-    """Contacts of each batch after the biased pass."""
+    """Contacts of each batch after the first pass."""
 
     listed: ListedPairs
     packed: list[Array]
@@ -552,7 +552,7 @@ class NearbyPairs(ContactSolver):
             cache, touch = caches[i]._replace(rows=carried[0]), carried[1]
             constraint, memory, points, setup = self._unpack_contacts(listed, i, k)
             pair = unpack(list(solved.packed[i][k]), solved.specs[i])
-            a, b, (last, warm) = contact_passes.relax(constraint, memory, points, pair, a, b, setup)
+            a, b, (last, warm) = contact_passes.relax(constraint, memory, points, pair, a, b, setup, self.params)
             new = CachedConstraint(warm, jnp.full(self.chunk, carry.step, self._dtype), None, None)
             if self.setup.log:
                 event = record_event(self._event_so_far(carry, cache.at(indices.pair)), pair, last, time)

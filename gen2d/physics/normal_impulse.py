@@ -1,6 +1,6 @@
 """Normal impulses at the one or two points of a contact: a linear complementarity problem, solved exactly.
 
-At each point speed + compliance * impulse >= target and impulse >= 0, one of them with equality. Two points of one
+At each point speed >= target and impulse >= 0, one of them with equality. Two points of one
 contact that both bounce, or both rest, are solved together, as one after the other would turn a box that lands flat, or
 tilt one that stands. If only one bounces, they are solved one after the other: a bounce keeps the energy of the speeds
 that it finds.
@@ -11,16 +11,8 @@ from typing import NamedTuple, TypeAlias
 
 import jax.numpy as jnp
 
-from gen2d.physics.constraint import (
-    ActiveContact,
-    ContactConstraint,
-    Impulse,
-    Inertia,
-    reciprocal,
-    softness,
-)
+from gen2d.physics.constraint import ActiveContact, ContactConstraint, Impulse, Inertia
 from gen2d.physics.jointed import joint_coupling
-from gen2d.physics.params import SolverParams
 from gen2d.physics.time_of_impact import MISSES
 from gen2d.records.axes import Array
 
@@ -32,8 +24,6 @@ class NormalTarget(NamedTuple):
 
     active: Array
     speed: Array  # m/s
-    compliance: Array | float  # of the impulse, relative to k_normal
-    leak: Array | float  # share of what a spring with this compliance would take from the impulse of the last step
     idle: Array  # N s: the impulse where not active
     bounces: Array
     apart: Array | None = None  # whether it is an impact of its own, whose friction is bounded by its own impulse
@@ -51,45 +41,22 @@ def bounce_speed(constraint: ContactConstraint, contact: ActiveContact, speed: A
     return jnp.where(arrival > 0, jnp.maximum(constraint.elasticity * arrival - contact.fall, 0.0), speed)
 
 
-LEAK, LEAK_BY_RATIO = 0.3, 0.01
-SUPPORTED_LEAK = 0.15  # with shock propagation
-
-
-def _leak(constraint: ContactConstraint, params: SolverParams) -> Array | float:
-    """Share of the leak of a spring, between its least, LEAK or SUPPORTED_LEAK, and 1.
-
-    A contact that leaks like a spring sinks under its load by Hooke's law. One that does not leak at all would make
-    heavy bodies on light ones unstable, whose loads take as many steps to arrive as the ratio of the masses.
-    """
-    least = SUPPORTED_LEAK if params.shock_propagation else LEAK
-    if constraint.a is None or constraint.static:
-        return least
-    a, b = constraint.a.mass, constraint.b.mass
-    ratio = jnp.maximum(a, b) * reciprocal(jnp.minimum(a, b), jnp.minimum(a, b) > 0)
-    return jnp.clip(LEAK_BY_RATIO * ratio, least, 1.0)
-
-
-def biased_target(
-    constraint: ContactConstraint, contact: ActiveContact, speed: Array, old: Impulse, params: SolverParams
+def step_target(
+    constraint: ContactConstraint, contact: ActiveContact, speed: Array, old: Impulse, h: float
 ) -> NormalTarget:
-    """Target of the biased solve.
+    """Target of the first pass.
 
-    A separated contact may close its gap, an overlapping one is pushed apart softly, and a bounce reaches its target
-    speed exactly. A fast approach that misses in this step gets no impulse, as the straight line of a soft contact
-    would stop a body that only grazes the other or arrives a step later. With shock propagation, a static body stops
-    another at once, whatever its load.
+    A separated contact may close its gap, a touching one does not approach, and a bounce reaches its target speed. A
+    fast approach that misses in this step gets no impulse, as the straight line of a contact at rest would stop a body
+    that only grazes the other or arrives a step later.
     """
-    rate, mass_scale, impulse_scale = softness(constraint, params)
-    apart, bounces = contact.gap > 0, contact.tau >= 0
-    bias = jnp.where(apart, contact.gap / params.step, jnp.maximum(rate * contact.gap, -params.push_speed))
+    bounces = contact.tau >= 0
     bounce = bounce_speed(constraint, contact, speed)
-    touches, firm = contact.frame.normal_mass > 0, constraint.static and params.shock_propagation
+    touches = contact.frame.normal_mass > 0
     active = touches & jnp.where(bounces, bounce > speed, contact.tau > MISSES)
     return NormalTarget(
         active=active,
-        speed=jnp.where(bounces, bounce, -bias),
-        compliance=jnp.where(apart | bounces, 0.0, 0.0 if firm else impulse_scale / mass_scale),
-        leak=_leak(constraint, params),
+        speed=jnp.where(bounces, bounce, -jnp.maximum(contact.gap, 0.0) / h),
         idle=jnp.where(touches & bounces, old.normal, 0.0),
         bounces=bounces,
     )
@@ -101,7 +68,7 @@ def impact_target(
     """Target of an impact alone, where it happens: the speed of its bounce."""
     bounce = bounce_speed(constraint, contact, speed)
     active = happens & (bounce > speed) & (contact.frame.normal_mass > 0)
-    return NormalTarget(active, bounce, 0.0, 0.0, old.normal, happens, apart=happens)
+    return NormalTarget(active, bounce, old.normal, happens, apart=happens)
 
 
 def bounces_again(contact: ActiveContact, speed: Array, threshold: Array) -> Array:
@@ -112,7 +79,7 @@ def bounces_again(contact: ActiveContact, speed: Array, threshold: Array) -> Arr
 def relaxed_target(
     constraint: ContactConstraint, contact: ActiveContact, speed: Array, old: Impulse, threshold: Array
 ) -> NormalTarget:
-    """Target of the relaxing solve, without bias.
+    """Target of the relaxing pass.
 
     Leave unchanged: contacts that bounced and are separating; separated contacts that carried no impulse, which would
     brake a body one step before its impact; and gaps that a neighbour is closing, which bounce in a later step.
@@ -121,7 +88,7 @@ def relaxed_target(
     again = bounces_again(contact, speed, threshold)
     active = again | (rests & (contact.frame.normal_mass > 0))
     target, apart = jnp.where(again, -constraint.elasticity * speed, 0.0), again | (contact.tau >= 0)
-    return NormalTarget(active, target, 0.0, 0.0, old.normal, again, apart)
+    return NormalTarget(active, target, old.normal, again, apart)
 
 
 class _Row:
@@ -129,12 +96,11 @@ class _Row:
 
     def __init__(self, contact: ActiveContact, speed: Array, old: Impulse, target: NormalTarget) -> None:
         k_normal, mass = contact.frame.k_normal, contact.frame.normal_mass
-        stiff = 1 + target.compliance
         self.active, self.bounces = target.active, target.active & target.bounces
-        self.old, self.k = old.normal, stiff * k_normal
-        self.missing = target.speed - speed - target.leak * target.compliance * k_normal * old.normal
+        self.old, self.k = old.normal, k_normal
+        self.missing = target.speed - speed
         self.least = jnp.where(target.active, 0.0, target.idle)
-        self._mass = mass / stiff
+        self._mass = mass
 
     def impulse(self, added: Array | float) -> Array:
         """Impulse at this point alone, if the other adds a speed in m/s."""

@@ -34,7 +34,7 @@ class ContactSolver(Protocol):
     def solve(
         self, carry: Any, contacts: Any, sides: list[BodySide], statics: list[BodySide]
     ) -> tuple[list[BodySide], Any]:
-        """Sides after the biased pass, and the solved contacts; uses motion, drift, push and work."""
+        """Sides after the first pass, and the solved contacts; uses motion, drift, push and work."""
         ...
 
     def relax(

@@ -4,14 +4,16 @@ A step of h seconds:
 
 1. Gravity, forces and damping change the velocities.
 2. The impulses of the last step are applied again (warm starting), at half of the step.
-3. Every pair is solved once with its soft bias, bounces at the exact time of impact, then all rigid joints at once.
+3. Every pair is solved once, bounces at the exact time of impact, and is pushed apart where it overlaps, which
+   moves the bodies but leaves no speed; then all rigid joints at once.
 4. The bodies move.
-5. Every pair and all joints are solved once more without the bias, so that pushing apart leaves no speed behind.
+5. Every pair and all joints are solved once more, where the bodies are at the end of the step.
 
 Pairs are solved in rounds of disjoint pairs (schedule.py), all of them (all_pairs.py) or those that are near
 (nearby_pairs.py), each round from the result of the last. Springs, limits and motors come before the contacts
-(springs_limits_motors.py), static bodies last of all pairs. Rigid joints (rigid_joints.py) are solved before the
-contacts, which see what the joints leave of their bodies' masses (jointed.py), and after them.
+(springs_limits_motors.py), static bodies last of all pairs. Overlaps are corrected by displacements of their own
+(position_correction.py). Rigid joints (rigid_joints.py) are solved before the contacts, which see what the joints
+leave of their bodies' masses (jointed.py), and after them.
 
 Restitution. A contact that closes within the step bounces: Newton's law is applied to the velocities that it finds, so
 impacts follow one another and never add energy. The impulse P acts at the time of impact tau, not at the start of the
@@ -23,8 +25,8 @@ Impulse and reaction act at one point, where the bodies are when they act, which
 move the contact points by the displacement until then, the last one to the end of the step.
 
 Sources: E. Catto, 'Iterative dynamics with temporal coherence' (GDC 2005) for accumulated impulses and warm starting;
-'Solver2D' (2024) for small steps with soft contacts and a relaxing pass; Y. Hu et al., DiffTaichi (arXiv 1910.00935)
-for the time of impact in gradients.
+'Solver2D' (2024) for small steps and a relaxing pass; Y. Hu et al., DiffTaichi (arXiv 1910.00935) for the time of
+impact in gradients.
 """
 
 import math
@@ -116,7 +118,7 @@ class _RigidJoints:
         return motions
 
     def hold(self, sides: list[BodySide]) -> list[BodySide]:
-        """Sides of the biased pass, whose contacts see the joints at the start of the step."""
+        """Sides of the first pass, whose contacts see the joints at the start of the step."""
         if self._system is None:
             return sides
         self._factored = rigid_joints.FactoredSystem(self._system, self._anchors)

@@ -9,7 +9,7 @@ from gen2d.records.axes import Array
 
 SLOWEST = 1e-12  # m/s or m: keeps divisions finite where nothing moves or has a size
 # Values that stand for a time of impact, in s:
-NONE = -1.0  # no fast approach: a soft contact
+NONE = -1.0  # no fast approach: a contact at rest
 MISSES = -2.0  # a fast approach without an impact in this step: no impulse yet
 WAITS = -3.0  # an impact after another one of the same bodies, which has not acted yet: no impulse yet
 # Contacts with tau > MISSES may get an impulse, so WAITS lies below it.

@@ -1,9 +1,8 @@
 """Limits of the solver that a config exceeds: masses that rest on far lighter ones, and speeds for the step.
 
-A contact at rest loses a share of its load in each step, and so gives way like a spring: a body that rests on one of a
-part 1 / r of its mass sinks in by SINKING (1 + r) g / w^2, times r / 30 for ratios above 30, with w the angular
-frequency of the contact. A body that several others hit in one step may overlap them by about its displacement in it.
-Both depend on numbers of the config alone, and are compared with the size of the bodies.
+A body that comes to rest on one of a part 1 / r of its mass sinks in by up to r g h^2 in steps of h s, as the load
+takes many steps to arrive, and rises again. A body that several others hit in one step may overlap them by about its
+displacement in it. Both depend on numbers of the config alone, and are compared with the size of the bodies.
 """
 
 import dataclasses
@@ -16,12 +15,9 @@ from gen2d.config.config import Config
 from gen2d.config.contracts import Bodies
 from gen2d.config.distributions import Distribution
 from gen2d.config.sections import PhysicsOptions
-from gen2d.physics.params import solver_params
 from gen2d.physics.simulate import substeps
 from gen2d.physics.support import LARGEST_RATIO
 
-SINKING = 0.375  # measured, with boxes: tests/programs/test_limits.py
-LEAKING = 30.0  # mass ratio above which a contact loses more of its impulse (physics.md, Rest)
 SAFE_SINKING = 0.005  # over the least size of the lighter body
 SAFE_DISPLACEMENT = 0.5  # in a step, over the least radius
 DEVIATIONS = 4.0  # of a normal distribution, which has no largest value
@@ -48,23 +44,22 @@ def exceeded_limits(config: Config) -> list[str]:
     exceeded = dict[str, tuple[float, str]]()  # by kind of limit: the worst, over what is safe, and its sentence
     for physics in dict.fromkeys(each.physics for each in configs):
         steps = substeps(config.video.fps, physics.substeps, physics.max_step)
-        masses = _of_masses(options, family.bodies, kinds, gravity, physics, config.video.fps, steps)
-        speeds = _of_speeds(family.bodies, kinds, fall, 1 / (config.video.fps * steps))
+        step = 1 / (config.video.fps * steps)
+        masses = _of_masses(options, family.bodies, kinds, gravity, physics, step)
+        speeds = _of_speeds(family.bodies, kinds, fall, step)
         for kind, found in (("mass", masses), ("speed", speeds)):
             exceeded[kind] = max([exceeded.get(kind, (1.0, "")), *found], key=lambda each: each[0])
     return [sentence for _, sentence in exceeded.values() if sentence]
 
 
-def sinking(ratio: float, gravity: float, hertz: float) -> float:
-    """Depth in m to which a body sinks into one of 1 / ratio of its mass, with contacts of this frequency."""
-    return SINKING * (1 + ratio) * max(1.0, ratio / LEAKING) * gravity / (2 * math.pi * hertz) ** 2
+def sinking(ratio: float, gravity: float, step: float) -> float:
+    """Largest depth in m to which a body sinks into one of 1 / ratio of its mass, in steps of so many s."""
+    return ratio * gravity * step**2
 
 
-def safe_ratio(depth: float, gravity: float, hertz: float) -> float:
-    """Largest mass ratio at which a body sinks in by at most `depth` m; below 1 if equal ones sink in deeper."""
-    rest = depth * (2 * math.pi * hertz) ** 2 / (SINKING * gravity)
-    linear = rest - 1
-    return linear if linear <= LEAKING else (math.sqrt(1 + 4 * LEAKING * rest) - 1) / 2
+def safe_ratio(depth: float, gravity: float, step: float) -> float:
+    """Largest mass ratio at which a body sinks in by at most `depth` m; below 1 if equal ones may sink in deeper."""
+    return depth / sinking(1.0, gravity, step)
 
 
 def _of_masses(
@@ -73,20 +68,17 @@ def _of_masses(
     kinds: Mapping[str, _Extremes],
     gravity: float,
     physics: PhysicsOptions,
-    fps: float,
-    steps: int,
+    step: float,
 ) -> Iterator[tuple[float, str]]:
     """For each two kinds of bodies, how far their mass ratio may be beyond the safe one, and the sentence."""
-    hertz = float(solver_params(physics, fps, steps).hertz)
     for lower, upper in itertools.product(bodies, bodies):
         if upper not in bodies[lower].bears or not gravity:
             continue
         light, heavy = kinds[lower], kinds[upper]
         ratio = _largest_ratio(options, (bodies[lower], light), (bodies[upper], heavy))
         depth = SAFE_SINKING * 2 * light.radius
-        safe = LARGEST_RATIO if physics.shock_propagation else safe_ratio(depth, gravity, hertz)
+        safe = LARGEST_RATIO if physics.shock_propagation else safe_ratio(depth, gravity, step)
         names = dict.fromkeys([*_names(bodies[upper]), *_names(bodies[lower])])
-        limited = " (limited by the step)" if hertz < float(physics.contact_hertz) else ""
         bound = f"mass ratios up to {safe:.4g} are safe" if safe >= 1 else "not even equal masses are safe"
         if not physics.shock_propagation:
             bound += (
@@ -96,8 +88,7 @@ def _of_masses(
         yield (
             ratio / safe if safe > 0 else math.inf,
             f"{' and '.join(f'scene.{name}' for name in names)} allow {upper} of {heavy.mass[1]:.3g} kg on {lower} "
-            f"of {light.mass[0]:.3g} kg, a mass ratio of {ratio:.3g}: at physics.contact_hertz={hertz:.3g}{limited}, "
-            f"{bound}",
+            f"of {light.mass[0]:.3g} kg, a mass ratio of {ratio:.3g}: in steps of {step:.3g} s, {bound}",
         )
 
 

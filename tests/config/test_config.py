@@ -210,7 +210,7 @@ def test_a_later_option_is_written_only_where_it_is_changed():
 def test_defaults_are_those_of_the_pages():
     physics = load_config({}).physics
     assert physics.max_step == 1 / 240
-    assert (physics.contact_hertz, physics.contact_damping_ratio, physics.push_speed) == (30, 10, 3)
+    assert (physics.contact_hertz, physics.contact_damping_ratio, physics.push_speed) == (30, 2, 3)
     look = load_config({}).look.options
     assert (look.wall_width, look.contrast) == (1.5, 120)
     engine = Ray()

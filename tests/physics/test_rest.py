@@ -54,24 +54,26 @@ def test_a_disc_a_hair_above_a_floor_comes_to_rest_on_it():
     holds("Rest: a hair above the floor, height in the end, m", made.x[:, :, -1, 0, 1] - RADIUS, 1e-4)
 
 
-@pytest.mark.asked
 def test_column_of_ten_in_a_channel_rests():
     discs = [{"x": (0, RADIUS * (1 + 2 * k)), "elasticity": 0.5, "friction": 0.5} for k in range(10)]
     case = Case(discs, [FLOOR, wall(-RADIUS), wall(RADIUS)], DOWN)
     depth, way, speed = rest_measures(case, 16, settle=5)
-    holds("Rest: column of 10, overlap, m", np.maximum(depth, 0), 2e-3, asked=1e-3)
+    holds("Rest: column of 10, overlap, m", np.maximum(depth, 0), 3e-4)
     holds("Rest: column of 10, way in 10 s, m", way, 1e-3)
     holds("Rest: column of 10, speed, m/s", speed, 1e-3)
 
 
 def test_zigzag_channel_of_sixteen_rests():
-    """Smooth discs in a channel 1.6 diameters wide press against both walls: the hardest to carry."""
+    """Smooth discs in a channel 1.6 diameters wide press against both walls: the hardest to carry.
+
+    Pushed together at the start by 2 mm, they take half a minute to part.
+    """
     width = 1.6 * 2 * RADIUS
     side, rise = width / 2 - RADIUS, np.sqrt((2 * RADIUS) ** 2 - (width - 2 * RADIUS) ** 2)
     discs = [{"x": ((-1) ** k * side, RADIUS + k * rise), "elasticity": 0} for k in range(16)]
     case = Case(discs, [FLOOR, wall(-width / 2), wall(width / 2)], DOWN)
-    depth, way, speed = rest_measures(case, 16, settle=5)
-    holds("Rest: zigzag channel of 16, overlap, m", np.maximum(depth, 0), 0.011)
+    depth, way, speed = rest_measures(case, 16, settle=30)
+    holds("Rest: zigzag channel of 16, overlap, m", np.maximum(depth, 0), 5e-4)
     holds("Rest: zigzag channel of 16, way in 10 s, m", way, 1e-3)
     holds("Rest: zigzag channel of 16, speed, m/s", speed, 1e-3)
 
@@ -83,7 +85,7 @@ def test_walled_pyramid_of_six_rows_rests():
     discs = [{"x": x, "elasticity": 0, "friction": np.sqrt(0.5)} for x in places]
     case = Case(discs, [{**FLOOR, "friction": np.sqrt(0.5)}, wall(-rows / 2), wall(rows / 2)], DOWN)
     depth, way, speed = rest_measures(case, 22, settle=5)
-    holds("Rest: pyramid of 6 rows, overlap, m", np.maximum(depth, 0), 0.005)
+    holds("Rest: pyramid of 6 rows, overlap, m", np.maximum(depth, 0), 3e-4)
     holds("Rest: pyramid of 6 rows, way in 10 s, m", way, 1e-3)
     holds("Rest: pyramid of 6 rows, speed, m/s", speed, 1e-3)
 
@@ -105,12 +107,11 @@ def bin_of(count: int, width: float) -> Case:
 
 
 @pytest.mark.parametrize(
-    ("count", "width", "bound", "asked"),
-    [(32, 6.0, 3e-3, None), pytest.param(64, 8.0, 5e-3, 3e-3, marks=[pytest.mark.slow, pytest.mark.asked])],
+    ("count", "width", "settle"), [(32, 6.0, 15), pytest.param(64, 8.0, 40, marks=pytest.mark.slow)]
 )
-def test_full_bin_rests(count, width, bound, asked):
-    depth, way, speed = rest_measures(bin_of(count, width), count, settle=15)
-    holds(f"Rest: bin of {count}, overlap, m", np.maximum(depth, 0), bound, asked)
+def test_full_bin_rests(count, width, settle):
+    depth, way, speed = rest_measures(bin_of(count, width), count, settle)
+    holds(f"Rest: bin of {count}, overlap, m", np.maximum(depth, 0), 5e-4)
     holds(f"Rest: bin of {count}, speed, m/s", speed, 1e-3)
     holds(f"Rest: bin of {count}, way in 10 s, m", way, 1e-3)
 
@@ -125,18 +126,18 @@ def test_bowl_of_the_article_rests():
     places = [(2, 2 + 2), (4, 3 + 2), (3, 6 + 2), (6, 5 + 2), (5, 7 + 2)]
     discs = [{"x": x, "radius": 1, "mass": 1, "moment": 0.5, "elasticity": 0.5, "friction": 0.2} for x in places]
     depth, way, speed = rest_measures(Case(discs, bowl, DOWN), 8, settle=30)
-    holds("Rest: bowl of the article, overlap, m", np.maximum(depth, 0), 0.005)
+    holds("Rest: bowl of the article, overlap, m", np.maximum(depth, 0), 5e-4)
     holds("Rest: bowl of the article, way in 10 s, m", way, 1e-3)
     holds("Rest: bowl of the article, speed, m/s", speed, 1e-3)
 
 
-@pytest.mark.parametrize(("ratio", "bound"), [(10, 0.02), (100, 0.1)])
+@pytest.mark.parametrize(("ratio", "bound"), [(10, 5e-4), (100, 5e-3)])
 def test_heavy_disc_rests_on_a_light_one(ratio, bound):
     discs = [{"x": (0, RADIUS), "mass": 1}, {"x": (0, 3 * RADIUS), "mass": ratio}]
     for name, first, second in (("heavy on light", *discs), ("light on heavy", *discs[::-1])):
         pair = [{**first, "x": discs[0]["x"]}, {**second, "x": discs[1]["x"]}]
         pair = [{**d, "elasticity": 0, "friction": 0.5} for d in pair]
-        depth, way, speed = rest_measures(Case(pair, [FLOOR, wall(-RADIUS), wall(RADIUS)], DOWN), 8, settle=5)
+        depth, way, speed = rest_measures(Case(pair, [FLOOR, wall(-RADIUS), wall(RADIUS)], DOWN), 8, settle=10)
         holds(f"Mass ratio {ratio}, {name}: overlap, m", np.maximum(depth, 0), bound)
         holds(f"Mass ratio {ratio}, {name}: way in 10 s, m", way, 1e-3)
         holds(f"Mass ratio {ratio}, {name}: speed, m/s", speed, 1e-3)

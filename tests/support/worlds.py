@@ -32,7 +32,7 @@ def rules(step: float = STEP, **changes: Any) -> SolverParams:
     numbers: dict[str, Any] = {
         "bounce_threshold": 0.01,
         "hertz": min(30.0, 0.125 / step),
-        "damping_ratio": 10.0,
+        "damping_ratio": 2.0,
         "push_speed": 3.0,
         "damping": 0.0,
         "mixing": "product",
