@@ -128,7 +128,9 @@ def config_names() -> list[str]:
 def find_config(name: str) -> pathlib.Path:
     """Path of a YAML file, given by that path or by the name of a config that comes with gen2d.
 
-    A folder of that name in the working directory does not hide the config. Raises ConfigError if there is no such file.
+    A folder of that name in the working directory does not hide the config.
+
+    Raises ConfigError if there is no such file.
     """
     path = pathlib.Path(name).expanduser()
     if path.is_file():
