@@ -128,14 +128,16 @@ def config_names() -> list[str]:
 def find_config(name: str) -> pathlib.Path:
     """Path of a YAML file, given by that path or by the name of a config that comes with gen2d.
 
+    A folder of that name in the working directory does not hide the config.
+
     Raises ConfigError if there is no such file.
     """
     path = pathlib.Path(name).expanduser()
     if path.is_file():
         return path
-    if name and path.is_dir():
-        raise ConfigError(f"the config is {name!r}, which is a folder; name a YAML file")
     for candidate in (path.name, f"{path.name}.yaml"):
         if path.parent == pathlib.Path() and (config_folder() / candidate).is_file():
             return config_folder() / candidate
+    if name and path.is_dir():
+        raise ConfigError(f"the config is {name!r}, which is a folder; name a YAML file")
     raise ConfigError(f"the config is {name!r}, but there is no such file; {nearest(path.name, config_names())}")

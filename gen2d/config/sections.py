@@ -34,9 +34,9 @@ class PhysicsOptions:
         0.01, float, "m/s", "smallest impact speed that bounces; at least the gain by gravity in two steps", low=0
     )
     contact_hertz: float = option(
-        30.0, float, "Hz", "natural frequency of a contact, at most 1/8 of the step rate", above=0
+        30.0, float, "Hz", "frequency of the spring that corrects overlaps, at most 1/8 of the step rate", above=0
     )
-    contact_damping_ratio: float = option(2.0, float, "1", "damping ratio of a contact", above=0)
+    contact_damping_ratio: float = option(2.0, float, "1", "damping ratio of that spring", above=0)
     push_speed: float = option(3.0, float, "m/s", "largest speed at which an overlap is resolved", above=0)
     precision: str = option(
         "float32",

@@ -55,7 +55,7 @@ from gen2d.records.axes import Array
 from gen2d.records.trajectory import Contacts
 from gen2d.xla import materialize, max_bodies
 
-CONSTANTS = ("shape", "acceleration", "displacement", "schur")  # of a `BodySide`: a pass does not change them
+CONSTANTS = "shape", "acceleration", "displacement", "schur"  # of a `BodySide`: no pass changes them
 NEVER = -2  # the step of an event that has not happened
 
 
@@ -143,6 +143,7 @@ class SolvedChunk(NamedTuple):
 class BodyTables(NamedTuple):
     """Packed bodies of a pass."""
 
+    constants: tuple[str, ...]  # fields of the sides that the pass does not change
     changing: list[PackedTable]  # by group: what a pass changes
     constant: list[PackedTable]
     fixed: list[PackedTable | None]  # static bodies of each batch that has any
@@ -327,29 +328,42 @@ class NearbyPairs(ContactSolver):
         return self._table(jax.tree.map(lambda *x: jnp.concatenate(x, axis=-2), *trees), len(trees))
 
     def _pass(
-        self, sides: list[BodySide], statics: list[BodySide], listed: ListedPairs, carries: list[Any], play: Callable
+        self,
+        sides: list[BodySide],
+        statics: list[BodySide],
+        listed: ListedPairs,
+        carries: list[Any],
+        play: Callable,
+        constants: tuple[str, ...],
     ) -> tuple[list[BodySide], list[Any]]:
         """Sides and carries of all batches after a pass over the near pairs.
 
         `play(i, k, indices, a, b, carry)` returns both sides and the carry after chunk k of batch i. A carry with a
         None has no buffer yet; one chunk is then played to find its shape.
         """
-        bodies = self._bodies(sides, statics)
+        bodies = self._bodies(sides, statics, constants)
         rows, carries = self._play(bodies, bodies.rows, listed, carries, play, range(len(self.batches)))
         return self._unpacked(bodies, rows), carries
 
-    def _bodies(self, sides: list[BodySide], statics: list[BodySide]) -> BodyTables:
+    @property
+    def _solver_constants(self) -> tuple[str, ...]:
+        """Fields of the sides that the passes after the warm start do not change."""
+        return (*CONSTANTS, "support") if self.params.shock_propagation else (*CONSTANTS, "push")
+
+    def _bodies(self, sides: list[BodySide], statics: list[BodySide], constants: tuple[str, ...]) -> BodyTables:
         """Tables of the bodies, and of the static bodies of each batch."""
-        changing, constant = zip(*(_split(side) for side in sides), strict=True)
+        changing, constant = zip(*(_split(side, constants) for side in sides), strict=True)
         tables, inputs = ([self._table(x, self._size(g)) for g, x in enumerate(of)] for of in (changing, constant))
         fixed = [self._static_table([statics[j] for j in b.statics]) if b.first is None else None for b in self.batches]
-        return BodyTables(tables, inputs, fixed, list(constant))
+        return BodyTables(constants, tables, inputs, fixed, list(constant))
 
     def _unpacked(self, bodies: BodyTables, rows: list[Array]) -> list[BodySide]:
         """Sides with the rows of tables in which a pass has changed them."""
         shapes = [(self._size(g), self._scenes) for g in range(len(rows))]
         of = zip(bodies.changing, rows, shapes, bodies.sides, strict=True)
-        return [_merge(table._replace(rows=x).unpack(shape), constant) for table, x, shape, constant in of]
+        return [
+            _merge(table._replace(rows=x).unpack(shape), constant, bodies.constants) for table, x, shape, constant in of
+        ]
 
     def _play(
         self,
@@ -368,7 +382,8 @@ class NearbyPairs(ContactSolver):
         rows, carries = list(rows), list(carries)
 
         def side(rows: dict[int, Array], group: int, where: Array) -> BodySide:
-            return _merge(bodies.changing[group]._replace(rows=rows[group]).at(where), bodies.constant[group].at(where))
+            changing = bodies.changing[group]._replace(rows=rows[group])
+            return _merge(changing.at(where), bodies.constant[group].at(where), bodies.constants)
 
         for i in numbers:
             batch = self.batches[i]
@@ -405,7 +420,7 @@ class NearbyPairs(ContactSolver):
         return rows, carries
 
     def _put(self, bodies: BodyTables, rows: dict[int, Array], group: int, where: Array, side: BodySide) -> Array:
-        return bodies.changing[group]._replace(rows=rows[group]).put(where, _split(side)[0]).rows
+        return bodies.changing[group]._replace(rows=rows[group]).put(where, _split(side, bodies.constants)[0]).rows
 
     def _store(self, batch: PairBatch, buffer: Array | None, k: Array, values: list[Array]) -> Array:
         """Buffer with the values of chunk k; a new one if there is none."""
@@ -443,7 +458,7 @@ class NearbyPairs(ContactSolver):
             return a, b, self._store(batch, buffer, k, values)
 
         buffers = [None] * len(self.batches) if carry.buffers is None else [b.contacts for b in carry.buffers]
-        sides, packed = self._pass(sides, statics, listed, buffers, play)
+        sides, packed = self._pass(sides, statics, listed, buffers, play, CONSTANTS)
         return sides, listed._replace(packed=packed, specs=specs)
 
     def _unpack_contacts(
@@ -469,7 +484,8 @@ class NearbyPairs(ContactSolver):
 
         buffers = [None] * len(self.batches) if carry.buffers is None else [b.solved for b in carry.buffers]
         zero = jnp.zeros_like(carry.depth), jnp.zeros_like(carry.begins)
-        sides, carries = self._pass(sides, statics, contacts, [(buffer, *zero) for buffer in buffers], play)
+        starts = [(buffer, *zero) for buffer in buffers]
+        sides, carries = self._pass(sides, statics, contacts, starts, play, self._solver_constants)
         observed = [(depth, begins) for _, depth, begins in carries]
         solved = SolvedChunk(contacts, [packed for packed, *_ in carries], specs, observed)
         return self._later_impacts(solved, sides, statics)
@@ -485,7 +501,7 @@ class NearbyPairs(ContactSolver):
         batches = [i for i, of in enumerate(points) if takes_part(of, sides[0])]
         if not batches:
             return sides, solved
-        bodies = self._bodies(sides, statics)
+        bodies = self._bodies(sides, statics, self._solver_constants)
         clocks = [_column(table, "clock") for table in bodies.changing]
 
         def idle(i: int, buffer: Array, k: Array, indices: GatherIndices, rows: dict[int, Array]) -> Array:
@@ -564,7 +580,8 @@ class NearbyPairs(ContactSolver):
             return a, b, (cache.put(indices.pair, new).rows, touch)
 
         last_touch = carry.last_touch or [jnp.zeros(0, jnp.int32)] * len(self.batches)
-        sides, carries = self._pass(sides, statics, listed, list(zip(carry.cache, last_touch, strict=True)), play)
+        starts = list(zip(carry.cache, last_touch, strict=True))
+        sides, carries = self._pass(sides, statics, listed, starts, play, self._solver_constants)
         depth, begins = carry.depth, carry.begins
         for overlap, began in solved.observed:
             depth, begins = jnp.maximum(depth, overlap), begins + began
@@ -650,10 +667,10 @@ class NearbyPairs(ContactSolver):
         return depth, begins, contacts_of(*jax.tree.map(in_order, log), count=count)
 
 
-def _split(side: BodySide) -> tuple[BodySide, BodySide]:
+def _split(side: BodySide, constants: tuple[str, ...]) -> tuple[BodySide, BodySide]:
     """What a pass changes of a side, and the rest."""
-    constants = {name: getattr(side, name) for name in CONSTANTS}
-    return side._replace(**dict.fromkeys(CONSTANTS)), BodySide(**constants)
+    rest = {name: getattr(side, name) for name in constants}
+    return side._replace(**dict.fromkeys(constants)), BodySide(**rest)
 
 
 def _column(table: PackedTable, name: str) -> int:
@@ -661,9 +678,9 @@ def _column(table: PackedTable, name: str) -> int:
     return getattr(jax.tree.unflatten(table.spec.tree, [leaf.first for leaf in table.spec.leaves]), name)
 
 
-def _merge(changing: BodySide, constant: BodySide) -> BodySide:
+def _merge(changing: BodySide, constant: BodySide, constants: tuple[str, ...]) -> BodySide:
     """A side from its two parts."""
-    return changing._replace(**{name: getattr(constant, name) for name in CONSTANTS})
+    return changing._replace(**{name: getattr(constant, name) for name in constants})
 
 
 def _empty_row(dtype: Any) -> ContactRow:

@@ -246,3 +246,12 @@ def test_a_family_of_ones_own_is_a_file(tmp_path):
 @given(st.floats(-1e6, 1e6), st.floats(0, 1e6))
 def test_a_range_keeps_its_ends(low, width):
     assert parse([low, low + width]).support == (low, low + width)
+
+
+def test_a_folder_does_not_hide_a_config_of_its_name(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for name in ("bouncing", "mine"):
+        (tmp_path / name).mkdir()
+    assert plugins.find_config("bouncing") == plugins.config_folder() / "bouncing.yaml"
+    with pytest.raises(ConfigError, match="'mine', which is a folder; name a YAML file"):
+        plugins.find_config("mine")

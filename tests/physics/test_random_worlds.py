@@ -56,7 +56,7 @@ RARELY, RARELY_OF_FEW = 0.01, 0.3
 FEW_BOUNDS: dict[str, Bounds] = {
     "discs": {RISING: None},
     "elastic discs": {},
-    "discs, mass ratios up to 1e6": {RISING: 0.7, OVERLAPPING: 0.7},
+    "discs, mass ratios up to 1e6": {RISING: None, OVERLAPPING: 0.7},
     "all shapes": {RISING: None, OVERLAPPING: None},
     "elastic shapes": {RISING: None},
     "mass ratios up to 1e6": {ABOVE: None, RISING: None, OVERLAPPING: 0.6},

@@ -192,7 +192,6 @@ def test_chain():
 
 
 @pytest.mark.full
-@pytest.mark.asked
 def test_bridge():
     space = Space(gravity=(0, -GRAVITY))
     ends = [(0, 0), (0.75, -0.25), (1.5, -0.4), (2.25, -0.25), (3, 0)]
@@ -207,7 +206,7 @@ def test_bridge():
     assert apart(video)[:, -30:].max() < 2e-3  # and so far under its weight
     low = min(end[-1, 1] for joint in range(5) for end in worlds(video, joint))
     assert video.position[-1, ball, 1] > low  # the bridge holds it
-    holds("ball on a bridge: overlap, m", deepest_overlap(space, video), 0.015, asked=5e-3)  # as it lands
+    holds("ball on a bridge: overlap, m", deepest_overlap(space, video), 1e-3)
     total(video)
 
 
