@@ -30,10 +30,10 @@ from gen2d.renderers.primitives import ImagePose
 from gen2d.renderers.relief import Relief, tilt
 
 FROM_ABOVE = 0.25  # part of the ambient light that comes from above
-SHOULDER = 12.0  # of display values above 1
+SHOULDER = 0.12  # display values beyond 1 at which the shoulder ends, half as high
 RIM = 0.25  # part of the light of the rim, seen at a grazing angle
-SKY = 0.3  # change of the light of a room from its middle to its sides
-HORIZON, DARKEST = 0.4, 0.72  # place and half width of the dark band, and what it lacks
+SKY = 0.12  # change of the light of a room from its middle to its sides
+HORIZON, DARKEST = 0.4, 0.44  # place and half width of the dark band, and what it lacks
 SHEEN = 0.7  # of metal: part of the light of the highlights' colour where a surface is vertical, towards the light
 STEEPEST = 0.98  # largest square of the tilt; beyond the rim, surfaces are as at the rim
 
@@ -70,16 +70,14 @@ def lit_color(
     nx, ny = slope * tilt_x, slope * tilt_y
     nz = jnp.sqrt(1 - jnp.minimum(nx * nx + ny * ny, STEEPEST))
     lx, ly, lz = (a[..., None, None] for a in (relief.light[..., 0], relief.light[..., 1], light.direction[..., 2]))
-    along, square = nx * lx + ny * ly, soft * soft
-    cosine = along + nz * lz
-    strength = (1 - ambient) / (lz + jnp.sqrt(lz * lz + square))
-    irradiance = strength * (cosine + jnp.sqrt(cosine * cosine + square)) + ambient * (1 - FROM_ABOVE * ny)
+    along = nx * lx + ny * ly
+    strength = (1 - ambient) / lambert(lz, soft)
+    irradiance = strength * lambert(along + nz * lz, soft) + ambient * (1 - FROM_ABOVE * ny)
     # In pixels: the length over which the surface tilts, for averages over a pixel.
     radius = jnp.maximum(relief.radius if relief.normal is None else surface.bevel * pose.scale, 0.5)[..., None, None]
     toward = along * (1 / jnp.maximum(jnp.sqrt(lx * lx + ly * ly), 1e-6))
+    across = _part_across(relief, pose, nx, ny, toward)
     mirror = None if surface.mirror is None else surface.mirror[..., None, None]
-    if mirror is not None:
-        irradiance = irradiance + mirror * (_room(toward, slope / radius) - irradiance)
     if surface.pattern is not None:
         irradiance = irradiance * (1 + _pattern(surface.pattern, pose, x, y))
     irradiance = jnp.clip(irradiance, 0.01, 2.0)  # beyond the rim, where the tilt is larger than any
@@ -88,16 +86,18 @@ def lit_color(
     half_cosine = (along + nz * (lz + 1)) * norm
     # The average over a pixel widens the lobe, whose variance is 1 / sharpness in the plane of tilts, and lowers it: in
     # two directions on a disc, across the core of a capsule, and across the bevel of a polygon.
-    width = 1 / sharpness + (slope / radius) ** 2 * ((1 + 4 * norm * norm) / 24)
+    spread = (1 + 4 * norm * norm) / 2 if relief.is_disc else 1 + (4 * norm * norm - 1) * across * across
+    width = 1 / sharpness + (slope / radius) ** 2 * (spread / 12)
     part = 1 / (sharpness * width)
     shown = shown * (part if relief.is_disc else jnp.sqrt(part))
     lobe = jnp.clip(1 - (1 - half_cosine) * (0.25 / width), 0.0, 1.0)
     lobe, grazing = lobe * lobe, 1 - nz
     shine = gloss * shown * (lobe * lobe) + RIM * (grazing * grazing * grazing)
+    shine, value = jnp.minimum(shine, 1.0), display(irradiance)
     if mirror is not None:
-        shine = shine + SHEEN * mirror * jnp.maximum(toward, 0.0) ** 2
-    shine = jnp.minimum(shine, 1.0)
-    share = display(irradiance) * (1 - shine)
+        shine = shine + SHEEN * mirror * jnp.maximum(toward, 0.0) ** 2 * (1 - shine)
+        value = value + mirror * (_room(toward, slope / radius * across) - value)
+    share = tone(value) * (1 - shine)
     if surface.stripe is None or surface.stripe_light is None or not relief.is_disc:
         return ShadedColor(color, light.highlight[..., None, None, :], share, shine)
     half = surface.stripe[..., None, None] * radius
@@ -111,6 +111,24 @@ def lit_color(
         share - jnp.abs(bright) * band,
         shine + jnp.maximum(bright, 0.0) * band,
     )
+
+
+def lambert(cosine: Array, soft: Array) -> Array:
+    """Light of a source of this softness on a surface, by the cosine of the angle between its normal and the light."""
+    part = jnp.clip((cosine + soft) * (0.5 / soft), 0.0, 1.0)
+    return soft * part * part + jnp.maximum(cosine - soft, 0.0)
+
+
+def _part_across(relief: Relief, pose: ImagePose, nx: Array, ny: Array, toward: Array) -> Array | float:
+    """Part of the change of a tilt that is one towards the light: all of it on a disc, that across the core of a capsule,
+    that across the nearest side of a polygon."""
+    if relief.is_disc:
+        return 1.0
+    if relief.normal is not None:
+        return jnp.abs(toward) / jnp.maximum(jnp.sqrt(nx * nx + ny * ny), 1e-6)
+    lx, ly = relief.light[..., 0], relief.light[..., 1]
+    part = (ly * pose.cos - lx * pose.sin) / jnp.maximum(jnp.sqrt(lx * lx + ly * ly), 1e-6)
+    return jnp.abs(part)[..., None, None]
 
 
 def _room(toward: Array, change: Array) -> Array:
@@ -131,9 +149,13 @@ def _beyond_edge(depth: Array, cos: Array, sin: Array) -> Array:
 def display(light: Array) -> Array:
     """Display values of light from 0.12 to 2, relative to those of 1: the power 1 / 2.2, with a shoulder above 1."""
     root = jnp.sqrt(light)
-    value = 0.02592 + root * (1.06405 + root * (-0.11431 + root * 0.02434))  # within 4e-4 of the power
-    over = jnp.maximum(value - 1, 0.0)
-    return jnp.minimum(value, 1.0) + over / (1 + SHOULDER * over)
+    return 0.02592 + root * (1.06405 + root * (-0.11431 + root * 0.02434))  # within 4e-4 of the power
+
+
+def tone(value: Array) -> Array:
+    """Display values with a shoulder above 1."""
+    over = jnp.clip(value - 1, 0.0, SHOULDER)
+    return jnp.minimum(value, 1.0) + over * (1 - over * (0.5 / SHOULDER))
 
 
 def _pattern(pattern: Pattern, pose: ImagePose, x: Array, y: Array) -> Array:

@@ -57,7 +57,7 @@ class Finish(NamedTuple):
 MATERIALS = {
     "rubber": Finish(0.8, 25.0, 0.95, striped=1.0),
     "wood": Finish(0.15, 12.0, 0.9, cell=0.35, stretch=8.0, contrast=1.0),
-    "metal": Finish(2.2, 100.0, 0.95, cell=0.05, stretch=20.0, contrast=0.15, mirror=0.85),
+    "metal": Finish(1.8, 60.0, 0.95, cell=0.05, stretch=20.0, contrast=0.15, mirror=0.85),
     "paper": Finish(0.0, 10.0, 0.3, cell=0.12, contrast=0.25),
 }
 

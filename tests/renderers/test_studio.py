@@ -132,21 +132,25 @@ def lit(stage, slot, body, points):
     normal = np.concatenate([flat, np.sqrt(1 - np.minimum((flat**2).sum(-1), 0.98))[..., None]], -1)
 
     def source(cosine):
-        return (cosine + np.sqrt(cosine**2 + light.softness**2)) / 2
+        soft = light.softness
+        return np.where(cosine < soft, soft * np.clip((cosine + soft) / (2 * soft), 0, 1) ** 2, cosine)
 
     direct = source(normal @ toward) / source(toward[2])
     ambient = 1 + 0.25 * normal[..., 1]
     irradiance = (1 - light.ambient) * direct + light.ambient * ambient
     mirror = 0.0 if surface.mirror is None else surface.mirror[slot]
     beside = normal[..., :2] @ toward[:2] / np.linalg.norm(toward[:2])  # the part v of the normal
-    room = 1 + 0.3 * beside - 0.72 * np.maximum(1 - ((beside + 0.4) / 0.4) ** 2, 0) ** 2
-    factor = (irradiance + mirror * (room - irradiance)) ** (1 / 2.2)
-    factor = np.where(factor > 1, 1 + (factor - 1) / (1 + 12 * np.maximum(factor - 1, 0)), factor)
+    room = 1 + 0.12 * beside - 0.44 * np.maximum(1 - ((beside + 0.4) / 0.4) ** 2, 0) ** 2
+    factor = irradiance ** (1 / 2.2)
+    factor = factor + mirror * (room - factor)
+    over = np.clip(factor - 1, 0, 0.12)
+    factor = np.minimum(factor, 1) + over - over**2 / 0.24
     half = toward + np.array([0, 0, 1])
     half = half / np.linalg.norm(half)
     lobe = np.maximum(1 - surface.sharpness[slot] / 4 * (1 - normal @ half), 0) ** 4
     shine = surface.gloss[slot] * lobe + 0.25 * (1 - normal[..., 2]) ** 3
-    shine = np.minimum(shine + mirror * 0.7 * np.maximum(beside, 0) ** 2, 1)
+    shine = np.minimum(shine, 1)
+    shine = shine + mirror * 0.7 * np.maximum(beside, 0) ** 2 * (1 - shine)
     color = np.asarray(stage.paint.color[slot], float) * factor[..., None]
     if surface.stripe is not None and surface.stripe[slot] and body.shape == CIRCLE:
         band = (np.abs(local[..., 1]) < surface.stripe[slot] * body.radius)[..., None]
