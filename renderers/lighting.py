@@ -2,21 +2,21 @@
 
 A surface with the normal n gets the light
 
-    E(n) = (1 - a) D(n) / D(z) + a (1 + 0.25 u),    D(n) = (c + sqrt(c^2 + s^2)) / 2,    c = n l
+    E(n) = (1 - a) D(n) / D(z) + a ((1 + n_z) / 2 + 0.25 u),    D(n) = ((c + s)_+^2 - (c - s)_+^2) / (4 s),    c = n l
 
-from a source in the direction l of softness s, by Lambert's law without a kink at its end, and of ambient light a, a
-part of which comes from above, where u is the upward part of n. A surface that faces the viewer gets 1, and has its own
-colour. Display values are proportional to F = E^(1/2.2), so one factor serves all channels; where it exceeds 1, it is
-1 + (F - 1) / (1 + 12 (F - 1)), so that few colours reach 255.
+from a source in the direction l of softness s, by Lambert's law with a parabola between cosines of -s and s, and of
+ambient light a from the viewer's side, a part of which comes from above, where u is the upward part of n. A surface
+that faces the viewer gets 1, and has its own colour. Display values are proportional to F = E^(1/2.2), so one factor
+serves all channels; above 1, it bends until it is constant, so that few colours reach 255.
 
-Of metal, a part m of E(n) is instead the reflection of a room,
+Of metal, a part m of F is instead the display value of a room that it reflects,
 
-    R(v) = 1 + 0.3 v - 0.72 (1 - ((v + 0.4) / 0.4)^2)^2,
+    R(v) = 1 + 0.12 v - 0.44 (1 - ((v + 0.4) / 0.4)^2)^2,
 
 where v is the part of n towards the light's azimuth: bright on the side of the light, with a dark band, the horizon,
 beyond the middle (the last term is 0 outside of it). Highlights mix in their own colour: that of J. Blinn,
-'Models of light reflection' (1977), as the fourth power of a parabola instead of a power of the cosine, and a faint one
-at the rim.
+'Models of light reflection' (1977), as the fourth power of a parabola instead of a power of the cosine, a faint one
+at the rim, and on metal one towards the light.
 """
 
 from typing import NamedTuple
@@ -30,10 +30,10 @@ from gen2d.renderers.primitives import ImagePose
 from gen2d.renderers.relief import Relief, tilt
 
 FROM_ABOVE = 0.25  # part of the ambient light that comes from above
-SHOULDER = 12.0  # of display values above 1
+SHOULDER = 0.12  # display values beyond 1 at which the shoulder ends, half as high
 RIM = 0.25  # part of the light of the rim, seen at a grazing angle
-SKY = 0.3  # change of the light of a room from its middle to its sides
-HORIZON, DARKEST = 0.4, 0.72  # place and half width of the dark band, and what it lacks
+SKY = 0.12  # change of the display value of a room from its middle to its sides
+HORIZON, DARKEST = 0.4, 0.44  # place and half width of the dark band, and what it lacks
 SHEEN = 0.7  # of metal: part of the light of the highlights' colour where a surface is vertical, towards the light
 STEEPEST = 0.98  # largest square of the tilt; beyond the rim, surfaces are as at the rim
 
@@ -70,34 +70,36 @@ def lit_color(
     nx, ny = slope * tilt_x, slope * tilt_y
     nz = jnp.sqrt(1 - jnp.minimum(nx * nx + ny * ny, STEEPEST))
     lx, ly, lz = (a[..., None, None] for a in (relief.light[..., 0], relief.light[..., 1], light.direction[..., 2]))
-    along, square = nx * lx + ny * ly, soft * soft
-    cosine = along + nz * lz
-    strength = (1 - ambient) / (lz + jnp.sqrt(lz * lz + square))
-    irradiance = strength * (cosine + jnp.sqrt(cosine * cosine + square)) + ambient * (1 - FROM_ABOVE * ny)
+    along = nx * lx + ny * ly
+    strength = (1 - ambient) / lambert(lz, soft)
+    irradiance = strength * lambert(along + nz * lz, soft) + ambient * (0.5 + 0.5 * nz - FROM_ABOVE * ny)
     # In pixels: the length over which the surface tilts, for averages over a pixel.
     radius = jnp.maximum(relief.radius if relief.normal is None else surface.bevel * pose.scale, 0.5)[..., None, None]
     toward = along * (1 / jnp.maximum(jnp.sqrt(lx * lx + ly * ly), 1e-6))
+    across = _part_across(relief, pose, nx, ny, toward)
     mirror = None if surface.mirror is None else surface.mirror[..., None, None]
-    if mirror is not None:
-        irradiance = irradiance + mirror * (_room(toward, slope / radius) - irradiance)
-    if surface.pattern is not None:
-        irradiance = irradiance * (1 + _pattern(surface.pattern, pose, x, y))
-    irradiance = jnp.clip(irradiance, 0.01, 2.0)  # beyond the rim, where the tilt is larger than any
+    grain = None if surface.pattern is None else 1 + _pattern(surface.pattern, pose, x, y)
+    if grain is not None:
+        irradiance = irradiance * grain
+    irradiance = jnp.maximum(irradiance, 0.01)  # beyond the rim, where the tilt is larger than any
     # The half vector of the light and the viewer.
     norm = 1 / jnp.sqrt(2 + 2 * lz)
     half_cosine = (along + nz * (lz + 1)) * norm
     # The average over a pixel widens the lobe, whose variance is 1 / sharpness in the plane of tilts, and lowers it: in
     # two directions on a disc, across the core of a capsule, and across the bevel of a polygon.
-    width = 1 / sharpness + (slope / radius) ** 2 * ((1 + 4 * norm * norm) / 24)
+    spread = (1 + 4 * norm * norm) / 2 if relief.is_disc else 1 + (4 * norm * norm - 1) * across * across
+    width = 1 / sharpness + (slope / radius) ** 2 * (spread / 12)
     part = 1 / (sharpness * width)
     shown = shown * (part if relief.is_disc else jnp.sqrt(part))
-    lobe = jnp.clip(1 - (1 - half_cosine) * (0.25 / width), 0.0, 1.0)
+    lobe = jnp.maximum(1 - (1 - half_cosine) * (0.25 / width), 0.0)
     lobe, grazing = lobe * lobe, 1 - nz
     shine = gloss * shown * (lobe * lobe) + RIM * (grazing * grazing * grazing)
+    shine, value = jnp.minimum(shine, 1.0), display(irradiance)
     if mirror is not None:
-        shine = shine + SHEEN * mirror * jnp.maximum(toward, 0.0) ** 2
-    shine = jnp.minimum(shine, 1.0)
-    share = display(irradiance) * (1 - shine)
+        shine = shine + SHEEN * mirror * jnp.maximum(toward, 0.0) ** 2 * (1 - shine)
+        room = _room(toward, slope / radius * across) * (1.0 if grain is None else display(grain))
+        value = value + mirror * (room - value)
+    share = tone(value) * (1 - shine)
     if surface.stripe is None or surface.stripe_light is None or not relief.is_disc:
         return ShadedColor(color, light.highlight[..., None, None, :], share, shine)
     half = surface.stripe[..., None, None] * radius
@@ -113,9 +115,29 @@ def lit_color(
     )
 
 
+def lambert(cosine: Array, soft: Array) -> Array:
+    """Light of a source of this softness on a surface, by the cosine of the angle between its normal and the light."""
+    lit, whole = jnp.maximum(cosine + soft, 0.0), jnp.maximum(cosine - soft, 0.0)
+    return (lit * lit - whole * whole) * (0.25 / soft)
+
+
+def _part_across(relief: Relief, pose: ImagePose, nx: Array, ny: Array, toward: Array) -> Array | float:
+    """Largest change of the tilt towards the light over that of the tilt: 1 on a disc, less where surfaces tilt in one
+    direction only, which is across the core of a capsule or the nearest side of a polygon."""
+    if relief.is_disc:
+        return 1.0
+    if relief.normal is not None:
+        return jnp.abs(toward) / jnp.maximum(jnp.sqrt(nx * nx + ny * ny), 1e-6)
+    lx, ly = relief.light[..., 0], relief.light[..., 1]
+    part = (ly * pose.cos - lx * pose.sin) / jnp.maximum(jnp.sqrt(lx * lx + ly * ly), 1e-6)
+    return jnp.abs(part)[..., None, None]
+
+
 def _room(toward: Array, change: Array) -> Array:
-    """Light of a room as reflected where the normal has the part `toward` towards the light; it changes by `change` in
-    a pixel, over which the dark band is averaged: widened and lowered."""
+    """Display value of a room as reflected where the normal has the part `toward` towards the light.
+
+    `toward` changes by `change` in a pixel, over which the dark band is averaged: widened and lowered.
+    """
     width = jnp.sqrt(HORIZON * HORIZON + 7 / 12 * change * change)
     band = jnp.maximum(1 - ((toward + HORIZON) / width) ** 2, 0.0)
     return 1 + SKY * toward - DARKEST * HORIZON / width * (band * band)
@@ -131,9 +153,14 @@ def _beyond_edge(depth: Array, cos: Array, sin: Array) -> Array:
 def display(light: Array) -> Array:
     """Display values of light from 0.12 to 2, relative to those of 1: the power 1 / 2.2, with a shoulder above 1."""
     root = jnp.sqrt(light)
-    value = 0.02592 + root * (1.06405 + root * (-0.11431 + root * 0.02434))  # within 4e-4 of the power
+    return 0.02592 + root * (1.06405 + root * (-0.11431 + root * 0.02434))  # within 4e-4 of the power
+
+
+def tone(value: Array) -> Array:
+    """Display values with a shoulder above 1."""
+    value = jnp.minimum(value, 1 + SHOULDER)
     over = jnp.maximum(value - 1, 0.0)
-    return jnp.minimum(value, 1.0) + over / (1 + SHOULDER * over)
+    return value - over * over * (0.5 / SHOULDER)
 
 
 def _pattern(pattern: Pattern, pose: ImagePose, x: Array, y: Array) -> Array:

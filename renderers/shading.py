@@ -13,6 +13,7 @@ from gen2d.renderers.noise import textured
 from gen2d.renderers.paint import Light, Paint, Surface, Texture
 from gen2d.renderers.primitives import ImagePose, ObjectParts, PixelWindow, Primitive
 from gen2d.renderers.relief import Relief
+from gen2d.xla import materialize
 
 
 class Fills(NamedTuple):
@@ -83,6 +84,7 @@ def covered_color(
     whole = _coverage(edges.whole, largest)
     color: Array | ShadedColor = fills.color[..., None, None, :]
     if edges.pose is not None:
+        whole = whole if edges.relief is None else materialize(whole)
         color = _varied_color(color, fills, edges.pose, edges.relief, window, whole)
     if edges.mark is None and edges.inner is None:
         return whole, color

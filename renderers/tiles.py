@@ -30,6 +30,7 @@ from gen2d.renderers.primitives import Instants, PixelWindow
 from gen2d.renderers.sensor import record
 from gen2d.renderers.shading import EdgeTerms, covered_color, fills_of
 from gen2d.renderers.shadows import ShadowTerms, shadow_cover, shadow_terms
+from gen2d.xla import runtime_one
 
 
 def draw_tiles(scenes: RenderScene, plan: FramePlan) -> tuple[Array | None, Array | None]:
@@ -51,7 +52,8 @@ def draw_tiles(scenes: RenderScene, plan: FramePlan) -> tuple[Array | None, Arra
         canvas = renderer.paint_separately(canvas) if plan.frames else canvas
         return renderer.paint_owners(canvas) if plan.owners else canvas
 
-    canvas = jax.lax.fori_loop(0, videos, video, LayerCanvas(image, owner))
+    with runtime_one((scenes.instants.view.scale[0, 0] > 0).astype(jnp.float32)):
+        canvas = jax.lax.fori_loop(0, videos, video, LayerCanvas(image, owner))
     canvas = jax.tree.map(lambda a: a.reshape(videos, frames, *a.shape[1:]), canvas)
     return record(scenes.sensor, scenes.seed, canvas.image, canvas.owner, plan.height, plan.width)
 

@@ -32,8 +32,8 @@ from gen2d.plugin import (
     sampled_options,
 )
 
-LIFT = 0.3  # height of the bodies above the background, over the size of a typical one
-BLUR = 0.2  # half width of the soft edges of shadows, over the same
+LIFT = 0.4  # height of the bodies above the background, over the size of a typical one
+BLUR = 0.35  # half width of the soft edges of shadows, over the same
 BEVEL = 0.3  # width of the bevel of polygons, over the same
 FLATTER = 0.6  # slope of bevels and lines, over that of other domes
 WHITE, DARK = (246.0, 242.0, 233.0), (40.0, 28.0, 20.0)  # colours of highlights and stripes, and of shadows
@@ -55,9 +55,9 @@ class Finish(NamedTuple):
 
 
 MATERIALS = {
-    "rubber": Finish(0.8, 25.0, 0.95, striped=1.0),
+    "rubber": Finish(1.2, 40.0, 0.95, striped=1.0),
     "wood": Finish(0.15, 12.0, 0.9, cell=0.35, stretch=8.0, contrast=1.0),
-    "metal": Finish(2.2, 100.0, 0.95, cell=0.05, stretch=20.0, contrast=0.15, mirror=0.85),
+    "metal": Finish(1.5, 60.0, 0.95, cell=0.05, stretch=20.0, contrast=0.15, mirror=0.85),
     "paper": Finish(0.0, 10.0, 0.3, cell=0.12, contrast=0.25),
 }
 
@@ -79,11 +79,11 @@ class Options(PlainOptions):
     )  # fmt: skip
     stripe: float = option(0.22, float, "1", "half width of the stripe of rubber discs, over the radius", low=0, high=1)
     azimuth: Distribution = option(
-        2.1, float, "rad", "direction of the light, counter-clockwise from the right",
+        2.2, float, "rad", "direction of the light, counter-clockwise from the right",
         draw=True, low=-10, high=10,
     )  # fmt: skip
     elevation: Distribution = option(
-        0.9, float, "rad", "elevation of the light above the plane of motion",
+        0.75, float, "rad", "elevation of the light above the plane of motion",
         draw=True, low=0.2, high=1.57,
     )  # fmt: skip
     softness: Distribution = option(

@@ -132,21 +132,25 @@ def lit(stage, slot, body, points):
     normal = np.concatenate([flat, np.sqrt(1 - np.minimum((flat**2).sum(-1), 0.98))[..., None]], -1)
 
     def source(cosine):
-        return (cosine + np.sqrt(cosine**2 + light.softness**2)) / 2
+        soft = light.softness
+        return np.where(cosine < soft, soft * np.clip((cosine + soft) / (2 * soft), 0, 1) ** 2, cosine)
 
     direct = source(normal @ toward) / source(toward[2])
-    ambient = 1 + 0.25 * normal[..., 1]
+    ambient = (1 + normal[..., 2]) / 2 + 0.25 * normal[..., 1]
     irradiance = (1 - light.ambient) * direct + light.ambient * ambient
     mirror = 0.0 if surface.mirror is None else surface.mirror[slot]
     beside = normal[..., :2] @ toward[:2] / np.linalg.norm(toward[:2])  # the part v of the normal
-    room = 1 + 0.3 * beside - 0.72 * np.maximum(1 - ((beside + 0.4) / 0.4) ** 2, 0) ** 2
-    factor = (irradiance + mirror * (room - irradiance)) ** (1 / 2.2)
-    factor = np.where(factor > 1, 1 + (factor - 1) / (1 + 12 * np.maximum(factor - 1, 0)), factor)
+    room = 1 + 0.12 * beside - 0.44 * np.maximum(1 - ((beside + 0.4) / 0.4) ** 2, 0) ** 2
+    factor = irradiance ** (1 / 2.2)
+    factor = factor + mirror * (room - factor)
+    over = np.clip(factor - 1, 0, 0.12)
+    factor = np.minimum(factor, 1) + over - over**2 / 0.24
     half = toward + np.array([0, 0, 1])
     half = half / np.linalg.norm(half)
     lobe = np.maximum(1 - surface.sharpness[slot] / 4 * (1 - normal @ half), 0) ** 4
     shine = surface.gloss[slot] * lobe + 0.25 * (1 - normal[..., 2]) ** 3
-    shine = np.minimum(shine + mirror * 0.7 * np.maximum(beside, 0) ** 2, 1)
+    shine = np.minimum(shine, 1)
+    shine = shine + mirror * 0.7 * np.maximum(beside, 0) ** 2 * (1 - shine)
     color = np.asarray(stage.paint.color[slot], float) * factor[..., None]
     if surface.stripe is not None and surface.stripe[slot] and body.shape == CIRCLE:
         band = (np.abs(local[..., 1]) < surface.stripe[slot] * body.radius)[..., None]
@@ -201,8 +205,7 @@ CASES = {
     "metal, 88 px": ((("material", "metal"),), 88, 0.0),
     "metal, 128 px, turned": ((("material", "metal"), ("palette", "dusk"), ("azimuth", 0.5)), 128, 0.25),
 }
-METAL = [case for case in CASES if "metal" in case]
-TIERED = [pytest.param(case, marks=pytest.mark.full if i > 1 else ()) for i, case in enumerate(CASES)]
+TIERED = [pytest.param(case, marks=pytest.mark.full if i not in (1, 4) else ()) for i, case in enumerate(CASES)]
 
 
 def errors_of(case):
@@ -212,23 +215,12 @@ def errors_of(case):
     return np.abs(image - reference(scene, plan, stage))
 
 
-@pytest.mark.parametrize("case", [case for case in TIERED if case.values[0] not in METAL])
+@pytest.mark.parametrize("case", TIERED)
 def test_lit_frames_are_those_of_a_supersampled_reference(case):
     errors = errors_of(case)
-    holds("studio: mean error", errors.mean(), 0.7)
+    holds("studio: mean error", errors.mean(), 0.6)
     holds("studio: error of 99.9 % of all values", np.quantile(errors, 0.999), 6)
-    holds("studio: largest error", errors.max(), 40)
-
-
-@pytest.mark.asked
-@pytest.mark.full
-@pytest.mark.parametrize("case", METAL)
-def test_frames_of_metal_are_those_of_a_supersampled_reference(case):
-    """Metal has the largest contrasts, at corners of bevels above all."""
-    errors = errors_of(case)
-    holds("metal: mean error", errors.mean(), 0.7)
-    holds("metal: largest error", errors.max(), 90)
-    holds("metal: error of 99.9 % of all values", np.quantile(errors, 0.999), 9, asked=6)
+    holds("studio: largest error", errors.max(), 60)
 
 
 @pytest.mark.parametrize("case", TIERED)
@@ -284,7 +276,7 @@ def test_shadows_own_no_pixel_and_fall_away_from_the_light():
 def test_defaults_are_those_of_the_page():
     options = load_config({"look": "studio"}).look.options
     drawn = [getattr(options, name).support[0] for name in ("azimuth", "elevation", "softness", "ambient")]
-    assert drawn == [2.1, 0.9, 0.3, 0.3]
+    assert drawn == [2.2, 0.75, 0.3, 0.3]
     assert [options.stripe, options.gloss.support[0], options.shadow.support[0]] == [0.22, 0.45, 0.4]
     assert options.material == ("rubber",)
 
@@ -292,9 +284,9 @@ def test_defaults_are_those_of_the_page():
 def test_materials_are_those_of_the_page():
     found = {name: (m.slope, m.gloss, m.sharpness) for name, m in studio.MATERIALS.items()}
     assert found == {
-        "rubber": (0.95, 0.8, 25),
+        "rubber": (0.95, 1.2, 40),
         "wood": (0.9, 0.15, 12),
-        "metal": (0.95, 2.2, 100),
+        "metal": (0.95, 1.5, 60),
         "paper": (0.3, 0, 10),
     }
     assert (studio.MATERIALS["metal"].mirror, studio.FLATTER) == (0.85, 0.6)
