@@ -16,7 +16,6 @@ from gen2d.config.contracts import Bodies
 from gen2d.config.distributions import Distribution
 from gen2d.config.sections import PhysicsOptions
 from gen2d.physics.simulate import substeps
-from gen2d.physics.support import LARGEST_RATIO
 
 SAFE_SINKING = 0.01  # over the least size of the lighter body: less than a pixel in most frames
 SAFE_DISPLACEMENT = 0.5  # in a step, over the least radius
@@ -77,14 +76,12 @@ def _of_masses(
         light, heavy = kinds[lower], kinds[upper]
         ratio = _largest_ratio(options, (bodies[lower], light), (bodies[upper], heavy))
         depth = SAFE_SINKING * 2 * light.radius
-        safe = LARGEST_RATIO if physics.shock_propagation else safe_ratio(depth, gravity, step)
+        safe = safe_ratio(depth, gravity, step)
         names = dict.fromkeys([*_names(bodies[upper]), *_names(bodies[lower])])
         bound = f"mass ratios up to {safe:.4g} are safe" if safe >= 1 else "not even equal masses are safe"
-        if not physics.shock_propagation:
-            bound += (
-                f", as the heavier sinks in by {100 * SAFE_SINKING:g} % of the other's size; with "
-                f"physics.shock_propagation=true, those up to {LARGEST_RATIO:g} are"
-            )
+        bound += f", as the heavier sinks in by {100 * SAFE_SINKING:g} % of the other's size"
+        if safe > 0:
+            bound += f"; physics.max_step={_below(step * math.sqrt(safe / ratio)):g} or less is short enough"
         yield (
             ratio / safe if safe > 0 else math.inf,
             f"{' and '.join(f'scene.{name}' for name in names)} allow {upper} of {heavy.mass[1]:.3g} kg on {lower} "
@@ -106,9 +103,15 @@ def _of_speeds(
             speed * step / safe if safe > 0 else math.inf,
             f"{' and '.join(causes)} allow {name} of {speed:.3g} m/s, which move by {speed * step:.3g} m in a step of "
             f"{step:.3g} s: up to {safe:.3g} m, half of the least radius of the {smallest}, is safe, as a body that is "
-            f"hit from several sides in a step may overlap others by as much; physics.max_step={safe / speed:.2g} or "
-            "less is short enough",
+            "hit from several sides in a step may overlap others by as much; "
+            f"physics.max_step={_below(safe / speed):g} or less is short enough",
         )
+
+
+def _below(value: float) -> float:
+    """Largest number of two digits that is not above a positive one."""
+    unit = 10.0 ** (math.floor(math.log10(value)) - 1)
+    return math.floor(value / unit) * unit
 
 
 def _parts(value: Any) -> tuple[Distribution, ...]:

@@ -31,7 +31,6 @@ from gen2d.core.progress import waiting
 from gen2d.physics import inertia
 from gen2d.physics.params import SolverParams, solver_params
 from gen2d.physics.simulate import Forces, SaveAt, substeps
-from gen2d.physics.support import LARGEST_RATIO
 from gen2d.records.axes import to_device
 from gen2d.records.layout import JointSpec, Layout, SlotGroup
 from gen2d.records.scene import Joints, Objects, Scene, State
@@ -52,7 +51,7 @@ from gen2d.space.video import Video
 
 _log = logging.getLogger(__name__)
 TORN = 0.1  # of the longest arm or radius of gyration: larger gaps of hinges are warned of; usual ones are under 1e-3
-SAFE_RATIO = 10  # of two masses, without shock propagation: at 240 steps/s the heavier one first sinks in by 2 mm
+SAFE_RATIO = 10  # of two masses: at 240 steps/s the heavier one first sinks in by 2 mm
 
 
 class Space:
@@ -520,8 +519,8 @@ class Space:
         """Simulate the space from its initial state.
 
         The first call compiles a program, which takes seconds. Another space with as many bodies of each shape and the
-        same joints reuses it. Logs a warning if masses differ more than contacts at rest bear: by a factor of 10, or of
-        3000 with `shock_propagation`, and if hinges come apart.
+        same joints reuses it. Logs a warning if masses differ more than contacts at rest bear: by a factor of 10,
+        and if hinges come apart.
 
         Parameters
         ----------
@@ -593,13 +592,11 @@ class Space:
     def _warn_of_masses(self) -> None:
         """Log a warning if the masses of dynamic bodies differ more than contacts at rest can bear."""
         masses = [body.mass for body in self.bodies if body.kind == DYNAMIC and math.isfinite(body.mass)]
-        safe = LARGEST_RATIO if self.physics.shock_propagation else SAFE_RATIO
-        if masses and max(masses) > safe * min(masses):
+        if masses and max(masses) > SAFE_RATIO * min(masses):
             _log.warning(
                 "Space: masses from %.3g to %.3g kg differ by a factor of %.3g: a body that rests on one of less than "
-                "1/%g of its mass sinks in%s",
-                *(min(masses), max(masses), max(masses) / min(masses), safe),
-                "" if self.physics.shock_propagation else f"; shock_propagation=True holds up to {LARGEST_RATIO:g}",
+                "1/%g of its mass sinks in; half the max_step bears four times the factor",
+                *(min(masses), max(masses), max(masses) / min(masses), SAFE_RATIO),
             )
 
     def _warn_of_gaps(self, position: np.ndarray, angle: np.ndarray, step: float) -> None:

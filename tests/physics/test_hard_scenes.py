@@ -73,6 +73,28 @@ def heavy_on_light(ratio: float, bound: float, asked: float | None = None, **phy
     holds(f"heavy box on a light one, {ratio}:1, {physics}, sideways, m", sideways, 1e-3 if ratio < 1000 else 0.01)
 
 
+@pytest.mark.asked
+@pytest.mark.full
+@pytest.mark.parametrize(
+    ("scene", "shock_propagation", "bound"),
+    [("off centre", False, 2e-3), ("plank", False, 6e-3), ("off centre", True, 8e-3), ("plank", True, 0.5)],
+)
+def test_heavy_boxes_that_are_off_centre_stand_on_light_ones(scene, shock_propagation, bound):
+    """A box of ten times the mass .3 m beside the centre of another, and a plank over two boxes."""
+    space = Space(gravity=(0, -GRAVITY), shock_propagation=shock_propagation)
+    space.add_segment((-10, 0), (10, 0))
+    if scene == "off centre":
+        space.add_box((0, 0.5), 1, 1)
+        heavy = space.add_box((0.3, 1.5), 1, 1, density=10)
+    else:
+        for x in (-1, 1):
+            space.add_box((x, 0.25), 0.5, 0.5)
+        heavy = space.add_box((0, 0.75), 3, 0.5, density=10)
+    heights = space.simulate(6, fps=240, energy=False, contacts=0).position[:, heavy, 1]
+    name = f"{scene}{', shock propagation' if shock_propagation else ''}"
+    holds(f"heavy box on light ones, {name}, sinking in 6 s, m", heights[0] - heights, bound, 5e-4)
+
+
 def test_heavy_discs_stand_on_light_ones_with_shock_propagation():
     """Light discs between walls, each under a heavy one."""
     space = Space(gravity=(0, -GRAVITY), shock_propagation=True)
