@@ -74,7 +74,7 @@ MANY_BOUNDS: dict[str, Bounds] = {
     "smooth elastic boxes and fast small discs": {OVERLAPPING: None},
     "fast, mass ratios up to 1e6, e = 0.0": {ABOVE: None, RISING: 0.02, SLIPPING: 1e-5, OVERLAPPING: 0.9},
     "fast, mass ratios up to 1e6, e = 0.5": {ABOVE: None, RISING: 0.02, OVERLAPPING: 0.48},
-    "fast, mass ratios up to 1e6, e = 1.0": {ABOVE: None, RISING: 0.02, OVERLAPPING: 0.24},
+    "fast, mass ratios up to 1e6, e = 1.0": {ABOVE: None, RISING: 0.02, SLIPPING: 1e-5, OVERLAPPING: 0.24},
     "joints, with gravity": {ABOVE: 0.05, RISING: 0.9},
     "joints, without": {ABOVE: 0.15, RISING: 0.6},
 }
