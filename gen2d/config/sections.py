@@ -54,9 +54,6 @@ class PhysicsOptions:
         choices=("pairs", "time"),
         later=True,
     )
-    shock_propagation: bool = option(
-        False, bool, "", "bodies between heavier ones and static ones do not give way; slower", later=True
-    )
 
     @property
     def x64(self) -> bool:

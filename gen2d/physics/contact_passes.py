@@ -4,8 +4,6 @@ A batch holds any number of pairs: all pairs of a round (all_pairs.py) or a chun
 """
 
 import functools
-from collections.abc import Sequence
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -43,120 +41,76 @@ from gen2d.physics.normal_impulse import (
 )
 from gen2d.physics.params import SolverParams
 from gen2d.physics.position_correction import correct_positions
-from gen2d.physics.support import SupportedPair, add_support, supported_pair
+from gen2d.physics.support import SupportedContacts, SupportedPair, add_support, supported_pair
 from gen2d.records.axes import Array
 from gen2d.xla import materialize
 
 
-class _SeenPair(NamedTuple):
-    """The contacts of a pair as its impulses see them: with what bears the lighter body, where they rest."""
-
-    supported: SupportedPair | None
-    rests: Array | None  # None: nothing bears them
-    contacts: list[ActiveContact]
-    speeds: list[Array]  # m/s
-    targets: list[NormalTarget]
-    taken: Array | float  # 1/kg, from the coupling of two points
+def _normal_speeds(contacts: list[ActiveContact], motions: MotionPair) -> list[Array]:
+    return [relative_speed(contact.frame, contact.normal, *motions)[0] for contact in contacts]
 
 
-def _rests(targets: Sequence[NormalTarget]) -> Array:
-    """Whether no point of a contact bounces."""
-    return ~functools.reduce(jnp.logical_or, [target.bounces for target in targets])
+def _supported_contacts(
+    constraint: ContactConstraint, pair: SolvedPair, target_of: TargetOf, a: BodySide, b: BodySide
+) -> tuple[SupportedContacts, list[Array], list[NormalTarget]]:
+    """Contacts with what supports leave of their bodies, their normal speeds, m/s, and targets.
 
-
-def _seen_pair(
-    constraint: ContactConstraint,
-    pair: SolvedPair,
-    target_of: TargetOf,
-    speeds: list[Array],
-    a: BodySide,
-    b: BodySide,
-) -> _SeenPair:
+    An impact does not see what bears a body.
+    """
     assert b.motion is not None, "only static bodies lack a motion"
     contacts, motions = pair.contacts, (a.motion, b.motion)
+    free = _normal_speeds(contacts, motions)
     supported = supported_pair(constraint, contacts[0].normal, (a.support, b.support))
     if supported is None:
-        targets = [target_of(*of) for of in zip(contacts, speeds, pair.impulses, strict=True)]
-        return _SeenPair(None, None, contacts, speeds, targets, 0.0)
-    borne = [
-        jnp.where(contact.tau < 0, supported.speed(contact, speed, motions), speed)
-        for contact, speed in zip(contacts, speeds, strict=True)
-    ]
-    targets = [target_of(*of) for of in zip(contacts, borne, pair.impulses, strict=True)]
-    rests = _rests(targets)
-    speeds = [jnp.where(rests, x, y) for x, y in zip(borne, speeds, strict=True)]
-    taken = supported.coupling(contacts[0], contacts[1], rests) if len(contacts) == 2 else 0.0
-    contacts = [contact._replace(frame=supported.frame(contact, rests)) for contact in contacts]
-    return _SeenPair(supported, rests, contacts, speeds, targets, taken)
+        targets = [target_of(*of) for of in zip(contacts, free, pair.impulses, strict=True)]
+        return SupportedContacts(None, contacts, 0.0), free, targets
+    borne = _normal_speeds(contacts, supported.left(motions))
+    speeds = [jnp.where(c.tau < 0, x, y) for c, x, y in zip(contacts, borne, free, strict=True)]
+    targets = [target_of(*of) for of in zip(contacts, speeds, pair.impulses, strict=True)]
+    rests = ~functools.reduce(jnp.logical_or, [target.bounces for target in targets])
+    speeds = [jnp.where(rests, x, y) for x, y in zip(borne, free, strict=True)]
+    return supported.where(rests).contacts(contacts), speeds, targets
 
 
 def _with_pushes(
-    seen: _SeenPair, pair: SolvedPair, normals: list[Array], a: BodySide, b: BodySide
+    supported: SupportedPair | None, pair: SolvedPair, normals: list[Array], a: BodySide, b: BodySide
 ) -> tuple[BodySide, BodySide]:
     """Both sides with the push of these normal impulses, so that what bears the lighter body does not see an impact."""
-    assert seen.supported is not None, "the pair is supported"
-    assert seen.rests is not None, "the pair is supported"
+    if supported is None:
+        return a, b
     changes = [jnp.abs(normal - old.normal) for normal, old in zip(normals, pair.impulses, strict=True)]
-    of_a, of_b = seen.supported.pushes(functools.reduce(jnp.add, changes), seen.rests)
+    of_a, of_b = supported.pushes(functools.reduce(jnp.add, changes))
     return a._replace(push=jnp.maximum(a.push, of_a)), b._replace(push=jnp.maximum(b.push, of_b))
-
-
-def _press_again(
-    constraint: ContactConstraint,
-    contacts: list[ActiveContact],
-    impulses: list[Impulse],
-    targets: list[NormalTarget],
-    motions: tuple[Motion | None, Motion],
-) -> tuple[tuple[Motion | None, Motion], list[Impulse]]:
-    """Motions and impulses after another normal solve, as friction has turned the body between its two points.
-
-    Friction stays within Coulomb's bound.
-    """
-    rests = _rests(targets)
-    speeds = [relative_speed(contact.frame, contact.normal, *motions)[0] for contact in contacts]
-    normals = materialize(solve_normals(constraint, contacts, speeds, impulses, targets))
-    new = []
-    for contact, old, normal in zip(contacts, impulses, normals, strict=True):
-        bound = constraint.friction * normal
-        impulse = Impulse(normal, jnp.clip(old.tangent, -bound, bound))
-        new.append(Impulse(*(jnp.where(rests, x, y) for x, y in zip(impulse, old, strict=True))))
-        motions = apply_impulse(constraint, contact, impulse_change(new[-1], old), *motions)
-    return motions, new
 
 
 def _apply_pass(
     constraint: ContactConstraint, pair: SolvedPair, target_of: TargetOf, a: BodySide, b: BodySide
-) -> tuple[BodySide, BodySide, SolvedPair]:
-    """Both sides and the pair after normal impulses, friction and rolling resistance."""
+) -> tuple[BodySide, BodySide, SolvedPair, SupportedContacts]:
+    """Both sides and the pair after impulses of contact and friction, and the contacts as these saw them."""
     assert b.motion is not None, "only static bodies lack a motion"
     before, roll, impulses, jointed = (a.motion, b.motion), pair.roll, [], b.joint_motion is not None
-    speeds, slips = zip(*(relative_speed(c.frame, c.normal, *before) for c in pair.contacts), strict=True)
-    seen = _seen_pair(constraint, pair, target_of, list(speeds), a, b)
-    targets = seen.targets
-    normals = materialize(solve_normals(constraint, seen.contacts, seen.speeds, pair.impulses, targets, seen.taken))
-    if seen.supported is not None:
-        a, b = _with_pushes(seen, pair, normals, a, b)
+    seen, speeds, targets = _supported_contacts(constraint, pair, target_of, a, b)
+    normals = materialize(solve_normals(constraint, seen.contacts, speeds, pair.impulses, targets, seen.taken))
+    a, b = _with_pushes(seen.pair, pair, normals, a, b)
     if constraint.frame is not None and roll is None and not jointed:
         # The normal impulse between two discs adds no slip, so both impulses follow from the same velocities.
-        (contact,), (old,), (normal,), (target,) = pair.contacts, pair.impulses, normals, targets
-        (speed,), (slip,) = speeds, slips
+        (contact,), (old,), (normal,), (target,) = seen.contacts, pair.impulses, normals, targets
+        speed, free = relative_speed(contact.frame, contact.normal, *before)
+        slip = free if seen.pair is None else relative_speed(contact.frame, contact.normal, *seen.left(before))[1]
         tangent = materialize(friction_impulse(constraint, contact, normal, slip, old, target.apart))
         impulses.append(Impulse(normal, tangent))
         change = impulse_change(impulses[0], old)
         motions = apply_impulse(constraint, contact, change, *before)
-        work = add_disc_dissipation(b.work, contact.frame, change, speed, slip)
+        work = add_disc_dissipation(b.work, contact.frame, change, speed, free)
     else:
         motions = before
         for contact, old, normal in zip(pair.contacts, pair.impulses, normals, strict=True):
             motions = apply_impulse(constraint, contact, (normal - old.normal, None), *motions)
-        for contact, old, normal, target in zip(pair.contacts, pair.impulses, normals, targets, strict=True):
-            _, slip = relative_speed(contact.frame, contact.normal, *motions)
+        for contact, old, normal, target in zip(seen.contacts, pair.impulses, normals, targets, strict=True):
+            _, slip = relative_speed(contact.frame, contact.normal, *seen.left(motions))
             tangent = materialize(friction_impulse(constraint, contact, normal, slip, old, target.apart))
             impulses.append(Impulse(normal, tangent))
             motions = apply_impulse(constraint, contact, (None, tangent - old.tangent), *motions)
-        if constraint.static and b.support is not None and len(impulses) == 2:
-            motions, impulses = _press_again(constraint, pair.contacts, impulses, targets, motions)
-            normals = [impulse.normal for impulse in impulses]
         if pair.roll is not None:
             roll = materialize(rolling_impulse(constraint, functools.reduce(jnp.add, normals), *motions, pair.roll))
             motions = apply_angular_impulse(constraint, roll - pair.roll, *motions)
@@ -166,7 +120,8 @@ def _apply_pass(
         work = add_dissipation(b.work, constraint, pair.contacts, changes, twist, *free)
         a, b = (with_motions(*of) for of in zip((a, b), motions, free[1], strict=True))
     solved = SolvedPair(pair.contacts, impulses, roll)
-    return a._replace(motion=motions[0]), b._replace(motion=motions[1], work=work), solved
+    a, b = a._replace(motion=motions[0]), b._replace(motion=motions[1], work=work)
+    return a, b, solved, seen
 
 
 def _free_motions(
@@ -215,8 +170,8 @@ def warm_start(
         work = add_dissipation(b.work, constraint, moved, olds, roll, before, motions)
     motion_b = materialize(motions[1]) if constraint.static else motions[1]
     a, b = a._replace(motion=motions[0]), b._replace(motion=motion_b, work=work)
-    if constraint.a is None and b.support is not None:
-        b = b._replace(support=add_support(b.support, constraint, points, olds))
+    if constraint.a is None and a.motion is None and b.support is not None:
+        b = b._replace(support=add_support(b.support, points, olds))
     if takes_part(points, b):
         a, b = with_first(a, b, *impact_times(points, a, b, setup, h))
     return a, b, points
@@ -273,10 +228,12 @@ def solve(
         return step_target(constraint, contact, speed, old, params.step)
 
     pair = SolvedPair(contacts, warm_start_impulses(constraint, points, memory.impulses), memory.roll)
-    new_a, new_b, solved = _apply_pass(constraint, pair, target_of, a, b)
+    new_a, new_b, solved, seen = _apply_pass(constraint, pair, target_of, a, b)
     bounces = functools.reduce(jnp.logical_or, [tau >= 0 for tau in taus])
     new_a, new_b = _after_impulses(constraint, (a, b), (new_a, new_b), bounces, time)
-    new_a, new_b = correct_positions(constraint, contacts, points[0].acceleration, new_a, new_b, setup, params)
+    assert new_b.motion is not None, "only static bodies lack a motion"
+    motions = seen.means((new_a.motion, new_b.motion))
+    new_a, new_b = correct_positions(constraint, contacts, motions, points[0].acceleration, new_a, new_b, setup, params)
     if constraint.static:
         new_b = materialize(new_b._replace(work=None))._replace(work=new_b.work)
     return new_a, new_b, solved
@@ -300,7 +257,7 @@ def solve_impact(
     def target_of(contact: ActiveContact, speed: Array, old: Impulse) -> NormalTarget:
         return impact_target(constraint, contact, speed, old, happens)
 
-    new_a, new_b, new = _apply_pass(constraint, solved._replace(contacts=contacts), target_of, a, b)
+    new_a, new_b, new, _ = _apply_pass(constraint, solved._replace(contacts=contacts), target_of, a, b)
     new_a, new_b = _after_impulses(constraint, (a, b), (new_a, new_b), happens, time)
     return jax.tree.map(lambda x, y: jnp.where(happens, x, y), (new_a, new_b, new), (a, b, solved))
 
@@ -384,7 +341,7 @@ def relax(
         bounced.append(bounces_again(contact, speed, threshold))
         return relaxed_target(constraint, contact, speed, old, threshold)
 
-    new_a, new_b, last = _apply_pass(constraint, solved._replace(contacts=contacts), target_of, a, b)
+    new_a, new_b, last, _ = _apply_pass(constraint, solved._replace(contacts=contacts), target_of, a, b)
     of = zip(last.contacts, bounced, last.impulses, memory.impulses, strict=True)
     impulses = materialize(
         [_next_impulse(constraint, c, (c.tau >= 0) | b, new, old, setup, params.step) for c, b, new, old in of]

@@ -30,7 +30,7 @@ class BodySide(NamedTuple):
     schur: Array | None = None  # [6, N, ...] what rigid joints take from the inverse mass (jointed.py)
     joint_motion: Motion | None = None  # m/s, rad/s: what they take from the motion in a pass
     joint_drift: Motion | None = None  # m, rad: what they take from the drift
-    support: Support | None = None  # None: static bodies, and without shock propagation
+    support: Support | None = None  # None: static bodies, and after the first pass
     first: Array | None = None  # [N, ...] s: least time of impact of a body in the step; infinite without one
     clock: Array | None = None  # [N, ...] s: of a body's last impact in the step so far; 0 without one
 

@@ -345,11 +345,6 @@ class NearbyPairs(ContactSolver):
         rows, carries = self._play(bodies, bodies.rows, listed, carries, play, range(len(self.batches)))
         return self._unpacked(bodies, rows), carries
 
-    @property
-    def _solver_constants(self) -> tuple[str, ...]:
-        """Fields of the sides that the passes after the warm start do not change."""
-        return (*CONSTANTS, "support") if self.params.shock_propagation else (*CONSTANTS, "push")
-
     def _bodies(self, sides: list[BodySide], statics: list[BodySide], constants: tuple[str, ...]) -> BodyTables:
         """Tables of the bodies, and of the static bodies of each batch."""
         changing, constant = zip(*(_split(side, constants) for side in sides), strict=True)
@@ -485,7 +480,7 @@ class NearbyPairs(ContactSolver):
         buffers = [None] * len(self.batches) if carry.buffers is None else [b.solved for b in carry.buffers]
         zero = jnp.zeros_like(carry.depth), jnp.zeros_like(carry.begins)
         starts = [(buffer, *zero) for buffer in buffers]
-        sides, carries = self._pass(sides, statics, contacts, starts, play, self._solver_constants)
+        sides, carries = self._pass(sides, statics, contacts, starts, play, (*CONSTANTS, "support"))
         observed = [(depth, begins) for _, depth, begins in carries]
         solved = SolvedChunk(contacts, [packed for packed, *_ in carries], specs, observed)
         return self._later_impacts(solved, sides, statics)
@@ -501,7 +496,7 @@ class NearbyPairs(ContactSolver):
         batches = [i for i, of in enumerate(points) if takes_part(of, sides[0])]
         if not batches:
             return sides, solved
-        bodies = self._bodies(sides, statics, self._solver_constants)
+        bodies = self._bodies(sides, statics, (*CONSTANTS, "support"))
         clocks = [_column(table, "clock") for table in bodies.changing]
 
         def idle(i: int, buffer: Array, k: Array, indices: GatherIndices, rows: dict[int, Array]) -> Array:
@@ -581,7 +576,7 @@ class NearbyPairs(ContactSolver):
 
         last_touch = carry.last_touch or [jnp.zeros(0, jnp.int32)] * len(self.batches)
         starts = list(zip(carry.cache, last_touch, strict=True))
-        sides, carries = self._pass(sides, statics, listed, starts, play, self._solver_constants)
+        sides, carries = self._pass(sides, statics, listed, starts, play, (*CONSTANTS, "push"))
         depth, begins = carry.depth, carry.begins
         for overlap, began in solved.observed:
             depth, begins = jnp.maximum(depth, overlap), begins + began

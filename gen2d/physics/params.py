@@ -20,7 +20,6 @@ class SolverParams:
     push_speed: float  # m/s: the fastest correction of an overlap
     damping: float  # 1/s, of velocity and spin
     mixing: str
-    shock_propagation: bool  # contacts see what bears the lighter body (support.py)
     by_time: bool  # the impacts of discs in a step act in the order of their times, not of the solver's pairs
 
     def softness(self, hertz: float, damping_ratio: float) -> tuple[float, float, float]:
@@ -43,5 +42,4 @@ def solver_params(physics: PhysicsOptions, fps: float, steps: int) -> SolverPara
         damping=physics.damping,
         mixing=physics.mixing,
         by_time=physics.impact_order == "time",
-        shock_propagation=physics.shock_propagation,
     )

@@ -29,7 +29,7 @@ from gen2d.physics.constraint import (
     softness,
 )
 from gen2d.physics.contact_state import BodySide, PassSetup
-from gen2d.physics.energy import Work
+from gen2d.physics.energy import MotionPair, Work
 from gen2d.physics.normal_impulse import NormalTarget, solve_normals
 from gen2d.physics.params import SolverParams
 from gen2d.physics.time_of_impact import SLOWEST
@@ -40,6 +40,7 @@ from gen2d.xla import materialize
 def correct_positions(
     constraint: ContactConstraint,
     contacts: list[ActiveContact],
+    motions: MotionPair,
     acceleration: Array | None,
     a: BodySide,
     b: BodySide,
@@ -48,14 +49,17 @@ def correct_positions(
 ) -> tuple[BodySide, BodySide]:
     """Both sides with drifts that push the pair apart where it overlaps.
 
-    `acceleration` is that of b relative to a. An overlap that speeds below the bounce threshold cause in one step
-    stays, so that contacts at rest do not part.
+    `motions` are the means of both bodies in the step, as the pair foresees them, and `acceleration` is that of b
+    relative to a. An overlap that speeds below the bounce threshold cause in one step stays, so that contacts at rest
+    do not part.
     """
     assert b.drift is not None, "only static bodies lack a drift"
     h, (rate, *_), allowed = params.step, softness(constraint, params), 0.5 * params.step * setup.threshold
+    of_a, of_b = motions
+    ends = None if of_a is None else _end(of_a, a.drift, h), _end(of_b, b.drift, h)
     zero, gaps, targets = jnp.zeros_like(contacts[0].gap), [], []
     for contact in contacts:
-        moved, _ = relative_speed(contact.frame, contact.normal, None if a.motion is None else _end(a, h), _end(b, h))
+        moved, _ = relative_speed(contact.frame, contact.normal, *ends)
         fall = 0.0 if acceleration is None else -0.5 * h**2 * dot(contact.normal, acceleration)
         gaps.append(contact.gap + moved + fall)
         deep = jnp.maximum(-contact.gap - allowed, 0.0)
@@ -76,11 +80,10 @@ def correct_positions(
     return new_a._replace(motion=of_a), new_b._replace(motion=of_b, work=work)
 
 
-def _end(side: BodySide, h: float) -> Motion:
+def _end(motion: Motion, drift: Motion | None, h: float) -> Motion:
     """Displacement of bodies in the step, m and rad."""
-    assert side.motion is not None, "only static bodies lack a motion"
-    moved = jax.tree.map(lambda x: h * x, side.motion)
-    return moved if side.drift is None else jax.tree.map(jnp.add, moved, side.drift)
+    moved = jax.tree.map(lambda x: h * x, motion)
+    return moved if drift is None else jax.tree.map(jnp.add, moved, drift)
 
 
 def _slowed(

@@ -35,6 +35,7 @@ import jax
 import jax.numpy as jnp
 
 from gen2d.physics import rigid_joints, springs_limits_motors
+from gen2d.physics.collision import Disc
 from gen2d.physics.constraint import Motion
 from gen2d.physics.contact_state import BodySide
 from gen2d.physics.energy import Ledger, accumulate, record_energy
@@ -192,7 +193,7 @@ def step(world: WorldState, model: Model, params: SolverParams) -> WorldState:
             acceleration,
             displacement=_scaled(motion, 0.5 * h),
             work=work,
-            support=no_support(motion.velocity) if params.shock_propagation else None,
+            support=no_support(motion.velocity, isinstance(shape, Disc)),
         )
         for shape, motion, acceleration, work in of_groups
     ]
@@ -230,10 +231,7 @@ def step(world: WorldState, model: Model, params: SolverParams) -> WorldState:
         joints, motions, displacements, accelerations, fixed, params, biased=False
     )
     of_groups = zip(sides, motions, displacements, strict=True)
-    sides = [
-        BodySide(motion=m, displacement=moved, push=side.push, work=side.work, support=side.support)
-        for side, m, moved in of_groups
-    ]
+    sides = [BodySide(motion=m, displacement=moved, push=side.push, work=side.work) for side, m, moved in of_groups]
     sides, carry = solver.relax(carry, solved, rigid.hold_again(sides, displacements), statics, world.time)
     motions = rigid.stay(sides)
     if ledger is not None:

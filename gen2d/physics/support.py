@@ -1,24 +1,28 @@
-"""Shock propagation: heavy bodies on light ones that a static body supports.
+"""Heavy bodies on light ones that static bodies bear (shock propagation).
 
 A light body between a heavy one and a floor cannot give way, but sequential impulses pass on only a share of the load
-in each step, which falls with the ratio of the masses. With `physics.shock_propagation`, the contact of two moving
-bodies therefore sees the lighter one as its contacts with static bodies leave it: with its inverse mass less the Schur
-complement of those that bore a load in the last step, and with the velocity that it will have after their impulses.
-Impulse and reaction stay equal, so momentum is conserved. Static bodies come last in a pass and take up what the
-lighter body cannot.
+in each pass, which falls with the ratio of the masses. In the first pass, the contact of a body with one of less than a
+third of its mass therefore sees the lighter one as if it could not move along the load that static bodies bore in the
+last step: along the sum of their normal impulses, with its torque. A body that two points of a contact bear cannot turn
+either. Its inverse mass lacks the Schur complement of these directions, and its velocity the part along them. Impulse
+and reaction stay equal, so momentum is conserved. Static bodies come last in a pass and take up what the lighter body
+cannot.
 
 Source: E. Guendelman, R. Bridson and R. Fedkiw, 'Nonconvex rigid bodies with stacking' (2003), give supported bodies an
 infinite mass.
 """
 
+import functools
 from collections.abc import Sequence
-from typing import NamedTuple, TypeAlias
+from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 
-from gen2d.physics.collision import dot
+from gen2d.physics.collision import dot, perpendicular
 from gen2d.physics.constraint import (
     ActiveContact,
+    Components,
     ContactConstraint,
     ContactFrame,
     ContactPoint,
@@ -27,108 +31,187 @@ from gen2d.physics.constraint import (
     Motion,
     reciprocal,
 )
-from gen2d.physics.symmetric import Direction, inner, outer, product
 from gen2d.records.axes import Array
 
-Motions: TypeAlias = tuple[Motion | None, Motion]  # of both bodies of a pair
+LEAST_RATIO = 3.0  # of the masses: sequential impulses serve smaller ones
+LARGEST_RATIO = 3000.0  # a lighter body gives way, as its rounding errors would move the heavy one
+LARGEST_IN_CORNERS = 30.0  # where friction on one wall lifts the lighter body off another
+PARALLEL = 0.2  # sine of the angle between two loads that act in one direction
+PRESSED = 0.5  # least cosine of the angle between a contact's normal and the load of the static bodies
+LARGEST_SPEED = 9.0  # of a point of a uniform triangle after an impulse at a corner, over that of its centre
+LEAST_LEFT = 1e-4  # share of a contact's compliance that a support leaves at least, as the rest would be rounding
 
-REGULAR = 1e-3  # share of its compliance that a contact must keep beside others to take more from a body
-LARGEST_RATIO = 3000.0  # of two masses: a lighter body gives way, as its rounding errors would move the heavy one
-PRESSED = 0.5  # least cosine of the angle between a contact's load and that of the static bodies
+LINE, FLUSH, CORNER = 0.0, 1.0, 2.0  # kinds of supports: in one direction, at two points of a contact, in several
 
 
 class Support(NamedTuple):
-    """What the static bodies that bear a body take from its inverse mass."""
+    """Normal impulses of the static bodies that bear a body, in the last step."""
 
-    load: Array  # [2, N, ...] N s: sum of their normal impulses in the last step
-    matrix: Array  # [6, N, ...] of x, y and angle, symmetric: xx, xy, yy, xt, yt, tt
+    load: Array  # [2, N, ...] N s
+    torque: Array | None  # [N, ...] N m s; None: discs
+    kind: Array  # [N, ...] LINE, FLUSH or CORNER
 
 
-def no_support(velocity: Array) -> Support:
+def no_support(velocity: Array, disc: bool) -> Support:
     """Support of bodies [2, N, ...] that nothing bears."""
-    return Support(jnp.zeros_like(velocity), jnp.zeros((6, *velocity.shape[1:]), velocity.dtype))
+    zero = jnp.zeros_like(velocity[0])
+    return Support(jnp.zeros_like(velocity), None if disc else zero, zero)
 
 
-def _with_row(support: Support, inverse: Inertia, direction: Direction, k: Array, acts: Array) -> Support:
-    """Support with another direction in which the body cannot move, where it `acts`; k is its compliance alone."""
-    (linear, turn), (unit, lever) = product(support.matrix, direction), direction
-    linear = inverse.mass * unit - linear
-    turn = -turn if lever is None else inverse.moment * lever - turn
-    left = inner(direction, (linear, turn))
-    share, row = reciprocal(left, acts & (left > REGULAR * k)), (*linear, turn)
-    return support._replace(matrix=support.matrix + share * outer(row, row))
-
-
-def add_support(
-    support: Support, constraint: ContactConstraint, points: Sequence[ContactPoint], impulses: Sequence[Impulse]
-) -> Support:
+def add_support(support: Support, points: Sequence[ContactPoint], impulses: Sequence[Impulse]) -> Support:
     """Support with the contact with a static body, from its impulses in the last step."""
+    load, torque, kind = support
+    borne = [impulse.normal > 0 for impulse in impulses]
+    crossing = dot(load, perpendicular(points[0].normal)) ** 2 > PARALLEL**2 * dot(load, load)
+    any_point, both = functools.reduce(jnp.logical_or, borne), functools.reduce(jnp.logical_and, borne)
+    kind = jnp.where(any_point & crossing & (kind == LINE), CORNER, kind)
+    if len(impulses) == 2:
+        kind = jnp.where(both, FLUSH, kind)
     for point, impulse in zip(points, impulses, strict=True):
-        frame = point.frame
-        row = point.normal, frame.normal_b
-        support = _with_row(support, constraint.b, row, frame.k_normal, impulse.normal > 0)
-        support = support._replace(load=support.load + impulse.normal * point.normal)
-    return support
-
-
-def _normals(contact: ActiveContact) -> tuple[Direction, Direction]:
-    """Direction of the normal impulse, for a and for b."""
-    return (contact.normal, contact.frame.normal_a), (contact.normal, contact.frame.normal_b)
+        load = load + impulse.normal * point.normal
+        if point.frame.normal_b is not None and torque is not None:
+            torque = torque + impulse.normal * point.frame.normal_b
+    return Support(load, torque, kind)
 
 
 class SupportedPair(NamedTuple):
     """Two moving bodies in contact, of which static bodies may bear the lighter."""
 
-    inertia: tuple[Inertia, Inertia]
-    supports: tuple[Support, Support]
-    pressed: tuple[Array, Array]  # whether the contact presses the body, which is the lighter, onto what bears it
+    lighter: tuple[Array, Array]  # whether each is the lighter and pressed onto what bears it
+    mass: Array  # 1/kg: inverse mass of the lighter
+    moment: Array  # 1 / (kg m^2): its inverse moment of inertia; zero if two points of a contact bear it
+    locked: Array  # 1 / (kg m^2): what such a contact takes from it
+    load: Array  # N s: direction in which it does not move, with the torque
+    torque: Array | None  # N m s
+    share: Array  # kg / (N s)^2: reciprocal of the load's compliance; zero where nothing bears it
 
-    def speed(self, contact: ActiveContact, speed: Array, motions: Motions) -> Array:
-        """Normal speed of b relative to a at a point after the support's impulses, m/s; `speed` is that before."""
-        taken, of = [], zip(self.inertia, self.supports, self.pressed, motions, _normals(contact), strict=True)
-        for inertia, support, pressed, motion, direction in of:
-            assert motion is not None, "both bodies move"
-            mass, moment = (reciprocal(x, x > 0) for x in inertia)
-            momentum = mass * motion.velocity, moment * motion.spin
-            taken.append(jnp.where(pressed, inner(direction, product(support.matrix, momentum)), 0.0))
-        return speed - (taken[1] - taken[0])
+    def where(self, rests: Array) -> "SupportedPair":
+        """The pair where it `rests`; elsewhere nothing bears a body."""
+        lighter_a, lighter_b = self.lighter
+        return self._replace(
+            lighter=(lighter_a & rests, lighter_b & rests),
+            locked=jnp.where(rests, self.locked, 0.0),
+            share=jnp.where(rests, self.share, 0.0),
+        )
 
-    def _compliance(self, p: tuple[Direction, Direction], q: tuple[Direction, Direction]) -> Array:
-        """What the support takes from the speed along q that a unit impulse along p causes, 1/kg."""
-        of_a, of_b = (inner(y, product(support.matrix, x)) for support, x, y in zip(self.supports, p, q, strict=True))
-        return jnp.where(self.pressed[0], of_a, 0.0) + jnp.where(self.pressed[1], of_b, 0.0)
+    def left(self, motions: tuple[Motion | None, Motion]) -> tuple[Motion, Motion]:
+        """Motions of both bodies that supports leave."""
+        a, b = motions
+        assert a is not None, "both bodies move"
+        velocity, spin = jax.tree.map(self._of_lighter, a, b)
+        power = dot(self.load, velocity)
+        if self.torque is not None:
+            power = power + jnp.where(self.locked > 0, 0.0, self.torque * spin)
+        impulse = self.share * power
+        new = velocity - self.mass * impulse * self.load, spin
+        if self.torque is not None:
+            new = new[0], jnp.where(self.locked > 0, 0.0, spin - self.moment * impulse * self.torque)
+        of = zip(self.lighter, motions, strict=True)
+        of_a, of_b = (
+            jax.tree.map(lambda x, y, borne=borne: jnp.where(borne, x, y), Motion(*new), m) for borne, m in of
+        )
+        return of_a, of_b
 
-    def frame(self, contact: ActiveContact, rests: Array) -> ContactFrame:
-        """Frame of a contact, with the effective mass that the support leaves where it `rests`."""
-        normals = _normals(contact)
-        k = contact.frame.k_normal - jnp.where(rests, self._compliance(normals, normals), 0.0)
-        return contact.frame._replace(k_normal=k, normal_mass=reciprocal(k, contact.frame.normal_mass > 0))
+    def _of_lighter(self, a: Array, b: Array) -> Array:
+        return jnp.where(self.lighter[1], b, a)
 
-    def coupling(self, first: ActiveContact, second: ActiveContact, rests: Array) -> Array:
-        """What the support takes from the speed at one point that a unit impulse at another causes, 1/kg."""
-        return jnp.where(rests, self._compliance(_normals(first), _normals(second)), 0.0)
+    def _lever(self, levers: Components) -> Array | float:
+        """Lever of a direction on the lighter body, m."""
+        of_a, of_b = (0.0 if lever is None else lever for lever in levers)
+        return jnp.where(self.lighter[1], of_b, of_a)
 
-    def pushes(self, impulse: Array, rests: Array) -> tuple[Array, Array]:
-        """Bounds on the speed, m/s, that a change of the normal impulse gives to the supported body of each side."""
-        of = zip(self.inertia, self.pressed, strict=True)
-        a, b = (jnp.where(pressed & rests, inertia.mass * impulse, 0.0) for inertia, pressed in of)
-        return a, b
+    def _taken(self, p: tuple[Array, Components], q: tuple[Array, Components]) -> Array:
+        """What the support takes from the speed along q that a unit impulse along p causes, 1/kg.
+
+        Both are directions with levers on both bodies.
+        """
+        alongs, (lever_p, lever_q) = [], (self._lever(levers) for _, levers in (p, q))
+        for (unit, _), lever in zip((p, q), (lever_p, lever_q), strict=True):
+            along = self.mass * dot(self.load, unit)
+            alongs.append(along if self.torque is None else along + self.moment * self.torque * lever)
+        taken = self.share * alongs[0] * alongs[1]
+        return taken if self.torque is None else taken + self.locked * lever_p * lever_q
+
+    def _frame(self, frame: ContactFrame, normal: Array) -> ContactFrame:
+        """Frame of a contact with the effective masses that the support leaves."""
+        near = frame.normal_mass > 0
+
+        def left(k: Array, direction: tuple[Array, Components]) -> Array:
+            return jnp.maximum(k - self._taken(direction, direction), LEAST_LEFT * k)
+
+        k_normal = left(frame.k_normal, (normal, (frame.normal_a, frame.normal_b)))
+        k_tangent = left(frame.k_tangent, (perpendicular(normal), (frame.tangent_a, frame.tangent_b)))
+        masses = reciprocal(k_normal, near), reciprocal(k_tangent, near)
+        return frame._replace(k_normal=k_normal, k_tangent=k_tangent, normal_mass=masses[0], tangent_mass=masses[1])
+
+    def contacts(self, contacts: list[ActiveContact]) -> "SupportedContacts":
+        """Contacts of the pair with the effective masses that the support leaves."""
+        taken = 0.0
+        if len(contacts) == 2:
+            of_p, of_q = ((c.normal, (c.frame.normal_a, c.frame.normal_b)) for c in contacts)
+            taken = self._taken(of_p, of_q)
+        left = [contact._replace(frame=self._frame(contact.frame, contact.normal)) for contact in contacts]
+        return SupportedContacts(self, left, taken)
+
+    def pushes(self, impulse: Array) -> tuple[Array, Array]:
+        """Bounds on the speeds, m/s, of all points of each body, if borne, after normal impulses of this sum, N s."""
+        of_a, of_b = (jnp.where(borne, LARGEST_SPEED * self.mass * impulse, 0.0) for borne in self.lighter)
+        return of_a, of_b
+
+
+class SupportedContacts(NamedTuple):
+    """Contacts of a pair as its impulses see them: with what supports leave of its bodies."""
+
+    pair: SupportedPair | None  # None: nothing bears them
+    contacts: list[ActiveContact]
+    taken: Array | float  # 1/kg, by the support from the speed at one of two points after a unit impulse at the other
+
+    def left(self, motions: tuple[Motion | None, Motion]) -> tuple[Motion | None, Motion]:
+        """Motions, or displacements, of both bodies that supports leave."""
+        return motions if self.pair is None else self.pair.left(motions)
+
+    def means(self, motions: tuple[Motion | None, Motion]) -> tuple[Motion | None, Motion]:
+        """Mean motions in the step, as the supports' impulses act at its half."""
+        return motions if self.pair is None else jax.tree.map(_mean, motions, self.pair.left(motions))
+
+
+def _mean(x: Array, y: Array) -> Array:
+    return 0.5 * (x + y)
 
 
 def supported_pair(
     constraint: ContactConstraint, normal: Array, supports: tuple[Support | None, Support | None]
 ) -> SupportedPair | None:
-    """The pair in contact along a normal; None without shock propagation, and for a static body."""
+    """The pair in contact along a normal; None for a static body, and in passes that see no supports.
+
+    Nothing bears a body on a rigid joint.
+    """
     a, b = supports
     if constraint.static or constraint.a is None or a is None or b is None:
         return None
-    mass_a, mass_b = constraint.a.mass, constraint.b.mass  # 1/kg
-    heavier_a = (mass_b > mass_a) & (mass_b <= LARGEST_RATIO * mass_a)
-    heavier_b = (mass_a > mass_b) & (mass_a <= LARGEST_RATIO * mass_b)
+    of_a, of_b = constraint.a, constraint.b  # inverse masses
 
-    def onto(load: Array, direction: Array) -> Array:
-        along = dot(load, direction)
-        return (along > 0) & (along * along > PRESSED**2 * dot(load, load))
+    def far_lighter(one: Inertia, other: Inertia, support: Support, schur: Array | None) -> Array:
+        largest = jnp.where(support.kind == CORNER, LARGEST_IN_CORNERS, LARGEST_RATIO)
+        lighter = (one.mass > LEAST_RATIO * other.mass) & (one.mass <= largest * other.mass)
+        return lighter if schur is None else lighter & (schur == 0).all(0)
 
-    pressed = heavier_b & onto(a.load, normal), heavier_a & onto(b.load, -normal)
-    return SupportedPair((constraint.a, constraint.b), (a, b), pressed)
+    lighter_a = far_lighter(of_a, of_b, a, constraint.schur_a)
+    lighter_b = far_lighter(of_b, of_a, b, constraint.schur_b)
+    load, kind, mass, moment = (
+        jnp.where(lighter_b, y, x)
+        for x, y in ((a.load, b.load), (a.kind, b.kind), (of_a.mass, of_b.mass), (of_a.moment, of_b.moment))
+    )
+    square, along = dot(load, load), dot(load, normal)
+    along = jnp.where(lighter_b, -along, along)
+    pressed = (lighter_a | lighter_b) & (along > 0) & (along * along > PRESSED**2 * square)
+    torque, k = None, mass * square
+    locked = jnp.zeros_like(moment)
+    if a.torque is not None or b.torque is not None:
+        x, y = (jnp.zeros_like(k) if torque is None else torque for torque in (a.torque, b.torque))
+        flush = kind == FLUSH
+        torque, locked = jnp.where(lighter_b, y, x), jnp.where(flush & pressed, moment, 0.0)
+        moment = jnp.where(flush, 0.0, moment)
+        k = k + moment * torque * torque
+    share = reciprocal(k, pressed)
+    return SupportedPair((pressed & lighter_a, pressed & lighter_b), mass, moment, locked, load, torque, share)

@@ -1,8 +1,9 @@
 """Limits of the solver that a config exceeds: masses that rest on far lighter ones, and speeds for the step.
 
-A body that comes to rest on one of a part 1 / r of its mass sinks in by up to r g h^2 in steps of h s, as the load
-takes many steps to arrive, and rises again. A body that several others hit in one step may overlap them by about its
-displacement in it. Both depend on numbers of the config alone, and are compared with the size of the bodies.
+A body that comes to rest on two of a part 1 / r of its mass, one on the other, sinks in by up to 2 r g h^2 in steps of
+h s, as the load takes many steps to arrive, and rises again. A body that several others hit in one step may overlap
+them by about its displacement in it. Both depend on numbers of the config alone, and are compared with the size of the
+bodies.
 """
 
 import dataclasses
@@ -52,8 +53,8 @@ def exceeded_limits(config: Config) -> list[str]:
 
 
 def sinking(ratio: float, gravity: float, step: float) -> float:
-    """Largest depth in m to which a body sinks into one of 1 / ratio of its mass, in steps of so many s."""
-    return ratio * gravity * step**2
+    """Largest depth in m to which a body sinks into a tower of 1 / ratio of its mass each, in steps of so many s."""
+    return 2 * ratio * gravity * step**2
 
 
 def safe_ratio(depth: float, gravity: float, step: float) -> float:

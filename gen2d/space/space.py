@@ -66,8 +66,7 @@ class Space:
     **physics
         Options of a config's section `physics`, with the same defaults: damping (1/s), mixing ("product", "mean",
         "max", "geometric"), bounce_threshold (m/s), max_step (s), substeps, contact_hertz (Hz), contact_damping_ratio,
-        push_speed (m/s), precision ("float32", "float64"), impact_order ("pairs", "time"),
-        shock_propagation (False, True).
+        push_speed (m/s), precision ("float32", "float64"), impact_order ("pairs", "time").
 
     Raises
     ------
@@ -595,7 +594,8 @@ class Space:
         if masses and max(masses) > SAFE_RATIO * min(masses):
             _log.warning(
                 "Space: masses from %.3g to %.3g kg differ by a factor of %.3g: a body that rests on one of less than "
-                "1/%g of its mass sinks in; half the max_step bears four times the factor",
+                "1/%g of its mass sinks in where no static body bears that one; half the max_step bears four times "
+                "the factor",
                 *(min(masses), max(masses), max(masses) / min(masses), SAFE_RATIO),
             )
 

@@ -299,7 +299,6 @@ def rows(demo: Demo) -> Iterator[tuple[str, ...]]:
     """Rows of the table for a demonstration, one for each engine."""
     engines: dict[str, tuple[Callable[[Space], Run], dict[str, Any]]] = {
         "gen2d": (in_gen2d, {}),
-        "gen2d, shock propagation": (in_gen2d, {"shock_propagation": True}),
         "Box2D": (lambda space: stepped(in_box2d(space)), {}),
         "Chipmunk": (lambda space: stepped(in_chipmunk(space)), {}),
     }

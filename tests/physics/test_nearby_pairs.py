@@ -70,8 +70,7 @@ def test_both_forms_give_the_same_of_more_discs_than_a_word_has_bits():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("shock_propagation", [False, True])
-def test_both_forms_give_the_same_mixture(shock_propagation):
+def test_both_forms_give_the_same_mixture():
     """Pairs of several shapes, bodies that move as they like, a joint, and forces that depend on the state."""
     space = Space((0, -9.81))
     space.add_segment((-4, 0), (0, 0.5))
@@ -90,7 +89,7 @@ def test_both_forms_give_the_same_mixture(shock_propagation):
         return jnp.stack([jnp.cos(time) - 0.1 * state.velocity[0], 0 * state.angle]), -0.1 * state.angular_velocity
 
     def made(sparse: bool) -> trajectory.Trajectory:
-        params = rules(shock_propagation=shock_propagation)
+        params = rules()
         program = jax.jit(lambda a, b: simulate(a, b, layout, params, 31, 4, EVERYTHING, wind, sparse))
         return jax.tree.map(np.asarray, axes.to_stored(program(many[0], many[1])))
 

@@ -271,7 +271,7 @@ def rests_as_box2d(
 def test_discs_rest_as_well_as_in_box2d():
     piles = {f"pyramid, e = {e:g}": (pyramid(e), 0.005, 1e-3) for e in (0.0, 0.5)}
     piles |= {f"column of 10, e = {e:g}": (column(e), 0.0055, 1e-3) for e in (0.0, 0.5)}
-    rests_as_box2d(piles, 22, settle=3, watch=3)
+    rests_as_box2d(piles, 22, settle=8, watch=2)
 
 
 @pytest.mark.full

@@ -188,13 +188,11 @@ OPTIONS = {
         hertz=60.0, damping_ratio=1.0, push_speed=30.0, bounce_threshold=1.0, mixing="max"
     ),
     "short steps, soft contacts, geometric means": rules(1 / 960, hertz=5.0, push_speed=0.1, mixing="geometric"),
-    "shock propagation": rules(shock_propagation=True),
 }
 OPTION_BOUNDS: dict[str, Bounds] = {
     "long steps, damping, means": {RISING: 0.15, OVERLAPPING: 0.15},
     "stiff contacts, high threshold, maxima": {RISING: 0.2},
     "short steps, soft contacts, geometric means": {RISING: None},
-    "shock propagation": {RISING: 0.2, ABOVE: None, OVERLAPPING: 0.06},
 }
 
 

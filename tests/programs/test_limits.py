@@ -20,19 +20,19 @@ def limits(config: str, *overrides: str) -> list[str]:
 
 
 @pytest.mark.parametrize("fps", [240, pytest.param(480, marks=pytest.mark.full)])
-def test_a_heavy_box_sinks_as_deep_as_the_law_says_and_rises_again(fps: int) -> None:
+def test_a_heavy_box_on_two_light_ones_sinks_as_deep_as_the_law_says_and_rises_again(fps: int) -> None:
     ratios = np.array([10.0, 30.0, 100.0])
     space = Space(gravity=(0, -G), max_step=1 / fps)
     space.add_segment((-5, 0), (15, 0))
     for place, ratio in enumerate(ratios):
-        space.add_box((5.0 * place, 0.5), 1, 1, density=1)
-        space.add_box((5.0 * place, 1.5), 1, 1, density=ratio)
+        for height, density in ((0.5, 1.0), (1.5, 1.0), (2.5, ratio)):
+            space.add_box((5.0 * place, height), 1, 1, density=density)
     heights = space.simulate(4, fps=fps, energy=False, contacts=0).position[:, 1:, 1]
-    depth = 1 - (heights[:, 1::2] - heights[:, ::2])
+    depth = np.maximum(1 - (heights[:, 2::3] - heights[:, 1::3]), 1 - (heights[:, 1::3] - heights[:, ::3]))
     share = depth.max(0) / [sinking(ratio, G, 1 / fps) for ratio in ratios]
     holds("sinking at 10, 30 and 100:1 over that of the law", share, 1.0)
-    holds("the law over twice the sinking", 0.5 / share, 1.0)
-    holds("sinking in the end over that of the law", depth[-1] / depth.max(0), 0.2)
+    holds(".4 times the law over the sinking", 0.4 / share, 1.0)
+    holds("sinking in the end over that of the law", depth[-1] / depth.max(0), 0.25)
 
 
 @pytest.mark.parametrize("name", plugins.config_names())
@@ -52,7 +52,6 @@ def test_masses_that_differ_too_much_are_named_with_what_is_safe() -> None:
     assert f"balls of {heaviest:.3g} kg on balls of {lightest:.3g} kg" in sentence
     safe = safe_ratio(0.01, 9.8, 1 / 240)  # of a thickness of 1 m
     assert f"ratios up to {safe:.4g} are" in sentence
-    assert len(limits("bouncing", DENSITIES, "physics.shock_propagation=true")) == 1  # off centre it bears less
     narrow = f"scene.density=[1, {safe / 4 * 0.99}]"  # the radii make a factor of 4
     assert limits("bouncing", narrow) == []
     (wider,) = limits("bouncing", f"scene.density=[1, {safe / 4 * 1.5}]")

@@ -36,7 +36,6 @@ def rules(step: float = STEP, **changes: Any) -> SolverParams:
         "push_speed": 3.0,
         "damping": 0.0,
         "mixing": "product",
-        "shock_propagation": False,
         "by_time": False,
     }
     return SolverParams(step=step, **(numbers | changes))
