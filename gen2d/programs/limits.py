@@ -18,7 +18,7 @@ from gen2d.config.distributions import Distribution
 from gen2d.config.sections import PhysicsOptions
 from gen2d.physics.simulate import substeps
 
-SAFE_SINKING = 0.01  # over the least size of the lighter body: less than a pixel in most frames
+SAFE_SINKING = 0.02  # over the least size of the lighter body: less than a pixel in most frames
 SAFE_DISPLACEMENT = 0.5  # in a step, over the least radius
 DEVIATIONS = 4.0  # of a normal distribution, which has no largest value
 

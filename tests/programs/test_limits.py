@@ -50,7 +50,7 @@ def test_masses_that_differ_too_much_are_named_with_what_is_safe() -> None:
     lightest, heaviest = 0.001 * math.pi * 0.25, 1000 * math.pi
     assert "scene.density and scene.radius" in sentence
     assert f"balls of {heaviest:.3g} kg on balls of {lightest:.3g} kg" in sentence
-    safe = safe_ratio(0.01, 9.8, 1 / 240)  # of a thickness of 1 m
+    safe = safe_ratio(0.02, 9.8, 1 / 240)  # of a thickness of 1 m
     assert f"ratios up to {safe:.4g} are" in sentence
     narrow = f"scene.density=[1, {safe / 4 * 0.99}]"  # the radii make a factor of 4
     assert limits("bouncing", narrow) == []
