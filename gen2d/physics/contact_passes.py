@@ -46,30 +46,14 @@ from gen2d.records.axes import Array
 from gen2d.xla import materialize
 
 
-def _normal_speeds(contacts: list[ActiveContact], motions: MotionPair) -> list[Array]:
-    return [relative_speed(contact.frame, contact.normal, *motions)[0] for contact in contacts]
-
-
 def _supported_contacts(
-    constraint: ContactConstraint, pair: SolvedPair, target_of: TargetOf, a: BodySide, b: BodySide
+    supported: SupportedPair | None, pair: SolvedPair, target_of: TargetOf, motions: MotionPair
 ) -> tuple[SupportedContacts, list[Array], list[NormalTarget]]:
-    """Contacts with what supports leave of their bodies, their normal speeds, m/s, and targets.
-
-    An impact does not see what bears a body.
-    """
-    assert b.motion is not None, "only static bodies lack a motion"
-    contacts, motions = pair.contacts, (a.motion, b.motion)
-    free = _normal_speeds(contacts, motions)
-    supported = supported_pair(constraint, contacts[0].normal, (a.support, b.support))
-    if supported is None:
-        targets = [target_of(*of) for of in zip(contacts, free, pair.impulses, strict=True)]
-        return SupportedContacts(None, contacts, 0.0), free, targets
-    borne = _normal_speeds(contacts, supported.left(motions))
-    speeds = [jnp.where(c.tau < 0, x, y) for c, x, y in zip(contacts, borne, free, strict=True)]
-    targets = [target_of(*of) for of in zip(contacts, speeds, pair.impulses, strict=True)]
-    rests = ~functools.reduce(jnp.logical_or, [target.bounces for target in targets])
-    speeds = [jnp.where(rests, x, y) for x, y in zip(borne, free, strict=True)]
-    return supported.where(rests).contacts(contacts), speeds, targets
+    """Contacts with what supports leave of their bodies, their normal speeds, m/s, and targets."""
+    seen = SupportedContacts(None, pair.contacts, 0.0) if supported is None else supported.contacts(pair.contacts)
+    left = seen.left(motions)
+    speeds = [relative_speed(contact.frame, contact.normal, *left)[0] for contact in seen.contacts]
+    return seen, speeds, [target_of(*of) for of in zip(seen.contacts, speeds, pair.impulses, strict=True)]
 
 
 def _with_pushes(
@@ -84,19 +68,24 @@ def _with_pushes(
 
 
 def _apply_pass(
-    constraint: ContactConstraint, pair: SolvedPair, target_of: TargetOf, a: BodySide, b: BodySide
+    constraint: ContactConstraint,
+    pair: SolvedPair,
+    target_of: TargetOf,
+    a: BodySide,
+    b: BodySide,
+    supported: SupportedPair | None = None,
 ) -> tuple[BodySide, BodySide, SolvedPair, SupportedContacts]:
     """Both sides and the pair after impulses of contact and friction, and the contacts as these saw them."""
     assert b.motion is not None, "only static bodies lack a motion"
     before, roll, impulses, jointed = (a.motion, b.motion), pair.roll, [], b.joint_motion is not None
-    seen, speeds, targets = _supported_contacts(constraint, pair, target_of, a, b)
+    seen, speeds, targets = _supported_contacts(supported, pair, target_of, before)
     normals = materialize(solve_normals(constraint, seen.contacts, speeds, pair.impulses, targets, seen.taken))
-    a, b = _with_pushes(seen.pair, pair, normals, a, b)
+    a, b = _with_pushes(supported, pair, normals, a, b)
     if constraint.frame is not None and roll is None and not jointed:
         # The normal impulse between two discs adds no slip, so both impulses follow from the same velocities.
         (contact,), (old,), (normal,), (target,) = seen.contacts, pair.impulses, normals, targets
         speed, free = relative_speed(contact.frame, contact.normal, *before)
-        slip = free if seen.pair is None else relative_speed(contact.frame, contact.normal, *seen.left(before))[1]
+        slip = free if supported is None else relative_speed(contact.frame, contact.normal, *seen.left(before))[1]
         tangent = materialize(friction_impulse(constraint, contact, normal, slip, old, target.apart))
         impulses.append(Impulse(normal, tangent))
         change = impulse_change(impulses[0], old)
@@ -199,12 +188,14 @@ def _after_impulses(
     new: tuple[BodySide, BodySide],
     bounces: Array,
     time: Array,
+    times: tuple[Array, ...] | None = None,
 ) -> tuple[BodySide, BodySide]:
-    """Both sides with the drift and the clock after impulses at this time, s."""
+    """Both sides with the drift and the clock after impulses at this time, s; at `times` for each body, if given."""
     (a, b), (new_a, new_b) = old, new
-    new_b = _update_drift(b, new_b, time)
+    time_a, time_b = times or (time, time)
+    new_b = _update_drift(b, new_b, time_b)
     if constraint.a is not None and a.drift is not None:
-        new_a = _update_drift(a, new_a, time)
+        new_a = _update_drift(a, new_a, time_a)
     return after_impact(new_a, new_b, bounces, time)
 
 
@@ -219,21 +210,32 @@ def solve(
 ) -> tuple[BodySide, BodySide, SolvedPair]:
     """Both sides and the pair after the first pass: impulses, bounces and the correction of overlaps."""
     constraint = with_joints(constraint, a, b)
+    acceleration, by_time = points[0].acceleration, takes_part(points, b)
+    supported = supported_pair(constraint, points[0].normal, (a.support, b.support))
+    if supported is not None:
+        # Impacts in the order of time have the times that the warm start has compared.
+        supported = supported._replace(in_impacts=supported.in_impacts & (not by_time))
+        pull = supported.acceleration(acceleration, setup.gravity)
+        points = [point._replace(acceleration=pull) for point in points]
     taus = impact_times(points, a, b, setup, params.step)
-    if takes_part(points, b):
+    if by_time:
         taus = [in_order(points[0], taus[0], a, b)]
+    bounces = functools.reduce(jnp.logical_or, [tau >= 0 for tau in taus])
+    supported = None if supported is None else supported.seen(bounces)
     contacts, time = active_contacts(constraint, points, taus, a, b, params.step)
 
     def target_of(contact: ActiveContact, speed: Array, old: Impulse) -> NormalTarget:
         return step_target(constraint, contact, speed, old, params.step)
 
     pair = SolvedPair(contacts, warm_start_impulses(constraint, points, memory.impulses), memory.roll)
-    new_a, new_b, solved, seen = _apply_pass(constraint, pair, target_of, a, b)
-    bounces = functools.reduce(jnp.logical_or, [tau >= 0 for tau in taus])
-    new_a, new_b = _after_impulses(constraint, (a, b), (new_a, new_b), bounces, time)
+    new_a, new_b, solved, seen = _apply_pass(constraint, pair, target_of, a, b, supported)
+    times = None
+    if supported is not None:  # what bears a body acts at half of the step
+        times = tuple(jnp.where(borne, 0.5 * params.step, time) for borne in supported.lighter)
+    new_a, new_b = _after_impulses(constraint, (a, b), (new_a, new_b), bounces, time, times)
     assert new_b.motion is not None, "only static bodies lack a motion"
     motions = seen.means((new_a.motion, new_b.motion))
-    new_a, new_b = correct_positions(constraint, contacts, motions, points[0].acceleration, new_a, new_b, setup, params)
+    new_a, new_b = correct_positions(constraint, contacts, motions, acceleration, new_a, new_b, setup, params)
     if constraint.static:
         new_b = materialize(new_b._replace(work=None))._replace(work=new_b.work)
     return new_a, new_b, solved

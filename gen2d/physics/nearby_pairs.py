@@ -448,7 +448,8 @@ class NearbyPairs(ContactSolver):
                 constraint = constraint._replace(neighbours=first.neighbours)
             setup = self.setup._replace(gravity=second.gravity, threshold=second.threshold)
             a, b, points = contact_passes.warm_start(constraint, warm, a, b, setup, self.params.step)
-            packed = (constraint, warm, points, second.threshold)
+            gravity = None if batch.first is None else second.gravity  # of what a static body bears
+            packed = (constraint, warm, points, second.threshold, gravity)
             values, specs[i] = pack(packed, (self.chunk,), self._dtype, once=True)
             return a, b, self._store(batch, buffer, k, values)
 
@@ -460,8 +461,8 @@ class NearbyPairs(ContactSolver):
         self, listed: ListedPairs, i: int, k: Array
     ) -> tuple[ContactConstraint, WarmStart, list, PassSetup]:
         """Constraint, impulses, points and setup of chunk k of batch i, as the warm start stored them."""
-        constraint, warm, points, threshold = unpack(list(listed.packed[i][k]), listed.specs[i])
-        return constraint, warm, points, self.setup._replace(threshold=threshold)
+        constraint, warm, points, threshold, gravity = unpack(list(listed.packed[i][k]), listed.specs[i])
+        return constraint, warm, points, self.setup._replace(threshold=threshold, gravity=gravity)
 
     def solve(
         self, carry: NearbyCarry, contacts: ListedPairs, sides: list[BodySide], statics: list[BodySide]

@@ -35,6 +35,7 @@ from gen2d.records.axes import Array
 
 LEAST_RATIO = 3.0  # of the masses: sequential impulses serve smaller ones
 LARGEST_RATIO = 3000.0  # a lighter body gives way, as its rounding errors would move the heavy one
+LARGEST_IN_IMPACTS = 300.0  # beyond, heavy bodies would press too long into light ones in corners
 LARGEST_IN_CORNERS = 30.0  # where friction on one wall lifts the lighter body off another
 PARALLEL = 0.2  # sine of the angle between two loads that act in one direction
 PRESSED = 0.5  # least cosine of the angle between a contact's normal and the load of the static bodies
@@ -84,15 +85,7 @@ class SupportedPair(NamedTuple):
     load: Array  # N s: direction in which it does not move, with the torque
     torque: Array | None  # N m s
     share: Array  # kg / (N s)^2: reciprocal of the load's compliance; zero where nothing bears it
-
-    def where(self, rests: Array) -> "SupportedPair":
-        """The pair where it `rests`; elsewhere nothing bears a body."""
-        lighter_a, lighter_b = self.lighter
-        return self._replace(
-            lighter=(lighter_a & rests, lighter_b & rests),
-            locked=jnp.where(rests, self.locked, 0.0),
-            share=jnp.where(rests, self.share, 0.0),
-        )
+    in_impacts: Array  # whether impacts see the support, too
 
     def left(self, motions: tuple[Motion | None, Motion]) -> tuple[Motion, Motion]:
         """Motions of both bodies that supports leave."""
@@ -152,6 +145,21 @@ class SupportedPair(NamedTuple):
             taken = self._taken(of_p, of_q)
         left = [contact._replace(frame=self._frame(contact.frame, contact.normal)) for contact in contacts]
         return SupportedContacts(self, left, taken)
+
+    def acceleration(self, acceleration: Array | None, gravity: Array) -> Array:
+        """Acceleration [2, ...] of b relative to a, m/s^2: gravity's of the heavier body, if the lighter is borne."""
+        free = jnp.zeros_like(self.load) if acceleration is None else acceleration
+        lighter_a, lighter_b = (borne & self.in_impacts for borne in self.lighter)
+        return jnp.where(lighter_a, gravity, jnp.where(lighter_b, -gravity, free))
+
+    def seen(self, impact: Array) -> "SupportedPair":
+        """The pair as its contacts see it, which may have an impact in this step."""
+        sees, (lighter_a, lighter_b) = self.in_impacts | ~impact, self.lighter
+        return self._replace(
+            lighter=(lighter_a & sees, lighter_b & sees),
+            locked=jnp.where(sees, self.locked, 0.0),
+            share=jnp.where(sees, self.share, 0.0),
+        )
 
     def pushes(self, impulse: Array) -> tuple[Array, Array]:
         """Bounds on the speeds, m/s, of all points of each body, if borne, after normal impulses of this sum, N s."""
@@ -214,4 +222,6 @@ def supported_pair(
         moment = jnp.where(flush, 0.0, moment)
         k = k + moment * torque * torque
     share = reciprocal(k, pressed)
-    return SupportedPair((pressed & lighter_a, pressed & lighter_b), mass, moment, locked, load, torque, share)
+    in_impacts = mass <= LARGEST_IN_IMPACTS * jnp.where(lighter_b, of_a.mass, of_b.mass)
+    lighter = pressed & lighter_a, pressed & lighter_b
+    return SupportedPair(lighter, mass, moment, locked, load, torque, share, in_impacts)

@@ -111,6 +111,49 @@ def test_a_heavy_box_stands_on_a_light_one_on_a_slope():
     holds("heavy box on a light one on a slope: way in 6 s, m", way @ along, 0.01)
 
 
+@pytest.mark.full
+@pytest.mark.parametrize("ratio", [4, 10, 50, 290])
+def test_a_heavy_box_that_falls_onto_a_light_one_does_not_enter_it(ratio):
+    space = Space(gravity=(0, -GRAVITY))
+    space.add_segment((-10, 0), (10, 0))
+    space.add_box((0, 0.5), 1, 1)
+    heavy = space.add_box((0, 2.5), 1, 1, density=ratio)
+    heights = space.simulate(4, fps=240, energy=False, contacts=0).position[:, heavy, 1]
+    holds(f"heavy box dropped on a light one, {ratio}:1: overlap, m", np.maximum(1.5 - heights, 0), 5e-4)
+
+
+def test_a_heavy_ball_rebounds_from_a_light_box_as_from_the_floor():
+    """It returns to e^2 of its height, and loses nothing if e = 1."""
+    height, heights = 1.2, {}
+    for e in (0.5, 1.0):
+        space = Space(gravity=(0, -GRAVITY))
+        space.add_segment((-10, 0), (10, 0), elasticity=1)
+        space.add_box((0, 0.25), 1, 0.5, elasticity=1)
+        ball = space.add_circle((0.2, 0.8 + height), 0.3, density=50, elasticity=e)
+        heights[e] = space.simulate(3, fps=240, energy=False, contacts=0).position[:, ball, 1] - 0.8
+    start = round(240 * math.sqrt(2 * height / GRAVITY))
+    holds("heavy ball on a light box, e = 1: gain of height in 3 s", heights[1.0].max() / height - 1, 1e-4)
+    last = heights[1.0][-240:].max()
+    holds("heavy ball on a light box, e = 1: loss of height in 3 s", last / height - 1, 1e-4)
+    first = heights[0.5][start + 5 : start + 130].max()
+    holds("heavy ball on a light box, e = .5: first height over a quarter", first / (0.25 * height) - 1, 1e-3)
+    holds("heavy ball on a light box: overlap, m", [np.minimum(h, 0).min() for h in heights.values()], 5e-4)
+
+
+@pytest.mark.parametrize("ratio", [20, 100])
+def test_a_heavy_plank_rolls_on_light_rollers(ratio):
+    """Without slip, at constant speed; the rollers are half as fast."""
+    space = Space(gravity=(0, -GRAVITY))
+    space.add_segment((-5, 0), (60, 0), friction=1.0)
+    for x in (-1, 1):
+        roller = space.add_circle((x, 0.25), 0.25, velocity=(0.5, 0), spin=-2, friction=1.0)
+    plank = space.add_box((0, 0.75), 4, 0.5, density=ratio, velocity=(1, 0), friction=1.0)
+    video = space.simulate(1.2, fps=240, energy=False, contacts=0)
+    holds(f"plank on rollers, {ratio}:1: change of speed", video.velocity[-1, plank, 0] - 1, 1e-3)
+    holds(f"plank on rollers, {ratio}:1: change of the rollers'", video.velocity[-1, roller, 0] - 0.5, 1e-3)
+    holds(f"plank on rollers, {ratio}:1: sinking, m", 0.75 - video.position[:, plank, 1], 5e-4)
+
+
 def test_heavy_discs_stand_on_light_ones():
     """Light discs between walls, each under a heavy one."""
     space = Space(gravity=(0, -GRAVITY))
