@@ -83,14 +83,16 @@ def _apply_pass(
     a, b = _with_pushes(supported, pair, normals, a, b)
     if constraint.frame is not None and roll is None and not jointed:
         # The normal impulse between two discs adds no slip, so both impulses follow from the same velocities.
-        (contact,), (old,), (normal,), (target,) = seen.contacts, pair.impulses, normals, targets
-        speed, free = relative_speed(contact.frame, contact.normal, *before)
-        slip = free if supported is None else relative_speed(contact.frame, contact.normal, *seen.left(before))[1]
-        tangent = materialize(friction_impulse(constraint, contact, normal, slip, old, target.apart))
+        (contact,), (borne,), (old,), (normal,), (target,) = (
+            pair.contacts, seen.contacts, pair.impulses, normals, targets,
+        )  # fmt: skip
+        speed, slip = relative_speed(contact.frame, contact.normal, *before)
+        _, seen_slip = relative_speed(borne.frame, borne.normal, *seen.left(before))
+        tangent = materialize(friction_impulse(constraint, borne, normal, seen_slip, old, target.apart))
         impulses.append(Impulse(normal, tangent))
         change = impulse_change(impulses[0], old)
         motions = apply_impulse(constraint, contact, change, *before)
-        work = add_disc_dissipation(b.work, contact.frame, change, speed, free)
+        work = add_disc_dissipation(b.work, contact.frame, change, speed, slip)
     else:
         motions = before
         for contact, old, normal in zip(pair.contacts, pair.impulses, normals, strict=True):

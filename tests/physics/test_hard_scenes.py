@@ -190,6 +190,19 @@ def test_a_heavy_disc_stands_on_two_light_ones_in_a_box(ratio, bound, asked):
     holds(name, heights[0] - heights, bound, asked)
 
 
+@pytest.mark.parametrize(("drop", "precision", "bound"), [(0.0, "float32", 1e-4), (1.0, "float64", 1e-9)])
+def test_the_energy_budget_accounts_for_heavy_discs_on_light_ones(drop, precision, bound):
+    space = Space(gravity=(0, -GRAVITY), precision=precision)
+    space.add_segment((-10, 0), (10, 0))
+    for x in (-0.5, 0.5):
+        space.add_segment((x, 0), (x, 4), friction=0.5)
+    space.add_circle((0, 0.5), 0.5)
+    heavy = space.add_circle((0, 1.5 + drop), 0.5, density=100)
+    energy = space.simulate(2, fps=60, contacts=0).energy
+    name = f"heavy disc on a light one, dropped from {drop:g} m: residual"
+    holds(f"{name} over its weight times a metre", energy.residual / (space.bodies[heavy].mass * GRAVITY), bound)
+
+
 @pytest.mark.asked
 @pytest.mark.full
 def test_stack_of_ten_boxes_stands():
