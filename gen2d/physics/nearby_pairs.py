@@ -448,7 +448,7 @@ class NearbyPairs(ContactSolver):
                 constraint = constraint._replace(neighbours=first.neighbours)
             setup = self.setup._replace(gravity=second.gravity, threshold=second.threshold)
             a, b, points = contact_passes.warm_start(constraint, warm, a, b, setup, self.params.step)
-            gravity = None if batch.first is None else second.gravity  # of what a static body bears
+            gravity = None if batch.first is None else second.gravity  # of impacts on supported bodies
             packed = (constraint, warm, points, second.threshold, gravity)
             values, specs[i] = pack(packed, (self.chunk,), self._dtype, once=True)
             return a, b, self._store(batch, buffer, k, values)

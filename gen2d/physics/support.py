@@ -113,7 +113,7 @@ class SupportedPair(NamedTuple):
         of_a, of_b = (0.0 if lever is None else lever for lever in levers)
         return jnp.where(self.lighter[1], of_b, of_a)
 
-    def _taken(self, p: tuple[Array, Components], q: tuple[Array, Components]) -> Array:
+    def _schur_complement(self, p: tuple[Array, Components], q: tuple[Array, Components]) -> Array:
         """What the support takes from the speed along q that a unit impulse along p causes, 1/kg.
 
         Both are directions with levers on both bodies.
@@ -130,7 +130,7 @@ class SupportedPair(NamedTuple):
         near = frame.normal_mass > 0
 
         def left(k: Array, direction: tuple[Array, Components]) -> Array:
-            return jnp.maximum(k - self._taken(direction, direction), LEAST_LEFT * k)
+            return jnp.maximum(k - self._schur_complement(direction, direction), LEAST_LEFT * k)
 
         k_normal = left(frame.k_normal, (normal, (frame.normal_a, frame.normal_b)))
         k_tangent = left(frame.k_tangent, (perpendicular(normal), (frame.tangent_a, frame.tangent_b)))
@@ -142,7 +142,7 @@ class SupportedPair(NamedTuple):
         taken = 0.0
         if len(contacts) == 2:
             of_p, of_q = ((c.normal, (c.frame.normal_a, c.frame.normal_b)) for c in contacts)
-            taken = self._taken(of_p, of_q)
+            taken = self._schur_complement(of_p, of_q)
         left = [contact._replace(frame=self._frame(contact.frame, contact.normal)) for contact in contacts]
         return SupportedContacts(self, left, taken)
 
