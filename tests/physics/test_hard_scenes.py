@@ -124,22 +124,27 @@ def test_a_heavy_box_that_falls_onto_a_light_one_does_not_enter_it(ratio):
     holds(f"heavy box dropped on a light one, {ratio}:1: overlap, m", np.maximum(1.5 - heights, 0), 5e-4)
 
 
-def test_a_heavy_ball_rebounds_from_a_light_box_as_from_the_floor():
+@pytest.mark.parametrize("lower", ["box", "disc"])
+def test_a_heavy_ball_rebounds_from_a_light_body_as_from_the_floor(lower):
     """It returns to e^2 of its height, and loses nothing if e = 1."""
     height, heights = 1.2, {}
     for e in (0.5, 1.0):
         space = Space(gravity=(0, -GRAVITY))
         space.add_segment((-10, 0), (10, 0), elasticity=1)
-        space.add_box((0, 0.25), 1, 0.5, elasticity=1)
-        ball = space.add_circle((0.2, 0.8 + height), 0.3, density=50, elasticity=e)
+        if lower == "box":
+            space.add_box((0, 0.25), 1, 0.5, elasticity=1)
+        else:
+            space.add_circle((0, 0.25), 0.25, elasticity=1)
+        x = 0.2 if lower == "box" else 0.0
+        ball = space.add_circle((x, 0.8 + height), 0.3, density=50, elasticity=e)
         heights[e] = space.simulate(3, fps=240, energy=False, contacts=0).position[:, ball, 1] - 0.8
     start = round(240 * math.sqrt(2 * height / GRAVITY))
-    holds("heavy ball on a light box, e = 1: gain of height in 3 s", heights[1.0].max() / height - 1, 1e-4)
+    holds(f"heavy ball on a light {lower}, e = 1: gain of height in 3 s", heights[1.0].max() / height - 1, 1e-4)
     last = heights[1.0][-240:].max()
-    holds("heavy ball on a light box, e = 1: loss of height in 3 s", last / height - 1, 1e-4)
+    holds(f"heavy ball on a light {lower}, e = 1: loss of height in 3 s", last / height - 1, 1e-4)
     first = heights[0.5][start + 5 : start + 130].max()
-    holds("heavy ball on a light box, e = .5: first height over a quarter", first / (0.25 * height) - 1, 1e-3)
-    holds("heavy ball on a light box: overlap, m", [np.minimum(h, 0).min() for h in heights.values()], 5e-4)
+    holds(f"heavy ball on a light {lower}, e = .5: first height over a quarter", first / (0.25 * height) - 1, 1e-3)
+    holds(f"heavy ball on a light {lower}: overlap, m", [np.minimum(h, 0).min() for h in heights.values()], 5e-4)
 
 
 @pytest.mark.parametrize("ratio", [20, 100])
