@@ -24,7 +24,7 @@ from gen2d.physics.contact_log import (
     record_event,
 )
 from gen2d.physics.contact_state import BodySide, PassSetup, SolvedPair, WarmStart
-from gen2d.physics.impact_order import TURNS, later_impact, not_hit, takes_part, with_first
+from gen2d.physics.impact_order import TURNS, in_order, later_impact, not_hit, takes_part, with_first
 from gen2d.physics.params import SolverParams
 from gen2d.physics.schedule import Match, run_schedule
 from gen2d.physics.solver_protocol import ContactSolver
@@ -136,7 +136,9 @@ class AllPairs(ContactSolver):
                 if not round_pairs[k]:
                     return a, b, pairs[k]
                 point = points[k][0]
-                return contact_passes.solve_impact(self.constraints[k], point, pairs[k], a, b, self.setup, self.params)
+                tau = later_impact(point, pairs[k].contacts[0], a, b, self.setup, self.params.step)
+                tau = in_order(point, tau, a, b)
+                return contact_passes.solve_impact(self.constraints[k], point, pairs[k], tau, a, b, self.params)
 
             return *run_schedule(sides, statics, self.order, play), follow
 

@@ -116,8 +116,9 @@ def active_pairs(words: Array, chunk: int) -> ActivePairs:
     """Pairs with a bit in words [R, W n], in chunks of `chunk` pairs."""
     words = jnp.pad(words, ((0, 0), (0, -words.shape[1] % BLOCK)))
     counts = count_active(words)
-    # In blocks, as jnp.cumsum takes quadratic time on a CPU.
-    inside = jnp.cumsum(counts.reshape(len(counts), -1, BLOCK), axis=-1, dtype=jnp.int32)
+    # In blocks, as jnp.cumsum takes quadratic time on a CPU; those of a block by a product of matrices, which is exact.
+    in_blocks = counts.reshape(len(counts), -1, BLOCK).astype(jnp.float32)
+    inside = (in_blocks @ np.triu(np.ones((BLOCK, BLOCK), np.float32))).astype(jnp.int32)
     blocks = jnp.cumsum(inside[..., -1], axis=-1, dtype=jnp.int32)
     upto = (inside + (blocks - inside[..., -1])[..., None]).reshape(counts.shape)
     starts = jnp.cumsum(-(-upto[:, -1] // chunk), dtype=jnp.int32)

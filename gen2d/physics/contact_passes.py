@@ -28,7 +28,7 @@ from gen2d.physics.contact_points import (
 from gen2d.physics.contact_state import BodySide, PassSetup, SolvedPair, WarmStart
 from gen2d.physics.energy import MotionPair, add_disc_dissipation, add_dissipation
 from gen2d.physics.friction import apply_angular_impulse, friction_impulse, rolling_impulse
-from gen2d.physics.impact_order import after_impact, in_order, later_impact, takes_part, with_first
+from gen2d.physics.impact_order import after_impact, in_order, takes_part, with_first
 from gen2d.physics.jointed import free_motion, jointed_frame, with_joints, with_motions
 from gen2d.physics.normal_impulse import (
     NormalTarget,
@@ -212,16 +212,17 @@ def solve(
 ) -> tuple[BodySide, BodySide, SolvedPair]:
     """Both sides and the pair after the first pass: impulses, bounces and the correction of overlaps."""
     constraint = with_joints(constraint, a, b)
-    acceleration, by_time = points[0].acceleration, takes_part(points, b)
+    acceleration = points[0].acceleration
     supported = supported_pair(constraint, points[0].normal, (a.support, b.support))
     if supported is not None:
-        # Impacts in the order of time have the times that the warm start has compared.
-        supported = supported._replace(in_impacts=supported.in_impacts & (not by_time))
         pull = supported.acceleration(acceleration, setup.gravity)
         points = [point._replace(acceleration=pull) for point in points]
     taus = impact_times(points, a, b, setup, params.step)
-    if by_time:
-        taus = [in_order(points[0], taus[0], a, b)]
+    if takes_part(points, b):
+        (tau,) = taus
+        taus = [in_order(points[0], tau, a, b)]
+        if supported is not None:  # as what bears a body acts at half of the step
+            taus = [jnp.where(supported.bears_impacts, tau, taus[0])]
     bounces = functools.reduce(jnp.logical_or, [tau >= 0 for tau in taus])
     supported = None if supported is None else supported.seen(bounces)
     contacts, time = active_contacts(constraint, points, taus, a, b, params.step)
@@ -247,14 +248,13 @@ def solve_impact(
     constraint: ContactConstraint,
     point: ContactPoint,
     solved: SolvedPair,
+    tau: Array,
     a: BodySide,
     b: BodySide,
-    setup: PassSetup,
     params: SolverParams,
 ) -> tuple[BodySide, BodySide, SolvedPair]:
-    """Both sides and the pair after an impact that follows another one of their bodies, if it is their next."""
+    """Both sides and the pair after an impact at tau that follows others of their bodies; unchanged without one."""
     constraint = with_joints(constraint, a, b)
-    tau = in_order(point, later_impact(point, solved.contacts[0], a, b, setup, params.step), a, b)
     contacts, time = active_contacts(constraint, [point], [tau], a, b, params.step)
     happens = tau >= 0
 

@@ -33,6 +33,7 @@ class BodySide(NamedTuple):
     support: Support | None = None  # None: static bodies, and after the first pass
     first: Array | None = None  # [N, ...] s: least time of impact of a body in the step; infinite without one
     clock: Array | None = None  # [N, ...] s: of a body's last impact in the step so far; 0 without one
+    clearance: Array | None = None  # [N, ...] m: least way that leads a body to what it has met in the pass so far
 
 
 class WarmStart(NamedTuple):

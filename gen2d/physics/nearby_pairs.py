@@ -10,19 +10,15 @@ The loops end with the last near pair, so there is no reverse-mode gradient; all
 
 import dataclasses
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from gen2d.physics import contact_passes
 from gen2d.physics.broad_phase import (
-    BITS,
     ActivePairs,
-    RoundRobin,
-    RowLookup,
     active_pairs,
     bits_in_round_robin,
     bits_of,
@@ -32,7 +28,7 @@ from gen2d.physics.broad_phase import (
     signed_distance,
 )
 from gen2d.physics.collision import Shape, dot
-from gen2d.physics.constraint import ContactConstraint, Impulse
+from gen2d.physics.constraint import Impulse
 from gen2d.physics.contact_log import (
     ON,
     ContactEvent,
@@ -44,74 +40,27 @@ from gen2d.physics.contact_log import (
     record_event,
     sort_order,
 )
-from gen2d.physics.contact_state import BodySide, PassSetup, WarmStart
-from gen2d.physics.impact_order import TURNS, later_impact, may_follow, takes_part, with_first
-from gen2d.physics.packing import SAFE, PackedTable, TableSpec, make_table, pack, repeat_rows, table_of_rows, unpack
-from gen2d.physics.params import SolverParams
+from gen2d.physics.contact_state import BodySide, WarmStart
+from gen2d.physics.impact_order import alone, ordered, with_clearance
+from gen2d.physics.nearby_impacts import LaterImpacts
+from gen2d.physics.packing import SAFE, PackedTable, TableSpec, pack, repeat_rows, table_of_rows, unpack
+from gen2d.physics.pair_batches import (
+    CONSTANTS,
+    GatherIndices,
+    ListedPairs,
+    PairBatch,
+    PairBatches,
+    SolvedChunk,
+    StaticSide,
+)
 from gen2d.physics.schedule import bipartite_rounds
-from gen2d.physics.segment_lines import Neighbours
 from gen2d.physics.solver_protocol import ContactSolver
 from gen2d.records.axes import Array
 from gen2d.records.trajectory import Contacts
 from gen2d.xla import materialize, max_bodies
 
-CONSTANTS = "shape", "acceleration", "displacement", "schur"  # of a `BodySide`: no pass changes them
 NEVER = -2  # the step of an event that has not happened
-
-
-class StaticSide(NamedTuple):
-    """Constants of a static or kinematic body; leaves [..., 1, n]."""
-
-    material: Any
-    neighbours: Neighbours | None
-    present: Array
-
-
-class DynamicSide(NamedTuple):
-    """Constants of a group of bodies; leaves [..., N, n]."""
-
-    material: Any
-    gravity: Array
-    threshold: Array
-
-
-@dataclasses.dataclass(frozen=True)
-class PairBatch:
-    """Pairs that are solved by the same operations: of two groups, or of some static bodies with a group."""
-
-    first: int | None  # a group; None: static bodies
-    statics: dict[int, StaticSide]  # by number
-    second: int
-    a: np.ndarray  # [R, P] the pairs of R rounds, by number in the group or place among the statics
-    b: np.ndarray
-    slots: tuple[np.ndarray, np.ndarray]  # [R, P] of the objects
-    round_robin: RoundRobin | None  # of a group with itself
-    constraint: Callable[[Any, Any], ContactConstraint]  # from the materials of both sides
-    points: int
-
-    @property
-    def groups(self) -> list[int]:
-        """Groups whose bodies move."""
-        return [self.second] if self.first in (None, self.second) else [self.first, self.second]
-
-    @property
-    def pairs_in_order(self) -> np.ndarray:
-        """The pair [R, P] that each bit of a round stands for, unless bits are in the order of a round robin."""
-        return np.broadcast_to(np.arange(self.a.shape[1]), self.a.shape)
-
-    @property
-    def pair_of_bit(self) -> np.ndarray:
-        """The pair [R, bits] that each bit of a round stands for."""
-        return self.pairs_in_order if self.round_robin is None else self.round_robin.pair
-
-
-class GatherIndices(NamedTuple):
-    """Table rows of the pairs of a chunk, each [C]; the last row of a table where there is no pair."""
-
-    a: Array  # of the bodies
-    b: Array
-    pair: Array  # of the pairs
-    scene: Array
+FOLLOWS = 1 << 20  # added to the contacts of a scene that begin in a step: a pair that an impact may follow
 
 
 class PassBuffers(NamedTuple):
@@ -120,39 +69,6 @@ class PassBuffers(NamedTuple):
     indices: Array  # [K, 4, C]
     contacts: Array  # [K, F, C]
     solved: Array
-
-
-class ListedPairs(NamedTuple):
-    """Near pairs of each batch, and their contacts after the warm start."""
-
-    chunks: list[Array]  # how many there are
-    indices: list[Array]
-    packed: list[Array]
-    specs: dict[int, TableSpec]  # of the packed contacts
-
-
-class SolvedChunk(NamedTuple):
-    """Contacts of each batch after the first pass."""
-
-    listed: ListedPairs
-    packed: list[Array]
-    specs: dict[int, TableSpec]
-    observed: list[tuple[Array, Array]]  # [n + 1] each: deepest overlap, m, and contacts that began
-
-
-class BodyTables(NamedTuple):
-    """Packed bodies of a pass."""
-
-    constants: tuple[str, ...]  # fields of the sides that the pass does not change
-    changing: list[PackedTable]  # by group: what a pass changes
-    constant: list[PackedTable]
-    fixed: list[PackedTable | None]  # static bodies of each batch that has any
-    sides: list[BodySide]  # with the constant part alone
-
-    @property
-    def rows(self) -> list[Array]:
-        """Rows of the changing tables."""
-        return [table.rows for table in self.changing]
 
 
 class CachedConstraint(NamedTuple):
@@ -188,35 +104,20 @@ class ContactRow(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True)
-class NearbyPairs(ContactSolver):
+class NearbyPairs(PairBatches, ContactSolver):
     """Contact solver over all pairs of a video, of which each step solves those that are near."""
 
-    batches: list[PairBatch]
-    groups: list[DynamicSide]
-    rolling: bool  # whether anything resists rolling
-    setup: PassSetup
-    params: SolverParams
-    chunk: int  # pairs that are solved at once
-
-    @property
-    def _scenes(self) -> int:
-        return self.setup.threshold.shape[-1]
-
-    @property
-    def _dtype(self) -> Any:
-        return self.setup.threshold.dtype
-
     def start(self, slots: int) -> NearbyCarry:
-        n, count = self._scenes, jnp.zeros(self._scenes + 1, jnp.int32)
+        n, count = self.scenes, jnp.zeros(self.scenes + 1, jnp.int32)
         return NearbyCarry(
-            cache=[repeat_rows(self._empty_entry(b), b.a.size * n, self._dtype) for b in self.batches],
+            cache=[repeat_rows(self._empty_entry(b), b.a.size * n, self.dtype) for b in self.batches],
             last_touch=[jnp.full(b.a.size * n + 1, NEVER, jnp.int32) for b in self.batches] if slots else [],
             buffers=None,
-            depth=count.astype(self._dtype),
+            depth=count.astype(self.dtype),
             begins=count,
             step=jnp.zeros((), jnp.int32),
             first=jnp.zeros((), jnp.int32),
-            log=repeat_rows(_empty_row(self._dtype), slots * n, self._dtype) if slots else None,
+            log=repeat_rows(_empty_row(self.dtype), slots * n, self.dtype) if slots else None,
             log_count=count if slots else None,
         )
 
@@ -226,11 +127,11 @@ class NearbyPairs(ContactSolver):
 
     def _empty_entry(self, batch: PairBatch) -> CachedConstraint:
         """Cache entry of a pair before its first contact."""
-        zero = jnp.zeros(1, self._dtype)
+        zero = jnp.zeros(1, self.dtype)
         warm = WarmStart([Impulse(zero, zero)] * batch.points, zero if self.rolling else None)
         if not self.setup.log:
             return CachedConstraint(warm, zero + NEVER, None, None)
-        return CachedConstraint(warm, zero + NEVER, empty_events((1,), self._dtype), zero)
+        return CachedConstraint(warm, zero + NEVER, empty_events((1,), self.dtype), zero)
 
     def _cache_tables(self, carry: NearbyCarry) -> list[PackedTable]:
         entries = [self._empty_entry(batch) for batch in self.batches]
@@ -242,7 +143,7 @@ class NearbyPairs(ContactSolver):
         """Pairs of each batch that may meet in this step."""
         motions = [side.motion for side in sides if side.motion is not None]
         squares = [dot(motion.velocity, motion.velocity) for motion in motions]
-        fastest = jnp.zeros(self._scenes, self._dtype)
+        fastest = jnp.zeros(self.scenes, self.dtype)
         for square in squares:
             fastest = jnp.maximum(fastest, jnp.sqrt(max_bodies(square)))
         for side in statics:
@@ -281,24 +182,6 @@ class NearbyPairs(ContactSolver):
         *_, gaps = bipartite_rounds(bodies[batch.first], (centre, reach), play)
         return bits_of(jnp.stack(gaps) < 0)
 
-    def _chunk_indices(self, batch: PairBatch, lookup: RowLookup, pair_of_bit: np.ndarray) -> GatherIndices:
-        """Table rows of the pairs of a chunk."""
-        n, (_, pairs), bits = self._scenes, batch.a.shape, pair_of_bit.shape[1]
-        scene, bit = lookup.word % n, jnp.minimum(lookup.word // n * BITS + lookup.bit, bits - 1)
-
-        def entry(values: np.ndarray, where: Array) -> Array:
-            return jnp.asarray(values.reshape(-1), jnp.int32).at[where].get(mode=SAFE)
-
-        pair = lookup.round * pairs + entry(pair_of_bit, lookup.round * bits + bit)
-        a, b = entry(batch.a, pair), entry(batch.b, pair)
-        count = len(batch.statics) if batch.first is None else self._size(batch.first)
-        ends = count, self._size(batch.second), batch.a.size
-        rows = (jnp.where(lookup.there, x * n + scene, end * n) for x, end in zip((a, b, pair), ends, strict=True))
-        return GatherIndices(*rows, scene=jnp.where(lookup.there, scene, n))
-
-    def _size(self, group: int) -> int:
-        return self.groups[group].threshold.shape[0]
-
     def _all_indices(self, near: list[ActivePairs], buffers: list[PassBuffers] | None) -> list[Array]:
         """Table rows of the pairs of all chunks, in loops of their own, or each gather would compute them again."""
         if buffers is None:
@@ -307,7 +190,7 @@ class NearbyPairs(ContactSolver):
 
         def of_batch(batch: PairBatch, active: ActivePairs, buffer: PassBuffers) -> Array:
             def chunk(k: Array, indices: Array) -> Array:
-                new = self._chunk_indices(batch, row_lookup(active, k, self.chunk), batch.pair_of_bit)
+                new = self.chunk_indices(batch, row_lookup(active, k, self.chunk), batch.pair_of_bit)
                 return indices.at[k].set(jnp.stack(new), mode=SAFE)
 
             return jax.lax.fori_loop(0, active.starts[-1], chunk, buffer.indices)
@@ -316,16 +199,9 @@ class NearbyPairs(ContactSolver):
 
     def _most_chunks(self, batch: PairBatch) -> int:
         rounds, pairs = batch.a.shape
-        return rounds * -(-pairs * self._scenes // self.chunk)
+        return rounds * -(-pairs * self.scenes // self.chunk)
 
     # ---- The passes
-
-    def _table(self, tree: Any, count: int) -> PackedTable:
-        return make_table(tree, (count, self._scenes), self._dtype)
-
-    def _static_table(self, trees: list[Any]) -> PackedTable:
-        """Table of static bodies, from trees with leaves [..., 1, n]."""
-        return self._table(jax.tree.map(lambda *x: jnp.concatenate(x, axis=-2), *trees), len(trees))
 
     def _pass(
         self,
@@ -336,98 +212,23 @@ class NearbyPairs(ContactSolver):
         play: Callable,
         constants: tuple[str, ...],
     ) -> tuple[list[BodySide], list[Any]]:
-        """Sides and carries of all batches after a pass over the near pairs.
-
-        `play(i, k, indices, a, b, carry)` returns both sides and the carry after chunk k of batch i. A carry with a
-        None has no buffer yet; one chunk is then played to find its shape.
-        """
-        bodies = self._bodies(sides, statics, constants)
-        rows, carries = self._play(bodies, bodies.rows, listed, carries, play, range(len(self.batches)))
-        return self._unpacked(bodies, rows), carries
-
-    def _bodies(self, sides: list[BodySide], statics: list[BodySide], constants: tuple[str, ...]) -> BodyTables:
-        """Tables of the bodies, and of the static bodies of each batch."""
-        changing, constant = zip(*(_split(side, constants) for side in sides), strict=True)
-        tables, inputs = ([self._table(x, self._size(g)) for g, x in enumerate(of)] for of in (changing, constant))
-        fixed = [self._static_table([statics[j] for j in b.statics]) if b.first is None else None for b in self.batches]
-        return BodyTables(constants, tables, inputs, fixed, list(constant))
-
-    def _unpacked(self, bodies: BodyTables, rows: list[Array]) -> list[BodySide]:
-        """Sides with the rows of tables in which a pass has changed them."""
-        shapes = [(self._size(g), self._scenes) for g in range(len(rows))]
-        of = zip(bodies.changing, rows, shapes, bodies.sides, strict=True)
-        return [
-            _merge(table._replace(rows=x).unpack(shape), constant, bodies.constants) for table, x, shape, constant in of
-        ]
-
-    def _play(
-        self,
-        bodies: BodyTables,
-        rows: list[Array],
-        listed: ListedPairs,
-        carries: list[Any],
-        play: Callable,
-        numbers: Sequence[int],
-        skip: Callable | None = None,
-    ) -> tuple[list[Array], list[Any]]:
-        """Rows of the bodies' tables and carries after `play` of all chunks of some batches.
-
-        `skip(i, k, indices, rows, carry)` returns whether a chunk is left out.
-        """
-        rows, carries = list(rows), list(carries)
-
-        def side(rows: dict[int, Array], group: int, where: Array) -> BodySide:
-            changing = bodies.changing[group]._replace(rows=rows[group])
-            return _merge(changing.at(where), bodies.constant[group].at(where), bodies.constants)
-
-        for i in numbers:
-            batch = self.batches[i]
-
-            def chunk(k: Array, state: tuple, i: int = i, batch: PairBatch = batch) -> tuple:
-                rows, carry = state
-                indices, fixed = GatherIndices(*listed.indices[i][k]), bodies.fixed[i]
-                if batch.first is not None:
-                    a = side(rows, batch.first, indices.a)
-                else:
-                    assert fixed is not None, "a batch without a first group has static bodies"
-                    a = fixed.at(indices.a)
-                a, b, carry = play(i, k, indices, a, side(rows, batch.second, indices.b), carry)
-                new = dict(rows)
-                if batch.first is not None:
-                    new[batch.first] = self._put(bodies, new, batch.first, indices.a, a)
-                new[batch.second] = self._put(bodies, new, batch.second, indices.b, b)
-                return new, carry
-
-            def chunk_if_needed(k: Array, state: tuple, i: int = i, chunk: Callable = chunk) -> tuple:
-                assert skip is not None, "without it no chunk is skipped"
-                idle = skip(i, k, GatherIndices(*listed.indices[i][k]), *state)
-                # A loop of one turn, as XLA copies the tables that a branch changes.
-                return jax.lax.fori_loop(0, jnp.where(idle, 0, 1), lambda _, state: chunk(k, state), state)
-
-            start = {g: rows[g] for g in batch.groups}, carries[i]
-            if any(x is None for x in jax.tree.leaves(carries[i], is_leaf=lambda x: x is None)):
-                new, carries[i] = chunk(jnp.zeros((), jnp.int32), start)
-            else:
-                body = chunk if skip is None else chunk_if_needed
-                new, carries[i] = jax.lax.fori_loop(0, listed.chunks[i], body, start)
-            for g, x in new.items():
-                rows[g] = x
-        return rows, carries
-
-    def _put(self, bodies: BodyTables, rows: dict[int, Array], group: int, where: Array, side: BodySide) -> Array:
-        return bodies.changing[group]._replace(rows=rows[group]).put(where, _split(side, bodies.constants)[0]).rows
+        """Sides and carries of all batches after a pass over the near pairs."""
+        bodies = self.bodies(sides, statics, constants)
+        rows, carries = self.play(bodies, bodies.rows, listed, carries, play)
+        return self.unpacked(bodies, rows), carries
 
     def _store(self, batch: PairBatch, buffer: Array | None, k: Array, values: list[Array]) -> Array:
         """Buffer with the values of chunk k; a new one if there is none."""
         if buffer is None:
-            return jnp.zeros((self._most_chunks(batch), len(values), self.chunk), self._dtype)
+            return jnp.zeros((self._most_chunks(batch), len(values), self.chunk), self.dtype)
         return buffer.at[k].set(materialize(jnp.stack(values)), mode=SAFE)
 
     def warm_start(
         self, carry: NearbyCarry, sides: list[BodySide], statics: list[BodySide]
     ) -> tuple[list[BodySide], ListedPairs]:
         near = self._find_near_pairs(sides, statics)
-        listed = ListedPairs([active.starts[-1] for active in near], self._all_indices(near, carry.buffers), [], {})
+        chunks, indices = [active.starts[-1] for active in near], self._all_indices(near, carry.buffers)
+        listed = ListedPairs(near, chunks, indices, [], {})
         groups = [self._table(group, self._size(g)) for g, group in enumerate(self.groups)]
         firsts = [
             self._static_table(list(b.statics.values())) if b.first is None else groups[b.first] for b in self.batches
@@ -441,7 +242,7 @@ class NearbyPairs(ContactSolver):
             batch = self.batches[i]
             first, second = firsts[i].at(indices.a), groups[batch.second].at(indices.b)
             cached = caches[i].at(indices.pair)
-            fresh = cached.stamp == (carry.step - 1).astype(self._dtype)
+            fresh = cached.stamp == (carry.step - 1).astype(self.dtype)
             warm = jax.tree.map(lambda x: jnp.where(fresh, x, 0.0), cached.warm)
             constraint = batch.constraint(first.material, second.material)
             if isinstance(first, StaticSide):
@@ -450,109 +251,45 @@ class NearbyPairs(ContactSolver):
             a, b, points = contact_passes.warm_start(constraint, warm, a, b, setup, self.params.step)
             gravity = None if batch.first is None else second.gravity  # of impacts on supported bodies
             packed = (constraint, warm, points, second.threshold, gravity)
-            values, specs[i] = pack(packed, (self.chunk,), self._dtype, once=True)
+            values, specs[i] = pack(packed, (self.chunk,), self.dtype, once=True)
             return a, b, self._store(batch, buffer, k, values)
 
         buffers = [None] * len(self.batches) if carry.buffers is None else [b.contacts for b in carry.buffers]
         sides, packed = self._pass(sides, statics, listed, buffers, play, CONSTANTS)
         return sides, listed._replace(packed=packed, specs=specs)
 
-    def _unpack_contacts(
-        self, listed: ListedPairs, i: int, k: Array
-    ) -> tuple[ContactConstraint, WarmStart, list, PassSetup]:
-        """Constraint, impulses, points and setup of chunk k of batch i, as the warm start stored them."""
-        constraint, warm, points, threshold, gravity = unpack(list(listed.packed[i][k]), listed.specs[i])
-        return constraint, warm, points, self.setup._replace(threshold=threshold, gravity=gravity)
-
     def solve(
         self, carry: NearbyCarry, contacts: ListedPairs, sides: list[BodySide], statics: list[BodySide]
     ) -> tuple[list[BodySide], SolvedChunk]:
         specs: dict[int, TableSpec] = {}
+        constants = *CONSTANTS, "support", "first"
+        first = [unpack(list(packed[0]), contacts.specs[i]) for i, packed in enumerate(contacts.packed)]
+        by_time = self.params.by_time and any(ordered(points) for _, _, points, *_ in first)
 
         def play(i: int, k: Array, indices: GatherIndices, a: BodySide, b: BodySide, carried: tuple) -> tuple:
             buffer, depth, begins = carried
-            constraint, warm, points, setup = self._unpack_contacts(contacts, i, k)
-            a, b, solved = contact_passes.solve(constraint, warm, points, a, b, setup, self.params)
-            values, specs[i] = pack(solved, (self.chunk,), self._dtype, once=True)
+            constraint, warm, points, setup = self.unpack_contacts(list(contacts.packed[i][k]), contacts.specs[i])
+            old, (a, b, solved) = (a, b), contact_passes.solve(constraint, warm, points, a, b, setup, self.params)
+            values, specs[i] = pack(solved, (self.chunk,), self.dtype, once=True)
             overlap, began = contact_passes.observe(solved, warm)
-            depth, begins = depth.at[indices.scene].max(overlap), begins.at[indices.scene].add(began.astype(jnp.int32))
+            counted = began.astype(jnp.int32)
+            if by_time:
+                a, b, follow = with_clearance(solved, ordered(points), old, a, b, self.params.step)
+                counted = counted + jnp.where(follow, FOLLOWS, 0)
+            depth, begins = depth.at[indices.scene].max(overlap), begins.at[indices.scene].add(counted)
             return a, b, (self._store(self.batches[i], buffer, k, values), depth, begins)
 
         buffers = [None] * len(self.batches) if carry.buffers is None else [b.solved for b in carry.buffers]
         zero = jnp.zeros_like(carry.depth), jnp.zeros_like(carry.begins)
-        starts = [(buffer, *zero) for buffer in buffers]
-        sides, carries = self._pass(sides, statics, contacts, starts, play, (*CONSTANTS, "support"))
-        observed = [(depth, begins) for _, depth, begins in carries]
+        bodies = self.bodies(alone(sides) if by_time else sides, statics, constants)
+        rows, carries = self.play(bodies, bodies.rows, contacts, [(buffer, *zero) for buffer in buffers], play)
+        observed = [(depth, begins % FOLLOWS) for _, depth, begins in carries]
         solved = SolvedChunk(contacts, [packed for packed, *_ in carries], specs, observed)
-        return self._later_impacts(solved, sides, statics)
-
-    def _later_impacts(
-        self, solved: SolvedChunk, sides: list[BodySide], statics: list[BodySide]
-    ) -> tuple[list[BodySide], SolvedChunk]:
-        """Sides and contacts after the impacts that follow others of their bodies in this step."""
-        if not self.params.by_time:
-            return sides, solved
-        listed, zero = solved.listed, jnp.zeros((), jnp.int32)
-        points = [self._unpack_contacts(listed, i, zero)[2] for i in range(len(self.batches))]
-        batches = [i for i, of in enumerate(points) if takes_part(of, sides[0])]
-        if not batches:
-            return sides, solved
-        bodies = self._bodies(sides, statics, (*CONSTANTS, "support"))
-        clocks = [_column(table, "clock") for table in bodies.changing]
-
-        def idle(i: int, buffer: Array, k: Array, indices: GatherIndices, rows: dict[int, Array]) -> Array:
-            """Whether no impact may follow in a chunk."""
-
-            def clock_of(group: int, where: Array) -> Array:
-                return rows[group][:, clocks[group]].at[where].get(mode=SAFE)
-
-            batch, (contact,) = self.batches[i], unpack(list(buffer[k]), solved.specs[i]).contacts
-            clock = clock_of(batch.second, indices.b)
-            if batch.first is not None:
-                clock = jnp.maximum(clock, clock_of(batch.first, indices.a))
-            return ~jnp.any(may_follow(contact, clock))
-
-        def find(rows: list[Array], packed: list[Array]) -> tuple[list[Array], Array]:
-            def play(i: int, k: Array, indices: GatherIndices, a: BodySide, b: BodySide, follow: Array) -> tuple:
-                _, _, points, setup = self._unpack_contacts(listed, i, k)
-                pair = unpack(list(packed[i][k]), solved.specs[i])
-                tau = later_impact(points[0], pair.contacts[0], a, b, setup, self.params.step)
-                return *with_first(a, b, tau), follow | jnp.any(tau >= 0)
-
-            firsts = [_column(table, "first") for table in bodies.changing]
-            rows = [x.at[:, column].set(jnp.inf) for x, column in zip(rows, firsts, strict=True)]
-            none = [jnp.zeros((), bool)] * len(self.batches)
-            rows, follow = self._play(
-                bodies,
-                rows,
-                listed,
-                none,
-                play,
-                batches,
-                lambda i, k, indices, rows, _: idle(i, packed[i], k, indices, rows),
-            )
-            return rows, functools.reduce(jnp.logical_or, follow)
-
-        def turn(state: tuple) -> tuple:
-            rows, packed, _, count = state
-            rows, follow = find(rows, packed)
-
-            def play(i: int, k: Array, indices: GatherIndices, a: BodySide, b: BodySide, buffer: Array) -> tuple:
-                constraint, _, points, setup = self._unpack_contacts(listed, i, k)
-                pair = unpack(list(buffer[k]), solved.specs[i])
-                a, b, pair = contact_passes.solve_impact(constraint, points[0], pair, a, b, setup, self.params)
-                values, _ = pack(pair, (self.chunk,), self._dtype, once=True)
-                return a, b, self._store(self.batches[i], buffer, k, values)
-
-            def skip(i: int, k: Array, indices: GatherIndices, rows: dict[int, Array], buffer: Array) -> Array:
-                return ~follow | idle(i, buffer, k, indices, rows)
-
-            rows, packed = self._play(bodies, rows, listed, packed, play, batches, skip)
-            return rows, packed, follow, count + 1
-
-        start = bodies.rows, solved.packed, jnp.ones((), bool), zero
-        rows, packed, *_ = jax.lax.while_loop(lambda state: state[2] & (state[3] < TURNS), turn, start)
-        return self._unpacked(bodies, rows), solved._replace(packed=packed)
+        if by_time:
+            follow = functools.reduce(jnp.logical_or, [begins >= FOLLOWS for *_, begins in carries])[:-1]
+            rows, packed = LaterImpacts(self, bodies, solved, follow).solve(rows)
+            solved = solved._replace(packed=packed)
+        return self.unpacked(bodies, rows), solved
 
     def relax(
         self, carry: NearbyCarry, solved: SolvedChunk, sides: list[BodySide], statics: list[BodySide], time: Array
@@ -562,10 +299,10 @@ class NearbyPairs(ContactSolver):
 
         def play(i: int, k: Array, indices: GatherIndices, a: BodySide, b: BodySide, carried: tuple) -> tuple:
             cache, touch = caches[i]._replace(rows=carried[0]), carried[1]
-            constraint, memory, points, setup = self._unpack_contacts(listed, i, k)
+            constraint, memory, points, setup = self.unpack_contacts(list(listed.packed[i][k]), listed.specs[i])
             pair = unpack(list(solved.packed[i][k]), solved.specs[i])
             a, b, (last, warm) = contact_passes.relax(constraint, memory, points, pair, a, b, setup, self.params)
-            new = CachedConstraint(warm, jnp.full(self.chunk, carry.step, self._dtype), None, None)
+            new = CachedConstraint(warm, jnp.full(self.chunk, carry.step, self.dtype), None, None)
             if self.setup.log:
                 event = record_event(self._event_so_far(carry, cache.at(indices.pair)), pair, last, time)
                 new = new._replace(event=event, elasticity=constraint.elasticity)
@@ -609,10 +346,10 @@ class NearbyPairs(ContactSolver):
             return carry, None
         log, count = carry.log, carry.log_count
         for batch, cache, touch in zip(self.batches, self._cache_tables(carry), carry.last_touch, strict=True):
-            recent = touch[:-1].reshape(*batch.a.shape, self._scenes) >= 2 * carry.first - 1
+            recent = touch[:-1].reshape(*batch.a.shape, self.scenes) >= 2 * carry.first - 1
             words = bits_of(recent)
             log = self._append_to_log(carry, batch, cache, words, log, count)
-            new = jnp.sum(count_active(words).reshape(-1, self._scenes), axis=0, dtype=jnp.int32)
+            new = jnp.sum(count_active(words).reshape(-1, self.scenes), axis=0, dtype=jnp.int32)
             count = count.at[:-1].add(new)
         return carry._replace(log=log, log_count=count), None
 
@@ -620,7 +357,7 @@ class NearbyPairs(ContactSolver):
         self, carry: NearbyCarry, batch: PairBatch, cache: PackedTable, words: Array, log: Array, count: Array
     ) -> Array:
         """Log with the pairs of a batch that have a bit in words [R, W n], after `count` [n + 1] contacts."""
-        n, active = self._scenes, active_pairs(words, self.chunk)
+        n, active = self.scenes, active_pairs(words, self.chunk)
         counts = count_active(words).reshape(-1, n)
         before = count[:-1] + jnp.cumsum(counts, axis=0, dtype=jnp.int32) - counts  # by round and word
         table, slots = self._log_table(log), [jnp.asarray(x.reshape(-1), jnp.int32) for x in batch.slots]
@@ -629,12 +366,12 @@ class NearbyPairs(ContactSolver):
 
         def chunk(k: Array, log: Array) -> Array:
             lookup = row_lookup(active, k, self.chunk)
-            indices = self._chunk_indices(batch, lookup, batch.pairs_in_order)
+            indices = self.chunk_indices(batch, lookup, batch.pairs_in_order)
             cached = cache.at(indices.pair)
-            event, last = self._event_so_far(carry, cached), cached.stamp == (carry.step - 1).astype(self._dtype)
+            event, last = self._event_so_far(carry, cached), cached.stamp == (carry.step - 1).astype(self.dtype)
             event = event._replace(flags=jnp.where(last, event.flags, event.flags & ~ON))
             new = pair_event(event, cached.elasticity)
-            began = carry.first.astype(self._dtype) * self.params.step  # the time of an end without a touch
+            began = carry.first.astype(self.dtype) * self.params.step  # the time of an end without a touch
             new = new._replace(time=jnp.where(new.time >= 0, new.time, began))
             word = jnp.minimum(lookup.round * width + lookup.word, before.size - 1)
             rank = before.reshape(-1).at[word].get(mode=SAFE) + lookup.rank
@@ -646,13 +383,13 @@ class NearbyPairs(ContactSolver):
         return jax.lax.fori_loop(0, active.starts[-1], chunk, log)
 
     def _log_table(self, rows: Array) -> PackedTable:
-        return table_of_rows(rows, _empty_row(self._dtype))
+        return table_of_rows(rows, _empty_row(self.dtype))
 
     def results(self, carry: NearbyCarry, events: None, slots: int, fps: float) -> tuple[Array, Array, Contacts | None]:
         depth, begins = carry.depth[:-1], carry.begins[:-1]
         if carry.log is None or carry.log_count is None:
             return depth, begins, None
-        log, count = self._log_table(carry.log).unpack((slots, self._scenes)), carry.log_count[:-1]
+        log, count = self._log_table(carry.log).unpack((slots, self.scenes)), carry.log_count[:-1]
         filled = jnp.arange(slots)[:, None] < count
         order = sort_order(jnp.where(filled, log.pair_event.time, jnp.inf))
 
@@ -661,22 +398,6 @@ class NearbyPairs(ContactSolver):
             return jnp.take_along_axis(x, jnp.broadcast_to(order, x.shape), axis=-2)
 
         return depth, begins, contacts_of(*jax.tree.map(in_order, log), count=count)
-
-
-def _split(side: BodySide, constants: tuple[str, ...]) -> tuple[BodySide, BodySide]:
-    """What a pass changes of a side, and the rest."""
-    rest = {name: getattr(side, name) for name in constants}
-    return side._replace(**dict.fromkeys(constants)), BodySide(**rest)
-
-
-def _column(table: PackedTable, name: str) -> int:
-    """Column of a scalar of the bodies in a table."""
-    return getattr(jax.tree.unflatten(table.spec.tree, [leaf.first for leaf in table.spec.leaves]), name)
-
-
-def _merge(changing: BodySide, constant: BodySide, constants: tuple[str, ...]) -> BodySide:
-    """A side from its two parts."""
-    return changing._replace(**{name: getattr(constant, name) for name in constants})
 
 
 def _empty_row(dtype: Any) -> ContactRow:

@@ -18,7 +18,8 @@ from gen2d.physics.broad_phase import round_robin_of
 from gen2d.physics.collision import Stadium
 from gen2d.physics.constraint import ContactConstraint, Inertia, Motion, frame_of, mix_materials, reciprocal
 from gen2d.physics.contact_state import PassSetup
-from gen2d.physics.nearby_pairs import DynamicSide, NearbyPairs, PairBatch, StaticSide, chunk_size
+from gen2d.physics.nearby_pairs import NearbyPairs, chunk_size
+from gen2d.physics.pair_batches import DynamicSide, PairBatch, StaticSide
 from gen2d.physics.params import SolverParams
 from gen2d.physics.schedule import matches, pairings, run_schedule
 from gen2d.physics.segment_lines import Neighbours, neighbours_of

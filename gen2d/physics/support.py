@@ -146,6 +146,11 @@ class SupportedPair(NamedTuple):
         left = [contact._replace(frame=self._frame(contact.frame, contact.normal)) for contact in contacts]
         return SupportedContacts(self, left, taken)
 
+    @property
+    def bears_impacts(self) -> Array:
+        """Whether impacts see what bears the lighter body."""
+        return (self.lighter[0] | self.lighter[1]) & self.in_impacts
+
     def acceleration(self, acceleration: Array | None, gravity: Array) -> Array:
         """Acceleration [2, ...] of b relative to a, m/s^2: gravity's of the heavier body, if the lighter is borne."""
         free = jnp.zeros_like(self.load) if acceleration is None else acceleration
