@@ -28,7 +28,7 @@ class _Turn(NamedTuple):
     firsts: list[Array]  # s: times of the next impacts of the bodies, by rows of their tables
     acts: Array  # whether the next impacts are known and act; else they are found
     more: Array  # whether to go on
-    count: Array
+    turns: Array  # so far
 
 
 class _List(NamedTuple):
@@ -92,35 +92,36 @@ class LaterImpacts:
                     return self._solve_chunk(i, _Chunk(*pairs.indices[k]), now.acts, carry)
 
                 state, packed[i] = jax.lax.fori_loop(0, pairs.chunks, chunk, (state, packed[i]))
-            return _Turn(state[0], packed, state[1], ~now.acts, state[2], now.count + 1)
+            rows, firsts, more = state
+            return _Turn(rows, packed, firsts, ~now.acts, more, now.turns + 1)
 
         none, zero = [jnp.full(len(x), jnp.inf, x.dtype) for x in rows], jnp.zeros((), jnp.int32)
         start = _Turn(rows, packed, none, zero > 0, zero == 0, zero)
-        end = jax.lax.while_loop(lambda now: now.more & (now.count < 2 * TURNS), turn, start)
+        end = jax.lax.while_loop(lambda now: now.more & (now.turns < 2 * TURNS), turn, start)
         return end.rows, end.packed
 
     def _solve_chunk(self, i: int, own: _Chunk, acts: Array, carry: tuple) -> tuple:
         """Rows, times and whether to go on, and packed contacts after the impacts of a chunk are found or act."""
         (rows, firsts, more), buffer = carry
         rows, firsts, solver, bodies = list(rows), list(firsts), self._solver, self._bodies
-        sides = list(solver.sides_of(bodies, dict(enumerate(rows)), i, own.a, own.b))
-        groups = self._groups(i, own)
-        moving = range(2 - len(groups), 2)
-        for side, (group, where) in zip(moving, groups, strict=True):
-            sides[side] = sides[side]._replace(first=firsts[group].at[where].get(mode=SAFE))
+        batch, groups = solver.batches[i], self._groups(i, own)
+        a, b = solver.sides_of(bodies, dict(enumerate(rows)), i, own.a, own.b)
+        b = b._replace(first=firsts[batch.second].at[own.b].get(mode=SAFE))
+        if batch.first is not None:
+            a = a._replace(first=firsts[batch.first].at[own.a].get(mode=SAFE))
         constraint, _, (point, *_), setup = self._contacts(i, own)
         pair = unpack(own.columns(buffer), self._solved.specs[i])
-        tau = later_impact(point, pair.contacts[0], *sides, setup, solver.params.step)
+        tau = later_impact(point, pair.contacts[0], a, b, setup, solver.params.step)
+        more = more | jnp.any(tau >= 0)
         for group, where in groups:
             found = jnp.where(acts, jnp.inf, first_time(tau)).astype(tau.dtype)
             firsts[group] = firsts[group].at[where].min(found, mode=SAFE)
-        more = more | jnp.any(tau >= 0)
-        tau = in_order(point, tau, *sides)
+        tau = in_order(point, tau, a, b)
         tau = jnp.where(acts & _leading(groups, rows, tau >= 0), tau, NONE)
-        *sides, pair = solve_impact(constraint, point, pair, tau, *sides, solver.params)
-        for side, (group, where) in zip(moving, groups, strict=True):
+        a, b, pair = solve_impact(constraint, point, pair, tau, a, b, solver.params)
+        for (group, where), side in zip(groups, (a, b)[-len(groups) :], strict=True):
             where = jnp.where(tau >= 0, where, len(rows[group]) - 1)
-            rows[group] = solver.put(bodies, rows[group], group, where, sides[side])
+            rows[group] = solver.put(bodies, rows[group], group, where, side)
         values, _ = pack(pair, (CHUNK,), buffer.dtype, once=True)
         return (rows, firsts, more), own.put(buffer, values)
 

@@ -108,8 +108,8 @@ def sample(case: Case, number: int) -> Start:
 def works(case: Case) -> tuple[dict[str, Callable[[], float]], dict[str, float]]:
     """By engine, functions that simulate videos and return the CPU seconds per video; gen2d's compile times, s."""
     ours, seconds = {}, {}
-    for name, everything in (("states", False), ("all", True)):
-        program, inputs, seconds[f"compile {name}"] = gen2d_program(case, everything)
+    for name, *options in (("states", False, False), ("all", True, False), ("time", True, True)):
+        program, inputs, seconds[f"compile {name}"] = gen2d_program(case, *options)
         ours[name] = _timed_program(program, inputs, case.batch_size)
     by_engine = ours | {"pymunk": lambda: chipmunk_seconds(case)}
     if case.peers[1] and has_phyjax2d():
@@ -129,10 +129,11 @@ def _timed_program(program: Callable, inputs: Sequence[Any], videos: int) -> Cal
     return timed(lambda: jax.block_until_ready(program(*inputs)), videos)
 
 
-def gen2d_program(case: Case, everything: bool) -> tuple[Callable, Any, float]:
+def gen2d_program(case: Case, everything: bool, by_time: bool = False) -> tuple[Callable, Any, float]:
     """Compiled program, its inputs, and the CPU seconds of its compilation.
 
-    With `everything`, it also records energy and contacts, in as many rows as `annotations.contacts: 4` gives.
+    With `everything`, it also records energy and contacts, in as many rows as `annotations.contacts: 4` gives; with
+    `by_time`, the impacts of a step act in the order of their times.
     """
     import jax
     from worlds import rules
@@ -151,9 +152,9 @@ def gen2d_program(case: Case, everything: bool) -> tuple[Callable, Any, float]:
 
     def run(scene: scene_module.Scene, state: scene_module.State) -> trajectory.Trajectory:
         device = axes.to_device(scene), axes.to_device(state)
-        return axes.to_stored(simulate(*device, layout, rules(STEP), FRAMES, STEPS, save_at, sparse=True))
+        return axes.to_stored(simulate(*device, layout, params, FRAMES, STEPS, save_at, sparse=True))
 
-    began = time.process_time()
+    params, began = rules(STEP, by_time=by_time), time.process_time()
     program = jax.jit(run).lower(*inputs).compile()
     return program, jax.device_put(inputs), time.process_time() - began
 
@@ -261,6 +262,7 @@ class Cost(NamedTuple):
 LINES = {
     "states": "gen2d, states only",
     "all": "gen2d, contacts and energy too",
+    "time": "gen2d, and impacts in the order of time",
     "pymunk": "pymunk",
     "phyjax2d": "phyjax2d, vmap",
 }
@@ -269,20 +271,23 @@ LINES = {
 def cost_of(case: Case, seconds: Mapping[str, float]) -> Cost:
     """Row of the table, from the seconds per video by engine and gen2d's compile times in s."""
     micros = {name: seconds[name] / STEPPED * 1e6 for name in LINES if name in seconds}
-    compiled = {name: seconds[f"compile {name}"] for name in ("states", "all")}
+    compiled = {name: seconds[f"compile {name}"] for name in ("states", "all", "time")}
     return Cost(case.name, case.objects, case.pairs, micros, compiled)
 
 
 def table(costs: Sequence[Cost]) -> list[str]:
     """Lines of the table."""
     lines = [
-        "one core, microseconds of CPU time a video and step; gen2d with states only, and with contacts and energy"
+        "one core, microseconds of CPU time a video and step; gen2d with states only, with contacts and energy too, and"
+        " with those and impacts in the order of time"
     ]
-    lines += [f"{'':12} {'pairs':>6} {'states':>8} {'all':>8} {'pymunk':>8} {'phyjax2d':>9}   compile, s: states, all"]
+    head = f"{'states':>8} {'all':>8} {'time':>8} {'pymunk':>8} {'phyjax2d':>9}"
+    lines += [f"{'':12} {'pairs':>6} {head}   compile, s: states, all, time"]
     for c in costs:
-        states, all_, pymunk_, phyjax2d = (f"{c.micros[name]:.2f}" if name in c.micros else "-" for name in LINES)
-        compiled = f"{c.compile['states']:.1f}, {c.compile['all']:.1f}"
-        lines += [f"{c.name:12} {c.pairs:6} {states:>8} {all_:>8} {pymunk_:>8} {phyjax2d:>9}   {compiled}"]
+        states, all_, time_, *others = (f"{c.micros[name]:.2f}" if name in c.micros else "-" for name in LINES)
+        compiled = ", ".join(f"{seconds:.1f}" for seconds in c.compile.values())
+        of_peers = f"{others[0]:>8} {others[1]:>9}"
+        lines += [f"{c.name:12} {c.pairs:6} {states:>8} {all_:>8} {time_:>8} {of_peers}   {compiled}"]
     return lines
 
 

@@ -124,12 +124,19 @@ def test_a_heavy_box_that_falls_onto_a_light_one_does_not_enter_it(ratio):
     holds(f"heavy box dropped on a light one, {ratio}:1: overlap, m", np.maximum(1.5 - heights, 0), 5e-4)
 
 
-@pytest.mark.parametrize("lower", ["box", "disc"])
-def test_a_heavy_ball_rebounds_from_a_light_body_as_from_the_floor(lower):
+@pytest.mark.parametrize(
+    ("lower", "order"),
+    [
+        pytest.param("box", "pairs", id="box"),
+        pytest.param("disc", "pairs", id="disc"),
+        pytest.param("disc", "time", id="disc, in the order of time"),
+    ],
+)
+def test_a_heavy_ball_rebounds_from_a_light_body_as_from_the_floor(lower, order):
     """It returns to e^2 of its height, and loses nothing if e = 1."""
     height, heights = 1.2, {}
     for e in (0.5, 1.0):
-        space = Space(gravity=(0, -GRAVITY))
+        space = Space(gravity=(0, -GRAVITY), impact_order=order)
         space.add_segment((-10, 0), (10, 0), elasticity=1)
         if lower == "box":
             space.add_box((0, 0.25), 1, 0.5, elasticity=1)

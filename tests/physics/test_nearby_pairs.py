@@ -1,9 +1,12 @@
 """The solver's two forms: what is near is found, each pair once, and solving only that changes nothing."""
 
+import math
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from laws import holds
 from worlds import box, rules, run, world
 
 from gen2d.physics.broad_phase import (
@@ -59,6 +62,20 @@ def test_both_forms_give_the_same_impacts_in_the_order_of_their_times():
     made = [run(worlds, 41, 4, rules(by_time=True), EVERYTHING, sparse=sparse) for sparse in (True, False)]
     assert made[0].contacts.count.min() > 0
     assert_alike(*made, within=2e-3)
+
+
+def test_a_disc_that_is_struck_into_a_corner_rebounds_from_both_walls_in_the_same_step():
+    """A disc strikes it along the diagonal, it meets both walls at one time, and strikes the disc back."""
+    gap, speed = 0.01, 60.0  # m; m/s along each axis
+    rows = [
+        {"x": (-0.5 - gap, -0.5 - gap)},
+        {"x": (-0.5 - gap - math.sqrt(0.5) - 2 * gap,) * 2, "v": (speed, speed)},
+    ]
+    walls = [{"a": (-9.0, 0.0), "b": (0.0, 0.0)}, {"a": (0.0, -9.0), "b": (0.0, 0.0)}]
+    for sparse in (True, False):
+        made = run([world(rows, walls)], 3, 1, rules(by_time=True), sparse=sparse)
+        holds("struck into a corner: velocity of the disc, m/s", made.states.velocity[0, 1:, 0], 1e-3)
+        holds("struck into a corner: velocity of the other, m/s", made.states.velocity[0, 1:, 1] + speed, 1e-3)
 
 
 @pytest.mark.slow
