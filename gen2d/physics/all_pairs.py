@@ -123,7 +123,7 @@ class AllPairs(ContactSolver):
                 if not round_pairs[k]:
                     return a, b, False
                 tau = later_impact(points[k][0], pairs[k].contacts[0], a, b, self.setup, self.params.step)
-                return *with_first(a, b, tau), jnp.any(tau >= 0)
+                return *with_first(points[k][0], a, b, tau), jnp.any(tau >= 0)
 
             sides, follow = run_schedule(not_hit(sides), statics, self.order, play)
             return sides, functools.reduce(jnp.logical_or, follow)

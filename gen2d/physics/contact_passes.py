@@ -164,7 +164,7 @@ def warm_start(
     if constraint.a is None and a.motion is None and b.support is not None:
         b = b._replace(support=add_support(b.support, points, olds))
     if takes_part(points, b):
-        a, b = with_first(a, b, *impact_times(points, a, b, setup, h))
+        a, b = with_first(points[0], a, b, *impact_times(points, a, b, setup, h))
     return a, b, points
 
 

@@ -78,14 +78,19 @@ def not_hit(sides: list[BodySide]) -> list[BodySide]:
     return [side._replace(first=jnp.full_like(side.motion.spin, jnp.inf)) for side in sides if side.motion is not None]
 
 
+def _there(point: ContactPoint) -> Array:
+    """Whether both bodies are there: the solver of all pairs finds times for absent ones, too."""
+    return point.frame.normal_mass > 0
+
+
 def first_time(tau: Array) -> Array:
     """Time of an impact, s; infinite without one, which is negative."""
     return jax.lax.stop_gradient(jnp.where(tau >= 0, tau, jnp.inf))
 
 
-def with_first(a: BodySide, b: BodySide, tau: Array) -> tuple[BodySide, BodySide]:
+def with_first(point: ContactPoint, a: BodySide, b: BodySide, tau: Array) -> tuple[BodySide, BodySide]:
     """Both sides with `first` reduced to a time of impact, s; a negative one is none."""
-    tau = first_time(tau)
+    tau = jnp.where(_there(point), first_time(tau), jnp.inf)
 
     def reduced(side: BodySide) -> BodySide:
         return side if side.first is None else side._replace(first=jnp.minimum(side.first, tau))
@@ -103,7 +108,7 @@ def _comes_next(side: BodySide, tau: Array) -> Array | bool:
 def in_order(point: ContactPoint, tau: Array, a: BodySide, b: BodySide) -> Array:
     """Time of impact in s; WAITS for an impact that is not the next one of both bodies."""
     waits = (tau >= 0) & (point.gap > 0) & ~(_comes_next(a, tau) & _comes_next(b, tau))
-    return jnp.where(waits, WAITS, tau)
+    return jnp.where(_there(point), jnp.where(waits, WAITS, tau), NONE)
 
 
 def after_impact(a: BodySide, b: BodySide, happens: Array, time: Array) -> tuple[BodySide, BodySide]:
@@ -127,4 +132,4 @@ def later_impact(
     clock = pair_clock(a, b)
     assert clock is not None, "moving bodies have clocks"
     (tau,) = impact_times([point], a, b, setup, h)
-    return jnp.where(may_follow(contact, clock), tau, NONE)
+    return jnp.where(may_follow(contact, clock) & _there(point), tau, NONE)

@@ -1,5 +1,6 @@
 """The solver's two forms: what is near is found, each pair once, and solving only that changes nothing."""
 
+import itertools
 import math
 
 import jax
@@ -64,18 +65,38 @@ def test_both_forms_give_the_same_impacts_in_the_order_of_their_times():
     assert_alike(*made, within=2e-3)
 
 
-def test_a_disc_that_is_struck_into_a_corner_rebounds_from_both_walls_in_the_same_step():
-    """A disc strikes it along the diagonal, it meets both walls at one time, and strikes the disc back."""
+def velocities_in_a_step(rows: list[dict], walls: list[dict]) -> np.ndarray:
+    """Velocities [solver, order, step, disc, 2] in the first steps, of discs in all orders, by both solvers."""
+    orders = [list(order) for order in itertools.permutations(range(len(rows)))]
+    worlds = [world([rows[k] for k in order], walls) for order in orders]
+    both = [run(worlds, 3, 1, rules(by_time=True), sparse=sparse).states.velocity for sparse in (True, False)]
+    return np.array([[v[k, 1:, np.argsort(order)] for k, order in enumerate(orders)] for v in both]).swapaxes(2, 3)
+
+
+def test_discs_that_strike_one_into_a_corner_in_a_step_are_struck_back_in_it():
+    """Two of the three wait behind the first, along the diagonal; it meets both walls at one time."""
     gap, speed = 0.01, 60.0  # m; m/s along each axis
-    rows = [
-        {"x": (-0.5 - gap, -0.5 - gap)},
-        {"x": (-0.5 - gap - math.sqrt(0.5) - 2 * gap,) * 2, "v": (speed, speed)},
-    ]
+    places = [-0.5 - gap - k * (math.sqrt(0.5) + 2 * gap) for k in range(3)]
+    rows = [{"x": (place, place)} for place in places]
     walls = [{"a": (-9.0, 0.0), "b": (0.0, 0.0)}, {"a": (0.0, -9.0), "b": (0.0, 0.0)}]
-    for sparse in (True, False):
-        made = run([world(rows, walls)], 3, 1, rules(by_time=True), sparse=sparse)
-        holds("struck into a corner: velocity of the disc, m/s", made.states.velocity[0, 1:, 0], 1e-3)
-        holds("struck into a corner: velocity of the other, m/s", made.states.velocity[0, 1:, 1] + speed, 1e-3)
+    found = velocities_in_a_step([*rows[:2], rows[2] | {"v": (speed, speed)}], walls)
+    holds("struck into a corner: velocities, m/s", found - [(0, 0), (0, 0), (-speed, -speed)], 1e-3)
+
+
+def test_an_impact_that_waits_for_one_that_does_not_happen_acts():
+    """The first disc would graze the third, which the fourth strikes out of its way, and then strikes the second."""
+    speed, h = 60.0, 1 / 240
+    normal = np.array([math.cos(math.radians(10)), math.sin(math.radians(10))])
+    third = np.array([0.3 * speed * h + math.sqrt(1 - 0.995**2), 0.995])
+    rows = [
+        {"x": (0, 0), "v": (speed, 0)},
+        {"x": (1 + 0.5 * speed * h, 0)},
+        {"x": tuple(third)},
+        {"x": tuple(third - (1 + 0.1 * speed * h) * normal), "v": tuple(speed * normal)},
+    ]
+    found = velocities_in_a_step(rows, [])
+    exact = [(0, 0), (speed, 0), speed * normal, (0, 0)]
+    holds("impact that waits for another one: velocities, m/s", found[:, :, 0] - exact, 1e-3)
 
 
 @pytest.mark.slow
