@@ -17,7 +17,7 @@ from gen2d.records.axes import Array
 from gen2d.records.layout import SlotGroup
 from gen2d.renderers.camera import to_world
 from gen2d.renderers.color import LINEAR, to_linear, to_srgb
-from gen2d.renderers.lighting import ShadedColor, as_color
+from gen2d.renderers.lighting import ShadedColor, as_color, lit_terms
 from gen2d.renderers.noise import textured
 from gen2d.renderers.plan import FramePlan, RenderScene
 from gen2d.renderers.primitives import Instants, PixelWindow, object_parts
@@ -281,4 +281,8 @@ def run_edge_terms(
         return edge_terms(part, PixelWindow(top, left, window.rows, window.columns), run.shape == "circle", varied)
 
     edges = jax.lax.map(sample, (parts, *corners))
-    return edges if paint.surface is None else edges._replace(relief=relief_of(run, first, scene.bodies, at, paint))
+    if paint.surface is None or paint.light is None:
+        return edges
+    surface = jax.tree.map(lambda a: a[first : first + run.count], paint.surface)
+    relief = relief_of(run, first, scene.bodies, at, paint)
+    return edges._replace(relief=relief, lit=lit_terms(paint.light, surface, relief, parts.pose))
