@@ -69,9 +69,9 @@ def tilt(
     """Tilt towards x and towards y [..., rows, columns], from 0 to 1 at the rim, and the part [..., rows, columns] of a
     highlight that shows: half of it where a pixel averages two sides of a polygon.
 
-    `x` [..., 1, columns] and `y` [..., rows, 1] are relative to the centre, in px; `inverse`
-    [..., 1, 1] is 1 over the width that slopes, of a slot and not of each pixel. Where the coverage is c, the tilt is that at the centroid of the covered part, (1 - c) / 2 from the pixel's centre. `mitre` is
-    how sharp the edges between the sides of a polygon are.
+    `x` [..., 1, columns] and `y` [..., rows, 1] are relative to the centre, in px; `inverse` [..., 1, 1] is 1 over the
+    width that slopes. Where the coverage is c, the tilt is that at the centroid of the covered part, (1 - c) / 2 from
+    the pixel's centre. `mitre` is how sharp the edges between the sides of a polygon are.
     """
     inwards = (1 - cover) / 2
     if relief.normal is not None and relief.distance is not None:
