@@ -90,6 +90,22 @@ def over(under: Array, cover: Array, color: Array | PackedColor, linear: bool) -
     return (under + ((product + 16) >> 5)).astype(jnp.uint8)
 
 
+def paint_tile(
+    canvas: LayerCanvas, cover: Array, color: Any, object_id: Array | int, corner: tuple[Array, ...], linear: bool
+) -> LayerCanvas:
+    """Canvas with a quantised layer [1, rows, columns] painted at a corner (image, top, left); owners are of one image."""
+    image, owner = canvas
+    if image is not None:
+        start = (*corner, 0)
+        under = jax.lax.dynamic_slice(image, start, (*cover.shape, 3))
+        image = jax.lax.dynamic_update_slice(image, over(under, cover, color, linear), start)
+    if owner is not None:
+        start = (0, *corner[1:])
+        under = jax.lax.dynamic_slice(owner, start, cover.shape)
+        owner = jax.lax.dynamic_update_slice(owner, ownership(under, cover, object_id), start)
+    return LayerCanvas(image, owner)
+
+
 def ownership(owner: Array, cover: Array, object_id: Array | int) -> Array:
     """Owner of each pixel after a layer of coverage by `quantize_cover` is painted over the current owners.
 

@@ -19,12 +19,10 @@ from gen2d.renderers.compositing import (
     PackedColor,
     background_layer,
     occluder_layer,
-    over,
-    ownership,
+    paint_tile,
     quantize_color,
     quantize_cover,
     run_edge_terms,
-    static_layer,
 )
 from gen2d.renderers.plan import FramePlan, RenderScene, tile_windows
 from gen2d.renderers.postprocessing import expose, exposure_average, exposure_start
@@ -32,6 +30,7 @@ from gen2d.renderers.primitives import Instants, PixelWindow
 from gen2d.renderers.sensor import record
 from gen2d.renderers.shading import covered_color, fills_of
 from gen2d.renderers.shadows import ShadowTerms, shadow_cover, shadow_terms
+from gen2d.renderers.static_layer import static_layer_by_blocks
 from gen2d.xla import runtime_one
 
 BLOCK = 8  # instants whose tiles are computed at once
@@ -41,7 +40,9 @@ BLOCK_PIXELS = 2**16  # largest number of pixels of all their tiles
 def draw_tiles(scenes: RenderScene, plan: FramePlan) -> tuple[Array | None, Array | None]:
     """Frames [n, T, H, W, 3] uint8 and owners [n, T, H, W] uint8, None if `plan` does not want them."""
     videos, frames = scenes.instants.angle.shape[:2]
-    layers = jax.lax.map(functools.partial(static_layer, plan=plan), scenes)
+    one = (scenes.instants.view.scale[0, 0] > 0).astype(jnp.float32)
+    with runtime_one(one):
+        layers = jax.lax.map(functools.partial(static_layer_by_blocks, plan=plan), scenes)
     shape = videos, frames, plan.height, plan.width
     image = None if layers.image is None else jnp.broadcast_to(layers.image, (*shape, 3)).reshape(-1, *shape[2:], 3)
     owner = jnp.zeros((videos * frames, *shape[2:]), jnp.uint8) if plan.owners else None
@@ -64,7 +65,7 @@ def draw_tiles(scenes: RenderScene, plan: FramePlan) -> tuple[Array | None, Arra
             _VideoRenderer(scene, alone, layer, start, scene.instants).paint_owners(canvas) if plan.owners else canvas
         )
 
-    with runtime_one((scenes.instants.view.scale[0, 0] > 0).astype(jnp.float32)):
+    with runtime_one(one):
         canvas = jax.lax.fori_loop(0, videos, video, LayerCanvas(image, owner))
     canvas = jax.tree.map(lambda a: a.reshape(videos, frames, *a.shape[1:]), canvas)
     return record(scenes.sensor, scenes.seed, canvas.image, canvas.owner, plan.height, plan.width)
@@ -269,22 +270,7 @@ class _VideoRenderer:
 
         cover, color = jax.tree.map(pick, layers)
         corner = (frame, tiles.window.top[k, i], tiles.window.left[k, i])
-        return self._paint_layer(canvas, cover, color, tiles.first + k + 1, corner)
-
-    def _paint_layer(
-        self, canvas: LayerCanvas, cover: Array, color: Any, object_id: Array | int, corner: tuple[Array, ...]
-    ) -> LayerCanvas:
-        """Canvas with a quantised layer [1, rows, columns] painted at a corner (frame, top, left)."""
-        image, owner = canvas
-        if image is not None:
-            start = (*corner, 0)
-            under = jax.lax.dynamic_slice(image, start, (*cover.shape, 3))
-            image = jax.lax.dynamic_update_slice(image, over(under, cover, color, self.plan.linear), start)
-        if owner is not None:
-            start = (0, *corner[1:])
-            under = jax.lax.dynamic_slice(owner, start, cover.shape)
-            owner = jax.lax.dynamic_update_slice(owner, ownership(under, cover, object_id), start)
-        return LayerCanvas(image, owner)
+        return paint_tile(canvas, cover, color, tiles.first + k + 1, corner, self.plan.linear)
 
     def _paint_run(
         self,
@@ -307,5 +293,5 @@ class _VideoRenderer:
                 shown = (below >= rank) & ((below < rank + count) | is_last)
                 cover, color = occluder_layer(self.scene, self.plan, i, shown)
                 cover, color, corner = quantize_cover(cover), quantize_color(color), (frame, jnp.int32(0), jnp.int32(0))
-                canvas = self._paint_layer(canvas, cover, color, OCCLUDER, corner)
+                canvas = paint_tile(canvas, cover, color, OCCLUDER, corner, self.plan.linear)
         return jax.lax.fori_loop(done, drawn, paint_slot, canvas)
