@@ -17,7 +17,8 @@ from gen2d.records.axes import Array
 from gen2d.records.layout import SlotGroup
 from gen2d.renderers.camera import to_world
 from gen2d.renderers.color import LINEAR, to_linear, to_srgb
-from gen2d.renderers.lighting import ShadedColor, as_color, lit_terms
+from gen2d.renderers.lighting import ShadedColor, as_color
+from gen2d.renderers.lit_terms import lit_terms
 from gen2d.renderers.noise import textured
 from gen2d.renderers.plan import FramePlan, RenderScene
 from gen2d.renderers.primitives import Instants, PixelWindow, object_parts
@@ -93,7 +94,7 @@ def over(under: Array, cover: Array, color: Array | PackedColor, linear: bool) -
 def paint_tile(
     canvas: LayerCanvas, cover: Array, color: Any, object_id: Array | int, corner: tuple[Array, ...], linear: bool
 ) -> LayerCanvas:
-    """Canvas with a quantised layer [1, rows, columns] painted at a corner (image, top, left); owners are of one image."""
+    """Canvas with a quantised layer [1, rows, columns] painted at a corner (image, top, left), owners in one image."""
     image, owner = canvas
     if image is not None:
         start = (*corner, 0)

@@ -8,7 +8,8 @@ import jax.numpy as jnp
 from gen2d.records.axes import Array
 from gen2d.renderers.coverage import disc as disc_module
 from gen2d.renderers.coverage import polygon
-from gen2d.renderers.lighting import LitTerms, ShadedColor, as_color, lit_color
+from gen2d.renderers.lighting import ShadedColor, as_color, lit_color
+from gen2d.renderers.lit_terms import LitTerms
 from gen2d.renderers.noise import textured
 from gen2d.renderers.paint import Paint, Texture
 from gen2d.renderers.primitives import ImagePose, ObjectParts, PixelWindow, Primitive

@@ -8,7 +8,6 @@ from PIL import Image
 
 from gen2d.media.images import WEBP_SIDE
 
-
 STEP = 32  # of rare colours that are rounded before they are encoded without loss
 COMMON = 1 / 512  # part of a frame from which a colour is not rare
 PLAIN = 0.9  # part of a frame that has common colours, from which on this is small
@@ -36,8 +35,8 @@ def sprite_rows(frames: int, height: int) -> int:
 def sprite_sheet(frames: np.ndarray, quality: int | None) -> bytes:
     """WebP picture of the frames [T, H, W, 3 or 4], uint8 RGB or RGBA, one below the other in columns of `sprite_rows`.
 
-    `quality` is from 0 to 100, None for lossless. From `GOOD` on, frames of few colours are encoded without loss, but for
-    rare colours, which are rounded: plain grounds have no noise then, and rims are right to half a `STEP`. The same
+    `quality` is from 0 to 100, None for lossless. From `GOOD` on, frames of few colours are encoded without loss, but
+    for rare colours, which are rounded: plain grounds have no noise, and rims are right to half a `STEP`. The same
     frames give the same bytes with the same version of Pillow, which brings its own encoder.
     """
     count, height, width = frames.shape[:3]
