@@ -60,10 +60,10 @@ def draw_tiles(scenes: RenderScene, plan: FramePlan) -> tuple[Array | None, Arra
             if scene.exposed is not None:
                 instants = jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:]), scene.exposed)
             canvas = _VideoRenderer(scene, plan, layer, start, instants).paint_separately(canvas)
-        alone = dataclasses.replace(plan, frames=False)
-        return (
-            _VideoRenderer(scene, alone, layer, start, scene.instants).paint_owners(canvas) if plan.owners else canvas
-        )
+        if plan.owners:
+            alone = dataclasses.replace(plan, frames=False)
+            canvas = _VideoRenderer(scene, alone, layer, start, scene.instants).paint_owners(canvas)
+        return canvas
 
     with runtime_one(one):
         canvas = jax.lax.fori_loop(0, videos, video, LayerCanvas(image, owner))
