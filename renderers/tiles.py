@@ -24,6 +24,7 @@ from gen2d.renderers.compositing import (
     quantize_cover,
     run_edge_terms,
 )
+from gen2d.renderers.lighting import ShadedColor
 from gen2d.renderers.plan import FramePlan, RenderScene, tile_windows
 from gen2d.renderers.postprocessing import expose, exposure_average, exposure_start
 from gen2d.renderers.primitives import Instants, PixelWindow
@@ -33,7 +34,7 @@ from gen2d.renderers.shadows import ShadowTerms, shadow_cover, shadow_terms
 from gen2d.renderers.static_layer import static_layer_by_blocks
 from gen2d.xla import runtime_one
 
-BLOCK = 8  # instants whose tiles are computed at once
+BLOCK = 16  # instants whose tiles are computed at once
 BLOCK_PIXELS = 2**16  # largest number of pixels of all their tiles
 
 
@@ -78,13 +79,16 @@ class RunTiles(NamedTuple):
     first: int  # slot
     window: PixelWindow
     terms: Any  # EdgeTerms or ShadowTerms
+    color: Any  # [k, 1, 1, 3] int16, of slots and of their highlights if they have any
 
 
 class TileLayers(NamedTuple):
     """Quantised tiles of a run's k slots at the B instants of a block."""
 
     cover: Array  # [k, B, rows, columns] int16
-    color: Any  # [k, B or 1, rows or 1, columns or 1, 3] int16, or a PackedColor; None of shadows
+    color: (
+        Array | None
+    )  # [k, B, rows, columns, 3] int16, or [k, B, rows, columns] shares of a PackedColor; None: constant
 
 
 class _VideoRenderer:
@@ -165,7 +169,11 @@ class _VideoRenderer:
             for run, first in group.runs:
                 window = tile_windows(self.plan, group, self.at, run, first)
                 terms = run_edge_terms(self.scene, self.plan, self.at, run, first, window)
-                tiles.append(RunTiles(run, first, window, terms))
+                fills = fills_of(self.scene.paint, slice(first, first + run.count))
+                colors = [
+                    quantize_color(part[:, None, None]) for part in (fills.color, fills.accent) if part is not None
+                ]
+                tiles.append(RunTiles(run, first, window, terms, colors))
         return tiles
 
     def _shadow_tiles(self) -> list[RunTiles]:
@@ -177,7 +185,8 @@ class _VideoRenderer:
             for run, first in group.runs:
                 window = tile_windows(self.plan, wider, self.at, run, first, shadow.offset)
                 terms = shadow_terms(self.scene, self.plan, self.at, run, first, window)
-                tiles.append(RunTiles(run, first, window, terms))
+                color = quantize_color(jnp.broadcast_to(shadow.color, (run.count, 1, 1, 3)))
+                tiles.append(RunTiles(run, first, window, terms, [color]))
         return tiles
 
     def _each_instant(self, begin: Array, count: int, paint: Callable[..., Any], canvas: Any) -> Any:
@@ -226,10 +235,9 @@ class _VideoRenderer:
             return TileLayers(quantize_cover(shadow_cover(terms, tiles.window)), None)
         fills = fills_of(self.scene.paint, slice(tiles.first, tiles.first + tiles.run.count))
         cover, color = covered_color(terms, jax.tree.map(of_slot, fills), tiles.window, self.plan.largest(tiles.run))
-        color = quantize_color(color)
-        if isinstance(color, PackedColor):
-            return TileLayers(quantize_cover(cover), color._replace(color=color.color[None], accent=color.accent[None]))
-        return TileLayers(quantize_cover(cover), color.reshape(-1, *color.shape[-3:]))
+        if isinstance(color, ShadedColor):
+            return TileLayers(quantize_cover(cover), quantize_color(color).shares)
+        return TileLayers(quantize_cover(cover), None if color.ndim == 3 else quantize_color(color))
 
     def _drawn(self, tiles: RunTiles) -> Array:
         """Number of slots of a run up to the last one that is rendered: absent objects are at its end."""
@@ -243,9 +251,7 @@ class _VideoRenderer:
         shadow = self.scene.paint.shadow
         if shadow is None or image is None:
             return image
-        color, of_shadows = quantize_color(shadow.color), layers[len(self.tiles) :]
-        for tiles, of_run in zip(self.shadows, of_shadows, strict=True):
-            layer = TileLayers(of_run.cover, jnp.broadcast_to(color, (tiles.run.count, 1, 1, 1, 3)))
+        for tiles, layer in zip(self.shadows, layers[len(self.tiles) :], strict=True):
             paint = functools.partial(self._paint_slot, tiles=tiles, layers=layer, i=i, place=place, frame=frame)
             image = jax.lax.fori_loop(0, self._drawn(tiles), paint, LayerCanvas(image, None)).image
         return image
@@ -265,10 +271,14 @@ class _VideoRenderer:
         self, k: Array, canvas: LayerCanvas, tiles: RunTiles, layers: TileLayers, i: Array, place: Array, frame: Array
     ) -> LayerCanvas:
         def pick(a: Array) -> Array:
-            start = (k, place if a.shape[1] > 1 else 0, *[0] * (a.ndim - 2))
-            return jax.lax.dynamic_slice(a, start, (1, 1, *a.shape[2:]))[0]
+            return jax.lax.dynamic_slice(a, (k, place, *[0] * (a.ndim - 2)), (1, 1, *a.shape[2:]))[0]
 
-        cover, color = jax.tree.map(pick, layers)
+        cover, color = pick(layers.cover), None if layers.color is None else pick(layers.color)
+        constant = [jax.lax.dynamic_index_in_dim(part, k) for part in tiles.color]
+        if color is None:
+            color = constant[0]
+        elif color.ndim == 3:
+            color = PackedColor(*constant, color)
         corner = (frame, tiles.window.top[k, i], tiles.window.left[k, i])
         return paint_tile(canvas, cover, color, tiles.first + k + 1, corner, self.plan.linear)
 
