@@ -278,7 +278,7 @@ class _VideoRenderer:
         if color is None:
             color = constant[0]
         elif color.ndim == 3:
-            color = PackedColor(*constant, color)
+            color = PackedColor(constant[0], constant[1], color)
         corner = (frame, tiles.window.top[k, i], tiles.window.left[k, i])
         return paint_tile(canvas, cover, color, tiles.first + k + 1, corner, self.plan.linear)
 
