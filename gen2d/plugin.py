@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from gen2d.renderers.camera import pixel_at, to_pixels
     from gen2d.renderers.compositing import OCCLUDER
     from gen2d.renderers.look import (
+        LINES,
         LineOptions,
         PlainOptions,
         are_lines,
@@ -80,7 +81,7 @@ _HOMES = {
     "gen2d.renderers.camera": "pixel_at to_pixels",
     "gen2d.renderers.compositing": "OCCLUDER",
     "gen2d.renderers.look": (
-        "LineOptions PlainOptions are_lines are_moving backdrop contrasting line_fields line_margin mean_color "
+        "LINES LineOptions PlainOptions are_lines are_moving backdrop contrasting line_fields line_margin mean_color "
         "palette_option plain sampled_options"
     ),
     "gen2d.renderers.noise": "fraction hashed",
@@ -103,6 +104,7 @@ __all__ = [
     "CLEARANCE",
     "DYNAMIC",
     "KINEMATIC",
+    "LINES",
     "OCCLUDER",
     "POLYGON",
     "STATIC",

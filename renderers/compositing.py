@@ -18,6 +18,7 @@ from gen2d.records.layout import SlotGroup
 from gen2d.renderers.camera import to_world
 from gen2d.renderers.color import LINEAR, to_linear, to_srgb
 from gen2d.renderers.lighting import ShadedColor, as_color
+from gen2d.renderers.lit_terms import lit_terms
 from gen2d.renderers.noise import textured
 from gen2d.renderers.plan import FramePlan, RenderScene
 from gen2d.renderers.primitives import Instants, PixelWindow, object_parts
@@ -88,6 +89,22 @@ def over(under: Array, cover: Array, color: Array | PackedColor, linear: bool) -
     difference = (color - under) << 6
     product = ((difference.astype(jnp.int32) * cover.astype(jnp.int32)) >> 16).astype(jnp.int16)
     return (under + ((product + 16) >> 5)).astype(jnp.uint8)
+
+
+def paint_tile(
+    canvas: LayerCanvas, cover: Array, color: Any, object_id: Array | int, corner: tuple[Array, ...], linear: bool
+) -> LayerCanvas:
+    """Canvas with a quantised layer [1, rows, columns] painted at a corner (image, top, left), owners in one image."""
+    image, owner = canvas
+    if image is not None:
+        start = (*corner, 0)
+        under = jax.lax.dynamic_slice(image, start, (*cover.shape, 3))
+        image = jax.lax.dynamic_update_slice(image, over(under, cover, color, linear), start)
+    if owner is not None:
+        start = (0, *corner[1:])
+        under = jax.lax.dynamic_slice(owner, start, cover.shape)
+        owner = jax.lax.dynamic_update_slice(owner, ownership(under, cover, object_id), start)
+    return LayerCanvas(image, owner)
 
 
 def ownership(owner: Array, cover: Array, object_id: Array | int) -> Array:
@@ -281,4 +298,8 @@ def run_edge_terms(
         return edge_terms(part, PixelWindow(top, left, window.rows, window.columns), run.shape == "circle", varied)
 
     edges = jax.lax.map(sample, (parts, *corners))
-    return edges if paint.surface is None else edges._replace(relief=relief_of(run, first, scene.bodies, at, paint))
+    if paint.surface is None or paint.light is None:
+        return edges
+    surface = jax.tree.map(lambda a: a[first : first + run.count], paint.surface)
+    relief = relief_of(run, first, scene.bodies, at, paint)
+    return edges._replace(relief=relief, lit=lit_terms(paint.light, surface, relief, parts.pose))

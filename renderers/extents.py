@@ -13,12 +13,16 @@ def bounding_boxes(scene: RenderScene, plan: FramePlan) -> Array:
     """Bounding boxes [T, K, 4] px (x0 y0 x1 y1) of whole objects as rendered; 0 for slots that are not rendered."""
 
     def box(primitive: Primitive, disc: bool) -> Array:
-        corners = primitive.corners[..., None, :] if disc else primitive.corners
-        radius = 0.0 if primitive.radius is None else primitive.radius[..., None]
-        bounds = jnp.concatenate([corners.min(-2) - radius, corners.max(-2) + radius], -1)
-        return jnp.where(area_of(primitive, disc)[..., None] > 0, bounds, 0.0)
+        return jnp.where(area_of(primitive, disc)[..., None] > 0, bounds_of(primitive, disc), 0.0)
 
     return _measure_slots(scene, plan, box)
+
+
+def bounds_of(primitive: Primitive, disc: bool) -> Array:
+    """Bounds [..., 4] px of primitives: left, top, right, bottom."""
+    corners = primitive.corners[..., None, :] if disc else primitive.corners
+    radius = 0.0 if primitive.radius is None else primitive.radius[..., None]
+    return jnp.concatenate([corners.min(-2) - radius, corners.max(-2) + radius], -1)
 
 
 def areas(scene: RenderScene, plan: FramePlan) -> Array:

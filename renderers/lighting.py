@@ -24,8 +24,8 @@ from typing import NamedTuple
 import jax.numpy as jnp
 
 from gen2d.records.axes import Array
+from gen2d.renderers.lit_terms import LitTerms, PatternTerms, StripeTerms, lambert
 from gen2d.renderers.noise import noise
-from gen2d.renderers.paint import Light, Pattern, Surface
 from gen2d.renderers.primitives import ImagePose
 from gen2d.renderers.relief import Relief, tilt
 
@@ -56,81 +56,50 @@ def as_color(shaded: Array | ShadedColor) -> Array:
 
 
 def lit_color(
-    color: Array, light: Light, surface: Surface, relief: Relief, pose: ImagePose, x: Array, y: Array, cover: Array
+    color: Array, accent: Array, lit: LitTerms, relief: Relief, pose: ImagePose, x: Array, y: Array, cover: Array
 ) -> ShadedColor:
-    """Colours of lit bodies of `color` [..., 1, 1, 3], means of the covered part of each pixel.
+    """Colours of lit bodies of `color`, with highlights of `accent`, both [..., 1, 1, 3]; means of the covered part of
+    each pixel.
 
     `x` [..., 1, columns] and `y` [..., rows, 1] are pixel centres relative to the body's centre, in px; `cover`
     [..., rows, columns] is the coverage.
     """
-    slope, gloss, sharpness, soft, ambient = (
-        a[..., None, None] for a in (surface.slope, surface.gloss, surface.sharpness, light.softness, light.ambient)
-    )
-    tilt_x, tilt_y, shown = tilt(relief, pose, x, y, surface.bevel, cover)
-    nx, ny = slope * tilt_x, slope * tilt_y
-    nz = jnp.sqrt(1 - jnp.minimum(nx * nx + ny * ny, STEEPEST))
-    lx, ly, lz = (a[..., None, None] for a in (relief.light[..., 0], relief.light[..., 1], light.direction[..., 2]))
-    along = nx * lx + ny * ly
-    strength = (1 - ambient) / lambert(lz, soft)
-    irradiance = strength * lambert(along + nz * lz, soft) + ambient * (0.5 + 0.5 * nz - FROM_ABOVE * ny)
-    # In pixels: the length over which the surface tilts, for averages over a pixel.
-    radius = jnp.maximum(relief.radius if relief.normal is None else surface.bevel * pose.scale, 0.5)[..., None, None]
-    toward = along * (1 / jnp.maximum(jnp.sqrt(lx * lx + ly * ly), 1e-6))
-    across = _part_across(relief, pose, nx, ny, toward)
-    mirror = None if surface.mirror is None else surface.mirror[..., None, None]
-    grain = None if surface.pattern is None else 1 + _pattern(surface.pattern, pose, x, y)
+    tilt_x, tilt_y, shown = tilt(relief, pose, x, y, lit.inverse, cover)
+    nx, ny = lit.slope * tilt_x, lit.slope * tilt_y
+    square = nx * nx + ny * ny
+    nz = jnp.sqrt(1 - jnp.minimum(square, STEEPEST))
+    along = nx * lit.toward + ny * lit.down
+    irradiance = lit.strength * lambert(along + nz * lit.height, lit.soft)
+    irradiance = irradiance + lit.ambient * (0.5 + 0.5 * nz - FROM_ABOVE * ny)
+    toward = along * lit.azimuth
+    # The largest change of the tilt towards the light over that of the tilt: 1 on a disc, less where surfaces tilt in
+    # one direction only, which is across the core of a capsule or the nearest side of a polygon.
+    across = jnp.abs(toward) / jnp.maximum(jnp.sqrt(square), 1e-6) if lit.across is None else lit.across
+    grain = None if lit.pattern is None else 1 + _pattern(lit.pattern, pose, x, y)
     if grain is not None:
         irradiance = irradiance * grain
     irradiance = jnp.maximum(irradiance, 0.01)  # beyond the rim, where the tilt is larger than any
-    # The half vector of the light and the viewer.
-    norm = 1 / jnp.sqrt(2 + 2 * lz)
-    half_cosine = (along + nz * (lz + 1)) * norm
     # The average over a pixel widens the lobe, whose variance is 1 / sharpness in the plane of tilts, and lowers it: in
     # two directions on a disc, across the core of a capsule, and across the bevel of a polygon.
-    spread = (1 + 4 * norm * norm) / 2 if relief.is_disc else 1 + (4 * norm * norm - 1) * across * across
-    width = 1 / sharpness + (slope / radius) ** 2 * (spread / 12)
-    part = 1 / (sharpness * width)
-    shown = shown * (part if relief.is_disc else jnp.sqrt(part))
-    lobe = jnp.maximum(1 - (1 - half_cosine) * (0.25 / width), 0.0)
+    steeper = 4 * lit.half * lit.half
+    spread = (1 + steeper) / 2 if relief.is_disc else 1 + (steeper - 1) * across * across
+    width = 1 / (lit.width + lit.spread * spread)
+    part = lit.width * width
+    gloss = lit.gloss * (part if relief.is_disc else jnp.sqrt(part) * shown)
+    # The half vector of the light and the viewer.
+    lobe = jnp.maximum(1 - (1 - (along + nz * (lit.height + 1)) * lit.half) * (0.25 * width), 0.0)
     lobe, grazing = lobe * lobe, 1 - nz
-    shine = gloss * shown * (lobe * lobe) + RIM * (grazing * grazing * grazing)
+    shine = gloss * (lobe * lobe) + RIM * (grazing * grazing * grazing)
     shine, value = jnp.minimum(shine, 1.0), display(irradiance)
-    if mirror is not None:
-        shine = shine + SHEEN * mirror * jnp.maximum(toward, 0.0) ** 2 * (1 - shine)
-        room = _room(toward, slope / radius * across) * (1.0 if grain is None else display(grain))
-        value = value + mirror * (room - value)
+    if lit.mirror is not None:
+        shine = shine + SHEEN * lit.mirror * jnp.maximum(toward, 0.0) ** 2 * (1 - shine)
+        room = _room(toward, jnp.sqrt(12 * lit.spread) * across) * (1.0 if grain is None else display(grain))
+        value = value + lit.mirror * (room - value)
     share = tone(value) * (1 - shine)
-    if surface.stripe is None or surface.stripe_light is None or not relief.is_disc:
-        return ShadedColor(color, light.highlight[..., None, None, :], share, shine)
-    half = surface.stripe[..., None, None] * radius
-    cos, sin = pose.cos[..., None, None], pose.sin[..., None, None]
-    band = jnp.where(half > 0, _beyond_edge(half - jnp.abs(y * cos - x * sin), cos, sin), 0.0) * share
-    # A stripe of 1 has the colour of highlights; one below 0 is a part of the object's own colour.
-    bright = surface.stripe_light[..., None, None]
-    return ShadedColor(
-        color,
-        light.highlight[..., None, None, :],
-        share - jnp.abs(bright) * band,
-        shine + jnp.maximum(bright, 0.0) * band,
-    )
-
-
-def lambert(cosine: Array, soft: Array) -> Array:
-    """Light of a source of this softness on a surface, by the cosine of the angle between its normal and the light."""
-    lit, whole = jnp.maximum(cosine + soft, 0.0), jnp.maximum(cosine - soft, 0.0)
-    return (lit * lit - whole * whole) * (0.25 / soft)
-
-
-def _part_across(relief: Relief, pose: ImagePose, nx: Array, ny: Array, toward: Array) -> Array | float:
-    """Largest change of the tilt towards the light over that of the tilt: 1 on a disc, less where surfaces tilt in one
-    direction only, which is across the core of a capsule or the nearest side of a polygon."""
-    if relief.is_disc:
-        return 1.0
-    if relief.normal is not None:
-        return jnp.abs(toward) / jnp.maximum(jnp.sqrt(nx * nx + ny * ny), 1e-6)
-    lx, ly = relief.light[..., 0], relief.light[..., 1]
-    part = (ly * pose.cos - lx * pose.sin) / jnp.maximum(jnp.sqrt(lx * lx + ly * ly), 1e-6)
-    return jnp.abs(part)[..., None, None]
+    if lit.stripe is None:
+        return ShadedColor(color, accent, share, shine)
+    band = _stripe(lit.stripe, pose, x, y) * share
+    return ShadedColor(color, accent, share - lit.stripe.dark * band, shine + lit.stripe.bright * band)
 
 
 def _room(toward: Array, change: Array) -> Array:
@@ -143,11 +112,12 @@ def _room(toward: Array, change: Array) -> Array:
     return 1 + SKY * toward - DARKEST * HORIZON / width * (band * band)
 
 
-def _beyond_edge(depth: Array, cos: Array, sin: Array) -> Array:
-    """Part of a pixel within a straight edge at a distance `depth` from the pixel's centre, in this direction."""
-    a, b = (jnp.maximum(jnp.abs(part), 0.02) for part in (cos, sin))
-    reach = jnp.clip(depth + (a + b) / 2, 0.0, a + b)
-    return (reach**2 - jnp.maximum(reach - a, 0.0) ** 2 - jnp.maximum(reach - b, 0.0) ** 2) * (0.5 / (a * b))
+def _stripe(stripe: StripeTerms, pose: ImagePose, x: Array, y: Array) -> Array:
+    """Part of each pixel [..., rows, columns] within the stripes."""
+    away = jnp.abs(y * pose.cos[..., None, None] - x * pose.sin[..., None, None])
+    reach = jnp.clip(stripe.reach - away, 0.0, stripe.wide + stripe.narrow)
+    beyond = jnp.maximum(reach - stripe.wide, 0.0) ** 2 + jnp.maximum(reach - stripe.narrow, 0.0) ** 2
+    return (reach**2 - beyond) * stripe.area
 
 
 def display(light: Array) -> Array:
@@ -163,10 +133,8 @@ def tone(value: Array) -> Array:
     return value - over * over * (0.5 / SHOULDER)
 
 
-def _pattern(pattern: Pattern, pose: ImagePose, x: Array, y: Array) -> Array:
+def _pattern(pattern: PatternTerms, pose: ImagePose, x: Array, y: Array) -> Array:
     """Relative change of the light [..., rows, columns] by a pattern."""
-    seed, cell, stretch, contrast = (a[..., None, None] for a in pattern)
-    cos, sin, scale = (a[..., None, None] for a in (pose.cos, pose.sin, pose.scale))
-    along, across = (x * cos + y * sin) / scale, (y * cos - x * sin) / scale
-    pixel = 1 / (cell * scale)
-    return contrast * (2 * noise(along / (cell * stretch), across / cell, seed, pixel) - 1)
+    cos, sin = pose.cos[..., None, None], pose.sin[..., None, None]
+    along, across = (x * cos + y * sin) * pattern.along, (y * cos - x * sin) * pattern.across
+    return pattern.contrast * (2 * noise(along, across, pattern.seed, pattern.across) - 1)

@@ -16,6 +16,7 @@ from gen2d.records.scene import Scene
 from gen2d.renderers.color import palette, to_linear
 from gen2d.renderers.paint import Background, Paint, Picture, Texture
 
+LINES = ("segment",)  # shapes that `line_fields` grows
 CROP = 0.6  # least size of a crop of an image, over that of the largest
 
 

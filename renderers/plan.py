@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 
-from gen2d.core.enums import STATIC
+from gen2d.core.enums import SHAPES, STATIC
 from gen2d.records.axes import Array
 from gen2d.records.layout import Layout, SlotGroup
 from gen2d.renderers.camera import to_pixels
@@ -47,6 +47,7 @@ class FramePlan:
     width: int
     scale: float  # px/m, upper bound
     grow: float = 0.0  # px, upper bound of what the look adds to an object's rim
+    grown: tuple[str, ...] = SHAPES  # shapes to which the look adds it
     blur: float = 0.0  # px, upper bound of half the width of the soft edges of shadows
     still: bool = True  # whether the camera never moves
     linear: bool = False  # whether colours mix in linear light
@@ -82,7 +83,8 @@ class FramePlan:
 
     def largest(self, run: SlotGroup) -> float:
         """Upper bound of the distance from centre to rim (px) of a run's objects; infinite for static runs."""
-        return math.inf if run.kind == STATIC else self.layout.reach * self.scale + self.grow
+        grow = self.grow if run.shape in self.grown else 0.0
+        return math.inf if run.kind == STATIC else self.layout.reach * self.scale + grow
 
 
 class TileGroup(NamedTuple):

@@ -64,18 +64,17 @@ def outline_of(
 
 
 def tilt(
-    relief: Relief, pose: ImagePose, x: Array, y: Array, bevel: Array, cover: Array, mitre: float = MITRE
+    relief: Relief, pose: ImagePose, x: Array, y: Array, inverse: Array, cover: Array, mitre: float = MITRE
 ) -> tuple[Array, Array, Array | float]:
     """Tilt towards x and towards y [..., rows, columns], from 0 to 1 at the rim, and the part [..., rows, columns] of a
     highlight that shows: half of it where a pixel averages two sides of a polygon.
 
-    `x` [..., 1, columns] and `y` [..., rows, 1] are relative to the centre, in px; `bevel` [...] is in m. Where the
-    coverage is c, the tilt is that at the centroid of the covered part, (1 - c) / 2 from the pixel's centre. `mitre` is
-    how sharp the edges between the sides of a polygon are.
+    `x` [..., 1, columns] and `y` [..., rows, 1] are relative to the centre, in px; `inverse` [..., 1, 1] is 1 over the
+    width that slopes. Where the coverage is c, the tilt is that at the centroid of the covered part, (1 - c) / 2 from
+    the pixel's centre. `mitre` is how sharp the edges between the sides of a polygon are.
     """
     inwards = (1 - cover) / 2
     if relief.normal is not None and relief.distance is not None:
-        width = sloping_width(relief, pose, bevel)[..., None, None]
         nx, ny, even = jnp.zeros_like(cover), jnp.zeros_like(cover), jnp.ones_like(cover)
         farthest = jnp.full_like(cover, -jnp.inf)
         for side in range(relief.normal.shape[-2]):
@@ -86,14 +85,12 @@ def tilt(
             nx, ny = nx + nearer * (a - nx), ny + nearer * (b - ny)
             even = jnp.where(nearer < 0.5, even, 1.0) * (2 * nearer - 1) ** 2
             farthest = jnp.maximum(farthest, beyond)
-        amount = jnp.clip(1 + (farthest - inwards) * (1 / width), 0.0, 1.0)
+        amount = jnp.clip(1 + (farthest - inwards) * inverse, 0.0, 1.0)
         return nx * amount, ny * amount, (1 + even) / 2
-    radius = sloping_width(relief, pose, bevel)[..., None, None]
     if relief.half is not None:
         cos, sin, half = (a[..., None, None] for a in (pose.cos, pose.sin, relief.half))
         along = jnp.clip(x * cos + y * sin, -half, half)
         x, y = x - along * cos, y - along * sin
-    inverse = 1 / radius  # of a slot, and not of each pixel
     part = (1 - inwards * inverse) * inverse
     return x * part, y * part, 1.0
 
@@ -117,7 +114,8 @@ def surface_points(relief: Relief, pose: ImagePose, slope: Array, bevel: Array, 
     A tilt t from 0 to 1 at the rim is the sine s t of the steepest tilt s. So a dome, of which t is the distance from
     the core over the radius w, is the cap of a sphere of radius w / s; a bevel of width w has the same profile.
     """
-    tilt_x, tilt_y, _ = tilt(relief, pose, x, y, bevel, jnp.ones_like(x + y), SHARP)
+    inverse = (1 / sloping_width(relief, pose, bevel))[..., None, None]
+    tilt_x, tilt_y, _ = tilt(relief, pose, x, y, inverse, jnp.ones_like(x + y), SHARP)
     square = tilt_x * tilt_x + tilt_y * tilt_y
     inside = jax.lax.rsqrt(jnp.maximum(square, 1.0))
     slope, square = slope[..., None, None], jnp.minimum(square, 1.0)

@@ -9,8 +9,9 @@ from gen2d.records.axes import Array
 from gen2d.renderers.coverage import disc as disc_module
 from gen2d.renderers.coverage import polygon
 from gen2d.renderers.lighting import ShadedColor, as_color, lit_color
+from gen2d.renderers.lit_terms import LitTerms
 from gen2d.renderers.noise import textured
-from gen2d.renderers.paint import Light, Paint, Surface, Texture
+from gen2d.renderers.paint import Paint, Texture
 from gen2d.renderers.primitives import ImagePose, ObjectParts, PixelWindow, Primitive
 from gen2d.renderers.relief import Relief
 from gen2d.xla import materialize
@@ -24,15 +25,14 @@ class Fills(NamedTuple):
     mark: Array | None
     shade: Array | None
     texture: Texture | None
-    light: Light | None
-    surface: Surface | None
+    accent: Array | None  # of highlights
 
 
 def fills_of(paint: Paint, slots: slice) -> Fills:
     """Fills of some slots; arrays [k, ...]."""
     color = paint.color if paint.fill is None else paint.fill
-    light = jax.tree.map(lambda a: jnp.broadcast_to(a, (len(color), *a.shape)), paint.light)
-    fills = Fills(color, paint.rim_color, paint.mark_color, paint.shade, paint.texture, light, paint.surface)
+    accent = None if paint.light is None else jnp.broadcast_to(paint.light.highlight, color.shape)
+    fills = Fills(color, paint.rim_color, paint.mark_color, paint.shade, paint.texture, accent)
     return jax.tree.map(lambda a: a[slots], fills)
 
 
@@ -43,18 +43,17 @@ class EdgeTerms(NamedTuple):
     inner: Any
     mark: Any
     pose: ImagePose | None  # relative to the window, if the colour varies within it
-    relief: Relief | None  # of lit surfaces
+    relief: Relief | None = None  # of lit surfaces
+    lit: LitTerms | None = None
 
 
-def edge_terms(
-    parts: ObjectParts, window: PixelWindow, disc: bool, varied: bool, relief: Relief | None = None
-) -> EdgeTerms:
+def edge_terms(parts: ObjectParts, window: PixelWindow, disc: bool, varied: bool) -> EdgeTerms:
     """Edge terms of parts in a window; `disc` for discs, `varied` if shade, texture or light varies the colour."""
     pose = parts.pose
     pose = pose._replace(column=pose.column - window.left, row=pose.row - window.top) if varied else None
     inner = None if parts.inner is None else _primitive_terms(parts.inner, window, disc)
     mark = None if parts.mark is None else _primitive_terms(parts.mark, window, disc=False)
-    return EdgeTerms(_primitive_terms(parts.whole, window, disc), inner, mark, pose, relief)
+    return EdgeTerms(_primitive_terms(parts.whole, window, disc), inner, mark, pose)
 
 
 def _primitive_terms(primitive: Primitive, window: PixelWindow, disc: bool) -> Any:
@@ -85,7 +84,7 @@ def covered_color(
     color: Array | ShadedColor = fills.color[..., None, None, :]
     if edges.pose is not None:
         whole = whole if edges.relief is None else materialize(whole)
-        color = _varied_color(color, fills, edges.pose, edges.relief, window, whole)
+        color = _varied_color(color, fills, edges, edges.pose, window, whole)
     if edges.mark is None and edges.inner is None:
         return whole, color
     color = as_color(color)
@@ -100,7 +99,7 @@ def covered_color(
 
 
 def _varied_color(
-    color: Array, fills: Fills, pose: ImagePose, relief: Relief | None, window: PixelWindow, cover: Array
+    color: Array, fills: Fills, edges: EdgeTerms, pose: ImagePose, window: PixelWindow, cover: Array
 ) -> Array | ShadedColor:
     """Colours of textured, shaded or lit slots at pixel centres."""
     x = jnp.arange(window.columns) + 0.5 - pose.column[..., None]
@@ -119,6 +118,6 @@ def _varied_color(
         # Lit from the upper left: darkest at the opposite rim.
         far = ((x / reach + 0.35) ** 2 + (y / reach + 0.35) ** 2) / 2.24
         color = color * (1 - fills.shade[..., None, None] * jnp.minimum(far, 1.0))[..., None]
-    if fills.surface is not None and fills.light is not None and relief is not None:
-        return lit_color(color, fills.light, fills.surface, relief, pose, x, y, cover)
+    if edges.relief is not None and edges.lit is not None and fills.accent is not None:
+        return lit_color(color, fills.accent[..., None, None, :], edges.lit, edges.relief, pose, x, y, cover)
     return color

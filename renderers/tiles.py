@@ -3,6 +3,7 @@
 Each step of the loops over videos, frames and objects touches little memory; `vmap` would turn them into scatters.
 """
 
+import dataclasses
 import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -11,32 +12,38 @@ import jax
 import jax.numpy as jnp
 
 from gen2d.records.axes import Array
+from gen2d.records.layout import SlotGroup
 from gen2d.renderers.compositing import (
     OCCLUDER,
     LayerCanvas,
     PackedColor,
     background_layer,
     occluder_layer,
-    over,
-    ownership,
+    paint_tile,
     quantize_color,
     quantize_cover,
     run_edge_terms,
-    static_layer,
 )
-from gen2d.renderers.plan import FramePlan, RenderScene, TileGroup, tile_windows
+from gen2d.renderers.lighting import ShadedColor
+from gen2d.renderers.plan import FramePlan, RenderScene, tile_windows
 from gen2d.renderers.postprocessing import expose, exposure_average, exposure_start
 from gen2d.renderers.primitives import Instants, PixelWindow
 from gen2d.renderers.sensor import record
-from gen2d.renderers.shading import EdgeTerms, covered_color, fills_of
+from gen2d.renderers.shading import covered_color, fills_of
 from gen2d.renderers.shadows import ShadowTerms, shadow_cover, shadow_terms
+from gen2d.renderers.static_layer import static_layer_by_blocks
 from gen2d.xla import runtime_one
+
+BLOCK = 16  # instants whose tiles are computed at once
+BLOCK_PIXELS = 2**16  # largest number of pixels of all their tiles
 
 
 def draw_tiles(scenes: RenderScene, plan: FramePlan) -> tuple[Array | None, Array | None]:
     """Frames [n, T, H, W, 3] uint8 and owners [n, T, H, W] uint8, None if `plan` does not want them."""
     videos, frames = scenes.instants.angle.shape[:2]
-    layers = jax.lax.map(functools.partial(static_layer, plan=plan), scenes)
+    one = (scenes.instants.view.scale[0, 0] > 0).astype(jnp.float32)
+    with runtime_one(one):
+        layers = jax.lax.map(functools.partial(static_layer_by_blocks, plan=plan), scenes)
     shape = videos, frames, plan.height, plan.width
     image = None if layers.image is None else jnp.broadcast_to(layers.image, (*shape, 3)).reshape(-1, *shape[2:], 3)
     owner = jnp.zeros((videos * frames, *shape[2:]), jnp.uint8) if plan.owners else None
@@ -46,73 +53,71 @@ def draw_tiles(scenes: RenderScene, plan: FramePlan) -> tuple[Array | None, Arra
             jax.tree.map(lambda a: jax.lax.dynamic_index_in_dim(a, v, keepdims=False), tree)
             for tree in (scenes, layers)
         )
-        renderer = _VideoRenderer(scene, plan, layer, v * frames)
+        start = v * frames
         if plan.still and not plan.exposed:
-            return renderer.paint_in_place(canvas)
-        canvas = renderer.paint_separately(canvas) if plan.frames else canvas
-        return renderer.paint_owners(canvas) if plan.owners else canvas
+            return _VideoRenderer(scene, plan, layer, start, scene.instants).paint_in_place(canvas)
+        if plan.frames:
+            instants = scene.instants
+            if scene.exposed is not None:
+                instants = jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:]), scene.exposed)
+            canvas = _VideoRenderer(scene, plan, layer, start, instants).paint_separately(canvas)
+        if plan.owners:
+            alone = dataclasses.replace(plan, frames=False)
+            canvas = _VideoRenderer(scene, alone, layer, start, scene.instants).paint_owners(canvas)
+        return canvas
 
-    with runtime_one((scenes.instants.view.scale[0, 0] > 0).astype(jnp.float32)):
+    with runtime_one(one):
         canvas = jax.lax.fori_loop(0, videos, video, LayerCanvas(image, owner))
     canvas = jax.tree.map(lambda a: a.reshape(videos, frames, *a.shape[1:]), canvas)
     return record(scenes.sensor, scenes.seed, canvas.image, canvas.owner, plan.height, plan.width)
 
 
-class TileEdges(NamedTuple):
-    """Edge terms of a group's slots in their tiles at all instants; arrays [k, I, ...]."""
+class RunTiles(NamedTuple):
+    """Terms of a run's slots in their tiles at all instants; arrays [k, I, ...]."""
 
-    group: TileGroup
+    run: SlotGroup
+    first: int  # slot
     window: PixelWindow
-    of_runs: list[EdgeTerms]
+    terms: Any  # EdgeTerms or ShadowTerms
+    color: Any  # [k, 1, 1, 3] int16, of slots and of their highlights if they have any
 
 
-class ShadowTiles(NamedTuple):
-    """Shadows of a group's slots in their tiles at all instants; arrays [k, I, ...]."""
+class TileLayers(NamedTuple):
+    """Quantised tiles of a run's k slots at the B instants of a block."""
 
-    group: TileGroup
-    window: PixelWindow
-    of_runs: list[ShadowTerms]
-
-
-class TileCoverage(NamedTuple):
-    """Quantised tiles of a group's k slots at one instant."""
-
-    cover: Array  # [k, rows, columns] int16
-    color: Any  # [k, rows or 1, columns or 1, 3] int16, or a PackedColor
-    object_id: Array  # [k] slot + 1
-    top: Array  # [k] first row
-    left: Array  # [k] first column
+    cover: Array  # [k, B, rows, columns] int16
+    color: (
+        Array | None
+    )  # [k, B, rows, columns, 3] int16, or [k, B, rows, columns] shares of a PackedColor; None: constant
 
 
 class _VideoRenderer:
-    """Renders one video, frame by frame, from frame `first` of a canvas on."""
+    """Renders one video, frame by frame, from frame `first` of a canvas on; `at` are the instants of its images."""
 
-    def __init__(self, scene: RenderScene, plan: FramePlan, back: LayerCanvas, first: Array) -> None:
-        self.scene, self.plan, self.back, self.first = scene, plan, back, first
+    def __init__(self, scene: RenderScene, plan: FramePlan, back: LayerCanvas, first: Array, at: Instants) -> None:
+        self.scene, self.plan, self.back, self.first, self.at = scene, plan, back, first, at
         self.frames = scene.instants.angle.shape[0]
+        self.tiles, self.shadows = self._edge_tiles(), self._shadow_tiles()
 
     def paint_in_place(self, canvas: LayerCanvas) -> LayerCanvas:
         """Frames, and owners if wanted, painted in place: the canvas already holds the static layer of its frames."""
-        edges = self._tile_edges(self.scene.instants)
-        shadows = self._shadow_tiles(self.scene.instants)
 
-        def frame(t: Array, canvas: LayerCanvas) -> LayerCanvas:
-            image = self._paint_shadows(canvas.image, self.first + t, shadows, t)
-            image, owner = self._paint_instant(LayerCanvas(image, self.back.owner), self.first + t, edges, t)
+        def frame(t: Array, canvas: LayerCanvas, layers: list[TileLayers], place: Array) -> LayerCanvas:
+            image = self._paint_shadows(canvas.image, self.first + t, layers, t, place)
+            image, owner = self._paint_slots(LayerCanvas(image, self.back.owner), self.first + t, layers, t, place)
             return LayerCanvas(image, self._store_owner(canvas.owner, owner, t))
 
-        return jax.lax.fori_loop(0, self.frames, frame, canvas)
+        return self._each_instant(jnp.int32(0), self.frames, frame, canvas)
 
     def paint_owners(self, canvas: LayerCanvas) -> LayerCanvas:
         """Owners alone, without frames."""
-        edges = self._tile_edges(self.scene.instants)
 
-        def frame(t: Array, canvas: LayerCanvas) -> LayerCanvas:
-            start = self._background(self.scene.instants, t)._replace(image=None)
-            owner = self._paint_instant(start, jnp.int32(0), edges, t).owner
+        def frame(t: Array, canvas: LayerCanvas, layers: list[TileLayers], place: Array) -> LayerCanvas:
+            start = self._background(t)._replace(image=None)
+            owner = self._paint_slots(start, jnp.int32(0), layers, t, place).owner
             return LayerCanvas(canvas.image, self._store_owner(canvas.owner, owner, t))
 
-        return jax.lax.fori_loop(0, self.frames, frame, canvas)
+        return self._each_instant(jnp.int32(0), self.frames, frame, canvas)
 
     def _store_owner(self, owners: Array | None, owner: Array | None, t: Array) -> Array | None:
         if owners is None or owner is None:
@@ -121,159 +126,182 @@ class _VideoRenderer:
 
     def paint_separately(self, canvas: LayerCanvas) -> LayerCanvas:
         """Frames painted on a separate image: for motion blur or a moving camera."""
-        scene, plan = self.scene, self.plan
-        instants = scene.instants
-        if scene.exposed is not None:
-            instants = jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:]), scene.exposed)
-        samples, edges = max(plan.exposed, 1), self._tile_edges(instants)
-        shadows = self._shadow_tiles(instants)
+        plan, samples = self.plan, max(self.plan.exposed, 1)
 
-        def render_instant(i: Array) -> Array:
-            start = self._paint_shadows(self._background(instants, i).image, jnp.int32(0), shadows, i)
-            image = self._paint_instant(LayerCanvas(start, None), jnp.int32(0), edges, i).image
+        def render_instant(i: Array, layers: list[TileLayers], place: Array) -> Array:
+            start = self._paint_shadows(self._background(i).image, jnp.int32(0), layers, i, place)
+            image = self._paint_slots(LayerCanvas(start, None), jnp.int32(0), layers, i, place).image
             assert image is not None
             return image
 
-        def average_exposure(t: Array) -> Array:
-            def add(s: Array, total: Array) -> Array:
-                return expose(total, render_instant(t * samples + s), plan.linear)
-
-            start = exposure_start((1, plan.height, plan.width, 3), plan.linear)
-            return exposure_average(jax.lax.fori_loop(0, samples, add, start), samples, plan.linear)
-
-        def frame(t: Array, canvas: LayerCanvas) -> LayerCanvas:
-            image = average_exposure(t) if plan.exposed else render_instant(t)
+        def store(t: Array, canvas: LayerCanvas, image: Array) -> LayerCanvas:
             assert canvas.image is not None
             return LayerCanvas(
                 jax.lax.dynamic_update_slice(canvas.image, image, (self.first + t, 0, 0, 0)), canvas.owner
             )
 
-        return jax.lax.fori_loop(0, self.frames, frame, canvas)
+        def frame(t: Array, canvas: LayerCanvas, layers: list[TileLayers], place: Array) -> LayerCanvas:
+            return store(t, canvas, render_instant(t, layers, place))
 
-    def _background(self, at: Instants, i: Array) -> LayerCanvas:
+        def exposed_frame(t: Array, canvas: LayerCanvas) -> LayerCanvas:
+            def add(i: Array, total: Array, layers: list[TileLayers], place: Array) -> Array:
+                return expose(total, render_instant(i, layers, place), plan.linear)
+
+            start = exposure_start((1, plan.height, plan.width, 3), plan.linear)
+            total = self._each_instant(t * samples, samples, add, start)
+            return store(t, canvas, exposure_average(total, samples, plan.linear))
+
+        if plan.exposed:
+            return jax.lax.fori_loop(0, self.frames, exposed_frame, canvas)
+        return self._each_instant(jnp.int32(0), self.frames, frame, canvas)
+
+    def _background(self, i: Array) -> LayerCanvas:
         """Canvas behind the moving slots at instant i."""
         if self.plan.still:
             return self.back
-        return background_layer(
-            self.scene, jax.tree.map(lambda a: jax.lax.dynamic_slice_in_dim(a, i, 1), at), self.plan
-        )
+        now = jax.tree.map(lambda a: jax.lax.dynamic_slice_in_dim(a, i, 1), self.at)
+        return background_layer(self.scene, now, self.plan)
 
-    def _tile_edges(self, at: Instants) -> list[TileEdges]:
-        """Edge terms of each group at all instants."""
-        edges = []
+    def _edge_tiles(self) -> list[RunTiles]:
+        """Edge terms of each run at all instants."""
+        tiles = []
         for group in self.plan.groups:
-            windows = [tile_windows(self.plan, group, at, run, first) for run, first in group.runs]
-            pairs = zip(group.runs, windows, strict=True)
-            samples = [run_edge_terms(self.scene, self.plan, at, run, first, window) for (run, first), window in pairs]
-            top, left = (_concatenate([getattr(w, edge) for w in windows]) for edge in ("top", "left"))
-            edges.append(TileEdges(group, PixelWindow(top, left, windows[0].rows, windows[0].columns), samples))
-        return edges
-
-    def _shadow_tiles(self, at: Instants) -> list[ShadowTiles]:
-        """Shadows of each group at all instants."""
-        tiles, shadow = [], self.scene.paint.shadow
-        for group in self.plan.groups if shadow is not None else []:
-            assert shadow is not None
-            wider = group._replace(reach=group.reach + self.plan.blur)
-            windows = [tile_windows(self.plan, wider, at, run, first, shadow.offset) for run, first in group.runs]
-            pairs = zip(group.runs, windows, strict=True)
-            terms = [shadow_terms(self.scene, self.plan, at, run, first, window) for (run, first), window in pairs]
-            top, left = (_concatenate([getattr(w, edge) for w in windows]) for edge in ("top", "left"))
-            tiles.append(ShadowTiles(wider, PixelWindow(top, left, windows[0].rows, windows[0].columns), terms))
+            for run, first in group.runs:
+                window = tile_windows(self.plan, group, self.at, run, first)
+                terms = run_edge_terms(self.scene, self.plan, self.at, run, first, window)
+                fills = fills_of(self.scene.paint, slice(first, first + run.count))
+                colors = [
+                    quantize_color(part[:, None, None]) for part in (fills.color, fills.accent) if part is not None
+                ]
+                tiles.append(RunTiles(run, first, window, terms, colors))
         return tiles
 
-    def _paint_shadows(self, image: Array | None, frame: Array, tiles: list[ShadowTiles], i: Array) -> Array | None:
+    def _shadow_tiles(self) -> list[RunTiles]:
+        """Shadows of each run at all instants; none without frames."""
+        tiles, shadow = [], self.scene.paint.shadow
+        for group in self.plan.groups if shadow is not None and self.plan.frames else []:
+            assert shadow is not None
+            wider = group._replace(reach=group.reach + self.plan.blur)
+            for run, first in group.runs:
+                window = tile_windows(self.plan, wider, self.at, run, first, shadow.offset)
+                terms = shadow_terms(self.scene, self.plan, self.at, run, first, window)
+                color = quantize_color(jnp.broadcast_to(shadow.color, (run.count, 1, 1, 3)))
+                tiles.append(RunTiles(run, first, window, terms, [color]))
+        return tiles
+
+    def _each_instant(self, begin: Array, count: int, paint: Callable[..., Any], canvas: Any) -> Any:
+        """Canvas after `paint(i, canvas, layers, place)` at `count` instants i from `begin` on, one after the other.
+
+        The layers of a block of instants are computed at once, as long loops are faster; `place` is that in the block.
+        """
+        tiles = [*self.tiles, *self.shadows]
+        pixels = sum(each.run.count * each.window.rows * each.window.columns for each in tiles)
+        size = min(max(BLOCK_PIXELS // max(pixels, 1), 1), BLOCK, count)
+
+        def empty(each: RunTiles) -> TileLayers:
+            layer = jax.eval_shape(lambda: self._layer(each, jnp.int32(0), begin, size))
+            return jax.tree.map(lambda a: jnp.zeros((each.run.count, *a.shape), a.dtype), layer)
+
+        def block(number: Array, carry: tuple[Any, list[TileLayers]]) -> tuple[Any, list[TileLayers]]:
+            canvas, layers = carry
+            done = jnp.minimum(number * size, count - size)  # the last block overlaps the one before it
+            layers = [self._filled(old, each, begin + done, size) for old, each in zip(layers, tiles, strict=True)]
+
+            def paint_one(i: Array, canvas: Any) -> Any:
+                return paint(begin + i, canvas, layers, i - done)
+
+            until = jnp.minimum((number + 1) * size, count)
+            return jax.lax.fori_loop(number * size, until, paint_one, canvas), layers
+
+        return jax.lax.fori_loop(0, -(-count // size), block, (canvas, [empty(each) for each in tiles]))[0]
+
+    def _filled(self, layers: TileLayers, tiles: RunTiles, begin: Array, size: int) -> TileLayers:
+        """`layers` with those of the slots that are rendered, at `size` instants from `begin` on."""
+
+        def fill(k: Array, layers: TileLayers) -> TileLayers:
+            layer = self._layer(tiles, k, begin, size)
+            return jax.tree.map(lambda old, new: jax.lax.dynamic_update_index_in_dim(old, new, k, 0), layers, layer)
+
+        return jax.lax.fori_loop(0, self._drawn(tiles), fill, layers)
+
+    def _layer(self, tiles: RunTiles, k: Array, begin: Array, size: int) -> TileLayers:
+        """Tiles [B, ...] of slot k of a run."""
+
+        def of_slot(a: Array) -> Array:
+            return jax.lax.dynamic_index_in_dim(a, k, keepdims=False)
+
+        terms = jax.tree.map(lambda a: jax.lax.dynamic_slice_in_dim(of_slot(a), begin, size), tiles.terms)
+        if isinstance(terms, ShadowTerms):
+            return TileLayers(quantize_cover(shadow_cover(terms, tiles.window)), None)
+        fills = fills_of(self.scene.paint, slice(tiles.first, tiles.first + tiles.run.count))
+        cover, color = covered_color(terms, jax.tree.map(of_slot, fills), tiles.window, self.plan.largest(tiles.run))
+        if isinstance(color, ShadedColor):
+            return TileLayers(quantize_cover(cover), quantize_color(color).shares)
+        return TileLayers(quantize_cover(cover), None if color.ndim == 3 else quantize_color(color))
+
+    def _drawn(self, tiles: RunTiles) -> Array:
+        """Number of slots of a run up to the last one that is rendered: absent objects are at its end."""
+        drawn = self.scene.paint.drawn[tiles.first : tiles.first + tiles.run.count]
+        return jnp.max(jnp.where(drawn, jnp.arange(1, tiles.run.count + 1), 0))
+
+    def _paint_shadows(
+        self, image: Array | None, frame: Array, layers: list[TileLayers], i: Array, place: Array
+    ) -> Array | None:
         """Image with all shadows of moving slots at instant i painted into image `frame`."""
         shadow = self.scene.paint.shadow
         if shadow is None or image is None:
             return image
-        color = quantize_color(shadow.color)
-
-        def pick(a: Array) -> Array:
-            return jax.lax.dynamic_index_in_dim(a, i, 1, keepdims=False)
-
-        for group, window, of_runs in tiles:
-            covers = [quantize_cover(shadow_cover(jax.tree.map(pick, terms), window)) for terms in of_runs]
-            cover, top, left = _concatenate(covers), pick(window.top), pick(window.left)
-
-            def paint(
-                k: Array, canvas: LayerCanvas, cover: Array = cover, top: Array = top, left: Array = left
-            ) -> LayerCanvas:
-                corner = (frame, top[k], left[k])
-                return self._paint_layer(canvas, jax.lax.dynamic_index_in_dim(cover, k), color, 0, corner)
-
-            image = jax.lax.fori_loop(0, len(group.slots), paint, LayerCanvas(image, None)).image
+        for tiles, layer in zip(self.shadows, layers[len(self.tiles) :], strict=True):
+            paint = functools.partial(self._paint_slot, tiles=tiles, layers=layer, i=i, place=place, frame=frame)
+            image = jax.lax.fori_loop(0, self._drawn(tiles), paint, LayerCanvas(image, None)).image
         return image
 
-    def _paint_instant(self, canvas: LayerCanvas, frame: Array, edges: list[TileEdges], i: Array) -> LayerCanvas:
+    def _paint_slots(
+        self, canvas: LayerCanvas, frame: Array, layers: list[TileLayers], i: Array, place: Array
+    ) -> LayerCanvas:
         """Canvas with all moving slots at instant i painted into image `frame`; owners hold a single frame."""
         rank = 0
-        for group_edges in edges:
-            count = len(group_edges.group.slots)
-            paint_slot = functools.partial(self._paint_slot, tiles=self._tile_coverage(group_edges, i), frame=frame)
-            canvas = self._paint_slots(canvas, paint_slot, rank, count, frame)
-            rank += count
+        for tiles, of_run in zip(self.tiles, layers, strict=False):  # those of shadows follow
+            paint = functools.partial(self._paint_slot, tiles=tiles, layers=of_run, i=i, place=place, frame=frame)
+            canvas = self._paint_run(canvas, paint, rank, tiles, frame)
+            rank += tiles.run.count
         return canvas
 
-    def _tile_coverage(self, edges: TileEdges, i: Array) -> TileCoverage:
-        def pick(a: Array) -> Array:
-            return jax.lax.dynamic_index_in_dim(a, i, 1, keepdims=False)
-
-        covers, colors = [], []
-        for (run, first), samples in zip(edges.group.runs, edges.of_runs, strict=True):
-            fills = fills_of(self.scene.paint, slice(first, first + run.count))
-            cover, color = covered_color(jax.tree.map(pick, samples), fills, edges.window, self.plan.largest(run))
-            covers.append(quantize_cover(cover))
-            colors.append(quantize_color(color))
-        if not isinstance(colors[0], PackedColor):
-            shape = jnp.broadcast_shapes(*(color.shape[1:] for color in colors))
-            colors = [jnp.broadcast_to(color, (color.shape[0], *shape)) for color in colors]
-        color = jax.tree.map(lambda *parts: _concatenate(list(parts)), *colors)
-        ids = jnp.asarray(edges.group.slots, jnp.int32) + 1
-        return TileCoverage(_concatenate(covers), color, ids, pick(edges.window.top), pick(edges.window.left))
-
-    def _paint_slot(self, k: Array, canvas: LayerCanvas, tiles: TileCoverage, frame: Array) -> LayerCanvas:
-        cover, color = jax.tree.map(lambda a: jax.lax.dynamic_index_in_dim(a, k), (tiles.cover, tiles.color))
-        return self._paint_layer(canvas, cover, color, tiles.object_id[k], (frame, tiles.top[k], tiles.left[k]))
-
-    def _paint_layer(
-        self, canvas: LayerCanvas, cover: Array, color: Any, object_id: Array | int, corner: tuple[Array, ...]
+    def _paint_slot(
+        self, k: Array, canvas: LayerCanvas, tiles: RunTiles, layers: TileLayers, i: Array, place: Array, frame: Array
     ) -> LayerCanvas:
-        """Canvas with a quantised layer [1, rows, columns] painted at a corner (frame, top, left)."""
-        image, owner = canvas
-        if image is not None:
-            start = (*corner, 0)
-            under = jax.lax.dynamic_slice(image, start, (*cover.shape, 3))
-            image = jax.lax.dynamic_update_slice(image, over(under, cover, color, self.plan.linear), start)
-        if owner is not None:
-            start = (0, *corner[1:])
-            under = jax.lax.dynamic_slice(owner, start, cover.shape)
-            owner = jax.lax.dynamic_update_slice(owner, ownership(under, cover, object_id), start)
-        return LayerCanvas(image, owner)
+        def pick(a: Array) -> Array:
+            return jax.lax.dynamic_slice(a, (k, place, *[0] * (a.ndim - 2)), (1, 1, *a.shape[2:]))[0]
 
-    def _paint_slots(
+        cover, color = pick(layers.cover), None if layers.color is None else pick(layers.color)
+        constant = [jax.lax.dynamic_index_in_dim(part, k) for part in tiles.color]
+        if color is None:
+            color = constant[0]
+        elif color.ndim == 3:
+            color = PackedColor(constant[0], constant[1], color)
+        corner = (frame, tiles.window.top[k, i], tiles.window.left[k, i])
+        return paint_tile(canvas, cover, color, tiles.first + k + 1, corner, self.plan.linear)
+
+    def _paint_run(
         self,
         canvas: LayerCanvas,
         paint_slot: Callable[[Array, LayerCanvas], LayerCanvas],
         rank: int,
-        count: int,
+        tiles: RunTiles,
         frame: Array,
     ) -> LayerCanvas:
-        """Canvas after `count` tiles of ranks from `rank` on, and the occluders between them."""
+        """Canvas after the tiles of a run, of ranks from `rank` on, and the occluders between them."""
+        count, drawn = tiles.run.count, self._drawn(tiles)
         occluders = self.scene.occluders
-        done: Array | int = 0
+        done = jnp.int32(0)
         if occluders is not None:
             is_last = rank + count == self.plan.moving  # also paints the occluders before all slots
             for i, below in enumerate(occluders.rank):
                 until = jnp.clip(below - rank, 0, count)
-                canvas = jax.lax.fori_loop(done, until, paint_slot, canvas)
+                canvas = jax.lax.fori_loop(done, jnp.minimum(until, drawn), paint_slot, canvas)
                 done = until
                 shown = (below >= rank) & ((below < rank + count) | is_last)
                 cover, color = occluder_layer(self.scene, self.plan, i, shown)
                 cover, color, corner = quantize_cover(cover), quantize_color(color), (frame, jnp.int32(0), jnp.int32(0))
-                canvas = self._paint_layer(canvas, cover, color, OCCLUDER, corner)
-        return jax.lax.fori_loop(done, count, paint_slot, canvas)
-
-
-def _concatenate(arrays: list[Array]) -> Array:
-    return arrays[0] if len(arrays) == 1 else jnp.concatenate(arrays)
+                canvas = paint_tile(canvas, cover, color, OCCLUDER, corner, self.plan.linear)
+        return jax.lax.fori_loop(done, drawn, paint_slot, canvas)

@@ -11,6 +11,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+from gen2d.core.enums import SHAPES
 from gen2d.core.schema import Field
 
 
@@ -134,6 +135,7 @@ class Look(_Contract):
         look/NAME.
     - margin(options): largest distance, in px, to which an object is rendered beyond its outline; `line_margin` for
         `LineOptions`.
+    - grown: shapes that are rendered beyond their outlines; `LINES` if they are segments alone, which is faster.
     - blur(options, layout): largest half width of the soft edges of shadows, in m; 0 for looks without shadows.
     - check(options): raises ValueError if the options are invalid; the message begins with an option's name.
     - parts: names of parts of `Paint` that `paint` always returns, and that annotations may need: surface, shadow.
@@ -142,6 +144,7 @@ class Look(_Contract):
     options: type
     paint: Callable[[Any, Any, Any, Any], Any]
     margin: Callable[[Any], float]
+    grown: tuple[str, ...] = SHAPES
     blur: Callable[[Any, Any], float] = _no_blur
     check: Callable[[Any], None] = _nothing
     parts: tuple[str, ...] = ()

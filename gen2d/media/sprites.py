@@ -8,6 +8,11 @@ from PIL import Image
 
 from gen2d.media.images import WEBP_SIDE
 
+STEP = 32  # of rare colours that are rounded before they are encoded without loss
+COMMON = 1 / 512  # part of a frame from which a colour is not rare
+PLAIN = 0.9  # part of a frame that has common colours, from which on this is small
+GOOD = 50  # quality from which it replaces WebP's lossy form
+
 
 def reduced(frames: np.ndarray, side: int) -> np.ndarray:
     """Frames [T, H, W, 3] averaged over square blocks of pixels, so that they have at most `side` ** 2 pixels each."""
@@ -30,16 +35,40 @@ def sprite_rows(frames: int, height: int) -> int:
 def sprite_sheet(frames: np.ndarray, quality: int | None) -> bytes:
     """WebP picture of the frames [T, H, W, 3 or 4], uint8 RGB or RGBA, one below the other in columns of `sprite_rows`.
 
-    `quality` is from 0 to 100, None for lossless. The same frames give the same bytes with the same version of Pillow,
-    which brings its own encoder.
+    `quality` is from 0 to 100, None for lossless. From `GOOD` on, frames of few colours are encoded without loss, but
+    for rare colours, which are rounded: plain grounds have no noise, and rims are right to half a `STEP`. The same
+    frames give the same bytes with the same version of Pillow, which brings its own encoder.
     """
     count, height, width = frames.shape[:3]
     rows = sprite_rows(count, height)
     columns = -(-count // rows)
     padded = np.concatenate([frames, np.repeat(frames[-1:], rows * columns - count, axis=0)])
     sheet = np.concatenate(padded.reshape(columns, rows * height, width, frames.shape[3]), axis=1)
-    lossless = {"lossless": True, "quality": 30, "method": 1}
+    if quality is None:
+        return _webp(sheet, lossless=True)
+    colors, counts = np.unique(_packed(frames[0]), return_counts=True)
+    common = counts >= COMMON * height * width
+    if quality < GOOD or counts[common].sum() < PLAIN * height * width:
+        return _webp(sheet, lossless=False, quality=quality)
+    is_common = np.zeros(2**24, bool)
+    is_common[colors[common]] = True
+    return _webp(np.where(is_common[_packed(sheet)][..., None], sheet, _rounded(sheet)), lossless=True, quality=60)
+
+
+def _webp(sheet: np.ndarray, lossless: bool, quality: int = 30) -> bytes:
+    """WebP picture; without loss, `quality` is the effort."""
     content = io.BytesIO()
-    options = lossless if quality is None else {"quality": quality, "method": 2}
-    Image.fromarray(np.ascontiguousarray(sheet)).save(content, "WEBP", **options)
+    picture = Image.fromarray(np.ascontiguousarray(sheet))
+    picture.save(content, "WEBP", lossless=lossless, quality=quality, method=1 if lossless else 2)
     return content.getvalue()
+
+
+def _rounded(colors: np.ndarray) -> np.ndarray:
+    """Colours rounded to multiples of `STEP`, white to white."""
+    return np.minimum((colors.astype(np.uint16) + STEP // 2) // STEP * STEP, 255).astype(np.uint8)
+
+
+def _packed(colors: np.ndarray) -> np.ndarray:
+    """Colours [..., 3] as numbers of 24 bits."""
+    red, green, blue = np.moveaxis(colors.astype(np.uint32), -1, 0)
+    return red << 16 | green << 8 | blue

@@ -53,6 +53,7 @@ def plan_of(config: Config, layout: Layout) -> FramePlan:
         width=video.width,
         scale=scale,
         grow=look.contract.margin(look.options),
+        grown=look.contract.grown,
         blur=look.contract.blur(look.options, layout) * scale,
         still=not camera.may_move(config.camera),
         linear=image.blending == "linear",

@@ -2,7 +2,7 @@
 
 import dataclasses
 
-from gen2d.plugin import Array, Layout, Look, Paint, PlainOptions, Scene, line_margin, plain
+from gen2d.plugin import LINES, Array, Layout, Look, Paint, PlainOptions, Scene, line_margin, plain
 
 
 @dataclasses.dataclass(frozen=True)
@@ -15,4 +15,4 @@ def paint(scene: Scene, layout: Layout, options: Options, key: Array) -> Paint:
     return plain(scene, layout, options, key)
 
 
-LOOK = Look(options=Options, paint=paint, margin=line_margin)
+LOOK = Look(options=Options, paint=paint, margin=line_margin, grown=LINES)

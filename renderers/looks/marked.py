@@ -5,6 +5,7 @@ import dataclasses
 import jax.numpy as jnp
 
 from gen2d.plugin import (
+    LINES,
     Array,
     Layout,
     Look,
@@ -40,4 +41,4 @@ def paint(scene: Scene, layout: Layout, options: Options, key: Array) -> Paint:
     return marked._replace(rim=jnp.where(are_lines(scene), 0.0, options.rim_width), rim_color=rim_color)
 
 
-LOOK = Look(options=Options, paint=paint, margin=line_margin)
+LOOK = Look(options=Options, paint=paint, margin=line_margin, grown=LINES)

@@ -5,6 +5,7 @@ import dataclasses
 import jax.numpy as jnp
 
 from gen2d.plugin import (
+    LINES,
     Array,
     Layout,
     Look,
@@ -37,4 +38,4 @@ def paint(scene: Scene, layout: Layout, options: Options, key: Array) -> Paint:
     return base._replace(fill=fill, rim=jnp.where(lines, 0.0, options.width), rim_color=base.color)
 
 
-LOOK = Look(options=Options, paint=paint, margin=line_margin)
+LOOK = Look(options=Options, paint=paint, margin=line_margin, grown=LINES)

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from gen2d.plugin import (
+    LINES,
     Array,
     Background,
     Layout,
@@ -40,4 +41,4 @@ def paint(scene: Scene, layout: Layout, options: Options, key: Array) -> Paint:
     return Paint(Background(jnp.asarray(WHITE)), colors, *line_fields(scene, options))
 
 
-LOOK = Look(options=Options, paint=paint, margin=line_margin)
+LOOK = Look(options=Options, paint=paint, margin=line_margin, grown=LINES)

@@ -4,7 +4,7 @@ import dataclasses
 
 import jax.numpy as jnp
 
-from gen2d.plugin import Array, Layout, Look, Paint, PlainOptions, Scene, are_lines, line_margin, option, plain
+from gen2d.plugin import LINES, Array, Layout, Look, Paint, PlainOptions, Scene, are_lines, line_margin, option, plain
 
 
 @dataclasses.dataclass(frozen=True)
@@ -20,4 +20,4 @@ def paint(scene: Scene, layout: Layout, options: Options, key: Array) -> Paint:
     return plain(scene, layout, options, key)._replace(shade=shade)
 
 
-LOOK = Look(options=Options, paint=paint, margin=line_margin)
+LOOK = Look(options=Options, paint=paint, margin=line_margin, grown=LINES)

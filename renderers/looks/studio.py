@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from gen2d.plugin import (
+    LINES,
     POLYGON,
     Array,
     Background,
@@ -170,4 +171,4 @@ def _backdrop(base: Paint, layout: Layout, options: Options, key: Array, azimuth
     return backdrop(named, layout, jax.random.fold_in(key, 1))._replace(direction=azimuth)
 
 
-LOOK = Look(options=Options, paint=paint, margin=line_margin, blur=blur, parts=("surface", "shadow"))
+LOOK = Look(options=Options, paint=paint, margin=line_margin, grown=LINES, blur=blur, parts=("surface", "shadow"))

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from gen2d.plugin import (
+    LINES,
     Array,
     Layout,
     Look,
@@ -44,4 +45,4 @@ def paint(scene: Scene, layout: Layout, options: Options, key: Array) -> Paint:
     return base._replace(texture=texture)
 
 
-LOOK = Look(options=Options, paint=paint, margin=line_margin)
+LOOK = Look(options=Options, paint=paint, margin=line_margin, grown=LINES)

@@ -87,6 +87,26 @@ def test_a_sprite_sheet_holds_every_frame(frames: int, height: int) -> None:
     assert_array_equal(pictures({**sprite, "rows": sprite_rows(frames, height)}, frames), images)
 
 
+def test_plain_grounds_have_no_noise() -> None:
+    """A box with a soft rim moves over paper and a white wall; frames of many colours are lossy."""
+    frames = np.full((9, 64, 64, 3), (239, 228, 207), np.uint8)
+    frames[:, :, :3] = 255
+    for t, frame in enumerate(frames):
+        frame[20 + 3 * t : 30 + 3 * t, 9 + 4 * t : 19 + 4 * t] = 209, 73, 91
+        frame[20 + 3 * t, 9 + 4 * t : 19 + 4 * t] = 224 + t, 150 + t, 149
+        frame[5, 5] = 251
+    content, lossy = sprite_sheet(frames, 80), io.BytesIO()
+    Image.fromarray(frames.reshape(-1, 64, 3)).save(lossy, "WEBP", quality=80, method=4)
+    sprite = {"content": base64.b64encode(content), "height": 64, "width": 64, "rows": sprite_rows(9, 64)}
+    found = np.asarray(pictures(sprite, 9)).astype(int)
+    apart, rare = abs(found - frames), (frames[..., 2] == 149) | (frames[..., 2] == 251)
+    assert 0 < apart[rare].max() <= 16
+    assert (apart[~rare] == 0).all()
+    assert len(content) < len(lossy.getvalue())
+    noise = np.random.default_rng(0).integers(0, 256, frames.shape, np.uint8)
+    assert len(sprite_sheet(noise, 80)) < 0.7 * noise.size
+
+
 def test_reduced_frames_are_averages_of_blocks() -> None:
     frames = np.random.default_rng(1).integers(0, 256, (2, 30, 65, 3), np.uint8)
     found = reduced(frames, 16)

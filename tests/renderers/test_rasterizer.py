@@ -13,13 +13,14 @@ from tiny import CONFIG
 from worlds import outline, polygon_areas, straight_motion
 
 from gen2d.config.config import load_config
-from gen2d.core.enums import STATIC
+from gen2d.core.enums import SHAPES, STATIC
 from gen2d.programs import shared
 from gen2d.programs.rollout import DeviceBatch, Rollout
 from gen2d.records.layout import Layout, SlotGroup
-from gen2d.renderers import rasterizer
+from gen2d.renderers import rasterizer, tiles
 from gen2d.renderers.camera import CameraView
 from gen2d.renderers.compositing import OCCLUDER
+from gen2d.renderers.look import LINES
 from gen2d.renderers.paint import Background, Paint, Texture
 from gen2d.renderers.plan import FramePlan, Occluders, RenderScene
 from gen2d.renderers.primitives import BodyGeometry, Instants
@@ -276,6 +277,22 @@ def test_patches_and_dense_are_one_image(case):
     apart = difference_of_forms(case, 0)
     print(f"{case}: frames differ by {apart.max()} at most, in {(apart > 0).mean():.1e} of all values")
     assert apart.max() <= 1
+
+
+def test_patches_of_a_video_longer_than_a_block_are_those_of_its_frames():
+    plan = plan_for((SlotGroup("circle", 4), SlotGroup("circle", 1, STATIC)), 20, 36)
+    some = stages(plan, frames=tiles.BLOCK + 3, seed=0, videos=4)
+    (frames, _), (dense, _) = (drawn_as(form, some, plan) for form in (PATCHES, DENSE))
+    assert frames.std() > 20
+    assert np.abs(np.diff(frames.astype(int), axis=1)).max((2, 3, 4)).min() > 20
+    assert np.abs(frames.astype(int) - dense).max() <= 1
+
+
+def test_a_patch_holds_what_a_look_adds_to_the_rims_of_these_shapes():
+    disc, line = SlotGroup("circle", 1), SlotGroup("segment", 1)
+    for grown, added in ((SHAPES, (0.75, 0.75)), (LINES, (0.0, 0.75)), ((), (0.0, 0.0))):
+        plan = plan_for((disc, line), 24, 40, grown=grown)
+        assert [plan.largest(run) - REACH * plan.scale for run in (disc, line)] == pytest.approx(added)
 
 
 @pytest.mark.slow

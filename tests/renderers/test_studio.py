@@ -270,6 +270,14 @@ def test_shadows_own_no_pixel_and_fall_away_from_the_light():
     assert darker[row, right] == 0
 
 
+def test_shadows_of_walls_fall_far_from_them_in_both_forms():
+    _, plan, stage = staged((("azimuth", 3.14), ("elevation", 0.25)), 88)
+    tiles, dense = (frames(form, stage, plan)[0].astype(int) for form in (TILES, DENSE))
+    assert np.abs(tiles - dense).max() <= 1
+    row = int(plan.scale)  # away from all bodies, where the light comes from the left
+    assert dense[row, 16].sum() < dense[row, 30].sum() - 20
+
+
 # ---- Options
 
 
