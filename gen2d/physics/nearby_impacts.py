@@ -55,20 +55,23 @@ class _Chunk(NamedTuple):
         return buffer.at[self.chunk, :, self.lane].set(materialize(jnp.stack(values)).T, mode="drop")
 
 
+def ordered_batches(listed: ListedPairs) -> list[int]:
+    """Numbers of the batches whose impacts can act in the order of their times."""
+    points = [unpack(list(packed[0]), listed.specs[i])[2] for i, packed in enumerate(listed.packed)]
+    return [i for i, of in enumerate(points) if ordered(of)]
+
+
 class LaterImpacts:
-    """Impacts that follow others in those scenes [n] where any may `follow`."""
+    """Impacts that follow others, of some batches."""
 
-    def __init__(self, solver: PairBatches, bodies: BodyTables, solved: SolvedChunk, follow: Array) -> None:
-        self._solver, self._bodies, self._solved, self._follow = solver, bodies, solved, follow
-        listed = solved.listed
-        points = {i: solver.unpack_contacts(list(x[0]), listed.specs[i])[2] for i, x in enumerate(listed.packed)}
-        self._batches = [i for i, of in points.items() if ordered(of)]
+    def __init__(self, solver: PairBatches, bodies: BodyTables, solved: SolvedChunk, batches: list[int]) -> None:
+        self._solver, self._bodies, self._solved, self._batches = solver, bodies, solved, batches
 
-    def solve(self, rows: list[Array]) -> tuple[list[Array], list[Array]]:
-        """Rows of the bodies' tables and packed contacts after these impacts."""
+    def solve(self, rows: list[Array], follow: Array) -> tuple[list[Array], list[Array]]:
+        """Rows of the bodies' tables and packed contacts after these impacts, in scenes [n] where any may `follow`."""
         scenes = self._solver.scenes
         size = min(GROUP, scenes)
-        groups = active_pairs(self._follow[None].astype(jnp.uint32), size)
+        groups = active_pairs(follow[None].astype(jnp.uint32), size)
 
         def group(k: Array, state: tuple) -> tuple:
             lookup = row_lookup(groups, k, size)

@@ -42,7 +42,7 @@ from gen2d.physics.contact_log import (
 )
 from gen2d.physics.contact_state import BodySide, WarmStart
 from gen2d.physics.impact_order import alone, ordered, with_clearance
-from gen2d.physics.nearby_impacts import LaterImpacts
+from gen2d.physics.nearby_impacts import LaterImpacts, ordered_batches
 from gen2d.physics.packing import SAFE, PackedTable, TableSpec, pack, repeat_rows, table_of_rows, unpack
 from gen2d.physics.pair_batches import (
     CONSTANTS,
@@ -263,8 +263,7 @@ class NearbyPairs(PairBatches, ContactSolver):
     ) -> tuple[list[BodySide], SolvedChunk]:
         specs: dict[int, TableSpec] = {}
         constants = *CONSTANTS, "support", "first"
-        first = [unpack(list(packed[0]), contacts.specs[i]) for i, packed in enumerate(contacts.packed)]
-        by_time = self.params.by_time and any(ordered(points) for _, _, points, *_ in first)
+        by_time = ordered_batches(contacts) if self.params.by_time else []
 
         def play(i: int, k: Array, indices: GatherIndices, a: BodySide, b: BodySide, carried: tuple) -> tuple:
             buffer, depth, begins = carried
@@ -287,7 +286,7 @@ class NearbyPairs(PairBatches, ContactSolver):
         solved = SolvedChunk(contacts, [packed for packed, *_ in carries], specs, observed)
         if by_time:
             follow = functools.reduce(jnp.logical_or, [begins >= FOLLOWS for *_, begins in carries])[:-1]
-            rows, packed = LaterImpacts(self, bodies, solved, follow).solve(rows)
+            rows, packed = LaterImpacts(self, bodies, solved, by_time).solve(rows, follow)
             solved = solved._replace(packed=packed)
         return self.unpacked(bodies, rows), solved
 
