@@ -36,8 +36,8 @@ def sprite_sheet(frames: np.ndarray, quality: int | None) -> bytes:
     """WebP picture of the frames [T, H, W, 3 or 4], uint8 RGB or RGBA, one below the other in columns of `sprite_rows`.
 
     `quality` is from 0 to 100, None for lossless. From `GOOD` on, frames of few colours are encoded without loss, but
-    for rare colours, which are rounded: plain grounds have no noise, and rims are right to half a `STEP`. The same
-    frames give the same bytes with the same version of Pillow, which brings its own encoder.
+    for the rare colours of rims, which are rounded to half a `STEP`: plain grounds have no noise. Shades are not
+    rounded. The same frames give the same bytes with the same version of Pillow, which brings its own encoder.
     """
     count, height, width = frames.shape[:3]
     rows = sprite_rows(count, height)
@@ -48,7 +48,8 @@ def sprite_sheet(frames: np.ndarray, quality: int | None) -> bytes:
         return _webp(sheet, lossless=True)
     colors, counts = np.unique(_packed(frames[0]), return_counts=True)
     common = counts >= COMMON * height * width
-    if quality < GOOD or counts[common].sum() < PLAIN * height * width:
+    few = quality >= GOOD and counts[common].sum() >= PLAIN * height * width
+    if not few or _are_shades(~np.isin(_packed(frames[0]), colors[common])):
         return _webp(sheet, lossless=False, quality=quality)
     is_common = np.zeros(2**24, bool)
     is_common[colors[common]] = True
@@ -61,6 +62,12 @@ def _webp(sheet: np.ndarray, lossless: bool, quality: int = 30) -> bytes:
     picture = Image.fromarray(np.ascontiguousarray(sheet))
     picture.save(content, "WEBP", lossless=lossless, quality=quality, method=1 if lossless else 2)
     return content.getvalue()
+
+
+def _are_shades(rare: np.ndarray) -> bool:
+    """Whether pixels [H, W] of rare colours lie side by side, as those of shades do; those of rims form thin lines."""
+    inner = rare[1:-1, 1:-1] & rare[:-2, 1:-1] & rare[2:, 1:-1] & rare[1:-1, :-2] & rare[1:-1, 2:]
+    return bool(inner.sum() > 0.1 * rare.sum())
 
 
 def _rounded(colors: np.ndarray) -> np.ndarray:

@@ -107,6 +107,16 @@ def test_plain_grounds_have_no_noise() -> None:
     assert len(sprite_sheet(noise, 80)) < 0.7 * noise.size
 
 
+def test_shades_on_a_plain_ground_are_not_rounded():
+    y, x = np.mgrid[:64, :64]
+    inside = np.hypot(x - 30, y - 30) < 9
+    shades = np.stack([5 * x, 5 * y, np.full_like(x, 100)], axis=-1)
+    frame = np.where(inside[..., None], shades, 240).astype(np.uint8)
+    frames = np.broadcast_to(frame, (4, 64, 64, 3))
+    sheet = np.array(Image.open(io.BytesIO(sprite_sheet(frames, 80))).convert("RGB"), int)[:64]
+    assert len(np.unique(sheet[inside], axis=0)) > 0.5 * inside.sum()
+
+
 def test_reduced_frames_are_averages_of_blocks() -> None:
     frames = np.random.default_rng(1).integers(0, 256, (2, 30, 65, 3), np.uint8)
     found = reduced(frames, 16)
