@@ -197,33 +197,40 @@ def static_layer(scene: RenderScene, plan: FramePlan) -> LayerCanvas:
     canvas, alone = background_layer(scene, first, plan), scene._replace(occluders=None)
     paint = quantized_painter(plan.linear)
     canvas = paint_shadows(canvas, scene, plan, first, plan.static_runs, paint)
-    return paint_runs(canvas, alone, plan, first, plan.static_runs, paint)
+    return paint_runs(canvas, alone, plan, first, plan.static_runs, paint, len(plan.static_runs))
 
 
 def paint_runs(
-    canvas: Any, scene: RenderScene, plan: FramePlan, at: Instants, runs: list[tuple[SlotGroup, int]], paint: Painter
-) -> Any:
-    """Canvas with the slots of `runs`, and the occluders between them, painted over its full size.
+    canvas: Any, scene: RenderScene, plan: FramePlan, at: Instants, runs: list[tuple[SlotGroup, int]], paint: Painter,
+    shaded: int,
+) -> Any:  # fmt: skip
+    """Canvas with the slots of `runs`, and the occluders between them, painted over its full size; each slot over its
+    shadow, but for the first `shaded` runs, which are painted without shadows.
 
     The loop over slots keeps the compiler from fusing terms that depend on a row or a column alone into the
     computation of each pixel: they are computed once, before the loop.
     """
     window = PixelWindow(0, 0, plan.height, plan.width)
     rank = 0
-    for run, first in runs:
+    for number, (run, first) in enumerate(runs):
         slots = slice(first, first + run.count)
 
         def paint_run(
-            canvas: Any, run: SlotGroup = run, first: int = first, slots: slice = slots, rank: int = rank
-        ) -> Any:
+            canvas: Any, number: int = number, run: SlotGroup = run, first: int = first, slots: slice = slots,
+            rank: int = rank,
+        ) -> Any:  # fmt: skip
             def paint_slot(canvas: Any, entry: tuple[Any, ...]) -> tuple[Any, None]:
-                edges, fills, slot, rank = entry
+                shadow, edges, fills, slot, rank = entry
                 canvas = paint_occluders(canvas, scene, plan, lambda of: of == rank, paint)
+                if shadow is not None:
+                    canvas = _paint_shadow(canvas, scene, shadow, window, paint)
                 return paint(canvas, *covered_color(edges, fills, window, plan.largest(run)), slot + 1), None
 
-            offsets = jnp.arange(run.count)
+            shadow, offsets = None, jnp.arange(run.count)
+            if scene.paint.shadow is not None and number >= shaded:
+                shadow = shadow_terms(scene, plan, at, run, first, window)
             entries = run_edge_terms(scene, plan, at, run, first, window), fills_of(scene.paint, slots)
-            return jax.lax.scan(paint_slot, canvas, (*entries, first + offsets, rank + offsets))[0]
+            return jax.lax.scan(paint_slot, canvas, (shadow, *entries, first + offsets, rank + offsets))[0]
 
         needed = scene.occluders is not None or scene.paint.drawn[slots].any()
         canvas = jax.lax.cond(needed, paint_run, lambda same: same, canvas)
@@ -235,24 +242,27 @@ def paint_shadows(
     canvas: Any, scene: RenderScene, plan: FramePlan, at: Instants, runs: list[tuple[SlotGroup, int]], paint: Painter
 ) -> Any:
     """Canvas with the shadows of the slots of `runs` painted over its full size."""
-    shadow = scene.paint.shadow
-    if shadow is None:
-        return canvas
     window = PixelWindow(0, 0, plan.height, plan.width)
 
     def paint_shadow(canvas: Any, terms: ShadowTerms) -> tuple[Any, None]:
-        return paint(canvas, shadow_cover(terms, window), shadow.color, None), None
+        return _paint_shadow(canvas, scene, terms, window, paint), None
 
-    for run, first in runs:
+    for run, first in runs if scene.paint.shadow is not None else []:
         canvas = jax.lax.scan(paint_shadow, canvas, shadow_terms(scene, plan, at, run, first, window))[0]
     return canvas
 
 
+def _paint_shadow(canvas: Any, scene: RenderScene, terms: ShadowTerms, window: PixelWindow, paint: Painter) -> Any:
+    """Canvas with one slot's shadow, which owns no pixel, painted over its full size."""
+    assert scene.paint.shadow is not None
+    return paint(canvas, shadow_cover(terms, window), scene.paint.shadow.color, None)
+
+
 def paint_moving(canvas: Any, scene: RenderScene, plan: FramePlan, at: Instants, paint: Painter) -> Any:
-    """Canvas with all moving slots and all occluders painted over its full size."""
+    """Canvas with all moving slots, their shadows and all occluders painted over its full size."""
     runs = [span for group in plan.groups for span in group.runs]
-    canvas = paint_shadows(canvas, scene, plan, at, runs, paint)
-    canvas = paint_runs(canvas, scene, plan, at, runs, paint)
+    canvas = paint_shadows(canvas, scene, plan, at, runs[: plan.shaded_first], paint)
+    canvas = paint_runs(canvas, scene, plan, at, runs, paint, plan.shaded_first)
     return paint_occluders(canvas, scene, plan, lambda rank: rank >= plan.moving, paint)
 
 

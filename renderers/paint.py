@@ -51,7 +51,7 @@ class Pattern(NamedTuple):
 
 
 class Shadow(NamedTuple):
-    """Shadows on the background of everything in front of it."""
+    """Shadows of objects on everything behind them."""
 
     offset: Array  # [2] m, of a shadow from its object
     blur: Array  # [] m, half the width of its soft edge; at most `Look.blur` says

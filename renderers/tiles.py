@@ -103,8 +103,8 @@ class _VideoRenderer:
         """Frames, and owners if wanted, painted in place: the canvas already holds the static layer of its frames."""
 
         def frame(t: Array, canvas: LayerCanvas, layers: list[TileLayers], place: Array) -> LayerCanvas:
-            image = self._paint_shadows(canvas.image, self.first + t, layers, t, place)
-            image, owner = self._paint_slots(LayerCanvas(image, self.back.owner), self.first + t, layers, t, place)
+            start = LayerCanvas(canvas.image, self.back.owner)
+            image, owner = self._paint_slots(start, self.first + t, layers, t, place)
             return LayerCanvas(image, self._store_owner(canvas.owner, owner, t))
 
         return self._each_instant(jnp.int32(0), self.frames, frame, canvas)
@@ -129,8 +129,8 @@ class _VideoRenderer:
         plan, samples = self.plan, max(self.plan.exposed, 1)
 
         def render_instant(i: Array, layers: list[TileLayers], place: Array) -> Array:
-            start = self._paint_shadows(self._background(i).image, jnp.int32(0), layers, i, place)
-            image = self._paint_slots(LayerCanvas(start, None), jnp.int32(0), layers, i, place).image
+            start = self._background(i)._replace(owner=None)
+            image = self._paint_slots(start, jnp.int32(0), layers, i, place).image
             assert image is not None
             return image
 
@@ -244,28 +244,39 @@ class _VideoRenderer:
         drawn = self.scene.paint.drawn[tiles.first : tiles.first + tiles.run.count]
         return jnp.max(jnp.where(drawn, jnp.arange(1, tiles.run.count + 1), 0))
 
-    def _paint_shadows(
-        self, image: Array | None, frame: Array, layers: list[TileLayers], i: Array, place: Array
-    ) -> Array | None:
-        """Image with all shadows of moving slots at instant i painted into image `frame`."""
-        shadow = self.scene.paint.shadow
-        if shadow is None or image is None:
-            return image
-        for tiles, layer in zip(self.shadows, layers[len(self.tiles) :], strict=True):
-            paint = functools.partial(self._paint_slot, tiles=tiles, layers=layer, i=i, place=place, frame=frame)
-            image = jax.lax.fori_loop(0, self._drawn(tiles), paint, LayerCanvas(image, None)).image
-        return image
-
     def _paint_slots(
         self, canvas: LayerCanvas, frame: Array, layers: list[TileLayers], i: Array, place: Array
     ) -> LayerCanvas:
-        """Canvas with all moving slots at instant i painted into image `frame`; owners hold a single frame."""
+        """Canvas with all moving slots at instant i, each over its shadow, painted into image `frame`; owners hold a
+        single frame."""
+        paint_slot = functools.partial(self._paint_slot, i=i, place=place, frame=frame)
+        shadows: list[Any] = [
+            functools.partial(self._paint_shadow, paint_slot, tiles, of_run)
+            for tiles, of_run in zip(self.shadows, layers[len(self.tiles) :], strict=True)
+        ] or [None] * len(self.tiles)
+        for number in range(self.plan.shaded_first):
+            if shadows[number] is not None:
+                canvas = jax.lax.fori_loop(0, self._drawn(self.tiles[number]), shadows[number], canvas)
+                shadows[number] = None
         rank = 0
-        for tiles, of_run in zip(self.tiles, layers, strict=False):  # those of shadows follow
-            paint = functools.partial(self._paint_slot, tiles=tiles, layers=of_run, i=i, place=place, frame=frame)
+        for tiles, of_run, shadow in zip(self.tiles, layers, shadows, strict=False):  # those of shadows follow
+
+            def paint(
+                k: Array, canvas: LayerCanvas, tiles: Any = tiles, layers: Any = of_run, shadow: Any = shadow
+            ) -> LayerCanvas:
+                canvas = canvas if shadow is None else shadow(k, canvas)
+                return paint_slot(k, canvas, tiles=tiles, layers=layers)
+
             canvas = self._paint_run(canvas, paint, rank, tiles, frame)
             rank += tiles.run.count
         return canvas
+
+    @staticmethod
+    def _paint_shadow(
+        paint_slot: Callable[..., LayerCanvas], tiles: RunTiles, layers: TileLayers, k: Array, canvas: LayerCanvas
+    ) -> LayerCanvas:
+        """Canvas with the shadow of slot k of a run, which owns no pixel."""
+        return canvas._replace(image=paint_slot(k, LayerCanvas(canvas.image, None), tiles=tiles, layers=layers).image)
 
     def _paint_slot(
         self, k: Array, canvas: LayerCanvas, tiles: RunTiles, layers: TileLayers, i: Array, place: Array, frame: Array

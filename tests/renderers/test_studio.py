@@ -1,5 +1,7 @@
-"""Studio: lit frames are those of a supersampled reference in float64, in both forms; shadows own no pixel."""
+"""Studio: lit frames are those of a supersampled reference in float64, in both forms; shadows own no pixel and fall on
+what lies behind."""
 
+import dataclasses
 import functools
 from typing import Any
 
@@ -10,6 +12,7 @@ import pytest
 from laws import holds
 from numpy.testing import assert_allclose, assert_array_equal
 
+from gen2d.annotations import shadow
 from gen2d.config.config import load_config
 from gen2d.core.enums import CIRCLE, POLYGON
 from gen2d.core.errors import ConfigError
@@ -26,9 +29,9 @@ SAMPLES = 10  # per side of a pixel
 
 
 def groups():
-    """Discs, capsules and boxes apart from each other, between two walls."""
-    discs = builder.discs(jnp.asarray([[2.2, 2.3], [7.6, 7.5], [5.3, 3.2]]), jnp.asarray([1.5, 1.1, 0.6]), angle=0.4)
-    capsules = builder.capsules(jnp.asarray([[2.5, 7.3]]), 0.7, 1.0, 0.5)
+    """Discs, capsules and boxes between two walls; a disc and the capsule cast shadows on the discs that they touch."""
+    discs = builder.discs(jnp.asarray([[2.2, 2.3], [7.6, 7.5], [6.55, 8.85]]), jnp.asarray([1.5, 1.1, 0.6]), angle=0.4)
+    capsules = builder.capsules(jnp.asarray([[2.3, 4.95]]), 0.7, 1.0, 0.5)
     boxes = builder.boxes(jnp.asarray([[8.0, 2.6]]), 0.3, 1.6, 2.0)
     walls = builder.segments([(1.1, 0.25), (0.25, 0.7)], [(9.7, 0.25), (0.25, 9.6)])
     return discs, capsules, boxes, walls
@@ -171,8 +174,8 @@ def reference(scene, plan, stage):
     turn = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
     offset, blur = scale * turn @ np.asarray(shadow.offset, float), max(scale * float(shadow.blur), 0.5)
     order = sorted(drawn, key=lambda slot: int(scene.objects.depth[slot]))
-    still = [slot for slot in order if plan.still and not np.isfinite(scene.objects.mass[slot])]
-    for part in (still, [slot for slot in order if slot not in still]):
+    still = [slot for slot in order if not np.isfinite(scene.objects.mass[slot])]
+    for part in (still, *([slot] for slot in order if slot not in still)):
         for slot in part:
             opacity = float(shadow.opacity) * bodies[slot].shadow(points, offset, blur)
             image = image + opacity[..., None] * (np.asarray(shadow.color, float) - image)
@@ -276,6 +279,42 @@ def test_shadows_of_walls_fall_far_from_them_in_both_forms():
     assert np.abs(tiles - dense).max() <= 1
     row = int(plan.scale)  # away from all bodies, where the light comes from the left
     assert dense[row, 16].sum() < dense[row, 30].sum() - 20
+
+
+def inner_pixels(scene, plan, stage):
+    """Mask [H, W] of each body's pixels whose centres are 2 px or more inside its rim, without its neighbours'."""
+    points = np.stack(np.meshgrid(np.arange(plan.width) + 0.5, plan.height - 0.5 - np.arange(plan.height)), -1)
+    around = [points + 2 * np.array(way) for way in ((1, 0), (-1, 0), (0, 1), (0, -1))]
+    bodies = [Body(scene, stage, plan, slot) for slot in range(plan.layout.slots)]
+    return [np.all([body.surface(part)[0] for part in around], 0) for body in bodies]
+
+
+@pytest.mark.parametrize("form", [TILES, DENSE])
+def test_shadows_fall_on_the_objects_behind_theirs_and_on_no_others(form):
+    """The capsule's on the first disc, the third disc's on the second; by as much as the shadow mask says."""
+    scene, plan, stage = staged((), 88)
+    opaque = stage.paint.shadow
+    assert opaque is not None
+    bare = stage._replace(paint=stage.paint._replace(shadow=opaque._replace(opacity=jnp.zeros_like(opaque.opacity))))
+    image, without = (frames(form, some, plan)[0].astype(int) for some in (stage, bare))
+    stages = jax.tree.map(lambda a: a[None], stage)
+    share = np.asarray(shadow.annotate(stages, None, plan, on=True)["surface/shadow"])[0, 0, ..., None] / 255
+    behind, second, third, capsule, box, *_ = inner_pixels(scene, plan, stage)
+    for below in (behind, second):
+        assert (without - image)[below].sum(-1).max() > 40
+        expected = without + share * (np.asarray(opaque.color) - without)
+        assert np.abs(expected - image)[below].max() < 2.5
+    for above in (third, capsule, box):
+        assert above.sum() > 20
+        assert_array_equal(without[above], image[above])
+
+
+@pytest.mark.parametrize("form", [TILES, DENSE])
+def test_shadows_are_the_same_where_the_camera_may_move(form):
+    """Those of walls, which no static layer holds then, fall on the background alone."""
+    _, plan, stage = staged((("azimuth", 2.6), ("elevation", 0.25)), 88)  # that of the second wall reaches the first
+    still, moving = (frames(form, stage, dataclasses.replace(plan, still=way))[0].astype(int) for way in (True, False))
+    assert np.abs(still - moving).max() <= 1
 
 
 # ---- Options
