@@ -20,6 +20,7 @@ from gen2d.renderers.color import LINEAR, to_linear, to_srgb
 from gen2d.renderers.lighting import ShadedColor, as_color
 from gen2d.renderers.lit_terms import lit_terms
 from gen2d.renderers.noise import textured
+from gen2d.renderers.occluders import OccluderLayer, occluder_layers
 from gen2d.renderers.plan import FramePlan, RenderScene
 from gen2d.renderers.primitives import Instants, PixelWindow, object_parts
 from gen2d.renderers.relief import relief_of
@@ -210,7 +211,7 @@ def paint_runs(
     The loop over slots keeps the compiler from fusing terms that depend on a row or a column alone into the
     computation of each pixel: they are computed once, before the loop.
     """
-    window = PixelWindow(0, 0, plan.height, plan.width)
+    window, layers = PixelWindow(0, 0, plan.height, plan.width), occluder_layers(scene, plan)
     rank = 0
     for number, (run, first) in enumerate(runs):
         slots = slice(first, first + run.count)
@@ -221,7 +222,7 @@ def paint_runs(
         ) -> Any:  # fmt: skip
             def paint_slot(canvas: Any, entry: tuple[Any, ...]) -> tuple[Any, None]:
                 shadow, edges, fills, slot, rank = entry
-                canvas = paint_occluders(canvas, scene, plan, lambda of: of == rank, paint)
+                canvas = paint_occluders(canvas, scene, layers, lambda of: of == rank, paint)
                 if shadow is not None:
                     canvas = _paint_shadow(canvas, scene, shadow, window, paint)
                 return paint(canvas, *covered_color(edges, fills, window, plan.largest(run)), slot + 1), None
@@ -263,32 +264,20 @@ def paint_moving(canvas: Any, scene: RenderScene, plan: FramePlan, at: Instants,
     runs = [span for group in plan.groups for span in group.runs]
     canvas = paint_shadows(canvas, scene, plan, at, runs[: plan.shaded_first], paint)
     canvas = paint_runs(canvas, scene, plan, at, runs, paint, plan.shaded_first)
-    return paint_occluders(canvas, scene, plan, lambda rank: rank >= plan.moving, paint)
+    return paint_occluders(canvas, scene, occluder_layers(scene, plan), lambda rank: rank >= plan.moving, paint)
 
 
 def paint_occluders(
-    canvas: Any, scene: RenderScene, plan: FramePlan, here: Callable[[Array], Array], paint: Painter
+    canvas: Any, scene: RenderScene, layers: list[OccluderLayer], here: Callable[[Array], Array], paint: Painter
 ) -> Any:
-    """Canvas with the occluders painted whose rank satisfies `here`."""
-    if scene.occluders is None:
-        return canvas
-    for i, rank in enumerate(scene.occluders.rank):
-        cover, color = occluder_layer(scene, plan, i, here(rank))
-        canvas = paint(canvas, cover, color, OCCLUDER)
+    """Canvas with the occluders painted whose rank satisfies `here`, each over its shadow."""
+    for i, layer in enumerate(layers):
+        assert scene.occluders is not None
+        shown = here(scene.occluders.rank[i])
+        if layer.shadow is not None and scene.paint.shadow is not None:
+            canvas = paint(canvas, jnp.where(shown, layer.shadow, 0.0), scene.paint.shadow.color, None)
+        canvas = paint(canvas, jnp.where(shown, layer.cover, 0.0), layer.color, OCCLUDER)
     return canvas
-
-
-def occluder_layer(scene: RenderScene, plan: FramePlan, i: int, here: Array) -> tuple[Array, Array]:
-    """Coverage [1, H, W] and colour [3] of occluder `i`; the coverage is 0 unless `here` is true."""
-    assert scene.occluders is not None
-    left, top, right, bottom = scene.occluders.box[i]
-
-    def part(count: int, low: Array, high: Array) -> Array:
-        edge = jnp.arange(count, dtype=jnp.float32)
-        return jnp.clip(jnp.minimum(high, edge + 1) - jnp.maximum(low, edge), 0.0, 1.0)
-
-    cover = part(plan.height, top, bottom)[:, None] * part(plan.width, left, right)
-    return jnp.where(here, cover, 0.0)[None], scene.occluders.color[i]
 
 
 def run_edge_terms(

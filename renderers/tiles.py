@@ -18,13 +18,13 @@ from gen2d.renderers.compositing import (
     LayerCanvas,
     PackedColor,
     background_layer,
-    occluder_layer,
     paint_tile,
     quantize_color,
     quantize_cover,
     run_edge_terms,
 )
 from gen2d.renderers.lighting import ShadedColor
+from gen2d.renderers.occluders import occluder_layers
 from gen2d.renderers.plan import FramePlan, RenderScene, tile_windows
 from gen2d.renderers.postprocessing import expose, exposure_average, exposure_start
 from gen2d.renderers.primitives import Instants, PixelWindow
@@ -98,6 +98,7 @@ class _VideoRenderer:
         self.scene, self.plan, self.back, self.first, self.at = scene, plan, back, first, at
         self.frames = scene.instants.angle.shape[0]
         self.tiles, self.shadows = self._edge_tiles(), self._shadow_tiles()
+        self.occluders = occluder_layers(scene, plan)
 
     def paint_in_place(self, canvas: LayerCanvas) -> LayerCanvas:
         """Frames, and owners if wanted, painted in place: the canvas already holds the static layer of its frames."""
@@ -312,7 +313,24 @@ class _VideoRenderer:
                 canvas = jax.lax.fori_loop(done, jnp.minimum(until, drawn), paint_slot, canvas)
                 done = until
                 shown = (below >= rank) & ((below < rank + count) | is_last)
-                cover, color = occluder_layer(self.scene, self.plan, i, shown)
-                cover, color, corner = quantize_cover(cover), quantize_color(color), (frame, jnp.int32(0), jnp.int32(0))
-                canvas = paint_tile(canvas, cover, color, OCCLUDER, corner, self.plan.linear)
+                paint_occluder = functools.partial(self._paint_occluder, i, frame)
+                canvas = jax.lax.fori_loop(0, shown.astype(jnp.int32), paint_occluder, canvas)
         return jax.lax.fori_loop(done, drawn, paint_slot, canvas)
+
+    def _paint_occluder(self, i: int, frame: Array, _: Array, canvas: LayerCanvas) -> LayerCanvas:
+        """Canvas with an occluder painted over its shadow into image `frame`."""
+        (cover, color, opacity), shadow, image = self.occluders[i], self.scene.paint.shadow, canvas.image
+        corner = jnp.int32(0), jnp.int32(0), jnp.int32(0)
+        if image is not None:
+            # Both layers in one piece: of two updates of the same place in a row, XLA copies the whole canvas.
+            start = (frame, *corner)
+            under = LayerCanvas(jax.lax.dynamic_slice(image, start, (*cover.shape, 3)), None)
+            for layer, fill in ((opacity, None if shadow is None else shadow.color), (cover, color)):
+                if layer is not None and fill is not None:
+                    tile = quantize_cover(layer), quantize_color(fill)
+                    under = paint_tile(under, *tile, OCCLUDER, corner, self.plan.linear)
+            assert under.image is not None
+            image = jax.lax.dynamic_update_slice(image, under.image, start)
+        owner = LayerCanvas(None, canvas.owner)
+        owner = paint_tile(owner, quantize_cover(cover), color, OCCLUDER, corner, self.plan.linear).owner
+        return LayerCanvas(image, owner)
