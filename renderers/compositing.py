@@ -20,6 +20,7 @@ from gen2d.renderers.color import LINEAR, to_linear, to_srgb
 from gen2d.renderers.lighting import ShadedColor, as_color
 from gen2d.renderers.lit_terms import lit_terms
 from gen2d.renderers.noise import textured
+from gen2d.renderers.occluders import OccluderLayer, occluder_layers
 from gen2d.renderers.plan import FramePlan, RenderScene
 from gen2d.renderers.primitives import Instants, PixelWindow, object_parts
 from gen2d.renderers.relief import relief_of
@@ -197,33 +198,40 @@ def static_layer(scene: RenderScene, plan: FramePlan) -> LayerCanvas:
     canvas, alone = background_layer(scene, first, plan), scene._replace(occluders=None)
     paint = quantized_painter(plan.linear)
     canvas = paint_shadows(canvas, scene, plan, first, plan.static_runs, paint)
-    return paint_runs(canvas, alone, plan, first, plan.static_runs, paint)
+    return paint_runs(canvas, alone, plan, first, plan.static_runs, paint, len(plan.static_runs))
 
 
 def paint_runs(
-    canvas: Any, scene: RenderScene, plan: FramePlan, at: Instants, runs: list[tuple[SlotGroup, int]], paint: Painter
-) -> Any:
-    """Canvas with the slots of `runs`, and the occluders between them, painted over its full size.
+    canvas: Any, scene: RenderScene, plan: FramePlan, at: Instants, runs: list[tuple[SlotGroup, int]], paint: Painter,
+    shaded: int,
+) -> Any:  # fmt: skip
+    """Canvas with the slots of `runs`, and the occluders between them, painted over its full size; each slot over its
+    shadow, but for the first `shaded` runs, which are painted without shadows.
 
     The loop over slots keeps the compiler from fusing terms that depend on a row or a column alone into the
     computation of each pixel: they are computed once, before the loop.
     """
-    window = PixelWindow(0, 0, plan.height, plan.width)
+    window, layers = PixelWindow(0, 0, plan.height, plan.width), occluder_layers(scene, plan)
     rank = 0
-    for run, first in runs:
+    for number, (run, first) in enumerate(runs):
         slots = slice(first, first + run.count)
 
         def paint_run(
-            canvas: Any, run: SlotGroup = run, first: int = first, slots: slice = slots, rank: int = rank
-        ) -> Any:
+            canvas: Any, number: int = number, run: SlotGroup = run, first: int = first, slots: slice = slots,
+            rank: int = rank,
+        ) -> Any:  # fmt: skip
             def paint_slot(canvas: Any, entry: tuple[Any, ...]) -> tuple[Any, None]:
-                edges, fills, slot, rank = entry
-                canvas = paint_occluders(canvas, scene, plan, lambda of: of == rank, paint)
+                shadow, edges, fills, slot, rank = entry
+                canvas = paint_occluders(canvas, scene, layers, lambda of: of == rank, paint)
+                if shadow is not None:
+                    canvas = _paint_shadow(canvas, scene, shadow, window, paint)
                 return paint(canvas, *covered_color(edges, fills, window, plan.largest(run)), slot + 1), None
 
-            offsets = jnp.arange(run.count)
+            shadow, offsets = None, jnp.arange(run.count)
+            if scene.paint.shadow is not None and number >= shaded:
+                shadow = shadow_terms(scene, plan, at, run, first, window)
             entries = run_edge_terms(scene, plan, at, run, first, window), fills_of(scene.paint, slots)
-            return jax.lax.scan(paint_slot, canvas, (*entries, first + offsets, rank + offsets))[0]
+            return jax.lax.scan(paint_slot, canvas, (shadow, *entries, first + offsets, rank + offsets))[0]
 
         needed = scene.occluders is not None or scene.paint.drawn[slots].any()
         canvas = jax.lax.cond(needed, paint_run, lambda same: same, canvas)
@@ -235,50 +243,41 @@ def paint_shadows(
     canvas: Any, scene: RenderScene, plan: FramePlan, at: Instants, runs: list[tuple[SlotGroup, int]], paint: Painter
 ) -> Any:
     """Canvas with the shadows of the slots of `runs` painted over its full size."""
-    shadow = scene.paint.shadow
-    if shadow is None:
-        return canvas
     window = PixelWindow(0, 0, plan.height, plan.width)
 
     def paint_shadow(canvas: Any, terms: ShadowTerms) -> tuple[Any, None]:
-        return paint(canvas, shadow_cover(terms, window), shadow.color, None), None
+        return _paint_shadow(canvas, scene, terms, window, paint), None
 
-    for run, first in runs:
+    for run, first in runs if scene.paint.shadow is not None else []:
         canvas = jax.lax.scan(paint_shadow, canvas, shadow_terms(scene, plan, at, run, first, window))[0]
     return canvas
 
 
+def _paint_shadow(canvas: Any, scene: RenderScene, terms: ShadowTerms, window: PixelWindow, paint: Painter) -> Any:
+    """Canvas with one slot's shadow, which owns no pixel, painted over its full size."""
+    assert scene.paint.shadow is not None
+    return paint(canvas, shadow_cover(terms, window), scene.paint.shadow.color, None)
+
+
 def paint_moving(canvas: Any, scene: RenderScene, plan: FramePlan, at: Instants, paint: Painter) -> Any:
-    """Canvas with all moving slots and all occluders painted over its full size."""
+    """Canvas with all moving slots, their shadows and all occluders painted over its full size."""
     runs = [span for group in plan.groups for span in group.runs]
-    canvas = paint_shadows(canvas, scene, plan, at, runs, paint)
-    canvas = paint_runs(canvas, scene, plan, at, runs, paint)
-    return paint_occluders(canvas, scene, plan, lambda rank: rank >= plan.moving, paint)
+    canvas = paint_shadows(canvas, scene, plan, at, runs[: plan.shaded_first], paint)
+    canvas = paint_runs(canvas, scene, plan, at, runs, paint, plan.shaded_first)
+    return paint_occluders(canvas, scene, occluder_layers(scene, plan), lambda rank: rank >= plan.moving, paint)
 
 
 def paint_occluders(
-    canvas: Any, scene: RenderScene, plan: FramePlan, here: Callable[[Array], Array], paint: Painter
+    canvas: Any, scene: RenderScene, layers: list[OccluderLayer], here: Callable[[Array], Array], paint: Painter
 ) -> Any:
-    """Canvas with the occluders painted whose rank satisfies `here`."""
-    if scene.occluders is None:
-        return canvas
-    for i, rank in enumerate(scene.occluders.rank):
-        cover, color = occluder_layer(scene, plan, i, here(rank))
-        canvas = paint(canvas, cover, color, OCCLUDER)
+    """Canvas with the occluders painted whose rank satisfies `here`, each over its shadow."""
+    for i, layer in enumerate(layers):
+        assert scene.occluders is not None
+        shown = here(scene.occluders.rank[i])
+        if layer.shadow is not None and scene.paint.shadow is not None:
+            canvas = paint(canvas, jnp.where(shown, layer.shadow, 0.0), scene.paint.shadow.color, None)
+        canvas = paint(canvas, jnp.where(shown, layer.cover, 0.0), layer.color, OCCLUDER)
     return canvas
-
-
-def occluder_layer(scene: RenderScene, plan: FramePlan, i: int, here: Array) -> tuple[Array, Array]:
-    """Coverage [1, H, W] and colour [3] of occluder `i`; the coverage is 0 unless `here` is true."""
-    assert scene.occluders is not None
-    left, top, right, bottom = scene.occluders.box[i]
-
-    def part(count: int, low: Array, high: Array) -> Array:
-        edge = jnp.arange(count, dtype=jnp.float32)
-        return jnp.clip(jnp.minimum(high, edge + 1) - jnp.maximum(low, edge), 0.0, 1.0)
-
-    cover = part(plan.height, top, bottom)[:, None] * part(plan.width, left, right)
-    return jnp.where(here, cover, 0.0)[None], scene.occluders.color[i]
 
 
 def run_edge_terms(

@@ -172,19 +172,20 @@ def slot_colors(scene: Scene, layout: Layout, options: PlainOptions, key: Array,
     each other and with the background."""
     colors, moving = scene.objects.color.astype(jnp.float32), are_moving(layout)
     if options.named_palette is not None:
-        return palette_colors(scene, moving, options.named_palette, jax.random.fold_in(key, 3))
+        return palette_colors(scene, layout, options.named_palette, jax.random.fold_in(key, 3))
     count = int(moving.sum())
     if options.palette == "scene" or not count:
         return colors
     return colors.at[np.flatnonzero(moving)].set(palette(key, count, options.contrast, background_colors(background)))
 
 
-def palette_colors(scene: Scene, moving: np.ndarray, named: Palette, key: Array) -> Array:
+def palette_colors(scene: Scene, layout: Layout, named: Palette, key: Array) -> Array:
     """Colours [K, 3] of a named palette in a random order: distinct for the moving objects that are present, or each as
-    often as any other, to one, if there are more objects than colours; static slots have the colour of walls."""
-    colors = jnp.asarray([*named.objects.values()], jnp.float32)
+    often as any other, to one, if there are more objects than colours; a chain counts as one object. Static slots have
+    the colour of walls."""
+    colors, moving = jnp.asarray([*named.objects.values()], jnp.float32), are_moving(layout)
     order = jax.random.permutation(key, len(colors))
-    place = jnp.cumsum(scene.objects.present & moving) - 1
+    place = jnp.cumsum(scene.objects.present & (moving & ~layout.later_links)) - 1
     wall = jnp.asarray(named.wall[1], jnp.float32)
     return jnp.where(jnp.asarray(moving)[:, None], colors[order[place % len(colors)]], wall)
 

@@ -29,7 +29,7 @@ class Light(NamedTuple):
 
 
 class Surface(NamedTuple):
-    """Relief and material of objects that are lit by a `Light`."""
+    """Relief and material of objects that are lit by a `Light`; arrays [K], of occluders []."""
 
     slope: Array  # [K] sine of the steepest tilt, at the rim; 0: flat
     bevel: Array  # [K] m, width of the sloping border of polygons; discs, capsules and segments are domes
@@ -51,7 +51,7 @@ class Pattern(NamedTuple):
 
 
 class Shadow(NamedTuple):
-    """Shadows on the background of everything in front of it."""
+    """Shadows of objects on everything behind them."""
 
     offset: Array  # [2] m, of a shadow from its object
     blur: Array  # [] m, half the width of its soft edge; at most `Look.blur` says
@@ -96,5 +96,6 @@ class Paint(NamedTuple):
     light: Light | None = None  # lights `surface`
     surface: Surface | None = None
     shadow: Shadow | None = None
+    screen: Surface | None = None  # [] each, of occluders
     material: Array | None = None  # [K] int, index into `materials` of the look's options, stored as `objects/material`
     sampled: dict[str, Array] | None = None  # [] each, values of the look's sampled options, stored as `look/NAME`

@@ -58,9 +58,20 @@ class FramePlan:
     @property
     def static_runs(self) -> list[tuple[SlotGroup, int]]:
         """Runs of the static layer, each with its first slot, back to front; empty if the camera moves."""
+        return self._behind if self.still else []
+
+    @property
+    def _behind(self) -> list[tuple[SlotGroup, int]]:
+        """Static runs behind all moving ones, as in `static_runs`."""
         spans = self.layout.back_to_front
-        first = next((i for i, (run, _) in enumerate(spans) if not self.still or run.kind != STATIC), len(spans))
+        first = next((i for i, (run, _) in enumerate(spans) if run.kind != STATIC), len(spans))
         return list(spans[:first])
+
+    @property
+    def shaded_first(self) -> int:
+        """Number of runs of `groups`, the first ones, whose shadows lie below all of them: static ones, whose shadows
+        fall on the background alone. Each later slot has its shadow below itself, on everything behind it."""
+        return len(self._behind) - len(self.static_runs)
 
     @property
     def groups(self) -> "list[TileGroup]":

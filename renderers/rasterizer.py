@@ -91,7 +91,8 @@ def draw_soft(scene: RenderScene, plan: FramePlan, sigma: float = 0.0) -> Array:
     image = background_image(scene, at, plan)
     image = jnp.broadcast_to(to_linear(image) if plan.linear else image, (len(at.angle), *image.shape[1:]))
     image = paint_shadows(image, scene, plan, at, plan.static_runs, paint)
-    image = paint_runs(image, scene._replace(occluders=None), plan, at, plan.static_runs, paint)
+    static = plan.static_runs
+    image = paint_runs(image, scene._replace(occluders=None), plan, at, static, paint, len(static))
     image = paint_moving(image, scene, plan, at, paint)
     return to_srgb(image) if plan.linear else image
 

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 
 from gen2d.records.axes import Array
 from gen2d.records.layout import SlotGroup
+from gen2d.renderers.camera import CameraView
 from gen2d.renderers.paint import Paint
 from gen2d.renderers.primitives import BodyGeometry, ImagePose, Instants, side_normals
 
@@ -37,10 +38,15 @@ def relief_of(run: SlotGroup, first: int, bodies: BodyGeometry, at: Instants, pa
     """Relief of a run's slots at I instants; arrays [k, I, ...]."""
     assert paint.light is not None, "surfaces need a light"
     outline = outline_of(run, first, bodies, at, paint)
-    cos, sin = jnp.cos(at.view.angle), jnp.sin(at.view.angle)
-    right, up = paint.light.direction[0], paint.light.direction[1]
-    toward = jnp.stack([right * cos + up * sin, right * sin - up * cos], -1)  # as the camera sees it, y down
+    toward = in_image(paint.light.direction[:2], at.view)
     return Relief(*outline, jnp.broadcast_to(toward, (*outline[0].shape, 2)))
+
+
+def in_image(direction: Array, view: CameraView) -> Array:
+    """A direction [2] of the world as the camera sees it at I instants [I, 2], y down."""
+    cos, sin = jnp.cos(view.angle), jnp.sin(view.angle)
+    right, up = direction[0], direction[1]
+    return jnp.stack([right * cos + up * sin, right * sin - up * cos], -1)
 
 
 def outline_of(

@@ -1,4 +1,4 @@
-"""Shadows of bodies on the background: their outlines moved along the light, with a soft edge.
+"""Shadows of bodies on what lies behind them: their outlines moved along the light, with a soft edge.
 
 The edge goes from 1 to 0 over twice the blur: over the squared distance from a disc's centre or a capsule's core, so
 that no root is needed, and across each side of a polygon, whose sum also fades its corners. A shadow smaller than its

@@ -14,7 +14,8 @@ import jax.numpy as jnp
 
 from gen2d.records.axes import Array
 from gen2d.records.layout import SlotGroup
-from gen2d.renderers.compositing import static_layer
+from gen2d.renderers.compositing import OCCLUDER, static_layer
+from gen2d.renderers.occluders import over_occluders
 from gen2d.renderers.plan import FramePlan, RenderScene, tile_windows
 from gen2d.renderers.primitives import ImagePose, Instants, PixelWindow, object_parts
 from gen2d.renderers.relief import Relief, SurfacePoints, relief_of, surface_points
@@ -36,9 +37,14 @@ class SurfaceTerms(NamedTuple):
 def visible_surfaces(scenes: RenderScene, owners: Array, plan: FramePlan, measure: Measure) -> Any:
     """Results [n, T, H, W] of `measure` on the surface that each pixel shows, by owners [n, T, H, W].
 
-    The background and occluders are flat, with a height of 0. Raises AssertionError for paint without a surface.
+    The background is flat, with a height of 0. Raises AssertionError for paint without a surface.
     """
-    return (_by_tiles if on_cpu() else _by_pixels)(scenes, owners, plan, measure)
+    values = (_by_tiles if on_cpu() else _by_pixels)(scenes, owners, plan, measure)
+
+    def video(scene: RenderScene, shown: Array, values: Any) -> Any:
+        return over_occluders(scene, plan, shown, values, measure)
+
+    return jax.vmap(video)(scenes, owners == OCCLUDER, values)
 
 
 def _by_pixels(scenes: RenderScene, owners: Array, plan: FramePlan, measure: Measure) -> Any:

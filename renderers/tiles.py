@@ -18,13 +18,13 @@ from gen2d.renderers.compositing import (
     LayerCanvas,
     PackedColor,
     background_layer,
-    occluder_layer,
     paint_tile,
     quantize_color,
     quantize_cover,
     run_edge_terms,
 )
 from gen2d.renderers.lighting import ShadedColor
+from gen2d.renderers.occluders import occluder_layers
 from gen2d.renderers.plan import FramePlan, RenderScene, tile_windows
 from gen2d.renderers.postprocessing import expose, exposure_average, exposure_start
 from gen2d.renderers.primitives import Instants, PixelWindow
@@ -98,13 +98,14 @@ class _VideoRenderer:
         self.scene, self.plan, self.back, self.first, self.at = scene, plan, back, first, at
         self.frames = scene.instants.angle.shape[0]
         self.tiles, self.shadows = self._edge_tiles(), self._shadow_tiles()
+        self.occluders = occluder_layers(scene, plan)
 
     def paint_in_place(self, canvas: LayerCanvas) -> LayerCanvas:
         """Frames, and owners if wanted, painted in place: the canvas already holds the static layer of its frames."""
 
         def frame(t: Array, canvas: LayerCanvas, layers: list[TileLayers], place: Array) -> LayerCanvas:
-            image = self._paint_shadows(canvas.image, self.first + t, layers, t, place)
-            image, owner = self._paint_slots(LayerCanvas(image, self.back.owner), self.first + t, layers, t, place)
+            start = LayerCanvas(canvas.image, self.back.owner)
+            image, owner = self._paint_slots(start, self.first + t, layers, t, place)
             return LayerCanvas(image, self._store_owner(canvas.owner, owner, t))
 
         return self._each_instant(jnp.int32(0), self.frames, frame, canvas)
@@ -129,8 +130,8 @@ class _VideoRenderer:
         plan, samples = self.plan, max(self.plan.exposed, 1)
 
         def render_instant(i: Array, layers: list[TileLayers], place: Array) -> Array:
-            start = self._paint_shadows(self._background(i).image, jnp.int32(0), layers, i, place)
-            image = self._paint_slots(LayerCanvas(start, None), jnp.int32(0), layers, i, place).image
+            start = self._background(i)._replace(owner=None)
+            image = self._paint_slots(start, jnp.int32(0), layers, i, place).image
             assert image is not None
             return image
 
@@ -244,28 +245,39 @@ class _VideoRenderer:
         drawn = self.scene.paint.drawn[tiles.first : tiles.first + tiles.run.count]
         return jnp.max(jnp.where(drawn, jnp.arange(1, tiles.run.count + 1), 0))
 
-    def _paint_shadows(
-        self, image: Array | None, frame: Array, layers: list[TileLayers], i: Array, place: Array
-    ) -> Array | None:
-        """Image with all shadows of moving slots at instant i painted into image `frame`."""
-        shadow = self.scene.paint.shadow
-        if shadow is None or image is None:
-            return image
-        for tiles, layer in zip(self.shadows, layers[len(self.tiles) :], strict=True):
-            paint = functools.partial(self._paint_slot, tiles=tiles, layers=layer, i=i, place=place, frame=frame)
-            image = jax.lax.fori_loop(0, self._drawn(tiles), paint, LayerCanvas(image, None)).image
-        return image
-
     def _paint_slots(
         self, canvas: LayerCanvas, frame: Array, layers: list[TileLayers], i: Array, place: Array
     ) -> LayerCanvas:
-        """Canvas with all moving slots at instant i painted into image `frame`; owners hold a single frame."""
+        """Canvas with all moving slots at instant i, each over its shadow, painted into image `frame`; owners hold a
+        single frame."""
+        paint_slot = functools.partial(self._paint_slot, i=i, place=place, frame=frame)
+        shadows: list[Any] = [
+            functools.partial(self._paint_shadow, paint_slot, tiles, of_run)
+            for tiles, of_run in zip(self.shadows, layers[len(self.tiles) :], strict=True)
+        ] or [None] * len(self.tiles)
+        for number in range(self.plan.shaded_first):
+            if shadows[number] is not None:
+                canvas = jax.lax.fori_loop(0, self._drawn(self.tiles[number]), shadows[number], canvas)
+                shadows[number] = None
         rank = 0
-        for tiles, of_run in zip(self.tiles, layers, strict=False):  # those of shadows follow
-            paint = functools.partial(self._paint_slot, tiles=tiles, layers=of_run, i=i, place=place, frame=frame)
+        for tiles, of_run, shadow in zip(self.tiles, layers, shadows, strict=False):  # those of shadows follow
+
+            def paint(
+                k: Array, canvas: LayerCanvas, tiles: Any = tiles, layers: Any = of_run, shadow: Any = shadow
+            ) -> LayerCanvas:
+                canvas = canvas if shadow is None else shadow(k, canvas)
+                return paint_slot(k, canvas, tiles=tiles, layers=layers)
+
             canvas = self._paint_run(canvas, paint, rank, tiles, frame)
             rank += tiles.run.count
         return canvas
+
+    @staticmethod
+    def _paint_shadow(
+        paint_slot: Callable[..., LayerCanvas], tiles: RunTiles, layers: TileLayers, k: Array, canvas: LayerCanvas
+    ) -> LayerCanvas:
+        """Canvas with the shadow of slot k of a run, which owns no pixel."""
+        return canvas._replace(image=paint_slot(k, LayerCanvas(canvas.image, None), tiles=tiles, layers=layers).image)
 
     def _paint_slot(
         self, k: Array, canvas: LayerCanvas, tiles: RunTiles, layers: TileLayers, i: Array, place: Array, frame: Array
@@ -301,7 +313,24 @@ class _VideoRenderer:
                 canvas = jax.lax.fori_loop(done, jnp.minimum(until, drawn), paint_slot, canvas)
                 done = until
                 shown = (below >= rank) & ((below < rank + count) | is_last)
-                cover, color = occluder_layer(self.scene, self.plan, i, shown)
-                cover, color, corner = quantize_cover(cover), quantize_color(color), (frame, jnp.int32(0), jnp.int32(0))
-                canvas = paint_tile(canvas, cover, color, OCCLUDER, corner, self.plan.linear)
+                paint_occluder = functools.partial(self._paint_occluder, i, frame)
+                canvas = jax.lax.fori_loop(0, shown.astype(jnp.int32), paint_occluder, canvas)
         return jax.lax.fori_loop(done, drawn, paint_slot, canvas)
+
+    def _paint_occluder(self, i: int, frame: Array, _: Array, canvas: LayerCanvas) -> LayerCanvas:
+        """Canvas with an occluder painted over its shadow into image `frame`."""
+        (cover, color, opacity), shadow, image = self.occluders[i], self.scene.paint.shadow, canvas.image
+        corner = jnp.int32(0), jnp.int32(0), jnp.int32(0)
+        if image is not None:
+            # Both layers in one piece: of two updates of the same place in a row, XLA copies the whole canvas.
+            start = (frame, *corner)
+            under = LayerCanvas(jax.lax.dynamic_slice(image, start, (*cover.shape, 3)), None)
+            for layer, fill in ((opacity, None if shadow is None else shadow.color), (cover, color)):
+                if layer is not None and fill is not None:
+                    tile = quantize_cover(layer), quantize_color(fill)
+                    under = paint_tile(under, *tile, OCCLUDER, corner, self.plan.linear)
+            assert under.image is not None
+            image = jax.lax.dynamic_update_slice(image, under.image, start)
+        owner = LayerCanvas(None, canvas.owner)
+        owner = paint_tile(owner, quantize_cover(cover), color, OCCLUDER, corner, self.plan.linear).owner
+        return LayerCanvas(image, owner)

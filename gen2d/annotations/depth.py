@@ -17,8 +17,8 @@ ANNOTATION = Annotation(
             "float16",
             "n T H W",
             "m",
-            "height, towards the viewer, of the surface of the object of the instance mask at the pixel's centre; 0 at "
-            "rims, of the background and of occluders",
+            "height, towards the viewer, of the surface of the object of the instance mask at the pixel's centre; of "
+            "an occluder within its box; 0 at rims and of the background",
         )
     },
     annotate=annotate,

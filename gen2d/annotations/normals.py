@@ -29,7 +29,7 @@ ANNOTATION = Annotation(
             "n T H W 3",
             "1/127",
             "unit normal, right, up and towards the viewer in the image, of the surface of the object of the instance "
-            "mask at the pixel's centre; 0 0 127 of the background and of occluders",
+            "mask at the pixel's centre, of an occluder within its box; 0 0 127 of the background",
         )
     },
     annotate=annotate,

@@ -52,7 +52,7 @@ def check_look(options: Any, scene: Any, look: Any) -> None:
     if not options.change or named is None:
         return
     palette, specs, layout = look.options.palette, factor_options(scene.contract), scene.contract.layout(scene.options)
-    moving = sum(run.count for run in layout.groups if run.kind != STATIC)
+    moving = sum(run.count for run in layout.groups if run.kind != STATIC) - int(layout.later_links.sum())
     for name in options.change:
         if name.endswith("color"):
             raise ValueError(f"change is {name}, which look.palette={palette} hides: look.palette must be scene")

@@ -82,3 +82,17 @@ class Layout:
         """Rank of each slot in the rendering order, int16 [K], 0 farthest back; stored as `objects/depth`."""
         order = [slot for group, first in self.back_to_front for slot in range(first, first + group.count)]
         return np.argsort(order).astype(np.int16)
+
+    @property
+    def later_links(self) -> np.ndarray:
+        """Mask [K] of the links of chains but the first of each: capsules that are joined to the slot before them, of
+        the same group."""
+        joined = {(min(joint.a, joint.b), max(joint.a, joint.b)) for joint in self.joints}
+        return np.asarray(
+            [
+                group.shape == "capsule" and slot > first and (slot - 1, slot) in joined
+                for group, first in self.spans
+                for slot in range(first, first + group.count)
+            ],
+            bool,
+        )

@@ -145,8 +145,11 @@ def paint(scene: Scene, layout: Layout, options: Options, key: Array) -> Paint:
     shadow = Shadow(offset, jnp.float32(1) * blur(options, layout), drawn["shadow"], jnp.asarray(DARK))
     number = material.number.astype(jnp.uint8)
     background = _backdrop(base, layout, options, key, drawn["azimuth"])
+    board = MATERIALS[options.material[0]]
+    shape = jnp.float32(FLATTER * board.slope), jnp.float32(1) * BEVEL * _size(layout)
+    screen = Surface(*shape, drawn["gloss"] * board.gloss, jnp.float32(board.sharpness))
     return base._replace(
-        background=background, light=light, surface=surface, shadow=shadow, material=number,
+        background=background, light=light, surface=surface, shadow=shadow, screen=screen, material=number,
         sampled=drawn,
     )  # fmt: skip
 

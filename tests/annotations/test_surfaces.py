@@ -28,7 +28,7 @@ SMALL = ["video.frames=3", "video.fps=6", f"video.height={HEIGHT}", f"video.widt
 ON = [f"annotations.{name}=true" for name in NAMES]
 MOVING = ("camera.pan=[2,1]", "camera.turn=0.7", "camera.zoom=0.3", "image.occluders=2", "image.occluder_front=0.5")
 CASES = {
-    "bouncing": ("bouncing", ()),
+    "bouncing": ("bouncing", ("image.occluders=2", "image.occluder_front=0.5")),
     "seen by a moving camera": ("bouncing", MOVING),
     "pile": ("pile", ("look.material=metal",)),
     "seesaw": ("seesaw", MOVING),
@@ -118,10 +118,41 @@ def test_normals_are_unit_vectors_across_the_slope_of_the_height(case):
 @pytest.mark.parametrize("case", TIERED)
 def test_what_has_no_relief_is_flat(case):
     made = drawn(case)
-    bare = (made.columns["masks/instance"] == 0) | (made.columns["masks/instance"] == reference.OCCLUDER)
+    bare = made.columns["masks/instance"] == 0
     assert bare.any()
     assert (made.columns["surface/height"][bare] == 0).all()
     assert_array_equal(np.unique(made.columns["surface/normal"][bare], axis=0), [[0, 0, 127]])
+
+
+@pytest.mark.parametrize("case", [case for case in TIERED if case != "pile"])
+def test_occluders_are_boards_with_a_bevel(case):
+    """In each frame as in the first one; of two in one place the last one shows."""
+    made, sides, seen = drawn(case), np.array([[1, 0], [0, -1], [-1, 0], [0, 1]]), 0
+    screen = made.stages.paint.screen
+    x, y = np.moveaxis(reference.pixel_centers(made.view), -1, 0)
+    for v in range(2):
+        video, slope = made.of(v), float(screen.slope[v])
+        scale = float(video["camera/scale"][0])
+        bevel = max(float(screen.bevel[v]) * scale, 1)
+        gaps = [np.stack([x1 - x, y1 - y, x - x0, y - y0], -1) for x0, y0, x1, y1 in video["occluders/box"]]
+        assert len(gaps) == 2
+        for t in range(3):
+            height, normal = np.zeros(x.shape), np.tile([0.0, 0, 1], (*x.shape, 1))
+            mitre = np.zeros(x.shape, bool)
+            for gap in gaps:
+                inside, nearest = gap.min(-1) >= 0, np.sort(gap, -1)
+                tilt = slope * np.clip(1 - gap.min(-1) / bevel, 0, 1)
+                cap = bevel / slope * (np.sqrt(1 - tilt**2) - np.sqrt(1 - slope**2)) / scale
+                across = np.concatenate([sides[gap.argmin(-1)] * tilt[..., None], np.sqrt(1 - tilt**2)[..., None]], -1)
+                height, normal = np.where(inside, cap, height), np.where(inside[..., None], across, normal)
+                mitre = np.where(inside, nearest[..., 1] - nearest[..., 0] < 1e-3, mitre)
+            here = video["masks/instance"][t] == reference.OCCLUDER
+            assert_allclose(video["surface/height"][t][here], height[here], atol=1e-4, rtol=1e-3)
+            assert_allclose(
+                video["surface/normal"][t][here & ~mitre] / 127, normal[here & ~mitre], atol=HALF_STEP + 1e-3
+            )
+            seen += (here & (normal[..., 2] < 0.95)).sum()
+    assert seen > 50
 
 
 def test_the_depth_of_a_ball_is_its_dome():

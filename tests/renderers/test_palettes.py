@@ -11,7 +11,7 @@ from worlds import straight_motion, world
 
 import gen2d
 from gen2d.config.config import load_config
-from gen2d.core.enums import STATIC
+from gen2d.core.enums import SHAPES, STATIC
 from gen2d.core.errors import ConfigError
 from gen2d.core.palettes import NAME_BYTES, PALETTES
 from gen2d.programs import render
@@ -67,6 +67,26 @@ def test_objects_of_a_video_have_distinct_colours_of_the_palette_in_a_random_ord
     assert all(count.max() - count.min() <= 1 for count in counts)
     assert (crowd[:, -1] == PALETTES[name].wall[1]).all()
     assert len(np.unique(crowd[:, 0], axis=0)) == len(entries)
+
+
+@pytest.mark.parametrize("scene", ["chain", "wrecking_ball"])
+def test_the_links_of_a_chain_have_one_colour(scene):
+    """Which no other moving object has, but for a tower of more blocks than colours are left."""
+    config = load_config({"scene": scene, "look": {"name": "flat", "palette": "dusk"}, "video": {"frames": 2}})
+    rollout = Rollout(config, jax.devices()[:1])
+    columns = rollout.host_columns(rollout.start("train", np.arange(rollout.batch_size)))[0]
+    links = (columns["objects/shape"] == SHAPES.index("capsule")) & columns["objects/present"]
+    rest = columns["objects/present"] & ~links & (columns["objects/kind"] != STATIC)
+    first = set()
+    for color, link, other in zip(columns["objects/color"], links, rest, strict=True):
+        assert link.sum() > 3
+        assert len(np.unique(color[link], axis=0)) == 1
+        colors = {*map(tuple, color[other].tolist())}
+        assert len(colors) == min(other.sum(), 8)
+        assert other.sum() > 7 or tuple(color[link][0].tolist()) not in colors
+        assert other.any() == (scene == "wrecking_ball")
+        first.add(tuple(color[link][0].tolist()))
+    assert len(first) > 3
 
 
 def test_a_palette_colours_all_looks_alike():
@@ -140,6 +160,12 @@ def test_a_matched_change_that_a_palette_hides_or_spreads_is_refused(change, pal
     with pytest.raises(ConfigError, match=f"look.palette={palette}"):
         load_config({"matched": {"change": change}, "look": {"name": "flat", "palette": palette}})
     load_config({"matched": {"change": change}})
+
+
+def test_a_matched_change_of_a_chain_of_more_links_than_colours_is_not_refused():
+    """The links have one colour, whatever their number."""
+    look = {"name": "flat", "palette": "paper"}
+    load_config({"scene": {"name": "chain", "links": 12}, "matched": {"change": "pulled_above"}, "look": look})
 
 
 RED = {"color": [[200, 250], [0, 20], [0, 20]]}

@@ -1,6 +1,6 @@
 """Heights of surfaces as 16-bit grey levels: images/KEY-0000.png and depth/KEY-0000.png.
 
-A level is .1 mm of height above the plane of motion, towards the viewer. The background, rims and occluders are 0.
+A level is .1 mm of height above the plane of motion, towards the viewer. The background and rims are 0.
 """
 
 from pathlib import Path
