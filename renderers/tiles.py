@@ -277,7 +277,18 @@ class _VideoRenderer:
         paint_slot: Callable[..., LayerCanvas], tiles: RunTiles, layers: TileLayers, k: Array, canvas: LayerCanvas
     ) -> LayerCanvas:
         """Canvas with the shadow of slot k of a run, which owns no pixel."""
-        return canvas._replace(image=paint_slot(k, LayerCanvas(canvas.image, None), tiles=tiles, layers=layers).image)
+
+        def paint(_: Any, image: Array) -> Array:
+            painted = paint_slot(k, LayerCanvas(image, None), tiles=tiles, layers=layers).image
+            assert painted is not None
+            return painted
+
+        if canvas.image is None:
+            return canvas
+        if canvas.owner is None:
+            return canvas._replace(image=paint(0, canvas.image))
+        # In a loop of its own: of two updates in a row, XLA copies the whole canvas if it also has owners.
+        return canvas._replace(image=jax.lax.fori_loop(0, jnp.minimum(k + 1, 1), paint, canvas.image))
 
     def _paint_slot(
         self, k: Array, canvas: LayerCanvas, tiles: RunTiles, layers: TileLayers, i: Array, place: Array, frame: Array
