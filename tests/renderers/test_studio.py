@@ -3,6 +3,8 @@ what lies behind."""
 
 import dataclasses
 import functools
+import math
+import re
 from typing import Any
 
 import jax
@@ -11,6 +13,7 @@ import numpy as np
 import pytest
 from laws import holds
 from numpy.testing import assert_allclose, assert_array_equal
+from worlds import straight_motion
 
 from gen2d.annotations import shadow
 from gen2d.config.config import load_config
@@ -354,6 +357,19 @@ def test_shadows_are_the_same_where_the_camera_may_move(form):
     _, plan, stage = staged((("azimuth", 2.6), ("elevation", 0.25)), 88)  # that of the second wall reaches the first
     still, moving = (frames(form, stage, dataclasses.replace(plan, still=way))[0].astype(int) for way in (True, False))
     assert np.abs(still - moving).max() <= 1
+
+
+def test_no_layer_copies_a_whole_video():
+    """XLA's CPU compiler copies the canvas for each layer where it cannot see that it may be painted in place."""
+    stages, plan, *_ = straight_motion(
+        {"video": {"frames": 8, "height": 48, "width": 40}, "look": {"name": "studio"}, "annotations": {"masks": True},
+         "image": {"occluders": 2, "occluder_front": 0.5}},
+        2,
+    )  # fmt: skip
+    code = TILES.lower(stages, plan).compile().as_text()
+    copied = re.findall(r"\[([\d,]+)\]\S* copy\(", code)
+    assert all(math.prod(map(int, shape.split(","))) < 8 * 48 * 40 * 3 for shape in copied)
+    assert "48,40,3]" in code
 
 
 # ---- Options
