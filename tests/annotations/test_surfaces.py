@@ -124,7 +124,7 @@ def test_what_has_no_relief_is_flat(case):
     assert_array_equal(np.unique(made.columns["surface/normal"][bare], axis=0), [[0, 0, 127]])
 
 
-@pytest.mark.parametrize("case", [case for case in TIERED if case != "pile"])
+@pytest.mark.parametrize("case", [case for case in TIERED if "pile" not in case.values])
 def test_occluders_are_boards_with_a_bevel(case):
     """In each frame as in the first one; of two in one place the last one shows."""
     made, sides, seen = drawn(case), np.array([[1, 0], [0, -1], [-1, 0], [0, 1]]), 0
