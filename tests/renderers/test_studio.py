@@ -366,7 +366,7 @@ def test_no_layer_copies_a_whole_video():
          "image": {"occluders": 2, "occluder_front": 0.5}},
         2,
     )  # fmt: skip
-    code = TILES.lower(stages, plan).compile().as_text()
+    code = TILES.lower(stages, plan).compile().as_text() or ""
     copied = re.findall(r"\[([\d,]+)\]\S* copy\(", code)
     assert all(math.prod(map(int, shape.split(","))) < 8 * 48 * 40 * 3 for shape in copied)
     assert "48,40,3]" in code
