@@ -195,23 +195,41 @@ def background_layer(scene: RenderScene, at: Instants, plan: FramePlan) -> Layer
 def static_layer(scene: RenderScene, plan: FramePlan) -> LayerCanvas:
     """Canvas [1, ...] of the background and of static slots behind all moving ones, without occluders."""
     first = jax.tree.map(lambda a: a[:1], scene.instants)
-    canvas, alone = background_layer(scene, first, plan), scene._replace(occluders=None)
-    paint = quantized_painter(plan.linear)
-    canvas = paint_shadows(canvas, scene, plan, first, plan.static_runs, paint)
-    return paint_runs(canvas, alone, plan, first, plan.static_runs, paint, len(plan.static_runs))
+    return paint_static(background_layer(scene, first, plan), scene, plan, first, quantized_painter(plan.linear))
 
 
-def paint_runs(
+def paint_static(canvas: Any, scene: RenderScene, plan: FramePlan, at: Instants, paint: Painter) -> Any:
+    """Canvas with the static slots behind all moving ones painted over its full size, all over their shadows."""
+    runs = plan.static_runs
+    return _paint_runs(canvas, scene, plan, at, runs, paint, shaded=len(runs), layers=[])
+
+
+def paint_moving(canvas: Any, scene: RenderScene, plan: FramePlan, at: Instants, paint: Painter) -> Any:
+    """Canvas with all moving slots, their shadows and all occluders painted over its full size."""
+    runs, layers = [span for group in plan.groups for span in group.runs], occluder_layers(scene, plan)
+    canvas = _paint_runs(canvas, scene, plan, at, runs, paint, plan.shaded_first, layers)
+    return paint_occluders(canvas, scene, layers, lambda rank: rank >= plan.moving, paint)
+
+
+def _paint_runs(
     canvas: Any, scene: RenderScene, plan: FramePlan, at: Instants, runs: list[tuple[SlotGroup, int]], paint: Painter,
-    shaded: int,
+    shaded: int, layers: list[OccluderLayer],
 ) -> Any:  # fmt: skip
-    """Canvas with the slots of `runs`, and the occluders between them, painted over its full size; each slot over its
-    shadow, but for the first `shaded` runs, which are painted without shadows.
+    """Canvas with the slots of `runs`, and the occluders between them, painted over its full size.
 
-    The loop over slots keeps the compiler from fusing terms that depend on a row or a column alone into the
-    computation of each pixel: they are computed once, before the loop.
+    The shadows of the first `shaded` runs lie below all slots, that of a later slot lies right below it. The loop over
+    slots keeps the compiler from fusing terms that depend on a row or a column alone into the computation of each
+    pixel: they are computed once, before the loop.
     """
-    window, layers = PixelWindow(0, 0, plan.height, plan.width), occluder_layers(scene, plan)
+    window, shadow = PixelWindow(0, 0, plan.height, plan.width), scene.paint.shadow
+
+    def paint_shadow(canvas: Any, terms: ShadowTerms | None) -> tuple[Any, None]:
+        if terms is None or shadow is None:
+            return canvas, None
+        return paint(canvas, shadow_cover(terms, window), shadow.color, None), None
+
+    for run, first in runs[:shaded] if shadow is not None else []:
+        canvas = jax.lax.scan(paint_shadow, canvas, shadow_terms(scene, plan, at, run, first, window))[0]
     rank = 0
     for number, (run, first) in enumerate(runs):
         slots = slice(first, first + run.count)
@@ -221,50 +239,21 @@ def paint_runs(
             rank: int = rank,
         ) -> Any:  # fmt: skip
             def paint_slot(canvas: Any, entry: tuple[Any, ...]) -> tuple[Any, None]:
-                shadow, edges, fills, slot, rank = entry
+                terms, edges, fills, slot, rank = entry
                 canvas = paint_occluders(canvas, scene, layers, lambda of: of == rank, paint)
-                if shadow is not None:
-                    canvas = _paint_shadow(canvas, scene, shadow, window, paint)
+                canvas, _ = paint_shadow(canvas, terms)
                 return paint(canvas, *covered_color(edges, fills, window, plan.largest(run)), slot + 1), None
 
-            shadow, offsets = None, jnp.arange(run.count)
-            if scene.paint.shadow is not None and number >= shaded:
-                shadow = shadow_terms(scene, plan, at, run, first, window)
+            terms, offsets = None, jnp.arange(run.count)
+            if shadow is not None and number >= shaded:
+                terms = shadow_terms(scene, plan, at, run, first, window)
             entries = run_edge_terms(scene, plan, at, run, first, window), fills_of(scene.paint, slots)
-            return jax.lax.scan(paint_slot, canvas, (shadow, *entries, first + offsets, rank + offsets))[0]
+            return jax.lax.scan(paint_slot, canvas, (terms, *entries, first + offsets, rank + offsets))[0]
 
-        needed = scene.occluders is not None or scene.paint.drawn[slots].any()
+        needed = bool(layers) or scene.paint.drawn[slots].any()
         canvas = jax.lax.cond(needed, paint_run, lambda same: same, canvas)
         rank += run.count
     return canvas
-
-
-def paint_shadows(
-    canvas: Any, scene: RenderScene, plan: FramePlan, at: Instants, runs: list[tuple[SlotGroup, int]], paint: Painter
-) -> Any:
-    """Canvas with the shadows of the slots of `runs` painted over its full size."""
-    window = PixelWindow(0, 0, plan.height, plan.width)
-
-    def paint_shadow(canvas: Any, terms: ShadowTerms) -> tuple[Any, None]:
-        return _paint_shadow(canvas, scene, terms, window, paint), None
-
-    for run, first in runs if scene.paint.shadow is not None else []:
-        canvas = jax.lax.scan(paint_shadow, canvas, shadow_terms(scene, plan, at, run, first, window))[0]
-    return canvas
-
-
-def _paint_shadow(canvas: Any, scene: RenderScene, terms: ShadowTerms, window: PixelWindow, paint: Painter) -> Any:
-    """Canvas with one slot's shadow, which owns no pixel, painted over its full size."""
-    assert scene.paint.shadow is not None
-    return paint(canvas, shadow_cover(terms, window), scene.paint.shadow.color, None)
-
-
-def paint_moving(canvas: Any, scene: RenderScene, plan: FramePlan, at: Instants, paint: Painter) -> Any:
-    """Canvas with all moving slots, their shadows and all occluders painted over its full size."""
-    runs = [span for group in plan.groups for span in group.runs]
-    canvas = paint_shadows(canvas, scene, plan, at, runs[: plan.shaded_first], paint)
-    canvas = paint_runs(canvas, scene, plan, at, runs, paint, plan.shaded_first)
-    return paint_occluders(canvas, scene, occluder_layers(scene, plan), lambda rank: rank >= plan.moving, paint)
 
 
 def paint_occluders(

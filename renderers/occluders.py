@@ -39,15 +39,13 @@ def occluder_layers(scene: RenderScene, plan: FramePlan) -> list[OccluderLayer]:
         return jnp.clip(jnp.minimum(high, edge + 1) - jnp.maximum(low, edge), 0.0, 1.0)
 
     cover = part(rows[:, None], top, bottom) * part(columns, left, right)
-    color, shadow = occluders.color, None
+    color, shadow, (relief, pose) = occluders.color, None, _board(scene)
     if paint.light is not None and paint.screen is not None:
-        relief, pose = _board(scene)
         terms = lit_terms(paint.light, paint.screen, relief, pose)
         x, y = _from_center(pose, plan)
         accent = jnp.broadcast_to(paint.light.highlight, color.shape)
         color = lit_color(color[:, None, None], accent[:, None, None], terms, relief, pose, x, y, cover)
     if paint.shadow is not None:
-        relief, pose = _board(scene)
         right, down = in_image(paint.shadow.offset, scene.instants.view)[0] * pose.scale[0]
         blur = jnp.maximum(paint.shadow.blur * pose.scale, 0.5)
         opacity = jnp.broadcast_to(paint.shadow.opacity, blur.shape)

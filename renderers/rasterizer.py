@@ -26,8 +26,7 @@ from gen2d.renderers.compositing import (
     background_layer,
     float_painter,
     paint_moving,
-    paint_runs,
-    paint_shadows,
+    paint_static,
     quantized_painter,
     run_edge_terms,
     static_layer,
@@ -90,10 +89,7 @@ def draw_soft(scene: RenderScene, plan: FramePlan, sigma: float = 0.0) -> Array:
     at, paint = scene.instants, float_painter(plan.linear, sigma)
     image = background_image(scene, at, plan)
     image = jnp.broadcast_to(to_linear(image) if plan.linear else image, (len(at.angle), *image.shape[1:]))
-    image = paint_shadows(image, scene, plan, at, plan.static_runs, paint)
-    static = plan.static_runs
-    image = paint_runs(image, scene._replace(occluders=None), plan, at, static, paint, len(static))
-    image = paint_moving(image, scene, plan, at, paint)
+    image = paint_moving(paint_static(image, scene, plan, at, paint), scene, plan, at, paint)
     return to_srgb(image) if plan.linear else image
 
 

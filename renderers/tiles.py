@@ -251,16 +251,16 @@ class _VideoRenderer:
         """Canvas with all moving slots at instant i, each over its shadow, painted into image `frame`; owners hold a
         single frame."""
         paint_slot = functools.partial(self._paint_slot, i=i, place=place, frame=frame)
-        shadows: list[Any] = [
-            functools.partial(self._paint_shadow, paint_slot, tiles, of_run)
-            for tiles, of_run in zip(self.shadows, layers[len(self.tiles) :], strict=True)
-        ] or [None] * len(self.tiles)
-        for number in range(self.plan.shaded_first):
-            if shadows[number] is not None:
-                canvas = jax.lax.fori_loop(0, self._drawn(self.tiles[number]), shadows[number], canvas)
-                shadows[number] = None
+        shadows = [
+            functools.partial(self._paint_shadow, paint_slot, *of)
+            for of in zip(self.shadows, layers[len(self.tiles) :], strict=True)
+        ]
+        shaded = self.plan.shaded_first
+        for tiles, paint_shadow in zip(self.tiles, shadows[:shaded], strict=False):
+            canvas = jax.lax.fori_loop(0, self._drawn(tiles), paint_shadow, canvas)
         rank = 0
-        for tiles, of_run, shadow in zip(self.tiles, layers, shadows, strict=False):  # those of shadows follow
+        for number, (tiles, of_run) in enumerate(zip(self.tiles, layers, strict=False)):  # those of shadows follow
+            shadow = shadows[number] if shadows and number >= shaded else None
 
             def paint(
                 k: Array, canvas: LayerCanvas, tiles: Any = tiles, layers: Any = of_run, shadow: Any = shadow

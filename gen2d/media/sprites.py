@@ -46,13 +46,13 @@ def sprite_sheet(frames: np.ndarray, quality: int | None) -> bytes:
     sheet = np.concatenate(padded.reshape(columns, rows * height, width, frames.shape[3]), axis=1)
     if quality is None:
         return _webp(sheet, lossless=True)
-    colors, counts = np.unique(_packed(frames[0]), return_counts=True)
+    first, is_common = _packed(frames[0]), np.zeros(2**24, bool)
+    colors, counts = np.unique(first, return_counts=True)
     common = counts >= COMMON * height * width
-    few = quality >= GOOD and counts[common].sum() >= PLAIN * height * width
-    if not few or _are_shades(~np.isin(_packed(frames[0]), colors[common])):
-        return _webp(sheet, lossless=False, quality=quality)
-    is_common = np.zeros(2**24, bool)
     is_common[colors[common]] = True
+    few = quality >= GOOD and counts[common].sum() >= PLAIN * height * width
+    if not few or _are_shades(~is_common[first]):
+        return _webp(sheet, lossless=False, quality=quality)
     return _webp(np.where(is_common[_packed(sheet)][..., None], sheet, _rounded(sheet)), lossless=True, quality=60)
 
 
