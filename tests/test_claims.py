@@ -40,7 +40,7 @@ NUMBER = r"(?<![\w.,^-])\.?\d[\d.,]*(?:e-?\d+)?(?![\w-])"
 PROMISE = re.compile(rf"\b(?:{STRONG}|{WORDS}|{COUNTS})\b|{NUMBER}", re.IGNORECASE)
 # Numbers and words in code, the targets of links, and the dates and numbers of citations promise nothing.
 SILENT = re.compile(r"`[^`]*`|\]\([^)]*\)|arXiv \d+\.\d+|\b(?:19|20)\d\d\b")
-MACHINE = re.compile(r"EPYC|\bspeed\.md\b")  # the machine of the figures, or a link to the page that names it
+MACHINE = re.compile(r"EPYC|H200|\bspeed\.md\b")  # the machine of the figures, or a link to the page that names it
 
 
 class Sentence(NamedTuple):

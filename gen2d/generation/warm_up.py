@@ -98,10 +98,10 @@ def _measure(
     if not single:
         jax.block_until_ready(rollout.start(request.split, request.numbers))
     marks.append(time.perf_counter())
-    rendered = jax.block_until_ready(rollout.draw(batches, part.start, rollout.slice))
+    drawn = jax.block_until_ready(rollout.draw(batches, part.start, rollout.slice))
     marks.append(time.perf_counter())
-    columns = rollout.host_columns(batches)
-    block = encoder.encode(VideoSlice(part, columns[part.device], rendered[part.device], source.schema.host_columns))
+    columns, rendered = rollout.host_columns(batches)[part.device], devices.start_transfer(drawn[part.device])
+    block = encoder.encode(VideoSlice(part, columns, rendered, source.schema.host_columns))
     marks.append(time.perf_counter())
     count, threads = len(rollout.devices), threads_for(devices.cores())
     videos = rollout.batch_size * count, rollout.slice * count, len(block) * threads

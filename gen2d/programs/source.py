@@ -13,6 +13,7 @@ import numpy as np
 
 from gen2d.config.config import Config
 from gen2d.core.errors import UserError
+from gen2d.programs.devices import start_transfer
 from gen2d.programs.rollout import Rollout
 from gen2d.programs.schema import VideoSchema
 from gen2d.programs.simulation import DeviceBatch
@@ -120,7 +121,8 @@ class VideoSource:
         for request, batches in self.batches(self.requests(ranges)):
             columns = self.rollout.host_columns(batches)
             for start in sorted({part.start for part in request.parts}):
-                rendered = self.rollout.draw(batches, start, self.rollout.slice)
+                drawn = self.rollout.draw(batches, start, self.rollout.slice)
+                rendered = [start_transfer(arrays) for arrays in drawn]
                 for part in request.parts:
                     if part.start == start:
                         at = part.device

@@ -129,11 +129,13 @@ def _timed_program(program: Callable, inputs: Sequence[Any], videos: int) -> Cal
     return timed(lambda: jax.block_until_ready(program(*inputs)), videos)
 
 
-def gen2d_program(case: Case, everything: bool, by_time: bool = False) -> tuple[Callable, Any, float]:
+def gen2d_program(
+    case: Case, everything: bool, by_time: bool = False, sparse: bool = True
+) -> tuple[Callable, Any, float]:
     """Compiled program, its inputs, and the CPU seconds of its compilation.
 
     With `everything`, it also records energy and contacts, in as many rows as `annotations.contacts: 4` gives; with
-    `by_time`, the impacts of a step act in the order of their times.
+    `by_time`, the impacts of a step act in the order of their times. `sparse` selects the solver of nearby pairs.
     """
     import jax
     from worlds import rules
@@ -152,7 +154,7 @@ def gen2d_program(case: Case, everything: bool, by_time: bool = False) -> tuple[
 
     def run(scene: scene_module.Scene, state: scene_module.State) -> trajectory.Trajectory:
         device = axes.to_device(scene), axes.to_device(state)
-        return axes.to_stored(simulate(*device, layout, params, FRAMES, STEPS, save_at, sparse=True))
+        return axes.to_stored(simulate(*device, layout, params, FRAMES, STEPS, save_at, sparse=sparse))
 
     params, began = rules(STEP, by_time=by_time), time.process_time()
     program = jax.jit(run).lower(*inputs).compile()

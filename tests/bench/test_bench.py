@@ -221,3 +221,18 @@ def test_the_chart_of_the_render_section_draws_what_was_measured(tmp_path: Path)
     assert image is not None
     assert image.shape == (charts.HEIGHT, charts.WIDTH, 3)
     assert all(has_color(image, color) for color in bench_render.COLORS.values())
+
+
+@pytest.mark.full
+def test_the_benchmark_of_gpus_runs_on_a_cpu() -> None:
+    command = [
+        sys.executable,
+        Path(__file__).with_name("bench_gpu.py"),
+        "--small",
+        "--only",
+        "agreement,draw,host",
+    ]
+    text = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    assert "Traceback" not in text
+    assert "bouncing" in text
+    assert "0 levels" in text
