@@ -43,7 +43,17 @@ from gen2d.physics.contact_log import (
 from gen2d.physics.contact_state import BodySide, WarmStart
 from gen2d.physics.impact_order import alone, ordered, with_clearance
 from gen2d.physics.nearby_impacts import LaterImpacts, ordered_batches
-from gen2d.physics.packing import SAFE, PackedTable, TableSpec, pack, repeat_rows, table_of_rows, unpack
+from gen2d.physics.packing import (
+    SAFE,
+    PackedTable,
+    TableSpec,
+    pack,
+    put_row,
+    repeat_rows,
+    row,
+    table_of_rows,
+    unpack,
+)
 from gen2d.physics.pair_batches import (
     CONSTANTS,
     GatherIndices,
@@ -52,6 +62,7 @@ from gen2d.physics.pair_batches import (
     PairBatches,
     SolvedChunk,
     StaticSide,
+    halves,
 )
 from gen2d.physics.schedule import bipartite_rounds
 from gen2d.physics.solver_protocol import ContactSolver
@@ -191,7 +202,7 @@ class NearbyPairs(PairBatches, ContactSolver):
         def of_batch(batch: PairBatch, active: ActivePairs, buffer: PassBuffers) -> Array:
             def chunk(k: Array, indices: Array) -> Array:
                 new = self.chunk_indices(batch, row_lookup(active, k, self.chunk), batch.pair_of_bit)
-                return indices.at[k].set(jnp.stack(new), mode=SAFE)
+                return put_row(indices, k, jnp.stack(new))
 
             return jax.lax.fori_loop(0, active.starts[-1], chunk, buffer.indices)
 
@@ -221,7 +232,7 @@ class NearbyPairs(PairBatches, ContactSolver):
         """Buffer with the values of chunk k; a new one if there is none."""
         if buffer is None:
             return jnp.zeros((self._most_chunks(batch), len(values), self.chunk), self.dtype)
-        return buffer.at[k].set(materialize(jnp.stack(values)), mode=SAFE)
+        return put_row(buffer, k, materialize(jnp.stack(values)))
 
     def warm_start(
         self, carry: NearbyCarry, sides: list[BodySide], statics: list[BodySide]
@@ -240,7 +251,10 @@ class NearbyPairs(PairBatches, ContactSolver):
             i: int, k: Array, indices: GatherIndices, a: BodySide, b: BodySide, buffer: Array | None
         ) -> tuple[BodySide, BodySide, Array]:
             batch = self.batches[i]
-            first, second = firsts[i].at(indices.a), groups[batch.second].at(indices.b)
+            if batch.first == batch.second:
+                first, second = halves(groups[batch.second].at(jnp.concatenate([indices.a, indices.b])))
+            else:
+                first, second = firsts[i].at(indices.a), groups[batch.second].at(indices.b)
             cached = caches[i].at(indices.pair)
             fresh = cached.stamp == (carry.step - 1).astype(self.dtype)
             warm = jax.tree.map(lambda x: jnp.where(fresh, x, 0.0), cached.warm)
@@ -267,7 +281,7 @@ class NearbyPairs(PairBatches, ContactSolver):
 
         def play(i: int, k: Array, indices: GatherIndices, a: BodySide, b: BodySide, carried: tuple) -> tuple:
             buffer, depth, begins = carried
-            constraint, warm, points, setup = self.unpack_contacts(list(contacts.packed[i][k]), contacts.specs[i])
+            constraint, warm, points, setup = self.unpack_contacts(list(row(contacts.packed[i], k)), contacts.specs[i])
             old, (a, b, solved) = (a, b), contact_passes.solve(constraint, warm, points, a, b, setup, self.params)
             values, specs[i] = pack(solved, (self.chunk,), self.dtype, once=True)
             overlap, began = contact_passes.observe(solved, warm)
@@ -298,8 +312,8 @@ class NearbyPairs(PairBatches, ContactSolver):
 
         def play(i: int, k: Array, indices: GatherIndices, a: BodySide, b: BodySide, carried: tuple) -> tuple:
             cache, touch = caches[i]._replace(rows=carried[0]), carried[1]
-            constraint, memory, points, setup = self.unpack_contacts(list(listed.packed[i][k]), listed.specs[i])
-            pair = unpack(list(solved.packed[i][k]), solved.specs[i])
+            constraint, memory, points, setup = self.unpack_contacts(list(row(listed.packed[i], k)), listed.specs[i])
+            pair = unpack(list(row(solved.packed[i], k)), solved.specs[i])
             a, b, (last, warm) = contact_passes.relax(constraint, memory, points, pair, a, b, setup, self.params)
             new = CachedConstraint(warm, jnp.full(self.chunk, carry.step, self.dtype), None, None)
             if self.setup.log:

@@ -91,6 +91,16 @@ def make_table(tree: Any, shape: tuple[int, ...], dtype: Any) -> PackedTable:
     return PackedTable(jnp.pad(jnp.stack(columns, axis=-1), ((0, 1), (0, 0))), spec)
 
 
+def row(rows: Array, k: Array) -> Array:
+    """Row k of an array [K, ...]; k is not negative, and below K."""
+    return jax.lax.dynamic_index_in_dim(rows, k.astype(jnp.uint32), keepdims=False)
+
+
+def put_row(rows: Array, k: Array, values: Array) -> Array:
+    """An array [K, ...] with these values in row k, which is not negative, and below K."""
+    return jax.lax.dynamic_update_index_in_dim(rows, values, k.astype(jnp.uint32), 0)
+
+
 def repeat_rows(row: Any, count: int, dtype: Any) -> Array:
     """`count` equal rows, a tree with leaves [..., 1], and one more."""
     columns, _ = pack(row, (1,), dtype)

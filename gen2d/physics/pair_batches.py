@@ -14,7 +14,7 @@ import numpy as np
 from gen2d.physics.broad_phase import BITS, ActivePairs, RoundRobin, RowLookup
 from gen2d.physics.constraint import ContactConstraint
 from gen2d.physics.contact_state import BodySide, PassSetup, WarmStart
-from gen2d.physics.packing import SAFE, PackedTable, TableSpec, make_table, unpack
+from gen2d.physics.packing import SAFE, PackedTable, TableSpec, make_table, row, unpack
 from gen2d.physics.params import SolverParams
 from gen2d.physics.segment_lines import Neighbours
 from gen2d.records.axes import Array
@@ -104,11 +104,12 @@ class BodyTables(NamedTuple):
     constant: list[PackedTable]
     fixed: list[PackedTable | None]  # static bodies of each batch that has any
     sides: list[BodySide]  # with the constant part alone
+    supports: list[PackedTable]  # by group; empty in passes that do not change them
 
     @property
     def rows(self) -> list[Array]:
-        """Rows of the changing tables."""
-        return [table.rows for table in self.changing]
+        """Rows of the changing tables, then of the supports."""
+        return [table.rows for table in (*self.changing, *self.supports)]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -135,7 +136,9 @@ class PairBatches:
     def chunk_indices(self, batch: PairBatch, lookup: RowLookup, pair_of_bit: np.ndarray) -> GatherIndices:
         """Table rows of the pairs of a chunk."""
         n, (_, pairs), bits = self.scenes, batch.a.shape, pair_of_bit.shape[1]
-        scene, bit = lookup.word % n, jnp.minimum(lookup.word // n * BITS + lookup.bit, bits - 1)
+        # Words are not negative: `%` and `//` would take the sign into account.
+        scene, group = jax.lax.rem(lookup.word, np.int32(n)), jax.lax.div(lookup.word, np.int32(n))
+        bit = jnp.minimum(group * BITS + lookup.bit, bits - 1)
 
         def entry(values: np.ndarray, where: Array) -> Array:
             return jnp.asarray(values.reshape(-1), jnp.int32).at[where].get(mode=SAFE)
@@ -160,17 +163,24 @@ class PairBatches:
     def bodies(self, sides: list[BodySide], statics: list[BodySide], constants: tuple[str, ...]) -> BodyTables:
         """Tables of the bodies, and of the static bodies of each batch."""
         changing, constant = zip(*(_split(side, constants) for side in sides), strict=True)
-        tables, inputs = ([self._table(x, self._size(g)) for g, x in enumerate(of)] for of in (changing, constant))
+        supports = [side.support for side in changing if side.support is not None]  # only static bodies change them
+        changing = [side._replace(support=None) for side in changing]
+        tables, inputs, borne = (
+            [self._table(x, self._size(g)) for g, x in enumerate(of)] for of in (changing, constant, supports)
+        )
         fixed = [self._static_table([statics[j] for j in b.statics]) if b.first is None else None for b in self.batches]
-        return BodyTables(constants, tables, inputs, fixed, list(constant))
+        return BodyTables(constants, tables, inputs, fixed, list(constant), borne)
 
     def unpacked(self, bodies: BodyTables, rows: list[Array]) -> list[BodySide]:
         """Sides with the rows of tables in which a pass has changed them."""
-        shapes = [(self._size(g), self.scenes) for g in range(len(rows))]
-        of = zip(bodies.changing, rows, shapes, bodies.sides, strict=True)
-        return [
-            _merge(table._replace(rows=x).unpack(shape), constant, bodies.constants) for table, x, shape, constant in of
-        ]
+        shapes = [(self._size(g), self.scenes) for g in range(len(self.groups))]
+        of = zip((*bodies.changing, *bodies.supports), rows, shapes * 2, strict=False)
+        trees = [table._replace(rows=x).unpack(shape) for table, x, shape in of]
+        sides = [_merge(*of, bodies.constants) for of in zip(trees, bodies.sides, strict=False)]
+        supports = trees[len(sides) :]
+        if not supports:
+            return sides
+        return [side._replace(support=support) for side, support in zip(sides, supports, strict=True)]
 
     def sides_of(
         self, bodies: BodyTables, rows: Mapping[int, Array], batch: int, first: Array, second: Array
@@ -181,13 +191,23 @@ class PairBatches:
             changing = bodies.changing[group]._replace(rows=rows[group])
             return _merge(changing.at(where), bodies.constant[group].at(where), bodies.constants)
 
-        of, fixed = self.batches[batch], bodies.fixed[batch]
+        of, fixed, supports = self.batches[batch], bodies.fixed[batch], bodies.supports
+        if of.first == of.second:  # one gather and one scatter, else the compiler would copy the table between two
+            return halves(side(of.second, jnp.concatenate([first, second])))
         if of.first is not None:
             a = side(of.first, first)
         else:
             assert fixed is not None, "a batch without a first group has static bodies"
             a = fixed.at(first)
-        return a, side(of.second, second)
+        b = side(of.second, second)
+        if of.first is None and supports:
+            b = b._replace(support=self._support(bodies, rows, of.second)[1].at(second))
+        return a, b
+
+    def _support(self, bodies: BodyTables, rows: Mapping[int, Array], group: int) -> tuple[int, PackedTable]:
+        """Number among the rows, and table, of the supports of a group."""
+        number = len(self.groups) + group
+        return number, bodies.supports[group]._replace(rows=rows[number])
 
     def play(
         self,
@@ -207,15 +227,26 @@ class PairBatches:
 
             def chunk(k: Array, state: tuple, i: int = i, batch: PairBatch = batch) -> tuple:
                 rows, carry = state
-                own = GatherIndices(*listed.indices[i][k])
+                own = GatherIndices(*row(listed.indices[i], k))
                 a, b, carry = play(i, k, own, *self.sides_of(bodies, rows, i, own.a, own.b), carry)
+                if batch.first == batch.second:
+                    where = jnp.concatenate([own.a, own.b])
+                    new = self.put(bodies, rows[batch.second], batch.second, where, _joined(a, b))
+                    return {batch.second: new}, carry
                 new = dict(rows)
                 if batch.first is not None:
                     new[batch.first] = self.put(bodies, new[batch.first], batch.first, own.a, a)
+                elif bodies.supports:
+                    support, table = self._support(bodies, rows, batch.second)
+                    new[support] = table.put(own.b, b.support).rows
+                    b = b._replace(support=None)
                 new[batch.second] = self.put(bodies, new[batch.second], batch.second, own.b, b)
                 return new, carry
 
-            start = {g: rows[g] for g in batch.groups}, carries[i]
+            used = list(batch.groups)
+            if batch.first is None and bodies.supports:  # pairs of moving bodies do not change them
+                used.append(len(self.groups) + batch.second)
+            start = {g: rows[g] for g in used}, carries[i]
             if any(x is None for x in jax.tree.leaves(carries[i], is_leaf=lambda x: x is None)):
                 new, carries[i] = chunk(jnp.zeros((), jnp.int32), start)
             else:
@@ -234,6 +265,17 @@ class PairBatches:
         """Constraint, impulses, points and setup of packed contacts, as the warm start stored them."""
         constraint, warm, points, threshold, gravity = unpack(columns, spec)
         return constraint, warm, points, self.setup._replace(threshold=threshold, gravity=gravity)
+
+
+def halves(tree: Any) -> tuple[Any, Any]:
+    """Trees of the first and of the second half of leaves [..., 2 C]."""
+    first = jax.tree.map(lambda x: x[..., : x.shape[-1] // 2], tree)
+    return first, jax.tree.map(lambda x: x[..., x.shape[-1] // 2 :], tree)
+
+
+def _joined(a: Any, b: Any) -> Any:
+    """Tree with leaves [..., 2 C] of two trees."""
+    return jax.tree.map(lambda x, y: jnp.concatenate([x, y], axis=-1), a, b)
 
 
 def _split(side: BodySide, constants: tuple[str, ...]) -> tuple[BodySide, BodySide]:

@@ -32,6 +32,7 @@ from gen2d.physics.constraint import (
     reciprocal,
 )
 from gen2d.records.axes import Array
+from gen2d.xla import materialize
 
 LEAST_RATIO = 3.0  # of the masses: sequential impulses serve smaller ones
 LARGEST_RATIO = 3000.0  # a lighter body gives way, as its rounding errors would move the heavy one
@@ -95,7 +96,7 @@ class SupportedPair(NamedTuple):
         power = dot(self.load, velocity)
         if self.torque is not None:
             power = power + jnp.where(self.locked > 0, 0.0, self.torque * spin)
-        impulse = self.share * power
+        impulse = materialize(self.share * power)
         new = velocity - self.mass * impulse * self.load, spin
         if self.torque is not None:
             new = new[0], jnp.where(self.locked > 0, 0.0, spin - self.moment * impulse * self.torque)
