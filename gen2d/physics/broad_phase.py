@@ -153,9 +153,9 @@ def row_lookup(rows: ActivePairs, k: Array, chunk: int) -> RowLookup:
         above = left >= low
         left, bit = jnp.where(above, left - low, left), jnp.where(above, bit + half, bit)
         bits = jnp.where(above, bits >> half, bits)
-    return RowLookup(current, word, _once(bit), rank, there)
+    return RowLookup(current, word, _materialize_integers(bit), rank, there)
 
 
-def _once(values: Array) -> Array:
+def _materialize_integers(values: Array) -> Array:
     """The same small integers, computed once and not again for each of their uses."""
     return materialize(values.astype(jnp.float32)).astype(values.dtype)

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from gen2d.physics.broad_phase import active_pairs, row_lookup
 from gen2d.physics.contact_passes import solve_impact
 from gen2d.physics.impact_order import TURNS, first_time, in_order, later_impact, ordered
-from gen2d.physics.packing import SAFE, pack, put_row, row, unpack
+from gen2d.physics.packing import SAFE, get_row, pack, put_row, unpack
 from gen2d.physics.pair_batches import BodyTables, ListedPairs, PairBatches, SolvedChunk
 from gen2d.physics.time_of_impact import NONE
 from gen2d.records.axes import Array
@@ -92,7 +92,7 @@ class LaterImpacts:
             for i, pairs in lists.items():
 
                 def chunk(k: Array, carry: tuple, i: int = i, pairs: _List = pairs) -> tuple:
-                    return self._solve_chunk(i, _Chunk(*row(pairs.indices, k)), now.acts, carry)
+                    return self._solve_chunk(i, _Chunk(*get_row(pairs.indices, k)), now.acts, carry)
 
                 state, packed[i] = jax.lax.fori_loop(0, pairs.chunks, chunk, (state, packed[i]))
             rows, firsts, more = state

@@ -47,10 +47,10 @@ from gen2d.physics.packing import (
     SAFE,
     PackedTable,
     TableSpec,
+    get_row,
     pack,
     put_row,
     repeat_rows,
-    row,
     table_of_rows,
     unpack,
 )
@@ -62,7 +62,6 @@ from gen2d.physics.pair_batches import (
     PairBatches,
     SolvedChunk,
     StaticSide,
-    halves,
 )
 from gen2d.physics.schedule import bipartite_rounds
 from gen2d.physics.solver_protocol import ContactSolver
@@ -252,7 +251,7 @@ class NearbyPairs(PairBatches, ContactSolver):
         ) -> tuple[BodySide, BodySide, Array]:
             batch = self.batches[i]
             if batch.first == batch.second:
-                first, second = halves(groups[batch.second].at(jnp.concatenate([indices.a, indices.b])))
+                first, second = groups[batch.second].at_both(indices.a, indices.b)
             else:
                 first, second = firsts[i].at(indices.a), groups[batch.second].at(indices.b)
             cached = caches[i].at(indices.pair)
@@ -281,7 +280,9 @@ class NearbyPairs(PairBatches, ContactSolver):
 
         def play(i: int, k: Array, indices: GatherIndices, a: BodySide, b: BodySide, carried: tuple) -> tuple:
             buffer, depth, begins = carried
-            constraint, warm, points, setup = self.unpack_contacts(list(row(contacts.packed[i], k)), contacts.specs[i])
+            constraint, warm, points, setup = self.unpack_contacts(
+                list(get_row(contacts.packed[i], k)), contacts.specs[i]
+            )
             old, (a, b, solved) = (a, b), contact_passes.solve(constraint, warm, points, a, b, setup, self.params)
             values, specs[i] = pack(solved, (self.chunk,), self.dtype, once=True)
             overlap, began = contact_passes.observe(solved, warm)
@@ -312,8 +313,10 @@ class NearbyPairs(PairBatches, ContactSolver):
 
         def play(i: int, k: Array, indices: GatherIndices, a: BodySide, b: BodySide, carried: tuple) -> tuple:
             cache, touch = caches[i]._replace(rows=carried[0]), carried[1]
-            constraint, memory, points, setup = self.unpack_contacts(list(row(listed.packed[i], k)), listed.specs[i])
-            pair = unpack(list(row(solved.packed[i], k)), solved.specs[i])
+            constraint, memory, points, setup = self.unpack_contacts(
+                list(get_row(listed.packed[i], k)), listed.specs[i]
+            )
+            pair = unpack(list(get_row(solved.packed[i], k)), solved.specs[i])
             a, b, (last, warm) = contact_passes.relax(constraint, memory, points, pair, a, b, setup, self.params)
             new = CachedConstraint(warm, jnp.full(self.chunk, carry.step, self.dtype), None, None)
             if self.setup.log:

@@ -72,12 +72,22 @@ class PackedTable(NamedTuple):
         """Tree with leaves [..., C] of some rows."""
         return unpack(list(self.rows.at[where].get(mode=SAFE).T), self.spec)
 
+    def at_both(self, a: Array, b: Array) -> tuple[Any, Any]:
+        """Trees of the rows `a` and `b`, by one gather."""
+        both, count = self.at(jnp.concatenate([a, b])), len(a)
+        return jax.tree.map(lambda x: x[..., :count], both), jax.tree.map(lambda x: x[..., count:], both)
+
     def put(self, where: Array, tree: Any) -> "PackedTable":
         """Table with some rows replaced; only the last row may occur more than once."""
         columns, _ = pack(tree, where.shape, self.rows.dtype)
         if not columns:
             return self
         return self._replace(rows=self.rows.at[where].set(materialize(jnp.stack(columns)).T, mode=SAFE))
+
+    def put_both(self, a: Array, tree_a: Any, b: Array, tree_b: Any) -> "PackedTable":
+        """Table with the rows `a` and `b` replaced, by one scatter: between two, the compiler would copy the table."""
+        both = jax.tree.map(lambda x, y: jnp.concatenate([x, y], axis=-1), tree_a, tree_b)
+        return self.put(jnp.concatenate([a, b]), both)
 
     def unpack(self, shape: tuple[int, ...]) -> Any:
         """Tree with leaves [..., *shape] of all rows but the last."""
@@ -91,7 +101,7 @@ def make_table(tree: Any, shape: tuple[int, ...], dtype: Any) -> PackedTable:
     return PackedTable(jnp.pad(jnp.stack(columns, axis=-1), ((0, 1), (0, 0))), spec)
 
 
-def row(rows: Array, k: Array) -> Array:
+def get_row(rows: Array, k: Array) -> Array:
     """Row k of an array [K, ...]; k is not negative, and below K."""
     return jax.lax.dynamic_index_in_dim(rows, k.astype(jnp.uint32), keepdims=False)
 

@@ -14,7 +14,7 @@ import numpy as np
 from gen2d.physics.broad_phase import BITS, ActivePairs, RoundRobin, RowLookup
 from gen2d.physics.constraint import ContactConstraint
 from gen2d.physics.contact_state import BodySide, PassSetup, WarmStart
-from gen2d.physics.packing import SAFE, PackedTable, TableSpec, make_table, row, unpack
+from gen2d.physics.packing import SAFE, PackedTable, TableSpec, get_row, make_table, unpack
 from gen2d.physics.params import SolverParams
 from gen2d.physics.segment_lines import Neighbours
 from gen2d.records.axes import Array
@@ -107,9 +107,14 @@ class BodyTables(NamedTuple):
     supports: list[PackedTable]  # by group; empty in passes that do not change them
 
     @property
+    def tables(self) -> list[PackedTable]:
+        """The tables that a pass changes: those of the groups, then those of their supports."""
+        return [*self.changing, *self.supports]
+
+    @property
     def rows(self) -> list[Array]:
-        """Rows of the changing tables, then of the supports."""
-        return [table.rows for table in (*self.changing, *self.supports)]
+        """Rows of `tables`."""
+        return [table.rows for table in self.tables]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -173,14 +178,13 @@ class PairBatches:
 
     def unpacked(self, bodies: BodyTables, rows: list[Array]) -> list[BodySide]:
         """Sides with the rows of tables in which a pass has changed them."""
-        shapes = [(self._size(g), self.scenes) for g in range(len(self.groups))]
-        of = zip((*bodies.changing, *bodies.supports), rows, shapes * 2, strict=False)
-        trees = [table._replace(rows=x).unpack(shape) for table, x, shape in of]
-        sides = [_merge(*of, bodies.constants) for of in zip(trees, bodies.sides, strict=False)]
-        supports = trees[len(sides) :]
-        if not supports:
+        count, trees = len(self.groups), []
+        for number, (table, of) in enumerate(zip(bodies.tables, rows, strict=True)):
+            trees.append(table._replace(rows=of).unpack((self._size(number % count), self.scenes)))
+        sides = [_merge(*of, bodies.constants) for of in zip(trees[:count], bodies.sides, strict=True)]
+        if not bodies.supports:
             return sides
-        return [side._replace(support=support) for side, support in zip(sides, supports, strict=True)]
+        return [side._replace(support=support) for side, support in zip(sides, trees[count:], strict=True)]
 
     def sides_of(
         self, bodies: BodyTables, rows: Mapping[int, Array], batch: int, first: Array, second: Array
@@ -188,26 +192,52 @@ class PairBatches:
         """Both sides of a chunk of pairs: these rows of the tables, of which the changing ones are given by group."""
 
         def side(group: int, where: Array) -> BodySide:
-            changing = bodies.changing[group]._replace(rows=rows[group])
+            changing = _current(bodies, rows, group)
             return _merge(changing.at(where), bodies.constant[group].at(where), bodies.constants)
 
-        of, fixed, supports = self.batches[batch], bodies.fixed[batch], bodies.supports
-        if of.first == of.second:  # one gather and one scatter, else the compiler would copy the table between two
-            return halves(side(of.second, jnp.concatenate([first, second])))
+        of, fixed = self.batches[batch], bodies.fixed[batch]
+        if of.first == of.second:
+            tables = _current(bodies, rows, of.second), bodies.constant[of.second]
+            changing, constant = (table.at_both(first, second) for table in tables)
+            a, b = (_merge(*parts, bodies.constants) for parts in zip(changing, constant, strict=True))
+            return a, b
         if of.first is not None:
-            a = side(of.first, first)
-        else:
-            assert fixed is not None, "a batch without a first group has static bodies"
-            a = fixed.at(first)
+            return side(of.first, first), side(of.second, second)
+        assert fixed is not None, "a batch without a first group has static bodies"
         b = side(of.second, second)
-        if of.first is None and supports:
-            b = b._replace(support=self._support(bodies, rows, of.second)[1].at(second))
-        return a, b
+        if bodies.supports:
+            b = b._replace(support=_current(bodies, rows, self._support(of.second)).at(second))
+        return fixed.at(first), b
 
-    def _support(self, bodies: BodyTables, rows: Mapping[int, Array], group: int) -> tuple[int, PackedTable]:
-        """Number among the rows, and table, of the supports of a group."""
-        number = len(self.groups) + group
-        return number, bodies.supports[group]._replace(rows=rows[number])
+    def _support(self, group: int) -> int:
+        """Number of the table of a group's supports."""
+        return len(self.groups) + group
+
+    def _changed(self, bodies: BodyTables, batch: PairBatch) -> list[int]:
+        """Numbers of the tables that a batch changes; those of supports are changed by static bodies alone."""
+        return batch.groups + ([self._support(batch.second)] if batch.first is None and bodies.supports else [])
+
+    def _put_sides(
+        self,
+        bodies: BodyTables,
+        rows: Mapping[int, Array],
+        batch: PairBatch,
+        own: GatherIndices,
+        a: BodySide,
+        b: BodySide,
+    ) -> dict[int, Array]:
+        """Rows of the tables that a batch changes, by number, with both sides of a chunk of pairs."""
+        if batch.first == batch.second:
+            of_a, of_b = (_split(side, bodies.constants)[0] for side in (a, b))
+            return {batch.second: _current(bodies, rows, batch.second).put_both(own.a, of_a, own.b, of_b).rows}
+        new = {}
+        if batch.first is not None:
+            new[batch.first] = self.put(bodies, rows[batch.first], batch.first, own.a, a)
+        elif bodies.supports:
+            number = self._support(batch.second)
+            new[number] = _current(bodies, rows, number).put(own.b, b.support).rows
+            b = b._replace(support=None)
+        return new | {batch.second: self.put(bodies, rows[batch.second], batch.second, own.b, b)}
 
     def play(
         self,
@@ -227,26 +257,11 @@ class PairBatches:
 
             def chunk(k: Array, state: tuple, i: int = i, batch: PairBatch = batch) -> tuple:
                 rows, carry = state
-                own = GatherIndices(*row(listed.indices[i], k))
+                own = GatherIndices(*get_row(listed.indices[i], k))
                 a, b, carry = play(i, k, own, *self.sides_of(bodies, rows, i, own.a, own.b), carry)
-                if batch.first == batch.second:
-                    where = jnp.concatenate([own.a, own.b])
-                    new = self.put(bodies, rows[batch.second], batch.second, where, _joined(a, b))
-                    return {batch.second: new}, carry
-                new = dict(rows)
-                if batch.first is not None:
-                    new[batch.first] = self.put(bodies, new[batch.first], batch.first, own.a, a)
-                elif bodies.supports:
-                    support, table = self._support(bodies, rows, batch.second)
-                    new[support] = table.put(own.b, b.support).rows
-                    b = b._replace(support=None)
-                new[batch.second] = self.put(bodies, new[batch.second], batch.second, own.b, b)
-                return new, carry
+                return self._put_sides(bodies, rows, batch, own, a, b), carry
 
-            used = list(batch.groups)
-            if batch.first is None and bodies.supports:  # pairs of moving bodies do not change them
-                used.append(len(self.groups) + batch.second)
-            start = {g: rows[g] for g in used}, carries[i]
+            start = {number: rows[number] for number in self._changed(bodies, batch)}, carries[i]
             if any(x is None for x in jax.tree.leaves(carries[i], is_leaf=lambda x: x is None)):
                 new, carries[i] = chunk(jnp.zeros((), jnp.int32), start)
             else:
@@ -267,15 +282,9 @@ class PairBatches:
         return constraint, warm, points, self.setup._replace(threshold=threshold, gravity=gravity)
 
 
-def halves(tree: Any) -> tuple[Any, Any]:
-    """Trees of the first and of the second half of leaves [..., 2 C]."""
-    first = jax.tree.map(lambda x: x[..., : x.shape[-1] // 2], tree)
-    return first, jax.tree.map(lambda x: x[..., x.shape[-1] // 2 :], tree)
-
-
-def _joined(a: Any, b: Any) -> Any:
-    """Tree with leaves [..., 2 C] of two trees."""
-    return jax.tree.map(lambda x, y: jnp.concatenate([x, y], axis=-1), a, b)
+def _current(bodies: BodyTables, rows: Mapping[int, Array], number: int) -> PackedTable:
+    """A table that the pass changes, with its present rows."""
+    return bodies.tables[number]._replace(rows=rows[number])
 
 
 def _split(side: BodySide, constants: tuple[str, ...]) -> tuple[BodySide, BodySide]:

@@ -16,16 +16,17 @@ import sys
 import tempfile
 import time
 import traceback
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from timing import first_batch, timed
+
 HERE = Path(__file__).resolve()
 ROOT = HERE.parents[2]
 sys.path += [str(ROOT), str(HERE.parents[1] / "support")]
-
-import numpy as np  # noqa: E402
 
 FAMILIES = ("bouncing", "collision", "pile", "chain")  # compared with the CPU
 COMPARED = 16  # videos of each
@@ -41,12 +42,8 @@ def best(work: Callable[[], Any], turns: int = 3) -> float:
     """Seconds of the fastest of several calls, after one that is not measured."""
     import jax
 
-    seconds = []
-    for _ in range(turns + 1):
-        began = time.perf_counter()
-        jax.block_until_ready(work())
-        seconds.append(time.perf_counter() - began)
-    return min(seconds[1:])
+    seconds = timed(lambda: jax.block_until_ready(work()), 1, time.perf_counter)
+    return min([seconds() for _ in range(turns + 1)][1:])
 
 
 def source_of(config: str, *overrides: str, slice_videos: int = 0) -> Any:
@@ -60,11 +57,6 @@ def source_of(config: str, *overrides: str, slice_videos: int = 0) -> Any:
         source.rollout.slice = slice_videos
     source.rollout.compile()
     return source
-
-
-def simulated(rollout: Any) -> Any:
-    """First batch of a rollout."""
-    return rollout.start("train", np.arange(rollout.batch_size))
 
 
 # ---- Sections
@@ -112,9 +104,9 @@ def solvers(small: bool) -> Lines:
     import bench_physics
     from bench_physics import STEPPED, Case
 
-    cases = [Case("discs", n, size, (0, 0), 1) for n, size in ((4, 4096), (8, 4096), (16, 2048), (32, 1024))]
-    cases = [*cases[1:2], *cases[:1], *cases[2:], Case("boxes", 8, 4096, (0, 0), 1)]
-    works = {(case, sparse): None for case in cases[: 1 if small else None] for sparse in (False, True)}
+    discs = (8, 4096), (4, 4096), (16, 2048), (32, 1024)
+    cases = [*(Case("discs", n, size, (0, 0), 1) for n, size in discs), Case("boxes", 8, 4096, (0, 0), 1)]
+    works = [(case, sparse) for case in cases[: 1 if small else None] for sparse in (False, True)]
     for (case, sparse), (program, inputs, seconds) in at_once(
         lambda case, sparse: bench_physics.gen2d_program(case, False, sparse=sparse), works
     ):
@@ -128,9 +120,8 @@ def solvers(small: bool) -> Lines:
         )
 
 
-def at_once(function: Callable[..., Any], arguments: Iterable[tuple]) -> list[tuple[tuple, Any]]:
+def at_once(function: Callable[..., Any], arguments: Sequence[tuple]) -> list[tuple[tuple, Any]]:
     """Arguments and results of a function that compiles, called in threads."""
-    arguments = list(arguments)
     with ThreadPoolExecutor(12) as pool:
         return list(zip(arguments, pool.map(lambda values: function(*values), arguments), strict=True))
 
@@ -143,8 +134,8 @@ def batches(small: bool) -> Lines:
     def source(config: str, size: int) -> Any:
         return source_of(config, f"storage.batch_size={size}", "storage.videos_per_shard=32768")
 
-    for (config, size), made in at_once(source, cases):
-        seconds = best(lambda rollout=made.rollout: simulated(rollout))
+    for (config, size), compiled in at_once(source, cases):
+        seconds = best(lambda rollout=compiled.rollout: first_batch(rollout))
         yield f"{config:24} {size:6} videos at once: {size / seconds:10,.0f} videos/s, {seconds:.3f} s a batch"
 
 
@@ -159,7 +150,7 @@ def draw(small: bool) -> Lines:
                     "benchmark.yaml", f"video.height={pixels}", f"video.width={pixels}", f"storage.batch_size={count}",
                     f"look.name={look}", slice_videos=count,
                 )  # fmt: skip
-                batch = simulated(source.rollout)
+                batch = first_batch(source.rollout)
                 seconds = best(lambda s=source, b=batch, c=count: s.rollout.draw(b, 0, c)) / count
                 yield (
                     f"{look:7} {pixels:3} px, {count:5} videos at once: {1 / seconds:10,.0f} videos/s,"
@@ -177,15 +168,13 @@ def host(small: bool) -> Lines:
     from gen2d.programs.source import VideoRange
     from gen2d.storage import codecs
 
-    for megabytes in (4,) if small else (16, 64, 512):
-        for threads in (1, 8):
-            arrays = [jax.block_until_ready(jax.numpy.full(megabytes << 20, i, np.uint8)) for i in range(16)]
-            with ThreadPoolExecutor(threads) as pool:
-                began = time.perf_counter()
-                list(pool.map(np.asarray, arrays))
-                seconds = time.perf_counter() - began
-            rate = (megabytes << 24) / seconds / 1e9
-            yield f"to the host, {megabytes:4} MiB arrays, {threads} at once: {rate:6.2f} GB/s"
+    ways = {"to NumPy": np.asarray, "to pinned memory": lambda array: np.asarray(devices.pinned(array))}
+    for name, to_host in ways.items():
+        for megabytes in (4,) if small else (16, 64, 512):
+            for turn in ("first", "again"):  # jax reuses pinned memory
+                arrays = [jax.block_until_ready(jax.numpy.full(megabytes << 20, i, np.uint8)) for i in range(16)]
+                seconds = timed(lambda way=to_host, of=arrays: [way(array) for array in of], 1, time.perf_counter)()
+                yield f"{name}, {megabytes:4} MiB arrays, {turn}: {(megabytes << 24) / seconds / 1e9:6.2f} GB/s"
     for config in ("benchmark.yaml", "phyworld_collision.yaml"):
         source, videos = source_of(config, "storage.batch_size=128"), 128
         with tempfile.TemporaryDirectory() as out:
