@@ -65,6 +65,17 @@ def test_both_forms_give_the_same_impacts_in_the_order_of_their_times():
     assert_alike(*made, within=2e-3)
 
 
+def test_both_forms_give_the_same_loads_on_a_disc_that_two_walls_bear():
+    """A disc of a twelfth of the mass of the one on it bears it in a valley; both walls add to what bears it."""
+    walls = [{"a": (-9.0, 9.0), "b": (0.0, 0.0)}, {"a": (0.0, 0.0), "b": (9.0, 9.0)}]
+    low, high = 0.5 * math.sqrt(2), 0.5 * math.sqrt(2) + 1.0
+    rows = [{"x": (0, low), "radius": 0.5, "mass": 1.0}, {"x": (0, high), "radius": 0.5, "mass": 12.0}]
+    worlds = [world(rows, walls, (side, -9.81)) for side in (0.0, 0.4)]
+    both = [run(worlds, 21, 4, keep=EVERYTHING, sparse=sparse) for sparse in (True, False)]
+    assert both[0].contacts.count.min() >= 3
+    assert_alike(*both, within=2e-4)
+
+
 def velocities_in_a_step(rows: list[dict], walls: list[dict]) -> np.ndarray:
     """Velocities [solver, order, step, disc, 2] in the first steps, of discs in all orders, by both solvers."""
     orders = [list(order) for order in itertools.permutations(range(len(rows)))]
