@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from gen2d.records.axes import Array
 from gen2d.records.layout import SlotGroup
@@ -22,7 +23,7 @@ from gen2d.renderers.relief import Relief, SurfacePoints, relief_of, surface_poi
 from gen2d.xla import on_cpu
 
 Measure = Callable[[SurfacePoints], Any]  # arrays of the same shape from surfaces, elementwise
-FLAT = SurfacePoints(jnp.float32(0), jnp.float32(0), jnp.float32(0))
+FLAT = SurfacePoints(*[np.float32(0)] * 3)  # of NumPy, as jax would choose its devices here
 
 
 class SurfaceTerms(NamedTuple):
