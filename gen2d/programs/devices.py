@@ -47,7 +47,8 @@ def keep_freed_memory() -> None:
 def prepare(device: str = "auto") -> list[Device]:
     """Devices to compute on: "cpu", "gpu", or "auto" for jax's default.
 
-    Each CPU core counts as one device, unless jax already runs in this process. Compiled programs are cached between
+    There is one for each CPU core. If jax already runs in this process with fewer, the first of them is listed again, as
+    several programs may run on it at once. Compiled programs are cached between
     runs in $JAX_COMPILATION_CACHE_DIR or the user's cache folder.
 
     Raises DeviceError if there is no such device, or if jax is in 64-bit mode.
@@ -69,19 +70,26 @@ def prepare(device: str = "auto") -> list[Device]:
         if device == "cpu":
             jax.config.update("jax_platforms", "cpu")
     except RuntimeError:
-        pass  # jax already runs, with these devices; the videos are the same on any number of them
+        pass  # jax already runs; the videos are the same on any number of devices
     if device == "auto":
-        return jax.devices()
+        return _for_all_cores(jax.devices())
     if device == "cpu" and jax.default_backend() != "cpu":
         raise DeviceError(
             f"{argument('device')} is 'cpu', but this process already runs jax on {jax.default_backend()}: start "
             "another"
         )
     try:
-        return jax.devices(device)
+        return _for_all_cores(jax.devices(device))
     except RuntimeError as error:
         hint = f"; pip install 'gen2d[cuda]', or use {argument('device', 'cpu')}" if device == "gpu" else ""
         raise DeviceError(f"{argument('device')} is {device!r}, but jax finds none{hint} ({error})") from None
+
+
+def _for_all_cores(found: list[Device]) -> list[Device]:
+    """These devices; on a CPU at least one for each core."""
+    if found[0].platform != "cpu" or len(found) >= cores():
+        return found
+    return found[:1] * cores()
 
 
 def start_transfer(arrays: dict[str, jax.Array]) -> dict[str, jax.Array]:

@@ -3,6 +3,10 @@
 import subprocess
 import sys
 
+import jax
+
+from gen2d.programs import devices
+
 STARTS_NOTHING = """
 import importlib, pkgutil
 import jax
@@ -24,3 +28,9 @@ assert len(jax.devices("cpu")) == 3
 def test_no_module_and_no_config_starts_jax_before_the_devices_are_chosen():
     """Else jax has one CPU device, and a run uses one core; and `--device cpu` comes too late beside a GPU."""
     subprocess.run([sys.executable, "-c", STARTS_NOTHING], check=True)
+
+
+def test_a_process_that_runs_jax_already_computes_on_all_cores(monkeypatch):
+    first = jax.devices("cpu")[0]
+    monkeypatch.setattr(devices, "cores", lambda: 5)
+    assert devices.prepare("cpu") == [first] * 5
