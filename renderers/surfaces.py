@@ -23,7 +23,8 @@ from gen2d.renderers.relief import Relief, SurfacePoints, relief_of, surface_poi
 from gen2d.xla import on_cpu
 
 Measure = Callable[[SurfacePoints], Any]  # arrays of the same shape from surfaces, elementwise
-FLAT = SurfacePoints(*[np.float32(0)] * 3)  # of NumPy, as jax would choose its devices here
+_ZERO: Any = np.float32(0)  # of NumPy: jax would choose its devices here
+FLAT = SurfacePoints(_ZERO, _ZERO, _ZERO)
 
 
 class SurfaceTerms(NamedTuple):

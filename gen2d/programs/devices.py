@@ -47,9 +47,9 @@ def keep_freed_memory() -> None:
 def prepare(device: str = "auto") -> list[Device]:
     """Devices to compute on: "cpu", "gpu", or "auto" for jax's default.
 
-    There is one for each CPU core. If jax already runs in this process with fewer, the first of them is listed again, as
-    several programs may run on it at once. Compiled programs are cached between
-    runs in $JAX_COMPILATION_CACHE_DIR or the user's cache folder.
+    There is one for each CPU core. If jax already runs in this process with fewer, the first of them is listed again,
+    as several programs may run on it at once. Compiled programs are cached between runs in $JAX_COMPILATION_CACHE_DIR
+    or the user's cache folder.
 
     Raises DeviceError if there is no such device, or if jax is in 64-bit mode.
     """
