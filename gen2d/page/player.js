@@ -45,7 +45,9 @@ let before = 0;
 function tick(now) {
   if (!state.playing) return;
   const video = clock();
-  state.time += (Math.min(now - before, 250) / 1000) * Number($("speed").value);
+  // The browser's first frame may have begun before the video was started.
+  const passed = Math.max(0, Math.min(now - before, 250));
+  state.time += (passed / 1000) * Number($("speed").value);
   before = now;
   const length = video ? (video.count * video.stride) / data.fps : 0;
   if (video && state.time >= length) state.time %= length;

@@ -96,6 +96,13 @@ def test_the_page_plays(opened: Tab) -> None:
     assert np.median(times) < 16  # ms, of a drawn frame with the gallery
 
 
+def test_the_page_never_shows_a_time_before_the_first_frame(opened: Tab) -> None:
+    early = "(play(true), tick(performance.now() - 100), play(false), [state.time, $('clock').textContent])"
+    time, text = opened.evaluate(early)
+    assert time >= 0
+    assert text.startswith("frame 0 of ")
+
+
 @pytest.mark.parametrize("name", OVERLAYS)
 def test_an_overlay_changes_pixels(opened: Tab, name: str) -> None:
     opened.evaluate("go(8)")
