@@ -42,6 +42,7 @@ PARALLEL = 0.2  # sine of the angle between two loads that act in one direction
 PRESSED = 0.5  # least cosine of the angle between a contact's normal and the load of the static bodies
 LARGEST_SPEED = 9.0  # of a point of a uniform triangle after an impulse at a corner, over that of its centre
 LEAST_LEFT = 1e-4  # share of a contact's compliance that a support leaves at least, as the rest would be rounding
+LEAST_COMPLIANCE = 1e-30  # (N s)^2 / kg, of a load that bears anything: a lesser one has no finite reciprocal
 
 LINE, FLUSH, CORNER = 0.0, 1.0, 2.0  # kinds of supports: in one direction, at two points of a contact, in several
 
@@ -219,15 +220,14 @@ def supported_pair(
     square, along = dot(load, load), dot(load, normal)
     along = jnp.where(lighter_b, -along, along)
     pressed = (lighter_a | lighter_b) & (along > 0) & (along * along > PRESSED**2 * square)
-    torque, k = None, mass * square
-    locked = jnp.zeros_like(moment)
+    torque, k, turning, flush = None, mass * square, moment, kind == FLUSH
     if a.torque is not None or b.torque is not None:
         x, y = (jnp.zeros_like(k) if torque is None else torque for torque in (a.torque, b.torque))
-        flush = kind == FLUSH
-        torque, locked = jnp.where(lighter_b, y, x), jnp.where(flush & pressed, moment, 0.0)
-        moment = jnp.where(flush, 0.0, moment)
-        k = k + moment * torque * torque
+        torque, turning = jnp.where(lighter_b, y, x), jnp.where(flush, 0.0, moment)
+        k = k + turning * torque * torque
+    pressed = pressed & (k > LEAST_COMPLIANCE)
+    locked = jnp.zeros_like(moment) if torque is None else jnp.where(flush & pressed, moment, 0.0)
     share = reciprocal(k, pressed)
     in_impacts = mass <= LARGEST_IN_IMPACTS * jnp.where(lighter_b, of_a.mass, of_b.mass)
     lighter = pressed & lighter_a, pressed & lighter_b
-    return SupportedPair(lighter, mass, moment, locked, load, torque, share, in_impacts)
+    return SupportedPair(lighter, mass, turning, locked, load, torque, share, in_impacts)

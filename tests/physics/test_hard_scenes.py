@@ -5,10 +5,13 @@ Each asks for what an exact solver would give; what gen2d owes is marked `asked`
 
 import math
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from laws import deepest_overlap, holds, total_energy
 
+from gen2d.physics.constraint import ContactConstraint, Inertia, Motion
+from gen2d.physics.support import Support, supported_pair
 from gen2d.space.space import Space
 
 GRAVITY = 9.81  # m/s^2
@@ -185,6 +188,27 @@ def test_heavy_discs_stand_on_light_ones():
     weight = sum(body.mass for body in video.bodies if np.isfinite(body.mass)) * GRAVITY
     load = rows.normal_impulse[(rows.time > 0.99) & ((rows.a == floor) | (rows.b == floor))].sum()
     holds("heavy discs on light ones: force on the floor, of their weight", load / weight - 1, 1e-2)
+
+
+@pytest.mark.parametrize("torque", [None, 0.0, 0.3])
+def test_a_load_that_fades_bears_nothing_in_the_end(torque):
+    """Of a body that slides along a wall without gravity: it falls by orders of magnitude in each step."""
+    load = jnp.asarray(np.logspace(-45, 0, 901), jnp.float32)
+    one, zero = jnp.ones_like(load), jnp.zeros_like(load)
+    heavy, light = Inertia(0.001 * one, 0.001 * one), Inertia(0.05 * one, 0.08 * one)
+    on_heavy = Support(jnp.stack([zero, zero]), None if torque is None else zero, zero)
+    on_light = Support(jnp.stack([zero, load]), None if torque is None else torque * load, zero)
+    constraint = ContactConstraint(heavy, light, one > 0, zero, zero, None, None, static=False)
+    pair = supported_pair(constraint, jnp.stack([zero, -one]), (on_heavy, on_light))
+    assert pair is not None
+    motion = Motion(jnp.stack([one, -one]), one)
+    _, left = pair.left((motion, motion))
+    assert all(jnp.isfinite(x).all() for x in (pair.share, left.velocity, left.spin))
+    borne = np.asarray(pair.lighter[1])
+    assert borne[np.asarray(load) > 1e-12].all()
+    assert not borne[np.asarray(load) < 1e-19].any()
+    along = left.velocity[1] + (0.0 if torque is None else torque * left.spin)
+    np.testing.assert_allclose(np.asarray(along)[borne], 0.0, atol=1e-6)
 
 
 @pytest.mark.full
