@@ -219,15 +219,16 @@ def supported_pair(
     )
     square, along = dot(load, load), dot(load, normal)
     along = jnp.where(lighter_b, -along, along)
-    pressed = (lighter_a | lighter_b) & (along > 0) & (along * along > PRESSED**2 * square)
-    torque, k, turning, flush = None, mass * square, moment, kind == FLUSH
+    torque, k = None, mass * square
+    pressed = (lighter_a | lighter_b) & (along > 0) & (along * along > PRESSED**2 * square) & (k > LEAST_COMPLIANCE)
+    locked = jnp.zeros_like(moment)
     if a.torque is not None or b.torque is not None:
         x, y = (jnp.zeros_like(k) if torque is None else torque for torque in (a.torque, b.torque))
-        torque, turning = jnp.where(lighter_b, y, x), jnp.where(flush, 0.0, moment)
-        k = k + turning * torque * torque
-    pressed = pressed & (k > LEAST_COMPLIANCE)
-    locked = jnp.zeros_like(moment) if torque is None else jnp.where(flush & pressed, moment, 0.0)
+        flush = kind == FLUSH
+        torque, locked = jnp.where(lighter_b, y, x), jnp.where(flush & pressed, moment, 0.0)
+        moment = jnp.where(flush, 0.0, moment)
+        k = k + moment * torque * torque
     share = reciprocal(k, pressed)
     in_impacts = mass <= LARGEST_IN_IMPACTS * jnp.where(lighter_b, of_a.mass, of_b.mass)
     lighter = pressed & lighter_a, pressed & lighter_b
-    return SupportedPair(lighter, mass, turning, locked, load, torque, share, in_impacts)
+    return SupportedPair(lighter, mass, moment, locked, load, torque, share, in_impacts)

@@ -192,7 +192,7 @@ def test_heavy_discs_stand_on_light_ones():
 
 @pytest.mark.parametrize("torque", [None, 0.0, 0.3])
 def test_a_load_that_fades_bears_nothing_in_the_end(torque):
-    """Of a body that slides along a wall without gravity: it falls by orders of magnitude in each step."""
+    """The load of a body that slides along a wall without gravity falls by orders of magnitude in each step."""
     load = jnp.asarray(np.logspace(-45, 0, 901), jnp.float32)
     one, zero = jnp.ones_like(load), jnp.zeros_like(load)
     heavy, light = Inertia(0.001 * one, 0.001 * one), Inertia(0.05 * one, 0.08 * one)

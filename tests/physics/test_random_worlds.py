@@ -67,7 +67,7 @@ MANY_BOUNDS: dict[str, Bounds] = {
     "discs": {RISING: None, OVERLAPPING: None},
     "elastic discs": {},
     "discs, mass ratios up to 1e6": {RISING: 0.03, OVERLAPPING: 0.56},
-    "all shapes": {ABOVE: None, RISING: None, OVERLAPPING: 0.1},
+    "all shapes": {ABOVE: 0.001, RISING: None, OVERLAPPING: 0.1},
     "elastic shapes": {RISING: None},
     "mass ratios up to 1e6": {ABOVE: None, RISING: 0.02, OVERLAPPING: 0.58},
     "smooth elastic boxes": {OVERLAPPING: 0.02},
@@ -75,7 +75,7 @@ MANY_BOUNDS: dict[str, Bounds] = {
     "fast, mass ratios up to 1e6, e = 0.0": {ABOVE: None, RISING: 0.02, SLIPPING: 1e-5, OVERLAPPING: 0.9},
     "fast, mass ratios up to 1e6, e = 0.5": {ABOVE: None, RISING: 0.02, OVERLAPPING: 0.48},
     "fast, mass ratios up to 1e6, e = 1.0": {ABOVE: None, RISING: 0.02, SLIPPING: 1e-5, OVERLAPPING: 0.24},
-    "joints, with gravity": {NOT_FINITE: None, ABOVE: 0.05, RISING: 0.9},
+    "joints, with gravity": {NOT_FINITE: 0.001, ABOVE: 0.05, RISING: 0.9},
     "joints, without": {ABOVE: 0.15, RISING: 0.6},
 }
 # Speeds up to half of a radius in a step; a fixed obstacle may form a wedge that is narrower than a disc.
