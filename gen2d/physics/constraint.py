@@ -153,6 +153,12 @@ def relative_speed(frame: ContactFrame, normal: Array, a: Motion | None, b: Moti
     return speed, slip
 
 
+def speed_bound(velocity: Array) -> Array:
+    """Bound on the speeds of velocities [2, ...], m/s: |x| + |y|."""
+    x, y = jnp.abs(velocity)
+    return x + y
+
+
 Components: TypeAlias = tuple[Array | None, Array | None]  # normal and tangential; None: zero
 
 

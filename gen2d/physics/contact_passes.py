@@ -57,11 +57,11 @@ def _supported_contacts(
 
 
 def _with_pushes(
-    supported: SupportedPair | None, pair: SolvedPair, normals: list[Array], a: BodySide, b: BodySide
+    supported: SupportedPair, pair: SolvedPair, normals: list[Array], a: BodySide, b: BodySide
 ) -> tuple[BodySide, BodySide]:
     """Both sides with the push of these normal impulses, so that what bears the lighter body does not see an impact."""
-    if supported is None:
-        return a, b
+    assert a.push is not None, "both bodies move"
+    assert b.push is not None, "both bodies move"
     changes = [jnp.abs(normal - old.normal) for normal, old in zip(normals, pair.impulses, strict=True)]
     of_a, of_b = supported.pushes(functools.reduce(jnp.add, changes))
     return a._replace(push=jnp.maximum(a.push, of_a)), b._replace(push=jnp.maximum(b.push, of_b))
@@ -80,7 +80,8 @@ def _apply_pass(
     before, roll, impulses, jointed = (a.motion, b.motion), pair.roll, [], b.joint_motion is not None
     seen, speeds, targets = _supported_contacts(supported, pair, target_of, before)
     normals = materialize(solve_normals(constraint, seen.contacts, speeds, pair.impulses, targets, seen.taken))
-    a, b = _with_pushes(supported, pair, normals, a, b)
+    if supported is not None:
+        a, b = _with_pushes(supported, pair, normals, a, b)
     if constraint.frame is not None and roll is None and not jointed:
         # The normal impulse between two discs adds no slip, so both impulses follow from the same velocities.
         (contact,), (borne,), (old,), (normal,), (target,) = (
@@ -168,6 +169,17 @@ def warm_start(
     return a, b, points
 
 
+def _with_resting(old: BodySide, new: BodySide, bounces: Array) -> BodySide:
+    """The side with what a contact at rest adds to its motion."""
+    if new.resting is None:
+        return new
+
+    def total(added: Array, x: Array, y: Array) -> Array:
+        return added + jax.lax.stop_gradient(jnp.where(bounces, 0.0, x - y))
+
+    return new._replace(resting=jax.tree.map(total, new.resting, new.motion, old.motion))
+
+
 def _update_drift(old: BodySide, new: BodySide, time: Array) -> BodySide:
     """The side with its drift reduced by the time of the impulses times the change of velocity."""
     assert old.motion, "only moving bodies drift"
@@ -236,6 +248,7 @@ def solve(
     if supported is not None:  # what bears a body acts at half of the step
         times = tuple(jnp.where(borne, 0.5 * params.step, time) for borne in supported.lighter)
     new_a, new_b = _after_impulses(constraint, (a, b), (new_a, new_b), bounces, time, times)
+    new_a, new_b = _with_resting(a, new_a, bounces), _with_resting(b, new_b, bounces)
     assert new_b.motion is not None, "only static bodies lack a motion"
     motions = seen.means((new_a.motion, new_b.motion))
     new_a, new_b = correct_positions(constraint, contacts, motions, acceleration, new_a, new_b, setup, params)

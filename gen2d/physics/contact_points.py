@@ -246,11 +246,18 @@ def bounce_threshold(
 ) -> Array:
     """Approach speed above which a contact bounces, m/s.
 
-    It exceeds what warm starting may have added and what the pair's last normal impulse causes in a step; otherwise a
-    pile would bounce on itself.
+    It exceeds what contacts at rest have added, and what the pair's last normal impulse causes in a step. Otherwise a
+    pile would bounce on itself: the answer to what is no impact would press on the contacts at rest, which would add
+    more in the next step.
     """
-    push = 0.0 if b.push is None else b.push if a.push is None else a.push + b.push
-    return setup.threshold + push + point.frame.k_normal * normal
+    frame, approach = point.frame, jnp.zeros_like(normal)
+    for side, lever, sign in ((a, frame.normal_a, 1.0), (b, frame.normal_b, -1.0)):
+        if side.resting is not None:
+            velocity, spin = side.resting
+            speed = dot(point.normal, velocity) if lever is None else dot(point.normal, velocity) + lever * spin
+            approach = approach + sign * speed
+    push = sum(side.push for side in (a, b) if side.push is not None)
+    return setup.threshold + frame.k_normal * normal + jnp.maximum(approach, 0.0) + push
 
 
 def _frame_of_discs(constraint: ContactConstraint, frame: ContactFrame, gap: Array) -> ContactFrame:

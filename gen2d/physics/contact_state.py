@@ -1,6 +1,6 @@
 """Records that the contact solver hands from pass to pass and from step to step."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from gen2d.physics.collision import Shape
 from gen2d.physics.constraint import ActiveContact, Impulse, Motion
@@ -25,7 +25,8 @@ class BodySide(NamedTuple):
     acceleration: Array | None = None  # [2, N, ...] m/s^2; None: gravity's
     drift: Motion | None = None  # m, rad: displacement beyond h times the new velocity, as impulses act at their time
     displacement: Motion | None = None  # m, rad: where the impulses of a pass act; None: of static bodies
-    push: Any = None  # [N, ...] m/s: bound on the speed that warm starting added; None: static
+    resting: Motion | None = None  # m/s, rad/s: what contacts at rest have added in the step; None: discs, static
+    push: Array | None = None  # [N, ...] m/s: bound on what warm starting added to a disc, or heavier bodies to any
     work: Work | None = None
     schur: Array | None = None  # [6, N, ...] what rigid joints take from the inverse mass (jointed.py)
     joint_motion: Motion | None = None  # m/s, rad/s: what they take from the motion in a pass

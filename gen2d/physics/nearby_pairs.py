@@ -330,7 +330,7 @@ class NearbyPairs(PairBatches, ContactSolver):
 
         last_touch = carry.last_touch or [jnp.zeros(0, jnp.int32)] * len(self.batches)
         starts = list(zip(carry.cache, last_touch, strict=True))
-        sides, carries = self._pass(sides, statics, listed, starts, play, (*CONSTANTS, "push"))
+        sides, carries = self._pass(sides, statics, listed, starts, play, (*CONSTANTS, "resting", "push"))
         depth, begins = carry.depth, carry.begins
         for overlap, began in solved.observed:
             depth, begins = jnp.maximum(depth, overlap), begins + began

@@ -137,7 +137,7 @@ class JointRows(NamedTuple):
 
 
 def zero_impulses(system: JointSystem) -> Array:
-    """Impulses of the rows before the first step, N s [R, ...]."""
+    """Impulses of the rows at the start of a step, N s [R, ...]."""
     return jnp.zeros_like(system.rest[..., system.plan.joint, :])
 
 
@@ -243,14 +243,9 @@ def _apply(system: JointSystem, rows: JointRows, table: Motion, impulses: Array)
     return new, Work(lost, driven, None)
 
 
-def warm_start(
-    system: JointSystem, bodies: list[Any], statics: list[Any], motions: list[Motion], impulses: Array
-) -> tuple[Anchors, list[Motion], Work]:
-    """Anchors at the start of the step, motions with the impulses of the last step, and their work."""
-    anchors = Anchors(*anchors_of(system.a, system.b, poses_of(bodies, statics)))
-    now = table_of(motions, [body.motion for body in statics])
-    now, work = _apply(system, _rows(system, anchors), now, impulses)
-    return anchors, groups_of(now, motions), work
+def anchors_at(system: JointSystem, bodies: list[Any], statics: list[Any]) -> Anchors:
+    """Anchors in these states of all bodies."""
+    return Anchors(*anchors_of(system.a, system.b, poses_of(bodies, statics)))
 
 
 class FactoredSystem:
@@ -276,7 +271,8 @@ class FactoredSystem:
     ) -> Solved:
         """Motions with which the anchors meet after a step of h seconds.
 
-        A body's displacement is h times its motion plus its drift.
+        A body's displacement is h times its motion plus its drift. The first of Newton's iterations is linear, as an
+        impact without the joints may have turned a light body far within the step.
         """
         system, anchors, now, drift, works = (
             self._system,
@@ -287,9 +283,12 @@ class FactoredSystem:
         )
         error = _error(system, self._rows, anchors.offset)
         remaining = error - jnp.clip(error, -h * FASTEST, h * FASTEST)
-        for _ in range(NEWTON_ITERATIONS):
+        for iteration in range(NEWTON_ITERATIONS):
             displacement = jax.tree.map(lambda x, y: h * x + y, now, drift)
-            error = _error(system, self._rows, _displace(system, anchors, displacement).offset)
+            if iteration == 0:
+                error = error + _speeds(system, self._rows, displacement)
+            else:
+                error = _error(system, self._rows, _displace(system, anchors, displacement).offset)
             impulses, now, work = self._solve(now, impulses, (error - remaining) / h)
             works.append(work)
         return Solved(groups_of(now, motions), impulses, jax.tree.map(lambda *x: sum(x), *works))

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 
 from gen2d.core.enums import DYNAMIC, STATIC
 from gen2d.core.errors import ConfigError
-from gen2d.physics import rigid_joints, springs_limits_motors
+from gen2d.physics import springs_limits_motors
 from gen2d.physics.constraint import Motion
 from gen2d.physics.energy import Ledger, Work, balance, close_balance
 from gen2d.physics.params import SolverParams
@@ -124,7 +124,6 @@ def _start(state: State, layout: Layout, model: Model, keep: SaveAt, params: Sol
         bodies.append(BodyState(own.position, own.angle, Motion(own.velocity, own.angular_velocity), zero))
     time, contacts = jnp.zeros((), state.angle.dtype), model.solver.start(keep.contacts)
     joints = [springs_limits_motors.zero_impulses(joint) for joint in model.joints]
-    system = None if model.joint_system is None else rigid_joints.zero_impulses(model.joint_system)
     if keep.energy:
         driven = model.forces is not None or any(f.motion is not None for f in model.statics)
         works = []
@@ -133,7 +132,7 @@ def _start(state: State, layout: Layout, model: Model, keep: SaveAt, params: Sol
             works.append(Work(zero, zero if driven else None, zero if params.damping else None))
         by_joints = Work(*(jnp.zeros_like(model.joints[0].rest[..., :1, :]) for _ in range(3))) if joints else None
         ledger = Ledger(works, by_joints)
-    return WorldState(bodies, time, contacts, joints, system, ledger)
+    return WorldState(bodies, time, contacts, joints, ledger)
 
 
 def _balance(world: WorldState, model: Model) -> tuple | None:

@@ -34,13 +34,16 @@ class ContactSolver(Protocol):
     def solve(
         self, carry: Any, contacts: Any, sides: list[BodySide], statics: list[BodySide]
     ) -> tuple[list[BodySide], Any]:
-        """Sides after the first pass, and the solved contacts; uses motion, drift, push and work."""
+        """Sides after the first pass, and the solved contacts; uses motion, drift, resting, push and work."""
         ...
 
     def relax(
         self, carry: Any, solved: Any, sides: list[BodySide], statics: list[BodySide], time: Array
     ) -> tuple[list[BodySide], Any]:
-        """Sides after the relaxing pass of the step that began at `time`, and the carry; uses motion, push and work."""
+        """Sides after the relaxing pass of the step that began at `time`, and the carry.
+
+        Uses motion, displacement, resting, push and work.
+        """
         ...
 
     def end_frame(self, carry: Any) -> tuple[Any, Any]:

@@ -77,5 +77,4 @@ class WorldState(NamedTuple):
     time: Array  # s
     contacts: Any  # carry of the contact solver
     joints: list[Any]  # impulses of each round of joints
-    joint_system: Array | None  # impulses of the rigid joints
     ledger: Ledger | None

@@ -36,9 +36,9 @@ import jax.numpy as jnp
 
 from gen2d.physics import rigid_joints, springs_limits_motors
 from gen2d.physics.collision import Disc
-from gen2d.physics.constraint import Motion
+from gen2d.physics.constraint import Motion, speed_bound
 from gen2d.physics.contact_state import BodySide
-from gen2d.physics.energy import Ledger, accumulate, record_energy
+from gen2d.physics.energy import Ledger, Work, accumulate, record_energy
 from gen2d.physics.impact_order import not_hit
 from gen2d.physics.jointed import hold, release
 from gen2d.physics.params import SolverParams
@@ -97,32 +97,23 @@ def _displace(body: BodyState, displacement: Motion, motion: Motion) -> BodyStat
 
 
 class _RigidJoints:
-    """The rigid joints in a step, with their impulses and work so far; does nothing without joints."""
+    """The rigid joints in a step, with their work so far; does nothing without joints."""
 
     def __init__(
         self, system: rigid_joints.JointSystem | None, world: WorldState, statics: list[BodyState], h: float
     ) -> None:
-        self._system, self._world, self._statics, self._h = system, world, statics, h
+        self._system, self._h = system, h
         self._fixed = [body.motion for body in statics]
-        self.impulses, self.works = world.joint_system, []
-        self._schur: list[Array] = []
-
-    def warm_start(self, motions: list[Motion]) -> list[Motion]:
-        """Motions with the impulses of the last step."""
-        if self._system is None or self.impulses is None:
-            return motions
-        bodies = self._world.bodies
-        self._anchors, motions, work = rigid_joints.warm_start(
-            self._system, bodies, self._statics, motions, self.impulses
-        )
-        self.works.append(work)
-        return motions
+        self.works: list[Work] = []
+        if system is not None:
+            self._impulses = rigid_joints.zero_impulses(system)
+            self._anchors = rigid_joints.anchors_at(system, world.bodies, statics)
+            self._factored = rigid_joints.FactoredSystem(system, self._anchors)
 
     def hold(self, sides: list[BodySide]) -> list[BodySide]:
         """Sides of the first pass, whose contacts see the joints at the start of the step."""
         if self._system is None:
             return sides
-        self._factored = rigid_joints.FactoredSystem(self._system, self._anchors)
         self._schur = self._factored.schur_complements(_motions(sides))
         return self._held(sides)
 
@@ -140,33 +131,37 @@ class _RigidJoints:
         A contact would take a speed along a rod for an approach, and answer it with the little that the rod leaves of
         the inverse mass.
         """
-        of = zip(sides, self.stay(sides), self._schur, strict=True)
+        of = zip(sides, self.stay(_motions(sides)), self._schur, strict=True)
         return [hold(side._replace(motion=motion), schur) for side, motion, schur in of]
 
     def meet(self, sides: list[BodySide], drifts: list[Motion]) -> tuple[list[Motion], list[Motion]]:
         """Motions with which the anchors meet at the end of the step, and the drifts: those of the sides and these."""
         sides = [release(side) for side in sides]
         drifts = [jax.tree.map(jnp.add, side.drift, more) for side, more in zip(sides, drifts, strict=True)]
-        if self._system is None or self.impulses is None:
+        if self._system is None:
             return _motions(sides), drifts
-        solved = self._factored.meet(_motions(sides), drifts, self._fixed, self.impulses, self._h)
+        solved = self._factored.meet(_motions(sides), drifts, self._fixed, self._impulses, self._h)
         return self._solved(solved), drifts
 
-    def stay(self, sides: list[BodySide]) -> list[Motion]:
+    def stay(self, motions: list[Motion]) -> list[Motion]:
         """Motions with which the anchors stay together."""
-        sides = [release(side) for side in sides]
-        if self._system is None or self.impulses is None:
-            return _motions(sides)
-        return self._solved(self._factored.hold(_motions(sides), self._fixed, self.impulses))
+        if self._system is None:
+            return motions
+        return self._solved(self._factored.hold(motions, self._fixed, self._impulses))
 
     def _solved(self, solved: rigid_joints.Solved) -> list[Motion]:
-        self.impulses = solved.impulses
+        self._impulses = solved.impulses
         self.works.append(solved.work)
         return solved.motions
 
 
 def _motions(sides: list[BodySide]) -> list[Motion]:
     return [side.motion for side in sides if side.motion is not None]
+
+
+def _released(sides: list[BodySide]) -> list[Motion]:
+    """Motions that the contacts alone gave the sides."""
+    return _motions([release(side) for side in sides])
 
 
 def step(world: WorldState, model: Model, params: SolverParams) -> WorldState:
@@ -180,7 +175,7 @@ def step(world: WorldState, model: Model, params: SolverParams) -> WorldState:
 
     joints, motions, work_warm = springs_limits_motors.warm_start(model.joints, world.bodies, fixed, free, world.joints)
     rigid = _RigidJoints(model.joint_system, world, fixed, h)
-    before = rigid.warm_start(motions)
+    before = rigid.stay(motions)
     shapes = [to_world(g.body_shape, b.position, b.angle) for g, b in zip(groups, world.bodies, strict=True)]
     statics = [BodySide(f.shape_at(b), f.motion) for f, b in zip(model.statics, fixed, strict=True)]
     different = accelerations if angular else [None] * len(groups)
@@ -201,23 +196,26 @@ def step(world: WorldState, model: Model, params: SolverParams) -> WorldState:
         sides = not_hit(sides)
     sides, contacts = solver.warm_start(carry, sides, statics)
     motions = _motions(sides)
-    pushes, drifts = [], []  # bounds on the speeds that warm starting added, and the drift of its impulses
-    for after, old in zip(motions, before, strict=True):
-        change = jax.tree.map(jnp.subtract, after, old)
-        x, y = jnp.abs(change.velocity)
-        pushes.append(x + y)
-        drifts.append(_scaled(change, -0.5 * h))
+    changes = [jax.tree.map(jnp.subtract, *of) for of in zip(motions, before, strict=True)]
+    drifts = [_scaled(change, -0.5 * h) for change in changes]
 
     joints, motions, drifts, work_solve = springs_limits_motors.solve(
         joints, motions, drifts, accelerations, fixed, params, biased=True
     )
-    of_groups = zip(sides, motions, drifts, pushes, strict=True)
+    of_groups = zip(sides, motions, drifts, jax.lax.stop_gradient(changes), shapes, strict=True)
     sides = [
-        BodySide(motion=m, drift=drift, push=push, work=s.work, support=s.support, first=s.first)
-        for s, m, drift, push in of_groups
+        BodySide(
+            motion=motion,
+            drift=drift,
+            resting=None if isinstance(shape, Disc) else change,
+            push=speed_bound(change.velocity) if isinstance(shape, Disc) else jnp.zeros_like(change.spin),
+            work=side.work,
+            support=side.support,
+            first=side.first,
+            clock=jnp.zeros_like(change.spin) if params.by_time else None,
+        )
+        for side, motion, drift, change, shape in of_groups
     ]
-    if params.by_time:
-        sides = [side._replace(clock=jnp.zeros_like(side.push)) for side in sides]
     statics = [BodySide(motion=side.motion) for side in statics]
     sides, solved = solver.solve(carry, contacts, rigid.hold(sides), statics)
     motions, drifts = rigid.meet(sides, free_drifts)
@@ -231,9 +229,12 @@ def step(world: WorldState, model: Model, params: SolverParams) -> WorldState:
         joints, motions, displacements, accelerations, fixed, params, biased=False
     )
     of_groups = zip(sides, motions, displacements, strict=True)
-    sides = [BodySide(motion=m, displacement=moved, push=side.push, work=side.work) for side, m, moved in of_groups]
+    sides = [
+        BodySide(motion=motion, displacement=moved, resting=side.resting, push=side.push, work=side.work)
+        for side, motion, moved in of_groups
+    ]
     sides, carry = solver.relax(carry, solved, rigid.hold_again(sides, displacements), statics, world.time)
-    motions = rigid.stay(sides)
+    motions = rigid.stay(_released(sides))
     if ledger is not None:
         olds, works = [body.motion for body in world.bodies], [side.work for side in sides]
         done = zip(works, groups, olds, free, free_drifts, displacements, accelerations, spin_ups, strict=True)
@@ -244,6 +245,5 @@ def step(world: WorldState, model: Model, params: SolverParams) -> WorldState:
         time=world.time + h,
         contacts=carry,
         joints=[joint.impulses for joint in joints],
-        joint_system=rigid.impulses,
         ledger=ledger,
     )

@@ -29,12 +29,21 @@ def wall(x: float, height: float = 60.0) -> dict:
 
 def rest_measures(case: Case, slots: int, settle: int, walls: int = 4) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Overlap in m, way in m and speed in m/s over the 10 s after `settle` s, at most, by pose; the bodies upright and
-    mirrored, at 60 frames per s."""
+    mirrored, at 60 frames per s.
+
+    The way of a disc on the floor is what it slides: nothing ends the rolling of one that no other disc presses.
+    """
     worlds = [pose_world(case, pose, slots, walls) for pose in (QUARTERS[0], POSES[4])]
     made = run(worlds, 60 * (settle + 10) + 1, 4)
-    position, velocity = (np.asarray(a, float)[:, 60 * settle :] for a in (made.states.position, made.states.velocity))
-    count = len(case.discs)
-    way = np.linalg.norm(position[:, :, :count] - position[:, :1, :count], axis=-1)
+    states, count = made.states, len(case.discs)
+    position, velocity, angle = (
+        np.asarray(a, float)[:, 60 * settle :] for a in (states.position, states.velocity, states.angle)
+    )
+    moved, turned = (a[:, :, :count] - a[:, :1, :count] for a in (position, angle))
+    radius = np.array([disc.get("radius", RADIUS) for disc in case.discs])
+    on_floor = np.abs(position[:, :, :count, 1] - radius) < SLOP
+    moved[..., 0] += np.where(on_floor, radius * turned, 0.0)
+    way = np.linalg.norm(moved, axis=-1)
     speed = np.linalg.norm(velocity[:, :, :count], axis=-1)
     depth = [overlaps(one, x) for one, x in zip(worlds, position, strict=True)]
     return np.max(depth, axis=1), way.max((1, 2)), speed.max((1, 2))
