@@ -159,9 +159,19 @@ def _motions(sides: list[BodySide]) -> list[Motion]:
     return [side.motion for side in sides if side.motion is not None]
 
 
-def _released(sides: list[BodySide]) -> list[Motion]:
-    """Motions that the contacts alone gave the sides."""
-    return _motions([release(side) for side in sides])
+def _first_pass_side(side: BodySide, motion: Motion, drift: Motion, change: Motion, params: SolverParams) -> BodySide:
+    """The side after warm starting, which changed its motion by `change`, as the first pass needs it."""
+    disc = isinstance(side.shape, Disc)
+    return BodySide(
+        motion=motion,
+        drift=drift,
+        resting=None if disc else change,
+        push=speed_bound(change.velocity) if disc else jnp.zeros_like(change.spin),
+        work=side.work,
+        support=side.support,
+        first=side.first,
+        clock=jnp.zeros_like(change.spin) if params.by_time else None,
+    )
 
 
 def step(world: WorldState, model: Model, params: SolverParams) -> WorldState:
@@ -202,20 +212,8 @@ def step(world: WorldState, model: Model, params: SolverParams) -> WorldState:
     joints, motions, drifts, work_solve = springs_limits_motors.solve(
         joints, motions, drifts, accelerations, fixed, params, biased=True
     )
-    of_groups = zip(sides, motions, drifts, jax.lax.stop_gradient(changes), shapes, strict=True)
-    sides = [
-        BodySide(
-            motion=motion,
-            drift=drift,
-            resting=None if isinstance(shape, Disc) else change,
-            push=speed_bound(change.velocity) if isinstance(shape, Disc) else jnp.zeros_like(change.spin),
-            work=side.work,
-            support=side.support,
-            first=side.first,
-            clock=jnp.zeros_like(change.spin) if params.by_time else None,
-        )
-        for side, motion, drift, change, shape in of_groups
-    ]
+    of_groups = zip(sides, motions, drifts, jax.lax.stop_gradient(changes), strict=True)
+    sides = [_first_pass_side(*of, params) for of in of_groups]
     statics = [BodySide(motion=side.motion) for side in statics]
     sides, solved = solver.solve(carry, contacts, rigid.hold(sides), statics)
     motions, drifts = rigid.meet(sides, free_drifts)
@@ -234,7 +232,7 @@ def step(world: WorldState, model: Model, params: SolverParams) -> WorldState:
         for side, motion, moved in of_groups
     ]
     sides, carry = solver.relax(carry, solved, rigid.hold_again(sides, displacements), statics, world.time)
-    motions = rigid.stay(_released(sides))
+    motions = rigid.stay(_motions([release(side) for side in sides]))
     if ledger is not None:
         olds, works = [body.motion for body in world.bodies], [side.work for side in sides]
         done = zip(works, groups, olds, free, free_drifts, displacements, accelerations, spin_ups, strict=True)
