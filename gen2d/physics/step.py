@@ -99,20 +99,19 @@ def _displace(body: BodyState, displacement: Motion, motion: Motion) -> BodyStat
 class _RigidJoints:
     """The rigid joints in a step, with their work so far; does nothing without joints."""
 
-    def __init__(
-        self, system: rigid_joints.JointSystem | None, world: WorldState, statics: list[BodyState], h: float
-    ) -> None:
-        self._system, self._h = system, h
+    def __init__(self, model: Model, world: WorldState, statics: list[BodyState], h: float) -> None:
+        self._system, self._h = model.joint_system, h
+        self._contacts = any(group.collides for group in model.groups)  # whether there may be contacts
         self._fixed = [body.motion for body in statics]
         self.works: list[Work] = []
-        if system is not None:
-            self._impulses = rigid_joints.zero_impulses(system)
-            self._anchors = rigid_joints.anchors_at(system, world.bodies, statics)
-            self._factored = rigid_joints.FactoredSystem(system, self._anchors)
+        if self._system is not None:
+            self._impulses = rigid_joints.zero_impulses(self._system)
+            self._anchors = rigid_joints.anchors_at(self._system, world.bodies, statics)
+            self._factored = rigid_joints.FactoredSystem(self._system, self._anchors)
 
     def hold(self, sides: list[BodySide]) -> list[BodySide]:
         """Sides of the first pass, whose contacts see the joints at the start of the step."""
-        if self._system is None:
+        if self._system is None or not self._contacts:
             return sides
         self._schur = self._factored.schur_complements(_motions(sides))
         return self._held(sides)
@@ -123,7 +122,7 @@ class _RigidJoints:
             return sides
         moved = table_of(displacements, [_scaled(motion, self._h) for motion in self._fixed])
         self._factored = rigid_joints.FactoredSystem(self._system, self._anchors, moved)
-        return self._held(sides)
+        return self._held(sides) if self._contacts else sides
 
     def _held(self, sides: list[BodySide]) -> list[BodySide]:
         """Sides of a pass, whose anchors stay together.
@@ -134,13 +133,13 @@ class _RigidJoints:
         of = zip(sides, self.stay(_motions(sides)), self._schur, strict=True)
         return [hold(side._replace(motion=motion), schur) for side, motion, schur in of]
 
-    def meet(self, sides: list[BodySide], drifts: list[Motion]) -> tuple[list[Motion], list[Motion]]:
+    def meet(self, sides: list[BodySide], free_drifts: list[Motion]) -> tuple[list[Motion], list[Motion]]:
         """Motions with which the anchors meet at the end of the step, and the drifts: those of the sides and these."""
         sides = [release(side) for side in sides]
-        drifts = [jax.tree.map(jnp.add, side.drift, more) for side, more in zip(sides, drifts, strict=True)]
+        motions, drifts = _motions(sides), [side.drift for side in sides]
         if self._system is None:
-            return _motions(sides), drifts
-        solved = self._factored.meet(_motions(sides), drifts, self._fixed, self._impulses, self._h)
+            return motions, [jax.tree.map(jnp.add, *of) for of in zip(drifts, free_drifts, strict=True)]
+        solved, drifts = self._factored.meet(motions, drifts, free_drifts, self._fixed, self._impulses, self._h)
         return self._solved(solved), drifts
 
     def stay(self, motions: list[Motion]) -> list[Motion]:
@@ -184,7 +183,7 @@ def step(world: WorldState, model: Model, params: SolverParams) -> WorldState:
     fixed = [body.at(world.time) for body in model.statics]
 
     joints, motions, work_warm = springs_limits_motors.warm_start(model.joints, world.bodies, fixed, free, world.joints)
-    rigid = _RigidJoints(model.joint_system, world, fixed, h)
+    rigid = _RigidJoints(model, world, fixed, h)
     before = rigid.stay(motions)
     shapes = [to_world(g.body_shape, b.position, b.angle) for g, b in zip(groups, world.bodies, strict=True)]
     statics = [BodySide(f.shape_at(b), f.motion) for f, b in zip(model.statics, fixed, strict=True)]
