@@ -19,11 +19,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from gen2d.physics import limits_motors
 from gen2d.physics.banded import factor, inverse_band, solve_factored
 from gen2d.physics.collision import dot, perpendicular
 from gen2d.physics.constraint import Inertia, Motion
 from gen2d.physics.energy import Work
-from gen2d.physics.springs_limits_motors import (
+from gen2d.physics.limits_motors import HingeImpulses
+from gen2d.physics.params import SolverParams
+from gen2d.physics.springs import (
+    JointBatch,
     JointSide,
     anchors_of,
     direction_of,
@@ -127,6 +131,7 @@ class JointSystem(NamedTuple):
     inertia: Inertia  # of all bodies in the table; zero of static ones
     rigid: Array  # bool: present, and no spring
     rest: Array  # m, of rods
+    hinges: JointBatch | None  # that may have limits or a motor
 
 
 class JointRows(NamedTuple):
@@ -313,6 +318,46 @@ class FactoredSystem:
 
     def _impulses(self, speeds: Array) -> Array:
         return -materialize(solve_factored(self._factors, materialize(speeds)))
+
+    def limit(
+        self,
+        motions: list[Motion],
+        drifts: list[Motion],
+        fixed: list[Motion],
+        angle: Array,
+        impulses: HingeImpulses,
+        params: SolverParams,
+        biased: bool,
+    ) -> tuple[list[Motion], HingeImpulses, Work]:
+        """Motions after the limits and motors of a pass, their impulses, and their work.
+
+        The first pass (`biased`) adds the impulses of the last step, and limits the displacement, with its drifts. The
+        angles are those at the start of the step, rad [H, ...].
+        """
+        system, rows, hinges, now = self._system, self._rows, self._system.hinges, table_of(motions, fixed)
+        assert hinges is not None, "a system without hinges has no limits"
+        pushes = self._twist_speeds(hinges)
+        answers = materialize(solve_factored(self._factors, pushes))
+        compliance = limits_motors.compliances(hinges) - jnp.sum(pushes[:, :, None] * answers[:, None], axis=0)
+        mean = jax.tree.map(lambda x, y: x + y / params.step, now, self._table(drifts)) if biased else now
+        speeds = limits_motors.relative_spins(hinges, mean)
+        speeds = speeds - jnp.sum(answers * _speeds(system, rows, mean)[:, None], axis=0)
+        if biased:
+            speeds = speeds + jnp.sum(compliance * impulses.twist[:, None], axis=0)
+        compliance, speeds = materialize((compliance, speeds))
+        new = limits_motors.solve(hinges, compliance, speeds, angle, impulses, params, biased)
+        change = new if biased else jax.tree.map(jnp.subtract, new, impulses)
+        now, work = limits_motors.apply(hinges, system.inertia.moment, now, change)
+        return groups_of(now, motions), new, work
+
+    def _twist_speeds(self, hinges: JointBatch) -> Array:
+        """Speeds along the rows after a unit twist on each hinge, J M^-1 E, [R, H, ...]."""
+        plan, total = self._system.plan, 0.0
+        for bodies, lever, sign in zip(plan.bodies, self._rows.levers, (-1.0, 1.0), strict=True):
+            for side, other in ((hinges.a, -1.0), (hinges.b, 1.0)):
+                same = jnp.asarray(sign * other * (bodies[plan.joint][:, None] == side.rows), lever.dtype)
+                total = total + same[..., None] * lever[:, None] * side.inertia.moment
+        return materialize(total)
 
     def schur_complements(self, groups: list[Motion]) -> list[Array]:
         """What the joints take from the inverse mass of each body, [6, N, ...] of x, y and angle, by group.

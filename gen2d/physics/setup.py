@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from gen2d.core.enums import DYNAMIC, KINEMATIC
-from gen2d.physics import rigid_joints, springs_limits_motors
+from gen2d.physics import rigid_joints, springs
 from gen2d.physics.all_pairs import AllPairs
 from gen2d.physics.broad_phase import round_robin_of
 from gen2d.physics.collision import Stadium
@@ -246,8 +246,8 @@ def _nearby_pairs(
 
 def _joints(
     scene: Scene, layout: Layout, groups: list[BodyGroupState]
-) -> tuple[list[springs_limits_motors.JointBatch], rigid_joints.JointSystem | None]:
-    """Joints in rounds, and the system of the rigid ones; bodies are rows of a table, groups before static bodies."""
+) -> tuple[list[springs.JointBatch], rigid_joints.JointSystem | None]:
+    """Springs in rounds, and the system of the rigid joints; bodies are rows of a table, static ones last."""
     if not layout.joints:
         return [], None
     values, zero = scene.joints, jnp.zeros_like(scene.objects.mass[:1])
@@ -260,26 +260,27 @@ def _joints(
     infinite = [Inertia(zero, zero)] * len(static)
     inverse = jax.tree.map(lambda *x: jnp.concatenate(x, axis=-2), *(g.inverse for g in groups), *infinite)
 
-    def side(slots: np.ndarray, anchor: Array) -> springs_limits_motors.JointSide:
+    def side(slots: np.ndarray, anchor: Array) -> springs.JointSide:
         own = np.array([rows[int(slot)] for slot in slots])
-        return springs_limits_motors.JointSide(
-            own, own >= sum(sizes), springs_limits_motors.take_rows(inverse, own), anchor
-        )
+        return springs.JointSide(own, own >= sum(sizes), springs.take_rows(inverse, own), anchor)
 
-    def batch(numbers: Sequence[int]) -> springs_limits_motors.JointBatch:
-        joints, own = [layout.joints[j] for j in numbers], springs_limits_motors.take_rows(values, np.array(numbers))
+    def batch(numbers: Sequence[int]) -> springs.JointBatch:
+        joints, own = [layout.joints[j] for j in numbers], springs.take_rows(values, np.array(numbers))
         a, b = (np.array([getattr(joint, side) for joint in joints]) for side in "ab")
         present = scene.objects.present[a] & scene.objects.present[b]
         sides = side(a, own.anchor_a), side(b, own.anchor_b)
         rest = (own.rest, own.stiffness, own.damping, own.lower, own.upper, own.motor_speed, own.motor_torque)
-        return springs_limits_motors.JointBatch(joints[0].kind, *sides, present, *rest)
+        return springs.JointBatch(*sides, present, *rest)
 
     joints = [JointSpec(joint.kind, rows[joint.a], rows[joint.b]) for joint in layout.joints]
     every = batch(range(len(joints)))
-    springs = np.array([joint.kind == "distance" for joint in joints])[:, None] & jnp.isfinite(every.stiffness)
+    soft = np.array([joint.kind == "distance" for joint in joints])[:, None] & jnp.isfinite(every.stiffness)
+    hinges = [j for j, joint in enumerate(layout.joints) if joint.kind == "revolute" and joint.limited]
     plan = rigid_joints.joint_system_plan(joints, sum(sizes))
-    system = rigid_joints.JointSystem(plan, every.a, every.b, inverse, every.present & ~springs, every.rest)
-    return [batch(numbers) for numbers in springs_limits_motors.joint_rounds(joints, sum(sizes))], system
+    system = rigid_joints.JointSystem(
+        plan, every.a, every.b, inverse, every.present & ~soft, every.rest, batch(hinges) if hinges else None
+    )
+    return [batch(numbers) for numbers in springs.spring_rounds(joints, sum(sizes))], system
 
 
 def build_model(

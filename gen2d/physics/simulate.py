@@ -10,7 +10,7 @@ import jax.numpy as jnp
 
 from gen2d.core.enums import DYNAMIC, STATIC
 from gen2d.core.errors import ConfigError
-from gen2d.physics import springs_limits_motors
+from gen2d.physics import limits_motors, springs
 from gen2d.physics.constraint import Motion
 from gen2d.physics.energy import Ledger, Work, balance, close_balance
 from gen2d.physics.params import SolverParams
@@ -123,16 +123,17 @@ def _start(state: State, layout: Layout, model: Model, keep: SaveAt, params: Sol
         zero = Motion(jnp.zeros_like(own.position), jnp.zeros_like(own.angle))
         bodies.append(BodyState(own.position, own.angle, Motion(own.velocity, own.angular_velocity), zero))
     time, contacts = jnp.zeros((), state.angle.dtype), model.solver.start(keep.contacts)
-    joints = [springs_limits_motors.zero_impulses(joint) for joint in model.joints]
+    system = model.joint_system
     if keep.energy:
         driven = model.forces is not None or any(f.motion is not None for f in model.statics)
         works = []
         for body in bodies:
             zero = jnp.zeros_like(body.angle)
             works.append(Work(zero, zero if driven else None, zero if params.damping else None))
-        by_joints = Work(*(jnp.zeros_like(model.joints[0].rest[..., :1, :]) for _ in range(3))) if joints else None
+        by_joints = None if system is None else Work(*[jnp.zeros_like(system.rest[..., :1, :])] * 3)
         ledger = Ledger(works, by_joints)
-    return WorldState(bodies, time, contacts, joints, ledger)
+    hinges = limits_motors.zero_impulses(None if system is None else system.hinges)
+    return WorldState(bodies, time, contacts, hinges, ledger)
 
 
 def _balance(world: WorldState, model: Model) -> tuple | None:
@@ -140,9 +141,8 @@ def _balance(world: WorldState, model: Model) -> tuple | None:
     if world.ledger is None:
         return None
     statics = [body.at(world.time) for body in model.statics]
-    springs = springs_limits_motors.springs_energy(model.joints, world.bodies, statics)
-    springs = springs + jnp.zeros_like(model.gravity[0])
-    return balance(model.groups, world.bodies, model.gravity, springs), close_balance(world.ledger, springs)
+    stored = springs.springs_energy(model.springs, world.bodies, statics) + jnp.zeros_like(model.gravity[0])
+    return balance(model.groups, world.bodies, model.gravity, stored), close_balance(world.ledger, stored)
 
 
 def _energy(first: tuple, later: tuple) -> Energy:

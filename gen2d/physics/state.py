@@ -5,10 +5,11 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 
-from gen2d.physics import rigid_joints, springs_limits_motors
+from gen2d.physics import rigid_joints, springs
 from gen2d.physics.collision import Shape
 from gen2d.physics.constraint import Inertia, Motion
 from gen2d.physics.energy import Ledger
+from gen2d.physics.limits_motors import HingeImpulses
 from gen2d.physics.shapes import BodyShape, to_world
 from gen2d.physics.solver_protocol import ContactSolver
 from gen2d.physics.tunnelling import Barrier
@@ -64,7 +65,7 @@ class Model(NamedTuple):
     barriers: list[Barrier]  # of static bodies at rest
     gravity: Array  # [2, ...] m/s^2
     solver: ContactSolver
-    joints: list[springs_limits_motors.JointBatch]
+    springs: list[springs.JointBatch]
     joint_system: rigid_joints.JointSystem | None
     forces: Callable | None  # (bodies, time) -> for each group force [2, N, ...] N and torque [N, ...] N m
     one: Array  # see `xla.runtime_one`
@@ -76,5 +77,5 @@ class WorldState(NamedTuple):
     bodies: list[BodyState]
     time: Array  # s
     contacts: Any  # carry of the contact solver
-    joints: list[Any]  # impulses of each round of joints
+    hinges: HingeImpulses | None  # of the last step
     ledger: Ledger | None

@@ -11,7 +11,7 @@ A step of h seconds:
 
 Pairs are solved in rounds of disjoint pairs (schedule.py), all of them (all_pairs.py) or those that are near
 (nearby_pairs.py), each round from the result of the last. Springs, limits and motors come before the contacts
-(springs_limits_motors.py), static bodies last of all pairs. Overlaps are corrected by displacements of their own
+(springs.py, limits_motors.py), static bodies last of all pairs. Overlaps are corrected by displacements of their own
 (position_correction.py). Rigid joints (rigid_joints.py) are solved before the contacts, which see what the joints
 leave of their bodies' masses (jointed.py), and after them.
 
@@ -34,16 +34,16 @@ import math
 import jax
 import jax.numpy as jnp
 
-from gen2d.physics import rigid_joints, springs_limits_motors
+from gen2d.physics import limits_motors, rigid_joints, springs
 from gen2d.physics.collision import Disc
 from gen2d.physics.constraint import Motion, speed_bound
 from gen2d.physics.contact_state import BodySide
-from gen2d.physics.energy import Ledger, Work, accumulate, record_energy
+from gen2d.physics.energy import Ledger, accumulate, record_energy
 from gen2d.physics.impact_order import not_hit
 from gen2d.physics.jointed import hold, release
 from gen2d.physics.params import SolverParams
 from gen2d.physics.shapes import to_world
-from gen2d.physics.springs_limits_motors import table_of
+from gen2d.physics.springs import poses_of, table_of
 from gen2d.physics.state import BodyState, Model, WorldState
 from gen2d.physics.support import no_support
 from gen2d.physics.tunnelling import clamp_displacement
@@ -99,15 +99,28 @@ def _displace(body: BodyState, displacement: Motion, motion: Motion) -> BodyStat
 class _RigidJoints:
     """The rigid joints in a step, with their work so far; does nothing without joints."""
 
-    def __init__(self, model: Model, world: WorldState, statics: list[BodyState], h: float) -> None:
-        self._system, self._h = model.joint_system, h
+    def __init__(self, model: Model, world: WorldState, statics: list[BodyState], params: SolverParams) -> None:
+        self._system, self._params = model.joint_system, params
         self._contacts = any(group.collides for group in model.groups)  # whether there may be contacts
         self._fixed = [body.motion for body in statics]
-        self.works: list[Work] = []
+        self.hinges, self.works = world.hinges, []
         if self._system is not None:
             self._impulses = rigid_joints.zero_impulses(self._system)
             self._anchors = rigid_joints.anchors_at(self._system, world.bodies, statics)
             self._factored = rigid_joints.FactoredSystem(self._system, self._anchors)
+            if self._system.hinges is not None:
+                self._angles = limits_motors.hinge_angles(self._system.hinges, poses_of(world.bodies, statics)[1])
+
+    def limit(self, motions: list[Motion], drifts: list[Motion] | None = None) -> list[Motion]:
+        """Motions after the limits and motors of hinges; the first pass needs the drifts."""
+        if self._system is None or self.hinges is None:
+            return motions
+        biased = drifts is not None
+        motions, self.hinges, work = self._factored.limit(
+            motions, drifts or [], self._fixed, self._angles, self.hinges, self._params, biased
+        )
+        self.works.append(work)
+        return motions
 
     def hold(self, sides: list[BodySide]) -> list[BodySide]:
         """Sides of the first pass, whose contacts see the joints at the start of the step."""
@@ -116,13 +129,15 @@ class _RigidJoints:
         self._schur = self._factored.schur_complements(_motions(sides))
         return self._held(sides)
 
-    def hold_again(self, sides: list[BodySide], displacements: list[Motion]) -> list[BodySide]:
-        """Sides of the relaxing pass, after displacements."""
-        if self._system is None:
-            return sides
-        moved = table_of(displacements, [_scaled(motion, self._h) for motion in self._fixed])
-        self._factored = rigid_joints.FactoredSystem(self._system, self._anchors, moved)
-        return self._held(sides) if self._contacts else sides
+    def move(self, displacements: list[Motion]) -> None:
+        """Moves the joints to the end of the step, for the relaxing pass."""
+        if self._system is not None:
+            moved = table_of(displacements, [_scaled(motion, self._params.step) for motion in self._fixed])
+            self._factored = rigid_joints.FactoredSystem(self._system, self._anchors, moved)
+
+    def hold_again(self, sides: list[BodySide]) -> list[BodySide]:
+        """Sides of the relaxing pass."""
+        return sides if self._system is None or not self._contacts else self._held(sides)
 
     def _held(self, sides: list[BodySide]) -> list[BodySide]:
         """Sides of a pass, whose anchors stay together.
@@ -136,10 +151,12 @@ class _RigidJoints:
     def meet(self, sides: list[BodySide], free_drifts: list[Motion]) -> tuple[list[Motion], list[Motion]]:
         """Motions with which the anchors meet at the end of the step, and the drifts: those of the sides and these."""
         sides = [release(side) for side in sides]
-        motions, drifts = _motions(sides), [side.drift for side in sides]
+        motions, drifts = _motions(sides), [side.drift for side in sides if side.drift is not None]
         if self._system is None:
             return motions, [jax.tree.map(jnp.add, *of) for of in zip(drifts, free_drifts, strict=True)]
-        solved, drifts = self._factored.meet(motions, drifts, free_drifts, self._fixed, self._impulses, self._h)
+        solved, drifts = self._factored.meet(
+            motions, drifts, free_drifts, self._fixed, self._impulses, self._params.step
+        )
         return self._solved(solved), drifts
 
     def stay(self, motions: list[Motion]) -> list[Motion]:
@@ -182,9 +199,8 @@ def step(world: WorldState, model: Model, params: SolverParams) -> WorldState:
     free, free_drifts = materialize([motion for motion, _ in flights]), [drift for _, drift in flights]
     fixed = [body.at(world.time) for body in model.statics]
 
-    joints, motions, work_warm = springs_limits_motors.warm_start(model.joints, world.bodies, fixed, free, world.joints)
-    rigid = _RigidJoints(model, world, fixed, h)
-    before = rigid.stay(motions)
+    rigid = _RigidJoints(model, world, fixed, params)
+    before = rigid.stay(free)
     shapes = [to_world(g.body_shape, b.position, b.angle) for g, b in zip(groups, world.bodies, strict=True)]
     statics = [BodySide(f.shape_at(b), f.motion) for f, b in zip(model.statics, fixed, strict=True)]
     different = accelerations if angular else [None] * len(groups)
@@ -208,9 +224,10 @@ def step(world: WorldState, model: Model, params: SolverParams) -> WorldState:
     changes = [jax.tree.map(jnp.subtract, *of) for of in zip(motions, before, strict=True)]
     drifts = [_scaled(change, -0.5 * h) for change in changes]
 
-    joints, motions, drifts, work_solve = springs_limits_motors.solve(
-        joints, motions, drifts, accelerations, fixed, params, biased=True
+    motions, drifts, works_of_springs = springs.apply(
+        model.springs, world.bodies, fixed, motions, drifts, accelerations, h
     )
+    motions = rigid.limit(motions, [jax.tree.map(jnp.add, *of) for of in zip(drifts, free_drifts, strict=True)])
     of_groups = zip(sides, motions, drifts, jax.lax.stop_gradient(changes), strict=True)
     sides = [_first_pass_side(*of, params) for of in of_groups]
     statics = [BodySide(motion=side.motion) for side in statics]
@@ -222,25 +239,24 @@ def step(world: WorldState, model: Model, params: SolverParams) -> WorldState:
     displacements = clamp_displacement(displacements, solid, model.barriers)
     bodies = [_displace(*of) for of in zip(world.bodies, displacements, motions, strict=True)]
 
-    joints, motions, _, work_relax = springs_limits_motors.solve(
-        joints, motions, displacements, accelerations, fixed, params, biased=False
-    )
+    rigid.move(displacements)
+    motions = rigid.limit(motions)
     of_groups = zip(sides, motions, displacements, strict=True)
     sides = [
         BodySide(motion=motion, displacement=moved, resting=side.resting, push=side.push, work=side.work)
         for side, motion, moved in of_groups
     ]
-    sides, carry = solver.relax(carry, solved, rigid.hold_again(sides, displacements), statics, world.time)
+    sides, carry = solver.relax(carry, solved, rigid.hold_again(sides), statics, world.time)
     motions = rigid.stay(_motions([release(side) for side in sides]))
     if ledger is not None:
         olds, works = [body.motion for body in world.bodies], [side.work for side in sides]
         done = zip(works, groups, olds, free, free_drifts, displacements, accelerations, spin_ups, strict=True)
-        by_joints = accumulate(ledger.joints, [*work_warm, *work_solve, *work_relax, *rigid.works])
+        by_joints = accumulate(ledger.joints, [*works_of_springs, *rigid.works])
         ledger = Ledger([record_energy(*of, gravity=model.gravity, h=h) for of in done], by_joints)
     return WorldState(
         bodies=[body._replace(motion=motion) for body, motion in zip(bodies, motions, strict=True)],
         time=world.time + h,
         contacts=carry,
-        joints=[joint.impulses for joint in joints],
+        hinges=rigid.hinges,
         ledger=ledger,
     )

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 
 from gen2d.physics.collision import FAR, Disc, Hull, Shape, Stadium, dot, perpendicular
 from gen2d.physics.constraint import Motion
-from gen2d.physics.springs_limits_motors import rotate
+from gen2d.physics.springs import rotate
 from gen2d.physics.time_of_impact import SLOWEST
 from gen2d.records.axes import Array
 

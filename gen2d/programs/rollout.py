@@ -87,7 +87,8 @@ class Rollout:
         # A shard size in the config must not change the videos.
         self.batch_size = config.storage.batch_size or min(default_batch, default_shard)
         slice_bytes = CPU_SLICE if self.sparse else GPU_SLICE
-        self.slice = divisor(self.batch_size, max(1, slice_bytes // frame_bytes))
+        rendered = self.plan.frames or config.annotations.wanted
+        self.slice = divisor(self.batch_size, max(1, slice_bytes // frame_bytes)) if rendered else self.batch_size
         lanes = [self.devices[0] if self.sparse else device for device in self.devices]
         self._lanes = [Lane(device, ThreadPoolExecutor(1, "lane")) for device in lanes]
         self._draws: dict[int, BoundProgram] = {}  # by number of videos

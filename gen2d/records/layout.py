@@ -25,13 +25,15 @@ class SlotGroup:
 class JointSpec:
     """A joint between slots `a` and `b`: "distance" or "revolute". The two bodies collide only if `collide`.
 
-    The slots count the objects of all groups of the layout, from 0.
+    The slots count the objects of all groups of the layout, from 0. A revolute joint that is not `limited` has neither
+    limits nor a motor, and takes less time to simulate.
     """
 
     kind: str
     a: int
     b: int
     collide: bool = False
+    limited: bool = True
 
     def __post_init__(self) -> None:
         assert self.kind in JOINT_KINDS, f"a joint is {self.kind!r}, but must be one of {', '.join(JOINT_KINDS)}"

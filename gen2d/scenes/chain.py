@@ -65,8 +65,8 @@ def check(options: Options) -> None:
 def layout(options: Options) -> Layout:
     """The pins, then the links, each hung from the previous one."""
     n, pins, radius = options.links, options.ends, options.radius.support[1]
-    joints = [JointSpec("revolute", pins + i - 1 if i else 0, pins + i) for i in range(n)]
-    joints += [JointSpec("revolute", 1, pins + n - 1)] if pins == 2 else []
+    ends = [(pins + i - 1 if i else 0, pins + i) for i in range(n)] + [(1, pins + n - 1)] * (pins == 2)
+    joints = [JointSpec("revolute", *of, limited=options.friction.support[1] > 0) for of in ends]
     groups = SlotGroup("circle", pins, STATIC, layer=2, collides=False), SlotGroup("capsule", n, collides=False)
     length = options.length.support[1]
     return Layout(groups, _bounds(options, n * length), length / 2 + radius, tuple(joints))

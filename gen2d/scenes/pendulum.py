@@ -54,10 +54,11 @@ def layout(options: Options) -> Layout:
     rods, bobs = SlotGroup("capsule", n, layer=1, collides=False), SlotGroup("circle", n, layer=2, collides=False)
     pin = SlotGroup("circle", 1, STATIC, layer=3, collides=False)
     # A bob turns about the pin or the bob above it; its light rod is fixed to it at both ends.
-    joints: list[JointSpec] = []
+    ends: list[tuple[int, int]] = []
     for i in range(n):
         rod, bob = 1 + i, 1 + n + i
-        joints += [JointSpec("revolute", bob - 1 if i else 0, bob), *[JointSpec("revolute", rod, bob)] * 2]
+        ends += [(bob - 1 if i else 0, bob), (rod, bob), (rod, bob)]
+    joints = [JointSpec("revolute", *of, limited=False) for of in ends]
     room, widest = n * length + radius, maximum(*map(abs, options.angle.support))
     low = n == 1 and options.spin.support == (0.0, 0.0) and widest < np.pi / 2
     top = maximum(radius - np.cos(widest) * options.length.support[0] if low else room, PIN)

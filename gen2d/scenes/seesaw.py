@@ -70,7 +70,8 @@ def layout(options: Options) -> Layout:
     top = options.pivot_height.support[1] + options.thickness.support[1] / 2 + options.drop_height.support[1] + height
     half = length / 2 + maximum(width, height)  # room for weights that slide off
     reach = maximum(length**2 + options.thickness.support[1] ** 2, width**2 + height**2) ** 0.5 / 2
-    return Layout(groups, (-half, 0.0, half, maximum(top, length / 2)), reach, (JointSpec("revolute", 1, 2),))
+    joint = JointSpec("revolute", 1, 2, limited=False)
+    return Layout(groups, (-half, 0.0, half, maximum(top, length / 2)), reach, (joint,))
 
 
 def sample(key: Array, factors: dict[str, Array], options: Options) -> SampledScene:

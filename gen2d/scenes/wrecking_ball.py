@@ -72,7 +72,8 @@ def layout(options: Options) -> Layout:
         SlotGroup("circle", 1, layer=3),
         SlotGroup("polygon", most, vertices=4),
     )
-    joints = [JointSpec("revolute", 1 + i, 2 + i) for i in range(n)] + [JointSpec("revolute", 2 + n, 1 + n)]
+    ends = [(1 + i, 2 + i) for i in range(n)] + [(2 + n, 1 + n)]
+    joints = [JointSpec("revolute", *of, limited=False) for of in ends]
     tower = most * height
     left = -2 * radius - options.gap.support[1] - chain
     top = maximum(options.ball_height.support[1] * tower + chain + PIN, tower)

@@ -1,6 +1,7 @@
 """Bodies, joints and poses of a `Space`."""
 
 import dataclasses
+import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple, Protocol, TypedDict
 
@@ -65,6 +66,12 @@ class Joint:
     anchor_b: np.ndarray
     collide: bool
     numbers: dict[str, float]
+
+    @property
+    def limited(self) -> bool:
+        """Whether it has a limit or a motor."""
+        limits = self.numbers["lower"], self.numbers["upper"]
+        return any(map(math.isfinite, limits)) or self.numbers["motor_torque"] > 0
 
 
 def hinge_gap(joints: Sequence[Joint], position: np.ndarray, angle: np.ndarray) -> float:

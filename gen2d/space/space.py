@@ -477,7 +477,7 @@ class Space:
         scene = Scene(objects, jnp.asarray(self.gravity, real), self._joints(real))
         # The last one, -1, is the world's if a joint needs it.
         slot = [*slots.tolist(), *np.flatnonzero(numbers < 0).tolist()]
-        joints = tuple(JointSpec(j.kind, slot[j.a], slot[j.b], j.collide) for j in self.joints)
+        joints = tuple(JointSpec(j.kind, slot[j.a], slot[j.b], j.collide, j.limited) for j in self.joints)
         return scene, state, Layout(groups, joints=joints)
 
     def _joints(self, real: Any) -> Joints | None:

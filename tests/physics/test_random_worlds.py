@@ -75,8 +75,8 @@ MANY_BOUNDS: dict[str, Bounds] = {
     "fast, mass ratios up to 1e6, e = 0.0": {ABOVE: None, RISING: 0.02, SLIPPING: 1e-5, OVERLAPPING: 0.9},
     "fast, mass ratios up to 1e6, e = 0.5": {ABOVE: None, RISING: 0.02, OVERLAPPING: 0.48},
     "fast, mass ratios up to 1e6, e = 1.0": {ABOVE: None, RISING: 0.02, SLIPPING: 1e-5, OVERLAPPING: 0.24},
-    "joints, with gravity": {ABOVE: 0.05, RISING: 0.9},
-    "joints, without": {ABOVE: 0.15, RISING: 0.6},
+    "joints, with gravity": {ABOVE: None, RISING: 0.2},
+    "joints, without": {ABOVE: None, RISING: 0.1},
 }
 # Speeds up to half of a radius in a step; a fixed obstacle may form a wedge that is narrower than a disc.
 HALF_A_RADIUS = replace(DISCS, radius=(0.45, 0.45), speed=14.0, gravity=0.0, fixed=0.0)

@@ -116,3 +116,41 @@ def test_a_spring_keeps_its_energy_at_any_stiffness(stiffness: float, bound: flo
     holds(f"spring of {stiffness:g} N/m: energy, relative", energy / energy[0] - 1, bound)  # of rounded positions
     momentum = (video.velocity * masses[:, None]).sum(1)
     holds(f"spring of {stiffness:g} N/m: momentum, relative", momentum / np.sqrt(energy[0]), 1e-4)
+
+
+def test_a_limit_that_stops_an_elbow_sees_the_shoulder():
+    """Two bars, the first pinned to the world, the second turning, stop as one body: no torque acts about the pin."""
+    space, spin, stop = Space(gravity=(0, 0)), 3.0, 1.0
+    upper = space.add_capsule((0, 0), (1, 0), 0.05, mass=2, moment=0.4)
+    lower = space.add_capsule((1, 0), (2.2, 0), 0.05, mass=1, moment=0.2, spin=spin, velocity=(0, 0.6 * spin))
+    space.add_joint("revolute", upper, anchor_a=(0, 0))
+    space.add_joint("revolute", upper, lower, anchor_a=(1, 0), limits=(-0.5, stop))
+    video = space.simulate(3, fps=240, contacts=0)
+    elbow = video.angle[:, lower] - video.angle[:, upper]
+    holds("elbow: angle beyond its limit, rad", np.maximum(elbow - stop, 0), 1e-4)
+    holds("elbow: largest angle, rad", elbow.max() - stop, 1e-4)
+    momentum = 0.2 * spin + 1.6 * 0.6 * spin  # about the pin
+    moment = 0.4 + 2 * 0.5**2 + 0.2 + 1 + 0.6**2 + 2 * 0.6 * math.cos(stop)  # at the limit
+    energy = np.asarray(video.energy.kinetic + video.energy.rotational)
+    stopped = int(np.argmax(elbow > stop - 1e-3)) + 3
+    holds(
+        "elbow: energy after the stop, relative", energy[stopped : stopped + 60] / (momentum**2 / moment / 2) - 1, 1e-3
+    )
+    holds("elbow: energy gained in a step, relative", np.maximum(np.diff(energy), 0) / energy[0], 5e-5)
+
+
+def test_a_spring_that_turns_keeps_its_energy_and_angular_momentum():
+    """Two bodies swing about each other on a spring that sweeps a radian in a tenth of a second."""
+    space, masses = Space(gravity=(0, 0)), np.array([1.0, 3.0])
+    starts = (0, 6.0), (0, -2.0)
+    bodies = [
+        space.add_circle((x, 0), 0.2, mass=m, velocity=v) for x, m, v in zip((-0.6, 0.2), masses, starts, strict=True)
+    ]
+    space.add_joint("distance", *bodies, length=1.0, stiffness=50.0)
+    video = space.simulate(4, fps=60, contacts=0)
+    x, v = (np.asarray(value, float) for value in (video.position, video.velocity))
+    stretch = np.linalg.norm(x[:, 1] - x[:, 0], axis=-1) - 1.0
+    energy = 0.5 * (masses * (v**2).sum(-1)).sum(1) + 0.5 * 50 * stretch**2
+    holds("spring that turns: energy, relative", energy / energy[0] - 1, 5e-4)
+    angular = (masses * (x[..., 0] * v[..., 1] - x[..., 1] * v[..., 0])).sum(1)
+    holds("spring that turns: angular momentum, relative", angular / angular[0] - 1, 2e-4)

@@ -1,0 +1,222 @@
+"""Springs, in rounds, and tables of the bodies that joints connect.
+
+A spring is a force, not a constraint: the mean of its values at both ends of the step, found implicitly and applied at
+half of the step (the implicit midpoint rule). This keeps the energy of a linear spring exactly and is stable at any
+stiffness. Rods and hinges are rigid and solved all at once (rigid_joints.py), with the limits and motors of hinges
+(limits_motors.py).
+
+A round is a batch of springs that share no moving body. A chain of any length takes two rounds, so programs do not grow
+with it. Bodies are rows of a table, those of all groups before the static ones.
+"""
+
+import itertools
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from gen2d.physics.collision import dot, perpendicular
+from gen2d.physics.constraint import Inertia, Motion
+from gen2d.physics.energy import Work
+from gen2d.records.axes import Array
+from gen2d.records.layout import JointSpec
+from gen2d.xla import materialize
+
+SHORTEST = 1e-6  # m: a shorter rod has no direction
+
+
+class JointSide(NamedTuple):
+    """One of the two bodies of each joint of a batch."""
+
+    rows: np.ndarray  # [P] in the table of bodies
+    static: np.ndarray  # [P] bool: static or kinematic
+    inertia: Inertia  # [P, ...]; zero of a static body
+    anchor: Array  # [2, P, ...] m, in the body's frame
+
+
+class JointBatch(NamedTuple):
+    """Constants of some joints, each [P, ...]. A distance joint of finite stiffness is a spring."""
+
+    a: JointSide
+    b: JointSide
+    present: Array
+    rest: Array
+    stiffness: Array
+    damping: Array
+    lower: Array
+    upper: Array
+    motor_speed: Array
+    motor_torque: Array
+
+
+def spring_rounds(joints: Sequence[JointSpec], moving: int) -> list[list[int]]:
+    """Numbers of the distance joints of each round; a joint is in the first round where both bodies are free.
+
+    Joints name bodies by table row; rows below `moving` are moving bodies.
+    """
+    rounds: list[tuple[set[int], list[int]]] = []
+    for number, joint in enumerate(joints):
+        if joint.kind == "distance":
+            bodies = {row for row in (joint.a, joint.b) if row < moving}
+            free = next((r for r in rounds if not r[0] & bodies), None)
+            if free is None:
+                free = set(), []
+                rounds.append(free)
+            free[0].update(bodies)
+            free[1].append(number)
+    return [numbers for _, numbers in rounds]
+
+
+def table_of(groups: Sequence[Any], statics: Sequence[Any]) -> Any:
+    """Values of all bodies in one table, [..., N, n]."""
+    return jax.tree.map(lambda *x: jnp.concatenate(x, axis=-2), *groups, *statics)
+
+
+def poses_of(bodies: Sequence[Any], statics: Sequence[Any]) -> Any:
+    """Positions and angles of all bodies in one table."""
+    return table_of(*([(body.position, body.angle) for body in some] for some in (bodies, statics)))
+
+
+def take_rows(table: Any, rows: np.ndarray) -> Any:
+    """Values of some rows of a table."""
+    return jax.tree.map(lambda x: x[..., rows, :], table)
+
+
+def groups_of(table: Any, groups: list[Any]) -> list[Any]:
+    """Values of the groups of a table."""
+    ends = list(itertools.accumulate((jax.tree.leaves(group)[0].shape[-2] for group in groups), initial=0))
+    return [jax.tree.map(lambda x, span=slice(*span): x[..., span, :], table) for span in itertools.pairwise(ends)]
+
+
+def rotate(vector: Array, angle: Array) -> Array:
+    """Vectors [2, ...] rotated counter-clockwise by an angle."""
+    cos, sin = jnp.cos(angle), jnp.sin(angle)
+    return jnp.stack([cos * vector[0] - sin * vector[1], sin * vector[0] + cos * vector[1]])
+
+
+def direction_of(offset: Array) -> tuple[Array, Array]:
+    """Unit direction and length of a vector; both zero where it is shorter than SHORTEST."""
+    squared = dot(offset, offset)
+    length = jnp.sqrt(jnp.where(squared > SHORTEST**2, squared, 1.0))
+    return jnp.where(squared > SHORTEST**2, offset / length, 0.0), jnp.where(squared > SHORTEST**2, length, 0.0)
+
+
+def anchors_of(a: JointSide, b: JointSide, poses: Any) -> tuple[Array, Array, Array]:
+    """Both arms, and the offset between the anchors, m [2, P, ...], from a table of positions and angles."""
+    (position_a, angle_a), (position_b, angle_b) = (take_rows(poses, side.rows) for side in (a, b))
+    arm_a, arm_b = materialize((rotate(a.anchor, angle_a), rotate(b.anchor, angle_b)))
+    return arm_a, arm_b, position_b + arm_b - position_a - arm_a
+
+
+def _put(table: Any, batch: JointBatch, a: Any, b: Any) -> Any:
+    """Table with both bodies of each joint replaced."""
+
+    def put(x: Array, new_a: Array, new_b: Array) -> Array:
+        count, rows = x.shape[-2], np.concatenate([batch.a.rows, batch.b.rows])
+        order = np.arange(count)
+        order[rows] = count + np.arange(len(rows))  # a static body may occur twice, but does not change
+        return jnp.concatenate([x, new_a, new_b], axis=-2)[..., order, :]
+
+    return jax.tree.map(put, table, a, b)
+
+
+def _apply_impulse(side: JointSide, arm: Array, motion: Motion, impulse: Array) -> Motion:
+    """Motion after an impulse at an arm."""
+    spin = side.inertia.moment * dot(perpendicular(arm), impulse)
+    return Motion(motion.velocity + side.inertia.mass * impulse, motion.spin + spin)
+
+
+def _total(x: Array) -> Array:
+    """Sum over a round, [1, ...]."""
+    return jnp.sum(x, axis=-2, keepdims=True)
+
+
+def apply(
+    batches: list[JointBatch],
+    bodies: list[Any],
+    statics: list[Any],
+    motions: list[Motion],
+    drifts: list[Motion],
+    accelerations: list[Array],
+    h: float,
+) -> tuple[list[Motion], list[Motion], list[Work]]:
+    """Motions and drifts (displacements beyond h times the motion) after the impulses of all springs, and works."""
+    if not batches:
+        return motions, drifts, []
+    still, poses = [body.motion for body in statics], poses_of(bodies, statics)
+    now, drift = table_of(motions, still), table_of(drifts, [jax.tree.map(jnp.zeros_like, motion) for motion in still])
+    acceleration, works = table_of(accelerations, [jnp.zeros_like(motion.velocity) for motion in still]), []
+    for batch in batches:
+        arms = anchors_of(batch.a, batch.b, poses)
+        now, drift, work = _spring(batch, *arms, now, drift, acceleration, h)
+        works.append(work)
+    return groups_of(now, motions), groups_of(drift, drifts), works
+
+
+def _spring(
+    batch: JointBatch,
+    arm_a: Array,
+    arm_b: Array,
+    offset: Array,
+    now: Motion,
+    drift: Motion,
+    acceleration: Array,
+    h: float,
+) -> tuple[Motion, Motion, Work]:
+    """Motions and drifts after the impulse of springs at half of the step, and the work that it took from the motion.
+
+    The energy stored in springs is subtracted in `energy.close_balance`.
+    """
+    soft = batch.present & jnp.isfinite(batch.stiffness)
+    k, c = (jnp.where(soft, x, 0.0) for x in (batch.stiffness, batch.damping))
+    olds = [take_rows(now, side.rows) for side in (batch.a, batch.b)]
+    arms = [rotate(arm, 0.5 * h * motion.spin) for arm, motion in zip((arm_a, arm_b), olds, strict=True)]
+    moved = [0.5 * h * old.velocity + new - arm for old, new, arm in zip(olds, arms, (arm_a, arm_b), strict=True)]
+    more, axis = moved[1] - moved[0], direction_of(offset)[0]
+    along = dot(axis, more)
+    axis, length = direction_of(offset + more - along * axis)
+    arms, axis, length, along = materialize((arms, axis, length, along))
+    sides = (batch.a, arms[0], -1), (batch.b, arms[1], 1)
+    inverse = sum(
+        side.inertia.mass + side.inertia.moment * dot(perpendicular(arm), axis) ** 2 for side, arm, _ in sides
+    )
+
+    def stretch_rate(motions: list[Motion]) -> Array:
+        of_a, of_b = (m.velocity + m.spin * perpendicular(arm) for m, (_, arm, _) in zip(motions, sides, strict=True))
+        return dot(axis, of_b - of_a)
+
+    speed = stretch_rate(olds)
+    stretch = length - batch.rest + along
+    size = -h * (k * stretch + c * speed) / (1 + inverse * h * (0.25 * h * k + 0.5 * c))
+    size, axis = materialize((size, axis))
+    impulse = size * axis
+    news = [_apply_impulse(side, arm, old, sign * impulse) for (side, arm, sign), old in zip(sides, olds, strict=True)]
+    lost = -0.5 * size * (speed + stretch_rate(news))
+    driven = jnp.zeros_like(lost)
+    for (side, arm, sign), motion in zip(sides, news, strict=True):
+        if side.static.any():  # a kinematic body does work where it is held
+            work = dot(motion.velocity + motion.spin * perpendicular(arm), impulse)
+            driven = driven - sign * jnp.where(side.static[:, None], work, 0.0)
+    # The work of the acceleration over the spring's own change of displacement is not that of contacts.
+    over_drift = jnp.zeros_like(lost)
+    for side, _, sign in sides:
+        over_drift = over_drift + 0.5 * h * sign * dot(take_rows(acceleration, side.rows), impulse)
+    drifts = [
+        _apply_impulse(side, arm, take_rows(drift, side.rows), -0.5 * h * sign * impulse) for side, arm, sign in sides
+    ]
+    work = Work(_total(-over_drift), _total(driven), _total(lost + over_drift))
+    return _put(now, batch, *news), _put(drift, batch, *drifts), work
+
+
+def springs_energy(batches: list[JointBatch], bodies: list[Any], statics: list[Any]) -> Array | float:
+    """Energy stored in all springs, J [...]: k x^2 / 2 each."""
+    if not batches:
+        return 0.0
+    poses, energy = poses_of(bodies, statics), 0.0
+    for batch in batches:
+        length = direction_of(anchors_of(batch.a, batch.b, poses)[2])[1]
+        stiffness = jnp.where(batch.present & jnp.isfinite(batch.stiffness), batch.stiffness, 0.0)
+        energy = energy + jnp.sum(0.5 * stiffness * (length - batch.rest) ** 2, axis=-2)
+    return energy
