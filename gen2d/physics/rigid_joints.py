@@ -24,7 +24,6 @@ from gen2d.physics.banded import factor, inverse_band, solve_factored
 from gen2d.physics.collision import dot, perpendicular
 from gen2d.physics.constraint import Inertia, Motion
 from gen2d.physics.energy import Work
-from gen2d.physics.limits_motors import HingeImpulses
 from gen2d.physics.params import SolverParams
 from gen2d.physics.springs import (
     JointBatch,
@@ -325,14 +324,14 @@ class FactoredSystem:
         drifts: list[Motion],
         fixed: list[Motion],
         angle: Array,
-        impulses: HingeImpulses,
+        twists: Array,
         params: SolverParams,
         biased: bool,
-    ) -> tuple[list[Motion], HingeImpulses, Work]:
-        """Motions after the limits and motors of a pass, their impulses, and their work.
+    ) -> tuple[list[Motion], Array, Work]:
+        """Motions after the limits and motors of a pass, their twists, N m s [H, ...], and their work.
 
-        The first pass (`biased`) adds the impulses of the last step, and limits the displacement, with its drifts. The
-        angles are those at the start of the step, rad [H, ...].
+        The first pass (`biased`) begins with the twists of the last step, which the motions do not have yet, and limits
+        the displacement, with its drifts. The angles are those at the start of the step, rad [H, ...].
         """
         system, rows, hinges, now = self._system, self._rows, self._system.hinges, table_of(motions, fixed)
         assert hinges is not None, "a system without hinges has no limits"
@@ -342,12 +341,11 @@ class FactoredSystem:
         mean = jax.tree.map(lambda x, y: x + y / params.step, now, self._table(drifts)) if biased else now
         speeds = limits_motors.relative_spins(hinges, mean)
         speeds = speeds - jnp.sum(answers * _speeds(system, rows, mean)[:, None], axis=0)
-        if biased:
-            speeds = speeds + jnp.sum(compliance * impulses.twist[:, None], axis=0)
+        applied = jnp.zeros_like(twists) if biased else twists
+        speeds = speeds - jnp.sum(compliance * applied, axis=1)
         compliance, speeds = materialize((compliance, speeds))
-        new = limits_motors.solve(hinges, compliance, speeds, angle, impulses, params, biased)
-        change = new if biased else jax.tree.map(jnp.subtract, new, impulses)
-        now, work = limits_motors.apply(hinges, system.inertia.moment, now, change)
+        new = limits_motors.solve(hinges, compliance, speeds, angle, twists, params, biased)
+        now, work = limits_motors.apply(hinges, system.inertia.moment, now, applied, new, params)
         return groups_of(now, motions), new, work
 
     def _twist_speeds(self, hinges: JointBatch) -> Array:

@@ -9,7 +9,6 @@ from gen2d.physics import rigid_joints, springs
 from gen2d.physics.collision import Shape
 from gen2d.physics.constraint import Inertia, Motion
 from gen2d.physics.energy import Ledger
-from gen2d.physics.limits_motors import HingeImpulses
 from gen2d.physics.shapes import BodyShape, to_world
 from gen2d.physics.solver_protocol import ContactSolver
 from gen2d.physics.tunnelling import Barrier
@@ -77,5 +76,5 @@ class WorldState(NamedTuple):
     bodies: list[BodyState]
     time: Array  # s
     contacts: Any  # carry of the contact solver
-    hinges: HingeImpulses | None  # of the last step
+    twists: Array | None  # N m s [H, ...]: of limits and motors in the last step
     ledger: Ledger | None

@@ -103,7 +103,7 @@ class _RigidJoints:
         self._system, self._params = model.joint_system, params
         self._contacts = any(group.collides for group in model.groups)  # whether there may be contacts
         self._fixed = [body.motion for body in statics]
-        self.hinges, self.works = world.hinges, []
+        self.twists, self.works = world.twists, []
         if self._system is not None:
             self._impulses = rigid_joints.zero_impulses(self._system)
             self._anchors = rigid_joints.anchors_at(self._system, world.bodies, statics)
@@ -113,11 +113,11 @@ class _RigidJoints:
 
     def limit(self, motions: list[Motion], drifts: list[Motion] | None = None) -> list[Motion]:
         """Motions after the limits and motors of hinges; the first pass needs the drifts."""
-        if self._system is None or self.hinges is None:
+        if self._system is None or self.twists is None:
             return motions
         biased = drifts is not None
-        motions, self.hinges, work = self._factored.limit(
-            motions, drifts or [], self._fixed, self._angles, self.hinges, self._params, biased
+        motions, self.twists, work = self._factored.limit(
+            motions, drifts or [], self._fixed, self._angles, self.twists, self._params, biased
         )
         self.works.append(work)
         return motions
@@ -257,6 +257,6 @@ def step(world: WorldState, model: Model, params: SolverParams) -> WorldState:
         bodies=[body._replace(motion=motion) for body, motion in zip(bodies, motions, strict=True)],
         time=world.time + h,
         contacts=carry,
-        hinges=rigid.hinges,
+        twists=rigid.twists,
         ledger=ledger,
     )

@@ -154,3 +154,31 @@ def test_a_spring_that_turns_keeps_its_energy_and_angular_momentum():
     holds("spring that turns: energy, relative", energy / energy[0] - 1, 5e-4)
     angular = (masses * (x[..., 0] * v[..., 1] - x[..., 1] * v[..., 0])).sum(1)
     holds("spring that turns: angular momentum, relative", angular / angular[0] - 1, 2e-4)
+
+
+def test_a_row_of_locked_hinges_is_a_stiff_beam():
+    """Eight bars from a wall, whose hinges have no room to turn: solved one after the other, they would fold."""
+    space, last = Space(gravity=(0, -9.81)), None
+    for i in range(8):
+        bar = space.add_box((0.5 + i, 0), 1.0, 0.2, mass=1.0)
+        ends = (bar,) if last is None else (last, bar)
+        space.add_joint("revolute", *ends, anchor_a=(i, 0), limits=(0, 0))
+        last = bar
+    video = space.simulate(2, fps=60, contacts=0)
+    holds("beam of 8 locked bars: way of its end, m", video.position[:, last, 1], 2e-3)
+    energy = np.asarray(video.energy.kinetic + video.energy.rotational + video.energy.potential)
+    holds("beam of 8 locked bars: energy gained, J", np.maximum(energy - energy[0], 0), 1e-4)
+
+
+def test_a_motor_holds_an_arm_with_just_the_torque_of_its_weight():
+    """Two bars of 1 kg, the second locked to the first, need 2 g 1 m."""
+    for torque, held in ((19.0, False), (20.0, True)):
+        space = Space(gravity=(0, -9.81))
+        upper, lower = (space.add_box((0.5 + i, 0), 1.0, 0.1, mass=1.0) for i in range(2))
+        space.add_joint("revolute", upper, anchor_a=(0, 0), motor_torque=torque)
+        space.add_joint("revolute", upper, lower, anchor_a=(1, 0), limits=(0, 0))
+        drop = space.simulate(1, fps=60, contacts=0).position[-1, lower, 1]
+        if held:
+            holds("arm that a motor holds: drop of its end, m", drop, 2e-4)
+        else:
+            assert drop < -0.05
