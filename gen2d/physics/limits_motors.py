@@ -25,7 +25,7 @@ from gen2d.records.axes import Array
 from gen2d.xla import materialize
 
 HERTZ, DAMPING_RATIO = 60.0, 5.0  # of turning back (E. Catto, 'Solver2D', 2024)
-ROUNDS, SWEEPS = 4, 2
+ROUNDS, SWEEPS = 2, 2
 LEAST = 1e-4  # share of a hinge's compliance that the joints leave at least, as the rest would be rounding
 
 
