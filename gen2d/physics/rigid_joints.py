@@ -337,7 +337,10 @@ class FactoredSystem:
         assert hinges is not None, "a system without hinges has no limits"
         pushes = self._twist_speeds(hinges)
         answers = materialize(solve_factored(self._factors, pushes))
-        compliance = limits_motors.compliances(hinges) - jnp.sum(pushes[:, :, None] * answers[:, None], axis=0)
+        compliance, padded = limits_motors.compliances(hinges), jnp.concatenate([pushes, jnp.zeros_like(pushes[:1])])
+        for places in self._rows_of_hinges(hinges):
+            own = padded[places, np.arange(len(places))]
+            compliance = compliance - own[:, None] * answers[np.minimum(places, len(answers) - 1)]
         mean = jax.tree.map(lambda x, y: x + y / params.step, now, self._table(drifts)) if biased else now
         speeds = limits_motors.relative_spins(hinges, mean)
         speeds = speeds - jnp.sum(answers * _speeds(system, rows, mean)[:, None], axis=0)
@@ -347,6 +350,15 @@ class FactoredSystem:
         new = limits_motors.solve(hinges, compliance, speeds, angle, twists, params, biased)
         now, work = limits_motors.apply(hinges, system.inertia.moment, now, applied, new, params)
         return groups_of(now, motions), new, work
+
+    def _rows_of_hinges(self, hinges: JointBatch) -> np.ndarray:
+        """Rows that share a moving body with each hinge, [most, H], padded with R."""
+        plan = self._system.plan
+        bodies = np.stack([np.where(side.static, -2, side.rows) for side in (hinges.a, hinges.b)])
+        shared = (plan.ends[:, None, :, None] == bodies[:, None]).any((0, 1))
+        places = [np.flatnonzero(rows) for rows in shared.T]
+        most = max(map(len, places))
+        return np.stack([np.pad(p, (0, most - len(p)), constant_values=len(shared)) for p in places], axis=1)
 
     def _twist_speeds(self, hinges: JointBatch) -> Array:
         """Speeds along the rows after a unit twist on each hinge, J M^-1 E, [R, H, ...]."""
