@@ -10,7 +10,6 @@ from typing import NamedTuple, TypeAlias
 import jax.numpy as jnp
 
 from gen2d.physics.collision import FAR, ManifoldPoint, dot, perpendicular
-from gen2d.physics.params import SolverParams
 from gen2d.physics.segment_lines import Neighbours
 from gen2d.physics.symmetric import product
 from gen2d.records.axes import Array
@@ -202,8 +201,3 @@ def _after_impulse(
 def impulse_change(new: Impulse, old: Impulse) -> Impulse:
     """Difference of two accumulated impulses."""
     return Impulse(new.normal - old.normal, new.tangent - old.tangent)
-
-
-def softness(constraint: ContactConstraint, params: SolverParams) -> tuple[float, float, float]:
-    """`SolverParams.softness` of an overlapping contact."""
-    return params.softness(2 * params.hertz if constraint.static else params.hertz, params.damping_ratio)

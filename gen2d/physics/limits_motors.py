@@ -46,10 +46,10 @@ def relative_spins(hinges: JointBatch, table: Motion) -> Array:
 
 def compliances(hinges: JointBatch) -> Array:
     """Relative spins of all hinges [H, H, ...] after a unit twist on each, without the other joints: E^T M^-1 E."""
-    total = jnp.zeros_like(hinges.rest[:, None] + hinges.rest)
+    total: Array | float = 0.0
     for p, sign in ((hinges.a, -1.0), (hinges.b, 1.0)):
         for q, other in ((hinges.a, -1.0), (hinges.b, 1.0)):
-            same = jnp.asarray(sign * other * (p.rows[:, None] == q.rows), total.dtype)
+            same = jnp.asarray(sign * other * (p.rows[:, None] == q.rows), hinges.rest.dtype)
             total = total + same[..., None] * p.inertia.moment[:, None]
     return total
 
@@ -83,9 +83,9 @@ def solve(
     angle: Array,
     twists: Array,
     params: SolverParams,
-    biased: bool,
+    first: bool,
 ) -> Array:
-    """Twists [H, ...] after a pass, from those of the last one.
+    """Twists [H, ...] after a pass, from those of the last one; the `first` turns hinges back that are beyond a limit.
 
     compliance: W, 1/(kg m^2) [H, H, ...]; speeds: relative spins of all hinges without twists, rad/s [H, ...];
     angle: that of each hinge at the start of the step, rad [H, ...].
@@ -94,7 +94,7 @@ def solve(
     numbers = np.arange(count)
     own, alone = compliance[numbers, numbers], hinges.a.inertia.moment + hinges.b.inertia.moment
     mass = reciprocal(own, hinges.present & (own > LEAST * alone))
-    rate = params.softness(HERTZ, DAMPING_RATIO)[0] if biased else 0.0
+    rate = params.bias_rate(HERTZ, DAMPING_RATIO) if first else 0.0
     ends = []
     for sign, limit in ((-1.0, hinges.lower), (1.0, hinges.upper)):
         limited = jnp.isfinite(limit)

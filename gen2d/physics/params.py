@@ -22,12 +22,10 @@ class SolverParams:
     mixing: str
     by_time: bool  # the impacts of discs in a step act in the order of their times, not of the solver's pairs
 
-    def softness(self, hertz: float, damping_ratio: float) -> tuple[float, float, float]:
-        """Bias rate (1/s), mass scale and impulse scale of an implicit damped spring."""
+    def bias_rate(self, hertz: float, damping_ratio: float) -> float:
+        """Share of an error that an implicit damped spring corrects, 1/s."""
         omega = 2 * math.pi * hertz
-        a1 = 2 * damping_ratio + self.step * omega
-        a2 = self.step * omega * a1
-        return omega / a1, a2 / (1 + a2), 1 / (1 + a2)
+        return omega / (2 * damping_ratio + self.step * omega)
 
 
 def solver_params(physics: PhysicsOptions, fps: float, steps: int) -> SolverParams:

@@ -26,7 +26,6 @@ from gen2d.physics.constraint import (
     apply_impulse,
     relative_speed,
     relative_velocity,
-    softness,
 )
 from gen2d.physics.contact_state import BodySide, PassSetup
 from gen2d.physics.energy import MotionPair, Work
@@ -54,7 +53,8 @@ def correct_positions(
     do not part.
     """
     assert b.drift is not None, "only static bodies lack a drift"
-    h, (rate, *_), allowed = params.step, softness(constraint, params), 0.5 * params.step * setup.threshold
+    h, allowed = params.step, 0.5 * params.step * setup.threshold
+    rate = params.bias_rate(2 * params.hertz if constraint.static else params.hertz, params.damping_ratio)
     of_a, of_b = motions
     ends = None if of_a is None else _end(of_a, a.drift, h), _end(of_b, b.drift, h)
     zero, gaps, targets = jnp.zeros_like(contacts[0].gap), [], []

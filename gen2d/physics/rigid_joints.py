@@ -42,7 +42,7 @@ from gen2d.xla import materialize
 
 X, Y, ALONG, ACROSS = range(4)  # the direction of a row
 COMPLIANCE = 2e-5  # relative to a row's diagonal: bounds the impulses of redundant joints
-NEWTON_ITERATIONS = 2
+NEWTON_ITERATIONS = 2  # with one, a level bridge of 20 planks falls
 FASTEST = 10.0  # m/s: the fastest correction of anchors that are apart
 
 
@@ -88,9 +88,13 @@ class JointSystemPlan:
 
 def places_of_bodies(bodies: np.ndarray, moving: int) -> np.ndarray:
     """Places of each body in a list of bodies, [most, N], padded with the list's length."""
-    places = [np.flatnonzero(bodies == body) for body in range(moving)]
+    return _padded([np.flatnonzero(bodies == body) for body in range(moving)], len(bodies))
+
+
+def _padded(places: list[np.ndarray], end: int) -> np.ndarray:
+    """Lists of places as columns, [most, lists], padded with `end`."""
     most = max(map(len, places))
-    return np.stack([np.pad(p, (0, most - len(p)), constant_values=len(bodies)) for p in places], axis=1)
+    return np.stack([np.pad(p, (0, most - len(p)), constant_values=end) for p in places], axis=1)
 
 
 def joint_system_plan(joints: Sequence[JointSpec], moving: int) -> JointSystemPlan:
@@ -321,33 +325,35 @@ class FactoredSystem:
     def limit(
         self,
         motions: list[Motion],
-        drifts: list[Motion],
+        drifts: list[Motion] | None,
         fixed: list[Motion],
         angle: Array,
         twists: Array,
         params: SolverParams,
-        biased: bool,
     ) -> tuple[list[Motion], Array, Work]:
         """Motions after the limits and motors of a pass, their twists, N m s [H, ...], and their work.
 
-        The first pass (`biased`) begins with the twists of the last step, which the motions do not have yet, and limits
-        the displacement, with its drifts. The angles are those at the start of the step, rad [H, ...].
+        The first pass limits the displacement, with its drifts, and begins with the twists of the last step, which the
+        motions do not have yet; the relaxing pass has no drifts. The angles are those at the start of the step, rad
+        [H, ...].
         """
         system, rows, hinges, now = self._system, self._rows, self._system.hinges, table_of(motions, fixed)
         assert hinges is not None, "a system without hinges has no limits"
         pushes = self._twist_speeds(hinges)
-        answers = materialize(solve_factored(self._factors, pushes))
+        answers = self._impulses(pushes)
         compliance, padded = limits_motors.compliances(hinges), jnp.concatenate([pushes, jnp.zeros_like(pushes[:1])])
         for places in self._rows_of_hinges(hinges):
             own = padded[places, np.arange(len(places))]
-            compliance = compliance - own[:, None] * answers[np.minimum(places, len(answers) - 1)]
-        mean = jax.tree.map(lambda x, y: x + y / params.step, now, self._table(drifts)) if biased else now
+            compliance = compliance + own[:, None] * answers[np.minimum(places, len(answers) - 1)]
+        first, mean, applied = drifts is not None, now, twists
+        if drifts is not None:
+            mean = jax.tree.map(lambda x, y: x + y / params.step, now, self._table(drifts))
+            applied = jnp.zeros_like(twists)
         speeds = limits_motors.relative_spins(hinges, mean)
-        speeds = speeds - jnp.sum(answers * _speeds(system, rows, mean)[:, None], axis=0)
-        applied = jnp.zeros_like(twists) if biased else twists
+        speeds = speeds + jnp.sum(answers * _speeds(system, rows, mean)[:, None], axis=0)
         speeds = speeds - jnp.sum(compliance * applied, axis=1)
         compliance, speeds = materialize((compliance, speeds))
-        new = limits_motors.solve(hinges, compliance, speeds, angle, twists, params, biased)
+        new = limits_motors.solve(hinges, compliance, speeds, angle, twists, params, first)
         now, work = limits_motors.apply(hinges, system.inertia.moment, now, applied, new, params)
         return groups_of(now, motions), new, work
 
@@ -356,9 +362,7 @@ class FactoredSystem:
         plan = self._system.plan
         bodies = np.stack([np.where(side.static, -2, side.rows) for side in (hinges.a, hinges.b)])
         shared = (plan.ends[:, None, :, None] == bodies[:, None]).any((0, 1))
-        places = [np.flatnonzero(rows) for rows in shared.T]
-        most = max(map(len, places))
-        return np.stack([np.pad(p, (0, most - len(p)), constant_values=len(shared)) for p in places], axis=1)
+        return _padded([np.flatnonzero(rows) for rows in shared.T], len(shared))
 
     def _twist_speeds(self, hinges: JointBatch) -> Array:
         """Speeds along the rows after a unit twist on each hinge, J M^-1 E, [R, H, ...]."""

@@ -149,21 +149,13 @@ def apply(
     now, drift = table_of(motions, still), table_of(drifts, [jax.tree.map(jnp.zeros_like, motion) for motion in still])
     acceleration, works = table_of(accelerations, [jnp.zeros_like(motion.velocity) for motion in still]), []
     for batch in batches:
-        arms = anchors_of(batch.a, batch.b, poses)
-        now, drift, work = _spring(batch, *arms, now, drift, acceleration, h)
+        now, drift, work = _spring(batch, poses, now, drift, acceleration, h)
         works.append(work)
     return groups_of(now, motions), groups_of(drift, drifts), works
 
 
 def _spring(
-    batch: JointBatch,
-    arm_a: Array,
-    arm_b: Array,
-    offset: Array,
-    now: Motion,
-    drift: Motion,
-    acceleration: Array,
-    h: float,
+    batch: JointBatch, poses: Any, now: Motion, drift: Motion, acceleration: Array, h: float
 ) -> tuple[Motion, Motion, Work]:
     """Motions and drifts after the impulse of springs at half of the step, and the work that it took from the motion.
 
@@ -172,9 +164,11 @@ def _spring(
     soft = batch.present & jnp.isfinite(batch.stiffness)
     k, c = (jnp.where(soft, x, 0.0) for x in (batch.stiffness, batch.damping))
     olds = [take_rows(now, side.rows) for side in (batch.a, batch.b)]
-    arms = [rotate(arm, 0.5 * h * motion.spin) for arm, motion in zip((arm_a, arm_b), olds, strict=True)]
-    moved = [0.5 * h * old.velocity + new - arm for old, new, arm in zip(olds, arms, (arm_a, arm_b), strict=True)]
+    *starts, offset = anchors_of(batch.a, batch.b, poses)
+    arms = [rotate(arm, 0.5 * h * motion.spin) for arm, motion in zip(starts, olds, strict=True)]
+    moved = [0.5 * h * old.velocity + arm - start for old, arm, start in zip(olds, arms, starts, strict=True)]
     more, axis = moved[1] - moved[0], direction_of(offset)[0]
+    # Only the sideways part turns the axis: a stiff spring would swing through zero length in half a step.
     along = dot(axis, more)
     axis, length = direction_of(offset + more - along * axis)
     arms, axis, length, along = materialize((arms, axis, length, along))
@@ -190,7 +184,7 @@ def _spring(
     speed = stretch_rate(olds)
     stretch = length - batch.rest + along
     size = -h * (k * stretch + c * speed) / (1 + inverse * h * (0.25 * h * k + 0.5 * c))
-    size, axis = materialize((size, axis))
+    size = materialize(size)
     impulse = size * axis
     news = [_apply_impulse(side, arm, old, sign * impulse) for (side, arm, sign), old in zip(sides, olds, strict=True)]
     lost = -0.5 * size * (speed + stretch_rate(news))

@@ -115,9 +115,8 @@ class _RigidJoints:
         """Motions after the limits and motors of hinges; the first pass needs the drifts."""
         if self._system is None or self.twists is None:
             return motions
-        biased = drifts is not None
         motions, self.twists, work = self._factored.limit(
-            motions, drifts or [], self._fixed, self._angles, self.twists, self._params, biased
+            motions, drifts, self._fixed, self._angles, self.twists, self._params
         )
         self.works.append(work)
         return motions
