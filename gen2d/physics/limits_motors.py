@@ -1,37 +1,63 @@
 """Limits and motors of hinges, solved with the other joints.
 
-A twist on a hinge, an angular impulse on b and its reaction on a, turns other bodies too, through the rigid joints.
-The relative spins of all hinges change by W = E^T (M^-1 - M^-1 J^T (J M^-1 J^T)^-1 J M^-1) E times the twists, with
-the directions E of the twists and the rows J of the joints (rigid_joints.py). Each hinge is free, driven by its motor
-with all of its torque, or pinned: to a limit, or to the speed of its motor. All pinned ones are solved at once, as one
-after the other would need thousands of sweeps where a chain of them hangs; a few rounds find which these are. Sweeps of
-projected Gauss-Seidel remove what is left.
+A twist on a hinge, an angular impulse on b and its reaction on a, turns other bodies too, through the rigid joints. So
+the system of the joints (rigid_joints.py) has a row for the angle of each hinge. Each hinge is free, driven by its
+motor with all of its torque, or pinned: to a limit, or to the speed of its motor. The rows of all pinned ones and of
+the joints are solved at once, as a chain of pinned ones is a beam, which would take thousands of sweeps of one after
+the other. A few rounds find which hinges these are, from those of the last step on (a primal-dual active set, M.
+Hintermueller, K. Ito and K. Kunisch, 2002). Without an answer after ROUNDS, the limits wait for the next pass. A pass
+keeps the twists alone: the joints are solved again after it.
 
 The first pass stops a hinge at its limit at the end of the step, and turns it back from beyond; the relaxing pass takes
 the speed of turning back away.
 """
 
+import functools
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gen2d.physics.constraint import Motion, reciprocal
+from gen2d.physics.banded import factor, multiply, solve_factored
+from gen2d.physics.constraint import Motion
 from gen2d.physics.energy import Work
 from gen2d.physics.params import SolverParams
-from gen2d.physics.springs import JointBatch, take_rows
+from gen2d.physics.rigid_joints import (
+    ANGLE,
+    COMPLIANCE,
+    Anchors,
+    JointSystem,
+    bands_of,
+    places_of_bodies,
+    rows_at,
+    speeds_along,
+    table_of_changes,
+)
+from gen2d.physics.springs import JointBatch, groups_of, table_of, take_rows
 from gen2d.records.axes import Array
 from gen2d.xla import materialize
 
 HERTZ, DAMPING_RATIO = 60.0, 5.0  # of turning back (E. Catto, 'Solver2D', 2024)
-ROUNDS, SWEEPS = 2, 2
-LEAST = 1e-4  # share of a hinge's compliance that the joints leave at least, as the rest would be rounding
+ROUNDS, LEAST_ROUNDS = 4, 2  # the second refines the solution of the first
 
 
-def zero_twists(hinges: JointBatch | None) -> Array | None:
-    """Twists before the first step, N m s [H, ...]; None without hinges."""
-    return None if hinges is None else jnp.zeros_like(hinges.rest)
+class LimitSystem(NamedTuple):
+    """Hinges that may have limits or a motor, in the order of their rows."""
+
+    joints: JointSystem  # all joints of the scene, with rows for the angles of these hinges
+    hinges: JointBatch
+    early: bool  # whether rounds end early, which has no reverse-mode derivative
+
+    @property
+    def rows(self) -> np.ndarray:
+        """Row of the angle of each hinge, [H]."""
+        return np.flatnonzero(self.joints.plan.direction == ANGLE)
+
+
+def zero_twists(system: LimitSystem | None) -> Array | None:
+    """Twists before the first step, N m s [H, ...]; None without such hinges."""
+    return None if system is None else jnp.zeros_like(system.hinges.rest)
 
 
 def hinge_angles(hinges: JointBatch, angles: Array) -> Array:
@@ -44,112 +70,151 @@ def relative_spins(hinges: JointBatch, table: Motion) -> Array:
     return take_rows(table.spin, hinges.b.rows) - take_rows(table.spin, hinges.a.rows)
 
 
-def compliances(hinges: JointBatch) -> Array:
-    """Relative spins of all hinges [H, H, ...] after a unit twist on each, without the other joints: E^T M^-1 E."""
-    total: Array | float = 0.0
-    for p, sign in ((hinges.a, -1.0), (hinges.b, 1.0)):
-        for q, other in ((hinges.a, -1.0), (hinges.b, 1.0)):
-            same = jnp.asarray(sign * other * (p.rows[:, None] == q.rows), hinges.rest.dtype)
-            total = total + same[..., None] * p.inertia.moment[:, None]
-    return total
+class _Status(NamedTuple):
+    """What pins each hinge, bool [H, ...]; a free one has no twist, or all of its motor's."""
+
+    low: Array  # its lower limit
+    high: Array
+    even: Array  # its motor, which has reached its speed
+
+    @property
+    def pinned(self) -> Array:
+        """Whether anything does."""
+        return self.low | self.high | self.even
 
 
-class _Hinge(NamedTuple):
-    """What a hinge alone does, each [H, ...] or of one hinge."""
+class _Hinges(NamedTuple):
+    """What hinges do in a pass, each [H, ...]."""
 
-    own: Array  # 1/(kg m^2): W on the diagonal
-    mass: Array  # its inverse, 0 where the joints leave nothing
-    torque: Array  # N m s: the motor's largest twist
+    usable: Array  # bool: present, of bodies that can turn
+    torque: Array  # N m s: the motor's largest twist; infinite if its limits lock the hinge
     motor: Array  # rad/s
     slowest: Array  # rad/s, by the lower limit; -infinite without one
     fastest: Array  # by the upper one
 
-    def answer(self, twist: Array, speed: Array) -> tuple[Array, Array, Array]:
-        """Twist that it needs alone, whether it is pinned, and to which speed; `speed` is that with `twist`."""
-        alone = speed - self.own * twist
-        driven = jnp.clip(self.mass * (self.motor - alone), -self.torque, self.torque)
-        turning = alone + self.own * driven
-        low, high = turning < self.slowest, turning > self.fastest
-        limit = jnp.where(low, self.slowest, jnp.where(high, self.fastest, 0.0))
-        pinned = (self.mass > 0) & (low | high | (jnp.abs(driven) < self.torque))
-        target = jnp.where(low | high, limit, self.motor)
-        return jnp.where(low | high, self.mass * (limit - alone), driven), pinned, target
+    def status(self, twists: Array) -> _Status:
+        """Status of hinges that need these twists: a limit can only push back, and a motor has a largest torque."""
+        # A motor that turns a hinge into a limit pushes with all of its torque there.
+        low = twists > jnp.where(self.motor < self.slowest, -self.torque, self.torque)
+        high = twists < jnp.where(self.motor > self.fastest, self.torque, -self.torque)
+        return _Status(*(x & self.usable for x in (low, high, ~low & ~high & (jnp.abs(twists) < self.torque))))
+
+    def next(self, status: _Status, twists: Array, speeds: Array) -> _Status:
+        """Status after a solution with another one, which gave these twists and relative spins."""
+        needed = self.status(twists)
+        free = self.usable & ~status.pinned
+        reached = free & (jnp.where(twists > 0, speeds > self.motor, speeds < self.motor) & (self.torque > 0))
+        low = (needed.low & status.low) | (free & (speeds < self.slowest))
+        high = (needed.high & status.high) | (free & (speeds > self.fastest))
+        return _Status(low, high, ~low & ~high & (needed.even | reached))
+
+    def pulls(self, status: _Status, twists: Array) -> Array:
+        """Whether a limit of a video would have to pull, bool [...]."""
+        needed = self.status(twists)
+        return jnp.any((status.low & ~needed.low) | (status.high & ~needed.high), axis=0)
+
+    def target(self, status: _Status) -> Array:
+        """Relative spin that pinned hinges have, rad/s."""
+        return jnp.where(status.low, self.slowest, jnp.where(status.high, self.fastest, self.motor))
 
 
-def solve(
-    hinges: JointBatch,
-    compliance: Array,
-    speeds: Array,
-    angle: Array,
-    twists: Array,
-    params: SolverParams,
-    first: bool,
-) -> Array:
-    """Twists [H, ...] after a pass, from those of the last one; the `first` turns hinges back that are beyond a limit.
-
-    compliance: W, 1/(kg m^2) [H, H, ...]; speeds: relative spins of all hinges without twists, rad/s [H, ...];
-    angle: that of each hinge at the start of the step, rad [H, ...].
-    """
-    count = len(hinges.a.rows)
-    numbers = np.arange(count)
-    own, alone = compliance[numbers, numbers], hinges.a.inertia.moment + hinges.b.inertia.moment
-    mass = reciprocal(own, hinges.present & (own > LEAST * alone))
+def _hinges(hinges: JointBatch, angle: Array, params: SolverParams, first: bool) -> _Hinges:
+    """What hinges at these angles do in a pass; the first one turns back those that are beyond a limit."""
     rate = params.bias_rate(HERTZ, DAMPING_RATIO) if first else 0.0
     ends = []
     for sign, limit in ((-1.0, hinges.lower), (1.0, hinges.upper)):
         limited = jnp.isfinite(limit)
         room = sign * (jnp.where(limited, limit, 0.0) - angle)
         ends.append(jnp.where(limited, sign * jnp.where(room > 0, room / params.step, rate * room), sign * jnp.inf))
-    hinge = _Hinge(own, mass, params.step * hinges.motor_torque, hinges.motor_speed, *ends)
-    hinge, compliance = materialize((hinge, compliance))
-
-    def with_twists(twists: Array) -> Array:
-        return speeds + jnp.sum(compliance * twists, axis=1)
-
-    def together(_: int, twists: Array) -> Array:
-        new, pinned, target = hinge.answer(twists, with_twists(twists))
-        free = jnp.where(pinned, 0.0, new)
-        return free + _pinned_twists(compliance, pinned, target - with_twists(free))
-
-    def one(speeds: Array, values: tuple) -> tuple[Array, Array]:
-        number, old, hinge, row = values
-        new, *_ = hinge.answer(old, jax.lax.dynamic_index_in_dim(speeds, number, keepdims=False))
-        return speeds + row * (new - old), new
-
-    if count > 1:
-        twists = jax.lax.fori_loop(0, ROUNDS, together, twists)
-    for _ in range(SWEEPS if count > 1 else 1):
-        twists = jax.lax.scan(one, with_twists(twists), (numbers, twists, hinge, compliance))[1]
-    return twists
+    usable = hinges.present & (hinges.a.inertia.moment + hinges.b.inertia.moment > 0)
+    locked = hinges.lower == hinges.upper
+    torque = jnp.where(locked, jnp.inf, params.step * hinges.motor_torque)
+    motor = jnp.where(locked, jnp.clip(0.0, *ends), hinges.motor_speed)
+    return _Hinges(usable, *materialize((torque, motor, *ends)))
 
 
-def _pinned_twists(compliance: Array, pinned: Array, missing: Array) -> Array:
-    """Twists [H, ...] that change the speeds of the pinned hinges by what is missing; 0 of others."""
-    numbers = np.arange(len(missing))
-    matrix = jnp.where(pinned[:, None] & pinned, compliance, 0.0)
-    matrix = matrix.at[numbers, numbers].add(jnp.where(pinned, LEAST * matrix[numbers, numbers], 1.0))
+class _Rounds(NamedTuple):
+    """State of the rounds."""
 
-    def eliminate(k: int, system: tuple[Array, Array]) -> tuple[Array, Array]:
-        matrix, values = system
-        row, value = (jax.lax.dynamic_index_in_dim(x, k, keepdims=False) for x in (matrix, values))
-        column = jax.lax.dynamic_index_in_dim(matrix, k, axis=1, keepdims=False)
-        share = column / jax.lax.dynamic_index_in_dim(row, k, keepdims=False)
-        share = jnp.where(numbers[:, None] == k, 0.0, share)
-        return matrix - share[:, None] * row, values - share * value
-
-    system = matrix, jnp.where(pinned, missing, 0.0)
-    matrix, values = jax.lax.fori_loop(0, len(numbers), eliminate, system)
-    return values / matrix[numbers, numbers]
+    status: _Status  # for the next one
+    twists: Array
+    speeds: Array  # along all rows [R, ...]
+    pulls: Array  # bool [...]: whether a limit of a video pulls
+    again: Array  # bool [...]: whether other limits would act in a video
+    number: Array | int
 
 
-def apply(
-    hinges: JointBatch, moments: Array, table: Motion, old: Array, new: Array, params: SolverParams
-) -> tuple[Motion, Work]:
-    """Motions of all bodies with new twists in place of old ones, and the work, J [1, ...]; moments are inverse."""
-    bodies, before = np.arange(len(moments))[:, None], relative_spins(hinges, table)
-    sign = jnp.asarray(1.0 * (bodies == hinges.b.rows) - 1.0 * (bodies == hinges.a.rows), before.dtype)
-    twist = materialize(new - old)
-    moved = Motion(table.velocity, materialize(table.spin + moments * jnp.sum(sign[..., None] * twist, axis=1)))
+def limit(
+    system: LimitSystem,
+    anchors: Anchors,
+    motions: list[Motion],
+    drifts: list[Motion] | None,
+    fixed: list[Motion],
+    angle: Array,
+    twists: Array,
+    params: SolverParams,
+) -> tuple[list[Motion], Array, Work]:
+    """Motions after the limits and motors of a pass, their twists, N m s [H, ...], and their work.
+
+    The first pass limits the displacement, with its drifts, and begins with the twists of the last step, which the
+    motions do not have yet; the relaxing pass has no drifts. The angles are those at the start of the step, rad
+    [H, ...].
+    """
+    joints, hinges, _ = system
+    first, now = drifts is not None, table_of(motions, fixed)
+    mean, applied = now, twists
+    if drifts is not None:
+        mean = jax.tree.map(lambda x, y: x + y / params.step, now, table_of_changes(joints, drifts))
+        applied = jnp.zeros_like(twists)
+    rows = rows_at(joints, anchors)
+    bands = bands_of(joints, rows)
+    rigid = take_rows(joints.rigid, joints.plan.joint) & (bands[:, 0] > 0)
+    of, places = _hinges(hinges, angle, params, first), np.full(len(joints.plan.joint), len(system.rows))
+    places[system.rows] = np.arange(len(system.rows))
+    is_angle = (joints.plan.direction == ANGLE)[:, None]
+
+    def at_rows(values: Array) -> Array:
+        """Values of the hinges at the rows of their angles, 0 or False at others."""
+        return take_rows(jnp.concatenate([values, jnp.zeros_like(values[:1])]), places)
+
+    def together(state: _Rounds) -> _Rounds:
+        status, twists, speeds = state.status, state.twists, state.speeds
+        free = jnp.clip(twists, -of.torque, of.torque)
+        change = at_rows(jnp.where(status.pinned, 0.0, free - twists))
+        speeds = materialize(speeds + multiply(bands, change))
+        factors = factor(bands, rigid & (~is_angle | at_rows(status.pinned)), COMPLIANCE)
+        more = materialize(-solve_factored(factors, materialize(speeds - at_rows(of.target(status)))))
+        twists = jnp.where(status.pinned, twists + take_rows(more, system.rows), free)
+        speeds = materialize(speeds + multiply(bands, more))
+        new = of.next(status, twists, take_rows(speeds, system.rows))
+        others = jnp.any((new.low != status.low) | (new.high != status.high), axis=0)
+        again, number = others | (state.number + 1 < LEAST_ROUNDS), state.number + 1
+        end = _Rounds(new, twists, speeds, of.pulls(status, twists), again, number)
+        kept = jax.tree.map(lambda new, old: jnp.where(state.again, new, old), end, state)
+        return kept._replace(number=number)
+
+    speeds = speeds_along(joints, rows, mean)
+    status = of.next(of.status(twists), twists, take_rows(speeds, system.rows))
+    speeds = materialize(speeds + multiply(bands, at_rows(twists - applied)))
+    every = jnp.ones_like(speeds[0], bool)
+    start = _Rounds(status, twists, speeds, pulls=~every, again=every, number=0)
+    if system.early:
+        end = jax.lax.while_loop(lambda now: jnp.any(now.again) & (now.number < ROUNDS), together, start)
+    else:
+        end = jax.lax.fori_loop(0, ROUNDS, lambda _, now: together(now), start)
+    new = jnp.where(end.pulls, jnp.clip(twists, -of.torque, of.torque), end.twists)
+    now, work = apply(system, now, applied, new, params)
+    return groups_of(now, motions), new, work
+
+
+def apply(system: LimitSystem, table: Motion, old: Array, new: Array, params: SolverParams) -> tuple[Motion, Work]:
+    """Motions of all bodies with new twists in place of old ones, and the work, J [1, ...]."""
+    hinges, twist = system.hinges, materialize(new - old)
+    before, moments = relative_spins(hinges, table), system.joints.inertia.moment
+    bodies = places_of_bodies(np.concatenate([hinges.a.rows, hinges.b.rows]), len(moments))
+    parts = jnp.concatenate([-twist, twist, jnp.zeros_like(twist[:1])])
+    total = functools.reduce(jnp.add, (take_rows(parts, places) for places in bodies))
+    moved = Motion(table.velocity, materialize(table.spin + moments * total))
     mean, bound = 0.5 * (before + relative_spins(hinges, moved)), params.step * hinges.motor_torque
     by_motor = jnp.clip(new, -bound, bound) - jnp.clip(old, -bound, bound)
     lost, driven = (by_motor - twist) * mean, by_motor * mean

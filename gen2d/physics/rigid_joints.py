@@ -7,7 +7,8 @@ diagonals for a chain of any length, and its L D L^T factors take one loop over 
 
 The two passes make a step RATTLE (H. C. Andersen, 1983), which keeps a pendulum's energy: the first makes the anchors
 meet at the end of the step, with arms that have turned by then, the second removes the speed with which they would part
-there. Contacts are solved between, and see the joints (jointed.py).
+there. Contacts are solved between, and see the joints (jointed.py). Limits and motors of hinges add rows for the angle
+of their hinge (limits_motors.py).
 """
 
 import dataclasses
@@ -19,14 +20,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gen2d.physics import limits_motors
 from gen2d.physics.banded import factor, inverse_band, solve_factored
 from gen2d.physics.collision import dot, perpendicular
 from gen2d.physics.constraint import Inertia, Motion
 from gen2d.physics.energy import Work
-from gen2d.physics.params import SolverParams
 from gen2d.physics.springs import (
-    JointBatch,
     JointSide,
     anchors_of,
     direction_of,
@@ -40,7 +38,7 @@ from gen2d.records.axes import Array
 from gen2d.records.layout import JointSpec
 from gen2d.xla import materialize
 
-X, Y, ALONG, ACROSS = range(4)  # the direction of a row
+X, Y, ALONG, ACROSS, ANGLE = range(5)  # the direction of a row
 COMPLIANCE = 2e-5  # relative to a row's diagonal: bounds the impulses of redundant joints
 NEWTON_ITERATIONS = 2  # with one, a level bridge of 20 planks falls
 FASTEST = 10.0  # m/s: the fastest correction of anchors that are apart
@@ -51,7 +49,7 @@ class JointSystemPlan:
     """Rows of the system and the bodies that they share; R rows of J joints in a table with N moving bodies."""
 
     joint: np.ndarray  # [R]
-    direction: np.ndarray  # [R] X, Y or ALONG; ACROSS: to the line from another hinge of the same two bodies
+    direction: np.ndarray  # [R] X, Y or ALONG; ACROSS the line from another hinge of the same two bodies; ANGLE
     other: np.ndarray  # [R] that hinge
     bodies: tuple[np.ndarray, np.ndarray]  # [J] table rows of both bodies
     moving: int  # N
@@ -88,19 +86,16 @@ class JointSystemPlan:
 
 def places_of_bodies(bodies: np.ndarray, moving: int) -> np.ndarray:
     """Places of each body in a list of bodies, [most, N], padded with the list's length."""
-    return _padded([np.flatnonzero(bodies == body) for body in range(moving)], len(bodies))
-
-
-def _padded(places: list[np.ndarray], end: int) -> np.ndarray:
-    """Lists of places as columns, [most, lists], padded with `end`."""
+    places = [np.flatnonzero(bodies == body) for body in range(moving)]
     most = max(map(len, places))
-    return np.stack([np.pad(p, (0, most - len(p)), constant_values=end) for p in places], axis=1)
+    return np.stack([np.pad(p, (0, most - len(p)), constant_values=len(bodies)) for p in places], axis=1)
 
 
-def joint_system_plan(joints: Sequence[JointSpec], moving: int) -> JointSystemPlan:
+def joint_system_plan(joints: Sequence[JointSpec], moving: int, angles: bool = False) -> JointSystemPlan:
     """Plan of joints whose bodies are named by table row, moving ones first.
 
-    Two hinges weld two bodies: the second has only a row across the line between them, a third is redundant.
+    Two hinges weld two bodies: the second has only a row across the line between them, a third is redundant. With
+    `angles`, each hinge that may have limits or a motor, and is the only one of its bodies, has a row for its angle.
     """
     from scipy.sparse import csr_array  # takes .2 s to import, for which scenes without joints need not wait
     from scipy.sparse.csgraph import reverse_cuthill_mckee
@@ -118,6 +113,8 @@ def joint_system_plan(joints: Sequence[JointSpec], moving: int) -> JointSystemPl
         if joints[j].kind == "distance":
             return [(j, ALONG, j)]
         alike = hinges[frozenset((joints[j].a, joints[j].b))]
+        if angles and joints[j].limited and len(alike) == 1:
+            return [(j, X, j), (j, Y, j), (j, ANGLE, j)]
         return [[(j, X, j), (j, Y, j)], [(j, ACROSS, alike[0])], []][min(alike.index(j), 2)]
 
     rows = [row for j in order for row in rows_of(int(j))]
@@ -134,7 +131,6 @@ class JointSystem(NamedTuple):
     inertia: Inertia  # of all bodies in the table; zero of static ones
     rigid: Array  # bool: present, and no spring
     rest: Array  # m, of rods
-    hinges: JointBatch | None  # that may have limits or a motor
 
 
 class JointRows(NamedTuple):
@@ -173,7 +169,8 @@ def _error(system: JointSystem, rows: JointRows, offset: Array) -> Array:
     return jnp.where((plan.direction == ALONG)[:, None], take_rows(length, plan.joint), along)
 
 
-def _rows(system: JointSystem, anchors: Anchors) -> JointRows:
+def rows_at(system: JointSystem, anchors: Anchors) -> JointRows:
+    """Rows of joints with these anchors."""
     plan, dtype = system.plan, system.rest.dtype
     direction = jnp.asarray(np.stack([plan.direction == X, plan.direction == Y])[..., None], dtype)
     direction = jnp.broadcast_to(direction, (*direction.shape[:2], *system.rest.shape[1:]))
@@ -188,11 +185,13 @@ def _rows(system: JointSystem, anchors: Anchors) -> JointRows:
     lever_a, lever_b = (
         dot(perpendicular(take_rows(arm, plan.joint)), direction) for arm in (anchors.arm_a, anchors.arm_b)
     )
+    if (plan.direction == ANGLE).any():
+        lever_a, lever_b = (jnp.where((plan.direction == ANGLE)[:, None], 1.0, x) for x in (lever_a, lever_b))
     return materialize(JointRows(direction, (lever_a, lever_b)))
 
 
-def _speeds(system: JointSystem, rows: JointRows, table: Motion) -> Array:
-    """Speed with which the anchors part along each row, m/s."""
+def speeds_along(system: JointSystem, rows: JointRows, table: Motion) -> Array:
+    """Speed with which the anchors part along each row, m/s, or the relative spin, rad/s, [R, ...]."""
     plan, speeds = system.plan, []
     for bodies, lever in zip(plan.bodies, rows.levers, strict=True):
         motion = take_rows(table, bodies[plan.joint])
@@ -200,13 +199,12 @@ def _speeds(system: JointSystem, rows: JointRows, table: Motion) -> Array:
     return speeds[1] - speeds[0]
 
 
-def _bands(system: JointSystem, rows: JointRows) -> list[Array]:
-    """Diagonals of J M^-1 J^T, 1/kg [R, ...], from the main one on.
+def bands_of(system: JointSystem, rows: JointRows) -> Array:
+    """The band matrix J M^-1 J^T, 1/kg [R, width, ...].
 
     An entry is the speed along a later row that a unit impulse along this row causes.
     """
     plan, bands = system.plan, []
-    usable = take_rows(system.rigid, plan.joint)
     inertias = [take_rows(side.inertia, plan.joint) for side in (system.a, system.b)]
     count = len(plan.joint)
     for offset in range(plan.width):
@@ -218,12 +216,7 @@ def _bands(system: JointSystem, rows: JointRows) -> list[Array]:
             angular = moment * rows.levers[a][here] * rows.levers[b][there]
             band = band + jnp.asarray(sign, linear.dtype)[:, None] * (mass * linear + angular)
         bands.append(jnp.concatenate([band, jnp.zeros_like(rows.levers[0][:offset])], axis=-2))
-    usable = usable & (bands[0] > 0)
-    for offset in range(1, plan.width):
-        both = usable & jnp.concatenate([usable[offset:], jnp.zeros_like(usable[:offset])], axis=-2)
-        bands[offset] = jnp.where(both, bands[offset], 0.0)
-    bands[0] = jnp.where(usable, (1 + COMPLIANCE) * bands[0], jnp.inf)
-    return materialize(bands)
+    return materialize(jnp.stack(bands, axis=1))
 
 
 def _apply(system: JointSystem, rows: JointRows, table: Motion, impulses: Array) -> tuple[Motion, Work]:
@@ -240,7 +233,7 @@ def _apply(system: JointSystem, rows: JointRows, table: Motion, impulses: Array)
     more = Motion(mass * total.velocity, moment * total.spin)
     new = jax.tree.map(lambda x, y: jnp.concatenate([x[..., :moving, :] + y, x[..., moving:, :]], axis=-2), table, more)
     new = materialize(new)
-    gain = 0.5 * impulses * (_speeds(system, rows, table) + _speeds(system, rows, new))
+    gain = 0.5 * impulses * (speeds_along(system, rows, table) + speeds_along(system, rows, new))
     driven, joint = jnp.zeros_like(gain), system.plan.joint
     for side, lever, sign in zip((system.a, system.b), rows.levers, (-1, 1), strict=True):
         if side.static.any():  # a kinematic body does work where it is held
@@ -256,23 +249,24 @@ def anchors_at(system: JointSystem, bodies: list[Any], statics: list[Any]) -> An
     return Anchors(*anchors_of(system.a, system.b, poses_of(bodies, statics)))
 
 
+def table_of_changes(system: JointSystem, changes: list[Motion]) -> Motion:
+    """Table of changes of the moving bodies, with zeros for the static ones."""
+    moving, rows = system.plan.moving, len(system.inertia.mass)
+    table = table_of(changes, [])
+    return jax.tree.map(lambda x: jnp.pad(x, [*[(0, 0)] * (x.ndim - 2), (0, rows - moving), (0, 0)]), table)
+
+
 class FactoredSystem:
     """The rows of the joints, factored: at the start of a step, or after displacements of all bodies."""
 
     def __init__(self, system: JointSystem, anchors: Anchors, displacements: Motion | None = None) -> None:
-        self._system, self._anchors = system, anchors
-        if displacements is not None:
-            anchors = _displace(system, anchors, displacements)
-        self._rows = _rows(system, anchors)
-        bands = _bands(system, self._rows)
-        self._compliance = jnp.where(jnp.isfinite(bands[0]), COMPLIANCE * bands[0], 0.0)
-        self._factors = factor(bands)
-
-    def _table(self, changes: list[Motion]) -> Motion:
-        """Table of changes of the moving bodies, with zeros for the static ones."""
-        moving, rows = self._system.plan.moving, len(self._system.inertia.mass)
-        table = table_of(changes, [])
-        return jax.tree.map(lambda x: jnp.pad(x, [*[(0, 0)] * (x.ndim - 2), (0, rows - moving), (0, 0)]), table)
+        self._system = system
+        self.anchors = anchors if displacements is None else _displace(system, anchors, displacements)
+        self._rows = rows_at(system, self.anchors)
+        bands, usable = bands_of(system, self._rows), take_rows(system.rigid, system.plan.joint)
+        usable = usable & (bands[:, 0] > 0)
+        self._compliance = jnp.where(usable, COMPLIANCE * bands[:, 0], 0.0)
+        self._factors = factor(bands, usable, COMPLIANCE)
 
     def meet(
         self,
@@ -290,13 +284,13 @@ class FactoredSystem:
         drift. Newton's iterations alone would put all of it into the motion, and start where a light body that is hit
         far from its hinge has turned by a radian.
         """
-        system, rows, anchors = self._system, self._rows, self._anchors
+        system, rows, anchors = self._system, self._rows, self.anchors
         error = _error(system, rows, anchors.offset)
         remaining = error - jnp.clip(error, -h * FASTEST, h * FASTEST)
         impulses, now, work = self._stay(table_of(motions, fixed), impulses)
-        drift, works = self._table(drifts), [work]
-        drift, _ = _apply(system, rows, drift, self._impulses(_speeds(system, rows, drift)))
-        drift = jax.tree.map(jnp.add, drift, self._table(free_drifts))
+        drift, works = table_of_changes(system, drifts), [work]
+        drift, _ = _apply(system, rows, drift, self._impulses(speeds_along(system, rows, drift)))
+        drift = jax.tree.map(jnp.add, drift, table_of_changes(system, free_drifts))
         for _ in range(NEWTON_ITERATIONS):
             displacement = jax.tree.map(lambda x, y: h * x + y, now, drift)
             error = _error(system, rows, _displace(system, anchors, displacement).offset)
@@ -312,7 +306,7 @@ class FactoredSystem:
 
     def _stay(self, now: Motion, impulses: Array) -> tuple[Array, Motion, Work]:
         """Accumulated impulses, motions with which the anchors stay together, and the work done."""
-        return self._solve(now, impulses, _speeds(self._system, self._rows, now))
+        return self._solve(now, impulses, speeds_along(self._system, self._rows, now))
 
     def _solve(self, now: Motion, impulses: Array, speeds: Array) -> tuple[Array, Motion, Work]:
         """Accumulated impulses that cancel the speeds of the rows, motions with them, and the work done."""
@@ -321,57 +315,6 @@ class FactoredSystem:
 
     def _impulses(self, speeds: Array) -> Array:
         return -materialize(solve_factored(self._factors, materialize(speeds)))
-
-    def limit(
-        self,
-        motions: list[Motion],
-        drifts: list[Motion] | None,
-        fixed: list[Motion],
-        angle: Array,
-        twists: Array,
-        params: SolverParams,
-    ) -> tuple[list[Motion], Array, Work]:
-        """Motions after the limits and motors of a pass, their twists, N m s [H, ...], and their work.
-
-        The first pass limits the displacement, with its drifts, and begins with the twists of the last step, which the
-        motions do not have yet; the relaxing pass has no drifts. The angles are those at the start of the step, rad
-        [H, ...].
-        """
-        system, rows, hinges, now = self._system, self._rows, self._system.hinges, table_of(motions, fixed)
-        assert hinges is not None, "a system without hinges has no limits"
-        pushes = self._twist_speeds(hinges)
-        answers = self._impulses(pushes)
-        compliance, padded = limits_motors.compliances(hinges), jnp.concatenate([pushes, jnp.zeros_like(pushes[:1])])
-        for places in self._rows_of_hinges(hinges):
-            own = padded[places, np.arange(len(places))]
-            compliance = compliance + own[:, None] * answers[np.minimum(places, len(answers) - 1)]
-        first, mean, applied = drifts is not None, now, twists
-        if drifts is not None:
-            mean = jax.tree.map(lambda x, y: x + y / params.step, now, self._table(drifts))
-            applied = jnp.zeros_like(twists)
-        speeds = limits_motors.relative_spins(hinges, mean)
-        speeds = speeds + jnp.sum(answers * _speeds(system, rows, mean)[:, None], axis=0)
-        speeds = speeds - jnp.sum(compliance * applied, axis=1)
-        compliance, speeds = materialize((compliance, speeds))
-        new = limits_motors.solve(hinges, compliance, speeds, angle, twists, params, first)
-        now, work = limits_motors.apply(hinges, system.inertia.moment, now, applied, new, params)
-        return groups_of(now, motions), new, work
-
-    def _rows_of_hinges(self, hinges: JointBatch) -> np.ndarray:
-        """Rows that share a moving body with each hinge, [most, H], padded with R."""
-        plan = self._system.plan
-        bodies = np.stack([np.where(side.static, -2, side.rows) for side in (hinges.a, hinges.b)])
-        shared = (plan.ends[:, None, :, None] == bodies[:, None]).any((0, 1))
-        return _padded([np.flatnonzero(rows) for rows in shared.T], len(shared))
-
-    def _twist_speeds(self, hinges: JointBatch) -> Array:
-        """Speeds along the rows after a unit twist on each hinge, J M^-1 E, [R, H, ...]."""
-        plan, total = self._system.plan, 0.0
-        for bodies, lever, sign in zip(plan.bodies, self._rows.levers, (-1.0, 1.0), strict=True):
-            for side, other in ((hinges.a, -1.0), (hinges.b, 1.0)):
-                same = jnp.asarray(sign * other * (bodies[plan.joint][:, None] == side.rows), lever.dtype)
-                total = total + same[..., None] * lever[:, None] * side.inertia.moment
-        return materialize(total)
 
     def schur_complements(self, groups: list[Motion]) -> list[Array]:
         """What the joints take from the inverse mass of each body, [6, N, ...] of x, y and angle, by group.
@@ -384,7 +327,7 @@ class FactoredSystem:
         for offset in range(plan.width):
             for a, b, sign in plan.shared(offset):
                 rows = np.flatnonzero(sign)
-                share = jnp.asarray(sign[rows], inverse[0].dtype)[:, None] * inverse[offset][rows]
+                share = jnp.asarray(sign[rows], inverse.dtype)[:, None] * inverse[rows, offset]
                 p, q = self._pushes(a, rows), self._pushes(b, rows + offset)
                 parts.append((share if offset == 0 else 2 * share) * outer(p, q))
                 bodies.append(plan.ends[a, rows])

@@ -3,6 +3,7 @@
 The layout says which slots hold what, so everything but the numbers is known when a program is compiled.
 """
 
+import dataclasses
 import itertools
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -12,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from gen2d.core.enums import DYNAMIC, KINEMATIC
-from gen2d.physics import rigid_joints, springs
+from gen2d.physics import limits_motors, rigid_joints, springs
 from gen2d.physics.all_pairs import AllPairs
 from gen2d.physics.broad_phase import round_robin_of
 from gen2d.physics.collision import Stadium
@@ -27,7 +28,7 @@ from gen2d.physics.shapes import BodyShape, CapsuleShape, DiscShape, body_shape_
 from gen2d.physics.state import BodyGroupState, Model, StaticBody
 from gen2d.physics.tunnelling import barriers_of
 from gen2d.records.axes import Array, Record
-from gen2d.records.layout import JointSpec, Layout, SlotGroup
+from gen2d.records.layout import Layout, SlotGroup
 from gen2d.records.scene import Objects, Scene, State
 
 
@@ -245,11 +246,11 @@ def _nearby_pairs(
 
 
 def _joints(
-    scene: Scene, layout: Layout, groups: list[BodyGroupState]
-) -> tuple[list[springs.JointBatch], rigid_joints.JointSystem | None]:
-    """Springs in rounds, and the system of the rigid joints; bodies are rows of a table, static ones last."""
+    scene: Scene, layout: Layout, groups: list[BodyGroupState], sparse: bool
+) -> tuple[list[springs.JointBatch], rigid_joints.JointSystem | None, limits_motors.LimitSystem | None]:
+    """Springs in rounds, rigid joints, limits and motors; bodies are rows of a table, static ones last."""
     if not layout.joints:
-        return [], None
+        return [], None, None
     values, zero = scene.joints, jnp.zeros_like(scene.objects.mass[:1])
     assert values is not None, "a layout with joints needs scene.joints"
     sizes = [padded_size(group.count) for group, _ in dynamic_groups(layout)]
@@ -272,15 +273,16 @@ def _joints(
         rest = (own.rest, own.stiffness, own.damping, own.lower, own.upper, own.motor_speed, own.motor_torque)
         return springs.JointBatch(*sides, present, *rest)
 
-    joints = [JointSpec(joint.kind, rows[joint.a], rows[joint.b]) for joint in layout.joints]
-    every = batch(range(len(joints)))
+    joints = [dataclasses.replace(joint, a=rows[joint.a], b=rows[joint.b]) for joint in layout.joints]
+    every, moving = batch(range(len(joints))), sum(sizes)
     soft = np.array([joint.kind == "distance" for joint in joints])[:, None] & jnp.isfinite(every.stiffness)
-    hinges = [j for j, joint in enumerate(layout.joints) if joint.kind == "revolute" and joint.limited]
-    plan = rigid_joints.joint_system_plan(joints, sum(sizes))
-    system = rigid_joints.JointSystem(
-        plan, every.a, every.b, inverse, every.present & ~soft, every.rest, batch(hinges) if hinges else None
-    )
-    return [batch(numbers) for numbers in springs.spring_rounds(joints, sum(sizes))], system
+    plan = rigid_joints.joint_system_plan(joints, moving)
+    system = rigid_joints.JointSystem(plan, every.a, every.b, inverse, every.present & ~soft, every.rest)
+    plan, limits = rigid_joints.joint_system_plan(joints, moving, angles=True), None
+    hinges = plan.joint[plan.direction == rigid_joints.ANGLE].tolist()
+    if hinges:
+        limits = limits_motors.LimitSystem(system._replace(plan=plan), batch(hinges), sparse)
+    return [batch(numbers) for numbers in springs.spring_rounds(joints, moving)], system, limits
 
 
 def build_model(
@@ -299,4 +301,4 @@ def build_model(
     for body, (group, slot) in zip(statics, static_slots(layout), strict=True):
         if group.collides and body.motion is None:
             barriers += barriers_of(body.shape, objects.present[slot : slot + 1])
-    return Model(groups, statics, barriers, scene.gravity, solver, *_joints(scene, layout, groups), forces, one)
+    return Model(groups, statics, barriers, scene.gravity, solver, *_joints(scene, layout, groups, sparse), forces, one)

@@ -132,7 +132,7 @@ def _start(state: State, layout: Layout, model: Model, keep: SaveAt, params: Sol
             works.append(Work(zero, zero if driven else None, zero if params.damping else None))
         by_joints = None if system is None else Work(*[jnp.zeros_like(system.rest[..., :1, :])] * 3)
         ledger = Ledger(works, by_joints)
-    twists = limits_motors.zero_twists(None if system is None else system.hinges)
+    twists = limits_motors.zero_twists(model.limit_system)
     return WorldState(bodies, time, contacts, twists, ledger)
 
 

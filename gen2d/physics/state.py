@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 
-from gen2d.physics import rigid_joints, springs
+from gen2d.physics import limits_motors, rigid_joints, springs
 from gen2d.physics.collision import Shape
 from gen2d.physics.constraint import Inertia, Motion
 from gen2d.physics.energy import Ledger
@@ -66,6 +66,7 @@ class Model(NamedTuple):
     solver: ContactSolver
     springs: list[springs.JointBatch]
     joint_system: rigid_joints.JointSystem | None
+    limit_system: limits_motors.LimitSystem | None
     forces: Callable | None  # (bodies, time) -> for each group force [2, N, ...] N and torque [N, ...] N m
     one: Array  # see `xla.runtime_one`
 

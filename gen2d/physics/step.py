@@ -100,23 +100,23 @@ class _RigidJoints:
     """The rigid joints in a step, with their work so far; does nothing without joints."""
 
     def __init__(self, model: Model, world: WorldState, statics: list[BodyState], params: SolverParams) -> None:
-        self._system, self._params = model.joint_system, params
+        self._system, self._limits, self._params = model.joint_system, model.limit_system, params
         self._contacts = any(group.collides for group in model.groups)  # whether there may be contacts
         self._fixed = [body.motion for body in statics]
         self.twists, self.works = world.twists, []
         if self._system is not None:
             self._impulses = rigid_joints.zero_impulses(self._system)
-            self._anchors = rigid_joints.anchors_at(self._system, world.bodies, statics)
-            self._factored = rigid_joints.FactoredSystem(self._system, self._anchors)
-            if self._system.hinges is not None:
-                self._angles = limits_motors.hinge_angles(self._system.hinges, poses_of(world.bodies, statics)[1])
+            anchors = rigid_joints.anchors_at(self._system, world.bodies, statics)
+            self._factored = rigid_joints.FactoredSystem(self._system, anchors)
+        if self._limits is not None:
+            self._angles = limits_motors.hinge_angles(self._limits.hinges, poses_of(world.bodies, statics)[1])
 
     def limit(self, motions: list[Motion], drifts: list[Motion] | None = None) -> list[Motion]:
         """Motions after the limits and motors of hinges; the first pass needs the drifts."""
-        if self._system is None or self.twists is None:
+        if self._limits is None or self.twists is None:
             return motions
-        motions, self.twists, work = self._factored.limit(
-            motions, drifts, self._fixed, self._angles, self.twists, self._params
+        motions, self.twists, work = limits_motors.limit(
+            self._limits, self._factored.anchors, motions, drifts, self._fixed, self._angles, self.twists, self._params
         )
         self.works.append(work)
         return motions
@@ -132,7 +132,7 @@ class _RigidJoints:
         """Moves the joints to the end of the step, for the relaxing pass."""
         if self._system is not None:
             moved = table_of(displacements, [_scaled(motion, self._params.step) for motion in self._fixed])
-            self._factored = rigid_joints.FactoredSystem(self._system, self._anchors, moved)
+            self._factored = rigid_joints.FactoredSystem(self._system, self._factored.anchors, moved)
 
     def hold_again(self, sides: list[BodySide]) -> list[BodySide]:
         """Sides of the relaxing pass."""

@@ -16,9 +16,9 @@ def test_band_of_an_inverse_is_that_of_the_whole_inverse(rows, width):
     i, j = np.indices((rows, rows))
     half = random.normal(size=(rows, rows)) * (i >= j) * (i - j < width) + 5 * np.eye(rows)
     matrix = half @ half.T
-    bands = [jnp.asarray(np.pad(np.diagonal(matrix, o), (0, o))[:, None], jnp.float32) for o in range(width)]
-    inverse = np.linalg.inv(matrix)
-    for offset, diagonal in enumerate(inverse_band(factor(bands))):
+    bands = np.stack([np.pad(np.diagonal(matrix, o), (0, o)) for o in range(width)], axis=1)[..., None]
+    inverse, ones = np.linalg.inv(matrix), jnp.ones((rows, 1), bool)
+    for offset, diagonal in enumerate(inverse_band(factor(jnp.asarray(bands, jnp.float32), ones)).swapaxes(0, 1)):
         expected = np.diagonal(inverse, offset)
         assert_allclose(np.asarray(diagonal)[: rows - offset, 0], expected, rtol=1e-4, atol=1e-6)
 

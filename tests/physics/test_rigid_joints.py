@@ -10,7 +10,7 @@ from laws import holds
 from numpy.testing import assert_allclose
 
 from gen2d import Space
-from gen2d.physics.banded import factor, solve_factored
+from gen2d.physics.banded import factor, multiply, solve_factored
 from gen2d.physics.rigid_joints import joint_system_plan
 from gen2d.records.layout import JointSpec
 from gen2d.space.bodies import hinge_gap
@@ -23,9 +23,15 @@ def test_a_band_is_solved_as_the_whole_matrix_is(rows, width):
     i, j = np.indices((rows, rows))
     half = random.normal(size=(5, rows, rows)) * (i >= j) * (i - j < width) + 5 * np.eye(rows)
     matrix, wanted = half @ half.swapaxes(1, 2), random.normal(size=(5, rows))
-    bands = [jnp.asarray(np.pad(np.diagonal(matrix, o, 1, 2), ((0, 0), (0, o))).T) for o in range(width)]
-    found = np.asarray(solve_factored(factor(bands), jnp.asarray(wanted.T))).T
-    assert_allclose(found, np.linalg.solve(matrix, wanted[..., None])[..., 0], rtol=1e-4, atol=1e-5)
+    bands = jnp.stack([np.pad(np.diagonal(matrix, o, 1, 2), ((0, 0), (0, o))).T for o in range(width)], axis=1)
+    every, some = np.ones((5, rows), bool), random.random((5, rows)) < 0.7
+    for usable in (every, some):
+        found = np.asarray(solve_factored(factor(bands, jnp.asarray(usable.T)), jnp.asarray(wanted.T))).T
+        both = usable[:, :, None] & usable[:, None]
+        expected = np.linalg.solve(np.where(both, matrix, np.eye(rows)), (usable * wanted)[..., None])[..., 0]
+        assert_allclose(found, expected, rtol=1e-4, atol=1e-5)
+    whole = (matrix @ wanted[..., None])[..., 0]
+    assert_allclose(np.asarray(multiply(bands, jnp.asarray(wanted.T))).T, whole, rtol=1e-4, atol=1e-4)
 
 
 def test_chains_are_narrow_bands_and_hinges_that_say_nothing_new_have_no_row():
