@@ -5,8 +5,9 @@ the system of the joints (rigid_joints.py) has a row for the angle of each hinge
 motor with all of its torque, or pinned: to a limit, or to the speed of its motor. The rows of all pinned ones and of
 the joints are solved at once, as a chain of pinned ones is a beam, which would take thousands of sweeps of one after
 the other. A few rounds find which hinges these are, from those of the last step on (a primal-dual active set, M.
-Hintermueller, K. Ito and K. Kunisch, 2002). Without an answer after ROUNDS, the limits wait for the next pass. A pass
-keeps the twists alone: the joints are solved again after it.
+Hintermueller, K. Ito and K. Kunisch, 2002). Without an answer after ROUNDS, as where other joints do not let a hinge
+turn to its limit, the limits of the video wait for the next pass. A pass keeps the twists alone: the joints are solved
+again after it.
 
 The first pass stops a hinge at its limit at the end of the step, and turns it back from beyond; the relaxing pass takes
 the speed of turning back away.
@@ -25,7 +26,6 @@ from gen2d.physics.energy import Work
 from gen2d.physics.params import SolverParams
 from gen2d.physics.rigid_joints import (
     ANGLE,
-    COMPLIANCE,
     Anchors,
     JointSystem,
     bands_of,
@@ -40,6 +40,10 @@ from gen2d.xla import materialize
 
 HERTZ, DAMPING_RATIO = 60.0, 5.0  # of turning back (E. Catto, 'Solver2D', 2024)
 ROUNDS, LEAST_ROUNDS = 4, 2  # the second refines the solution of the first
+COMPLIANCE = 5e-6  # relative to a row's diagonal: a beam of 30 locked bars needs a small one
+UNSOLVED = (
+    0.3  # share of the speeds at the start of a pass: more than this is left only where rows contradict each other
+)
 
 
 class LimitSystem(NamedTuple):
@@ -97,6 +101,7 @@ class _Hinges(NamedTuple):
         # A motor that turns a hinge into a limit pushes with all of its torque there.
         low = twists > jnp.where(self.motor < self.slowest, -self.torque, self.torque)
         high = twists < jnp.where(self.motor > self.fastest, self.torque, -self.torque)
+        low, high = low & jnp.isfinite(self.slowest), high & jnp.isfinite(self.fastest)
         return _Status(*(x & self.usable for x in (low, high, ~low & ~high & (jnp.abs(twists) < self.torque))))
 
     def next(self, status: _Status, twists: Array, speeds: Array) -> _Status:
@@ -139,7 +144,8 @@ class _Rounds(NamedTuple):
     status: _Status  # for the next one
     twists: Array
     speeds: Array  # along all rows [R, ...]
-    pulls: Array  # bool [...]: whether a limit of a video pulls
+    most: Array  # [...]: the largest of the speeds that the rounds had to remove
+    failed: Array  # bool [...]: whether a limit of a video pulls, or contradicts the joints
     again: Array  # bool [...]: whether other limits would act in a video
     number: Array | int
 
@@ -177,19 +183,25 @@ def limit(
         """Values of the hinges at the rows of their angles, 0 or False at others."""
         return take_rows(jnp.concatenate([values, jnp.zeros_like(values[:1])]), places)
 
+    def largest(speeds: Array, where: Array) -> Array:
+        return jnp.max(jnp.where(where, jnp.abs(speeds), 0.0), axis=0)
+
     def together(state: _Rounds) -> _Rounds:
         status, twists, speeds = state.status, state.twists, state.speeds
         free = jnp.clip(twists, -of.torque, of.torque)
         change = at_rows(jnp.where(status.pinned, 0.0, free - twists))
         speeds = materialize(speeds + multiply(bands, change))
-        factors = factor(bands, rigid & (~is_angle | at_rows(status.pinned)), COMPLIANCE)
-        more = materialize(-solve_factored(factors, materialize(speeds - at_rows(of.target(status)))))
+        used, target = rigid & (~is_angle | at_rows(status.pinned)), at_rows(of.target(status))
+        missing = materialize(speeds - target)
+        more = materialize(-solve_factored(factor(bands, used, COMPLIANCE), missing))
         twists = jnp.where(status.pinned, twists + take_rows(more, system.rows), free)
         speeds = materialize(speeds + multiply(bands, more))
         new = of.next(status, twists, take_rows(speeds, system.rows))
         others = jnp.any((new.low != status.low) | (new.high != status.high), axis=0)
         again, number = others | (state.number + 1 < LEAST_ROUNDS), state.number + 1
-        end = _Rounds(new, twists, speeds, of.pulls(status, twists), again, number)
+        most = jnp.maximum(state.most, largest(missing, used))
+        failed = of.pulls(status, twists) | (largest(speeds - target, used) > UNSOLVED * most)
+        end = _Rounds(new, twists, speeds, most, failed, again, number)
         kept = jax.tree.map(lambda new, old: jnp.where(state.again, new, old), end, state)
         return kept._replace(number=number)
 
@@ -197,12 +209,12 @@ def limit(
     status = of.next(of.status(twists), twists, take_rows(speeds, system.rows))
     speeds = materialize(speeds + multiply(bands, at_rows(twists - applied)))
     every = jnp.ones_like(speeds[0], bool)
-    start = _Rounds(status, twists, speeds, pulls=~every, again=every, number=0)
+    start = _Rounds(status, twists, speeds, jnp.zeros_like(speeds[0]), failed=~every, again=every, number=0)
     if system.early:
         end = jax.lax.while_loop(lambda now: jnp.any(now.again) & (now.number < ROUNDS), together, start)
     else:
         end = jax.lax.fori_loop(0, ROUNDS, lambda _, now: together(now), start)
-    new = jnp.where(end.pulls, jnp.clip(twists, -of.torque, of.torque), end.twists)
+    new = jnp.where(end.failed, jnp.clip(twists, -of.torque, of.torque), end.twists)
     now, work = apply(system, now, applied, new, params)
     return groups_of(now, motions), new, work
 

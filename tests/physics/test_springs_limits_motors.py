@@ -243,3 +243,29 @@ def test_limits_have_the_gradient_of_their_differences():
     gradient = jax.jit(jax.grad(last_angle))(jnp.asarray(0.5), scene, state)
     ends = [last_angle(jnp.asarray(torque), scene, state) for torque in (0.49, 0.51)]
     holds("bars: gradient less difference, relative", gradient / ((ends[1] - ends[0]) / 0.02) - 1, 2e-2)
+
+
+def test_chains_with_friction_in_their_hinges_only_lose_energy():
+    """Hinges that slip and stick, without limits."""
+    for torque in (0.05, 0.5):
+        space, last = Space(gravity=(0, -9.81)), None
+        for i in range(12):
+            link = space.add_capsule((0.2 * i, 0), (0.2 * i + 0.2, 0), 0.04, mass=0.1)
+            ends = (link,) if last is None else (last, link)
+            space.add_joint("revolute", *ends, anchor_a=(0.2 * i, 0), motor_torque=torque)
+            last = link
+        video = space.simulate(2, fps=60, contacts=0)
+        energy = np.asarray(video.energy.kinetic + video.energy.rotational + video.energy.potential)
+        holds("chain with friction: energy gained in a frame, J", np.maximum(np.diff(energy), 0), 1e-4)
+        holds("chain with friction: residual, J", video.energy.residual, 1e-3)
+
+
+def test_limits_that_other_joints_do_not_let_a_hinge_reach_do_nothing():
+    """A rod holds a box that its limits would turn by .3 rad."""
+    space = Space(gravity=(0, -9.81))
+    box = space.add_box((0.5, 0), 1.0, 0.2, mass=1.0)
+    space.add_joint("revolute", box, anchor_a=(0, 0), limits=(0.3, 1.0))
+    space.add_joint("distance", box, anchor_a=(1, 0), anchor_b=(1, 1))
+    video = space.simulate(2, fps=60, contacts=0)
+    holds("limits against a rod: angle, rad", video.angle[:, box], 1e-4)
+    holds("limits against a rod: spin, rad/s", video.angular_velocity[:, box], 1e-3)
