@@ -33,6 +33,7 @@ from gen2d.physics.rigid_joints import (
     rows_at,
     speeds_along,
     table_of_changes,
+    usable_rows,
 )
 from gen2d.physics.springs import JointBatch, groups_of, table_of, take_rows
 from gen2d.records.axes import Array
@@ -41,9 +42,7 @@ from gen2d.xla import materialize
 HERTZ, DAMPING_RATIO = 60.0, 5.0  # of turning back (E. Catto, 'Solver2D', 2024)
 ROUNDS, LEAST_ROUNDS = 4, 2  # the second refines the solution of the first
 COMPLIANCE = 5e-6  # relative to a row's diagonal: a beam of 30 locked bars needs a small one
-UNSOLVED = (
-    0.3  # share of the speeds at the start of a pass: more than this is left only where rows contradict each other
-)
+UNSOLVED = 0.3  # share of the speeds to remove: more than this is left only where rows contradict each other
 
 
 class LimitSystem(NamedTuple):
@@ -57,6 +56,12 @@ class LimitSystem(NamedTuple):
     def rows(self) -> np.ndarray:
         """Row of the angle of each hinge, [H]."""
         return np.flatnonzero(self.joints.plan.direction == ANGLE)
+
+    def at_rows(self, values: Array) -> Array:
+        """Values of the hinges [H, ...] at the rows of their angles, 0 or False at others, [R, ...]."""
+        places = np.full(len(self.joints.plan.joint), len(values))
+        places[self.rows] = np.arange(len(values))
+        return take_rows(jnp.concatenate([values, jnp.zeros_like(values[:1])]), places)
 
 
 def zero_twists(system: LimitSystem | None) -> Array | None:
@@ -79,12 +84,12 @@ class _Status(NamedTuple):
 
     low: Array  # its lower limit
     high: Array
-    even: Array  # its motor, which has reached its speed
+    at_speed: Array  # its motor, which has reached its speed
 
     @property
     def pinned(self) -> Array:
         """Whether anything does."""
-        return self.low | self.high | self.even
+        return self.low | self.high | self.at_speed
 
 
 class _Hinges(NamedTuple):
@@ -104,19 +109,14 @@ class _Hinges(NamedTuple):
         low, high = low & jnp.isfinite(self.slowest), high & jnp.isfinite(self.fastest)
         return _Status(*(x & self.usable for x in (low, high, ~low & ~high & (jnp.abs(twists) < self.torque))))
 
-    def next(self, status: _Status, twists: Array, speeds: Array) -> _Status:
+    def updated(self, status: _Status, twists: Array, speeds: Array) -> _Status:
         """Status after a solution with another one, which gave these twists and relative spins."""
         needed = self.status(twists)
         free = self.usable & ~status.pinned
         reached = free & (jnp.where(twists > 0, speeds > self.motor, speeds < self.motor) & (self.torque > 0))
         low = (needed.low & status.low) | (free & (speeds < self.slowest))
         high = (needed.high & status.high) | (free & (speeds > self.fastest))
-        return _Status(low, high, ~low & ~high & (needed.even | reached))
-
-    def pulls(self, status: _Status, twists: Array) -> Array:
-        """Whether a limit of a video would have to pull, bool [...]."""
-        needed = self.status(twists)
-        return jnp.any((status.low & ~needed.low) | (status.high & ~needed.high), axis=0)
+        return _Status(low, high, ~low & ~high & (needed.at_speed | reached))
 
     def target(self, status: _Status) -> Array:
         """Relative spin that pinned hinges have, rad/s."""
@@ -174,19 +174,13 @@ def limit(
         applied = jnp.zeros_like(twists)
     rows = rows_at(joints, anchors)
     bands = bands_of(joints, rows)
-    rigid = take_rows(joints.rigid, joints.plan.joint) & (bands[:, 0] > 0)
-    of, places = _hinges(hinges, angle, params, first), np.full(len(joints.plan.joint), len(system.rows))
-    places[system.rows] = np.arange(len(system.rows))
-    is_angle = (joints.plan.direction == ANGLE)[:, None]
-
-    def at_rows(values: Array) -> Array:
-        """Values of the hinges at the rows of their angles, 0 or False at others."""
-        return take_rows(jnp.concatenate([values, jnp.zeros_like(values[:1])]), places)
+    rigid, is_angle = usable_rows(joints, bands), (joints.plan.direction == ANGLE)[:, None]
+    of, at_rows = _hinges(hinges, angle, params, first), system.at_rows
 
     def largest(speeds: Array, where: Array) -> Array:
         return jnp.max(jnp.where(where, jnp.abs(speeds), 0.0), axis=0)
 
-    def together(state: _Rounds) -> _Rounds:
+    def solve_round(state: _Rounds) -> _Rounds:
         status, twists, speeds = state.status, state.twists, state.speeds
         free = jnp.clip(twists, -of.torque, of.torque)
         change = at_rows(jnp.where(status.pinned, 0.0, free - twists))
@@ -196,24 +190,25 @@ def limit(
         more = materialize(-solve_factored(factor(bands, used, COMPLIANCE), missing))
         twists = jnp.where(status.pinned, twists + take_rows(more, system.rows), free)
         speeds = materialize(speeds + multiply(bands, more))
-        new = of.next(status, twists, take_rows(speeds, system.rows))
+        new = of.updated(status, twists, take_rows(speeds, system.rows))
         others = jnp.any((new.low != status.low) | (new.high != status.high), axis=0)
         again, number = others | (state.number + 1 < LEAST_ROUNDS), state.number + 1
         most = jnp.maximum(state.most, largest(missing, used))
-        failed = of.pulls(status, twists) | (largest(speeds - target, used) > UNSOLVED * most)
+        pulls = jnp.any((status.low & ~new.low) | (status.high & ~new.high), axis=0)
+        failed = pulls | (largest(speeds - target, used) > UNSOLVED * most)
         end = _Rounds(new, twists, speeds, most, failed, again, number)
         kept = jax.tree.map(lambda new, old: jnp.where(state.again, new, old), end, state)
         return kept._replace(number=number)
 
     speeds = speeds_along(joints, rows, mean)
-    status = of.next(of.status(twists), twists, take_rows(speeds, system.rows))
+    status = of.updated(of.status(twists), twists, take_rows(speeds, system.rows))
     speeds = materialize(speeds + multiply(bands, at_rows(twists - applied)))
     every = jnp.ones_like(speeds[0], bool)
     start = _Rounds(status, twists, speeds, jnp.zeros_like(speeds[0]), failed=~every, again=every, number=0)
     if system.early:
-        end = jax.lax.while_loop(lambda now: jnp.any(now.again) & (now.number < ROUNDS), together, start)
+        end = jax.lax.while_loop(lambda now: jnp.any(now.again) & (now.number < ROUNDS), solve_round, start)
     else:
-        end = jax.lax.fori_loop(0, ROUNDS, lambda _, now: together(now), start)
+        end = jax.lax.fori_loop(0, ROUNDS, lambda _, now: solve_round(now), start)
     new = jnp.where(end.failed, jnp.clip(twists, -of.torque, of.torque), end.twists)
     now, work = apply(system, now, applied, new, params)
     return groups_of(now, motions), new, work

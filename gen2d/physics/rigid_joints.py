@@ -219,6 +219,11 @@ def bands_of(system: JointSystem, rows: JointRows) -> Array:
     return materialize(jnp.stack(bands, axis=1))
 
 
+def usable_rows(system: JointSystem, bands: Array) -> Array:
+    """Whether each row is of a present joint that can move a body, bool [R, ...]."""
+    return take_rows(system.rigid, system.plan.joint) & (bands[:, 0] > 0)
+
+
 def _apply(system: JointSystem, rows: JointRows, table: Motion, impulses: Array) -> tuple[Motion, Work]:
     """Motions after impulses, and their work, J [1, ...]."""
     linear, (lever_a, lever_b) = impulses * rows.direction, rows.levers
@@ -263,8 +268,8 @@ class FactoredSystem:
         self._system = system
         self.anchors = anchors if displacements is None else _displace(system, anchors, displacements)
         self._rows = rows_at(system, self.anchors)
-        bands, usable = bands_of(system, self._rows), take_rows(system.rigid, system.plan.joint)
-        usable = usable & (bands[:, 0] > 0)
+        bands = bands_of(system, self._rows)
+        usable = usable_rows(system, bands)
         self._compliance = jnp.where(usable, COMPLIANCE * bands[:, 0], 0.0)
         self._factors = factor(bands, usable, COMPLIANCE)
 
