@@ -99,11 +99,14 @@ def _clamp(
     for ((a, one_sided), b), risk in zip(pairs, risky, strict=True):
         normal, offset = perpendicular(a.direction), b.centre - a.centre
         distance, across = dot(normal, offset), dot(normal, b.displacement)
-        gap = jnp.sign(distance) * (distance + across) - a.radius - b.radius
-        through = (distance * across < 0) & (gap < -0.5 * b.radius)
-        crossing = distance / jnp.where(through, -across, 1.0)  # the fraction at which the centre is on the line
-        along = jnp.abs(dot(a.direction, offset + crossing * b.displacement))
-        through = through & (along <= a.half_length + 0.9 * b.radius)
+        inwards = distance * across < 0
+        crossing = distance / jnp.where(inwards, -across, 1.0)  # the fraction at which the centre is on the line
+        nearest = jnp.minimum(crossing, 1.0)
+        beside = jnp.maximum(jnp.abs(distance + nearest * across) - a.radius, 0.0)
+        along = jnp.abs(dot(a.direction, offset + nearest * b.displacement))
+        beyond = jnp.maximum(along - a.half_length, 0.0)
+        reach = jnp.where(crossing <= 1, 0.9, 0.5) * b.radius
+        through = inwards & (beside**2 + beyond**2 < reach**2)
         if one_sided:
             through = through & (distance > 0)
         through = through & risk  # so that other scenes of the batch have no effect

@@ -358,3 +358,31 @@ def test_the_end_of_a_capsule_does_not_turn_through_a_floor():
 
 def test_a_body_may_leave_a_polygon():
     assert clamped(shape_at(BODIES["disc"], 0, -0.3), (0, 3), 0.0, FLOORS["polygon"])[1] == 3
+
+
+SHORT = {
+    "segment": CapsuleShape(jnp.full((1, 1), 0.5), jnp.zeros((1, 1))),
+    "polygon": box(1.0, 0.4),
+    "rounded polygon": box(1.0, 0.4)._replace(radius=jnp.full((1, 1), 0.05)),
+}
+
+
+@pytest.mark.parametrize("barrier", SHORT)
+@pytest.mark.parametrize("ends", [1, 2])
+def test_a_body_that_passes_a_corner_is_not_held(barrier, ends):
+    """A capsule hung in the air beside the corner of a box: its end had crossed the line of a side, but not the side."""
+    rng, count, radius = np.random.default_rng(0), 20000, 0.1
+    start, moved = rng.uniform(-1, 1, (2, 1, count)), rng.uniform(-0.3, 0.3, (2, 1, count))
+    one, static = jnp.ones((1, count)), to_world(SHORT[barrier], jnp.zeros((2, 1, 1)), jnp.zeros((1, 1)))
+    disc, capsule = DiscShape(radius * one), CapsuleShape(0.2 * one, radius * one)
+    body = to_world(disc if ends == 1 else capsule, jnp.asarray(start), rng.uniform(0, np.pi, (1, count)))
+    (new,) = clamp_displacement([Motion(jnp.asarray(moved), 0 * one)], [body], barriers_of(static, one[:, :1] > 0))
+    arm = 0.0 if ends == 1 else 0.2 * np.asarray(body.direction)
+    height, skin = (0.0 if barrier == "segment" else 0.2), (0.05 if barrier == "rounded polygon" else 0.0)
+    free = np.ones(count, bool)
+    for part, side in itertools.product(np.linspace(0, 1, 101), (1, -1)):
+        x, y = np.abs(start + part * moved + side * arm)[:, 0]
+        free &= np.hypot(np.maximum(x - 0.5, 0), np.maximum(y - height, 0)) > radius + skin + 1e-3
+    assert 1000 < free.sum() < count - 1000
+    assert (np.asarray(new.velocity)[:, :, free] == np.asarray(jnp.asarray(moved))[:, :, free]).all()
+    assert (np.asarray(new.velocity) != np.asarray(jnp.asarray(moved))).any()  # some others are held
