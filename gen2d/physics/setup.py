@@ -129,6 +129,15 @@ def _collide(a: Material, b: Material, layout: Layout) -> Array:
     return ~excluded
 
 
+def _passing(layout: Layout, slot: int) -> list[np.ndarray]:
+    """Bodies [N, 1] of each dynamic group that do not collide with the one in this slot, as a joint connects them."""
+    ends = [{joint.a, joint.b} for joint in layout.joints if not joint.collide]
+    return [
+        np.array([[{slot, first + i} in ends] for i in range(padded_size(group.count))])
+        for group, first in dynamic_groups(layout)
+    ]
+
+
 def _constraint(
     a: Material, b: Material, shapes: tuple[BodyShape, BodyShape], static: bool, layout: Layout, mixing: str
 ) -> ContactConstraint:
@@ -300,5 +309,5 @@ def build_model(
     barriers = []
     for body, (group, slot) in zip(statics, static_slots(layout), strict=True):
         if group.collides and body.motion is None:
-            barriers += barriers_of(body.shape, objects.present[slot : slot + 1])
+            barriers += barriers_of(body.shape, objects.present[slot : slot + 1], _passing(layout, slot))
     return Model(groups, statics, barriers, scene.gravity, solver, *_joints(scene, layout, groups, sparse), forces, one)

@@ -39,12 +39,14 @@ RECIPES = {
 }
 NO_STATICS = replace(FULL, closed=False, gravity=0.0)
 DEEP = 0.05  # m: an overlap that is too large where bodies have had half a second to part
-NOT_FINITE, LEFT, RISING, ABOVE, OVERLAPPING, PULLING, SLIPPING, IDLE = LAWS = (
+DETOUR = 0.02  # m: more than overlaps push a body in a step
+NOT_FINITE, LEFT, RISING, ABOVE, OVERLAPPING, DETOURING, PULLING, SLIPPING, IDLE = LAWS = (
     "worlds that are not finite",
     "worlds that lose a body",
     "worlds that gain 1e-4 of their energy in a step",
     "worlds whose energy exceeds that at the start by 1e-4",
     "worlds with an overlap over 5 cm at the mark of a half second",
+    "worlds in which a body that touches nothing leaves its parabola",
     "rows of contacts that pull",
     "rows of contacts over Coulomb's bound",
     "rows without a contact that have an impulse",
@@ -68,13 +70,13 @@ MANY_BOUNDS: dict[str, Bounds] = {
     "elastic discs": {},
     "discs, mass ratios up to 1e6": {RISING: 0.03, OVERLAPPING: 0.56},
     "all shapes": {RISING: None, OVERLAPPING: 0.1},
-    "elastic shapes": {RISING: None},
-    "mass ratios up to 1e6": {ABOVE: None, RISING: 0.02, OVERLAPPING: 0.58},
+    "elastic shapes": {},
+    "mass ratios up to 1e6": {RISING: 0.02, OVERLAPPING: 0.58},
     "smooth elastic boxes": {OVERLAPPING: 0.02},
     "smooth elastic boxes and fast small discs": {OVERLAPPING: None},
-    "fast, mass ratios up to 1e6, e = 0.0": {ABOVE: None, RISING: 0.02, SLIPPING: 1e-5, OVERLAPPING: 0.9},
-    "fast, mass ratios up to 1e6, e = 0.5": {ABOVE: None, RISING: 0.02, OVERLAPPING: 0.48},
-    "fast, mass ratios up to 1e6, e = 1.0": {ABOVE: None, RISING: 0.02, SLIPPING: 1e-5, OVERLAPPING: 0.24},
+    "fast, mass ratios up to 1e6, e = 0.0": {RISING: 0.02, DETOURING: None, SLIPPING: 1e-5, OVERLAPPING: 0.9},
+    "fast, mass ratios up to 1e6, e = 0.5": {RISING: 0.02, OVERLAPPING: 0.48},
+    "fast, mass ratios up to 1e6, e = 1.0": {RISING: None, DETOURING: 0.09, SLIPPING: 1e-5, OVERLAPPING: 0.24},
     "joints, with gravity": {ABOVE: None, RISING: 0.2},
     "joints, without": {ABOVE: None, RISING: 0.1},
 }
@@ -95,6 +97,7 @@ def check_laws(name: str, batches: list[Measures], bounds: Bounds, rarely: float
         [m.gain_in_step > 1e-4 for m in batches],
         [m.gain > 1e-4 for m in batches],
         [(m.overlap > DEEP).any(1) for m in batches],
+        [m.detour > DETOUR for m in batches],
         [m.normal_impulse[m.rows] < 0 for m in batches],
         [m.slipping[m.rows] for m in batches],
         [m.idle_impulses for m in batches],
@@ -205,7 +208,7 @@ OPTIONS = {
     "short steps, soft contacts, geometric means": rules(1 / 960, hertz=5.0, push_speed=0.1, mixing="geometric"),
 }
 OPTION_BOUNDS: dict[str, Bounds] = {
-    "long steps, damping, means": {RISING: 0.15, OVERLAPPING: 0.15},
+    "long steps, damping, means": {OVERLAPPING: 0.05},
     "stiff contacts, high threshold, maxima": {RISING: 0.2},
     "short steps, soft contacts, geometric means": {RISING: None},
 }

@@ -52,6 +52,19 @@ def ends(video: Video, number: int, half: float) -> np.ndarray:
     return np.stack([video.position[:, number] - way, video.position[:, number] + way])
 
 
+@pytest.mark.parametrize("kind", ["revolute", "distance"])
+def test_a_body_swings_through_the_static_box_that_a_joint_ties_it_to(kind):
+    """The sides of the box stopped the body, which hung in the air, although the two do not collide."""
+    states = []
+    for size in ((0.8, 2.4), (0.1, 0.1)):
+        space = Space(gravity=(0, -9.81))
+        box, bob = space.add_box((0, 0), *size, kind="static"), space.add_capsule((-1.3, 0), (-0.5, 0), 0.1)
+        space.add_joint(kind, bob, box, anchor_a=(0, 0) if kind == "revolute" else None)
+        states.append(space.simulate(2.0, fps=60).position[:, bob])
+    assert states[1][:, 0].max() > 0.5  # it gets to the other side
+    assert_allclose(*states, atol=1e-4)
+
+
 def test_a_bob_on_a_rod_that_strikes_a_wall_gains_no_energy():
     """The rod is nearly perpendicular to the wall when the bob strikes, so it takes nearly all of each impact."""
     space, gravity = Space(gravity=(0, -9.81)), 9.81

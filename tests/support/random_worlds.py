@@ -303,6 +303,7 @@ class Measures(NamedTuple):
     contacts: Contacts
     friction: np.ndarray  # [n, C] of the pair of each row
     overlap: np.ndarray  # [n, M] m: deepest overlap of a moving body at each mark
+    detour: np.ndarray  # [n] m: farthest that a body on no joint, without a contact, ends a step off its parabola
 
     @property
     def gain_in_step(self) -> np.ndarray:
@@ -349,11 +350,11 @@ def measure(
     for k in range(len(recipes)):
         part = slice(k * seeds, (k + 1) * seeds)
         scene, states, contacts = jax.tree.map(lambda x, part=part: x[part], every)
-        measures.append(_measures(arena, scene, states, contacts, params.mixing))
+        measures.append(_measures(arena, scene, states, contacts, params))
     return measures
 
 
-def _measures(arena: Arena, scene: Scene, states: State, contacts: Contacts, mixing: str) -> Measures:
+def _measures(arena: Arena, scene: Scene, states: State, contacts: Contacts, params: SolverParams) -> Measures:
     objects, moving = scene.objects, slice(arena.moving)
     present = np.asarray(objects.present)[:, None, moving]
     mass, moment = (
@@ -377,9 +378,31 @@ def _measures(arena: Arena, scene: Scene, states: State, contacts: Contacts, mix
         angular_scale=turning.sum(-1)[:, 0],
         outside=np.where(present, np.nan_to_num(np.abs(x).max(-1) - HALF, nan=np.inf), -HALF).max((1, 2)),
         contacts=contacts,
-        friction=MIXING[mixing](*frictions),
+        friction=MIXING[params.mixing](*frictions),
         overlap=deepest(objects, np.asarray(states.position)[:, MARKS], np.asarray(states.angle)[:, MARKS]),
+        detour=_detour(present & ~_on_joints(arena, scene), x, v, contacts, params.step),
     )
+
+
+def _on_joints(arena: Arena, scene: Scene) -> np.ndarray:
+    """Whether a joint may hold a moving body, [n, 1, moving]."""
+    slots = [end for joint in arena.layout.joints for end in (joint.a, joint.b)]
+    stiffness = np.zeros((len(scene.gravity), 1)) if scene.joints is None else np.asarray(scene.joints.stiffness)
+    return np.isin(np.arange(arena.moving), slots) & (stiffness != 0).any(1)[:, None, None]
+
+
+def _detour(free: np.ndarray, x: np.ndarray, v: np.ndarray, contacts: Contacts, h: float) -> np.ndarray:
+    """See `Measures.detour`; `free` [n, 1, moving] are the bodies to look at."""
+    off = np.linalg.norm(np.diff(x, axis=1) - (v[:, 1:] + v[:, :-1]) * h / 2, axis=-1)
+    free = np.broadcast_to(free, off.shape).copy()
+    world, row = np.nonzero(np.asarray(contacts.kind) != NO_CONTACT)
+    frame = np.asarray(contacts.frame, int)[world, row]
+    for slots in (contacts.a, contacts.b):
+        slot = np.asarray(slots, int)[world, row]
+        moving = slot < off.shape[2]
+        for step in (frame - 1, frame):
+            free[world[moving], np.clip(step, 0, off.shape[1] - 1)[moving], slot[moving]] = False
+    return np.nan_to_num(np.where(free, off, 0.0)).max((1, 2))
 
 
 def _springs(arena: Arena, scene: Scene, states: State) -> np.ndarray | float:
