@@ -120,7 +120,7 @@ def tumbler(space: Space) -> None:
     for k in range(4):
         angle = k * math.pi / 2
         centre = 2.6 * math.cos(angle), 2.6 * math.sin(angle)
-        wall = space.add_box(centre, 0.3, 5.0, angle=angle, density=20.0)
+        wall = space.add_box(centre, 0.3, 4.88, angle=angle, density=20.0)
         space.add_joint("revolute", wall, anchor_a=(0, 0), motor_speed=0.5, motor_torque=1e4)
     for k in range(30):
         space.add_box((0.6 * (k % 6) - 1.5, 0.6 * (k // 6) - 1.2), 0.4, 0.4)
