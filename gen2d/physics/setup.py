@@ -124,16 +124,16 @@ def _collide(a: Material, b: Material, layout: Layout) -> Array:
         if not group.collides:
             for slot in (a.slot, b.slot):
                 excluded = excluded | ((slot >= first) & (slot < first + group.count))
-    for i, j in ((joint.a, joint.b) for joint in layout.joints if not joint.collide):
+    for i, j in layout.exempt:
         excluded = excluded | ((a.slot == i) & (b.slot == j)) | ((a.slot == j) & (b.slot == i))
     return ~excluded
 
 
 def _passing(layout: Layout, slot: int) -> list[np.ndarray]:
     """Bodies [N, 1] of each dynamic group that do not collide with the one in this slot, as a joint connects them."""
-    ends = [{joint.a, joint.b} for joint in layout.joints if not joint.collide]
+    exempt = layout.exempt
     return [
-        np.array([[{slot, first + i} in ends] for i in range(padded_size(group.count))])
+        np.array([[{slot, first + i} in exempt] for i in range(padded_size(group.count))])
         for group, first in dynamic_groups(layout)
     ]
 

@@ -70,6 +70,11 @@ class Layout:
         return tuple(zip(self.groups, starts, strict=False))
 
     @property
+    def exempt(self) -> frozenset[frozenset[int]]:
+        """Pairs of slots that do not collide, as a joint connects them."""
+        return frozenset(frozenset((joint.a, joint.b)) for joint in self.joints if not joint.collide)
+
+    @property
     def back_to_front(self) -> tuple[tuple[SlotGroup, int], ...]:
         """The groups of `spans` in rendering order: by layer, then by slot."""
 

@@ -664,8 +664,7 @@ class Space:
     def _overlaps(self, position: np.ndarray, angle: np.ndarray) -> Overlaps:
         scene, _, layout = self.scene()
         objects = to_device(jax.tree.map(lambda x: x[None], scene.objects))
-        number = body_numbers(self.slots, layout.slots)
-        exempt = {frozenset((joint.a, joint.b)) for joint in layout.joints if not joint.collide}
+        number, exempt = body_numbers(self.slots, layout.slots), layout.exempt
         body_poses = jnp.asarray(position.transpose(2, 1, 0)), jnp.asarray(angle.T)
         overlaps = []
         for span_a, span_b in itertools.combinations_with_replacement(layout.spans, 2):

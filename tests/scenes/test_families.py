@@ -101,14 +101,13 @@ def shapes_of(layout: Layout, objects: Objects, state: State) -> list[Any]:
 
 def overlap(layout: Layout, shapes: list[Any], present: jax.Array) -> jax.Array:
     """The deepest overlap [n] in m of two that collide."""
-    tied = {frozenset((tie.a, tie.b)) for tie in layout.joints if not tie.collide}
     deepest = jnp.full(present.shape[1:], -jnp.inf)
     spans = zip(layout.spans, shapes, strict=True)
     for ((a, first), of_a), ((b, second), of_b) in itertools.combinations_with_replacement(spans, 2):
         if not (a.collides and b.collides) or DYNAMIC not in (a.kind, b.kind):
             continue
         pairs = [(i, j) for i in range(a.count) for j in range(b.count) if first + i < second + j]
-        pairs = [pair for pair in pairs if frozenset((first + pair[0], second + pair[1])) not in tied]
+        pairs = [pair for pair in pairs if frozenset((first + pair[0], second + pair[1])) not in layout.exempt]
         if not pairs:
             continue
         i, j = np.array(pairs).T
