@@ -54,6 +54,10 @@ class PhysicsOptions:
         choices=("pairs", "time"),
         later=True,
     )
+    relax_iterations: int = option(
+        1, int, "passes", "passes over all contacts at the end of a step: more for piles and crushes", low=1, high=64,
+        later=True,
+    )  # fmt: skip
 
     @property
     def x64(self) -> bool:

@@ -148,6 +148,25 @@ class AllPairs(ContactSolver):
         (sides, pairs, _), _ = jax.lax.scan(turn, (sides, pairs, jnp.ones((), bool)), length=TURNS)
         return sides, pairs
 
+    def _relax_again(
+        self, solved: SolvedRounds, sides: list[BodySide], statics: list[BodySide]
+    ) -> tuple[list[BodySide], list[SolvedPair]]:
+        """Sides and pairs after all relaxing passes but the last."""
+        if self.params.relax_iterations == 1:
+            return sides, solved.pairs
+
+        def one(state: tuple, _: None) -> tuple[tuple, None]:
+            sides, pairs = state
+
+            def play(k: int, a: BodySide, b: BodySide) -> tuple[BodySide, BodySide, SolvedPair]:
+                of = self.constraints[k], solved.points[k], pairs[k]
+                return contact_passes.relax_again(*of, a, b, self.setup, self.params)
+
+            return run_schedule(sides, statics, self.order, play), None
+
+        state, _ = jax.lax.scan(one, (sides, solved.pairs), length=self.params.relax_iterations - 1)
+        return state
+
     def relax(
         self,
         carry: AllPairsCarry,
@@ -156,8 +175,10 @@ class AllPairs(ContactSolver):
         statics: list[BodySide],
         time: Array,
     ) -> tuple[list[BodySide], AllPairsCarry]:
+        sides, pairs = self._relax_again(solved, sides, statics)
+
         def play(k: int, a: BodySide, b: BodySide) -> tuple[BodySide, BodySide, tuple[SolvedPair, WarmStart]]:
-            of = self.constraints[k], carry.warm[k], solved.points[k], solved.pairs[k]
+            of = self.constraints[k], carry.warm[k], solved.points[k], pairs[k]
             return contact_passes.relax(*of, a, b, self.setup, self.params)
 
         sides, relaxed = run_schedule(sides, statics, self.order, play)

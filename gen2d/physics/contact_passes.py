@@ -332,17 +332,15 @@ def warm_start_impulses(
     return [Impulse(*(jnp.where(of, x, 0.0) for x in i)) for of, i in zip(held, impulses, strict=True)]
 
 
-def relax(
+def _relaxed(
     constraint: ContactConstraint,
-    memory: WarmStart,
     points: list[ContactPoint],
     solved: SolvedPair,
     a: BodySide,
     b: BodySide,
     setup: PassSetup,
-    params: SolverParams,
-) -> tuple[BodySide, BodySide, tuple[SolvedPair, WarmStart]]:
-    """Both sides and the pair after the relaxing solve at the end of the step, and the impulses for the next step."""
+) -> tuple[BodySide, BodySide, SolvedPair, list[Array]]:
+    """Both sides and the pair after a solve at the end of the step, and whether each point bounces in it."""
     assert b.displacement is not None, "only static bodies lack a displacement"
     moved = zip(solved.contacts, displaced_points(constraint, points, a.displacement, b.displacement), strict=True)
     constraint = with_joints(constraint, a, b)
@@ -359,6 +357,39 @@ def relax(
         return relaxed_target(constraint, contact, speed, old, threshold)
 
     new_a, new_b, last, _ = _apply_pass(constraint, solved._replace(contacts=contacts), target_of, a, b)
+    return new_a, new_b, last, bounced
+
+
+def relax_again(
+    constraint: ContactConstraint,
+    points: list[ContactPoint],
+    solved: SolvedPair,
+    a: BodySide,
+    b: BodySide,
+    setup: PassSetup,
+    params: SolverParams,
+) -> tuple[BodySide, BodySide, SolvedPair]:
+    """Both sides and the pair after a relaxing solve that others follow; a bounce in it is one of the step's end."""
+    new_a, new_b, last, bounced = _relaxed(constraint, points, solved, a, b, setup)
+    contacts = [
+        contact._replace(tau=jnp.where(bounces, params.step, contact.tau))
+        for contact, bounces in zip(solved.contacts, bounced, strict=True)
+    ]
+    return new_a, new_b, last._replace(contacts=contacts)
+
+
+def relax(
+    constraint: ContactConstraint,
+    memory: WarmStart,
+    points: list[ContactPoint],
+    solved: SolvedPair,
+    a: BodySide,
+    b: BodySide,
+    setup: PassSetup,
+    params: SolverParams,
+) -> tuple[BodySide, BodySide, tuple[SolvedPair, WarmStart]]:
+    """Both sides and the pair after the relaxing solve at the end of the step, and the impulses for the next step."""
+    new_a, new_b, last, bounced = _relaxed(constraint, points, solved, a, b, setup)
     of = zip(last.contacts, bounced, last.impulses, memory.impulses, strict=True)
     impulses = materialize(
         [_next_impulse(constraint, c, (c.tau >= 0) | b, new, old, setup, params.step) for c, b, new, old in of]

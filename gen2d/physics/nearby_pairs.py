@@ -70,6 +70,7 @@ from gen2d.records.trajectory import Contacts
 from gen2d.xla import materialize, max_bodies
 
 NEVER = -2  # the step of an event that has not happened
+RELAX_CONSTANTS = *CONSTANTS, "resting", "push"
 FOLLOWS = 1 << 20  # added to the contacts of a scene that begin in a step: a pair that an impact may follow
 
 
@@ -305,9 +306,35 @@ class NearbyPairs(PairBatches, ContactSolver):
             solved = solved._replace(packed=packed)
         return self.unpacked(bodies, rows), solved
 
+    def _relax_again(
+        self, solved: SolvedChunk, sides: list[BodySide], statics: list[BodySide]
+    ) -> tuple[list[BodySide], list[Array]]:
+        """Sides and packed contacts after all relaxing passes but the last."""
+        if self.params.relax_iterations == 1:
+            return sides, solved.packed
+        listed, bodies = solved.listed, self.bodies(sides, statics, RELAX_CONSTANTS)
+
+        def play(
+            i: int, k: Array, indices: GatherIndices, a: BodySide, b: BodySide, buffer: Array
+        ) -> tuple[BodySide, BodySide, Array]:
+            del indices
+            constraint, _, points, setup = self.unpack_contacts(list(get_row(listed.packed[i], k)), listed.specs[i])
+            pair = unpack(list(materialize(get_row(buffer, k))), solved.specs[i])
+            a, b, pair = contact_passes.relax_again(constraint, points, pair, a, b, setup, self.params)
+            values, _ = pack(pair, (self.chunk,), self.dtype, once=True)
+            return a, b, put_row(buffer, k, materialize(jnp.stack(values)))
+
+        def one(_: int, state: tuple) -> tuple:
+            return self.play(bodies, state[0], listed, state[1], play)
+
+        passes = self.params.relax_iterations - 1
+        rows, packed = jax.lax.fori_loop(0, passes, one, (bodies.rows, solved.packed))
+        return self.unpacked(bodies, rows), packed
+
     def relax(
         self, carry: NearbyCarry, solved: SolvedChunk, sides: list[BodySide], statics: list[BodySide], time: Array
     ) -> tuple[list[BodySide], NearbyCarry]:
+        sides, latest = self._relax_again(solved, sides, statics)
         listed = solved.listed
         caches = self._cache_tables(carry)
 
@@ -316,21 +343,21 @@ class NearbyPairs(PairBatches, ContactSolver):
             constraint, memory, points, setup = self.unpack_contacts(
                 list(get_row(listed.packed[i], k)), listed.specs[i]
             )
-            pair = unpack(list(get_row(solved.packed[i], k)), solved.specs[i])
+            first, pair = (unpack(list(get_row(of[i], k)), solved.specs[i]) for of in (solved.packed, latest))
             a, b, (last, warm) = contact_passes.relax(constraint, memory, points, pair, a, b, setup, self.params)
             new = CachedConstraint(warm, jnp.full(self.chunk, carry.step, self.dtype), None, None)
             if self.setup.log:
-                event = record_event(self._event_so_far(carry, cache.at(indices.pair)), pair, last, time)
+                event = record_event(self._event_so_far(carry, cache.at(indices.pair)), first, last, time)
                 new = new._replace(event=event, elasticity=constraint.elasticity)
                 now = 2 * carry.step + jnp.where((event.flags & ON) > 0, 1, 0)
                 old = touch.at[indices.pair].get(mode=SAFE)
-                now = jnp.where(contact_passes.touching(pair, last), now, old)
+                now = jnp.where(contact_passes.touching(first, last), now, old)
                 touch = touch.at[indices.pair].set(now, mode=SAFE)
             return a, b, (cache.put(indices.pair, new).rows, touch)
 
         last_touch = carry.last_touch or [jnp.zeros(0, jnp.int32)] * len(self.batches)
         starts = list(zip(carry.cache, last_touch, strict=True))
-        sides, carries = self._pass(sides, statics, listed, starts, play, (*CONSTANTS, "resting", "push"))
+        sides, carries = self._pass(sides, statics, listed, starts, play, RELAX_CONSTANTS)
         depth, begins = carry.depth, carry.begins
         for overlap, began in solved.observed:
             depth, begins = jnp.maximum(depth, overlap), begins + began

@@ -21,6 +21,7 @@ class SolverParams:
     damping: float  # 1/s, of velocity and spin
     mixing: str
     by_time: bool  # the impacts of discs in a step act in the order of their times, not of the solver's pairs
+    relax_iterations: int  # passes over all pairs at the end of a step
 
     def bias_rate(self, hertz: float, damping_ratio: float) -> float:
         """Share of an error that an implicit damped spring corrects, 1/s."""
@@ -40,4 +41,5 @@ def solver_params(physics: PhysicsOptions, fps: float, steps: int) -> SolverPara
         damping=physics.damping,
         mixing=physics.mixing,
         by_time=physics.impact_order == "time",
+        relax_iterations=physics.relax_iterations,
     )

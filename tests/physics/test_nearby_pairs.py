@@ -110,6 +110,23 @@ def test_an_impact_that_waits_for_one_that_does_not_happen_acts():
     holds("impact that waits for another one: velocities, m/s", found[:, :, 0] - exact, 1e-3)
 
 
+def test_relaxing_passes_pass_a_blow_on_through_a_row_of_discs():
+    """Six touching discs, in several orders of their slots: without elasticity all move on, with it the last one."""
+    count, speed = 6, 6.0  # m/s
+    orders = [np.random.default_rng(seed).permutation(count) for seed in range(8)]
+    elasticities = [0.0] * len(orders) + [1.0] * len(orders)
+    places = [np.argsort(order) for order in 2 * orders]
+    worlds = []
+    for order, elasticity in zip(2 * orders, elasticities, strict=True):
+        row = [{"x": (0.9999 * k, 0), "v": (speed * (k == 0), 0), "elasticity": elasticity} for k in order]
+        worlds.append(world(row))
+    both = [run(worlds, 31, 1, rules(relax_iterations=32), EVERYTHING, sparse=sparse) for sparse in (True, False)]
+    assert_alike(*both, within=1e-5)
+    velocity = np.array([v[:, place, 0] for v, place in zip(both[0].states.velocity, places, strict=True)])
+    holds("Row that a disc strikes, e = 0: departure from one speed, relative", velocity[:8, 1] - 1, 0.02)
+    holds("Row that a disc strikes, e = 1: speeds at the end, m/s", velocity[8:, -1] - [0, 0, 0, 0, 0, speed], 1e-4)
+
+
 @pytest.mark.slow
 def test_both_forms_give_the_same_of_more_discs_than_a_word_has_bits():
     worlds = [gas(seed, 19) for seed in range(3)]

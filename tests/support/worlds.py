@@ -37,6 +37,7 @@ def rules(step: float = STEP, **changes: Any) -> SolverParams:
         "damping": 0.0,
         "mixing": "product",
         "by_time": False,
+        "relax_iterations": 1,
     }
     return SolverParams(step=step, **(numbers | changes))
 
