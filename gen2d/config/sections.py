@@ -54,6 +54,9 @@ class PhysicsOptions:
         choices=("pairs", "time"),
         later=True,
     )
+    extreme_mass_ratios: bool = option(
+        False, bool, "", "far heavier bodies do not go through light ones that others stop (slower)", later=True
+    )
     relax_iterations: int = option(
         1, int, "passes", "passes over all contacts at the end of a step: more for piles and crushes", low=1, high=64,
         later=True,

@@ -28,6 +28,7 @@ from gen2d.physics.impact_order import TURNS, in_order, later_impact, not_hit, t
 from gen2d.physics.params import SolverParams
 from gen2d.physics.schedule import Match, run_schedule
 from gen2d.physics.solver_protocol import ContactSolver
+from gen2d.physics.support import is_crushed
 from gen2d.records.axes import Array
 from gen2d.records.trajectory import Contacts
 
@@ -93,9 +94,33 @@ class AllPairs(ContactSolver):
 
         return run_schedule(sides, statics, self.order, play)
 
+    def _find_obstacles(
+        self, carry: AllPairsCarry, contacts: list[list[ContactPoint]], sides: list[BodySide], statics: list[BodySide]
+    ) -> tuple[list[BodySide], list[list[ContactPoint]]]:
+        """Sides and contacts with the obstacles of bodies, in a step with pairs that are crushed."""
+        moving = [of for of in zip(self.constraints, contacts, strict=True) if of[0].a is not None]
+        if not moving or not self.params.extreme_mass_ratios:
+            return sides, contacts
+
+        def play(k: int, a: BodySide, b: BodySide) -> tuple[BodySide, BodySide, list[Array | None]]:
+            of = self.constraints[k], carry.warm[k], contacts[k]
+            a, b, points = contact_passes.find_obstacles(*of, a, b, self.params.step)
+            return a, b, [point.stop for point in points]
+
+        crushed = functools.reduce(jnp.logical_or, [jnp.any(is_crushed(*of)) for of in moving])
+        moves = [constraint.a is not None for constraint in self.constraints]
+        none = [[jnp.zeros_like(p.gap) if of else None for p in ps] for of, ps in zip(moves, contacts, strict=True)]
+        sides, stops = jax.lax.cond(
+            crushed, lambda: run_schedule(sides, statics, self.order, play), lambda: (sides, none)
+        )
+        of_rounds = zip(contacts, stops, strict=True)
+        return sides, [[p._replace(stop=x) for p, x in zip(*of, strict=True)] for of in of_rounds]
+
     def solve(
         self, carry: AllPairsCarry, contacts: list[list[ContactPoint]], sides: list[BodySide], statics: list[BodySide]
     ) -> tuple[list[BodySide], SolvedRounds]:
+        sides, contacts = self._find_obstacles(carry, contacts, sides, statics)
+
         def play(k: int, a: BodySide, b: BodySide) -> tuple[BodySide, BodySide, SolvedPair]:
             warm = carry.warm[k]
             return contact_passes.solve(self.constraints[k], warm, contacts[k], a, b, self.setup, self.params)

@@ -84,6 +84,7 @@ class ContactPoint(NamedTuple):
     position: Array | None  # [2, ...] m: of the point, or of b's centre if b is a disc; None: not logged
     core: CoreOffset | None = None  # None: shapes with corners
     moves_with_a: bool = False  # a is a disc, and the point moves with it; else with b
+    stop: Array | None = None  # N s: normal impulse that is known before the first pass; None: of static bodies
 
 
 class ActiveContact(NamedTuple):

@@ -26,7 +26,7 @@ from gen2d.physics.contact_points import (
     impact_times,
 )
 from gen2d.physics.contact_state import BodySide, PassSetup, SolvedPair, WarmStart
-from gen2d.physics.energy import MotionPair, add_disc_dissipation, add_dissipation
+from gen2d.physics.energy import MotionPair, Work, add_disc_dissipation, add_dissipation, kinetic_energy
 from gen2d.physics.friction import apply_angular_impulse, friction_impulse, rolling_impulse
 from gen2d.physics.impact_order import after_impact, in_order, takes_part, with_first
 from gen2d.physics.jointed import free_motion, jointed_frame, with_joints, with_motions
@@ -41,7 +41,7 @@ from gen2d.physics.normal_impulse import (
 )
 from gen2d.physics.params import SolverParams
 from gen2d.physics.position_correction import correct_positions
-from gen2d.physics.support import SupportedContacts, SupportedPair, add_support, supported_pair
+from gen2d.physics.support import SupportedContacts, SupportedPair, add_obstacles, add_support, supported_pair
 from gen2d.records.axes import Array
 from gen2d.xla import materialize
 
@@ -112,8 +112,23 @@ def _apply_pass(
         work = add_dissipation(b.work, constraint, pair.contacts, changes, twist, *free)
         a, b = (with_motions(*of) for of in zip((a, b), motions, free[1], strict=True))
     solved = SolvedPair(pair.contacts, impulses, roll)
+    if seen.pair is not None and seen.pair.crushed is not None:
+        motions, work = _without_what_obstacles_take(constraint, seen, motions, work)
     a, b = a._replace(motion=motions[0]), b._replace(motion=motions[1], work=work)
     return a, b, solved, seen
+
+
+def _without_what_obstacles_take(
+    constraint: ContactConstraint, seen: SupportedContacts, motions: MotionPair, work: Work | None
+) -> tuple[MotionPair, Work | None]:
+    """Motions that obstacles leave of a crushed body, and the work with its lost energy."""
+    kept = seen.kept(motions)
+    if work is None:
+        return kept, None
+    for inertia, old, new in zip((constraint.a, constraint.b), motions, kept, strict=True):
+        assert inertia is not None, "both bodies move"
+        work = work._replace(lost=work.lost + kinetic_energy(inertia, old) - kinetic_energy(inertia, new))
+    return kept, work
 
 
 def _free_motions(
@@ -167,6 +182,26 @@ def warm_start(
     if takes_part(points, b):
         a, b = with_first(points[0], a, b, *impact_times(points, a, b, setup, h))
     return a, b, points
+
+
+def find_obstacles(
+    constraint: ContactConstraint, memory: WarmStart, points: list[ContactPoint], a: BodySide, b: BodySide, h: float
+) -> tuple[BodySide, BodySide, list[ContactPoint]]:
+    """Both sides with each other as obstacles, and the points with their impulses; kinematic bodies are none.
+
+    A point's impulse is what it starts with, or more if it touches in this step: what ends its approach.
+    """
+    if constraint.a is None and a.motion is not None:
+        return a, b, points
+    assert b.motion is not None, "only static bodies lack a motion"
+    assert b.obstacles is not None, "moving bodies may have obstacles"
+    stopped = []
+    for point, old in zip(points, warm_start_impulses(constraint, points, memory.impulses), strict=True):
+        speed, _ = relative_speed(point.frame, point.normal, a.motion, b.motion)
+        ends = point.frame.normal_mass * jnp.maximum(-speed - jnp.maximum(point.gap, 0.0) / h, 0.0)
+        stopped.append(point._replace(stop=jnp.maximum(old.normal, ends)))
+    of_a, of_b = add_obstacles(constraint, stopped, (a.obstacles, b.obstacles), 1)
+    return a._replace(obstacles=of_a), b._replace(obstacles=of_b), points if constraint.a is None else stopped
 
 
 def _with_resting(old: BodySide, new: BodySide, bounces: Array) -> BodySide:
@@ -225,7 +260,7 @@ def solve(
     """Both sides and the pair after the first pass: impulses, bounces and the correction of overlaps."""
     constraint = with_joints(constraint, a, b)
     acceleration = points[0].acceleration
-    supported = supported_pair(constraint, points[0].normal, (a.support, b.support))
+    supported = supported_pair(constraint, points, (a.support, b.support), (a.obstacles, b.obstacles))
     if supported is not None:
         pull = supported.acceleration(acceleration, setup.gravity)
         points = [point._replace(acceleration=pull) for point in points]
@@ -251,7 +286,7 @@ def solve(
     new_a, new_b = _with_resting(a, new_a, bounces), _with_resting(b, new_b, bounces)
     assert new_b.motion is not None, "only static bodies lack a motion"
     motions = seen.means((new_a.motion, new_b.motion))
-    new_a, new_b = correct_positions(constraint, contacts, motions, acceleration, new_a, new_b, setup, params)
+    new_a, new_b = correct_positions(constraint, contacts, seen, motions, acceleration, new_a, new_b, setup, params)
     if constraint.static:
         new_b = materialize(new_b._replace(work=None))._replace(work=new_b.work)
     return new_a, new_b, solved

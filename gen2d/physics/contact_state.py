@@ -5,7 +5,7 @@ from typing import NamedTuple
 from gen2d.physics.collision import Shape
 from gen2d.physics.constraint import ActiveContact, Impulse, Motion
 from gen2d.physics.energy import Work
-from gen2d.physics.support import Support
+from gen2d.physics.support import Obstacles, Support
 from gen2d.records.axes import Array
 
 
@@ -32,6 +32,7 @@ class BodySide(NamedTuple):
     joint_motion: Motion | None = None  # m/s, rad/s: what they take from the motion in a pass
     joint_drift: Motion | None = None  # m, rad: what they take from the drift
     support: Support | None = None  # None: static bodies, and after the first pass
+    obstacles: Obstacles | None = None  # None: static bodies, and but for the first pass
     first: Array | None = None  # [N, ...] s: least time of impact of a body in the step; infinite without one
     clock: Array | None = None  # [N, ...] s: of a body's last impact in the step so far; 0 without one
     clearance: Array | None = None  # [N, ...] m: least way that leads a body to what it has met in the pass so far

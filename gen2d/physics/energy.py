@@ -18,7 +18,9 @@ from gen2d.physics.constraint import (
     ContactFrame,
     ContactPoint,
     Impulse,
+    Inertia,
     Motion,
+    reciprocal,
     relative_speed,
 )
 from gen2d.physics.friction import relative_spin
@@ -39,6 +41,13 @@ class Ledger(NamedTuple):
 
     groups: list[Work]
     joints: Work | None
+
+
+def kinetic_energy(inverse: Inertia, motion: Motion | None) -> Array:
+    """Kinetic energy of bodies with these inverse masses, J."""
+    assert motion is not None, "only moving bodies have energy"
+    (mass, moment), (velocity, spin) = (reciprocal(x, x > 0) for x in inverse), motion
+    return 0.5 * (mass * dot(velocity, velocity) + moment * spin**2)
 
 
 def add_disc_dissipation(

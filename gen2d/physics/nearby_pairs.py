@@ -65,6 +65,7 @@ from gen2d.physics.pair_batches import (
 )
 from gen2d.physics.schedule import bipartite_rounds
 from gen2d.physics.solver_protocol import ContactSolver
+from gen2d.physics.support import is_crushed
 from gen2d.records.axes import Array
 from gen2d.records.trajectory import Contacts
 from gen2d.xla import materialize, max_bodies
@@ -239,7 +240,7 @@ class NearbyPairs(PairBatches, ContactSolver):
     ) -> tuple[list[BodySide], ListedPairs]:
         near = self._find_near_pairs(sides, statics)
         chunks, indices = [active.starts[-1] for active in near], self._all_indices(near, carry.buffers)
-        listed = ListedPairs(near, chunks, indices, [], {})
+        listed = ListedPairs(near, chunks, indices, [], {}, jnp.zeros((), bool))
         groups = [self._table(group, self._size(g)) for g, group in enumerate(self.groups)]
         firsts = [
             self._static_table(list(b.statics.values())) if b.first is None else groups[b.first] for b in self.batches
@@ -248,9 +249,9 @@ class NearbyPairs(PairBatches, ContactSolver):
         specs: dict[int, TableSpec] = {}
 
         def play(
-            i: int, k: Array, indices: GatherIndices, a: BodySide, b: BodySide, buffer: Array | None
-        ) -> tuple[BodySide, BodySide, Array]:
-            batch = self.batches[i]
+            i: int, k: Array, indices: GatherIndices, a: BodySide, b: BodySide, carried: tuple
+        ) -> tuple[BodySide, BodySide, tuple]:
+            batch, (buffer, crushed) = self.batches[i], carried
             if batch.first == batch.second:
                 first, second = groups[batch.second].at_both(indices.a, indices.b)
             else:
@@ -264,19 +265,59 @@ class NearbyPairs(PairBatches, ContactSolver):
             setup = self.setup._replace(gravity=second.gravity, threshold=second.threshold)
             a, b, points = contact_passes.warm_start(constraint, warm, a, b, setup, self.params.step)
             gravity = None if batch.first is None else second.gravity  # of impacts on supported bodies
+            if self.params.extreme_mass_ratios and batch.first is not None:
+                crushed = crushed | jnp.any(is_crushed(constraint, points))
+                points = [point._replace(stop=jnp.zeros_like(point.gap)) for point in points]
             packed = (constraint, warm, points, second.threshold, gravity)
             values, specs[i] = pack(packed, (self.chunk,), self.dtype, once=True)
-            return a, b, self._store(batch, buffer, k, values)
+            return a, b, (self._store(batch, buffer, k, values), crushed)
 
         buffers = [None] * len(self.batches) if carry.buffers is None else [b.contacts for b in carry.buffers]
-        sides, packed = self._pass(sides, statics, listed, buffers, play, CONSTANTS)
-        return sides, listed._replace(packed=packed, specs=specs)
+        starts = [(buffer, listed.crushed) for buffer in buffers]
+        sides, carries = self._pass(sides, statics, listed, starts, play, CONSTANTS)
+        crushed = functools.reduce(jnp.logical_or, [of for _, of in carries], listed.crushed)
+        return sides, listed._replace(packed=[packed for packed, _ in carries], specs=specs, crushed=crushed)
+
+    def _find_obstacles(
+        self, contacts: ListedPairs, sides: list[BodySide], statics: list[BodySide]
+    ) -> tuple[list[BodySide], ListedPairs]:
+        """Sides and contacts with the obstacles of bodies, in a step with pairs that are crushed."""
+        if not self.params.extreme_mass_ratios or all(batch.first is None for batch in self.batches):
+            return sides, contacts
+
+        def play(
+            i: int, k: Array, indices: GatherIndices, a: BodySide, b: BodySide, buffer: Array
+        ) -> tuple[BodySide, BodySide, Array]:
+            del indices
+            columns = list(materialize(get_row(buffer, k)))
+            constraint, warm, points, _ = self.unpack_contacts(columns, contacts.specs[i])
+            a, b, points = contact_passes.find_obstacles(constraint, warm, points, a, b, self.params.step)
+            if self.batches[i].first is None:
+                return a, b, buffer
+            for point, place in zip(points, contacts.specs[i].places[2], strict=True):
+                columns[place.stop.first] = point.stop
+            return a, b, put_row(buffer, k, materialize(jnp.stack(columns)))
+
+        def find(_: int, state: tuple) -> tuple:
+            obstacles, packed = state
+            of_sides = zip(sides, obstacles, strict=True)
+            parts = [BodySide(motion=side.motion, obstacles=of) for side, of in of_sides]
+            bodies = self.bodies(parts, statics, ("motion",))
+            rows, packed = self.play(bodies, bodies.rows, contacts, packed, play)
+            return [side.obstacles for side in self.unpacked(bodies, rows)], packed
+
+        # A loop of one turn or none: a branch would copy the packed contacts.
+        start = [side.obstacles for side in sides], contacts.packed
+        obstacles, packed = jax.lax.fori_loop(0, contacts.crushed.astype(jnp.int32), find, start)
+        sides = [side._replace(obstacles=of) for side, of in zip(sides, obstacles, strict=True)]
+        return sides, contacts._replace(packed=packed)
 
     def solve(
         self, carry: NearbyCarry, contacts: ListedPairs, sides: list[BodySide], statics: list[BodySide]
     ) -> tuple[list[BodySide], SolvedChunk]:
         specs: dict[int, TableSpec] = {}
-        constants = *CONSTANTS, "support", "first"
+        constants = *CONSTANTS, "support", "obstacles", "first"
+        sides, contacts = self._find_obstacles(contacts, sides, statics)
         by_time = ordered_batches(contacts) if self.params.by_time else []
 
         def play(i: int, k: Array, indices: GatherIndices, a: BodySide, b: BodySide, carried: tuple) -> tuple:

@@ -27,6 +27,11 @@ class TableSpec(NamedTuple):
     tree: Any
     leaves: list[Any]
 
+    @property
+    def places(self) -> Any:
+        """The tree with the `LeafSpec` of each leaf in its place."""
+        return jax.tree.unflatten(self.tree, self.leaves)
+
 
 def pack(tree: Any, shape: tuple[int, ...], dtype: Any, once: bool = False) -> tuple[list[Array], TableSpec]:
     """Columns of a tree, arrays of `shape`, and how to unpack it.

@@ -85,6 +85,7 @@ class ListedPairs(NamedTuple):
     indices: list[Array]  # [K, 4, C] `GatherIndices` of each chunk
     packed: list[Array]  # [K, F, C]
     specs: dict[int, TableSpec]  # of the packed contacts
+    crushed: Array  # whether any pair is
 
 
 class SolvedChunk(NamedTuple):

@@ -21,6 +21,7 @@ class SolverParams:
     damping: float  # 1/s, of velocity and spin
     mixing: str
     by_time: bool  # the impacts of discs in a step act in the order of their times, not of the solver's pairs
+    extreme_mass_ratios: bool  # bodies that far heavier ones crush stop these where obstacles stop them
     relax_iterations: int  # passes over all pairs at the end of a step
 
     def bias_rate(self, hertz: float, damping_ratio: float) -> float:
@@ -41,5 +42,6 @@ def solver_params(physics: PhysicsOptions, fps: float, steps: int) -> SolverPara
         damping=physics.damping,
         mixing=physics.mixing,
         by_time=physics.impact_order == "time",
+        extreme_mass_ratios=physics.extreme_mass_ratios,
         relax_iterations=physics.relax_iterations,
     )

@@ -31,6 +31,7 @@ from gen2d.physics.contact_state import BodySide, PassSetup
 from gen2d.physics.energy import MotionPair, Work
 from gen2d.physics.normal_impulse import NormalTarget, solve_normals
 from gen2d.physics.params import SolverParams
+from gen2d.physics.support import SupportedContacts
 from gen2d.physics.time_of_impact import SLOWEST
 from gen2d.records.axes import Array
 from gen2d.xla import materialize
@@ -39,6 +40,7 @@ from gen2d.xla import materialize
 def correct_positions(
     constraint: ContactConstraint,
     contacts: list[ActiveContact],
+    seen: SupportedContacts,
     motions: MotionPair,
     acceleration: Array | None,
     a: BodySide,
@@ -48,17 +50,18 @@ def correct_positions(
 ) -> tuple[BodySide, BodySide]:
     """Both sides with drifts that push the pair apart where it overlaps.
 
-    `motions` are the means of both bodies in the step, as the pair foresees them, and `acceleration` is that of b
-    relative to a. An overlap that speeds below the bounce threshold cause in one step stays, so that contacts at rest
-    do not part.
+    `motions` are the means of both bodies in the step, as the pair foresees them, `acceleration` is that of b relative
+    to a, and `seen` are the contacts with what supports leave of their bodies. An overlap that speeds below the bounce
+    threshold cause in one step stays, so that contacts at rest do not part.
     """
     assert b.drift is not None, "only static bodies lack a drift"
     h, allowed = params.step, 0.5 * params.step * setup.threshold
     rate = params.bias_rate(2 * params.hertz if constraint.static else params.hertz, params.damping_ratio)
     of_a, of_b = motions
-    ends = None if of_a is None else _end(of_a, a.drift, h), _end(of_b, b.drift, h)
+    ends = seen.kept((None if of_a is None else _end(of_a, a.drift, h), _end(of_b, b.drift, h)))
     zero, gaps, targets = jnp.zeros_like(contacts[0].gap), [], []
-    for contact in contacts:
+    pushed, taken = seen.pushed(contacts)
+    for contact in pushed:
         moved, _ = relative_speed(contact.frame, contact.normal, *ends)
         fall = 0.0 if acceleration is None else -0.5 * h**2 * dot(contact.normal, acceleration)
         gaps.append(contact.gap + moved + fall)
@@ -67,15 +70,18 @@ def correct_positions(
         overlaps = (deep > 0) & (contact.frame.normal_mass > 0)
         targets.append(NormalTarget(overlaps, wanted, zero, jnp.zeros_like(overlaps)))
     nothing = [Impulse(zero, zero)] * len(contacts)
-    pushes = materialize(solve_normals(constraint, contacts, gaps, nothing, targets))  # kg m
+    pushes = materialize(solve_normals(constraint, pushed, gaps, nothing, targets, taken))  # kg m
     drifts = a.drift, b.drift
     for contact, push in zip(contacts, pushes, strict=True):
         drifts = apply_impulse(constraint, contact, (push, None), *drifts)
+    drifts = seen.kept(drifts)
     new_a, new_b = a._replace(drift=drifts[0]), b._replace(drift=drifts[1])
     if constraint.a is None or a.motion is None or constraint.static or b.joint_motion is not None:
         return new_a, new_b
     assert b.motion is not None, "only static bodies lack a motion"
     push = functools.reduce(jnp.add, pushes)
+    if seen.pair is not None and seen.pair.crushed is not None:
+        push = jnp.where(seen.pair.crushed, 0.0, push)  # obstacles take up the angular momentum
     work, of_a, of_b = _slowed((constraint.a, constraint.b), contacts[0], push, a.motion, b.motion, b.work)
     return new_a._replace(motion=of_a), new_b._replace(motion=of_b, work=work)
 

@@ -45,7 +45,7 @@ from gen2d.physics.params import SolverParams
 from gen2d.physics.shapes import to_world
 from gen2d.physics.springs import poses_of, table_of
 from gen2d.physics.state import BodyState, Model, WorldState
-from gen2d.physics.support import no_support
+from gen2d.physics.support import no_obstacles, no_support
 from gen2d.physics.tunnelling import clamp_displacement
 from gen2d.records.axes import Array
 from gen2d.records.parameter import apply
@@ -184,6 +184,7 @@ def _first_pass_side(side: BodySide, motion: Motion, drift: Motion, change: Moti
         push=speed_bound(change.velocity) if disc else jnp.zeros_like(change.spin),
         work=side.work,
         support=side.support,
+        obstacles=no_obstacles(side.support) if params.extreme_mass_ratios and side.support is not None else None,
         first=side.first,
         clock=jnp.zeros_like(change.spin) if params.by_time else None,
     )

@@ -8,6 +8,12 @@ either. Its inverse mass lacks the Schur complement of these directions, and its
 and reaction stay equal, so momentum is conserved. Static bodies come last in a pass and take up what the lighter body
 cannot.
 
+A light body that a heavy one has pressed onto others need not rest on them: it may bounce between them many times in a
+step, which each contact sees once, and the heavy one goes through it. So, with `physics.extreme_mass_ratios`, the
+contact of a pair that overlaps by more than `CRUSHED` sees the lighter one without the directions in which it
+approaches static bodies and far heavier ones in this step, its obstacles. What the lighter one would do in these
+directions is lost, and the obstacles do not feel it: passed on, it would throw the lighter one where it misses them.
+
 Source: E. Guendelman, R. Bridson and R. Fedkiw, 'Nonconvex rigid bodies with stacking' (2003), give supported bodies an
 infinite mass.
 """
@@ -41,8 +47,11 @@ LARGEST_IN_CORNERS = 30.0  # where friction on one wall lifts the lighter body o
 PARALLEL = 0.2  # sine of the angle between two loads that act in one direction
 PRESSED = 0.5  # least cosine of the angle between a contact's normal and the load of the static bodies
 LARGEST_SPEED = 9.0  # of a point of a uniform triangle after an impulse at a corner, over that of its centre
-LEAST_LEFT = 1e-4  # share of a contact's compliance that a support leaves at least, as the rest would be rounding
 LEAST_COMPLIANCE = 1e-30  # (N s)^2 / kg, of a load that bears anything: a lesser one has no finite reciprocal
+
+LEAST_LEFT = 1e-4  # share of a contact's compliance that a support leaves at least, as the rest would be rounding
+CRUSHED = 0.005  # m: least overlap of a pair whose lighter body has obstacles; bodies at rest overlap by far less
+SEVERAL = 0.98  # of the obstacles' impulses: length of their sum over the sum of their lengths, if they act in one line
 
 LINE, FLUSH, CORNER = 0.0, 1.0, 2.0  # kinds of supports: in one direction, at two points of a contact, in several
 
@@ -77,8 +86,56 @@ def add_support(support: Support, points: Sequence[ContactPoint], impulses: Sequ
     return Support(load, torque, kind)
 
 
+class Obstacles(NamedTuple):
+    """Impulses that static bodies and far heavier ones exert on a body in this step, as far as is known before it."""
+
+    load: Array  # [2, N, ...] N s: their sum
+    torque: Array | None  # [N, ...] N m s; None: discs
+    total: Array  # [N, ...] N s: sum of their lengths
+
+    def add(self, normal: Array, lever: Array | None, impulse: Array) -> "Obstacles":
+        """Obstacles with an impulse along a normal with this lever; without it if it is negative."""
+        torque = self.torque if self.torque is None or lever is None else self.torque + impulse * lever
+        return Obstacles(self.load + impulse * normal, torque, self.total + impulse)
+
+
+def no_obstacles(support: Support) -> Obstacles:
+    """Obstacles of bodies with these supports, of which none is known."""
+    zeros = jax.tree.map(jnp.zeros_like, support)
+    return Obstacles(zeros.load, zeros.torque, zeros.kind)
+
+
+def far_lighter(constraint: ContactConstraint) -> tuple[Array, Array]:
+    """Whether the bodies a and b are far lighter than the other; b is than a static body."""
+    if constraint.a is None:
+        return jnp.zeros_like(constraint.present), jnp.ones_like(constraint.present)
+    a, b = constraint.a.mass, constraint.b.mass
+    return a > LEAST_RATIO * b, b > LEAST_RATIO * a
+
+
+def is_crushed(constraint: ContactConstraint, points: Sequence[ContactPoint]) -> Array:
+    """Whether the pair overlaps so far that the obstacles of its lighter body count."""
+    lighter_a, lighter_b = far_lighter(constraint)
+    deep = [(point.gap < -CRUSHED) & (point.frame.normal_mass > 0) for point in points]
+    return (lighter_a | lighter_b) & functools.reduce(jnp.logical_or, deep)
+
+
+def add_obstacles(
+    constraint: ContactConstraint, points: Sequence[ContactPoint], of: tuple[Obstacles | None, Obstacles], sign: int
+) -> tuple[Obstacles | None, Obstacles]:
+    """Obstacles of both bodies with each other, the heavier of the lighter, or, if the sign is -1, without."""
+    (a, b), (lighter_a, lighter_b) = of, far_lighter(constraint)
+    for point in points:
+        assert point.stop is not None, "what stops a point is known"
+        b = b.add(point.normal, point.frame.normal_b, jnp.where(lighter_b, sign * point.stop, 0.0))
+        if a is not None:
+            lever = None if point.frame.normal_a is None else -point.frame.normal_a
+            a = a.add(-point.normal, lever, jnp.where(lighter_a, sign * point.stop, 0.0))
+    return a, b
+
+
 class SupportedPair(NamedTuple):
-    """Two moving bodies in contact, of which static bodies may bear the lighter."""
+    """Two moving bodies in contact, of which static bodies may bear the lighter, or obstacles stop it."""
 
     lighter: tuple[Array, Array]  # whether each is the lighter and pressed onto what bears it
     mass: Array  # 1/kg: inverse mass of the lighter
@@ -88,6 +145,9 @@ class SupportedPair(NamedTuple):
     torque: Array | None  # N m s
     share: Array  # kg / (N s)^2: reciprocal of the load's compliance; zero where nothing bears it
     in_impacts: Array  # whether impacts see the support, too
+    crushed: Array | None = None  # whether obstacles stop the lighter, instead of a support; None: none are known
+    fixed: Array | None = None  # whether these are in several directions, so that it does not move at all
+    heavier: Inertia | None = None
 
     def left(self, motions: tuple[Motion | None, Motion]) -> tuple[Motion, Motion]:
         """Motions of both bodies that supports leave."""
@@ -101,6 +161,8 @@ class SupportedPair(NamedTuple):
         new = velocity - self.mass * impulse * self.load, spin
         if self.torque is not None:
             new = new[0], jnp.where(self.locked > 0, 0.0, spin - self.moment * impulse * self.torque)
+        if self.fixed is not None:
+            new = [jnp.where(self.fixed, 0.0, x) for x in new]
         of = zip(self.lighter, motions, strict=True)
         of_a, of_b = (
             jax.tree.map(lambda x, y, borne=borne: jnp.where(borne, x, y), Motion(*new), m) for borne, m in of
@@ -110,29 +172,38 @@ class SupportedPair(NamedTuple):
     def _of_lighter(self, a: Array, b: Array) -> Array:
         return jnp.where(self.lighter[1], b, a)
 
-    def _lever(self, levers: Components) -> Array | float:
-        """Lever of a direction on the lighter body, m."""
+    def _levers(self, levers: Components) -> tuple[Array, Array]:
+        """Levers of a direction on the lighter and on the heavier body, m."""
         of_a, of_b = (0.0 if lever is None else lever for lever in levers)
-        return jnp.where(self.lighter[1], of_b, of_a)
+        return jnp.where(self.lighter[1], of_b, of_a), jnp.where(self.lighter[1], of_a, of_b)
 
     def _schur_complement(self, p: tuple[Array, Components], q: tuple[Array, Components]) -> Array:
         """What the support takes from the speed along q that a unit impulse along p causes, 1/kg.
 
         Both are directions with levers on both bodies.
         """
-        alongs, (lever_p, lever_q) = [], (self._lever(levers) for _, levers in (p, q))
+        alongs, (lever_p, lever_q) = [], (self._levers(levers)[0] for _, levers in (p, q))
         for (unit, _), lever in zip((p, q), (lever_p, lever_q), strict=True):
             along = self.mass * dot(self.load, unit)
             alongs.append(along if self.torque is None else along + self.moment * self.torque * lever)
         taken = self.share * alongs[0] * alongs[1]
-        return taken if self.torque is None else taken + self.locked * lever_p * lever_q
+        taken = taken if self.torque is None else taken + self.locked * lever_p * lever_q
+        if self.fixed is None:
+            return taken
+        return jnp.where(self.fixed, self.mass * dot(p[0], q[0]) + self.moment * lever_p * lever_q, taken)
 
     def _frame(self, frame: ContactFrame, normal: Array) -> ContactFrame:
         """Frame of a contact with the effective masses that the support leaves."""
         near = frame.normal_mass > 0
 
         def left(k: Array, direction: tuple[Array, Components]) -> Array:
-            return jnp.maximum(k - self._schur_complement(direction, direction), LEAST_LEFT * k)
+            left = k - self._schur_complement(direction, direction)
+            if self.heavier is None or self.fixed is None:
+                return jnp.maximum(left, LEAST_LEFT * k)
+            lever = self._levers(direction[1])[1]
+            least = self.heavier.mass + self.heavier.moment * lever**2
+            borne = self.lighter[0] | self.lighter[1]
+            return jnp.where(borne, jnp.where(self.fixed, least, jnp.maximum(left, least)), k)
 
         k_normal = left(frame.k_normal, (normal, (frame.normal_a, frame.normal_b)))
         k_tangent = left(frame.k_tangent, (perpendicular(normal), (frame.tangent_a, frame.tangent_b)))
@@ -166,6 +237,8 @@ class SupportedPair(NamedTuple):
             lighter=(lighter_a & sees, lighter_b & sees),
             locked=jnp.where(sees, self.locked, 0.0),
             share=jnp.where(sees, self.share, 0.0),
+            crushed=None if self.crushed is None else self.crushed & sees,
+            fixed=None if self.fixed is None else self.fixed & sees,
         )
 
     def pushes(self, impulse: Array) -> tuple[Array, Array]:
@@ -185,6 +258,22 @@ class SupportedContacts(NamedTuple):
         """Motions, or displacements, of both bodies that supports leave."""
         return motions if self.pair is None else self.pair.left(motions)
 
+    def kept(self, motions: tuple[Motion | None, Motion]) -> tuple[Motion | None, Motion]:
+        """Motions, or displacements, of which obstacles take up what a crushed body cannot do."""
+        if self.pair is None or self.pair.crushed is None:
+            return motions
+        crushed = self.pair.crushed
+        return jax.tree.map(lambda x, y: jnp.where(crushed, y, x), motions, self.pair.left(motions))
+
+    def pushed(self, contacts: list[ActiveContact]) -> tuple[list[ActiveContact], Array | float]:
+        """Contacts as the correction of overlaps sees them, and what is `taken`: only obstacles count."""
+        if self.pair is None or self.pair.crushed is None:
+            return contacts, 0.0
+        crushed, of = self.pair.crushed, zip(contacts, self.contacts, strict=True)
+        frames = [jax.tree.map(lambda x, y: jnp.where(crushed, y, x), c.frame, s.frame) for c, s in of]
+        contacts = [contact._replace(frame=frame) for contact, frame in zip(contacts, frames, strict=True)]
+        return contacts, jnp.where(crushed, self.taken, 0.0)
+
     def means(self, motions: tuple[Motion | None, Motion]) -> tuple[Motion | None, Motion]:
         """Mean motions in the step, as the supports' impulses act at its half."""
         return motions if self.pair is None else jax.tree.map(_mean, motions, self.pair.left(motions))
@@ -195,20 +284,27 @@ def _mean(x: Array, y: Array) -> Array:
 
 
 def supported_pair(
-    constraint: ContactConstraint, normal: Array, supports: tuple[Support | None, Support | None]
+    constraint: ContactConstraint,
+    points: Sequence[ContactPoint],
+    supports: tuple[Support | None, Support | None],
+    obstacles: tuple[Obstacles | None, Obstacles | None],
 ) -> SupportedPair | None:
-    """The pair in contact along a normal; None for a static body, and in passes that see no supports.
+    """The pair in contact; None for a static body, and in passes that see no supports.
 
-    Nothing bears a body on a rigid joint.
+    Nothing bears or stops a body on a rigid joint.
     """
-    a, b = supports
+    (a, b), normal = supports, points[0].normal
     if constraint.static or constraint.a is None or a is None or b is None:
         return None
     of_a, of_b = constraint.a, constraint.b  # inverse masses
+    crushed = fixed = heavier = None
+    if obstacles[1] is not None:
+        crushed = is_crushed(constraint, points)
 
     def far_lighter(one: Inertia, other: Inertia, support: Support, schur: Array | None) -> Array:
         largest = jnp.where(support.kind == CORNER, LARGEST_IN_CORNERS, LARGEST_RATIO)
-        lighter = (one.mass > LEAST_RATIO * other.mass) & (one.mass <= largest * other.mass)
+        enough = one.mass <= largest * other.mass
+        lighter = (one.mass > LEAST_RATIO * other.mass) & (enough if crushed is None else enough | crushed)
         return lighter if schur is None else lighter & (schur == 0).all(0)
 
     lighter_a = far_lighter(of_a, of_b, a, constraint.schur_a)
@@ -217,18 +313,36 @@ def supported_pair(
         jnp.where(lighter_b, y, x)
         for x, y in ((a.load, b.load), (a.kind, b.kind), (of_a.mass, of_b.mass), (of_a.moment, of_b.moment))
     )
+    torques, total = (a.torque, b.torque), jnp.zeros_like(mass)
+    if crushed is not None and obstacles[1] is not None:
+        stopped_a, stopped_b = add_obstacles(constraint, points, (obstacles[0], obstacles[1]), -1)
+        assert stopped_a is not None, "both bodies move"
+        load = jnp.where(crushed, jnp.where(lighter_b, stopped_b.load, stopped_a.load), load)
+        total = jnp.where(lighter_b, stopped_b.total, stopped_a.total)
+        torques = _chosen(crushed, a.torque, stopped_a.torque), _chosen(crushed, b.torque, stopped_b.torque)
+        kind = jnp.where(crushed, LINE, kind)
     square, along = dot(load, load), dot(load, normal)
     along = jnp.where(lighter_b, -along, along)
     torque, k = None, mass * square
     pressed = (lighter_a | lighter_b) & (along > 0) & (along * along > PRESSED**2 * square) & (k > LEAST_COMPLIANCE)
     locked = jnp.zeros_like(moment)
-    if a.torque is not None or b.torque is not None:
-        x, y = (jnp.zeros_like(k) if torque is None else torque for torque in (a.torque, b.torque))
+    if crushed is not None:
+        crushed = crushed & pressed
+        fixed = crushed & (square < SEVERAL**2 * total**2)
+        heavier = Inertia(*(jnp.where(lighter_b, x, y) for x, y in zip(of_a, of_b, strict=True)))
+    if torques[0] is not None or torques[1] is not None:
+        x, y = (jnp.zeros_like(k) if torque is None else torque for torque in torques)
         flush = kind == FLUSH
         torque, locked = jnp.where(lighter_b, y, x), jnp.where(flush & pressed, moment, 0.0)
         moment = jnp.where(flush, 0.0, moment)
         k = k + moment * torque * torque
     share = reciprocal(k, pressed)
     in_impacts = mass <= LARGEST_IN_IMPACTS * jnp.where(lighter_b, of_a.mass, of_b.mass)
+    if crushed is not None:
+        in_impacts = in_impacts | crushed
     lighter = pressed & lighter_a, pressed & lighter_b
-    return SupportedPair(lighter, mass, moment, locked, load, torque, share, in_impacts)
+    return SupportedPair(lighter, mass, moment, locked, load, torque, share, in_impacts, crushed, fixed, heavier)
+
+
+def _chosen(where: Array, yes: Array | None, no: Array | None) -> Array | None:
+    return None if yes is None or no is None else jnp.where(where, no, yes)

@@ -66,7 +66,8 @@ class Space:
     **physics
         Options of a config's section `physics`, with the same defaults: damping (1/s), mixing ("product", "mean",
         "max", "geometric"), bounce_threshold (m/s), max_step (s), substeps, contact_hertz (Hz), contact_damping_ratio,
-        push_speed (m/s), precision ("float32", "float64"), impact_order ("pairs", "time"), relax_iterations.
+        push_speed (m/s), precision ("float32", "float64"), impact_order ("pairs", "time"), relax_iterations,
+        extreme_mass_ratios.
 
     Raises
     ------

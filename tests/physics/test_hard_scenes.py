@@ -9,9 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from laws import deepest_overlap, holds, total_energy
+from worlds import rules, run, world
 
-from gen2d.physics.constraint import ContactConstraint, Inertia, Motion
-from gen2d.physics.support import Support, supported_pair
+from gen2d.physics.constraint import ContactConstraint, ContactFrame, ContactPoint, Inertia, Motion
+from gen2d.physics.support import Support, no_obstacles, supported_pair
 from gen2d.space.space import Space
 
 GRAVITY = 9.81  # m/s^2
@@ -190,6 +191,23 @@ def test_heavy_discs_stand_on_light_ones():
     holds("heavy discs on light ones: force on the floor, of their weight", load / weight - 1, 1e-2)
 
 
+@pytest.mark.parametrize(("ratio", "deepest"), [(18, 0.06), (400, 0.07), (20000, 0.08)])
+@pytest.mark.parametrize("sparse", [True, False])
+def test_a_heavy_disc_does_not_go_through_a_light_one_that_bounces_between_it_and_a_floor(ratio, deepest, sparse):
+    """Both fly towards the floor, which the light one strikes several times in a step."""
+    light = {"x": (0, 0.68), "v": (1, -17), "radius": 0.68, "mass": 1.0, "elasticity": 0.9}
+    heavy = {"x": (-0.05, 2.15), "v": (0, -9), "radius": 0.73, "mass": ratio, "elasticity": 0.9}
+    floor = {"a": (-40, 0), "b": (40, 0), "elasticity": 1}
+    numbers = rules(extreme_mass_ratios=True)
+    of = run([world([light, heavy], [floor], (0, -GRAVITY))], 61, 1, numbers, sparse=sparse).states
+    x, v = (np.asarray(a[0, :, :2], float) for a in (of.position, of.velocity))
+    holds("crushed light disc: overlap, m", np.maximum(1.41 - np.linalg.norm(x[:, 0] - x[:, 1], axis=-1), 0), deepest)
+    energy = np.array([1, ratio]) * (0.5 * (v**2).sum(-1) + GRAVITY * x[..., 1])
+    holds(
+        "crushed light disc: energy gained in a step, relative", np.diff(energy.sum(-1)).max() / energy[0].sum(), 1e-5
+    )
+
+
 @pytest.mark.parametrize("torque", [None, 0.0, 0.3])
 def test_a_load_that_fades_bears_nothing_in_the_end(torque):
     """The load of a body that slides along a wall without gravity falls by orders of magnitude in each step."""
@@ -199,7 +217,10 @@ def test_a_load_that_fades_bears_nothing_in_the_end(torque):
     on_heavy = Support(jnp.stack([zero, zero]), None if torque is None else zero, zero)
     on_light = Support(jnp.stack([zero, load]), None if torque is None else torque * load, zero)
     constraint = ContactConstraint(heavy, light, one > 0, zero, zero, None, None, static=False)
-    pair = supported_pair(constraint, jnp.stack([zero, -one]), (on_heavy, on_light))
+    frame = ContactFrame(None, None, None, zero, one, one, one, one)
+    point = ContactPoint(frame, jnp.stack([zero, -one]), zero, zero, None, None, stop=zero)
+    none = no_obstacles(on_heavy), no_obstacles(on_light)
+    pair = supported_pair(constraint, [point], (on_heavy, on_light), none)
     assert pair is not None
     motion = Motion(jnp.stack([one, -one]), one)
     _, left = pair.left((motion, motion))

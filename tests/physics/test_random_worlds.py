@@ -80,6 +80,11 @@ MANY_BOUNDS: dict[str, Bounds] = {
     "joints, with gravity": {ABOVE: None, RISING: 0.2},
     "joints, without": {ABOVE: None, RISING: 0.1},
 }
+EXTREME_BOUNDS: dict[str, Bounds] = {  # with `physics.extreme_mass_ratios`
+    "discs, mass ratios up to 1e6": {RISING: 0.12, ABOVE: None, OVERLAPPING: 0.12},
+    "mass ratios up to 1e6": {RISING: 0.05, DETOURING: None, OVERLAPPING: 0.2},
+    "fast, mass ratios up to 1e6, e = 0.5": {RISING: None, DETOURING: 0.08, OVERLAPPING: 0.2},
+}
 # Speeds up to half of a radius in a step; a fixed obstacle may form a wedge that is narrower than a disc.
 HALF_A_RADIUS = replace(DISCS, radius=(0.45, 0.45), speed=14.0, gravity=0.0, fixed=0.0)
 
@@ -170,6 +175,14 @@ def test_angular_momentum_is_conserved_among_all_shapes():
 def test_many_worlds_keep_the_laws(name):
     batches = [measure(LARGE, [RECIPES[name]], MANY, first=k * MANY)[0] for k in range(BATCHES)]
     check_laws(name, batches, MANY_BOUNDS[name], RARELY)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", classes(EXTREME_BOUNDS))
+def test_worlds_keep_the_laws_where_obstacles_stop_bodies_that_heavy_ones_crush(name):
+    numbers = rules(extreme_mass_ratios=True)
+    batches = [measure(LARGE, [RECIPES[name]], MANY, first=k * MANY, params=numbers)[0] for k in range(2)]
+    check_laws(name, batches, EXTREME_BOUNDS[name], RARELY)
 
 
 @pytest.mark.slow

@@ -38,6 +38,7 @@ def rules(step: float = STEP, **changes: Any) -> SolverParams:
         "mixing": "product",
         "by_time": False,
         "relax_iterations": 1,
+        "extreme_mass_ratios": False,
     }
     return SolverParams(step=step, **(numbers | changes))
 
