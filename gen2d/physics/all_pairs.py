@@ -90,7 +90,7 @@ class AllPairs(ContactSolver):
         self, carry: AllPairsCarry, sides: list[BodySide], statics: list[BodySide]
     ) -> tuple[list[BodySide], list[list[ContactPoint]]]:
         def play(k: int, a: BodySide, b: BodySide) -> tuple[BodySide, BodySide, list[ContactPoint]]:
-            return contact_passes.warm_start(self.constraints[k], carry.warm[k], a, b, self.setup, self.params.step)
+            return contact_passes.warm_start(self.constraints[k], carry.warm[k], a, b, self.setup, self.params)
 
         return run_schedule(sides, statics, self.order, play)
 
@@ -98,8 +98,7 @@ class AllPairs(ContactSolver):
         self, carry: AllPairsCarry, contacts: list[list[ContactPoint]], sides: list[BodySide], statics: list[BodySide]
     ) -> tuple[list[BodySide], list[list[ContactPoint]]]:
         """Sides and contacts with the obstacles of bodies, in a step with pairs that are crushed."""
-        moving = [of for of in zip(self.constraints, contacts, strict=True) if of[0].a is not None]
-        if not moving or not self.params.extreme_mass_ratios:
+        if not self.params.extreme_mass_ratios:
             return sides, contacts
 
         def play(k: int, a: BodySide, b: BodySide) -> tuple[BodySide, BodySide, list[Array | None]]:
@@ -107,9 +106,11 @@ class AllPairs(ContactSolver):
             a, b, points = contact_passes.find_obstacles(*of, a, b, self.params.step)
             return a, b, [point.stop for point in points]
 
-        crushed = functools.reduce(jnp.logical_or, [jnp.any(is_crushed(*of)) for of in moving])
-        moves = [constraint.a is not None for constraint in self.constraints]
-        none = [[jnp.zeros_like(p.gap) if of else None for p in ps] for of, ps in zip(moves, contacts, strict=True)]
+        crushed = jnp.zeros((), bool)
+        for constraint, points in zip(self.constraints, contacts, strict=True):
+            if constraint.a is not None:
+                crushed = crushed | jnp.any(is_crushed(constraint, points))
+        none = [[point.stop for point in points] for points in contacts]
         sides, stops = jax.lax.cond(
             crushed, lambda: run_schedule(sides, statics, self.order, play), lambda: (sides, none)
         )
@@ -173,25 +174,6 @@ class AllPairs(ContactSolver):
         (sides, pairs, _), _ = jax.lax.scan(turn, (sides, pairs, jnp.ones((), bool)), length=TURNS)
         return sides, pairs
 
-    def _relax_again(
-        self, solved: SolvedRounds, sides: list[BodySide], statics: list[BodySide]
-    ) -> tuple[list[BodySide], list[SolvedPair]]:
-        """Sides and pairs after all relaxing passes but the last."""
-        if self.params.relax_iterations == 1:
-            return sides, solved.pairs
-
-        def one(state: tuple, _: None) -> tuple[tuple, None]:
-            sides, pairs = state
-
-            def play(k: int, a: BodySide, b: BodySide) -> tuple[BodySide, BodySide, SolvedPair]:
-                of = self.constraints[k], solved.points[k], pairs[k]
-                return contact_passes.relax_again(*of, a, b, self.setup, self.params)
-
-            return run_schedule(sides, statics, self.order, play), None
-
-        state, _ = jax.lax.scan(one, (sides, solved.pairs), length=self.params.relax_iterations - 1)
-        return state
-
     def relax(
         self,
         carry: AllPairsCarry,
@@ -200,22 +182,31 @@ class AllPairs(ContactSolver):
         statics: list[BodySide],
         time: Array,
     ) -> tuple[list[BodySide], AllPairsCarry]:
-        sides, pairs = self._relax_again(solved, sides, statics)
+        def relaxed(sides: list[BodySide], pairs: list[SolvedPair]) -> tuple[list[BodySide], list]:
+            def play(k: int, a: BodySide, b: BodySide) -> tuple[BodySide, BodySide, tuple[SolvedPair, WarmStart]]:
+                of = self.constraints[k], carry.warm[k], solved.points[k], pairs[k]
+                return contact_passes.relax(*of, a, b, self.setup, self.params)
 
-        def play(k: int, a: BodySide, b: BodySide) -> tuple[BodySide, BodySide, tuple[SolvedPair, WarmStart]]:
-            of = self.constraints[k], carry.warm[k], solved.points[k], pairs[k]
-            return contact_passes.relax(*of, a, b, self.setup, self.params)
+            return run_schedule(sides, statics, self.order, play)
 
-        sides, relaxed = run_schedule(sides, statics, self.order, play)
+        def one(state: tuple, _: None) -> tuple[tuple, None]:
+            sides, last = relaxed(*state)
+            of = zip(solved.pairs, last, strict=True)
+            return (sides, [contact_passes.before_next_relax(pair, after) for pair, (after, _) in of]), None
+
+        pairs = solved.pairs
+        if self.params.relax_iterations > 1:
+            (sides, pairs), _ = jax.lax.scan(one, (sides, pairs), length=self.params.relax_iterations - 1)
+        sides, last_pairs = relaxed(sides, pairs)
         events, observed = carry.events, dict(carry.observed)
         if events is not None:
-            of = zip(events, solved.pairs, relaxed, strict=True)
+            of = zip(events, solved.pairs, last_pairs, strict=True)
             events = [record_event(event, pair, last, time) for event, pair, (last, _) in of]
         for pair, warm in zip(solved.pairs, carry.warm, strict=True):
             depth, began = contact_passes.observe(pair, warm)
             old = observed[size := depth.shape[0]]
             observed[size] = Observed(jnp.maximum(old.depth, depth), old.begins + began)
-        return sides, AllPairsCarry([warm for _, warm in relaxed], observed, events)
+        return sides, AllPairsCarry([warm for _, warm in last_pairs], observed, events)
 
     def end_frame(self, carry: AllPairsCarry) -> tuple[AllPairsCarry, PairEvent | None]:
         if carry.events is None:

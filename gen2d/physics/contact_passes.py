@@ -112,7 +112,7 @@ def _apply_pass(
         work = add_dissipation(b.work, constraint, pair.contacts, changes, twist, *free)
         a, b = (with_motions(*of) for of in zip((a, b), motions, free[1], strict=True))
     solved = SolvedPair(pair.contacts, impulses, roll)
-    if seen.pair is not None and seen.pair.crushed is not None:
+    if seen.crush is not None:
         motions, work = _without_what_obstacles_take(constraint, seen, motions, work)
     a, b = a._replace(motion=motions[0]), b._replace(motion=motions[1], work=work)
     return a, b, solved, seen
@@ -150,7 +150,7 @@ def _free_motions(
 
 
 def warm_start(
-    constraint: ContactConstraint, memory: WarmStart, a: BodySide, b: BodySide, setup: PassSetup, h: float
+    constraint: ContactConstraint, memory: WarmStart, a: BodySide, b: BodySide, setup: PassSetup, params: SolverParams
 ) -> tuple[BodySide, BodySide, list[ContactPoint]]:
     """Both sides with the impulses of the last step, which act at `displacement`, and the contact points.
 
@@ -180,7 +180,9 @@ def warm_start(
     if constraint.a is None and a.motion is None and b.support is not None:
         b = b._replace(support=add_support(b.support, points, olds))
     if takes_part(points, b):
-        a, b = with_first(points[0], a, b, *impact_times(points, a, b, setup, h))
+        a, b = with_first(points[0], a, b, *impact_times(points, a, b, setup, params.step))
+    if params.extreme_mass_ratios and constraint.a is not None:  # known in `find_obstacles`
+        points = [point._replace(stop=jnp.zeros_like(point.gap)) for point in points]
     return a, b, points
 
 
@@ -367,15 +369,20 @@ def warm_start_impulses(
     return [Impulse(*(jnp.where(of, x, 0.0) for x in i)) for of, i in zip(held, impulses, strict=True)]
 
 
-def _relaxed(
+def relax(
     constraint: ContactConstraint,
+    memory: WarmStart,
     points: list[ContactPoint],
     solved: SolvedPair,
     a: BodySide,
     b: BodySide,
     setup: PassSetup,
-) -> tuple[BodySide, BodySide, SolvedPair, list[Array]]:
-    """Both sides and the pair after a solve at the end of the step, and whether each point bounces in it."""
+    params: SolverParams,
+) -> tuple[BodySide, BodySide, tuple[SolvedPair, WarmStart]]:
+    """Both sides and the pair after a relaxing solve at the end of the step, and the impulses for the next step.
+
+    A bounce in it is an impact at the end of the step.
+    """
     assert b.displacement is not None, "only static bodies lack a displacement"
     moved = zip(solved.contacts, displaced_points(constraint, points, a.displacement, b.displacement), strict=True)
     constraint = with_joints(constraint, a, b)
@@ -392,46 +399,21 @@ def _relaxed(
         return relaxed_target(constraint, contact, speed, old, threshold)
 
     new_a, new_b, last, _ = _apply_pass(constraint, solved._replace(contacts=contacts), target_of, a, b)
-    return new_a, new_b, last, bounced
-
-
-def relax_again(
-    constraint: ContactConstraint,
-    points: list[ContactPoint],
-    solved: SolvedPair,
-    a: BodySide,
-    b: BodySide,
-    setup: PassSetup,
-    params: SolverParams,
-) -> tuple[BodySide, BodySide, SolvedPair]:
-    """Both sides and the pair after a relaxing solve that others follow; a bounce in it is one of the step's end."""
-    new_a, new_b, last, bounced = _relaxed(constraint, points, solved, a, b, setup)
-    contacts = [
-        contact._replace(tau=jnp.where(bounces, params.step, contact.tau))
-        for contact, bounces in zip(solved.contacts, bounced, strict=True)
-    ]
-    return new_a, new_b, last._replace(contacts=contacts)
-
-
-def relax(
-    constraint: ContactConstraint,
-    memory: WarmStart,
-    points: list[ContactPoint],
-    solved: SolvedPair,
-    a: BodySide,
-    b: BodySide,
-    setup: PassSetup,
-    params: SolverParams,
-) -> tuple[BodySide, BodySide, tuple[SolvedPair, WarmStart]]:
-    """Both sides and the pair after the relaxing solve at the end of the step, and the impulses for the next step."""
-    new_a, new_b, last, bounced = _relaxed(constraint, points, solved, a, b, setup)
     of = zip(last.contacts, bounced, last.impulses, memory.impulses, strict=True)
     impulses = materialize(
         [_next_impulse(constraint, c, (c.tau >= 0) | b, new, old, setup, params.step) for c, b, new, old in of]
     )
     if constraint.static:
         new_b = new_b._replace(motion=materialize(new_b.motion))
-    return new_a, new_b, (last, WarmStart(impulses, last.roll))
+    of = zip(last.contacts, bounced, strict=True)
+    contacts = [contact._replace(tau=jnp.where(bounces, params.step, contact.tau)) for contact, bounces in of]
+    return new_a, new_b, (last._replace(contacts=contacts), WarmStart(impulses, last.roll))
+
+
+def before_next_relax(solved: SolvedPair, relaxed: SolvedPair) -> SolvedPair:
+    """The relaxed pair for another relaxing solve, with its contacts as they were solved but for the bounces."""
+    of = zip(solved.contacts, relaxed.contacts, strict=True)
+    return relaxed._replace(contacts=[contact._replace(tau=end.tau) for contact, end in of])
 
 
 def touching(solved: SolvedPair, last: SolvedPair) -> Array:

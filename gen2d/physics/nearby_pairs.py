@@ -263,11 +263,10 @@ class NearbyPairs(PairBatches, ContactSolver):
             if isinstance(first, StaticSide):
                 constraint = constraint._replace(neighbours=first.neighbours)
             setup = self.setup._replace(gravity=second.gravity, threshold=second.threshold)
-            a, b, points = contact_passes.warm_start(constraint, warm, a, b, setup, self.params.step)
+            a, b, points = contact_passes.warm_start(constraint, warm, a, b, setup, self.params)
             gravity = None if batch.first is None else second.gravity  # of impacts on supported bodies
             if self.params.extreme_mass_ratios and batch.first is not None:
                 crushed = crushed | jnp.any(is_crushed(constraint, points))
-                points = [point._replace(stop=jnp.zeros_like(point.gap)) for point in points]
             packed = (constraint, warm, points, second.threshold, gravity)
             values, specs[i] = pack(packed, (self.chunk,), self.dtype, once=True)
             return a, b, (self._store(batch, buffer, k, values), crushed)
@@ -282,7 +281,7 @@ class NearbyPairs(PairBatches, ContactSolver):
         self, contacts: ListedPairs, sides: list[BodySide], statics: list[BodySide]
     ) -> tuple[list[BodySide], ListedPairs]:
         """Sides and contacts with the obstacles of bodies, in a step with pairs that are crushed."""
-        if not self.params.extreme_mass_ratios or all(batch.first is None for batch in self.batches):
+        if not self.params.extreme_mass_ratios:
             return sides, contacts
 
         def play(
@@ -294,7 +293,8 @@ class NearbyPairs(PairBatches, ContactSolver):
             a, b, points = contact_passes.find_obstacles(constraint, warm, points, a, b, self.params.step)
             if self.batches[i].first is None:
                 return a, b, buffer
-            for point, place in zip(points, contacts.specs[i].places[2], strict=True):
+            _, _, places, *_ = contacts.specs[i].places
+            for point, place in zip(points, places, strict=True):
                 columns[place.stop.first] = point.stop
             return a, b, put_row(buffer, k, materialize(jnp.stack(columns)))
 
@@ -359,10 +359,12 @@ class NearbyPairs(PairBatches, ContactSolver):
             i: int, k: Array, indices: GatherIndices, a: BodySide, b: BodySide, buffer: Array
         ) -> tuple[BodySide, BodySide, Array]:
             del indices
-            constraint, _, points, setup = self.unpack_contacts(list(get_row(listed.packed[i], k)), listed.specs[i])
+            constraint, memory, points, setup = self.unpack_contacts(
+                list(get_row(listed.packed[i], k)), listed.specs[i]
+            )
             pair = unpack(list(materialize(get_row(buffer, k))), solved.specs[i])
-            a, b, pair = contact_passes.relax_again(constraint, points, pair, a, b, setup, self.params)
-            values, _ = pack(pair, (self.chunk,), self.dtype, once=True)
+            a, b, (after, _) = contact_passes.relax(constraint, memory, points, pair, a, b, setup, self.params)
+            values, _ = pack(contact_passes.before_next_relax(pair, after), (self.chunk,), self.dtype, once=True)
             return a, b, put_row(buffer, k, materialize(jnp.stack(values)))
 
         def one(_: int, state: tuple) -> tuple:

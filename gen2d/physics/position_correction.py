@@ -80,8 +80,8 @@ def correct_positions(
         return new_a, new_b
     assert b.motion is not None, "only static bodies lack a motion"
     push = functools.reduce(jnp.add, pushes)
-    if seen.pair is not None and seen.pair.crushed is not None:
-        push = jnp.where(seen.pair.crushed, 0.0, push)  # obstacles take up the angular momentum
+    if seen.crush is not None:
+        push = jnp.where(seen.crush.crushed, 0.0, push)  # obstacles take up the angular momentum
     work, of_a, of_b = _slowed((constraint.a, constraint.b), contacts[0], push, a.motion, b.motion, b.work)
     return new_a._replace(motion=of_a), new_b._replace(motion=of_b, work=work)
 

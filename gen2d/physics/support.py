@@ -20,7 +20,7 @@ infinite mass.
 
 import functools
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -47,9 +47,8 @@ LARGEST_IN_CORNERS = 30.0  # where friction on one wall lifts the lighter body o
 PARALLEL = 0.2  # sine of the angle between two loads that act in one direction
 PRESSED = 0.5  # least cosine of the angle between a contact's normal and the load of the static bodies
 LARGEST_SPEED = 9.0  # of a point of a uniform triangle after an impulse at a corner, over that of its centre
-LEAST_COMPLIANCE = 1e-30  # (N s)^2 / kg, of a load that bears anything: a lesser one has no finite reciprocal
-
 LEAST_LEFT = 1e-4  # share of a contact's compliance that a support leaves at least, as the rest would be rounding
+LEAST_COMPLIANCE = 1e-30  # (N s)^2 / kg, of a load that bears anything: a lesser one has no finite reciprocal
 CRUSHED = 0.005  # m: least overlap of a pair whose lighter body has obstacles; bodies at rest overlap by far less
 SEVERAL = 0.98  # of the obstacles' impulses: length of their sum over the sum of their lengths, if they act in one line
 
@@ -134,6 +133,18 @@ def add_obstacles(
     return a, b
 
 
+class CrushedPair(NamedTuple):
+    """What a pair that may be crushed has beyond others."""
+
+    crushed: Array  # whether obstacles stop the lighter body, instead of a support
+    fixed: Array  # whether these are in several directions, so that it does not move at all
+    heavier: Inertia
+
+    def where(self, yes: Any, no: Any) -> Any:
+        """The tree `yes` where the pair is crushed, else `no`."""
+        return jax.tree.map(lambda x, y: jnp.where(self.crushed, x, y), yes, no)
+
+
 class SupportedPair(NamedTuple):
     """Two moving bodies in contact, of which static bodies may bear the lighter, or obstacles stop it."""
 
@@ -145,9 +156,7 @@ class SupportedPair(NamedTuple):
     torque: Array | None  # N m s
     share: Array  # kg / (N s)^2: reciprocal of the load's compliance; zero where nothing bears it
     in_impacts: Array  # whether impacts see the support, too
-    crushed: Array | None = None  # whether obstacles stop the lighter, instead of a support; None: none are known
-    fixed: Array | None = None  # whether these are in several directions, so that it does not move at all
-    heavier: Inertia | None = None
+    crush: CrushedPair | None  # None: no obstacles are known
 
     def left(self, motions: tuple[Motion | None, Motion]) -> tuple[Motion, Motion]:
         """Motions of both bodies that supports leave."""
@@ -161,8 +170,8 @@ class SupportedPair(NamedTuple):
         new = velocity - self.mass * impulse * self.load, spin
         if self.torque is not None:
             new = new[0], jnp.where(self.locked > 0, 0.0, spin - self.moment * impulse * self.torque)
-        if self.fixed is not None:
-            new = [jnp.where(self.fixed, 0.0, x) for x in new]
+        if self.crush is not None:
+            new = [jnp.where(self.crush.fixed, 0.0, x) for x in new]
         of = zip(self.lighter, motions, strict=True)
         of_a, of_b = (
             jax.tree.map(lambda x, y, borne=borne: jnp.where(borne, x, y), Motion(*new), m) for borne, m in of
@@ -188,9 +197,9 @@ class SupportedPair(NamedTuple):
             alongs.append(along if self.torque is None else along + self.moment * self.torque * lever)
         taken = self.share * alongs[0] * alongs[1]
         taken = taken if self.torque is None else taken + self.locked * lever_p * lever_q
-        if self.fixed is None:
+        if self.crush is None:
             return taken
-        return jnp.where(self.fixed, self.mass * dot(p[0], q[0]) + self.moment * lever_p * lever_q, taken)
+        return jnp.where(self.crush.fixed, self.mass * dot(p[0], q[0]) + self.moment * lever_p * lever_q, taken)
 
     def _frame(self, frame: ContactFrame, normal: Array) -> ContactFrame:
         """Frame of a contact with the effective masses that the support leaves."""
@@ -198,12 +207,12 @@ class SupportedPair(NamedTuple):
 
         def left(k: Array, direction: tuple[Array, Components]) -> Array:
             left = k - self._schur_complement(direction, direction)
-            if self.heavier is None or self.fixed is None:
+            if self.crush is None:
                 return jnp.maximum(left, LEAST_LEFT * k)
-            lever = self._levers(direction[1])[1]
-            least = self.heavier.mass + self.heavier.moment * lever**2
+            (_, fixed, heavier), (_, lever) = self.crush, self._levers(direction[1])
+            least = heavier.mass + heavier.moment * lever**2
             borne = self.lighter[0] | self.lighter[1]
-            return jnp.where(borne, jnp.where(self.fixed, least, jnp.maximum(left, least)), k)
+            return jnp.where(borne, jnp.where(fixed, least, jnp.maximum(left, least)), k)
 
         k_normal = left(frame.k_normal, (normal, (frame.normal_a, frame.normal_b)))
         k_tangent = left(frame.k_tangent, (perpendicular(normal), (frame.tangent_a, frame.tangent_b)))
@@ -232,13 +241,14 @@ class SupportedPair(NamedTuple):
 
     def seen(self, impact: Array) -> "SupportedPair":
         """The pair as its contacts see it, which may have an impact in this step."""
-        sees, (lighter_a, lighter_b) = self.in_impacts | ~impact, self.lighter
+        sees, (lighter_a, lighter_b), crush = self.in_impacts | ~impact, self.lighter, self.crush
+        if crush is not None:
+            crush = crush._replace(crushed=crush.crushed & sees, fixed=crush.fixed & sees)
         return self._replace(
             lighter=(lighter_a & sees, lighter_b & sees),
             locked=jnp.where(sees, self.locked, 0.0),
             share=jnp.where(sees, self.share, 0.0),
-            crushed=None if self.crushed is None else self.crushed & sees,
-            fixed=None if self.fixed is None else self.fixed & sees,
+            crush=crush,
         )
 
     def pushes(self, impulse: Array) -> tuple[Array, Array]:
@@ -258,21 +268,22 @@ class SupportedContacts(NamedTuple):
         """Motions, or displacements, of both bodies that supports leave."""
         return motions if self.pair is None else self.pair.left(motions)
 
+    @property
+    def crush(self) -> CrushedPair | None:
+        """What a pair that may be crushed has beyond others; None if no obstacles are known."""
+        return None if self.pair is None else self.pair.crush
+
     def kept(self, motions: tuple[Motion | None, Motion]) -> tuple[Motion | None, Motion]:
         """Motions, or displacements, of which obstacles take up what a crushed body cannot do."""
-        if self.pair is None or self.pair.crushed is None:
-            return motions
-        crushed = self.pair.crushed
-        return jax.tree.map(lambda x, y: jnp.where(crushed, y, x), motions, self.pair.left(motions))
+        return motions if self.crush is None else self.crush.where(self.left(motions), motions)
 
     def pushed(self, contacts: list[ActiveContact]) -> tuple[list[ActiveContact], Array | float]:
         """Contacts as the correction of overlaps sees them, and what is `taken`: only obstacles count."""
-        if self.pair is None or self.pair.crushed is None:
+        if self.crush is None:
             return contacts, 0.0
-        crushed, of = self.pair.crushed, zip(contacts, self.contacts, strict=True)
-        frames = [jax.tree.map(lambda x, y: jnp.where(crushed, y, x), c.frame, s.frame) for c, s in of]
+        frames = self.crush.where([c.frame for c in self.contacts], [c.frame for c in contacts])
         contacts = [contact._replace(frame=frame) for contact, frame in zip(contacts, frames, strict=True)]
-        return contacts, jnp.where(crushed, self.taken, 0.0)
+        return contacts, self.crush.where(self.taken, 0.0)
 
     def means(self, motions: tuple[Motion | None, Motion]) -> tuple[Motion | None, Motion]:
         """Mean motions in the step, as the supports' impulses act at its half."""
@@ -296,53 +307,49 @@ def supported_pair(
     (a, b), normal = supports, points[0].normal
     if constraint.static or constraint.a is None or a is None or b is None:
         return None
-    of_a, of_b = constraint.a, constraint.b  # inverse masses
-    crushed = fixed = heavier = None
-    if obstacles[1] is not None:
+    crushed, (stop_a, stop_b) = None, obstacles
+    if stop_b is not None:
         crushed = is_crushed(constraint, points)
+        stop_a, stop_b = add_obstacles(constraint, points, (stop_a, stop_b), -1)
+        assert stop_a is not None, "both bodies move"
+        a, b = _stopped(crushed, a, stop_a), _stopped(crushed, b, stop_b)
+    of_a, of_b = constraint.a, constraint.b  # inverse masses
 
-    def far_lighter(one: Inertia, other: Inertia, support: Support, schur: Array | None) -> Array:
-        largest = jnp.where(support.kind == CORNER, LARGEST_IN_CORNERS, LARGEST_RATIO)
-        enough = one.mass <= largest * other.mass
-        lighter = (one.mass > LEAST_RATIO * other.mass) & (enough if crushed is None else enough | crushed)
+    def borne(far: Array, one: Inertia, other: Inertia, support: Support, schur: Array | None) -> Array:
+        served = one.mass <= jnp.where(support.kind == CORNER, LARGEST_IN_CORNERS, LARGEST_RATIO) * other.mass
+        lighter = far & (served if crushed is None else served | crushed)
         return lighter if schur is None else lighter & (schur == 0).all(0)
 
-    lighter_a = far_lighter(of_a, of_b, a, constraint.schur_a)
-    lighter_b = far_lighter(of_b, of_a, b, constraint.schur_b)
+    far_a, far_b = far_lighter(constraint)
+    lighter_a = borne(far_a, of_a, of_b, a, constraint.schur_a)
+    lighter_b = borne(far_b, of_b, of_a, b, constraint.schur_b)
     load, kind, mass, moment = (
         jnp.where(lighter_b, y, x)
         for x, y in ((a.load, b.load), (a.kind, b.kind), (of_a.mass, of_b.mass), (of_a.moment, of_b.moment))
     )
-    torques, total = (a.torque, b.torque), jnp.zeros_like(mass)
-    if crushed is not None and obstacles[1] is not None:
-        stopped_a, stopped_b = add_obstacles(constraint, points, (obstacles[0], obstacles[1]), -1)
-        assert stopped_a is not None, "both bodies move"
-        load = jnp.where(crushed, jnp.where(lighter_b, stopped_b.load, stopped_a.load), load)
-        total = jnp.where(lighter_b, stopped_b.total, stopped_a.total)
-        torques = _chosen(crushed, a.torque, stopped_a.torque), _chosen(crushed, b.torque, stopped_b.torque)
-        kind = jnp.where(crushed, LINE, kind)
     square, along = dot(load, load), dot(load, normal)
     along = jnp.where(lighter_b, -along, along)
     torque, k = None, mass * square
     pressed = (lighter_a | lighter_b) & (along > 0) & (along * along > PRESSED**2 * square) & (k > LEAST_COMPLIANCE)
     locked = jnp.zeros_like(moment)
-    if crushed is not None:
-        crushed = crushed & pressed
-        fixed = crushed & (square < SEVERAL**2 * total**2)
-        heavier = Inertia(*(jnp.where(lighter_b, x, y) for x, y in zip(of_a, of_b, strict=True)))
-    if torques[0] is not None or torques[1] is not None:
-        x, y = (jnp.zeros_like(k) if torque is None else torque for torque in torques)
+    if a.torque is not None or b.torque is not None:
+        x, y = (jnp.zeros_like(k) if torque is None else torque for torque in (a.torque, b.torque))
         flush = kind == FLUSH
         torque, locked = jnp.where(lighter_b, y, x), jnp.where(flush & pressed, moment, 0.0)
         moment = jnp.where(flush, 0.0, moment)
         k = k + moment * torque * torque
     share = reciprocal(k, pressed)
-    in_impacts = mass <= LARGEST_IN_IMPACTS * jnp.where(lighter_b, of_a.mass, of_b.mass)
-    if crushed is not None:
-        in_impacts = in_impacts | crushed
+    in_impacts, crush = mass <= LARGEST_IN_IMPACTS * jnp.where(lighter_b, of_a.mass, of_b.mass), None
+    if crushed is not None and stop_a is not None and stop_b is not None:
+        crushed = crushed & pressed
+        fixed = crushed & (square < SEVERAL**2 * jnp.where(lighter_b, stop_b.total, stop_a.total) ** 2)
+        heavier = Inertia(*(jnp.where(lighter_b, x, y) for x, y in zip(of_a, of_b, strict=True)))
+        in_impacts, crush = in_impacts | crushed, CrushedPair(crushed, fixed, heavier)
     lighter = pressed & lighter_a, pressed & lighter_b
-    return SupportedPair(lighter, mass, moment, locked, load, torque, share, in_impacts, crushed, fixed, heavier)
+    return SupportedPair(lighter, mass, moment, locked, load, torque, share, in_impacts, crush)
 
 
-def _chosen(where: Array, yes: Array | None, no: Array | None) -> Array | None:
-    return None if yes is None or no is None else jnp.where(where, no, yes)
+def _stopped(crushed: Array, support: Support, stop: Obstacles) -> Support:
+    """Support with the obstacles in its place where the pair is crushed."""
+    line = Support(stop.load, stop.torque, jnp.full_like(support.kind, LINE))
+    return jax.tree.map(lambda x, y: jnp.where(crushed, x, y), line, support)

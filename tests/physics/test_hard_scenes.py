@@ -12,7 +12,7 @@ from laws import deepest_overlap, holds, total_energy
 from worlds import rules, run, world
 
 from gen2d.physics.constraint import ContactConstraint, ContactFrame, ContactPoint, Inertia, Motion
-from gen2d.physics.support import Support, no_obstacles, supported_pair
+from gen2d.physics.support import Support, supported_pair
 from gen2d.space.space import Space
 
 GRAVITY = 9.81  # m/s^2
@@ -218,9 +218,8 @@ def test_a_load_that_fades_bears_nothing_in_the_end(torque):
     on_light = Support(jnp.stack([zero, load]), None if torque is None else torque * load, zero)
     constraint = ContactConstraint(heavy, light, one > 0, zero, zero, None, None, static=False)
     frame = ContactFrame(None, None, None, zero, one, one, one, one)
-    point = ContactPoint(frame, jnp.stack([zero, -one]), zero, zero, None, None, stop=zero)
-    none = no_obstacles(on_heavy), no_obstacles(on_light)
-    pair = supported_pair(constraint, [point], (on_heavy, on_light), none)
+    point = ContactPoint(frame, jnp.stack([zero, -one]), zero, zero, None, None)
+    pair = supported_pair(constraint, [point], (on_heavy, on_light), (None, None))
     assert pair is not None
     motion = Motion(jnp.stack([one, -one]), one)
     _, left = pair.left((motion, motion))
