@@ -19,6 +19,7 @@ from gen2d.physics.constraint import (
     relative_speed,
 )
 from gen2d.physics.contact_points import (
+    accelerated,
     active_contacts,
     bounce_threshold,
     contact_points,
@@ -260,7 +261,7 @@ def solve(
     params: SolverParams,
 ) -> tuple[BodySide, BodySide, SolvedPair]:
     """Both sides and the pair after the first pass: impulses, bounces and the correction of overlaps."""
-    constraint = with_joints(constraint, a, b)
+    constraint, points = with_joints(constraint, a, b), accelerated(points, a, b)
     acceleration = points[0].acceleration
     supported = supported_pair(constraint, points, (a.support, b.support), (a.obstacles, b.obstacles))
     if supported is not None:
@@ -305,7 +306,7 @@ def solve_impact(
 ) -> tuple[BodySide, BodySide, SolvedPair]:
     """Both sides and the pair after an impact at tau that follows others of their bodies; unchanged without one."""
     constraint = with_joints(constraint, a, b)
-    contacts, time = active_contacts(constraint, [point], [tau], a, b, params.step)
+    contacts, time = active_contacts(constraint, accelerated([point], a, b), [tau], a, b, params.step)
     happens = tau >= 0
 
     def target_of(contact: ActiveContact, speed: Array, old: Impulse) -> NormalTarget:

@@ -32,6 +32,7 @@ from gen2d.physics.contact_state import BodySide, PassSetup
 from gen2d.physics.jointed import jointed_frame
 from gen2d.physics.segment_lines import admissible, onward, whole_line
 from gen2d.physics.time_of_impact import (
+    SLOWEST,
     ApproachPath,
     plane_approach_speed,
     plane_path,
@@ -152,6 +153,22 @@ def impact_times(points: list[ContactPoint], a: BodySide, b: BodySide, setup: Pa
     return [_time_of_impact(point, a, b, pair_clock(a, b), setup, h) for point in points]
 
 
+def accelerated(points: list[ContactPoint], a: BodySide, b: BodySide) -> list[ContactPoint]:
+    """Contact points with the acceleration of springs, which warm starting does not see."""
+    pull = _pull_of_springs(a, b)
+    if pull is None:
+        return points
+    return [
+        point._replace(acceleration=pull if point.acceleration is None else point.acceleration + pull)
+        for point in points
+    ]
+
+
+def _pull_of_springs(a: BodySide, b: BodySide) -> Array | None:
+    """Acceleration [2, ...] of b relative to a by springs, m/s^2; None without springs."""
+    return b.pull if a.pull is None or b.pull is None else b.pull - a.pull
+
+
 def pair_clock(a: BodySide, b: BodySide) -> Array | None:
     """Time of the last impact of either body in the step so far, s; None: of no body."""
     return b.clock if a.clock is None or b.clock is None else jnp.maximum(a.clock, b.clock)
@@ -167,13 +184,7 @@ def active_contacts(
     """
     assert b.motion, "only static bodies lack a motion"
     assert b.drift, "only static bodies lack a drift"
-    if len(taus) == 1:
-        time = jnp.where(taus[0] >= 0, taus[0], 0.5 * h)
-    else:
-        first, second = taus
-        both, total = (first >= 0) & (second >= 0), jnp.maximum(first, 0.0) + jnp.maximum(second, 0.0)
-        time = jnp.where(both, 0.5 * total, jnp.where((first >= 0) | (second >= 0), total, 0.5 * h))
-    taus, time = materialize((taus, time))
+    taus, time = materialize((taus, _time_of_impulses(taus, h)))
     shift, velocity = relative_velocity(a.drift, b.drift), _mean_velocity(points[0], a.motion, b.motion, h)
     contacts = []
     for point, tau in zip(points, taus, strict=True):
@@ -187,7 +198,30 @@ def active_contacts(
             # A disc's lever is minus its radius.
             position = position if constraint.frame is None else position + frame.tangent_b * normal
         contacts.append(ActiveContact(frame, normal, point.gap, tau, -speed - fall, fall, position))
+    if b.pull is not None:
+        time = _time_of_impulses([_time_with_rest(constraint, contact, h) for contact in contacts], h)
     return contacts, time
+
+
+def _time_of_impulses(taus: list[Array], h: float) -> Array:
+    """Time at which the impulses at one or two points act, s."""
+    if len(taus) == 1:
+        return jnp.where(taus[0] >= 0, taus[0], 0.5 * h)
+    first, second = taus
+    both, total = (first >= 0) & (second >= 0), jnp.maximum(first, 0.0) + jnp.maximum(second, 0.0)
+    return jnp.where(both, 0.5 * total, jnp.where((first >= 0) | (second >= 0), total, 0.5 * h))
+
+
+def _time_with_rest(constraint: ContactConstraint, contact: ActiveContact, h: float) -> Array:
+    """Mean time of an impact and of the force that holds the bodies together after it, s; negative without an impact.
+
+    A strong spring brings the bodies together again in this step, where they come to rest. An impulse at the time of
+    impact that leaves them no speed at the end of the step would throw them apart first, against the spring.
+    """
+    rests = constraint.elasticity * contact.arrival < contact.fall
+    share = contact.fall / jnp.maximum(contact.arrival + contact.fall, SLOWEST)  # of the impulse
+    held = (contact.tau >= 0) & (contact.arrival > 0) & rests
+    return jnp.where(held, contact.tau + 0.5 * (h - contact.tau) * share, contact.tau)
 
 
 def _path(side: BodySide, time: Array) -> Array | float:

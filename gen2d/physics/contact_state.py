@@ -23,6 +23,7 @@ class BodySide(NamedTuple):
     shape: Shape | None = None  # in the world
     motion: Motion | None = None  # None: static bodies at rest
     acceleration: Array | None = None  # [2, N, ...] m/s^2; None: gravity's
+    pull: Array | None = None  # [2, N, ...] m/s^2: of springs, expected before the warm start; None: no springs
     drift: Motion | None = None  # m, rad: displacement beyond h times the new velocity, as impulses act at their time
     displacement: Motion | None = None  # m, rad: where the impulses of a pass act; None: of static bodies
     resting: Motion | None = None  # m/s, rad/s: what contacts at rest have added in the step; None: discs, static

@@ -107,7 +107,7 @@ def record_energy(
     group: Any,
     old: Motion,
     free: Motion,
-    free_drift: Motion,
+    flown: Motion,
     displacement: Motion,
     acceleration: Array,
     angular: Array | float,
@@ -116,23 +116,29 @@ def record_energy(
 ) -> Work:
     """Work on a group after a step.
 
-    `old` is the motion before the step; `free`, and `free_drift` beyond h times it, are those of a step without any
-    contact or joint. The work of the acceleration over the displacement that differs from the free one belongs to
+    `old` is the motion before the step; `free`, and the displacement `flown`, are those of a step without any contact
+    or joint. The work of the acceleration over the displacement that differs from the free one belongs to
     contacts and joints. Damping takes the energy and the displacement that an undamped fall would have more.
     """
-    flight = Motion(h * free.velocity + free_drift.velocity, h * free.spin + free_drift.spin)
-    deviation = Motion(displacement.velocity - flight.velocity, displacement.spin - flight.spin)
+    deviation = Motion(displacement.velocity - flown.velocity, displacement.spin - flown.spin)
     lost = work.lost + _work_of(group, acceleration, angular, deviation)
     driven, damped = work.driven, work.damped
     if damped is not None:
         undamped = Motion(old.velocity + h * acceleration, old.spin + h * angular)
         fall = Motion(h * old.velocity + 0.5 * h**2 * acceleration, h * old.spin + 0.5 * h**2 * angular)
-        missing = Motion(flight.velocity - fall.velocity, flight.spin - fall.spin)
+        missing = Motion(flown.velocity - fall.velocity, flown.spin - fall.spin)
         damped = damped + _kinetic(undamped, group) - _kinetic(free, group)
         damped = damped + _work_of(group, acceleration, angular, missing)
     if driven is not None:
         driven = driven + _work_of(group, acceleration - gravity[:, None], angular, displacement)
     return Work(lost, driven, damped)
+
+
+def spring_work_over(groups: list[Any], pulls: list[Motion], displacements: list[Motion]) -> Work:
+    """Work of springs, which give bodies these accelerations, over displacements by contacts, as lost in these."""
+    of = zip(groups, pulls, displacements, strict=True)
+    total = sum(jnp.sum(_work_of(group, *pull, way), axis=-2, keepdims=True) for group, pull, way in of)
+    return Work(total, None, -total)
 
 
 def accumulate(work: Work | None, passes: list[Work]) -> Work | None:

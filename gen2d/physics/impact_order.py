@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 
 from gen2d.physics.constraint import ActiveContact, ContactPoint, Motion
-from gen2d.physics.contact_points import impact_times, pair_clock
+from gen2d.physics.contact_points import accelerated, impact_times, pair_clock
 from gen2d.physics.contact_state import BodySide, PassSetup, SolvedPair
 from gen2d.physics.time_of_impact import NONE, WAITS
 from gen2d.records.axes import Array
@@ -131,5 +131,5 @@ def later_impact(
     """Time of an impact that follows others of its bodies in this step, s; negative without one."""
     clock = pair_clock(a, b)
     assert clock is not None, "moving bodies have clocks"
-    (tau,) = impact_times([point], a, b, setup, h)
+    (tau,) = impact_times(accelerated([point], a, b), a, b, setup, h)
     return jnp.where(may_follow(contact, clock) & _there(point), tau, NONE)

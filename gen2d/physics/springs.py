@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from gen2d.physics.collision import dot, perpendicular
-from gen2d.physics.constraint import Inertia, Motion
+from gen2d.physics.constraint import Inertia, Motion, reciprocal
 from gen2d.physics.energy import Work
 from gen2d.records.axes import Array
 from gen2d.records.layout import JointSpec
@@ -133,6 +133,15 @@ def _total(x: Array) -> Array:
     return jnp.sum(x, axis=-2, keepdims=True)
 
 
+class Sprung(NamedTuple):
+    """Bodies after the impulses of all springs at half of a step."""
+
+    motions: list[Motion]
+    changes: list[Motion] | None  # of the motions; None without springs
+    impulses: list[Array]  # [2, P, ...] N s of each batch, on its bodies b
+    works: list[Work]
+
+
 def apply(
     batches: list[JointBatch],
     bodies: list[Any],
@@ -141,67 +150,159 @@ def apply(
     drifts: list[Motion],
     accelerations: list[Array],
     h: float,
-) -> tuple[list[Motion], list[Motion], list[Work]]:
-    """Motions and drifts (displacements beyond h times the motion) after the impulses of all springs, and works."""
+) -> Sprung:
+    """Bodies after the impulses of all springs; drifts are all displacements beyond h times these motions."""
     if not batches:
-        return motions, drifts, []
+        return Sprung(motions, None, [], [])
     still, poses = [body.motion for body in statics], poses_of(bodies, statics)
     now, drift = table_of(motions, still), table_of(drifts, [jax.tree.map(jnp.zeros_like, motion) for motion in still])
-    acceleration, works = table_of(accelerations, [jnp.zeros_like(motion.velocity) for motion in still]), []
+    acceleration, impulses, works = table_of(accelerations, [jnp.zeros_like(m.velocity) for m in still]), [], []
     for batch in batches:
-        now, drift, work = _spring(batch, poses, now, drift, acceleration, h)
+        now, drift, impulse, work = _spring(batch, poses, now, drift, acceleration, h)
+        impulses.append(impulse)
         works.append(work)
-    return groups_of(now, motions), groups_of(drift, drifts), works
+    news = groups_of(now, motions)
+    changes = [jax.tree.map(jnp.subtract, *of) for of in zip(news, motions, strict=True)]
+    return Sprung(news, changes, impulses, works)
+
+
+class _Lines(NamedTuple):
+    """Springs of a batch with the line through their anchors."""
+
+    batch: JointBatch
+    arms: list[Array]  # [2, P, ...] m, of both bodies
+    axis: Array  # [2, P, ...] unit vector from the anchor on a to that on b
+
+    @property
+    def sides(self) -> tuple[tuple[JointSide, Array, int], ...]:
+        """Both sides, with their arms, and the sign of an impulse on them."""
+        return (self.batch.a, self.arms[0], -1), (self.batch.b, self.arms[1], 1)
+
+    @property
+    def inverse_mass(self) -> Array:
+        """Stretch rate that a unit impulse causes, 1/kg."""
+        return sum(  # pyright: ignore[reportReturnType]
+            side.inertia.mass + side.inertia.moment * dot(perpendicular(arm), self.axis) ** 2
+            for side, arm, _ in self.sides
+        )
+
+    @property
+    def coefficients(self) -> tuple[Array, Array]:
+        """Stiffness in N/m and damping in N s/m; zero for rods."""
+        soft = self.batch.present & jnp.isfinite(self.batch.stiffness)
+        return jnp.where(soft, self.batch.stiffness, 0.0), jnp.where(soft, self.batch.damping, 0.0)
+
+    def of(self, table: Any) -> list[Any]:
+        """Values of both bodies of each spring, from a table."""
+        return [take_rows(table, side.rows) for side in (self.batch.a, self.batch.b)]
+
+    def stretch_rate(self, motions: list[Motion]) -> Array:
+        """Speed at which the springs get longer, m/s."""
+        of_a, of_b = (m.velocity + m.spin * perpendicular(arm) for m, arm in zip(motions, self.arms, strict=True))
+        return dot(self.axis, of_b - of_a)
+
+    def apply(self, motions: list[Motion], impulse: Array) -> list[Motion]:
+        """Motions, or displacements, of both bodies after an impulse [2, ...] on b and its reaction on a."""
+        return [
+            _apply_impulse(side, arm, motion, sign * impulse)
+            for (side, arm, sign), motion in zip(self.sides, motions, strict=True)
+        ]
+
+    def driven(self, motions: list[Motion], impulse: Array) -> Array:
+        """Work of kinematic bodies where the springs hold them, J."""
+        driven = jnp.zeros_like(impulse[0])
+        for (side, arm, sign), motion in zip(self.sides, motions, strict=True):
+            if side.static.any():
+                work = dot(motion.velocity + motion.spin * perpendicular(arm), impulse)
+                driven = driven - sign * jnp.where(side.static[:, None], work, 0.0)
+        return driven
 
 
 def _spring(
     batch: JointBatch, poses: Any, now: Motion, drift: Motion, acceleration: Array, h: float
-) -> tuple[Motion, Motion, Work]:
-    """Motions and drifts after the impulse of springs at half of the step, and the work that it took from the motion.
+) -> tuple[Motion, Motion, Array, Work]:
+    """Motions and drifts after the impulse of springs at half of the step, the impulse, and the work that it took.
 
     The energy stored in springs is subtracted in `energy.close_balance`.
     """
-    soft = batch.present & jnp.isfinite(batch.stiffness)
-    k, c = (jnp.where(soft, x, 0.0) for x in (batch.stiffness, batch.damping))
-    olds = [take_rows(now, side.rows) for side in (batch.a, batch.b)]
+    olds, drifts = ([take_rows(table, side.rows) for side in (batch.a, batch.b)] for table in (now, drift))
     *starts, offset = anchors_of(batch.a, batch.b, poses)
-    arms = [rotate(arm, 0.5 * h * motion.spin) for arm, motion in zip(starts, olds, strict=True)]
-    moved = [0.5 * h * old.velocity + arm - start for old, arm, start in zip(olds, arms, starts, strict=True)]
+    halves = [jax.tree.map(lambda v, x: 0.5 * (h * v + x), *of) for of in zip(olds, drifts, strict=True)]
+    arms = [rotate(arm, half.spin) for arm, half in zip(starts, halves, strict=True)]
+    moved = [half.velocity + arm - start for half, arm, start in zip(halves, arms, starts, strict=True)]
     more, axis = moved[1] - moved[0], direction_of(offset)[0]
     # Only the sideways part turns the axis: a stiff spring would swing through zero length in half a step.
     along = dot(axis, more)
     axis, length = direction_of(offset + more - along * axis)
     arms, axis, length, along = materialize((arms, axis, length, along))
-    sides = (batch.a, arms[0], -1), (batch.b, arms[1], 1)
-    inverse = sum(
-        side.inertia.mass + side.inertia.moment * dot(perpendicular(arm), axis) ** 2 for side, arm, _ in sides
-    )
-
-    def stretch_rate(motions: list[Motion]) -> Array:
-        of_a, of_b = (m.velocity + m.spin * perpendicular(arm) for m, (_, arm, _) in zip(motions, sides, strict=True))
-        return dot(axis, of_b - of_a)
-
-    speed = stretch_rate(olds)
+    lines = _Lines(batch, arms, axis)
+    (k, c), inverse, speed = lines.coefficients, lines.inverse_mass, lines.stretch_rate(olds)
     stretch = length - batch.rest + along
-    size = -h * (k * stretch + c * speed) / (1 + inverse * h * (0.25 * h * k + 0.5 * c))
+    rate = speed + lines.stretch_rate(drifts) / h
+    size = -h * (k * stretch + c * rate) / (1 + inverse * h * (0.25 * h * k + 0.5 * c))
     size = materialize(size)
     impulse = size * axis
-    news = [_apply_impulse(side, arm, old, sign * impulse) for (side, arm, sign), old in zip(sides, olds, strict=True)]
-    lost = -0.5 * size * (speed + stretch_rate(news))
-    driven = jnp.zeros_like(lost)
-    for (side, arm, sign), motion in zip(sides, news, strict=True):
-        if side.static.any():  # a kinematic body does work where it is held
-            work = dot(motion.velocity + motion.spin * perpendicular(arm), impulse)
-            driven = driven - sign * jnp.where(side.static[:, None], work, 0.0)
+    news = lines.apply(olds, impulse)
+    lost = -0.5 * size * (speed + lines.stretch_rate(news))
     # The work of the acceleration over the spring's own change of displacement is not that of contacts.
     over_drift = jnp.zeros_like(lost)
-    for side, _, sign in sides:
+    for side, _, sign in lines.sides:
         over_drift = over_drift + 0.5 * h * sign * dot(take_rows(acceleration, side.rows), impulse)
-    drifts = [
-        _apply_impulse(side, arm, take_rows(drift, side.rows), -0.5 * h * sign * impulse) for side, arm, sign in sides
-    ]
-    work = Work(_total(-over_drift), _total(driven), _total(lost + over_drift))
-    return _put(now, batch, *news), _put(drift, batch, *drifts), work
+    drifts = lines.apply(drifts, -0.5 * h * impulse)
+    work = Work(_total(-over_drift), _total(lines.driven(news, impulse)), _total(lost + over_drift))
+    return _put(now, batch, *news), _put(drift, batch, *drifts), impulse, work
+
+
+def conserve(
+    batches: list[JointBatch],
+    bodies: list[Any],
+    statics: list[Any],
+    displacements: list[Motion],
+    motions: list[Motion],
+    impulses: list[Array],
+    h: float,
+) -> tuple[list[Motion], list[Work]]:
+    """Motions at the end of a step, in which springs have given what they have lost, and the works.
+
+    The impulses were found for bodies that nothing hits. Over the displacements that impacts and joints have left, they
+    have done another work than what the springs have lost. The difference goes into the speeds of the anchors.
+    """
+    if not batches:
+        return motions, []
+    fixed = [body.motion for body in statics]
+    poses, moved = poses_of(bodies, statics), table_of(displacements, [jax.tree.map(lambda x: h * x, m) for m in fixed])
+    now, works = table_of(motions, fixed), []
+    for batch, impulse in zip(batches, impulses, strict=True):
+        now, work = _conserve(batch, poses, moved, now, impulse, h)
+        works.append(work)
+    return groups_of(now, motions), works
+
+
+def _conserve(
+    batch: JointBatch, poses: Any, moved: Motion, now: Motion, impulse: Array, h: float
+) -> tuple[Motion, Work]:
+    """Motions of a batch after displacements, in which the energy is what it should be, and the work for it."""
+    *starts, offset = anchors_of(batch.a, batch.b, poses)
+    ways = [take_rows(moved, side.rows) for side in (batch.a, batch.b)]
+    arms = [rotate(arm, way.spin) for arm, way in zip(starts, ways, strict=True)]
+    of_a, of_b = (way.velocity + arm - start for way, arm, start in zip(ways, arms, starts, strict=True))
+    way = of_b - of_a
+    (_, before), (axis, after) = direction_of(offset), direction_of(offset + way)
+    longer = dot(way, offset + offset + way) / jnp.maximum(before + after, SHORTEST)
+    lines = _Lines(batch, *materialize((arms, axis)))
+    (k, c), inverse, olds = lines.coefficients, lines.inverse_mass, lines.of(now)
+    # What springs and dampers have given over this way, less what the impulse has.
+    missing = -longer * (k * (0.5 * (before + after) - batch.rest) + c * longer / h) - dot(impulse, way) / h
+    speed = lines.stretch_rate(olds)
+    square = speed**2 + 2 * inverse * missing
+    root = jnp.sqrt(jnp.where(square > 0, square, 1.0))
+    exact = 2 * missing * reciprocal(jnp.where(speed < 0, speed - root, speed + root), square > 0)
+    size = jnp.where(square > 0, exact, -speed * reciprocal(inverse, inverse > 0))  # the anchors stop at most
+    more = jnp.where((k > 0) & (inverse > 0), materialize(size), 0.0)
+    news = lines.apply(olds, more * axis)
+    lost = -0.5 * more * (speed + lines.stretch_rate(news))
+    work = Work(_total(jnp.zeros_like(lost)), _total(lines.driven(news, more * axis)), _total(lost))
+    return _put(now, batch, *news), work
 
 
 def springs_energy(batches: list[JointBatch], bodies: list[Any], statics: list[Any]) -> Array | float:

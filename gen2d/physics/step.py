@@ -38,7 +38,7 @@ from gen2d.physics import limits_motors, rigid_joints, springs
 from gen2d.physics.collision import Disc
 from gen2d.physics.constraint import Motion, speed_bound
 from gen2d.physics.contact_state import BodySide
-from gen2d.physics.energy import Ledger, accumulate, record_energy
+from gen2d.physics.energy import Ledger, Work, accumulate, record_energy, spring_work_over
 from gen2d.physics.impact_order import not_hit
 from gen2d.physics.jointed import hold, release
 from gen2d.physics.params import SolverParams
@@ -94,6 +94,62 @@ def _displace(body: BodyState, displacement: Motion, motion: Motion) -> BodyStat
     new = materialize(jax.tree.map(jnp.add, old, add))
     remainder = jax.tree.map(lambda n, o, d: jax.lax.stop_gradient(d - (n - o)), new, old, add)
     return BodyState(new.velocity, new.spin, motion, remainder)
+
+
+class _Springs:
+    """The springs in a step, with their works so far; does nothing without springs."""
+
+    def __init__(self, model: Model, world: WorldState, statics: list[BodyState], h: float) -> None:
+        self._springs, self._groups, self._bodies, self._statics, self._h = (
+            model.springs, model.groups, world.bodies, statics, h,
+        )  # fmt: skip
+        self._sprung = springs.Sprung([], None, [], [])
+        self._works: list[Work] = []
+
+    def pull(
+        self, motions: list[Motion], drifts: list[Motion], free_drifts: list[Motion], accelerations: list[Array]
+    ) -> tuple[list[Motion], list[Motion]]:
+        """Motions after their impulses, and the drifts of all forces; `drifts` are those of other impulses."""
+        of = self._springs, self._bodies, self._statics, motions, _sums(drifts, free_drifts), accelerations
+        self._sprung = springs.apply(*of, self._h)
+        if self._sprung.changes is None:
+            return motions, free_drifts
+        own = [_scaled(change, -0.5 * self._h) for change in self._sprung.changes]
+        return self._sprung.motions, _sums(free_drifts, own)
+
+    def expected(
+        self, motions: list[Motion], free_drifts: list[Motion], accelerations: list[Array]
+    ) -> list[Array] | list[None]:
+        """Accelerations by the springs in a step without contacts."""
+        of = self._springs, self._bodies, self._statics, motions, free_drifts, accelerations
+        return self._by(springs.apply(*of, self._h).changes)
+
+    @property
+    def accelerations(self) -> list[Array] | list[None]:
+        """Acceleration [2, N, ...] of each group by the springs, m/s^2."""
+        return self._by(self._sprung.changes)
+
+    def _by(self, changes: list[Motion] | None) -> list[Array] | list[None]:
+        return [None] * len(self._groups) if changes is None else [change.velocity / self._h for change in changes]
+
+    def conserve(self, displacements: list[Motion], motions: list[Motion]) -> list[Motion]:
+        """Motions at the end of the step, in which the springs have given what they have lost."""
+        of = self._springs, self._bodies, self._statics, displacements, motions, self._sprung.impulses
+        motions, self._works = springs.conserve(*of, self._h)
+        return motions
+
+    def works(self, flown: list[Motion], displacements: list[Motion], warm: list[Motion]) -> list[Work]:
+        """All works; `flown` are the displacements without any contact or joint, `warm` the changes by warm starting.
+
+        A contact's work is that over the speeds that it meets, the springs' own included, which are given back by the
+        end of the step; but those of warm starting come before the springs, which meet its speeds instead.
+        """
+        works, changes, h = [*self._sprung.works, *self._works], self._sprung.changes, self._h
+        if changes is None:
+            return works
+        of = zip(displacements, flown, changes, warm, strict=True)
+        ways = [jax.tree.map(lambda x, free, own, first: x - free - h * (0.5 * own + first), *parts) for parts in of]
+        return [*works, spring_work_over(self._groups, [_scaled(change, 1 / h) for change in changes], ways)]
 
 
 class _RigidJoints:
@@ -152,7 +208,7 @@ class _RigidJoints:
         sides = [release(side) for side in sides]
         motions, drifts = _motions(sides), [side.drift for side in sides if side.drift is not None]
         if self._system is None:
-            return motions, [jax.tree.map(jnp.add, *of) for of in zip(drifts, free_drifts, strict=True)]
+            return motions, _sums(drifts, free_drifts)
         solved, drifts = self._factored.meet(
             motions, drifts, free_drifts, self._fixed, self._impulses, self._params.step
         )
@@ -170,15 +226,25 @@ class _RigidJoints:
         return solved.motions
 
 
+def _sums(first: list[Motion], second: list[Motion]) -> list[Motion]:
+    return [jax.tree.map(jnp.add, *of) for of in zip(first, second, strict=True)]
+
+
 def _motions(sides: list[BodySide]) -> list[Motion]:
     return [side.motion for side in sides if side.motion is not None]
 
 
-def _first_pass_side(side: BodySide, motion: Motion, drift: Motion, change: Motion, params: SolverParams) -> BodySide:
-    """The side after warm starting, which changed its motion by `change`, as the first pass needs it."""
+def _first_pass_side(
+    side: BodySide, motion: Motion, drift: Motion, change: Motion, pull: Array | None, params: SolverParams
+) -> BodySide:
+    """The side after warm starting, which changed its motion by `change`, as the first pass needs it.
+
+    `pull` is the acceleration of springs.
+    """
     disc = isinstance(side.shape, Disc)
     return BodySide(
         motion=motion,
+        pull=pull,
         drift=drift,
         resting=None if disc else change,
         push=speed_bound(change.velocity) if disc else jnp.zeros_like(change.spin),
@@ -203,19 +269,22 @@ def step(world: WorldState, model: Model, params: SolverParams) -> WorldState:
     before = rigid.stay(free)
     shapes = [to_world(g.body_shape, b.position, b.angle) for g, b in zip(groups, world.bodies, strict=True)]
     statics = [BodySide(f.shape_at(b), f.motion) for f, b in zip(model.statics, fixed, strict=True)]
+    pulling = _Springs(model, world, fixed, h)
+    pulls = pulling.expected(before, free_drifts, accelerations)
     different = accelerations if angular else [None] * len(groups)
     works = [None] * len(groups) if ledger is None else ledger.groups
-    of_groups = zip(shapes, before, different, works, strict=True)
+    of_groups = zip(shapes, before, different, pulls, works, strict=True)
     sides = [
         BodySide(
             shape,
             motion,
             acceleration,
+            pull,
             displacement=_scaled(motion, 0.5 * h),
             work=work,
             support=no_support(motion.velocity, isinstance(shape, Disc)),
         )
-        for shape, motion, acceleration, work in of_groups
+        for shape, motion, acceleration, pull, work in of_groups
     ]
     if params.by_time:
         sides = not_hit(sides)
@@ -224,20 +293,19 @@ def step(world: WorldState, model: Model, params: SolverParams) -> WorldState:
     changes = [jax.tree.map(jnp.subtract, *of) for of in zip(motions, before, strict=True)]
     drifts = [_scaled(change, -0.5 * h) for change in changes]
 
-    motions, drifts, works_of_springs = springs.apply(
-        model.springs, world.bodies, fixed, motions, drifts, accelerations, h
-    )
-    motions = rigid.limit(motions, [jax.tree.map(jnp.add, *of) for of in zip(drifts, free_drifts, strict=True)])
-    of_groups = zip(sides, motions, drifts, jax.lax.stop_gradient(changes), strict=True)
+    motions, forced_drifts = pulling.pull(motions, drifts, free_drifts, accelerations)
+    motions = rigid.limit(motions, _sums(drifts, forced_drifts))
+    of_groups = zip(sides, motions, drifts, jax.lax.stop_gradient(changes), pulling.accelerations, strict=True)
     sides = [_first_pass_side(*of, params) for of in of_groups]
     statics = [BodySide(motion=side.motion) for side in statics]
     sides, solved = solver.solve(carry, contacts, rigid.hold(sides), statics)
-    motions, drifts = rigid.meet(sides, free_drifts)
+    motions, drifts = rigid.meet(sides, forced_drifts)
 
     displacements = [jax.tree.map(lambda x, y: h * x + y, *of) for of in zip(motions, drifts, strict=True)]
     solid = [s if g.collides else None for s, g in zip(shapes, groups, strict=True)]
     displacements = clamp_displacement(displacements, solid, model.barriers)
     bodies = [_displace(*of) for of in zip(world.bodies, displacements, motions, strict=True)]
+    motions = pulling.conserve(displacements, motions)
 
     rigid.move(displacements)
     motions = rigid.limit(motions)
@@ -250,8 +318,9 @@ def step(world: WorldState, model: Model, params: SolverParams) -> WorldState:
     motions = rigid.stay(_motions([release(side) for side in sides]))
     if ledger is not None:
         olds, works = [body.motion for body in world.bodies], [side.work for side in sides]
-        done = zip(works, groups, olds, free, free_drifts, displacements, accelerations, spin_ups, strict=True)
-        by_joints = accumulate(ledger.joints, [*works_of_springs, *rigid.works])
+        flown = _sums([_scaled(motion, h) for motion in free], free_drifts)
+        done = zip(works, groups, olds, free, flown, displacements, accelerations, spin_ups, strict=True)
+        by_joints = accumulate(ledger.joints, [*pulling.works(flown, displacements, changes), *rigid.works])
         ledger = Ledger([record_energy(*of, gravity=model.gravity, h=h) for of in done], by_joints)
     return WorldState(
         bodies=[body._replace(motion=motion) for body, motion in zip(bodies, motions, strict=True)],

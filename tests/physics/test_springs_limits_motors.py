@@ -165,6 +165,45 @@ def test_a_spring_that_turns_keeps_its_energy_and_angular_momentum():
     holds("spring that turns: angular momentum, relative", angular / angular[0] - 1, 2e-4)
 
 
+@pytest.mark.parametrize("order", ["pairs", "time"])
+@pytest.mark.parametrize(("rate", "bound", "way"), [(5.0, 2e-5, 3e-4), (20.0, 2e-5, 0.01), (130.0, 1e-4, None)])
+def test_a_spring_and_an_elastic_wall_keep_the_energy(rate: float, bound: float, way: float | None, order: str):
+    """A disc swings about a place beyond a wall's reach, and bounces off the wall on each swing."""
+    space, swing, wall, mass = Space(gravity=(0, 0), impact_order=order), 0.3, -0.11, 2.0
+    disc = space.add_circle((swing, 0), 0.1, mass=mass, elasticity=1)
+    space.add_segment((wall - 0.1, -3), (wall - 0.1, 3), elasticity=1)
+    space.add_joint("distance", disc, anchor_b=(-5, 0), length=5, stiffness=mass * rate**2)
+    video = space.simulate(2, fps=240, contacts=0)
+    x, v = (np.asarray(values[:, disc, 0], float) for values in (video.position, video.velocity))
+    energy = 0.5 * mass * (v**2 + (rate * x) ** 2)
+    holds(f"spring at a wall, {rate:g} rad/s: energy, relative", energy / energy[0] - 1, bound)
+    if way is not None:
+        period = 2 * math.acos(wall / swing) / rate
+        phase = (np.asarray(video.time, float) + period / 2) % period - period / 2
+        holds(f"spring at a wall, {rate:g} rad/s: path, m", x - swing * np.cos(rate * phase), way)
+
+
+@pytest.mark.parametrize("rate", [20.0, 130.0])
+def test_a_spring_presses_a_disc_onto_a_wall_with_its_force(rate: float):
+    """From .2 m in front of a wall, until it rests there; what is lost is lost in the contact."""
+    space, wall, mass = Space(gravity=(0, 0)), 0.1, 2.0
+    disc = space.add_circle((0.3, 0), 0.1, mass=mass, elasticity=0.5)
+    space.add_segment((wall - 0.1, -3), (wall - 0.1, 3), elasticity=1)
+    space.add_joint("distance", disc, anchor_b=(-5, 0), length=5, stiffness=mass * rate**2)
+    video = space.simulate(2, fps=240, contacts=500)
+    x, force = np.asarray(video.position[:, disc, 0], float), mass * rate**2 * wall
+    last = video.contacts.frame > 240
+    holds("pressed disc: force on the wall, relative", video.contacts.normal_impulse[last] * 240 / force - 1, 1e-4)
+    holds("pressed disc: depth in the wall, m", np.maximum(wall - x, 0), 1e-6)
+    holds("pressed disc: way in the last second, m", np.ptp(x[240:]), 1e-6)
+    lost = 0.5 * mass * rate**2 * (0.3**2 - wall**2)
+    holds("pressed disc: lost in the contact, relative", video.energy.lost_in_contact[-1] / lost - 1, 1e-3)
+    holds(
+        "pressed disc: given in a contact, relative", np.minimum(np.diff(video.energy.lost_in_contact), 0) / lost, 1e-4
+    )
+    holds("pressed disc: lost to damping, relative", video.energy.lost_to_damping / lost, 1e-3)
+
+
 def test_a_row_of_locked_hinges_is_a_stiff_beam():
     """Eight bars from a wall, whose hinges have no room to turn: solved one after the other, they would fold."""
     space, last = Space(gravity=(0, -9.81)), None
