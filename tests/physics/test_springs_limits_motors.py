@@ -243,10 +243,12 @@ def swinging_bars(spin: float, torque: float) -> Space:
     return space
 
 
-def program(space: Space, frames: int, sparse: bool) -> tuple[Callable[..., Trajectory], Scene, State]:
-    """Simulation of a space without contacts, by one of the two solvers, and its arguments."""
+def program(
+    space: Space, frames: int, sparse: bool, collides: bool = False
+) -> tuple[Callable[..., Trajectory], Scene, State]:
+    """Simulation of a space, without contacts unless it `collides`, by one of the two solvers, and its arguments."""
     scene, state, layout = space.scene()
-    groups = tuple(dataclasses.replace(group, collides=False) for group in layout.groups)
+    groups = tuple(dataclasses.replace(group, collides=collides) for group in layout.groups)
     layout, params = dataclasses.replace(layout, groups=groups), rules()
 
     def run(scene: Scene, state: State) -> Trajectory:
@@ -282,6 +284,34 @@ def test_limits_have_the_gradient_of_their_differences():
     gradient = jax.jit(jax.grad(last_angle))(jnp.asarray(0.5), scene, state)
     ends = [last_angle(jnp.asarray(torque), scene, state) for torque in (0.49, 0.51)]
     holds("bars: gradient less difference, relative", gradient / ((ends[1] - ends[0]) / 0.02) - 1, 2e-2)
+
+
+@pytest.mark.slow
+def test_a_spring_at_a_wall_has_the_gradient_of_its_closed_form():
+    """By the start and the stiffness, after one bounce; the solver for CPUs has the same path."""
+    space, swing, wall, rate, mass, frames = Space(gravity=(0, 0)), 0.3, -0.11, 5.0, 2.0, 37
+    disc = space.add_circle((swing, 0), 0.1, mass=mass, elasticity=1)
+    space.add_segment((wall - 0.1, -3), (wall - 0.1, 3), elasticity=1)
+    space.add_joint("distance", disc, anchor_b=(-5, 0), length=5, stiffness=mass * rate**2)
+    run, scene, state = program(space, frames, False, collides=True)
+
+    def end(shift: jax.Array, stiffness: jax.Array) -> jax.Array:
+        joints = scene.joints
+        assert joints is not None
+        joints = dataclasses.replace(joints, stiffness=0 * joints.stiffness + stiffness)
+        moved = dataclasses.replace(state, position=state.position.at[0, 0].add(shift))
+        return run(dataclasses.replace(scene, joints=joints), moved).states.position[0, -1, 0, 0]
+
+    place, slopes = jax.jit(jax.value_and_grad(end, (0, 1)))(jnp.asarray(0.0), jnp.asarray(mass * rate**2))
+    time, reach = (frames - 1) / 60, math.acos(wall / swing)
+    phase = rate * time - 2 * reach
+    by_start = math.cos(phase) + 2 * math.sin(phase) * wall / swing / math.sin(reach)
+    by_rate = -swing * time * math.sin(phase)
+    holds("spring at a wall: place after a bounce, m", place - swing * math.cos(phase), 2e-4)
+    holds("spring at a wall: derivative by the start", slopes[0] - by_start, 2e-3)
+    holds("spring at a wall: derivative by the stiffness, relative", slopes[1] * 2 * mass * rate / by_rate - 1, 2e-2)
+    theirs, *of = program(space, frames, True, collides=True)
+    holds("spring at a wall: place by both solvers, m", jax.jit(theirs)(*of).states.position[0, -1, 0, 0] - place, 1e-6)
 
 
 def test_chains_with_friction_in_their_hinges_only_lose_energy():
