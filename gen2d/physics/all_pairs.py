@@ -92,7 +92,7 @@ class AllPairs(ContactSolver):
         def play(k: int, a: BodySide, b: BodySide) -> tuple[BodySide, BodySide, list[ContactPoint]]:
             return contact_passes.warm_start(self.constraints[k], carry.warm[k], a, b, self.setup, self.params)
 
-        sides = [side._replace(pull=None) for side in sides]  # only finding near pairs needs it
+        sides = [side._replace(push=None) for side in sides]  # only finding near pairs needs it
         return run_schedule(sides, statics, self.order, play)
 
     def _find_obstacles(

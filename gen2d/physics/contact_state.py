@@ -23,11 +23,12 @@ class BodySide(NamedTuple):
     shape: Shape | None = None  # in the world
     motion: Motion | None = None  # None: static bodies at rest
     acceleration: Array | None = None  # [2, N, ...] m/s^2; None: gravity's
-    pull: Array | None = None  # [2, N, ...] m/s^2: of springs, expected before the warm start; None: no springs
+    pull: Array | None = None  # [2, N, ...] m/s^2: of springs, in the first pass; None: no springs
     drift: Motion | None = None  # m, rad: displacement beyond h times the new velocity, as impulses act at their time
     displacement: Motion | None = None  # m, rad: where the impulses of a pass act; None: of static bodies
     resting: Motion | None = None  # m/s, rad/s: what contacts at rest have added in the step; None: discs, static
-    push: Array | None = None  # [N, ...] m/s: bound on what warm starting added to a disc, or heavier bodies to any
+    push: Array | None = None  # [N, ...] m/s: bound on what warm starting added to a disc, or heavier bodies to any;
+    # before the warm start, on what springs add
     work: Work | None = None
     schur: Array | None = None  # [6, N, ...] what rigid joints take from the inverse mass (jointed.py)
     joint_motion: Motion | None = None  # m/s, rad/s: what they take from the motion in a pass

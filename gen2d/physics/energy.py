@@ -137,7 +137,8 @@ def record_energy(
 def spring_work_over(groups: list[Any], pulls: list[Motion], displacements: list[Motion]) -> Work:
     """Work of springs, which give bodies these accelerations, over displacements by contacts, as lost in these."""
     of = zip(groups, pulls, displacements, strict=True)
-    total = sum(jnp.sum(_work_of(group, *pull, way), axis=-2, keepdims=True) for group, pull, way in of)
+    each = [jnp.sum(_work_of(group, *pull, way), axis=-2, keepdims=True) for group, pull, way in of]
+    total = sum(each[1:], each[0])
     return Work(total, None, -total)
 
 

@@ -155,9 +155,9 @@ class NearbyPairs(PairBatches, ContactSolver):
         """Pairs of each batch that may meet in this step."""
         motions = [side.motion for side in sides if side.motion is not None]
         squares = [dot(motion.velocity, motion.velocity) for motion in motions]
-        if sides[0].pull is not None:
-            pulls = [dot(side.pull, side.pull) for side in sides if side.pull is not None]
-            squares = [_largest_square(*of, self.params.step) for of in zip(squares, pulls, strict=True)]
+        pushes = [side.push for side in sides if side.push is not None]
+        if pushes:
+            squares = [(jnp.sqrt(square) + push) ** 2 for square, push in zip(squares, pushes, strict=True)]
         fastest = jnp.zeros(self.scenes, self.dtype)
         for square in squares:
             fastest = jnp.maximum(fastest, jnp.sqrt(max_bodies(square)))
@@ -242,7 +242,7 @@ class NearbyPairs(PairBatches, ContactSolver):
         self, carry: NearbyCarry, sides: list[BodySide], statics: list[BodySide]
     ) -> tuple[list[BodySide], ListedPairs]:
         near = self._find_near_pairs(sides, statics)
-        sides = [side._replace(pull=None) for side in sides]
+        sides = [side._replace(push=None) for side in sides]
         chunks, indices = [active.starts[-1] for active in near], self._all_indices(near, carry.buffers)
         listed = ListedPairs(near, chunks, indices, [], {}, jnp.zeros((), bool))
         groups = [self._table(group, self._size(g)) for g, group in enumerate(self.groups)]
@@ -488,11 +488,6 @@ class NearbyPairs(PairBatches, ContactSolver):
             return jnp.take_along_axis(x, jnp.broadcast_to(order, x.shape), axis=-2)
 
         return depth, begins, contacts_of(*jax.tree.map(in_order, log), count=count)
-
-
-def _largest_square(speed: Array, pull: Array, h: float) -> Array:
-    """Square of the sum of a speed, m/s, and what a pull adds in a step, from the squares of both."""
-    return (jnp.sqrt(speed) + h * jnp.sqrt(pull)) ** 2
 
 
 def _empty_row(dtype: Any) -> ContactRow:

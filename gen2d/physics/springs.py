@@ -11,19 +11,20 @@ with it. Bodies are rows of a table, those of all groups before the static ones.
 
 import itertools
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from gen2d.physics.collision import dot, perpendicular
-from gen2d.physics.constraint import Inertia, Motion, reciprocal
+from gen2d.physics.constraint import Inertia, Motion, reciprocal, speed_bound
 from gen2d.physics.energy import Work
 from gen2d.records.axes import Array
 from gen2d.records.layout import JointSpec
 from gen2d.xla import materialize
 
+Anchors: TypeAlias = tuple[Array, Array, Array]  # both arms and the offset between the anchors, m [2, P, ...]
 SHORTEST = 1e-6  # m: a shorter rod has no direction
 
 
@@ -103,7 +104,7 @@ def direction_of(offset: Array) -> tuple[Array, Array]:
     return jnp.where(squared > SHORTEST**2, offset / length, 0.0), jnp.where(squared > SHORTEST**2, length, 0.0)
 
 
-def anchors_of(a: JointSide, b: JointSide, poses: Any) -> tuple[Array, Array, Array]:
+def anchors_of(a: JointSide, b: JointSide, poses: Any) -> Anchors:
     """Both arms, and the offset between the anchors, m [2, P, ...], from a table of positions and angles."""
     (position_a, angle_a), (position_b, angle_b) = (take_rows(poses, side.rows) for side in (a, b))
     arm_a, arm_b = materialize((rotate(a.anchor, angle_a), rotate(b.anchor, angle_b)))
@@ -142,10 +143,30 @@ class Sprung(NamedTuple):
     works: list[Work]
 
 
+def speed_bounds(
+    batches: list[JointBatch], anchors: list[Anchors], statics: list[Motion], motions: list[Motion], h: float
+) -> list[Array] | list[None]:
+    """Bounds on the change of the velocities of each group by the springs in a step, m/s [N, ...]; None without any."""
+    if not batches:
+        return [None] * len(motions)
+    now = table_of(motions, statics)
+    bounds = jnp.zeros_like(now.spin)
+    for batch, (arm_a, arm_b, offset) in zip(batches, anchors, strict=True):
+        axis, length = direction_of(offset)
+        lines = _Lines(batch, [arm_a, arm_b], axis)
+        (k, c), inverse, (of_a, of_b) = lines.coefficients, lines.inverse_mass, lines.anchor_velocities(lines.of(now))
+        fastest = speed_bound(of_b - of_a)
+        impulse = h * (k * jnp.abs(length - batch.rest) + (0.5 * h * k + c) * fastest)
+        impulse = materialize(impulse / (1 + inverse * h * (0.25 * h * k + 0.5 * c)))
+        more = (old + s.inertia.mass * impulse for (s, *_), old in zip(lines.sides, lines.of(bounds), strict=True))
+        bounds = _put(bounds, batch, *more)
+    return groups_of(bounds, motions)
+
+
 def apply(
     batches: list[JointBatch],
-    bodies: list[Any],
-    statics: list[Any],
+    anchors: list[Anchors],
+    statics: list[Motion],
     motions: list[Motion],
     drifts: list[Motion],
     accelerations: list[Array],
@@ -154,11 +175,10 @@ def apply(
     """Bodies after the impulses of all springs; drifts are all displacements beyond h times these motions."""
     if not batches:
         return Sprung(motions, None, [], [])
-    still, poses = [body.motion for body in statics], poses_of(bodies, statics)
-    now, drift = table_of(motions, still), table_of(drifts, [jax.tree.map(jnp.zeros_like, motion) for motion in still])
-    acceleration, impulses, works = table_of(accelerations, [jnp.zeros_like(m.velocity) for m in still]), [], []
-    for batch in batches:
-        now, drift, impulse, work = _spring(batch, poses, now, drift, acceleration, h)
+    now, drift = table_of(motions, statics), table_of(drifts, [jax.tree.map(jnp.zeros_like, m) for m in statics])
+    acceleration, impulses, works = table_of(accelerations, [jnp.zeros_like(m.velocity) for m in statics]), [], []
+    for batch, start in zip(batches, anchors, strict=True):
+        now, drift, impulse, work = _spring(batch, start, now, drift, acceleration, h)
         impulses.append(impulse)
         works.append(work)
     news = groups_of(now, motions)
@@ -196,9 +216,13 @@ class _Lines(NamedTuple):
         """Values of both bodies of each spring, from a table."""
         return [take_rows(table, side.rows) for side in (self.batch.a, self.batch.b)]
 
+    def anchor_velocities(self, motions: list[Motion]) -> list[Array]:
+        """Velocities of both anchors, m/s [2, P, ...]."""
+        return [m.velocity + m.spin * perpendicular(arm) for m, arm in zip(motions, self.arms, strict=True)]
+
     def stretch_rate(self, motions: list[Motion]) -> Array:
         """Speed at which the springs get longer, m/s."""
-        of_a, of_b = (m.velocity + m.spin * perpendicular(arm) for m, arm in zip(motions, self.arms, strict=True))
+        of_a, of_b = self.anchor_velocities(motions)
         return dot(self.axis, of_b - of_a)
 
     def apply(self, motions: list[Motion], impulse: Array) -> list[Motion]:
@@ -219,14 +243,14 @@ class _Lines(NamedTuple):
 
 
 def _spring(
-    batch: JointBatch, poses: Any, now: Motion, drift: Motion, acceleration: Array, h: float
+    batch: JointBatch, anchors: Anchors, now: Motion, drift: Motion, acceleration: Array, h: float
 ) -> tuple[Motion, Motion, Array, Work]:
     """Motions and drifts after the impulse of springs at half of the step, the impulse, and the work that it took.
 
     The energy stored in springs is subtracted in `energy.close_balance`.
     """
     olds, drifts = ([take_rows(table, side.rows) for side in (batch.a, batch.b)] for table in (now, drift))
-    *starts, offset = anchors_of(batch.a, batch.b, poses)
+    *starts, offset = anchors
     halves = [jax.tree.map(lambda v, x: 0.5 * (h * v + x), *of) for of in zip(olds, drifts, strict=True)]
     arms = [rotate(arm, half.spin) for arm, half in zip(starts, halves, strict=True)]
     moved = [half.velocity + arm - start for half, arm, start in zip(halves, arms, starts, strict=True)]
@@ -255,8 +279,8 @@ def _spring(
 
 def conserve(
     batches: list[JointBatch],
-    bodies: list[Any],
-    statics: list[Any],
+    anchors: list[Anchors],
+    statics: list[Motion],
     displacements: list[Motion],
     motions: list[Motion],
     impulses: list[Array],
@@ -269,20 +293,19 @@ def conserve(
     """
     if not batches:
         return motions, []
-    fixed = [body.motion for body in statics]
-    poses, moved = poses_of(bodies, statics), table_of(displacements, [jax.tree.map(lambda x: h * x, m) for m in fixed])
-    now, works = table_of(motions, fixed), []
-    for batch, impulse in zip(batches, impulses, strict=True):
-        now, work = _conserve(batch, poses, moved, now, impulse, h)
+    moved = table_of(displacements, [jax.tree.map(lambda x: h * x, motion) for motion in statics])
+    now, works = table_of(motions, statics), []
+    for batch, start, impulse in zip(batches, anchors, impulses, strict=True):
+        now, work = _conserve(batch, start, moved, now, impulse, h)
         works.append(work)
     return groups_of(now, motions), works
 
 
 def _conserve(
-    batch: JointBatch, poses: Any, moved: Motion, now: Motion, impulse: Array, h: float
+    batch: JointBatch, anchors: Anchors, moved: Motion, now: Motion, impulse: Array, h: float
 ) -> tuple[Motion, Work]:
     """Motions of a batch after displacements, in which the energy is what it should be, and the work for it."""
-    *starts, offset = anchors_of(batch.a, batch.b, poses)
+    *starts, offset = anchors
     ways = [take_rows(moved, side.rows) for side in (batch.a, batch.b)]
     arms = [rotate(arm, way.spin) for arm, way in zip(starts, ways, strict=True)]
     of_a, of_b = (way.velocity + arm - start for way, arm, start in zip(ways, arms, starts, strict=True))

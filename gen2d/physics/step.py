@@ -100,42 +100,35 @@ class _Springs:
     """The springs in a step, with their works so far; does nothing without springs."""
 
     def __init__(self, model: Model, world: WorldState, statics: list[BodyState], h: float) -> None:
-        self._springs, self._groups, self._bodies, self._statics, self._h = (
-            model.springs, model.groups, world.bodies, statics, h,
-        )  # fmt: skip
-        self._sprung = springs.Sprung([], None, [], [])
+        self._groups, self._h, self._sprung = model.groups, h, springs.Sprung([], None, [], [])
         self._works: list[Work] = []
+        poses = poses_of(world.bodies, statics) if model.springs else None
+        anchors = [springs.anchors_of(batch.a, batch.b, poses) for batch in model.springs]
+        self._of = model.springs, anchors, [body.motion for body in statics]
+
+    def speed_bounds(self, motions: list[Motion]) -> list[Array] | list[None]:
+        """Bounds on the change of the velocities of each group, m/s [N, ...], for bodies with these motions."""
+        return springs.speed_bounds(*self._of, motions, self._h)
 
     def pull(
         self, motions: list[Motion], drifts: list[Motion], free_drifts: list[Motion], accelerations: list[Array]
     ) -> tuple[list[Motion], list[Motion]]:
         """Motions after their impulses, and the drifts of all forces; `drifts` are those of other impulses."""
-        of = self._springs, self._bodies, self._statics, motions, _sums(drifts, free_drifts), accelerations
-        self._sprung = springs.apply(*of, self._h)
+        self._sprung = springs.apply(*self._of, motions, _sums(drifts, free_drifts), accelerations, self._h)
         if self._sprung.changes is None:
             return motions, free_drifts
         own = [_scaled(change, -0.5 * self._h) for change in self._sprung.changes]
         return self._sprung.motions, _sums(free_drifts, own)
 
-    def expected(
-        self, motions: list[Motion], free_drifts: list[Motion], accelerations: list[Array]
-    ) -> list[Array] | list[None]:
-        """Accelerations by the springs in a step without contacts."""
-        of = self._springs, self._bodies, self._statics, motions, free_drifts, accelerations
-        return self._by(springs.apply(*of, self._h).changes)
-
     @property
     def accelerations(self) -> list[Array] | list[None]:
         """Acceleration [2, N, ...] of each group by the springs, m/s^2."""
-        return self._by(self._sprung.changes)
-
-    def _by(self, changes: list[Motion] | None) -> list[Array] | list[None]:
+        changes = self._sprung.changes
         return [None] * len(self._groups) if changes is None else [change.velocity / self._h for change in changes]
 
     def conserve(self, displacements: list[Motion], motions: list[Motion]) -> list[Motion]:
         """Motions at the end of the step, in which the springs have given what they have lost."""
-        of = self._springs, self._bodies, self._statics, displacements, motions, self._sprung.impulses
-        motions, self._works = springs.conserve(*of, self._h)
+        motions, self._works = springs.conserve(*self._of, displacements, motions, self._sprung.impulses, self._h)
         return motions
 
     def works(self, flown: list[Motion], displacements: list[Motion], warm: list[Motion]) -> list[Work]:
@@ -270,21 +263,20 @@ def step(world: WorldState, model: Model, params: SolverParams) -> WorldState:
     shapes = [to_world(g.body_shape, b.position, b.angle) for g, b in zip(groups, world.bodies, strict=True)]
     statics = [BodySide(f.shape_at(b), f.motion) for f, b in zip(model.statics, fixed, strict=True)]
     pulling = _Springs(model, world, fixed, h)
-    pulls = pulling.expected(before, free_drifts, accelerations)
     different = accelerations if angular else [None] * len(groups)
     works = [None] * len(groups) if ledger is None else ledger.groups
-    of_groups = zip(shapes, before, different, pulls, works, strict=True)
+    of_groups = zip(shapes, before, different, pulling.speed_bounds(before), works, strict=True)
     sides = [
         BodySide(
             shape,
             motion,
             acceleration,
-            pull,
+            push=push,
             displacement=_scaled(motion, 0.5 * h),
             work=work,
             support=no_support(motion.velocity, isinstance(shape, Disc)),
         )
-        for shape, motion, acceleration, pull, work in of_groups
+        for shape, motion, acceleration, push, work in of_groups
     ]
     if params.by_time:
         sides = not_hit(sides)

@@ -77,8 +77,8 @@ MANY_BOUNDS: dict[str, Bounds] = {
     "fast, mass ratios up to 1e6, e = 0.0": {RISING: 0.02, DETOURING: None, SLIPPING: 1e-5, OVERLAPPING: 0.9},
     "fast, mass ratios up to 1e6, e = 0.5": {RISING: 0.02, OVERLAPPING: 0.48},
     "fast, mass ratios up to 1e6, e = 1.0": {RISING: None, DETOURING: 0.09, SLIPPING: 1e-5, OVERLAPPING: 0.24},
-    "joints, with gravity": {ABOVE: None, RISING: 0.2},
-    "joints, without": {ABOVE: None, RISING: 0.1},
+    "joints, with gravity": {RISING: 0.1},
+    "joints, without": {RISING: 0.05},
 }
 EXTREME_BOUNDS: dict[str, Bounds] = {  # with `physics.extreme_mass_ratios`
     "discs, mass ratios up to 1e6": {RISING: 0.12, ABOVE: None, OVERLAPPING: 0.12},
