@@ -87,12 +87,13 @@ class AllPairs(ContactSolver):
         return carry._replace(events=events)
 
     def warm_start(
-        self, carry: AllPairsCarry, sides: list[BodySide], statics: list[BodySide]
+        self, carry: AllPairsCarry, sides: list[BodySide], statics: list[BodySide], pulls: list[Array] | None
     ) -> tuple[list[BodySide], list[list[ContactPoint]]]:
+        del pulls  # every pair is solved, near or not
+
         def play(k: int, a: BodySide, b: BodySide) -> tuple[BodySide, BodySide, list[ContactPoint]]:
             return contact_passes.warm_start(self.constraints[k], carry.warm[k], a, b, self.setup, self.params)
 
-        sides = [side._replace(push=None) for side in sides]  # only finding near pairs needs it
         return run_schedule(sides, statics, self.order, play)
 
     def _find_obstacles(

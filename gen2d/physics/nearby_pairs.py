@@ -151,13 +151,14 @@ class NearbyPairs(PairBatches, ContactSolver):
 
     # ---- Broad phase
 
-    def _find_near_pairs(self, sides: list[BodySide], statics: list[BodySide]) -> list[ActivePairs]:
+    def _find_near_pairs(
+        self, sides: list[BodySide], statics: list[BodySide], pulls: list[Array] | None
+    ) -> list[ActivePairs]:
         """Pairs of each batch that may meet in this step."""
         motions = [side.motion for side in sides if side.motion is not None]
         squares = [dot(motion.velocity, motion.velocity) for motion in motions]
-        pushes = [side.push for side in sides if side.push is not None]
-        if pushes:
-            squares = [(jnp.sqrt(square) + push) ** 2 for square, push in zip(squares, pushes, strict=True)]
+        if pulls is not None:
+            squares = [(jnp.sqrt(square) + pull) ** 2 for square, pull in zip(squares, pulls, strict=True)]
         fastest = jnp.zeros(self.scenes, self.dtype)
         for square in squares:
             fastest = jnp.maximum(fastest, jnp.sqrt(max_bodies(square)))
@@ -239,10 +240,9 @@ class NearbyPairs(PairBatches, ContactSolver):
         return put_row(buffer, k, materialize(jnp.stack(values)))
 
     def warm_start(
-        self, carry: NearbyCarry, sides: list[BodySide], statics: list[BodySide]
+        self, carry: NearbyCarry, sides: list[BodySide], statics: list[BodySide], pulls: list[Array] | None
     ) -> tuple[list[BodySide], ListedPairs]:
-        near = self._find_near_pairs(sides, statics)
-        sides = [side._replace(push=None) for side in sides]
+        near = self._find_near_pairs(sides, statics, pulls)
         chunks, indices = [active.starts[-1] for active in near], self._all_indices(near, carry.buffers)
         listed = ListedPairs(near, chunks, indices, [], {}, jnp.zeros((), bool))
         groups = [self._table(group, self._size(g)) for g, group in enumerate(self.groups)]

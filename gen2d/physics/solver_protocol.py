@@ -27,8 +27,13 @@ class ContactSolver(Protocol):
         """Carry at the start of a frame."""
         ...
 
-    def warm_start(self, carry: Any, sides: list[BodySide], statics: list[BodySide]) -> tuple[list[BodySide], Any]:
-        """Sides with the impulses of the last step, and the contacts; uses shape, motion, acceleration and work."""
+    def warm_start(
+        self, carry: Any, sides: list[BodySide], statics: list[BodySide], pulls: list[Array] | None
+    ) -> tuple[list[BodySide], Any]:
+        """Sides with the impulses of the last step, and the contacts; uses shape, motion, acceleration and work.
+
+        `pulls` [N, ...] are bounds, m/s, on what springs will add to the speeds of each group.
+        """
         ...
 
     def solve(

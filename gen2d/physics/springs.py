@@ -2,8 +2,9 @@
 
 A spring is a force, not a constraint: the mean of its values at both ends of the step, found implicitly and applied at
 half of the step (the implicit midpoint rule). This keeps the energy of a linear spring exactly and is stable at any
-stiffness. Rods and hinges are rigid and solved all at once (rigid_joints.py), with the limits and motors of hinges
-(limits_motors.py).
+stiffness. Contacts see it as an acceleration (contact_points.py). Where impacts have changed the way, its work differs
+from what the spring has lost, and the difference goes into the speeds at the end of the step. Rods and hinges are rigid
+and solved all at once (rigid_joints.py), with the limits and motors of hinges (limits_motors.py).
 
 A round is a batch of springs that share no moving body. A chain of any length takes two rounds, so programs do not grow
 with it. Bodies are rows of a table, those of all groups before the static ones.
@@ -50,6 +51,16 @@ class JointBatch(NamedTuple):
     upper: Array
     motor_speed: Array
     motor_torque: Array
+
+    @property
+    def coefficients(self) -> tuple[Array, Array]:
+        """Stiffness in N/m and damping in N s/m of springs; zero for other joints."""
+        soft = self.present & jnp.isfinite(self.stiffness)
+        return jnp.where(soft, self.stiffness, 0.0), jnp.where(soft, self.damping, 0.0)
+
+    def both(self, table: Any) -> list[Any]:
+        """Values of both bodies of each joint, from a table."""
+        return [take_rows(table, side.rows) for side in (self.a, self.b)]
 
 
 def spring_rounds(joints: Sequence[JointSpec], moving: int) -> list[list[int]]:
@@ -129,61 +140,16 @@ def _apply_impulse(side: JointSide, arm: Array, motion: Motion, impulse: Array) 
     return Motion(motion.velocity + side.inertia.mass * impulse, motion.spin + spin)
 
 
+def _moved(arms: Sequence[Array], ways: Sequence[Motion]) -> tuple[list[Array], Array]:
+    """Arms after displacements of both bodies, and how far the anchor on b moves relative to that on a, m."""
+    turned = [rotate(arm, way.spin) for arm, way in zip(arms, ways, strict=True)]
+    of_a, of_b = (way.velocity + new - old for way, new, old in zip(ways, turned, arms, strict=True))
+    return turned, of_b - of_a
+
+
 def _total(x: Array) -> Array:
     """Sum over a round, [1, ...]."""
     return jnp.sum(x, axis=-2, keepdims=True)
-
-
-class Sprung(NamedTuple):
-    """Bodies after the impulses of all springs at half of a step."""
-
-    motions: list[Motion]
-    changes: list[Motion] | None  # of the motions; None without springs
-    impulses: list[Array]  # [2, P, ...] N s of each batch, on its bodies b
-    works: list[Work]
-
-
-def speed_bounds(
-    batches: list[JointBatch], anchors: list[Anchors], statics: list[Motion], motions: list[Motion], h: float
-) -> list[Array] | list[None]:
-    """Bounds on the change of the velocities of each group by the springs in a step, m/s [N, ...]; None without any."""
-    if not batches:
-        return [None] * len(motions)
-    now = table_of(motions, statics)
-    bounds = jnp.zeros_like(now.spin)
-    for batch, (arm_a, arm_b, offset) in zip(batches, anchors, strict=True):
-        axis, length = direction_of(offset)
-        lines = _Lines(batch, [arm_a, arm_b], axis)
-        (k, c), inverse, (of_a, of_b) = lines.coefficients, lines.inverse_mass, lines.anchor_velocities(lines.of(now))
-        fastest = speed_bound(of_b - of_a)
-        impulse = h * (k * jnp.abs(length - batch.rest) + (0.5 * h * k + c) * fastest)
-        impulse = materialize(impulse / (1 + inverse * h * (0.25 * h * k + 0.5 * c)))
-        more = (old + s.inertia.mass * impulse for (s, *_), old in zip(lines.sides, lines.of(bounds), strict=True))
-        bounds = _put(bounds, batch, *more)
-    return groups_of(bounds, motions)
-
-
-def apply(
-    batches: list[JointBatch],
-    anchors: list[Anchors],
-    statics: list[Motion],
-    motions: list[Motion],
-    drifts: list[Motion],
-    accelerations: list[Array],
-    h: float,
-) -> Sprung:
-    """Bodies after the impulses of all springs; drifts are all displacements beyond h times these motions."""
-    if not batches:
-        return Sprung(motions, None, [], [])
-    now, drift = table_of(motions, statics), table_of(drifts, [jax.tree.map(jnp.zeros_like, m) for m in statics])
-    acceleration, impulses, works = table_of(accelerations, [jnp.zeros_like(m.velocity) for m in statics]), [], []
-    for batch, start in zip(batches, anchors, strict=True):
-        now, drift, impulse, work = _spring(batch, start, now, drift, acceleration, h)
-        impulses.append(impulse)
-        works.append(work)
-    news = groups_of(now, motions)
-    changes = [jax.tree.map(jnp.subtract, *of) for of in zip(news, motions, strict=True)]
-    return Sprung(news, changes, impulses, works)
 
 
 class _Lines(NamedTuple):
@@ -205,16 +171,6 @@ class _Lines(NamedTuple):
             side.inertia.mass + side.inertia.moment * dot(perpendicular(arm), self.axis) ** 2
             for side, arm, _ in self.sides
         )
-
-    @property
-    def coefficients(self) -> tuple[Array, Array]:
-        """Stiffness in N/m and damping in N s/m; zero for rods."""
-        soft = self.batch.present & jnp.isfinite(self.batch.stiffness)
-        return jnp.where(soft, self.batch.stiffness, 0.0), jnp.where(soft, self.batch.damping, 0.0)
-
-    def of(self, table: Any) -> list[Any]:
-        """Values of both bodies of each spring, from a table."""
-        return [take_rows(table, side.rows) for side in (self.batch.a, self.batch.b)]
 
     def anchor_velocities(self, motions: list[Motion]) -> list[Array]:
         """Velocities of both anchors, m/s [2, P, ...]."""
@@ -242,6 +198,58 @@ class _Lines(NamedTuple):
         return driven
 
 
+class Sprung(NamedTuple):
+    """Bodies after the impulses of all springs at half of a step."""
+
+    motions: list[Motion]
+    changes: list[Motion] | None  # of the motions; None without springs
+    impulses: list[Array]  # [2, P, ...] N s of each batch, on its bodies b
+    works: list[Work]
+
+
+def speed_bounds(
+    batches: list[JointBatch], anchors: list[Anchors], statics: list[Motion], motions: list[Motion], h: float
+) -> list[Array] | None:
+    """Bounds on what springs add to the speeds of each group in a step, m/s [N, ...]; None without springs."""
+    if not batches:
+        return None
+    now = table_of(motions, statics)
+    bounds = jnp.zeros_like(now.spin)
+    for batch, (arm_a, arm_b, offset) in zip(batches, anchors, strict=True):
+        axis, length = direction_of(offset)
+        lines = _Lines(batch, [arm_a, arm_b], axis)
+        (k, c), inverse, (of_a, of_b) = batch.coefficients, lines.inverse_mass, lines.anchor_velocities(batch.both(now))
+        fastest = speed_bound(of_b - of_a)
+        impulse = h * (k * jnp.abs(length - batch.rest) + (0.5 * h * k + c) * fastest)
+        impulse = materialize(impulse / (1 + inverse * h * (0.25 * h * k + 0.5 * c)))
+        more = (old + s.inertia.mass * impulse for (s, *_), old in zip(lines.sides, batch.both(bounds), strict=True))
+        bounds = _put(bounds, batch, *more)
+    return groups_of(bounds, motions)
+
+
+def apply(
+    batches: list[JointBatch],
+    anchors: list[Anchors],
+    statics: list[Motion],
+    motions: list[Motion],
+    drifts: list[Motion],
+    accelerations: list[Array],
+    h: float,
+) -> Sprung:
+    """Bodies after the impulses of all springs; drifts are all displacements beyond h times these motions."""
+    if not batches:
+        return Sprung(motions, None, [], [])
+    now, drift = table_of(motions, statics), table_of(drifts, [jax.tree.map(jnp.zeros_like, m) for m in statics])
+    acceleration, impulses, works = table_of(accelerations, [jnp.zeros_like(m.velocity) for m in statics]), [], []
+    for batch, start in zip(batches, anchors, strict=True):
+        now, drift, impulse, work = _spring(batch, start, now, drift, acceleration, h)
+        impulses.append(impulse)
+        works.append(work)
+    news = groups_of(now, motions)
+    changes = [jax.tree.map(jnp.subtract, *of) for of in zip(news, motions, strict=True)]
+    return Sprung(news, changes, impulses, works)
+
+
 def _spring(
     batch: JointBatch, anchors: Anchors, now: Motion, drift: Motion, acceleration: Array, h: float
 ) -> tuple[Motion, Motion, Array, Work]:
@@ -249,18 +257,16 @@ def _spring(
 
     The energy stored in springs is subtracted in `energy.close_balance`.
     """
-    olds, drifts = ([take_rows(table, side.rows) for side in (batch.a, batch.b)] for table in (now, drift))
+    olds, drifts = batch.both(now), batch.both(drift)
     *starts, offset = anchors
     halves = [jax.tree.map(lambda v, x: 0.5 * (h * v + x), *of) for of in zip(olds, drifts, strict=True)]
-    arms = [rotate(arm, half.spin) for arm, half in zip(starts, halves, strict=True)]
-    moved = [half.velocity + arm - start for half, arm, start in zip(halves, arms, starts, strict=True)]
-    more, axis = moved[1] - moved[0], direction_of(offset)[0]
+    (arms, more), (axis, _) = _moved(starts, halves), direction_of(offset)
     # Only the sideways part turns the axis: a stiff spring would swing through zero length in half a step.
     along = dot(axis, more)
     axis, length = direction_of(offset + more - along * axis)
     arms, axis, length, along = materialize((arms, axis, length, along))
     lines = _Lines(batch, arms, axis)
-    (k, c), inverse, speed = lines.coefficients, lines.inverse_mass, lines.stretch_rate(olds)
+    (k, c), inverse, speed = batch.coefficients, lines.inverse_mass, lines.stretch_rate(olds)
     stretch = length - batch.rest + along
     rate = speed + lines.stretch_rate(drifts) / h
     size = -h * (k * stretch + c * rate) / (1 + inverse * h * (0.25 * h * k + 0.5 * c))
@@ -306,14 +312,11 @@ def _conserve(
 ) -> tuple[Motion, Work]:
     """Motions of a batch after displacements, in which the energy is what it should be, and the work for it."""
     *starts, offset = anchors
-    ways = [take_rows(moved, side.rows) for side in (batch.a, batch.b)]
-    arms = [rotate(arm, way.spin) for arm, way in zip(starts, ways, strict=True)]
-    of_a, of_b = (way.velocity + arm - start for way, arm, start in zip(ways, arms, starts, strict=True))
-    way = of_b - of_a
+    arms, way = _moved(starts, batch.both(moved))
     (_, before), (axis, after) = direction_of(offset), direction_of(offset + way)
     longer = dot(way, offset + offset + way) / jnp.maximum(before + after, SHORTEST)
     lines = _Lines(batch, *materialize((arms, axis)))
-    (k, c), inverse, olds = lines.coefficients, lines.inverse_mass, lines.of(now)
+    (k, c), inverse, olds = batch.coefficients, lines.inverse_mass, batch.both(now)
     # What springs and dampers have given over this way, less what the impulse has.
     missing = -longer * (k * (0.5 * (before + after) - batch.rest) + c * longer / h) - dot(impulse, way) / h
     speed = lines.stretch_rate(olds)
@@ -335,6 +338,6 @@ def springs_energy(batches: list[JointBatch], bodies: list[Any], statics: list[A
     poses, energy = poses_of(bodies, statics), 0.0
     for batch in batches:
         length = direction_of(anchors_of(batch.a, batch.b, poses)[2])[1]
-        stiffness = jnp.where(batch.present & jnp.isfinite(batch.stiffness), batch.stiffness, 0.0)
+        stiffness, _ = batch.coefficients
         energy = energy + jnp.sum(0.5 * stiffness * (length - batch.rest) ** 2, axis=-2)
     return energy

@@ -6,7 +6,7 @@ A step of h seconds:
 2. The impulses of the last step are applied again (warm starting), at half of the step.
 3. Every pair is solved once, bounces at the exact time of impact, and is pushed apart where it overlaps, which
    moves the bodies but leaves no speed; then all rigid joints at once.
-4. The bodies move.
+4. The bodies move, and springs give the energy that they have lost over the way (springs.py).
 5. Every pair and all joints are solved once more, where the bodies are at the end of the step.
 
 Pairs are solved in rounds of disjoint pairs (schedule.py), all of them (all_pairs.py) or those that are near
@@ -106,8 +106,8 @@ class _Springs:
         anchors = [springs.anchors_of(batch.a, batch.b, poses) for batch in model.springs]
         self._of = model.springs, anchors, [body.motion for body in statics]
 
-    def speed_bounds(self, motions: list[Motion]) -> list[Array] | list[None]:
-        """Bounds on the change of the velocities of each group, m/s [N, ...], for bodies with these motions."""
+    def speed_bounds(self, motions: list[Motion]) -> list[Array] | None:
+        """Bounds on what they will add to the speeds of each group, m/s [N, ...], from these motions."""
         return springs.speed_bounds(*self._of, motions, self._h)
 
     def pull(
@@ -265,22 +265,21 @@ def step(world: WorldState, model: Model, params: SolverParams) -> WorldState:
     pulling = _Springs(model, world, fixed, h)
     different = accelerations if angular else [None] * len(groups)
     works = [None] * len(groups) if ledger is None else ledger.groups
-    of_groups = zip(shapes, before, different, pulling.speed_bounds(before), works, strict=True)
+    of_groups = zip(shapes, before, different, works, strict=True)
     sides = [
         BodySide(
             shape,
             motion,
             acceleration,
-            push=push,
             displacement=_scaled(motion, 0.5 * h),
             work=work,
             support=no_support(motion.velocity, isinstance(shape, Disc)),
         )
-        for shape, motion, acceleration, push, work in of_groups
+        for shape, motion, acceleration, work in of_groups
     ]
     if params.by_time:
         sides = not_hit(sides)
-    sides, contacts = solver.warm_start(carry, sides, statics)
+    sides, contacts = solver.warm_start(carry, sides, statics, pulling.speed_bounds(before))
     motions = _motions(sides)
     changes = [jax.tree.map(jnp.subtract, *of) for of in zip(motions, before, strict=True)]
     drifts = [_scaled(change, -0.5 * h) for change in changes]

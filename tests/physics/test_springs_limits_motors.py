@@ -112,6 +112,20 @@ def test_the_energy_budget_accounts_for_motors_dampers_and_limits(moved):
     holds("springs, limits and motors: residual, J", energy.residual, 1e-3)
 
 
+def test_a_step_of_a_spring_is_the_implicit_midpoint_rule():
+    """Its force is that of the mean place, from any place and speed, also where a step is half of a radian."""
+    space, h, rate, mass = Space(gravity=(0, 0)), 1 / 240, 120.0, 2.0
+    starts = [(x, v) for x in (-0.05, 0.0, 0.05) for v in (-6.0, 0.0, 2.0)]
+    for row, (x, v) in enumerate(starts):
+        disc = space.add_circle((x, row), 0.1, mass=mass, velocity=(v, 0))
+        space.add_joint("distance", disc, anchor_b=(-5, row), length=5, stiffness=mass * rate**2)
+    video = space.simulate(h, fps=240, contacts=0)
+    x, v = np.array(starts).T
+    q = (rate * h / 2) ** 2
+    holds("step of a spring: place, m", video.position[1, :, 0] - ((1 - q) * x + h * v) / (1 + q), 1e-6)
+    holds("step of a spring: speed, m/s", video.velocity[1, :, 0] - ((1 - q) * v - h * rate**2 * x) / (1 + q), 1e-4)
+
+
 @pytest.mark.parametrize(("stiffness", "bound"), [(1.0, 1e-5), (1e3, 1e-4), (1e6, 1e-3), (1e9, 1e-2)])
 def test_a_spring_keeps_its_energy_at_any_stiffness(stiffness: float, bound: float):
     """From 2 m between two bodies of 1 and 3 kg in space, pulled apart by a tenth of that."""
@@ -202,6 +216,17 @@ def test_a_spring_presses_a_disc_onto_a_wall_with_its_force(rate: float):
         "pressed disc: given in a contact, relative", np.minimum(np.diff(video.energy.lost_in_contact), 0) / lost, 1e-4
     )
     holds("pressed disc: lost to damping, relative", video.energy.lost_to_damping / lost, 1e-3)
+
+
+@pytest.mark.parametrize("gap", [0.001, 0.004])
+def test_a_body_that_a_spring_brings_back_in_the_step_of_its_impact_rests_there(gap: float):
+    """A slow disc meets a wall onto which a spring presses it with 170 g."""
+    space, wall, mass, rate = Space(gravity=(0, 0)), 0.1, 2.0, 130.0
+    disc = space.add_circle((wall + gap, 0), 0.1, mass=mass, elasticity=0.2, velocity=(-1, 0))
+    space.add_segment((wall - 0.1, -3), (wall - 0.1, 3), elasticity=1)
+    space.add_joint("distance", disc, anchor_b=(-5, 0), length=5, stiffness=mass * rate**2)
+    video = space.simulate(1 / 240, fps=240, contacts=0)
+    holds("disc that a spring brings back: way from the wall after a step, m", video.position[1, disc, 0] - wall, 1e-6)
 
 
 def test_a_row_of_locked_hinges_is_a_stiff_beam():
