@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from hub import hub
 from packages import require
+from PIL import Image
 
 import gen2d
 
@@ -53,11 +54,13 @@ class Shown(doctest.OutputChecker):
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Datasets of the examples."""
+    """Datasets and photos of the examples."""
     home = tmp_path_factory.mktemp("examples")
     gen2d.generate("bouncing.yaml", 64, home / "datasets" / "bouncing")
     for name in ("easy", "hard"):
         shutil.copytree(home / "datasets" / "bouncing", home / "datasets" / name)
+    (home / "photos").mkdir()
+    Image.new("RGB", (64, 64), (40, 90, 140)).save(home / "photos" / "sea.png")
     return home
 
 
@@ -95,5 +98,6 @@ def test_examples_show_what_they_say(name: str, folder: Path, tmp_path: Path, mo
     space.add_circle((0, 3), radius=0.5)
     position = ds.batch([0])["states/position"]
     known: dict[str, Any] = {"gen2d": gen2d, "jax": jax, "np": np, "ds": ds, "space": space, "position": position}
+    known["mixture"] = gen2d.mix({"bouncing": ds})
     test.globs = known | {"target": np.zeros((64, 64, 3)), "train_step": lambda frames: frames.mean()}
     doctest.DebugRunner(Shown()).run(test)
