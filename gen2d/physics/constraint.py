@@ -202,3 +202,8 @@ def _after_impulse(
 def impulse_change(new: Impulse, old: Impulse) -> Impulse:
     """Difference of two accumulated impulses."""
     return Impulse(new.normal - old.normal, new.tangent - old.tangent)
+
+
+def impulse_vectors(normal: Array, impulse: Impulse) -> Impulse:
+    """Normal and tangential impulse as vectors [2, ...], N s."""
+    return Impulse(impulse.normal * normal, impulse.tangent * perpendicular(normal))

@@ -46,6 +46,9 @@ def _impulse_of_step(solved: SolvedPair, relaxed: SolvedPair) -> tuple[Array, Ar
     begin, end = solved.contacts[0].normal, relaxed.contacts[0].normal
     (first, slid), (last, slides) = solved.impulses[0], relaxed.impulses[0]
     pressed = first * begin + (last - first) * end
+    friction = slid * perpendicular(begin) + (slides - slid) * perpendicular(end)
+    if relaxed.vectors is not None:
+        pressed, friction = relaxed.vectors
     squared = dot(pressed, pressed)
     has_direction = squared > (MOST_OF_IT * jnp.maximum(first, last)) ** 2
     length = jnp.sqrt(jnp.where(has_direction, squared, 1.0))
@@ -53,7 +56,6 @@ def _impulse_of_step(solved: SolvedPair, relaxed: SolvedPair) -> tuple[Array, Ar
     length, across = jnp.where(has_direction, length, last), perpendicular(normal)
     # After two bounces, friction has also acted along two tangents.
     twice = (solved.contacts[0].tau >= 0) & (last > first) & has_direction
-    friction = slid * perpendicular(begin) + (slides - slid) * perpendicular(end)
     tangent = jnp.where(twice, dot(across, friction), slides * (length * reciprocal(last, last > 0)))
     return normal, jnp.where(twice, length + dot(normal, friction), length), tangent
 

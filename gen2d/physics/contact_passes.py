@@ -16,6 +16,7 @@ from gen2d.physics.constraint import (
     Motion,
     apply_impulse,
     impulse_change,
+    impulse_vectors,
     relative_speed,
 )
 from gen2d.physics.contact_points import (
@@ -34,14 +35,20 @@ from gen2d.physics.jointed import free_motion, jointed_frame, with_joints, with_
 from gen2d.physics.normal_impulse import (
     NormalTarget,
     TargetOf,
-    bounces_again,
     impact_target,
-    relaxed_target,
     solve_normals,
     step_target,
 )
 from gen2d.physics.params import SolverParams
 from gen2d.physics.position_correction import correct_positions
+from gen2d.physics.relaxing import (
+    LateImpact,
+    closing_impact,
+    displaced_since,
+    displacement_before,
+    relaxed_target,
+    touching_impact,
+)
 from gen2d.physics.support import SupportedContacts, SupportedPair, add_obstacles, add_support, supported_pair
 from gen2d.records.axes import Array
 from gen2d.xla import materialize
@@ -112,7 +119,11 @@ def _apply_pass(
         free = _free_motions(constraint, pair.contacts, changes, twist, a, b) if jointed else (before, motions)
         work = add_dissipation(b.work, constraint, pair.contacts, changes, twist, *free)
         a, b = (with_motions(*of) for of in zip((a, b), motions, free[1], strict=True))
-    solved = SolvedPair(pair.contacts, impulses, roll)
+    vectors = pair.vectors
+    if vectors is not None:
+        more = impulse_vectors(pair.contacts[0].normal, impulse_change(impulses[0], pair.impulses[0]))
+        vectors = jax.tree.map(jnp.add, vectors, more)
+    solved = SolvedPair(pair.contacts, impulses, roll, vectors)
     if seen.crush is not None:
         motions, work = _without_what_obstacles_take(constraint, seen, motions, work)
     a, b = a._replace(motion=motions[0]), b._replace(motion=motions[1], work=work)
@@ -280,7 +291,10 @@ def solve(
     def target_of(contact: ActiveContact, speed: Array, old: Impulse) -> NormalTarget:
         return step_target(constraint, contact, speed, old, params.step)
 
-    pair = SolvedPair(contacts, warm_start_impulses(constraint, points, memory.impulses), memory.roll)
+    warm, vectors = warm_start_impulses(constraint, points, memory.impulses), None
+    if params.late_impacts and setup.log and constraint.frame is not None:
+        vectors = impulse_vectors(contacts[0].normal, warm[0])
+    pair = SolvedPair(contacts, warm, memory.roll, vectors)
     new_a, new_b, solved, seen = _apply_pass(constraint, pair, target_of, a, b, supported)
     times = None
     if supported is not None:  # what bears a body acts at half of the step
@@ -382,32 +396,51 @@ def relax(
 ) -> tuple[BodySide, BodySide, tuple[SolvedPair, WarmStart]]:
     """Both sides and the pair after a relaxing solve at the end of the step, and the impulses for the next step.
 
-    A bounce in it is an impact at the end of the step.
+    A bounce in it is a late impact (relaxing.py).
     """
-    assert b.displacement is not None, "only static bodies lack a displacement"
-    moved = zip(solved.contacts, displaced_points(constraint, points, a.displacement, b.displacement), strict=True)
-    constraint = with_joints(constraint, a, b)
-    contacts = [
-        contact._replace(frame=jointed_frame(constraint, end.frame, end.normal), normal=end.normal)
-        for contact, end in moved
-    ]
-    bounced = []
+    constraint, h = with_joints(constraint, a, b), params.step
+
+    def contacts_before(age: Array | None) -> list[ActiveContact]:
+        """The contacts this time, s, before the end of the step; None: at the end."""
+        of_a, of_b = displacement_before(a, age), displacement_before(b, age)
+        assert of_b is not None, "only static bodies lack a displacement"
+        moved = zip(solved.contacts, displaced_points(constraint, points, of_a, of_b), strict=True)
+        return [
+            contact._replace(frame=jointed_frame(constraint, new.frame, new.normal), normal=new.normal)
+            for contact, new in moved
+        ]
+
+    def threshold_of(contact: ActiveContact, old: Impulse) -> Array:
+        resting = jnp.where(contact.tau < 0, old.normal, 0.0)
+        return bounce_threshold(contact, resting, a, b, setup)
+
+    contacts = contacts_before(None)
+    late: list[LateImpact] = []
+    closing: list[LateImpact] = []
+    if params.late_impacts:
+        of = zip(points, contacts, solved.impulses, strict=True)
+        closing = [closing_impact(point, c, threshold_of(c, old), a, b, h) for point, c, old in of]
+        age = functools.reduce(jnp.maximum, [impact.age for impact in closing])
+        contacts = contacts_before(age)
 
     def target_of(contact: ActiveContact, speed: Array, old: Impulse) -> NormalTarget:
-        resting = jnp.where(contact.tau < 0, old.normal, 0.0)
-        threshold = bounce_threshold(contact, resting, a, b, setup)
-        bounced.append(bounces_again(contact, speed, threshold))
-        return relaxed_target(constraint, contact, speed, old, threshold)
+        threshold, k = threshold_of(contact, old), len(late)
+        late.append(closing[k].seen_at(speed) if closing else touching_impact(contact, speed, threshold))
+        return relaxed_target(constraint, contact, late[k], speed, old, threshold)
 
     new_a, new_b, last, _ = _apply_pass(constraint, solved._replace(contacts=contacts), target_of, a, b)
+    if closing:
+        age = functools.reduce(jnp.maximum, [impact.age for impact in closing])
+        new_a, new_b = displaced_since(a, new_a, age), displaced_since(b, new_b, age)
+    bounced = [(contact.tau >= 0) | impact.happens for contact, impact in zip(last.contacts, late, strict=True)]
     of = zip(last.contacts, bounced, last.impulses, memory.impulses, strict=True)
-    impulses = materialize(
-        [_next_impulse(constraint, c, (c.tau >= 0) | b, new, old, setup, params.step) for c, b, new, old in of]
-    )
+    impulses = materialize([_next_impulse(constraint, c, b, new, old, setup, h) for c, b, new, old in of])
     if constraint.static:
         new_b = new_b._replace(motion=materialize(new_b.motion))
-    of = zip(last.contacts, bounced, strict=True)
-    contacts = [contact._replace(tau=jnp.where(bounces, params.step, contact.tau)) for contact, bounces in of]
+    contacts = [
+        contact._replace(tau=jnp.where(impact.happens, h - impact.age, contact.tau))
+        for contact, impact in zip(last.contacts, late, strict=True)
+    ]
     return new_a, new_b, (last._replace(contacts=contacts), WarmStart(impulses, last.roll))
 
 

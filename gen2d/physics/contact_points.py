@@ -121,6 +121,17 @@ def displaced_points(
     return [_displaced_point(constraint, point, shift) for point in points]
 
 
+def displaced_gap(point: ContactPoint, a: Motion | None, b: Motion) -> Array:
+    """Gap of a contact point after displacements of both bodies, m."""
+    moved, _ = relative_speed(point.frame, point.normal, a, b)
+    gap, core = point.gap + moved, point.core
+    if core is None:
+        return gap
+    between = 1 / inverse_length(core.offset + relative_velocity(a, b)) - core.reach
+    gap = between if core.flat is None else jnp.where(core.flat, gap, between)
+    return jnp.where(point.gap < FAR / 2, gap, point.gap)
+
+
 def _displaced_point(constraint: ContactConstraint, point: ContactPoint, shift: Array) -> ContactPoint:
     if point.core is not None:
         offset = point.core.offset + shift
@@ -191,7 +202,7 @@ def active_contacts(
         frame, normal = materialize(_displaced_point(constraint, point, shift + time * velocity)[:2])
         frame = jointed_frame(constraint, frame, normal)
         speed, _ = relative_speed(frame, normal, a.motion, b.motion)
-        fall = _pull(point, normal) * (h - tau)
+        fall = pull_along(point, normal) * (h - tau)
         position = point.position
         if position is not None:
             position = position + _path(a if point.moves_with_a else b, time)
@@ -236,7 +247,7 @@ def _mean_velocity(point: ContactPoint, a: Motion | None, b: Motion, h: float) -
     return velocity if point.acceleration is None else velocity - 0.5 * h * point.acceleration
 
 
-def _pull(point: ContactPoint, normal: Array) -> Array | float:
+def pull_along(point: ContactPoint, normal: Array) -> Array | float:
     """Acceleration of b towards a along a normal, m/s^2."""
     return 0.0 if point.acceleration is None else -dot(normal, point.acceleration)
 
@@ -247,7 +258,7 @@ def _time_of_impact(
     """Time of impact in s after the clock, or NONE or MISSES."""
     assert b.motion, "only static bodies lack a motion"
     speed, _ = relative_speed(point.frame, point.normal, a.motion, b.motion)
-    pull, threshold = _pull(point, point.normal), bounce_threshold(point, point.last_normal, a, b, setup)
+    pull, threshold = pull_along(point, point.normal), bounce_threshold(point, point.last_normal, a, b, setup)
     approach, core = -speed - pull * h, point.core
     shift = jnp.zeros_like(point.normal) if b.drift is None else relative_velocity(a.drift, b.drift)
     if core is None:  # its corners turn within the step, so a path from a later time on is no better

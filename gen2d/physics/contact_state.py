@@ -52,3 +52,4 @@ class SolvedPair(NamedTuple):
     contacts: list[ActiveContact]
     impulses: list[Impulse]
     roll: Array | None
+    vectors: Impulse | None = None  # N s [2, ...]: those of a logged round contact, where its normal changes by pass

@@ -71,7 +71,6 @@ from gen2d.records.trajectory import Contacts
 from gen2d.xla import materialize, max_bodies
 
 NEVER = -2  # the step of an event that has not happened
-RELAX_CONSTANTS = *CONSTANTS, "resting", "push"
 FOLLOWS = 1 << 20  # added to the contacts of a scene that begin in a step: a pair that an impact may follow
 
 
@@ -351,13 +350,19 @@ class NearbyPairs(PairBatches, ContactSolver):
             solved = solved._replace(packed=packed)
         return self.unpacked(bodies, rows), solved
 
+    @property
+    def _relax_constants(self) -> tuple[str, ...]:
+        """Fields of a `BodySide` that a relaxing pass does not change."""
+        moved = {"displacement"} if self.params.late_impacts else set()
+        return *(name for name in CONSTANTS if name not in moved), "resting", "push"
+
     def _relax_again(
         self, solved: SolvedChunk, sides: list[BodySide], statics: list[BodySide]
     ) -> tuple[list[BodySide], list[Array]]:
         """Sides and packed contacts after all relaxing passes but the last."""
         if self.params.relax_iterations == 1:
             return sides, solved.packed
-        listed, bodies = solved.listed, self.bodies(sides, statics, RELAX_CONSTANTS)
+        listed, bodies = solved.listed, self.bodies(sides, statics, self._relax_constants)
 
         def play(
             i: int, k: Array, indices: GatherIndices, a: BodySide, b: BodySide, buffer: Array
@@ -404,7 +409,7 @@ class NearbyPairs(PairBatches, ContactSolver):
 
         last_touch = carry.last_touch or [jnp.zeros(0, jnp.int32)] * len(self.batches)
         starts = list(zip(carry.cache, last_touch, strict=True))
-        sides, carries = self._pass(sides, statics, listed, starts, play, RELAX_CONSTANTS)
+        sides, carries = self._pass(sides, statics, listed, starts, play, self._relax_constants)
         depth, begins = carry.depth, carry.begins
         for overlap, began in solved.observed:
             depth, begins = jnp.maximum(depth, overlap), begins + began

@@ -71,26 +71,6 @@ def impact_target(
     return NormalTarget(active, bounce, old.normal, happens, apart=happens)
 
 
-def bounces_again(contact: ActiveContact, speed: Array, threshold: Array) -> Array:
-    """Whether a touching contact bounces in the relaxing pass, as a neighbour's bounce closes it."""
-    return (speed < -threshold) & (contact.gap <= 0) & (contact.frame.normal_mass > 0)
-
-
-def relaxed_target(
-    constraint: ContactConstraint, contact: ActiveContact, speed: Array, old: Impulse, threshold: Array
-) -> NormalTarget:
-    """Target of the relaxing pass.
-
-    Leave unchanged: contacts that bounced and are separating; separated contacts that carried no impulse, which would
-    brake a body one step before its impact; and gaps that a neighbour is closing, which bounce in a later step.
-    """
-    rests = (contact.tau < 0) & ((old.normal > 0) | (contact.gap <= 0)) & (speed >= -threshold)
-    again = bounces_again(contact, speed, threshold)
-    active = again | (rests & (contact.frame.normal_mass > 0))
-    target, apart = jnp.where(again, -constraint.elasticity * speed, 0.0), again | (contact.tau >= 0)
-    return NormalTarget(active, target, old.normal, again, apart)
-
-
 class _Row:
     """A point of the problem: k (impulse - old) + (what the other point adds) >= missing."""
 

@@ -24,6 +24,11 @@ class SolverParams:
     extreme_mass_ratios: bool  # bodies that far heavier ones crush stop these where obstacles stop them
     relax_iterations: int  # passes over all pairs at the end of a step
 
+    @property
+    def late_impacts(self) -> bool:
+        """Whether the relaxing passes find impacts that others have caused in the step."""
+        return self.relax_iterations > 1
+
     def bias_rate(self, hertz: float, damping_ratio: float) -> float:
         """Share of an error that an implicit damped spring corrects, 1/s."""
         omega = 2 * math.pi * hertz

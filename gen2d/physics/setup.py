@@ -84,11 +84,14 @@ def _inverse(value: Array, present: Array) -> Array:
     return reciprocal(value, present & jnp.isfinite(value) & (value > 0))
 
 
-def _group(objects: Objects, group: SlotGroup, first: int) -> BodyGroupState:
+def _group(objects: Objects, layout: Layout, group: SlotGroup, first: int) -> BodyGroupState:
     own = slots_of(objects, first, group.count, padded_size(group.count))
     inverse = Inertia(_inverse(own.mass, own.present), _inverse(own.moment, own.present))
     mass, moment = (_inverse(x, x > 0) for x in inverse)
-    return BodyGroupState(body_shape_of(own, group, slice(None)), inverse, mass, moment, group.collides)
+    ends = {slot for joint in layout.joints for slot in (joint.a, joint.b)}
+    jointed = np.array([[first + i in ends] for i in range(padded_size(group.count))])
+    shape = body_shape_of(own, group, slice(None))
+    return BodyGroupState(shape, inverse, mass, moment, group.collides, jointed if jointed.any() else None)
 
 
 def _static(objects: Objects, state: State, group: SlotGroup, slot: int) -> StaticBody:
@@ -299,7 +302,7 @@ def build_model(
 ) -> Model:
     """Constants of a video; `log` asks for the positions of contacts, `sparse` for the solver of near pairs."""
     objects = scene.objects
-    groups = [_group(objects, group, first) for group, first in dynamic_groups(layout)]
+    groups = [_group(objects, layout, group, first) for group, first in dynamic_groups(layout)]
     statics = [_static(objects, state, group, slot) for group, slot in static_slots(layout)]
     one = 1.0 + jax.lax.stop_gradient(jnp.maximum(-jnp.max(objects.radius), 0.0))  # 1.0, unknown to the compiler
     # A pile at rest is stopped anew in each step from the speed that gravity gave it, which is not a bounce.

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
+import numpy as np
 
 from gen2d.physics import limits_motors, rigid_joints, springs
 from gen2d.physics.collision import Shape
@@ -32,6 +33,7 @@ class BodyGroupState(NamedTuple):
     mass: Array  # [N, ...] kg
     moment: Array  # [N, ...] kg m^2
     collides: bool = True  # whether they collide with anything
+    jointed: np.ndarray | None = None  # [N, 1] whether a joint holds a body; None: no joints
 
 
 class StaticBody(NamedTuple):

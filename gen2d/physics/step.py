@@ -44,7 +44,7 @@ from gen2d.physics.jointed import hold, release
 from gen2d.physics.params import SolverParams
 from gen2d.physics.shapes import to_world
 from gen2d.physics.springs import poses_of, table_of
-from gen2d.physics.state import BodyState, Model, WorldState
+from gen2d.physics.state import BodyGroupState, BodyState, Model, WorldState
 from gen2d.physics.support import no_obstacles, no_support
 from gen2d.physics.tunnelling import clamp_displacement
 from gen2d.records.axes import Array
@@ -249,6 +249,15 @@ def _first_pass_side(
     )
 
 
+def _relaxed_displacement(group: BodyGroupState, old: Motion, side: BodySide) -> Motion:
+    """Displacement with that of late impacts; that of a body on a joint stays, as the joint has been solved for it."""
+    assert side.displacement is not None, "moving bodies have a displacement"
+    jointed = group.jointed
+    if jointed is None:
+        return side.displacement
+    return jax.tree.map(lambda x, new: jnp.where(jointed, x, new), old, side.displacement)
+
+
 def step(world: WorldState, model: Model, params: SolverParams) -> WorldState:
     """World one step later."""
     h, groups, solver, carry, ledger = params.step, model.groups, model.solver, world.contacts, world.ledger
@@ -295,7 +304,6 @@ def step(world: WorldState, model: Model, params: SolverParams) -> WorldState:
     displacements = [jax.tree.map(lambda x, y: h * x + y, *of) for of in zip(motions, drifts, strict=True)]
     solid = [s if g.collides else None for s, g in zip(shapes, groups, strict=True)]
     displacements = clamp_displacement(displacements, solid, model.barriers)
-    bodies = [_displace(*of) for of in zip(world.bodies, displacements, motions, strict=True)]
     motions = pulling.conserve(displacements, motions)
 
     rigid.move(displacements)
@@ -307,6 +315,10 @@ def step(world: WorldState, model: Model, params: SolverParams) -> WorldState:
     ]
     sides, carry = solver.relax(carry, solved, rigid.hold_again(sides), statics, world.time)
     motions = rigid.stay(_motions([release(side) for side in sides]))
+    if params.late_impacts:
+        relaxed = [_relaxed_displacement(*of) for of in zip(groups, displacements, sides, strict=True)]
+        displacements = clamp_displacement(relaxed, solid, model.barriers)
+    bodies = [_displace(*of) for of in zip(world.bodies, displacements, motions, strict=True)]
     if ledger is not None:
         olds, works = [body.motion for body in world.bodies], [side.work for side in sides]
         flown = _sums([_scaled(motion, h) for motion in free], free_drifts)
@@ -314,7 +326,7 @@ def step(world: WorldState, model: Model, params: SolverParams) -> WorldState:
         by_joints = accumulate(ledger.joints, [*pulling.works(flown, displacements, changes), *rigid.works])
         ledger = Ledger([record_energy(*of, gravity=model.gravity, h=h) for of in done], by_joints)
     return WorldState(
-        bodies=[body._replace(motion=motion) for body, motion in zip(bodies, motions, strict=True)],
+        bodies=bodies,
         time=world.time + h,
         contacts=carry,
         twists=rigid.twists,

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from laws import holds
-from worlds import box, rules, run, world
+from worlds import STEP, box, rules, run, world
 
 from gen2d.physics.broad_phase import (
     active_pairs,
@@ -125,6 +125,44 @@ def test_relaxing_passes_pass_a_blow_on_through_a_row_of_discs():
     velocity = np.array([v[:, place, 0] for v, place in zip(both[0].states.velocity, places, strict=True)])
     holds("Row that a disc strikes, e = 0: departure from one speed, relative", velocity[:8, 1] - 1, 0.02)
     holds("Row that a disc strikes, e = 1: speeds at the end, m/s", velocity[8:, -1] - [0, 0, 0, 0, 0, speed], 1e-4)
+
+
+def exact_column(heights: list[float], speeds: list[float], elasticity: float, time: float) -> tuple[list, list]:
+    """Heights above the last contact and upward speeds of a disc over another one over a floor, one impact at a time.
+
+    The first height is that above the lower disc.
+    """
+    gaps, (upper, lower), left = list(heights), speeds, time
+    while True:
+        closing = [lower - upper, -lower]
+        times = [gap / speed if speed > 0 else np.inf for gap, speed in zip(gaps, closing, strict=True)]
+        first = min(*times, left)
+        gaps = [gap - first * speed for gap, speed in zip(gaps, closing, strict=True)]
+        left -= first
+        if left <= 0:
+            return gaps, [upper, lower]
+        if times[0] <= times[1]:
+            mean, half = (upper + lower) / 2, elasticity * (lower - upper) / 2
+            upper, lower = mean + half, mean - half
+        else:
+            lower = -elasticity * lower
+
+
+def test_relaxing_passes_find_impacts_that_others_cause_in_the_same_step():
+    """A disc strikes another one over a floor, and meets it again as it comes back, in the same step."""
+    speed, gaps, elasticities = -10.0, (0.01, 0.004), (0.3, 0.5)
+    floor = {"a": (-5, 0), "b": (5, 0)}
+    worlds = [
+        world([{"x": (0, 0.5 + gaps[1]), "elasticity": e}, {"x": (0, 1.5 + sum(gaps)), "v": (0, speed)}], [floor])
+        for e in elasticities
+    ]
+    exact = [exact_column(list(gaps), [speed, 0.0], e, STEP) for e in elasticities]
+    both = [run(worlds, 2, 1, rules(relax_iterations=8), EVERYTHING, sparse=sparse) for sparse in (True, False)]
+    assert_alike(*both, within=1e-5)
+    y, v = both[0].states.position[:, 1, :2, 1], both[0].states.velocity[:, 1, :2, 1]
+    found = np.stack([y[:, 1] - y[:, 0] - 1, y[:, 0] - 0.5], axis=1)
+    holds("Impacts that follow each other in a step: gaps, m", found - [of for of, _ in exact], 1e-5)
+    holds("Impacts that follow each other in a step: speeds, m/s", v[:, ::-1] - [of for _, of in exact], 1e-4)
 
 
 @pytest.mark.slow

@@ -85,6 +85,10 @@ EXTREME_BOUNDS: dict[str, Bounds] = {  # with `physics.extreme_mass_ratios`
     "mass ratios up to 1e6": {RISING: 0.05, DETOURING: None, OVERLAPPING: 0.2},
     "fast, mass ratios up to 1e6, e = 0.5": {RISING: None, DETOURING: 0.08, OVERLAPPING: 0.2},
 }
+RELAXED_BOUNDS: dict[str, Bounds] = {  # with four relaxing passes
+    "all shapes": {OVERLAPPING: 0.008},
+    "elastic shapes": {},
+}
 # Speeds up to half of a radius in a step; a fixed obstacle may form a wedge that is narrower than a disc.
 HALF_A_RADIUS = replace(DISCS, radius=(0.45, 0.45), speed=14.0, gravity=0.0, fixed=0.0)
 
@@ -183,6 +187,20 @@ def test_worlds_keep_the_laws_where_obstacles_stop_bodies_that_heavy_ones_crush(
     numbers = rules(extreme_mass_ratios=True)
     batches = [measure(LARGE, [RECIPES[name]], MANY, first=k * MANY, params=numbers)[0] for k in range(2)]
     check_laws(name, batches, EXTREME_BOUNDS[name], RARELY)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", classes(RELAXED_BOUNDS))
+def test_worlds_keep_the_laws_with_several_relaxing_passes(name):
+    numbers = rules(relax_iterations=4)
+    batches = [measure(LARGE, [RECIPES[name]], MANY, first=k * MANY, params=numbers)[0] for k in range(4)]
+    check_laws(name, batches, RELAXED_BOUNDS[name], RARELY)
+
+
+@pytest.mark.slow
+def test_angular_momentum_is_conserved_with_several_relaxing_passes():
+    (measures,) = measure(SMALL, [NO_STATICS], MANY, params=rules(relax_iterations=4))
+    holds("no statics, 4 passes: momentum, per s; angular momentum", momentum_drift(measures), 1e-5)
 
 
 @pytest.mark.slow
