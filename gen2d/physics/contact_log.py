@@ -47,8 +47,8 @@ def _impulse_of_step(solved: SolvedPair, relaxed: SolvedPair) -> tuple[Array, Ar
     (first, slid), (last, slides) = solved.impulses[0], relaxed.impulses[0]
     pressed = first * begin + (last - first) * end
     friction = slid * perpendicular(begin) + (slides - slid) * perpendicular(end)
-    if relaxed.vectors is not None:
-        pressed, friction = relaxed.vectors
+    if relaxed.vectors is not None:  # what passes along several normals have left of no impulse is no touch
+        pressed, friction = (jnp.where((first > 0) | (last > 0), vector, 0.0) for vector in relaxed.vectors)
     squared = dot(pressed, pressed)
     has_direction = squared > (MOST_OF_IT * jnp.maximum(first, last)) ** 2
     length = jnp.sqrt(jnp.where(has_direction, squared, 1.0))
