@@ -145,10 +145,10 @@ def test_a_seesaw_tips_to_the_side_of_the_larger_torque():
     np.testing.assert_array_equal(np.sign(angle[clear]), np.sign(torque[clear]))
     assert np.abs(angle[clear]).min() > 0.05
     holds("seesaw: pivot, m", apart(made), 1e-5)
-    holds("seesaw: energy gained, of the largest kinetic energy", gained(made), 0.1, asked=1e-2)
+    holds("seesaw: energy gained, of the largest kinetic energy", gained_of_kinetic(made), 0.1, asked=1e-2)
 
 
-def gained(made: Film) -> np.ndarray:
+def gained_of_kinetic(made: Film) -> np.ndarray:
     """Largest gain of energy of each video, over its largest kinetic energy."""
     least = np.minimum.accumulate(made.energy, axis=1)
     return (made.energy - least).max(1) / made.kinetic.max(1)
@@ -160,7 +160,7 @@ def test_a_seesaw_gains_less_energy_with_several_relaxing_passes():
     overrides = "scene.drop_height=0", "scene.plank_density=0.2", "physics.relax_iterations=4"
     made = film("seesaw", 32, 1.5, 240, *overrides, energy=True)
     holds("seesaw, 4 passes: pivot, m", apart(made), 1e-5)
-    holds("seesaw, 4 passes: energy gained, of the largest kinetic energy", gained(made), 0.05, asked=1e-2)
+    holds("seesaw, 4 passes: energy gained, of the largest kinetic energy", gained_of_kinetic(made), 0.05, asked=1e-2)
 
 
 # Pendulums ----------------------------------------------------------------------------------------------------------
