@@ -7,7 +7,7 @@ number of bodies.
 import dataclasses
 import functools
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -23,7 +23,7 @@ from gen2d.physics.contact_log import (
     pair_event,
     record_event,
 )
-from gen2d.physics.contact_state import BodySide, PassSetup, SolvedPair, WarmStart
+from gen2d.physics.contact_state import BodySide, PassSetup, RelaxedPair, SolvedPair, WarmStart
 from gen2d.physics.impact_order import TURNS, in_order, later_impact, not_hit, takes_part, with_first
 from gen2d.physics.params import SolverParams
 from gen2d.physics.schedule import Match, run_schedule
@@ -49,10 +49,11 @@ class AllPairsCarry(NamedTuple):
 
 
 class SolvedRounds(NamedTuple):
-    """Pairs of each round after the first pass, and their contact points at the start of the step."""
+    """Pairs of each round after the passes so far, and their contact points at the start of the step."""
 
     points: list[list[ContactPoint]]
     pairs: list[SolvedPair]
+    observed: list[tuple[Array, Array]]  # in the first pass: overlap, m, and whether the contact began
 
 
 @dataclasses.dataclass(frozen=True)
@@ -130,7 +131,8 @@ class AllPairs(ContactSolver):
 
         sides, pairs = run_schedule(sides, statics, self.order, play)
         sides, pairs = self._later_impacts(contacts, pairs, sides, statics)
-        return sides, SolvedRounds(contacts, pairs)
+        observed = [contact_passes.observe(*of) for of in zip(pairs, carry.warm, strict=True)]
+        return sides, SolvedRounds(contacts, pairs, observed)
 
     def _later_impacts(
         self,
@@ -183,32 +185,63 @@ class AllPairs(ContactSolver):
         sides: list[BodySide],
         statics: list[BodySide],
         time: Array,
-    ) -> tuple[list[BodySide], AllPairsCarry]:
-        def relaxed(sides: list[BodySide], pairs: list[SolvedPair]) -> tuple[list[BodySide], list]:
-            def play(k: int, a: BodySide, b: BodySide) -> tuple[BodySide, BodySide, tuple[SolvedPair, WarmStart]]:
-                of = self.constraints[k], carry.warm[k], solved.points[k], pairs[k]
-                return contact_passes.relax(*of, a, b, self.setup, self.params)
+    ) -> tuple[list[BodySide], AllPairsCarry, Array | None]:
+        def play(k: int, a: BodySide, b: BodySide) -> tuple[BodySide, BodySide, RelaxedPair]:
+            of = self.constraints[k], carry.warm[k], solved.points[k], solved.pairs[k]
+            return contact_passes.relax(*of, a, b, self.setup, self.params)
 
-            return run_schedule(sides, statics, self.order, play)
-
-        def one(state: tuple, _: None) -> tuple[tuple, None]:
-            sides, last = relaxed(*state)
-            of = zip(solved.pairs, last, strict=True)
-            return (sides, [contact_passes.before_next_relax(pair, after) for pair, (after, _) in of]), None
-
-        pairs = solved.pairs
-        if self.params.relax_iterations > 1:
-            (sides, pairs), _ = jax.lax.scan(one, (sides, pairs), length=self.params.relax_iterations - 1)
-        sides, last_pairs = relaxed(sides, pairs)
-        events, observed = carry.events, dict(carry.observed)
-        if events is not None:
-            of = zip(events, solved.pairs, last_pairs, strict=True)
-            events = [record_event(event, pair, last, time) for event, pair, (last, _) in of]
-        for pair, warm in zip(solved.pairs, carry.warm, strict=True):
-            depth, began = contact_passes.observe(pair, warm)
+        new, pairs = run_schedule(sides, statics, self.order, play)
+        state, some = (new, *self._relaxed(carry, solved.pairs, pairs, time)), None
+        if self.params.late_passes:
+            late = jnp.ones(self.setup.threshold.shape, bool)
+            if self.params.relax_iterations is None:
+                late = functools.reduce(
+                    jnp.logical_or, [jnp.any(x.late, axis=0) for x in pairs if x.late is not None], ~late
+                )
+            some = jnp.any(late)
+            redo = functools.partial(self._relax_late, carry, solved, sides, statics, time, late)
+            state = jax.lax.cond(some, redo, lambda *x: x, *state)
+        sides, warm, events = state
+        observed = dict(carry.observed)
+        for depth, began in solved.observed:
             old = observed[size := depth.shape[0]]
             observed[size] = Observed(jnp.maximum(old.depth, depth), old.begins + began)
-        return sides, AllPairsCarry([warm for _, warm in last_pairs], observed, events)
+        return sides, AllPairsCarry(warm, observed, events), some
+
+    def _relaxed(
+        self, carry: AllPairsCarry, pairs: list[SolvedPair], relaxed: list[RelaxedPair], time: Array
+    ) -> tuple[list[WarmStart], list[ContactEvent] | None]:
+        """What the next step starts with, and the events after this one."""
+        events = carry.events
+        if events is not None:
+            of = zip(events, pairs, relaxed, strict=True)
+            events = [record_event(event, pair, last.pair, time) for event, pair, last in of]
+        return [last.warm for last in relaxed], events
+
+    def _relax_late(
+        self,
+        carry: AllPairsCarry,
+        solved: SolvedRounds,
+        sides: list[BodySide],
+        statics: list[BodySide],
+        time: Array,
+        late: Array,
+        *others: Any,
+    ) -> tuple:
+        """Sides, warm starts and events after relaxing passes with late impacts in these scenes, in others `others`."""
+
+        def one(state: tuple, _: None) -> tuple[tuple, None]:
+            def play(k: int, a: BodySide, b: BodySide) -> tuple[BodySide, BodySide, SolvedPair]:
+                of = self.constraints[k], solved.points[k], state[1][k]
+                return contact_passes.relax_late(*of, a, b, self.setup, self.params)
+
+            return run_schedule(state[0], statics, self.order, play), None
+
+        (sides, pairs), _ = jax.lax.scan(one, (sides, solved.pairs), length=self.params.late_passes)
+        of_pairs = zip(self.constraints, carry.warm, pairs, strict=True)
+        relaxed = [contact_passes.relaxed_pair(*of, self.setup, self.params.step) for of in of_pairs]
+        new = sides, *self._relaxed(carry, pairs, relaxed, time)
+        return jax.tree.map(lambda x, y: jnp.where(late, x, y), new, others)
 
     def end_frame(self, carry: AllPairsCarry) -> tuple[AllPairsCarry, PairEvent | None]:
         if carry.events is None:

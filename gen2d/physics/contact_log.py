@@ -55,7 +55,9 @@ def _impulse_of_step(solved: SolvedPair, relaxed: SolvedPair) -> tuple[Array, Ar
     normal = jnp.where(has_direction, pressed / length, begin)
     length, across = jnp.where(has_direction, length, last), perpendicular(normal)
     # After two bounces, friction has also acted along two tangents.
-    twice = (solved.contacts[0].tau >= 0) & (last > first) & has_direction
+    twice = (solved.contacts[0].tau >= 0) & has_direction
+    if relaxed.vectors is None:
+        twice = twice & (last > first)
     tangent = jnp.where(twice, dot(across, friction), slides * (length * reciprocal(last, last > 0)))
     return normal, jnp.where(twice, length + dot(normal, friction), length), tangent
 

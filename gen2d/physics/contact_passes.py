@@ -26,8 +26,9 @@ from gen2d.physics.contact_points import (
     contact_points,
     displaced_points,
     impact_times,
+    position_of,
 )
-from gen2d.physics.contact_state import BodySide, PassSetup, SolvedPair, WarmStart
+from gen2d.physics.contact_state import BodySide, PassSetup, RelaxedPair, SolvedPair, WarmStart
 from gen2d.physics.energy import MotionPair, Work, add_disc_dissipation, add_dissipation, kinetic_energy
 from gen2d.physics.friction import apply_angular_impulse, friction_impulse, rolling_impulse
 from gen2d.physics.impact_order import after_impact, in_order, takes_part, with_first
@@ -292,7 +293,7 @@ def solve(
         return step_target(constraint, contact, speed, old, params.step)
 
     warm, vectors = warm_start_impulses(constraint, points, memory.impulses), None
-    if params.late_impacts and setup.log and constraint.frame is not None:
+    if params.late_passes and setup.log and constraint.frame is not None:
         vectors = impulse_vectors(contacts[0].normal, warm[0])
     pair = SolvedPair(contacts, warm, memory.roll, vectors)
     new_a, new_b, solved, seen = _apply_pass(constraint, pair, target_of, a, b, supported)
@@ -384,6 +385,81 @@ def warm_start_impulses(
     return [Impulse(*(jnp.where(of, x, 0.0) for x in i)) for of, i in zip(held, impulses, strict=True)]
 
 
+def _displaced_contacts(
+    constraint: ContactConstraint, points: list[ContactPoint], solved: SolvedPair, a: Motion | None, b: Motion | None
+) -> list[ActiveContact]:
+    """Solved contacts after displacements of both bodies."""
+    assert b is not None, "only static bodies lack a displacement"
+    moved = zip(solved.contacts, displaced_points(constraint, points, a, b), strict=True)
+    return [
+        contact._replace(frame=jointed_frame(constraint, new.frame, new.normal), normal=new.normal)
+        for contact, new in moved
+    ]
+
+
+def _relaxed_threshold(contact: ActiveContact, old: Impulse, a: BodySide, b: BodySide, setup: PassSetup) -> Array:
+    resting = jnp.where(contact.tau < 0, old.normal, 0.0)
+    return bounce_threshold(contact, resting, a, b, setup)
+
+
+def _closing_impacts(
+    constraint: ContactConstraint,
+    points: list[ContactPoint],
+    solved: SolvedPair,
+    a: BodySide,
+    b: BodySide,
+    setup: PassSetup,
+    h: float,
+) -> list[LateImpact]:
+    """Impacts of contacts that have closed by the end of the step; `constraint` is that with the joints."""
+    contacts = _displaced_contacts(constraint, points, solved, a.displacement, b.displacement)
+    return [
+        closing_impact(point, contact, _relaxed_threshold(contact, old, a, b, setup), a, b, h)
+        for point, contact, old in zip(points, contacts, solved.impulses, strict=True)
+    ]
+
+
+def _after_late_impact(
+    constraint: ContactConstraint,
+    point: ContactPoint,
+    old: ActiveContact,
+    contact: ActiveContact,
+    late: LateImpact,
+    a: Motion | None,
+    b: Motion | None,
+    h: float,
+) -> ActiveContact:
+    """The old contact with the late impact of the displaced one, if it is the first of the step."""
+    side = a if point.moves_with_a else b
+    path = 0.0 if side is None else side.velocity
+    position = position_of(constraint, point, contact.frame, contact.normal, path)
+    new = old._replace(normal=contact.normal, tau=h - late.age, arrival=late.arrival, position=position)
+    first = late.happens & (old.tau < 0)
+    return old._replace(
+        **{
+            name: jnp.where(first, getattr(new, name), getattr(old, name))
+            for name in ("normal", "tau", "arrival", "position")
+            if getattr(old, name) is not None
+        }
+    )
+
+
+def relaxed_pair(
+    constraint: ContactConstraint, memory: WarmStart, pair: SolvedPair, setup: PassSetup, h: float
+) -> RelaxedPair:
+    """The pair with what the next step starts with, after relaxing passes with late impacts."""
+    bounced = [contact.tau >= 0 for contact in pair.contacts]
+    return RelaxedPair(pair, _next_warm_start(constraint, memory, pair, bounced, setup, h), None)
+
+
+def _next_warm_start(
+    constraint: ContactConstraint, memory: WarmStart, pair: SolvedPair, bounced: list[Array], setup: PassSetup, h: float
+) -> WarmStart:
+    of = zip(pair.contacts, bounced, pair.impulses, memory.impulses, strict=True)
+    impulses = [_next_impulse(constraint, c, b, new, old, setup, h) for c, b, new, old in of]
+    return WarmStart(materialize(impulses), pair.roll)
+
+
 def relax(
     constraint: ContactConstraint,
     memory: WarmStart,
@@ -393,61 +469,61 @@ def relax(
     b: BodySide,
     setup: PassSetup,
     params: SolverParams,
-) -> tuple[BodySide, BodySide, tuple[SolvedPair, WarmStart]]:
-    """Both sides and the pair after a relaxing solve at the end of the step, and the impulses for the next step.
-
-    A bounce in it is a late impact (relaxing.py).
-    """
+) -> tuple[BodySide, BodySide, RelaxedPair]:
+    """Both sides and the pair after a relaxing solve at the end of the step."""
     constraint, h = with_joints(constraint, a, b), params.step
-
-    def contacts_before(age: Array | None) -> list[ActiveContact]:
-        """The contacts this time, s, before the end of the step; None: at the end."""
-        of_a, of_b = displacement_before(a, age), displacement_before(b, age)
-        assert of_b is not None, "only static bodies lack a displacement"
-        moved = zip(solved.contacts, displaced_points(constraint, points, of_a, of_b), strict=True)
-        return [
-            contact._replace(frame=jointed_frame(constraint, new.frame, new.normal), normal=new.normal)
-            for contact, new in moved
-        ]
-
-    def threshold_of(contact: ActiveContact, old: Impulse) -> Array:
-        resting = jnp.where(contact.tau < 0, old.normal, 0.0)
-        return bounce_threshold(contact, resting, a, b, setup)
-
-    contacts = contacts_before(None)
     late: list[LateImpact] = []
-    closing: list[LateImpact] = []
-    if params.late_impacts:
-        of = zip(points, contacts, solved.impulses, strict=True)
-        closing = [closing_impact(point, c, threshold_of(c, old), a, b, h) for point, c, old in of]
-        age = functools.reduce(jnp.maximum, [impact.age for impact in closing])
-        contacts = contacts_before(age)
 
     def target_of(contact: ActiveContact, speed: Array, old: Impulse) -> NormalTarget:
-        threshold, k = threshold_of(contact, old), len(late)
-        late.append(closing[k].seen_at(speed) if closing else touching_impact(contact, speed, threshold))
-        return relaxed_target(constraint, contact, late[k], speed, old, threshold)
+        threshold = _relaxed_threshold(contact, old, a, b, setup)
+        late.append(touching_impact(contact, speed, threshold))
+        return relaxed_target(constraint, contact, late[-1], speed, old, threshold)
 
+    contacts = _displaced_contacts(constraint, points, solved, a.displacement, b.displacement)
     new_a, new_b, last, _ = _apply_pass(constraint, solved._replace(contacts=contacts), target_of, a, b)
-    if closing:
-        age = functools.reduce(jnp.maximum, [impact.age for impact in closing])
-        new_a, new_b = displaced_since(a, new_a, age), displaced_since(b, new_b, age)
     bounced = [(contact.tau >= 0) | impact.happens for contact, impact in zip(last.contacts, late, strict=True)]
-    of = zip(last.contacts, bounced, last.impulses, memory.impulses, strict=True)
-    impulses = materialize([_next_impulse(constraint, c, b, new, old, setup, h) for c, b, new, old in of])
+    warm = _next_warm_start(constraint, memory, last, bounced, setup, h)
     if constraint.static:
         new_b = new_b._replace(motion=materialize(new_b.motion))
-    contacts = [
-        contact._replace(tau=jnp.where(impact.happens, h - impact.age, contact.tau))
-        for contact, impact in zip(last.contacts, late, strict=True)
-    ]
-    return new_a, new_b, (last._replace(contacts=contacts), WarmStart(impulses, last.roll))
+    if not params.late_passes:
+        return new_a, new_b, RelaxedPair(last, warm, None)
+    closing = _closing_impacts(constraint, points, solved, a, b, setup, h)
+    happens = functools.reduce(jnp.logical_or, [impact.happens for impact in closing])
+    return new_a, new_b, RelaxedPair(last, warm, happens)
 
 
-def before_next_relax(solved: SolvedPair, relaxed: SolvedPair) -> SolvedPair:
-    """The relaxed pair for another relaxing solve, with its contacts as they were solved but for the bounces."""
-    of = zip(solved.contacts, relaxed.contacts, strict=True)
-    return relaxed._replace(contacts=[contact._replace(tau=end.tau) for contact, end in of])
+def relax_late(
+    constraint: ContactConstraint,
+    points: list[ContactPoint],
+    solved: SolvedPair,
+    a: BodySide,
+    b: BodySide,
+    setup: PassSetup,
+    params: SolverParams,
+) -> tuple[BodySide, BodySide, SolvedPair]:
+    """Both sides and the pair after a relaxing solve with late impacts (relaxing.py), which also displace the sides.
+
+    The contacts of the pair stay as the first pass solved them, but for the ones that bounce late.
+    """
+    constraint, h = with_joints(constraint, a, b), params.step
+    closing = _closing_impacts(constraint, points, solved, a, b, setup, h)
+    age = functools.reduce(jnp.maximum, [impact.age for impact in closing])
+    displacements = displacement_before(a, age), displacement_before(b, age)
+    late: list[LateImpact] = []
+
+    def target_of(contact: ActiveContact, speed: Array, old: Impulse) -> NormalTarget:
+        late.append(closing[len(late)].seen_at(speed))
+        threshold = _relaxed_threshold(contact, old, a, b, setup)
+        return relaxed_target(constraint, contact, late[-1], speed, old, threshold)
+
+    contacts = _displaced_contacts(constraint, points, solved, *displacements)
+    new_a, new_b, last, _ = _apply_pass(constraint, solved._replace(contacts=contacts), target_of, a, b)
+    new_a, new_b = displaced_since(a, new_a, age), displaced_since(b, new_b, age)
+    if constraint.static:
+        new_b = new_b._replace(motion=materialize(new_b.motion))
+    of = zip(points, solved.contacts, contacts, late, strict=True)
+    contacts = [_after_late_impact(constraint, *each, *displacements, h) for each in of]
+    return new_a, new_b, last._replace(contacts=contacts)
 
 
 def touching(solved: SolvedPair, last: SolvedPair) -> Array:

@@ -203,15 +203,21 @@ def active_contacts(
         frame = jointed_frame(constraint, frame, normal)
         speed, _ = relative_speed(frame, normal, a.motion, b.motion)
         fall = pull_along(point, normal) * (h - tau)
-        position = point.position
-        if position is not None:
-            position = position + _path(a if point.moves_with_a else b, time)
-            # A disc's lever is minus its radius.
-            position = position if constraint.frame is None else position + frame.tangent_b * normal
+        position = position_of(constraint, point, frame, normal, _path(a if point.moves_with_a else b, time))
         contacts.append(ActiveContact(frame, normal, point.gap, tau, -speed - fall, fall, position))
     if b.pull is not None:
         time = _time_of_impulses([_time_with_rest(constraint, contact, h) for contact in contacts], h)
     return contacts, time
+
+
+def position_of(
+    constraint: ContactConstraint, point: ContactPoint, frame: ContactFrame, normal: Array, path: Array | float
+) -> Array | None:
+    """Position [2, ...] in m of a contact point that has moved along this path [2, ...]; None: not logged."""
+    if point.position is None:
+        return None
+    position = point.position + path
+    return position if constraint.frame is None else position + frame.tangent_b * normal  # the lever is minus a radius
 
 
 def _time_of_impulses(taus: list[Array], h: float) -> Array:

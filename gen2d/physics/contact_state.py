@@ -53,3 +53,11 @@ class SolvedPair(NamedTuple):
     impulses: list[Impulse]
     roll: Array | None
     vectors: Impulse | None = None  # N s [2, ...]: those of a logged round contact, where its normal changes by pass
+
+
+class RelaxedPair(NamedTuple):
+    """A contact after a relaxing pass."""
+
+    pair: SolvedPair
+    warm: WarmStart  # what the next step starts with
+    late: Array | None  # whether there was an impact that others have caused in the step; None: not looked for

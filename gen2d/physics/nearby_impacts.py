@@ -4,22 +4,20 @@ Few scenes of a thousand have any in most steps, so the near pairs of these are 
 those of all rounds together, in small chunks. A chunk may have a body twice, but a body has one next impact.
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-from gen2d.physics.broad_phase import active_pairs, row_lookup
 from gen2d.physics.contact_passes import solve_impact
 from gen2d.physics.impact_order import TURNS, first_time, in_order, later_impact, ordered
-from gen2d.physics.packing import SAFE, get_row, pack, put_row, unpack
+from gen2d.physics.packing import SAFE, pack, unpack
 from gen2d.physics.pair_batches import BodyTables, ListedPairs, PairBatches, SolvedChunk
+from gen2d.physics.scene_pairs import CHUNK, SceneChunk, SceneList, ScenePairs
 from gen2d.physics.time_of_impact import NONE
 from gen2d.records.axes import Array
-from gen2d.xla import materialize
 
 GROUP = 16  # scenes that are listed at once
-CHUNK = 16  # pairs of them that are solved at once
 
 
 class _Turn(NamedTuple):
@@ -29,30 +27,6 @@ class _Turn(NamedTuple):
     acts: Array  # whether the next impacts are known and act; else they are found
     more: Array  # whether to go on
     turns: Array  # so far
-
-
-class _List(NamedTuple):
-    """Pairs of a batch in some scenes."""
-
-    chunks: Array  # how many there are
-    indices: Array  # [K, 4, C] `_Chunk` of each
-
-
-class _Chunk(NamedTuple):
-    """Pairs of a chunk, each [C]."""
-
-    a: Array  # rows of the bodies' tables; the last ones where there is no pair
-    b: Array
-    chunk: Array  # place in the buffers of the passes; beyond the end where there is no pair
-    lane: Array
-
-    def columns(self, buffer: Array) -> list[Array]:
-        """Columns of a buffer [K, F, C]."""
-        return list(buffer.at[self.chunk, :, self.lane].get(mode="clip").T)
-
-    def put(self, buffer: Array, values: list[Array]) -> Array:
-        """Buffer with these columns."""
-        return buffer.at[self.chunk, :, self.lane].set(materialize(jnp.stack(values)).T, mode="drop")
 
 
 def ordered_batches(listed: ListedPairs) -> list[int]:
@@ -66,22 +40,17 @@ class LaterImpacts:
 
     def __init__(self, solver: PairBatches, bodies: BodyTables, solved: SolvedChunk, batches: list[int]) -> None:
         self._solver, self._bodies, self._solved, self._batches = solver, bodies, solved, batches
+        self._pairs = ScenePairs(solver, solved.listed, min(GROUP, solver.scenes))
 
     def solve(self, rows: list[Array], follow: Array) -> tuple[list[Array], list[Array]]:
         """Rows of the bodies' tables and packed contacts after these impacts, in scenes [n] where any may `follow`."""
-        scenes = self._solver.scenes
-        size = min(GROUP, scenes)
-        groups = active_pairs(follow[None].astype(jnp.uint32), size)
-
-        def group(k: Array, state: tuple) -> tuple:
-            lookup = row_lookup(groups, k, size)
-            lists = {i: self._list(i, jnp.where(lookup.there, lookup.word, scenes)) for i in self._batches}
-            return self._solve_group(lists, *state)
-
-        return jax.lax.fori_loop(0, groups.starts[-1], group, (rows, self._solved.packed))
+        start = rows, self._solved.packed
+        return self._pairs.run(
+            follow, self._batches, False, lambda lists, state: self._solve_group(lists, *state), start
+        )
 
     def _solve_group(
-        self, lists: dict[int, _List], rows: list[Array], packed: list[Array]
+        self, lists: dict[int, SceneList], rows: list[Array], packed: list[Array]
     ) -> tuple[list[Array], list[Array]]:
         """Rows and packed contacts after the impacts of a group of scenes."""
 
@@ -91,10 +60,10 @@ class LaterImpacts:
             state, packed = (now.rows, firsts, now.acts), list(now.packed)
             for i, pairs in lists.items():
 
-                def chunk(k: Array, carry: tuple, i: int = i, pairs: _List = pairs) -> tuple:
-                    return self._solve_chunk(i, _Chunk(*get_row(pairs.indices, k)), now.acts, carry)
+                def chunk(_: Array, own: SceneChunk, carry: tuple, i: int = i) -> tuple:
+                    return self._solve_chunk(i, own, now.acts, carry)
 
-                state, packed[i] = jax.lax.fori_loop(0, pairs.chunks, chunk, (state, packed[i]))
+                state, packed[i] = pairs.run(chunk, (state, packed[i]))
             rows, firsts, more = state
             return _Turn(rows, packed, firsts, ~now.acts, more, now.turns + 1)
 
@@ -103,7 +72,7 @@ class LaterImpacts:
         end = jax.lax.while_loop(lambda now: now.more & (now.turns < 2 * TURNS), turn, start)
         return end.rows, end.packed
 
-    def _solve_chunk(self, i: int, own: _Chunk, acts: Array, carry: tuple) -> tuple:
+    def _solve_chunk(self, i: int, own: SceneChunk, acts: Array, carry: tuple) -> tuple:
         """Rows, times and whether to go on, and packed contacts after the impacts of a chunk are found or act."""
         (rows, firsts, more), buffer = carry
         rows, firsts, solver, bodies = list(rows), list(firsts), self._solver, self._bodies
@@ -112,7 +81,7 @@ class LaterImpacts:
         b = b._replace(first=firsts[batch.second].at[own.b].get(mode=SAFE))
         if batch.first is not None:
             a = a._replace(first=firsts[batch.first].at[own.a].get(mode=SAFE))
-        constraint, _, (point, *_), setup = self._contacts(i, own)
+        constraint, _, (point, *_), setup = self._pairs.contacts(i, own)
         pair = unpack(own.columns(buffer), self._solved.specs[i])
         tau = later_impact(point, pair.contacts[0], a, b, setup, solver.params.step)
         more = more | jnp.any(tau >= 0)
@@ -128,42 +97,11 @@ class LaterImpacts:
         values, _ = pack(pair, (CHUNK,), buffer.dtype, once=True)
         return (rows, firsts, more), own.put(buffer, values)
 
-    @property
-    def _listed(self) -> ListedPairs:
-        return self._solved.listed
-
-    def _list(self, i: int, chosen: Array) -> _List:
-        """Near pairs of a batch in chosen scenes; numbers beyond the last scene are of none."""
-        near, batch, solver = self._listed.near[i], self._solver.batches[i], self._solver
-        scenes, size, (rounds, pairs) = solver.scenes, len(chosen), batch.a.shape
-        words = near.words[:, : near.words.shape[1] // scenes * scenes].reshape(rounds, -1, scenes)
-        words = jnp.where(chosen < scenes, words.at[..., chosen].get(mode="clip"), jnp.uint32(0))
-        width = words.shape[1] * size
-        merged = active_pairs(words.reshape(1, -1), CHUNK)
-
-        def chunk(k: Array, listed: Array) -> Array:
-            lookup = row_lookup(merged, k, CHUNK)
-            place = jnp.minimum(lookup.word, rounds * width - 1)
-            scene = jnp.minimum(chosen[place % size], scenes - 1)
-            lookup = lookup._replace(round=place // width, word=place % width // size * scenes + scene)
-            rank = near.before.at[lookup.round, lookup.word].get(mode=SAFE) + lookup.rank
-            first = near.starts.at[lookup.round].get(mode=SAFE)
-            buffer = jnp.where(lookup.there, first + rank // solver.chunk, len(self._listed.packed[i]))
-            indices = solver.chunk_indices(batch, lookup, batch.pair_of_bit)
-            return put_row(listed, k, jnp.stack(_Chunk(indices.a, indices.b, buffer, rank % solver.chunk)))
-
-        none = jnp.zeros((-(-rounds * pairs * size // CHUNK), len(_Chunk._fields), CHUNK), jnp.int32)
-        return _List(merged.starts[-1], jax.lax.fori_loop(0, merged.starts[-1], chunk, none))
-
-    def _groups(self, i: int, own: _Chunk) -> list[tuple[int, Array]]:
+    def _groups(self, i: int, own: SceneChunk) -> list[tuple[int, Array]]:
         """Groups of moving bodies of a chunk's sides, with their rows."""
         batch = self._solver.batches[i]
         sides = (batch.first, own.a), (batch.second, own.b)
         return [(group, where) for group, where in sides if group is not None]
-
-    def _contacts(self, i: int, own: _Chunk) -> tuple[Any, ...]:
-        """Constraint, impulses, points and setup of a chunk of pairs."""
-        return self._solver.unpack_contacts(own.columns(self._listed.packed[i]), self._listed.specs[i])
 
 
 def _leading(groups: list[tuple[int, Array]], rows: list[Array], some: Array) -> Array:

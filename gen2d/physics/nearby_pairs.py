@@ -28,7 +28,7 @@ from gen2d.physics.broad_phase import (
     signed_distance,
 )
 from gen2d.physics.collision import Shape, dot
-from gen2d.physics.constraint import Impulse
+from gen2d.physics.constraint import ContactConstraint, Impulse
 from gen2d.physics.contact_log import (
     ON,
     ContactEvent,
@@ -40,9 +40,10 @@ from gen2d.physics.contact_log import (
     record_event,
     sort_order,
 )
-from gen2d.physics.contact_state import BodySide, WarmStart
+from gen2d.physics.contact_state import BodySide, RelaxedPair, SolvedPair, WarmStart
 from gen2d.physics.impact_order import alone, ordered, with_clearance
 from gen2d.physics.nearby_impacts import LaterImpacts, ordered_batches
+from gen2d.physics.nearby_relaxing import LatePasses
 from gen2d.physics.packing import (
     SAFE,
     PackedTable,
@@ -63,12 +64,16 @@ from gen2d.physics.pair_batches import (
     SolvedChunk,
     StaticSide,
 )
+from gen2d.physics.scene_pairs import SceneChunk
 from gen2d.physics.schedule import bipartite_rounds
 from gen2d.physics.solver_protocol import ContactSolver
 from gen2d.physics.support import is_crushed
 from gen2d.records.axes import Array
 from gen2d.records.trajectory import Contacts
 from gen2d.xla import materialize, max_bodies
+
+LATE_CONSTANTS = *(name for name in CONSTANTS if name != "displacement"), "resting", "push"
+RELAX_CONSTANTS = *CONSTANTS, "resting", "push"
 
 NEVER = -2  # the step of an event that has not happened
 FOLLOWS = 1 << 20  # added to the contacts of a scene that begin in a step: a pair that an impact may follow
@@ -80,6 +85,21 @@ class PassBuffers(NamedTuple):
     indices: Array  # [K, 4, C]
     contacts: Array  # [K, F, C]
     solved: Array
+    touches: Array | None  # [K, F, C] `LastTouch` before the step; None: not kept
+
+
+class PairMemory(NamedTuple):
+    """What a batch keeps of its pairs from step to step."""
+
+    cache: Array  # a row per pair: see `CachedConstraint`
+    touch: Array  # [R P n + 1] see `NearbyCarry`; empty where contacts are not logged
+
+
+class LastTouch(NamedTuple):
+    """What is logged of a pair before a step."""
+
+    event: ContactEvent
+    step: Array  # see `NearbyCarry.last_touch`
 
 
 class CachedConstraint(NamedTuple):
@@ -350,78 +370,100 @@ class NearbyPairs(PairBatches, ContactSolver):
             solved = solved._replace(packed=packed)
         return self.unpacked(bodies, rows), solved
 
-    @property
-    def _relax_constants(self) -> tuple[str, ...]:
-        """Fields of a `BodySide` that a relaxing pass does not change."""
-        moved = {"displacement"} if self.params.late_impacts else set()
-        return *(name for name in CONSTANTS if name not in moved), "resting", "push"
-
-    def _relax_again(
-        self, solved: SolvedChunk, sides: list[BodySide], statics: list[BodySide]
-    ) -> tuple[list[BodySide], list[Array]]:
-        """Sides and packed contacts after all relaxing passes but the last."""
-        if self.params.relax_iterations == 1:
-            return sides, solved.packed
-        listed, bodies = solved.listed, self.bodies(sides, statics, self._relax_constants)
-
-        def play(
-            i: int, k: Array, indices: GatherIndices, a: BodySide, b: BodySide, buffer: Array
-        ) -> tuple[BodySide, BodySide, Array]:
-            del indices
-            constraint, memory, points, setup = self.unpack_contacts(
-                list(get_row(listed.packed[i], k)), listed.specs[i]
-            )
-            pair = unpack(list(materialize(get_row(buffer, k))), solved.specs[i])
-            a, b, (after, _) = contact_passes.relax(constraint, memory, points, pair, a, b, setup, self.params)
-            values, _ = pack(contact_passes.before_next_relax(pair, after), (self.chunk,), self.dtype, once=True)
-            return a, b, put_row(buffer, k, materialize(jnp.stack(values)))
-
-        def one(_: int, state: tuple) -> tuple:
-            return self.play(bodies, state[0], listed, state[1], play)
-
-        passes = self.params.relax_iterations - 1
-        rows, packed = jax.lax.fori_loop(0, passes, one, (bodies.rows, solved.packed))
-        return self.unpacked(bodies, rows), packed
-
     def relax(
         self, carry: NearbyCarry, solved: SolvedChunk, sides: list[BodySide], statics: list[BodySide], time: Array
-    ) -> tuple[list[BodySide], NearbyCarry]:
-        sides, latest = self._relax_again(solved, sides, statics)
-        listed = solved.listed
-        caches = self._cache_tables(carry)
+    ) -> tuple[list[BodySide], NearbyCarry, Array | None]:
+        listed, keeps_touches = solved.listed, self.setup.log and self.params.late_passes > 0
+        specs: dict[int, TableSpec] = {}
 
         def play(i: int, k: Array, indices: GatherIndices, a: BodySide, b: BodySide, carried: tuple) -> tuple:
-            cache, touch = caches[i]._replace(rows=carried[0]), carried[1]
-            constraint, memory, points, setup = self.unpack_contacts(
-                list(get_row(listed.packed[i], k)), listed.specs[i]
-            )
-            first, pair = (unpack(list(get_row(of[i], k)), solved.specs[i]) for of in (solved.packed, latest))
-            a, b, (last, warm) = contact_passes.relax(constraint, memory, points, pair, a, b, setup, self.params)
-            new = CachedConstraint(warm, jnp.full(self.chunk, carry.step, self.dtype), None, None)
-            if self.setup.log:
-                event = record_event(self._event_so_far(carry, cache.at(indices.pair)), first, last, time)
-                new = new._replace(event=event, elasticity=constraint.elasticity)
-                now = 2 * carry.step + jnp.where((event.flags & ON) > 0, 1, 0)
-                old = touch.at[indices.pair].get(mode=SAFE)
-                now = jnp.where(contact_passes.touching(first, last), now, old)
-                touch = touch.at[indices.pair].set(now, mode=SAFE)
-            return a, b, (cache.put(indices.pair, new).rows, touch)
+            memory, late, *buffer = carried
+            columns = list(get_row(listed.packed[i], k))
+            constraint, warm, points, setup = self.unpack_contacts(columns, listed.specs[i])
+            pair = unpack(list(get_row(solved.packed[i], k)), solved.specs[i])
+            a, b, relaxed = contact_passes.relax(constraint, warm, points, pair, a, b, setup, self.params)
+            old = self._last_touch(carry, i, memory, indices.pair) if self.setup.log else None
+            if keeps_touches:
+                values, specs[i] = pack(old, (self.chunk,), self.dtype)
+                buffer = [self._store(self.batches[i], buffer[0], k, values)]
+            if relaxed.late is not None:
+                late = late.at[indices.scene].max(relaxed.late)
+            memory = self._remember(carry, i, memory, indices.pair, old, constraint, pair, relaxed, time)
+            return a, b, (memory, late, *buffer)
 
         last_touch = carry.last_touch or [jnp.zeros(0, jnp.int32)] * len(self.batches)
-        starts = list(zip(carry.cache, last_touch, strict=True))
-        sides, carries = self._pass(sides, statics, listed, starts, play, self._relax_constants)
+        memories = [PairMemory(*of) for of in zip(carry.cache, last_touch, strict=True)]
+        buffers = [None] * len(self.batches) if carry.buffers is None else [b.touches for b in carry.buffers]
+        none, starts = jnp.zeros(self.scenes + 1, bool), zip(memories, buffers, strict=True)
+        starts = [(memory, none, *([buffer] if keeps_touches else [])) for memory, buffer in starts]
+        new, carries = self._pass(sides, statics, listed, starts, play, RELAX_CONSTANTS)
+        touches = [buffer[0] if buffer else None for _, _, *buffer in carries]
+        state, some = (new, [memory for memory, *_ in carries]), None
+        if self.params.late_passes:
+            late = functools.reduce(jnp.logical_or, [late for _, late, *_ in carries], none)[:-1]
+            if self.params.relax_iterations is not None:
+                late = ~none[:-1]
+            some = jnp.any(late)
+
+            def remember(i: int, memory: PairMemory, own: SceneChunk, contacts: tuple, pair: SolvedPair) -> PairMemory:
+                constraint, warm, _, setup = contacts
+                buffer = touches[i]
+                old = None if buffer is None else unpack(own.columns(buffer), specs[i])
+                relaxed = contact_passes.relaxed_pair(constraint, warm, pair, setup, self.params.step)
+                return self._remember(carry, i, memory, own.pair, old, constraint, pair, relaxed, time)
+
+            def again(_: int, state: tuple) -> tuple:
+                old = jax.tree.map(lambda x, y: jnp.where(late, x, y), sides, state[0])
+                bodies = self.bodies(old, statics, LATE_CONSTANTS)
+                rows, memories = LatePasses(self, bodies, solved, remember).solve(late, bodies.rows, state[1])
+                return self.unpacked(bodies, rows), memories
+
+            # A loop of one turn or none: a branch would copy the memories.
+            state = jax.lax.fori_loop(0, some.astype(jnp.int32), again, state)
+        sides, memories = state
         depth, begins = carry.depth, carry.begins
         for overlap, began in solved.observed:
             depth, begins = jnp.maximum(depth, overlap), begins + began
-        of_batches = zip(listed.indices, listed.packed, solved.packed, strict=True)
-        return sides, carry._replace(
-            cache=[cache for cache, _ in carries],
-            last_touch=[touch for _, touch in carries] if self.setup.log else [],
+        of_batches = zip(listed.indices, listed.packed, solved.packed, touches, strict=True)
+        carry = carry._replace(
+            cache=[memory.cache for memory in memories],
+            last_touch=[memory.touch for memory in memories] if self.setup.log else [],
             buffers=[PassBuffers(*of) for of in of_batches],
             depth=depth,
             begins=begins,
             step=carry.step + 1,
         )
+        return sides, carry, some
+
+    def _cache(self, i: int, memory: PairMemory) -> PackedTable:
+        return table_of_rows(memory.cache, self._empty_entry(self.batches[i]))
+
+    def _last_touch(self, carry: NearbyCarry, i: int, memory: PairMemory, where: Array) -> LastTouch:
+        event = self._event_so_far(carry, self._cache(i, memory).at(where))
+        return LastTouch(event, memory.touch.at[where].get(mode=SAFE))
+
+    def _remember(
+        self,
+        carry: NearbyCarry,
+        i: int,
+        memory: PairMemory,
+        where: Array,
+        old: LastTouch | None,
+        constraint: ContactConstraint,
+        pair: SolvedPair,
+        relaxed: RelaxedPair,
+        time: Array,
+    ) -> PairMemory:
+        """Memory of a batch with these pairs after the step; `old` is what is logged of them before it."""
+        touch = memory.touch
+        new = CachedConstraint(relaxed.warm, jnp.full(where.shape, carry.step, self.dtype), None, None)
+        if old is not None:
+            event = record_event(old.event, pair, relaxed.pair, time)
+            new = new._replace(event=event, elasticity=constraint.elasticity)
+            now = 2 * carry.step + jnp.where((event.flags & ON) > 0, 1, 0)
+            now = jnp.where(contact_passes.touching(pair, relaxed.pair), now, old.step)
+            touch = touch.at[where].set(now, mode=SAFE)
+        return PairMemory(self._cache(i, memory).put(where, new).rows, touch)
 
     # ---- Logged contacts
 

@@ -218,27 +218,28 @@ class PairBatches:
         """Numbers of the tables that a batch changes; those of supports are changed by static bodies alone."""
         return batch.groups + ([self._support(batch.second)] if batch.first is None and bodies.supports else [])
 
-    def _put_sides(
+    def put_sides(
         self,
         bodies: BodyTables,
         rows: Mapping[int, Array],
-        batch: PairBatch,
-        own: GatherIndices,
+        batch: int,
+        first: Array,
+        second: Array,
         a: BodySide,
         b: BodySide,
     ) -> dict[int, Array]:
-        """Rows of the tables that a batch changes, by number, with both sides of a chunk of pairs."""
-        if batch.first == batch.second:
+        """Rows of the tables that a batch changes, by number, with both sides of a chunk of pairs in these rows."""
+        of, new = self.batches[batch], {}
+        if of.first == of.second:
             of_a, of_b = (_split(side, bodies.constants)[0] for side in (a, b))
-            return {batch.second: _current(bodies, rows, batch.second).put_both(own.a, of_a, own.b, of_b).rows}
-        new = {}
-        if batch.first is not None:
-            new[batch.first] = self.put(bodies, rows[batch.first], batch.first, own.a, a)
+            return {of.second: _current(bodies, rows, of.second).put_both(first, of_a, second, of_b).rows}
+        if of.first is not None:
+            new[of.first] = self.put(bodies, rows[of.first], of.first, first, a)
         elif bodies.supports:
-            number = self._support(batch.second)
-            new[number] = _current(bodies, rows, number).put(own.b, b.support).rows
+            number = self._support(of.second)
+            new[number] = _current(bodies, rows, number).put(second, b.support).rows
             b = b._replace(support=None)
-        return new | {batch.second: self.put(bodies, rows[batch.second], batch.second, own.b, b)}
+        return new | {of.second: self.put(bodies, rows[of.second], of.second, second, b)}
 
     def play(
         self,
@@ -256,11 +257,11 @@ class PairBatches:
         rows, carries = list(rows), list(carries)
         for i, batch in enumerate(self.batches):
 
-            def chunk(k: Array, state: tuple, i: int = i, batch: PairBatch = batch) -> tuple:
+            def chunk(k: Array, state: tuple, i: int = i) -> tuple:
                 rows, carry = state
                 own = GatherIndices(*get_row(listed.indices[i], k))
                 a, b, carry = play(i, k, own, *self.sides_of(bodies, rows, i, own.a, own.b), carry)
-                return self._put_sides(bodies, rows, batch, own, a, b), carry
+                return self.put_sides(bodies, rows, i, own.a, own.b, a, b), carry
 
             start = {number: rows[number] for number in self._changed(bodies, batch)}, carries[i]
             if any(x is None for x in jax.tree.leaves(carries[i], is_leaf=lambda x: x is None)):

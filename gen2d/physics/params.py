@@ -6,6 +6,8 @@ import math
 from gen2d.config.sections import PhysicsOptions
 from gen2d.records.parameter import minimum
 
+LATE_PASSES = 4  # in scenes with a late impact
+
 
 @dataclasses.dataclass(frozen=True)
 class SolverParams:
@@ -22,12 +24,14 @@ class SolverParams:
     mixing: str
     by_time: bool  # the impacts of discs in a step act in the order of their times, not of the solver's pairs
     extreme_mass_ratios: bool  # bodies that far heavier ones crush stop these where obstacles stop them
-    relax_iterations: int  # passes over all pairs at the end of a step
+    relax_iterations: int | None  # passes over all pairs at the end of a step; None: `LATE_PASSES` if an impact is late
 
     @property
-    def late_impacts(self) -> bool:
-        """Whether the relaxing passes find impacts that others have caused in the step."""
-        return self.relax_iterations > 1
+    def late_passes(self) -> int:
+        """Relaxing passes that find impacts that others have caused in the step; 0: none."""
+        if self.relax_iterations is None:
+            return LATE_PASSES
+        return self.relax_iterations if self.relax_iterations > 1 else 0
 
     def bias_rate(self, hertz: float, damping_ratio: float) -> float:
         """Share of an error that an implicit damped spring corrects, 1/s."""

@@ -24,15 +24,17 @@ class LateImpact(NamedTuple):
     happens: Array
     age: Array  # s: from the impact to the end of the step; zero without one
     fall: Array | float  # m/s: approach speed that the acceleration adds in this time
+    arrival: Array  # m/s: approach speed at its time
 
     def seen_at(self, speed: Array) -> "LateImpact":
         """The impact of contacts that still approach at its time, where they have this normal speed, m/s."""
-        return self._replace(happens=self.happens & (speed < 0))
+        return self._replace(happens=self.happens & (speed < 0), arrival=-speed - self.fall)
 
 
 def touching_impact(contact: ActiveContact, speed: Array, threshold: Array) -> LateImpact:
     """Impact at the end of the step of a contact that touches at its start."""
-    return LateImpact(_approaches(contact, speed, threshold) & (contact.gap <= 0), jnp.zeros_like(speed), 0.0)
+    happens = _approaches(contact, speed, threshold) & (contact.gap <= 0)
+    return LateImpact(happens, jnp.zeros_like(speed), 0.0, -speed)
 
 
 def closing_impact(
@@ -50,7 +52,8 @@ def closing_impact(
     approach = jnp.where(happens, -speed, 1.0)
     deeper = jnp.maximum(jnp.minimum(contact.gap, 0.0) - gap, 0.0)  # than at the start
     age = jnp.where(happens, jnp.minimum(deeper / approach, h), 0.0)
-    return LateImpact(happens, age, jnp.minimum(pull_along(point, contact.normal) * age, approach))
+    fall = jnp.minimum(pull_along(point, contact.normal) * age, approach)
+    return LateImpact(happens, age, fall, -speed - fall)
 
 
 def _approaches(contact: ActiveContact, speed: Array, threshold: Array) -> Array:
@@ -72,14 +75,14 @@ def relaxed_target(
     """
     rests = (contact.tau < 0) & ((old.normal > 0) | (contact.gap <= 0)) & (speed >= -threshold)
     active = late.happens | (rests & (contact.frame.normal_mass > 0))
-    bounce = jnp.maximum(constraint.elasticity * (-speed - late.fall) - late.fall, 0.0)
+    bounce = jnp.maximum(constraint.elasticity * late.arrival - late.fall, 0.0)
     target, apart = jnp.where(late.happens, bounce, 0.0), late.happens | (contact.tau >= 0)
     return NormalTarget(active, target, old.normal, late.happens, apart)
 
 
-def displacement_before(side: BodySide, age: Array | None) -> Motion | None:
-    """Displacement of a side this time, s, before the end of the step; None: at the end."""
-    if age is None or side.displacement is None or side.motion is None:
+def displacement_before(side: BodySide, age: Array) -> Motion | None:
+    """Displacement of a side this time, s, before the end of the step."""
+    if side.displacement is None or side.motion is None:
         return side.displacement
     return jax.tree.map(lambda x, v: x - age * v, side.displacement, side.motion)
 

@@ -44,10 +44,10 @@ class ContactSolver(Protocol):
 
     def relax(
         self, carry: Any, solved: Any, sides: list[BodySide], statics: list[BodySide], time: Array
-    ) -> tuple[list[BodySide], Any]:
-        """Sides after the relaxing pass of the step that began at `time`, and the carry.
+    ) -> tuple[list[BodySide], Any, Array | None]:
+        """Sides after the relaxing passes of the step that began at `time`, the carry, and whether these displaced any.
 
-        Uses motion, displacement, resting, push and work.
+        Uses motion, displacement, resting, push and work. None: sides are never displaced.
         """
         ...
 

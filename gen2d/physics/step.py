@@ -29,7 +29,9 @@ Sources: E. Catto, 'Iterative dynamics with temporal coherence' (GDC 2005) for a
 impact in gradients.
 """
 
+import functools
 import math
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -44,7 +46,7 @@ from gen2d.physics.jointed import hold, release
 from gen2d.physics.params import SolverParams
 from gen2d.physics.shapes import to_world
 from gen2d.physics.springs import poses_of, table_of
-from gen2d.physics.state import BodyGroupState, BodyState, Model, WorldState
+from gen2d.physics.state import BodyState, Model, WorldState
 from gen2d.physics.support import no_obstacles, no_support
 from gen2d.physics.tunnelling import clamp_displacement
 from gen2d.records.axes import Array
@@ -249,13 +251,16 @@ def _first_pass_side(
     )
 
 
-def _relaxed_displacement(group: BodyGroupState, old: Motion, side: BodySide) -> Motion:
-    """Displacement with that of late impacts; that of a body on a joint stays, as the joint has been solved for it."""
-    assert side.displacement is not None, "moving bodies have a displacement"
-    jointed = group.jointed
-    if jointed is None:
-        return side.displacement
-    return jax.tree.map(lambda x, new: jnp.where(jointed, x, new), old, side.displacement)
+def _late_displacements(
+    model: Model, sides: list[BodySide], displacements: list[Motion], clamp: Callable[[list[Motion]], list[Motion]]
+) -> list[Motion]:
+    """Displacements of all groups with those of late impacts; a body on a joint keeps that of its joint."""
+    news = [side.displacement for side in sides if side.displacement is not None]
+    for number, group in enumerate(model.groups):
+        if group.jointed is not None:
+            of = displacements[number], news[number]
+            news[number] = jax.tree.map(lambda x, new, fixed=group.jointed: jnp.where(fixed, x, new), *of)
+    return clamp(news)
 
 
 def step(world: WorldState, model: Model, params: SolverParams) -> WorldState:
@@ -303,7 +308,8 @@ def step(world: WorldState, model: Model, params: SolverParams) -> WorldState:
 
     displacements = [jax.tree.map(lambda x, y: h * x + y, *of) for of in zip(motions, drifts, strict=True)]
     solid = [s if g.collides else None for s, g in zip(shapes, groups, strict=True)]
-    displacements = clamp_displacement(displacements, solid, model.barriers)
+    clamp = functools.partial(clamp_displacement, shapes=solid, barriers=model.barriers)
+    displacements = clamp(displacements)
     motions = pulling.conserve(displacements, motions)
 
     rigid.move(displacements)
@@ -313,11 +319,11 @@ def step(world: WorldState, model: Model, params: SolverParams) -> WorldState:
         BodySide(motion=motion, displacement=moved, resting=side.resting, push=side.push, work=side.work)
         for side, motion, moved in of_groups
     ]
-    sides, carry = solver.relax(carry, solved, rigid.hold_again(sides), statics, world.time)
+    sides, carry, late = solver.relax(carry, solved, rigid.hold_again(sides), statics, world.time)
+    if late is not None:
+        moved = functools.partial(_late_displacements, model, sides, clamp=clamp)
+        displacements = jax.lax.cond(late, moved, lambda x: x, displacements)
     motions = rigid.stay(_motions([release(side) for side in sides]))
-    if params.late_impacts:
-        relaxed = [_relaxed_displacement(*of) for of in zip(groups, displacements, sides, strict=True)]
-        displacements = clamp_displacement(relaxed, solid, model.barriers)
     bodies = [_displace(*of) for of in zip(world.bodies, displacements, motions, strict=True)]
     if ledger is not None:
         olds, works = [body.motion for body in world.bodies], [side.work for side in sides]

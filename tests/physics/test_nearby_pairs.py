@@ -10,6 +10,7 @@ import pytest
 from laws import holds
 from worlds import STEP, box, rules, run, world
 
+from gen2d.core.enums import IMPACT
 from gen2d.physics.broad_phase import (
     active_pairs,
     bits_in_round_robin,
@@ -148,7 +149,8 @@ def exact_column(heights: list[float], speeds: list[float], elasticity: float, t
             lower = -elasticity * lower
 
 
-def test_relaxing_passes_find_impacts_that_others_cause_in_the_same_step():
+@pytest.mark.parametrize("passes", [8, None])
+def test_relaxing_passes_find_impacts_that_others_cause_in_the_same_step(passes):
     """A disc strikes another one over a floor, and meets it again as it comes back, in the same step."""
     speed, gaps, elasticities = -10.0, (0.01, 0.004), (0.3, 0.5)
     floor = {"a": (-5, 0), "b": (5, 0)}
@@ -157,12 +159,33 @@ def test_relaxing_passes_find_impacts_that_others_cause_in_the_same_step():
         for e in elasticities
     ]
     exact = [exact_column(list(gaps), [speed, 0.0], e, STEP) for e in elasticities]
-    both = [run(worlds, 2, 1, rules(relax_iterations=8), EVERYTHING, sparse=sparse) for sparse in (True, False)]
+    both = [run(worlds, 2, 1, rules(relax_iterations=passes), EVERYTHING, sparse=sparse) for sparse in (True, False)]
     assert_alike(*both, within=1e-5)
     y, v = both[0].states.position[:, 1, :2, 1], both[0].states.velocity[:, 1, :2, 1]
     found = np.stack([y[:, 1] - y[:, 0] - 1, y[:, 0] - 0.5], axis=1)
     holds("Impacts that follow each other in a step: gaps, m", found - [of for of, _ in exact], 1e-5)
     holds("Impacts that follow each other in a step: speeds, m/s", v[:, ::-1] - [of for _, of in exact], 1e-4)
+
+
+@pytest.mark.parametrize("passes", [8, None])
+def test_an_impact_that_another_one_causes_in_the_same_step_is_logged(passes):
+    """A disc bounces off a floor and strikes another one above it, in the same step."""
+    speed, gaps = 10.0, (0.01, 0.02)
+    lower = {"x": (0, 0.5 + gaps[0]), "v": (0, -speed), "elasticity": 1.0}
+    upper = {"x": (0, 1.5 + sum(gaps)), "elasticity": 1.0}
+    worlds = [world([lower, upper], [{"a": (-5, 0), "b": (5, 0), "elasticity": 1.0}])]
+    both = [run(worlds, 2, 1, rules(relax_iterations=passes), EVERYTHING, sparse=sparse) for sparse in (True, False)]
+    assert_alike(*both, within=1e-5)
+    rows = both[0].contacts
+    assert rows.count[0] == 2
+    assert set(rows.kind[0, :2]) == {IMPACT}
+    holds("impact that a bounce causes: approach speeds, m/s", rows.approach_speed[0, :2] - speed, 1e-4)
+    holds(
+        "impact that a bounce causes: times, s",
+        rows.time[0, :2] - [gaps[0] / speed, (gaps[1] + 2 * gaps[0]) / speed],
+        1e-6,
+    )
+    holds("impact that a bounce causes: height of the point, m", rows.point[0, 1, 1] - (1 + sum(gaps)), 1e-5)
 
 
 @pytest.mark.slow

@@ -85,7 +85,7 @@ EXTREME_BOUNDS: dict[str, Bounds] = {  # with `physics.extreme_mass_ratios`
     "mass ratios up to 1e6": {RISING: 0.05, DETOURING: None, OVERLAPPING: 0.2},
     "fast, mass ratios up to 1e6, e = 0.5": {RISING: None, DETOURING: 0.08, OVERLAPPING: 0.2},
 }
-RELAXED_BOUNDS: dict[str, Bounds] = {  # with four relaxing passes
+RELAXED_BOUNDS: dict[str, Bounds] = {  # with four relaxing passes, in all scenes or in those that need them
     "all shapes": {RISING: 0.01},
     "elastic shapes": {},
     "joints, with gravity": {RISING: 0.08},
@@ -191,9 +191,10 @@ def test_worlds_keep_the_laws_where_obstacles_stop_bodies_that_heavy_ones_crush(
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("passes", [4, None])
 @pytest.mark.parametrize("name", classes(RELAXED_BOUNDS))
-def test_worlds_keep_the_laws_with_several_relaxing_passes(name):
-    numbers = rules(relax_iterations=4)
+def test_worlds_keep_the_laws_with_several_relaxing_passes(name, passes):
+    numbers = rules(relax_iterations=passes)
     batches = [measure(LARGE, [RECIPES[name]], MANY, first=k * MANY, params=numbers)[0] for k in range(4)]
     check_laws(name, batches, RELAXED_BOUNDS[name], RARELY)
 
