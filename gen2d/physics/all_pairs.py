@@ -26,6 +26,7 @@ from gen2d.physics.contact_log import (
 from gen2d.physics.contact_state import BodySide, PassSetup, RelaxedPair, SolvedPair, WarmStart
 from gen2d.physics.impact_order import TURNS, in_order, later_impact, not_hit, takes_part, with_first
 from gen2d.physics.params import SolverParams
+from gen2d.physics.relaxing import late_scenes
 from gen2d.physics.schedule import Match, run_schedule
 from gen2d.physics.solver_protocol import ContactSolver
 from gen2d.physics.support import is_crushed
@@ -190,17 +191,21 @@ class AllPairs(ContactSolver):
             of = self.constraints[k], carry.warm[k], solved.points[k], solved.pairs[k]
             return contact_passes.relax(*of, a, b, self.setup, self.params)
 
-        new, pairs = run_schedule(sides, statics, self.order, play)
-        state, some = (new, *self._relaxed(carry, solved.pairs, pairs, time)), None
+        new, relaxed = run_schedule(sides, statics, self.order, play)
+        scenes, some = late_scenes(new, self.setup.threshold.shape), None
+        before, new = ([side._replace(late=None) for side in of] for of in (sides, new))
+        state = new, *self._relaxed(carry, solved.pairs, relaxed, time)
         if self.params.late_passes:
-            late = jnp.ones(self.setup.threshold.shape, bool)
-            if self.params.relax_iterations is None:
-                late = functools.reduce(
-                    jnp.logical_or, [jnp.any(x.late, axis=0) for x in pairs if x.late is not None], ~late
-                )
-            some = jnp.any(late)
-            redo = functools.partial(self._relax_late, carry, solved, sides, statics, time, late)
-            state = jax.lax.cond(some, redo, lambda *x: x, *state)
+
+            def again(*others: Any) -> tuple:
+                sides, pairs = self._late_passes(solved, before, statics)
+                of_pairs = zip(self.constraints, carry.warm, pairs, strict=True)
+                relaxed = [contact_passes.relaxed_pair(*of, self.setup, self.params.step) for of in of_pairs]
+                new = sides, *self._relaxed(carry, pairs, relaxed, time)
+                return jax.tree.map(lambda x, y: jnp.where(scenes, x, y), new, others)
+
+            some = jnp.any(scenes)
+            state = jax.lax.cond(some, again, lambda *x: x, *state)
         sides, warm, events = state
         observed = dict(carry.observed)
         for depth, began in solved.observed:
@@ -218,17 +223,10 @@ class AllPairs(ContactSolver):
             events = [record_event(event, pair, last.pair, time) for event, pair, last in of]
         return [last.warm for last in relaxed], events
 
-    def _relax_late(
-        self,
-        carry: AllPairsCarry,
-        solved: SolvedRounds,
-        sides: list[BodySide],
-        statics: list[BodySide],
-        time: Array,
-        late: Array,
-        *others: Any,
-    ) -> tuple:
-        """Sides, warm starts and events after relaxing passes with late impacts in these scenes, in others `others`."""
+    def _late_passes(
+        self, solved: SolvedRounds, sides: list[BodySide], statics: list[BodySide]
+    ) -> tuple[list[BodySide], list[SolvedPair]]:
+        """Sides and pairs after relaxing passes with late impacts."""
 
         def one(state: tuple, _: None) -> tuple[tuple, None]:
             def play(k: int, a: BodySide, b: BodySide) -> tuple[BodySide, BodySide, SolvedPair]:
@@ -237,11 +235,7 @@ class AllPairs(ContactSolver):
 
             return run_schedule(state[0], statics, self.order, play), None
 
-        (sides, pairs), _ = jax.lax.scan(one, (sides, solved.pairs), length=self.params.late_passes)
-        of_pairs = zip(self.constraints, carry.warm, pairs, strict=True)
-        relaxed = [contact_passes.relaxed_pair(*of, self.setup, self.params.step) for of in of_pairs]
-        new = sides, *self._relaxed(carry, pairs, relaxed, time)
-        return jax.tree.map(lambda x, y: jnp.where(late, x, y), new, others)
+        return jax.lax.scan(one, (sides, solved.pairs), length=self.params.late_passes)[0]
 
     def end_frame(self, carry: AllPairsCarry) -> tuple[AllPairsCarry, PairEvent | None]:
         if carry.events is None:

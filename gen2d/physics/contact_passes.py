@@ -4,6 +4,7 @@ A batch holds any number of pairs: all pairs of a round (all_pairs.py) or a chun
 """
 
 import functools
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -433,15 +434,11 @@ def _after_late_impact(
     side = a if point.moves_with_a else b
     path = 0.0 if side is None else side.velocity
     position = position_of(constraint, point, contact.frame, contact.normal, path)
-    new = old._replace(normal=contact.normal, tau=h - late.age, arrival=late.arrival, position=position)
     first = late.happens & (old.tau < 0)
-    return old._replace(
-        **{
-            name: jnp.where(first, getattr(new, name), getattr(old, name))
-            for name in ("normal", "tau", "arrival", "position")
-            if getattr(old, name) is not None
-        }
-    )
+    new = contact.normal, h - late.age, late.arrival, position
+    of_both = new, (old.normal, old.tau, old.arrival, old.position)
+    normal, tau, arrival, position = jax.tree.map(lambda x, y: jnp.where(first, x, y), *of_both)
+    return old._replace(normal=normal, tau=tau, arrival=arrival, position=position)
 
 
 def relaxed_pair(
@@ -449,7 +446,7 @@ def relaxed_pair(
 ) -> RelaxedPair:
     """The pair with what the next step starts with, after relaxing passes with late impacts."""
     bounced = [contact.tau >= 0 for contact in pair.contacts]
-    return RelaxedPair(pair, _next_warm_start(constraint, memory, pair, bounced, setup, h), None)
+    return RelaxedPair(pair, _next_warm_start(constraint, memory, pair, bounced, setup, h))
 
 
 def _next_warm_start(
@@ -470,7 +467,10 @@ def relax(
     setup: PassSetup,
     params: SolverParams,
 ) -> tuple[BodySide, BodySide, RelaxedPair]:
-    """Both sides and the pair after a relaxing solve at the end of the step."""
+    """Both sides and the pair after a relaxing solve at the end of the step.
+
+    Sides with `late` know afterwards whether one with late impacts is needed.
+    """
     constraint, h = with_joints(constraint, a, b), params.step
     late: list[LateImpact] = []
 
@@ -480,16 +480,27 @@ def relax(
         return relaxed_target(constraint, contact, late[-1], speed, old, threshold)
 
     contacts = _displaced_contacts(constraint, points, solved, a.displacement, b.displacement)
-    new_a, new_b, last, _ = _apply_pass(constraint, solved._replace(contacts=contacts), target_of, a, b)
+    new_a, new_b, last = _relaxed(constraint, solved, contacts, target_of, a, b)
     bounced = [(contact.tau >= 0) | impact.happens for contact, impact in zip(last.contacts, late, strict=True)]
     warm = _next_warm_start(constraint, memory, last, bounced, setup, h)
-    if constraint.static:
-        new_b = new_b._replace(motion=materialize(new_b.motion))
-    if not params.late_passes:
-        return new_a, new_b, RelaxedPair(last, warm, None)
-    closing = _closing_impacts(constraint, points, solved, a, b, setup, h)
-    happens = functools.reduce(jnp.logical_or, [impact.happens for impact in closing])
-    return new_a, new_b, RelaxedPair(last, warm, happens)
+    if new_b.late is not None:
+        closing = _closing_impacts(constraint, points, solved, a, b, setup, h)
+        happens = functools.reduce(jnp.logical_or, [impact.happens for impact in closing])
+        new_b = new_b._replace(late=new_b.late | happens)
+    return new_a, new_b, RelaxedPair(last, warm)
+
+
+def _relaxed(
+    constraint: ContactConstraint,
+    solved: SolvedPair,
+    contacts: list[ActiveContact],
+    target_of: Callable[[ActiveContact, Array, Impulse], NormalTarget],
+    a: BodySide,
+    b: BodySide,
+) -> tuple[BodySide, BodySide, SolvedPair]:
+    """Both sides and the pair after a solve of displaced contacts."""
+    a, b, last, _ = _apply_pass(constraint, solved._replace(contacts=contacts), target_of, a, b)
+    return a, b._replace(motion=materialize(b.motion)) if constraint.static else b, last
 
 
 def relax_late(
@@ -517,10 +528,8 @@ def relax_late(
         return relaxed_target(constraint, contact, late[-1], speed, old, threshold)
 
     contacts = _displaced_contacts(constraint, points, solved, *displacements)
-    new_a, new_b, last, _ = _apply_pass(constraint, solved._replace(contacts=contacts), target_of, a, b)
+    new_a, new_b, last = _relaxed(constraint, solved, contacts, target_of, a, b)
     new_a, new_b = displaced_since(a, new_a, age), displaced_since(b, new_b, age)
-    if constraint.static:
-        new_b = new_b._replace(motion=materialize(new_b.motion))
     of = zip(points, solved.contacts, contacts, late, strict=True)
     contacts = [_after_late_impact(constraint, *each, *displacements, h) for each in of]
     return new_a, new_b, last._replace(contacts=contacts)

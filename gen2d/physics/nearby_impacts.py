@@ -46,7 +46,7 @@ class LaterImpacts:
         """Rows of the bodies' tables and packed contacts after these impacts, in scenes [n] where any may `follow`."""
         start = rows, self._solved.packed
         return self._pairs.run(
-            follow, self._batches, False, lambda lists, state: self._solve_group(lists, *state), start
+            follow, self._batches, False, lambda lists, _, state: self._solve_group(lists, *state), start
         )
 
     def _solve_group(

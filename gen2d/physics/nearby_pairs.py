@@ -64,6 +64,7 @@ from gen2d.physics.pair_batches import (
     SolvedChunk,
     StaticSide,
 )
+from gen2d.physics.relaxing import late_scenes
 from gen2d.physics.scene_pairs import SceneChunk
 from gen2d.physics.schedule import bipartite_rounds
 from gen2d.physics.solver_protocol import ContactSolver
@@ -72,7 +73,6 @@ from gen2d.records.axes import Array
 from gen2d.records.trajectory import Contacts
 from gen2d.xla import materialize, max_bodies
 
-LATE_CONSTANTS = *(name for name in CONSTANTS if name != "displacement"), "resting", "push"
 RELAX_CONSTANTS = *CONSTANTS, "resting", "push"
 
 NEVER = -2  # the step of an event that has not happened
@@ -164,9 +164,9 @@ class NearbyPairs(PairBatches, ContactSolver):
             return CachedConstraint(warm, zero + NEVER, None, None)
         return CachedConstraint(warm, zero + NEVER, empty_events((1,), self.dtype), zero)
 
-    def _cache_tables(self, carry: NearbyCarry) -> list[PackedTable]:
-        entries = [self._empty_entry(batch) for batch in self.batches]
-        return [table_of_rows(*of) for of in zip(carry.cache, entries, strict=True)]
+    def _cache(self, i: int, rows: Array) -> PackedTable:
+        """Table of the pairs of batch i, from its rows."""
+        return table_of_rows(rows, self._empty_entry(self.batches[i]))
 
     # ---- Broad phase
 
@@ -268,7 +268,7 @@ class NearbyPairs(PairBatches, ContactSolver):
         firsts = [
             self._static_table(list(b.statics.values())) if b.first is None else groups[b.first] for b in self.batches
         ]
-        caches = self._cache_tables(carry)
+        caches = [self._cache(*of) for of in enumerate(carry.cache)]
         specs: dict[int, TableSpec] = {}
 
         def play(
@@ -377,7 +377,7 @@ class NearbyPairs(PairBatches, ContactSolver):
         specs: dict[int, TableSpec] = {}
 
         def play(i: int, k: Array, indices: GatherIndices, a: BodySide, b: BodySide, carried: tuple) -> tuple:
-            memory, late, *buffer = carried
+            memory, *buffer = carried
             columns = list(get_row(listed.packed[i], k))
             constraint, warm, points, setup = self.unpack_contacts(columns, listed.specs[i])
             pair = unpack(list(get_row(solved.packed[i], k)), solved.specs[i])
@@ -386,41 +386,31 @@ class NearbyPairs(PairBatches, ContactSolver):
             if keeps_touches:
                 values, specs[i] = pack(old, (self.chunk,), self.dtype)
                 buffer = [self._store(self.batches[i], buffer[0], k, values)]
-            if relaxed.late is not None:
-                late = late.at[indices.scene].max(relaxed.late)
             memory = self._remember(carry, i, memory, indices.pair, old, constraint, pair, relaxed, time)
-            return a, b, (memory, late, *buffer)
+            return a, b, (memory, *buffer)
 
         last_touch = carry.last_touch or [jnp.zeros(0, jnp.int32)] * len(self.batches)
         memories = [PairMemory(*of) for of in zip(carry.cache, last_touch, strict=True)]
         buffers = [None] * len(self.batches) if carry.buffers is None else [b.touches for b in carry.buffers]
-        none, starts = jnp.zeros(self.scenes + 1, bool), zip(memories, buffers, strict=True)
-        starts = [(memory, none, *([buffer] if keeps_touches else [])) for memory, buffer in starts]
+        starts = [(of, *([buffer] if keeps_touches else [])) for of, buffer in zip(memories, buffers, strict=True)]
         new, carries = self._pass(sides, statics, listed, starts, play, RELAX_CONSTANTS)
-        touches = [buffer[0] if buffer else None for _, _, *buffer in carries]
-        state, some = (new, [memory for memory, *_ in carries]), None
+        memories, touches = (
+            [memory for memory, *_ in carries],
+            [buffer[0] if buffer else None for _, *buffer in carries],
+        )
+        some = None
         if self.params.late_passes:
-            late = functools.reduce(jnp.logical_or, [late for _, late, *_ in carries], none)[:-1]
-            if self.params.relax_iterations is not None:
-                late = ~none[:-1]
-            some = jnp.any(late)
+            scenes = late_scenes(new, (self.scenes,))
+            old, new = ([side._replace(late=None) for side in of] for of in (sides, new))
 
             def remember(i: int, memory: PairMemory, own: SceneChunk, contacts: tuple, pair: SolvedPair) -> PairMemory:
-                constraint, warm, _, setup = contacts
-                buffer = touches[i]
-                old = None if buffer is None else unpack(own.columns(buffer), specs[i])
+                (constraint, warm, _, setup), buffer = contacts, touches[i]
+                touch = None if buffer is None else unpack(own.columns(buffer), specs[i])
                 relaxed = contact_passes.relaxed_pair(constraint, warm, pair, setup, self.params.step)
-                return self._remember(carry, i, memory, own.pair, old, constraint, pair, relaxed, time)
+                return self._remember(carry, i, memory, own.pair, touch, constraint, pair, relaxed, time)
 
-            def again(_: int, state: tuple) -> tuple:
-                old = jax.tree.map(lambda x, y: jnp.where(late, x, y), sides, state[0])
-                bodies = self.bodies(old, statics, LATE_CONSTANTS)
-                rows, memories = LatePasses(self, bodies, solved, remember).solve(late, bodies.rows, state[1])
-                return self.unpacked(bodies, rows), memories
-
-            # A loop of one turn or none: a branch would copy the memories.
-            state = jax.lax.fori_loop(0, some.astype(jnp.int32), again, state)
-        sides, memories = state
+            new, memories = LatePasses(self, old, statics, solved, remember).solve(scenes, new, memories)
+            some = jnp.any(scenes)
         depth, begins = carry.depth, carry.begins
         for overlap, began in solved.observed:
             depth, begins = jnp.maximum(depth, overlap), begins + began
@@ -433,13 +423,10 @@ class NearbyPairs(PairBatches, ContactSolver):
             begins=begins,
             step=carry.step + 1,
         )
-        return sides, carry, some
-
-    def _cache(self, i: int, memory: PairMemory) -> PackedTable:
-        return table_of_rows(memory.cache, self._empty_entry(self.batches[i]))
+        return new, carry, some
 
     def _last_touch(self, carry: NearbyCarry, i: int, memory: PairMemory, where: Array) -> LastTouch:
-        event = self._event_so_far(carry, self._cache(i, memory).at(where))
+        event = self._event_so_far(carry, self._cache(i, memory.cache).at(where))
         return LastTouch(event, memory.touch.at[where].get(mode=SAFE))
 
     def _remember(
@@ -463,7 +450,7 @@ class NearbyPairs(PairBatches, ContactSolver):
             now = 2 * carry.step + jnp.where((event.flags & ON) > 0, 1, 0)
             now = jnp.where(contact_passes.touching(pair, relaxed.pair), now, old.step)
             touch = touch.at[where].set(now, mode=SAFE)
-        return PairMemory(self._cache(i, memory).put(where, new).rows, touch)
+        return PairMemory(self._cache(i, memory.cache).put(where, new).rows, touch)
 
     # ---- Logged contacts
 
@@ -482,7 +469,8 @@ class NearbyPairs(PairBatches, ContactSolver):
         if carry.log is None or carry.log_count is None:
             return carry, None
         log, count = carry.log, carry.log_count
-        for batch, cache, touch in zip(self.batches, self._cache_tables(carry), carry.last_touch, strict=True):
+        caches = [self._cache(*of) for of in enumerate(carry.cache)]
+        for batch, cache, touch in zip(self.batches, caches, carry.last_touch, strict=True):
             recent = touch[:-1].reshape(*batch.a.shape, self.scenes) >= 2 * carry.first - 1
             words = bits_of(recent)
             log = self._append_to_log(carry, batch, cache, words, log, count)

@@ -7,13 +7,15 @@ import jax
 import jax.numpy as jnp
 
 from gen2d.physics.contact_passes import relax_late
+from gen2d.physics.contact_state import BodySide
 from gen2d.physics.packing import get_row, pack, put_row, unpack
-from gen2d.physics.pair_batches import BodyTables, PairBatches, SolvedChunk
+from gen2d.physics.pair_batches import CONSTANTS, BodyTables, PairBatches, SolvedChunk, put_scenes, take_scenes
 from gen2d.physics.scene_pairs import CHUNK, SceneChunk, SceneList, ScenePairs
 from gen2d.records.axes import Array
 from gen2d.xla import materialize
 
 GROUP = 4  # scenes that are listed at once: few have late impacts in a step
+LATE_CONSTANTS = *(name for name in CONSTANTS if name != "displacement"), "resting", "push"
 
 
 class _Buffers(NamedTuple):
@@ -23,50 +25,69 @@ class _Buffers(NamedTuple):
     pairs: Array
 
 
+class _Group(NamedTuple):
+    """Scenes that are solved together, and their bodies."""
+
+    solver: PairBatches  # of these scenes
+    bodies: BodyTables
+    lists: dict[int, SceneList]
+    contacts: dict[int, Array]  # see `_Buffers`
+
+
 class LatePasses:
     """The passes over all pairs of some scenes.
 
     `remember(i, memory, chunk, contacts, pair)` returns the memory of batch i with a chunk of pairs after the passes.
     """
 
-    def __init__(self, solver: PairBatches, bodies: BodyTables, solved: SolvedChunk, remember: Callable) -> None:
-        self._solver, self._bodies, self._solved, self._remember = solver, bodies, solved, remember
+    def __init__(
+        self,
+        solver: PairBatches,
+        sides: list[BodySide],
+        statics: list[BodySide],
+        solved: SolvedChunk,
+        remember: Callable,
+    ) -> None:
+        self._solver, self._sides, self._statics, self._solved = solver, sides, statics, solved
+        self._remember = remember
         everywhere = solver.params.relax_iterations is not None
         sizes = (solver.scenes, solver.chunk) if everywhere else (min(GROUP, solver.scenes), CHUNK)
         self._pairs = ScenePairs(solver, solved.listed, *sizes)
 
-    def solve(self, scenes: Array, rows: list[Array], memories: list[Any]) -> tuple[list[Array], list[Any]]:
-        """Rows of the bodies' tables and memories after the passes over these scenes [n]."""
-        return self._pairs.run(
-            scenes, list(range(len(self._solver.batches))), True, self._solve_group, (rows, memories)
-        )
+    def solve(self, scenes: Array, sides: list[BodySide], memories: list[Any]) -> tuple[list[BodySide], list[Any]]:
+        """Sides and memories, those of these scenes [n] after the passes."""
+        batches = list(range(len(self._solver.batches)))
+        return self._pairs.run(scenes, batches, True, self._solve_group, (sides, memories))
 
-    def _solve_group(self, lists: dict[int, SceneList], state: tuple) -> tuple:
-        """Rows and memories after all passes over a group of scenes."""
-        start, memories = state
+    def _solve_group(self, lists: dict[int, SceneList], scenes: Array, state: tuple) -> tuple:
+        """Sides and memories after all passes over a group of scenes."""
+        (sides, memories), solver = state, self._solver.of_scenes(scenes)
+        own, statics = (take_scenes(of, scenes) for of in (self._sides, self._statics))
+        bodies = solver.bodies(own, statics, LATE_CONSTANTS)
         listed = {i: self._gathered(i, pairs) for i, pairs in lists.items()}
+        group = _Group(solver, bodies, lists, {i: of.contacts for i, of in listed.items()})
 
         def one(_: Array, state: tuple) -> tuple:
             rows, buffers = dict(enumerate(state[0])), dict(state[1])
             for i, pairs in lists.items():
 
                 def chunk(k: Array, own: SceneChunk, carry: tuple, i: int = i) -> tuple:
-                    return self._solve_chunk(i, k, own, listed[i].contacts, *carry)
+                    return self._solve_chunk(group, i, k, own, *carry)
 
                 rows, buffers[i] = pairs.run(chunk, (rows, buffers[i]))
             return list(rows.values()), buffers
 
-        start = start, {i: of.pairs for i, of in listed.items()}
-        rows, buffers = jax.lax.fori_loop(0, self._solver.params.late_passes, one, start)
+        start = bodies.rows, {i: of.pairs for i, of in listed.items()}
+        rows, buffers = jax.lax.fori_loop(0, solver.params.late_passes, one, start)
         memories = list(memories)
         for i, pairs in lists.items():
 
             def end(k: Array, own: SceneChunk, memory: Any, i: int = i) -> Any:
-                contacts = self._contacts(i, k, listed[i].contacts)
+                contacts = self._contacts(i, k, group.contacts[i])
                 return self._remember(i, memory, own, contacts, self._pair(i, k, buffers[i]))
 
             memories[i] = pairs.run(end, memories[i])
-        return rows, memories
+        return put_scenes(sides, scenes, solver.unpacked(bodies, rows)), memories
 
     def _gathered(self, i: int, pairs: SceneList) -> _Buffers:
         """Listed pairs in buffers of their own: to put them back where they were in each pass would take longer."""
@@ -87,13 +108,14 @@ class LatePasses:
         return unpack(list(materialize(get_row(pairs, k))), self._solved.specs[i])
 
     def _solve_chunk(
-        self, i: int, k: Array, own: SceneChunk, contacts: Array, rows: dict[int, Array], pairs: Array
+        self, group: _Group, i: int, k: Array, own: SceneChunk, rows: dict[int, Array], pairs: Array
     ) -> tuple[dict[int, Array], Array]:
-        solver, bodies = self._solver, self._bodies
-        a, b = solver.sides_of(bodies, rows, i, own.a, own.b)
-        constraint, _, points, setup = self._contacts(i, k, contacts)
+        solver, bodies = group.solver, group.bodies
+        places = own.bodies(self._solver.scenes, solver.scenes)
+        a, b = solver.sides_of(bodies, rows, i, *places)
+        constraint, _, points, setup = self._contacts(i, k, group.contacts[i])
         pair = self._pair(i, k, pairs)
         a, b, pair = relax_late(constraint, points, pair, a, b, setup, solver.params)
         values, _ = pack(pair, own.a.shape, pairs.dtype, once=True)
-        rows = rows | solver.put_sides(bodies, rows, i, own.a, own.b, a, b)
+        rows = rows | solver.put_sides(bodies, rows, i, *places, a, b)
         return rows, put_row(pairs, k, materialize(jnp.stack(values)))

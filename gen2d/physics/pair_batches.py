@@ -5,7 +5,7 @@ Bodies are rows of packed tables (packing.py): the rows of a chunk are gathered,
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import jax
 import jax.numpy as jnp
@@ -276,12 +276,27 @@ class PairBatches:
         """Rows of the changing table of a group with some replaced."""
         return bodies.changing[group]._replace(rows=rows).put(where, _split(side, bodies.constants)[0]).rows
 
+    def of_scenes(self, scenes: Array) -> Self:
+        """The same pairs in some scenes; their constraints stay packed (`ListedPairs`)."""
+        gravity, threshold = take_scenes((self.setup.gravity, self.setup.threshold), scenes)
+        return dataclasses.replace(self, setup=self.setup._replace(gravity=gravity, threshold=threshold))
+
     def unpack_contacts(
         self, columns: Sequence[Array], spec: TableSpec
     ) -> tuple[ContactConstraint, WarmStart, list, PassSetup]:
         """Constraint, impulses, points and setup of packed contacts, as the warm start stored them."""
         constraint, warm, points, threshold, gravity = unpack(columns, spec)
         return constraint, warm, points, self.setup._replace(threshold=threshold, gravity=gravity)
+
+
+def take_scenes(tree: Any, scenes: Array) -> Any:
+    """The tree, with leaves [..., n], of some scenes."""
+    return jax.tree.map(lambda x: x.at[..., scenes].get(mode="clip"), tree)
+
+
+def put_scenes(tree: Any, scenes: Array, new: Any) -> Any:
+    """The tree with those of some scenes replaced; numbers beyond the last scene are of none."""
+    return jax.tree.map(lambda x, y: x.at[..., scenes].set(y, mode="drop"), tree, new)
 
 
 def _current(bodies: BodyTables, rows: Mapping[int, Array], number: int) -> PackedTable:

@@ -6,6 +6,7 @@ that to the next step, as it cannot undo the overlap. Several passes solve such 
 to the time when the gap closed, so it also displaces the bodies by what it would have done since.
 """
 
+import functools
 from typing import NamedTuple
 
 import jax
@@ -58,6 +59,12 @@ def closing_impact(
 
 def _approaches(contact: ActiveContact, speed: Array, threshold: Array) -> Array:
     return (speed < -threshold) & (contact.frame.normal_mass > 0)
+
+
+def late_scenes(sides: list[BodySide], scenes: tuple[int, ...]) -> Array:
+    """Scenes [...] in which the passes look for late impacts: those that have any, or all if that is not known."""
+    flags = [jnp.any(side.late, axis=0) for side in sides if side.late is not None]
+    return functools.reduce(jnp.logical_or, flags) if flags else jnp.ones(scenes, bool)
 
 
 def relaxed_target(

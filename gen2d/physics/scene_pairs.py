@@ -26,6 +26,11 @@ class SceneChunk(NamedTuple):
     pair: Array  # rows of the pairs' tables
     chunk: Array  # place in the buffers of the passes; beyond the end where there is no pair
     lane: Array
+    member: Array  # number of the scene in its group
+
+    def bodies(self, scenes: int, group: int) -> tuple[Array, Array]:
+        """Rows of both bodies in tables of the group alone, of so many scenes."""
+        return self.a // scenes * group + self.member, self.b // scenes * group + self.member
 
     def columns(self, buffer: Array) -> list[Array]:
         """Columns of a buffer [K, F, C]."""
@@ -40,7 +45,7 @@ class SceneList(NamedTuple):
     """Pairs of a batch in some scenes."""
 
     chunks: Array  # how many there are
-    indices: Array  # [K, 5, C] `SceneChunk` of each
+    indices: Array  # [K, 6, C] `SceneChunk` of each
 
     def run(self, play: Callable, carry: Any) -> Any:
         """Carry after `play(k, chunk, carry)` of all chunks k."""
@@ -58,9 +63,10 @@ class ScenePairs:
         self._solver, self._listed, self._group, self._chunk = solver, listed, group, chunk
 
     def run(self, chosen: Array, batches: list[int], in_rounds: bool, play: Callable, carry: Any) -> Any:
-        """Carry after `play(lists, carry)` of all groups of the chosen scenes [n].
+        """Carry after `play(lists, scenes, carry)` of all groups of the chosen scenes [n].
 
-        `lists` has a `SceneList` of each of these batches. With `in_rounds`, the pairs of a chunk share no body.
+        `lists` has a `SceneList` of each of these batches, `scenes` the numbers of the group's scenes; those beyond
+        the last scene are of none. With `in_rounds`, the pairs of a chunk share no body.
         """
         scenes, size = self._solver.scenes, self._group
         groups = active_pairs(chosen[None].astype(jnp.uint32), size)
@@ -68,7 +74,7 @@ class ScenePairs:
         def group(k: Array, carry: Any) -> Any:
             lookup = row_lookup(groups, k, size)
             of_group = jnp.where(lookup.there, lookup.word, scenes)
-            return play({i: self._list(i, of_group, in_rounds) for i in batches}, carry)
+            return play({i: self._list(i, of_group, in_rounds) for i in batches}, of_group, carry)
 
         return jax.lax.fori_loop(0, groups.starts[-1], group, carry)
 
@@ -88,13 +94,15 @@ class ScenePairs:
         def chunk(k: Array, listed: Array) -> Array:
             lookup = row_lookup(active, k, self._chunk)
             place = jnp.minimum(lookup.round * width + lookup.word, rounds * width - 1)
-            scene = jnp.minimum(chosen[place % size], scenes - 1)
+            member = place % size
+            scene = jnp.minimum(chosen[member], scenes - 1)
             lookup = lookup._replace(round=place // width, word=place % width // size * scenes + scene)
             rank = near.before.at[lookup.round, lookup.word].get(mode=SAFE) + lookup.rank
             first = near.starts.at[lookup.round].get(mode=SAFE)
             buffer = jnp.where(lookup.there, first + rank // solver.chunk, len(self._listed.packed[i]))
             indices = solver.chunk_indices(batch, lookup, batch.pair_of_bit)
-            return put_row(listed, k, jnp.stack(SceneChunk(*indices[:3], buffer, rank % solver.chunk)))
+            member = jnp.where(lookup.there, member, 0)
+            return put_row(listed, k, jnp.stack(SceneChunk(*indices[:3], buffer, rank % solver.chunk, member)))
 
         most = rows * -(-rounds // rows * pairs * size // self._chunk)
         none = jnp.zeros((most, len(SceneChunk._fields), self._chunk), jnp.int32)

@@ -316,7 +316,14 @@ def step(world: WorldState, model: Model, params: SolverParams) -> WorldState:
     motions = rigid.limit(motions)
     of_groups = zip(sides, motions, displacements, strict=True)
     sides = [
-        BodySide(motion=motion, displacement=moved, resting=side.resting, push=side.push, work=side.work)
+        BodySide(
+            motion=motion,
+            displacement=moved,
+            resting=side.resting,
+            push=side.push,
+            work=side.work,
+            late=jnp.zeros(motion.spin.shape, bool) if params.relax_iterations is None else None,
+        )
         for side, motion, moved in of_groups
     ]
     sides, carry, late = solver.relax(carry, solved, rigid.hold_again(sides), statics, world.time)
