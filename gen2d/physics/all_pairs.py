@@ -186,13 +186,14 @@ class AllPairs(ContactSolver):
         sides: list[BodySide],
         statics: list[BodySide],
         time: Array,
-    ) -> tuple[list[BodySide], AllPairsCarry, Array | None]:
+        settle: Callable,
+    ) -> tuple[list[BodySide], AllPairsCarry]:
         def play(k: int, a: BodySide, b: BodySide) -> tuple[BodySide, BodySide, RelaxedPair]:
             of = self.constraints[k], carry.warm[k], solved.points[k], solved.pairs[k]
             return contact_passes.relax(*of, a, b, self.setup, self.params)
 
         new, relaxed = run_schedule(sides, statics, self.order, play)
-        scenes, some = late_scenes(new, self.setup.threshold.shape), None
+        scenes = late_scenes(new, self.setup.threshold.shape)
         before, new = ([side._replace(late=None) for side in of] for of in (sides, new))
         state = new, *self._relaxed(carry, solved.pairs, relaxed, time)
         if self.params.late_passes:
@@ -201,17 +202,16 @@ class AllPairs(ContactSolver):
                 sides, pairs = self._late_passes(solved, before, statics)
                 of_pairs = zip(self.constraints, carry.warm, pairs, strict=True)
                 relaxed = [contact_passes.relaxed_pair(*of, self.setup, self.params.step) for of in of_pairs]
-                new = sides, *self._relaxed(carry, pairs, relaxed, time)
+                new = settle(sides), *self._relaxed(carry, pairs, relaxed, time)
                 return jax.tree.map(lambda x, y: jnp.where(scenes, x, y), new, others)
 
-            some = jnp.any(scenes)
-            state = jax.lax.cond(some, again, lambda *x: x, *state)
+            state = jax.lax.cond(jnp.any(scenes), again, lambda *x: x, *state)
         sides, warm, events = state
         observed = dict(carry.observed)
         for depth, began in solved.observed:
             old = observed[size := depth.shape[0]]
             observed[size] = Observed(jnp.maximum(old.depth, depth), old.begins + began)
-        return sides, AllPairsCarry(warm, observed, events), some
+        return sides, AllPairsCarry(warm, observed, events)
 
     def _relaxed(
         self, carry: AllPairsCarry, pairs: list[SolvedPair], relaxed: list[RelaxedPair], time: Array

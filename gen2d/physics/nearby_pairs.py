@@ -371,8 +371,14 @@ class NearbyPairs(PairBatches, ContactSolver):
         return self.unpacked(bodies, rows), solved
 
     def relax(
-        self, carry: NearbyCarry, solved: SolvedChunk, sides: list[BodySide], statics: list[BodySide], time: Array
-    ) -> tuple[list[BodySide], NearbyCarry, Array | None]:
+        self,
+        carry: NearbyCarry,
+        solved: SolvedChunk,
+        sides: list[BodySide],
+        statics: list[BodySide],
+        time: Array,
+        settle: Callable,
+    ) -> tuple[list[BodySide], NearbyCarry]:
         listed, keeps_touches = solved.listed, self.setup.log and self.params.late_passes > 0
         specs: dict[int, TableSpec] = {}
 
@@ -398,7 +404,6 @@ class NearbyPairs(PairBatches, ContactSolver):
             [memory for memory, *_ in carries],
             [buffer[0] if buffer else None for _, *buffer in carries],
         )
-        some = None
         if self.params.late_passes:
             scenes = late_scenes(new, (self.scenes,))
             old, new = ([side._replace(late=None) for side in of] for of in (sides, new))
@@ -409,8 +414,7 @@ class NearbyPairs(PairBatches, ContactSolver):
                 relaxed = contact_passes.relaxed_pair(constraint, warm, pair, setup, self.params.step)
                 return self._remember(carry, i, memory, own.pair, touch, constraint, pair, relaxed, time)
 
-            new, memories = LatePasses(self, old, statics, solved, remember).solve(scenes, new, memories)
-            some = jnp.any(scenes)
+            new, memories = LatePasses(self, old, statics, solved, settle, remember).solve(scenes, new, memories)
         depth, begins = carry.depth, carry.begins
         for overlap, began in solved.observed:
             depth, begins = jnp.maximum(depth, overlap), begins + began
@@ -423,7 +427,7 @@ class NearbyPairs(PairBatches, ContactSolver):
             begins=begins,
             step=carry.step + 1,
         )
-        return new, carry, some
+        return new, carry
 
     def _last_touch(self, carry: NearbyCarry, i: int, memory: PairMemory, where: Array) -> LastTouch:
         event = self._event_so_far(carry, self._cache(i, memory.cache).at(where))

@@ -9,9 +9,9 @@ import jax.numpy as jnp
 from gen2d.physics.contact_passes import relax_late
 from gen2d.physics.contact_state import BodySide
 from gen2d.physics.packing import get_row, pack, put_row, unpack
-from gen2d.physics.pair_batches import CONSTANTS, BodyTables, PairBatches, SolvedChunk, put_scenes, take_scenes
+from gen2d.physics.pair_batches import CONSTANTS, BodyTables, PairBatches, SolvedChunk
 from gen2d.physics.scene_pairs import CHUNK, SceneChunk, SceneList, ScenePairs
-from gen2d.records.axes import Array
+from gen2d.records.axes import Array, put_scenes, take_scenes
 from gen2d.xla import materialize
 
 GROUP = 4  # scenes that are listed at once: few have late impacts in a step
@@ -37,7 +37,8 @@ class _Group(NamedTuple):
 class LatePasses:
     """The passes over all pairs of some scenes.
 
-    `remember(i, memory, chunk, contacts, pair)` returns the memory of batch i with a chunk of pairs after the passes.
+    `settle(sides, scenes)` returns the sides of some scenes after the passes with displacements that nothing forbids,
+    `remember(i, memory, chunk, contacts, pair)` the memory of batch i with a chunk of pairs.
     """
 
     def __init__(
@@ -46,10 +47,11 @@ class LatePasses:
         sides: list[BodySide],
         statics: list[BodySide],
         solved: SolvedChunk,
+        settle: Callable,
         remember: Callable,
     ) -> None:
         self._solver, self._sides, self._statics, self._solved = solver, sides, statics, solved
-        self._remember = remember
+        self._settle, self._remember = settle, remember
         everywhere = solver.params.relax_iterations is not None
         sizes = (solver.scenes, solver.chunk) if everywhere else (min(GROUP, solver.scenes), CHUNK)
         self._pairs = ScenePairs(solver, solved.listed, *sizes)
@@ -87,7 +89,7 @@ class LatePasses:
                 return self._remember(i, memory, own, contacts, self._pair(i, k, buffers[i]))
 
             memories[i] = pairs.run(end, memories[i])
-        return put_scenes(sides, scenes, solver.unpacked(bodies, rows)), memories
+        return put_scenes(sides, scenes, self._settle(solver.unpacked(bodies, rows), scenes)), memories
 
     def _gathered(self, i: int, pairs: SceneList) -> _Buffers:
         """Listed pairs in buffers of their own: to put them back where they were in each pass would take longer."""

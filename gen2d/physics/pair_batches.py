@@ -17,7 +17,7 @@ from gen2d.physics.contact_state import BodySide, PassSetup, WarmStart
 from gen2d.physics.packing import SAFE, PackedTable, TableSpec, get_row, make_table, unpack
 from gen2d.physics.params import SolverParams
 from gen2d.physics.segment_lines import Neighbours
-from gen2d.records.axes import Array
+from gen2d.records.axes import Array, take_scenes
 
 CONSTANTS = "shape", "acceleration", "displacement", "schur"  # of a `BodySide`: no pass changes them
 
@@ -287,16 +287,6 @@ class PairBatches:
         """Constraint, impulses, points and setup of packed contacts, as the warm start stored them."""
         constraint, warm, points, threshold, gravity = unpack(columns, spec)
         return constraint, warm, points, self.setup._replace(threshold=threshold, gravity=gravity)
-
-
-def take_scenes(tree: Any, scenes: Array) -> Any:
-    """The tree, with leaves [..., n], of some scenes."""
-    return jax.tree.map(lambda x: x.at[..., scenes].get(mode="clip"), tree)
-
-
-def put_scenes(tree: Any, scenes: Array, new: Any) -> Any:
-    """The tree with those of some scenes replaced; numbers beyond the last scene are of none."""
-    return jax.tree.map(lambda x, y: x.at[..., scenes].set(y, mode="drop"), tree, new)
 
 
 def _current(bodies: BodyTables, rows: Mapping[int, Array], number: int) -> PackedTable:

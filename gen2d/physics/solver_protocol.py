@@ -43,11 +43,18 @@ class ContactSolver(Protocol):
         ...
 
     def relax(
-        self, carry: Any, solved: Any, sides: list[BodySide], statics: list[BodySide], time: Array
-    ) -> tuple[list[BodySide], Any, Array | None]:
-        """Sides after the relaxing passes of the step that began at `time`, the carry, and whether these displaced any.
+        self,
+        carry: Any,
+        solved: Any,
+        sides: list[BodySide],
+        statics: list[BodySide],
+        time: Array,
+        settle: Callable[..., list[BodySide]],
+    ) -> tuple[list[BodySide], Any]:
+        """Sides after the relaxing passes of the step that began at `time`, and the carry.
 
-        Uses motion, displacement, resting, push and work. None: sides are never displaced.
+        Uses motion, displacement, resting, push, work and late. Where late impacts have displaced sides of all scenes,
+        or of some, `settle(sides)` or `settle(sides, scenes)` returns them with displacements that nothing forbids.
         """
         ...
 

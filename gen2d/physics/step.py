@@ -31,13 +31,12 @@ impact in gradients.
 
 import functools
 import math
-from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
 
 from gen2d.physics import limits_motors, rigid_joints, springs
-from gen2d.physics.collision import Disc
+from gen2d.physics.collision import Disc, Shape
 from gen2d.physics.constraint import Motion, speed_bound
 from gen2d.physics.contact_state import BodySide
 from gen2d.physics.energy import Ledger, Work, accumulate, record_energy, spring_work_over
@@ -49,7 +48,7 @@ from gen2d.physics.springs import poses_of, table_of
 from gen2d.physics.state import BodyState, Model, WorldState
 from gen2d.physics.support import no_obstacles, no_support
 from gen2d.physics.tunnelling import clamp_displacement
-from gen2d.records.axes import Array
+from gen2d.records.axes import Array, take_scenes
 from gen2d.records.parameter import apply
 from gen2d.xla import materialize
 
@@ -251,16 +250,27 @@ def _first_pass_side(
     )
 
 
-def _late_displacements(
-    model: Model, sides: list[BodySide], displacements: list[Motion], clamp: Callable[[list[Motion]], list[Motion]]
-) -> list[Motion]:
-    """Displacements of all groups with those of late impacts; a body on a joint keeps that of its joint."""
+def _settled(
+    sides: list[BodySide],
+    scenes: Array | None = None,
+    *,
+    displacements: list[Motion],
+    solid: list[Shape | None],
+    model: Model,
+) -> list[BodySide]:
+    """Sides that late impacts have displaced, in all scenes or in some: nothing passes through a barrier, and a body on
+    a joint keeps the displacement that its joint has given it."""
+    barriers = model.barriers
+    if scenes is not None:
+        displacements, solid = take_scenes((displacements, solid), scenes)
+        barriers = [barrier._replace(line=take_scenes(barrier.line, scenes)) for barrier in barriers]
     news = [side.displacement for side in sides if side.displacement is not None]
     for number, group in enumerate(model.groups):
         if group.jointed is not None:
             of = displacements[number], news[number]
             news[number] = jax.tree.map(lambda x, new, fixed=group.jointed: jnp.where(fixed, x, new), *of)
-    return clamp(news)
+    news = clamp_displacement(news, solid, barriers)
+    return [side._replace(displacement=new) for side, new in zip(sides, news, strict=True)]
 
 
 def step(world: WorldState, model: Model, params: SolverParams) -> WorldState:
@@ -308,8 +318,7 @@ def step(world: WorldState, model: Model, params: SolverParams) -> WorldState:
 
     displacements = [jax.tree.map(lambda x, y: h * x + y, *of) for of in zip(motions, drifts, strict=True)]
     solid = [s if g.collides else None for s, g in zip(shapes, groups, strict=True)]
-    clamp = functools.partial(clamp_displacement, shapes=solid, barriers=model.barriers)
-    displacements = clamp(displacements)
+    displacements = clamp_displacement(displacements, solid, model.barriers)
     motions = pulling.conserve(displacements, motions)
 
     rigid.move(displacements)
@@ -326,10 +335,9 @@ def step(world: WorldState, model: Model, params: SolverParams) -> WorldState:
         )
         for side, motion, moved in of_groups
     ]
-    sides, carry, late = solver.relax(carry, solved, rigid.hold_again(sides), statics, world.time)
-    if late is not None:
-        moved = functools.partial(_late_displacements, model, sides, clamp=clamp)
-        displacements = jax.lax.cond(late, moved, lambda x: x, displacements)
+    settle = functools.partial(_settled, displacements=displacements, solid=solid, model=model)
+    sides, carry = solver.relax(carry, solved, rigid.hold_again(sides), statics, world.time, settle)
+    displacements = [side.displacement for side in sides if side.displacement is not None]
     motions = rigid.stay(_motions([release(side) for side in sides]))
     bodies = [_displace(*of) for of in zip(world.bodies, displacements, motions, strict=True)]
     if ledger is not None:

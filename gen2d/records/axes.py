@@ -117,3 +117,13 @@ def to_device(value: Record) -> Record:
 def to_stored(value: Record) -> Record:
     """The record in stored layout (videos first), from device layout (videos last)."""
     return _transpose(value, back=True)
+
+
+def take_scenes(tree: Any, scenes: Array) -> Any:
+    """The tree, with leaves [..., n], of some scenes."""
+    return jax.tree.map(lambda x: x.at[..., scenes].get(mode="clip"), tree)
+
+
+def put_scenes(tree: Any, scenes: Array, new: Any) -> Any:
+    """The tree with those of some scenes replaced; numbers beyond the last scene are of none."""
+    return jax.tree.map(lambda x, y: x.at[..., scenes].set(y, mode="drop"), tree, new)
