@@ -14,7 +14,7 @@ from gen2d.physics.scene_pairs import CHUNK, SceneChunk, SceneList, ScenePairs
 from gen2d.records.axes import Array, put_scenes, take_scenes
 from gen2d.xla import materialize
 
-GROUP = 4  # scenes that are listed at once: few have late impacts in a step
+GROUP = 8  # scenes that are listed at once
 LATE_CONSTANTS = *(name for name in CONSTANTS if name != "displacement"), "resting", "push"
 
 
