@@ -44,10 +44,8 @@ class LaterImpacts:
 
     def solve(self, rows: list[Array], follow: Array) -> tuple[list[Array], list[Array]]:
         """Rows of the bodies' tables and packed contacts after these impacts, in scenes [n] where any may `follow`."""
-        start = rows, self._solved.packed
-        return self._pairs.run(
-            follow, self._batches, False, lambda lists, _, state: self._solve_group(lists, *state), start
-        )
+        start, buffers = (rows, self._solved.packed), {i: self._pairs.empty(i) for i in self._batches}
+        return self._pairs.run(follow, buffers, lambda lists, _, state: self._solve_group(lists, *state), start)[1]
 
     def _solve_group(
         self, lists: dict[int, SceneList], rows: list[Array], packed: list[Array]

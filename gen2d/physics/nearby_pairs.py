@@ -43,7 +43,7 @@ from gen2d.physics.contact_log import (
 from gen2d.physics.contact_state import BodySide, RelaxedPair, SolvedPair, WarmStart
 from gen2d.physics.impact_order import alone, ordered, with_clearance
 from gen2d.physics.nearby_impacts import LaterImpacts, ordered_batches
-from gen2d.physics.nearby_relaxing import LatePasses
+from gen2d.physics.nearby_relaxing import LateBuffers, LatePasses
 from gen2d.physics.packing import (
     SAFE,
     PackedTable,
@@ -117,6 +117,7 @@ class NearbyCarry(NamedTuple):
     cache: list[Array]  # of each batch, a row per pair: see `CachedConstraint`
     last_touch: list[Array]  # [R P n + 1] twice the last step in which a pair touched, plus 1 if it still touches
     buffers: list[PassBuffers] | None  # None: not allocated yet
+    late: list[LateBuffers]  # empty: not allocated yet, or no late passes
     depth: Array  # [n + 1] m
     begins: Array  # [n + 1]
     step: Array
@@ -144,6 +145,7 @@ class NearbyPairs(PairBatches, ContactSolver):
             cache=[repeat_rows(self._empty_entry(b), b.a.size * n, self.dtype) for b in self.batches],
             last_touch=[jnp.full(b.a.size * n + 1, NEVER, jnp.int32) for b in self.batches] if slots else [],
             buffers=None,
+            late=[],
             depth=count.astype(self.dtype),
             begins=count,
             step=jnp.zeros((), jnp.int32),
@@ -153,8 +155,9 @@ class NearbyPairs(PairBatches, ContactSolver):
         )
 
     def allocate(self, carry: NearbyCarry, step: Callable) -> NearbyCarry:
-        buffers = jax.eval_shape(step, carry).buffers
-        return carry._replace(buffers=jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), buffers))
+        after = jax.eval_shape(step, carry)
+        buffers, late = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), (after.buffers, after.late))
+        return carry._replace(buffers=buffers, late=late)
 
     def _empty_entry(self, batch: PairBatch) -> CachedConstraint:
         """Cache entry of a pair before its first contact."""
@@ -400,11 +403,10 @@ class NearbyPairs(PairBatches, ContactSolver):
         buffers = [None] * len(self.batches) if carry.buffers is None else [b.touches for b in carry.buffers]
         starts = [(of, *([buffer] if keeps_touches else [])) for of, buffer in zip(memories, buffers, strict=True)]
         new, carries = self._pass(sides, statics, listed, starts, play, RELAX_CONSTANTS)
-        memories, touches = (
-            [memory for memory, *_ in carries],
-            [buffer[0] if buffer else None for _, *buffer in carries],
-        )
-        if self.params.late_passes:
+        memories = [memory for memory, *_ in carries]
+        touches = [buffer[0] if buffer else None for _, *buffer in carries]
+        late = carry.late
+        if self.params.late_passes and self.batches:
             scenes = late_scenes(new, (self.scenes,))
             old, new = ([side._replace(late=None) for side in of] for of in (sides, new))
 
@@ -414,7 +416,8 @@ class NearbyPairs(PairBatches, ContactSolver):
                 relaxed = contact_passes.relaxed_pair(constraint, warm, pair, setup, self.params.step)
                 return self._remember(carry, i, memory, own.pair, touch, constraint, pair, relaxed, time)
 
-            new, memories = LatePasses(self, old, statics, solved, settle, remember).solve(scenes, new, memories)
+            passes = LatePasses(self, old, statics, solved, settle, remember)
+            late, new, memories = passes.solve(scenes, late, new, memories)
         depth, begins = carry.depth, carry.begins
         for overlap, began in solved.observed:
             depth, begins = jnp.maximum(depth, overlap), begins + began
@@ -423,6 +426,7 @@ class NearbyPairs(PairBatches, ContactSolver):
             cache=[memory.cache for memory in memories],
             last_touch=[memory.touch for memory in memories] if self.setup.log else [],
             buffers=[PassBuffers(*of) for of in of_batches],
+            late=late,
             depth=depth,
             begins=begins,
             step=carry.step + 1,

@@ -1,6 +1,6 @@
 """Relaxing passes over near pairs that find late impacts (relaxing.py), in the scenes that have any."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -14,13 +14,14 @@ from gen2d.physics.scene_pairs import CHUNK, SceneChunk, SceneList, ScenePairs
 from gen2d.records.axes import Array, put_scenes, take_scenes
 from gen2d.xla import materialize
 
-GROUP = 8  # scenes that are listed at once
+GROUP = 16  # scenes that are listed at once: few have late impacts in a step
 LATE_CONSTANTS = *(name for name in CONSTANTS if name != "displacement"), "resting", "push"
 
 
-class _Buffers(NamedTuple):
-    """Listed pairs of a batch, by chunk."""
+class LateBuffers(NamedTuple):
+    """Listed pairs of a batch, by chunk; kept from step to step, as to fill them with zeros would take longer."""
 
+    indices: Array  # [K, 6, C] see `SceneList`
     contacts: Array  # [K, F, C]
     pairs: Array
 
@@ -30,8 +31,7 @@ class _Group(NamedTuple):
 
     solver: PairBatches  # of these scenes
     bodies: BodyTables
-    lists: dict[int, SceneList]
-    contacts: dict[int, Array]  # see `_Buffers`
+    contacts: Sequence[Array]  # see `LateBuffers`
 
 
 class LatePasses:
@@ -54,23 +54,36 @@ class LatePasses:
         self._settle, self._remember = settle, remember
         everywhere = solver.params.relax_iterations is not None
         sizes = (solver.scenes, solver.chunk) if everywhere else (min(GROUP, solver.scenes), CHUNK)
-        self._pairs = ScenePairs(solver, solved.listed, *sizes)
+        self._pairs = ScenePairs(solver, solved.listed, *sizes, in_rounds=True)
 
-    def solve(self, scenes: Array, sides: list[BodySide], memories: list[Any]) -> tuple[list[BodySide], list[Any]]:
-        """Sides and memories, those of these scenes [n] after the passes."""
-        batches = list(range(len(self._solver.batches)))
-        return self._pairs.run(scenes, batches, True, self._solve_group, (sides, memories))
+    def solve(
+        self, scenes: Array, buffers: list[LateBuffers], sides: list[BodySide], memories: list[Any]
+    ) -> tuple[list[LateBuffers], list[BodySide], list[Any]]:
+        """Buffers, sides and memories; the latter are those of these scenes [n] after the passes."""
+        buffers = buffers or [self._empty(i) for i in range(len(memories))]
+        listed = [[of.contacts, of.pairs] for of in buffers]
+        indices, (listed, sides, memories) = self._pairs.run(
+            scenes, dict(enumerate(of.indices for of in buffers)), self._solve_group, (listed, sides, memories)
+        )
+        return [LateBuffers(indices[i], *of) for i, of in enumerate(listed)], sides, memories
+
+    def _empty(self, i: int) -> LateBuffers:
+        indices = self._pairs.empty(i)
+        packed = self._solved.listed.packed[i], self._solved.packed[i]
+        return LateBuffers(
+            indices, *[jnp.zeros((len(indices), of.shape[1], indices.shape[2]), of.dtype) for of in packed]
+        )
 
     def _solve_group(self, lists: dict[int, SceneList], scenes: Array, state: tuple) -> tuple:
-        """Sides and memories after all passes over a group of scenes."""
-        (sides, memories), solver = state, self._solver.of_scenes(scenes)
+        """Buffers, sides and memories after all passes over a group of scenes."""
+        (listed, sides, memories), solver = state, self._solver.of_scenes(scenes)
         own, statics = (take_scenes(of, scenes) for of in (self._sides, self._statics))
         bodies = solver.bodies(own, statics, LATE_CONSTANTS)
-        listed = {i: self._gathered(i, pairs) for i, pairs in lists.items()}
-        group = _Group(solver, bodies, lists, {i: of.contacts for i, of in listed.items()})
+        contacts, buffers = zip(*(self._gathered(i, lists[i], of) for i, of in enumerate(listed)), strict=True)
+        group = _Group(solver, bodies, contacts)
 
         def one(_: Array, state: tuple) -> tuple:
-            rows, buffers = dict(enumerate(state[0])), dict(state[1])
+            rows, buffers = dict(enumerate(state[0])), list(state[1])
             for i, pairs in lists.items():
 
                 def chunk(k: Array, own: SceneChunk, carry: tuple, i: int = i) -> tuple:
@@ -79,8 +92,7 @@ class LatePasses:
                 rows, buffers[i] = pairs.run(chunk, (rows, buffers[i]))
             return list(rows.values()), buffers
 
-        start = bodies.rows, {i: of.pairs for i, of in listed.items()}
-        rows, buffers = jax.lax.fori_loop(0, solver.params.late_passes, one, start)
+        rows, buffers = jax.lax.fori_loop(0, solver.params.late_passes, one, (bodies.rows, list(buffers)))
         memories = list(memories)
         for i, pairs in lists.items():
 
@@ -89,19 +101,18 @@ class LatePasses:
                 return self._remember(i, memory, own, contacts, self._pair(i, k, buffers[i]))
 
             memories[i] = pairs.run(end, memories[i])
-        return put_scenes(sides, scenes, self._settle(solver.unpacked(bodies, rows), scenes)), memories
+        sides = put_scenes(sides, scenes, self._settle(solver.unpacked(bodies, rows), scenes))
+        return [list(of) for of in zip(contacts, buffers, strict=True)], sides, memories
 
-    def _gathered(self, i: int, pairs: SceneList) -> _Buffers:
-        """Listed pairs in buffers of their own: to put them back where they were in each pass would take longer."""
+    def _gathered(self, i: int, pairs: SceneList, buffers: list[Array]) -> list[Array]:
+        """Buffers with the listed pairs: to put these back where they were in each pass would take longer."""
         packed = self._solved.listed.packed[i], self._solved.packed[i]
 
-        def gather(k: Array, own: SceneChunk, buffers: _Buffers) -> _Buffers:
+        def gather(k: Array, own: SceneChunk, buffers: list[Array]) -> list[Array]:
             of = zip(buffers, packed, strict=True)
-            return _Buffers(*[put_row(new, k, materialize(jnp.stack(own.columns(old)))) for new, old in of])
+            return [put_row(new, k, materialize(jnp.stack(own.columns(old)))) for new, old in of]
 
-        shape = pairs.indices.shape
-        none = _Buffers(*[jnp.zeros((shape[0], old.shape[1], shape[2]), old.dtype) for old in packed])
-        return pairs.run(gather, none)
+        return pairs.run(gather, buffers)
 
     def _contacts(self, i: int, k: Array, contacts: Array) -> tuple[Any, ...]:
         return self._solver.unpack_contacts(list(get_row(contacts, k)), self._solved.listed.specs[i])

@@ -57,38 +57,52 @@ class SceneList(NamedTuple):
 
 
 class ScenePairs:
-    """Near pairs of a step, of which those of some scenes are listed."""
+    """Near pairs of a step, of which those of some scenes are listed, a group at a time.
 
-    def __init__(self, solver: PairBatches, listed: ListedPairs, group: int, chunk: int = CHUNK) -> None:
+    With `in_rounds`, the pairs of a chunk share no body.
+    """
+
+    def __init__(
+        self, solver: PairBatches, listed: ListedPairs, group: int, chunk: int = CHUNK, in_rounds: bool = False
+    ) -> None:
         self._solver, self._listed, self._group, self._chunk = solver, listed, group, chunk
+        self._in_rounds = in_rounds
 
-    def run(self, chosen: Array, batches: list[int], in_rounds: bool, play: Callable, carry: Any) -> Any:
-        """Carry after `play(lists, scenes, carry)` of all groups of the chosen scenes [n].
+    def empty(self, i: int) -> Array:
+        """Buffer for the `SceneList` of a batch."""
+        rounds, pairs = self._solver.batches[i].a.shape
+        rows = rounds if self._in_rounds else 1
+        most = rows * -(-rounds // rows * pairs * self._group // self._chunk)
+        return jnp.zeros((most, len(SceneChunk._fields), self._chunk), jnp.int32)
 
-        `lists` has a `SceneList` of each of these batches, `scenes` the numbers of the group's scenes; those beyond
-        the last scene are of none. With `in_rounds`, the pairs of a chunk share no body.
+    def run(self, chosen: Array, buffers: dict[int, Array], play: Callable, carry: Any) -> tuple[dict[int, Array], Any]:
+        """Buffers, and the carry after `play(lists, scenes, carry)` of all groups of the chosen scenes [n].
+
+        `lists` has a `SceneList` of each batch with a buffer, `scenes` the numbers of the group's scenes; those beyond
+        the last scene are of none.
         """
         scenes, size = self._solver.scenes, self._group
         groups = active_pairs(chosen[None].astype(jnp.uint32), size)
 
-        def group(k: Array, carry: Any) -> Any:
+        def group(k: Array, state: tuple) -> tuple:
             lookup = row_lookup(groups, k, size)
             of_group = jnp.where(lookup.there, lookup.word, scenes)
-            return play({i: self._list(i, of_group, in_rounds) for i in batches}, of_group, carry)
+            lists = {i: self._list(i, of_group, buffer) for i, buffer in state[0].items()}
+            return {i: pairs.indices for i, pairs in lists.items()}, play(lists, of_group, state[1])
 
-        return jax.lax.fori_loop(0, groups.starts[-1], group, carry)
+        return jax.lax.fori_loop(0, groups.starts[-1], group, (buffers, carry))
 
     def contacts(self, i: int, own: SceneChunk) -> tuple[Any, ...]:
         """Constraint, impulses, points and setup of a chunk of pairs."""
         return self._solver.unpack_contacts(own.columns(self._listed.packed[i]), self._listed.specs[i])
 
-    def _list(self, i: int, chosen: Array, in_rounds: bool) -> SceneList:
+    def _list(self, i: int, chosen: Array, buffer: Array) -> SceneList:
         """Near pairs of a batch in chosen scenes; numbers beyond the last scene are of none."""
         near, batch, solver = self._listed.near[i], self._solver.batches[i], self._solver
-        scenes, size, (rounds, pairs) = solver.scenes, len(chosen), batch.a.shape
+        scenes, size, rounds = solver.scenes, len(chosen), len(batch.a)
         words = near.words[:, : near.words.shape[1] // scenes * scenes].reshape(rounds, -1, scenes)
         words = jnp.where(chosen < scenes, words.at[..., chosen].get(mode="clip"), jnp.uint32(0))
-        width, rows = words.shape[1] * size, rounds if in_rounds else 1
+        width, rows = words.shape[1] * size, rounds if self._in_rounds else 1
         active = active_pairs(words.reshape(rows, -1), self._chunk)
 
         def chunk(k: Array, listed: Array) -> Array:
@@ -99,11 +113,9 @@ class ScenePairs:
             lookup = lookup._replace(round=place // width, word=place % width // size * scenes + scene)
             rank = near.before.at[lookup.round, lookup.word].get(mode=SAFE) + lookup.rank
             first = near.starts.at[lookup.round].get(mode=SAFE)
-            buffer = jnp.where(lookup.there, first + rank // solver.chunk, len(self._listed.packed[i]))
+            place = jnp.where(lookup.there, first + rank // solver.chunk, len(self._listed.packed[i]))
             indices = solver.chunk_indices(batch, lookup, batch.pair_of_bit)
             member = jnp.where(lookup.there, member, 0)
-            return put_row(listed, k, jnp.stack(SceneChunk(*indices[:3], buffer, rank % solver.chunk, member)))
+            return put_row(listed, k, jnp.stack(SceneChunk(*indices[:3], place, rank % solver.chunk, member)))
 
-        most = rows * -(-rounds // rows * pairs * size // self._chunk)
-        none = jnp.zeros((most, len(SceneChunk._fields), self._chunk), jnp.int32)
-        return SceneList(active.starts[-1], jax.lax.fori_loop(0, active.starts[-1], chunk, none))
+        return SceneList(active.starts[-1], jax.lax.fori_loop(0, active.starts[-1], chunk, buffer))
