@@ -186,7 +186,7 @@ class AllPairs(ContactSolver):
         sides: list[BodySide],
         statics: list[BodySide],
         time: Array,
-        settle: Callable,
+        clamp: Callable,
     ) -> tuple[list[BodySide], AllPairsCarry]:
         def play(k: int, a: BodySide, b: BodySide) -> tuple[BodySide, BodySide, RelaxedPair]:
             of = self.constraints[k], carry.warm[k], solved.points[k], solved.pairs[k]
@@ -202,7 +202,7 @@ class AllPairs(ContactSolver):
                 sides, pairs = self._late_passes(solved, before, statics)
                 of_pairs = zip(self.constraints, carry.warm, pairs, strict=True)
                 relaxed = [contact_passes.relaxed_pair(*of, self.setup, self.params.step) for of in of_pairs]
-                new = settle(sides), *self._relaxed(carry, pairs, relaxed, time)
+                new = clamp(sides), *self._relaxed(carry, pairs, relaxed, time)
                 return jax.tree.map(lambda x, y: jnp.where(scenes, x, y), new, others)
 
             state = jax.lax.cond(jnp.any(scenes), again, lambda *x: x, *state)

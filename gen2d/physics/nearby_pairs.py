@@ -380,7 +380,7 @@ class NearbyPairs(PairBatches, ContactSolver):
         sides: list[BodySide],
         statics: list[BodySide],
         time: Array,
-        settle: Callable,
+        clamp: Callable,
     ) -> tuple[list[BodySide], NearbyCarry]:
         listed, keeps_touches = solved.listed, self.setup.log and self.params.late_passes > 0
         specs: dict[int, TableSpec] = {}
@@ -416,7 +416,7 @@ class NearbyPairs(PairBatches, ContactSolver):
                 relaxed = contact_passes.relaxed_pair(constraint, warm, pair, setup, self.params.step)
                 return self._remember(carry, i, memory, own.pair, touch, constraint, pair, relaxed, time)
 
-            passes = LatePasses(self, old, statics, solved, settle, remember)
+            passes = LatePasses(self, old, statics, solved, clamp, remember)
             late, new, memories = passes.solve(scenes, late, new, memories)
         depth, begins = carry.depth, carry.begins
         for overlap, began in solved.observed:

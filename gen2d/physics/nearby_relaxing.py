@@ -37,7 +37,7 @@ class _Group(NamedTuple):
 class LatePasses:
     """The passes over all pairs of some scenes.
 
-    `settle(sides, scenes)` returns the sides of some scenes after the passes with displacements that nothing forbids,
+    `clamp(sides, scenes)` returns the sides of some scenes after the passes with displacements that nothing forbids,
     `remember(i, memory, chunk, contacts, pair)` the memory of batch i with a chunk of pairs.
     """
 
@@ -47,11 +47,11 @@ class LatePasses:
         sides: list[BodySide],
         statics: list[BodySide],
         solved: SolvedChunk,
-        settle: Callable,
+        clamp: Callable,
         remember: Callable,
     ) -> None:
         self._solver, self._sides, self._statics, self._solved = solver, sides, statics, solved
-        self._settle, self._remember = settle, remember
+        self._clamp, self._remember = clamp, remember
         everywhere = solver.params.relax_iterations is not None
         sizes = (solver.scenes, solver.chunk) if everywhere else (min(GROUP, solver.scenes), CHUNK)
         self._pairs = ScenePairs(solver, solved.listed, *sizes, in_rounds=True)
@@ -101,7 +101,7 @@ class LatePasses:
                 return self._remember(i, memory, own, contacts, self._pair(i, k, buffers[i]))
 
             memories[i] = pairs.run(end, memories[i])
-        sides = put_scenes(sides, scenes, self._settle(solver.unpacked(bodies, rows), scenes))
+        sides = put_scenes(sides, scenes, self._clamp(solver.unpacked(bodies, rows), scenes))
         return [list(of) for of in zip(contacts, buffers, strict=True)], sides, memories
 
     def _gathered(self, i: int, pairs: SceneList, buffers: list[Array]) -> list[Array]:

@@ -49,12 +49,12 @@ class ContactSolver(Protocol):
         sides: list[BodySide],
         statics: list[BodySide],
         time: Array,
-        settle: Callable[..., list[BodySide]],
+        clamp: Callable[..., list[BodySide]],
     ) -> tuple[list[BodySide], Any]:
         """Sides after the relaxing passes of the step that began at `time`, and the carry.
 
         Uses motion, displacement, resting, push, work and late. Where late impacts have displaced sides of all scenes,
-        or of some, `settle(sides)` or `settle(sides, scenes)` returns them with displacements that nothing forbids.
+        or of some, `clamp(sides)` or `clamp(sides, scenes)` returns them with displacements that nothing forbids.
         """
         ...
 

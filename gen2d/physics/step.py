@@ -250,7 +250,7 @@ def _first_pass_side(
     )
 
 
-def _settled(
+def _clamp_late(
     sides: list[BodySide],
     scenes: Array | None = None,
     *,
@@ -335,8 +335,8 @@ def step(world: WorldState, model: Model, params: SolverParams) -> WorldState:
         )
         for side, motion, moved in of_groups
     ]
-    settle = functools.partial(_settled, displacements=displacements, solid=solid, model=model)
-    sides, carry = solver.relax(carry, solved, rigid.hold_again(sides), statics, world.time, settle)
+    clamp = functools.partial(_clamp_late, displacements=displacements, solid=solid, model=model)
+    sides, carry = solver.relax(carry, solved, rigid.hold_again(sides), statics, world.time, clamp)
     displacements = [side.displacement for side in sides if side.displacement is not None]
     motions = rigid.stay(_motions([release(side) for side in sides]))
     bodies = [_displace(*of) for of in zip(world.bodies, displacements, motions, strict=True)]

@@ -8,6 +8,7 @@ bodies.
 
 import dataclasses
 import itertools
+import json
 import math
 from collections.abc import Iterator, Mapping
 from typing import Any
@@ -20,6 +21,8 @@ from gen2d.physics.simulate import substeps
 
 SAFE_SINKING = 0.02  # over the least size of the lighter body: less than a pixel in most frames
 SAFE_DISPLACEMENT = 0.5  # in a step, over the least radius
+CRUSHING = {"extreme_mass_ratios": True, "relax_iterations": None}  # options for bodies that heavy ones crush
+RARELY_CRUSHED = 10.0  # times the mass
 DEVIATIONS = 4.0  # of a normal distribution, which has no largest value
 
 
@@ -83,6 +86,9 @@ def _of_masses(
         bound += f", as the heavier sinks in by {100 * SAFE_SINKING:g} % of the other's size"
         if safe > 0:
             bound += f"; physics.max_step={_below(step * math.sqrt(safe / ratio)):g} or less is short enough"
+        off = [f"physics.{name}={json.dumps(on)}" for name, on in CRUSHING.items() if getattr(physics, name) != on]
+        if off and ratio > RARELY_CRUSHED:
+            bound += f"; with {' and '.join(off)}, fewer heavy bodies go through light ones"
         yield (
             ratio / safe if safe > 0 else math.inf,
             f"{' and '.join(f'scene.{name}' for name in names)} allow {upper} of {heavy.mass[1]:.3g} kg on {lower} "

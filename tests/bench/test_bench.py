@@ -68,10 +68,11 @@ def test_states_are_made_and_loaded(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_both_precisions_are_timed(tmp_path: Path) -> None:
-    turns = bench.precisions(tmp_path, turns=1, overrides=TINY)
-    assert turns.keys() == {"float32", "float64"}
-    assert all(seconds > 0 for (seconds,) in turns.values())
+def test_an_option_of_physics_is_timed_and_its_overlaps_are_measured(tmp_path: Path) -> None:
+    values = "float32", "float64"
+    turns = bench.physics_option(tmp_path, 1, "bouncing.yaml", "precision", values, overrides=TINY)
+    assert turns.keys() == {*values, *(f"overlap {value}" for value in values)}
+    assert all(seconds > 0 for (seconds,) in (turns[value] for value in values))
 
 
 def test_every_way_to_store_is_timed(tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ boxes and joints, and under other options of the solver.
 import functools
 from collections.abc import Mapping
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -197,6 +198,35 @@ def test_worlds_keep_the_laws_with_several_relaxing_passes(name, passes):
     numbers = rules(relax_iterations=passes)
     batches = [measure(LARGE, [RECIPES[name]], MANY, first=k * MANY, params=numbers)[0] for k in range(4)]
     check_laws(name, batches, RELAXED_BOUNDS[name], RARELY)
+
+
+BY_RATIO = {  # largest share of worlds with an overlap, with mass ratios up to 10 and 100; both where it is owed
+    "discs": (dict[str, Any](), (0.02, 0.16)),
+    "discs, late impacts": ({"relax_iterations": None}, (0.0, 0.06)),
+    "discs, late impacts and extreme mass ratios": (
+        {"relax_iterations": None, "extreme_mass_ratios": True}, (0.0, 0.02)
+    ),
+    "all shapes": (dict[str, Any](), (0.12, 0.25)),
+    "all shapes, late impacts": ({"relax_iterations": None}, (0.03, 0.1)),
+    "all shapes, late impacts and extreme mass ratios": (
+        {"relax_iterations": None, "extreme_mass_ratios": True}, (0.02, 0.04)
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.asked
+@pytest.mark.slow
+@pytest.mark.parametrize("name", BY_RATIO)
+def test_overlaps_are_as_rare_as_the_mass_ratio_allows(name):
+    changes, bounds = BY_RATIO[name]
+    base = RECIPES["discs, mass ratios up to 1e6" if name.startswith("discs") else "mass ratios up to 1e6"]
+    recipes = [replace(base, density=decades / 2) for decades in (1, 2)]
+    numbers = rules(**changes)
+    parts = [measure(LARGE, recipes, MANY, first=k * MANY, params=numbers) for k in range(2)]
+    for ratio, bound, *of in zip((10, 100), bounds, *parts, strict=True):
+        overlap = np.concatenate([m.overlap for m in of]) > DEEP
+        law = f"{name}, mass ratios up to {ratio}: share of {len(overlap)} {OVERLAPPING}"
+        holds(law, overlap.any(1).mean(), bound, 0.0 if bound else None)
 
 
 @pytest.mark.slow

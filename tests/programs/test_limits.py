@@ -52,6 +52,10 @@ def test_masses_that_differ_too_much_are_named_with_what_is_safe() -> None:
     assert f"balls of {heaviest:.3g} kg on balls of {lightest:.3g} kg" in sentence
     safe = safe_ratio(0.02, 9.8, 1 / 240)  # of a thickness of 1 m
     assert f"ratios up to {safe:.4g} are" in sentence
+    on = "physics.extreme_mass_ratios=true", "physics.relax_iterations=null"
+    assert f"; with {on[0]} and {on[1]}, fewer heavy bodies go through light ones" in sentence
+    assert f"; with {on[1]}, fewer" in limits("bouncing", DENSITIES, on[0])[0]
+    assert "fewer" not in limits("bouncing", DENSITIES, *on)[0]
     narrow = f"scene.density=[1, {safe / 4 * 0.99}]"  # the radii make a factor of 4
     assert limits("bouncing", narrow) == []
     (wider,) = limits("bouncing", f"scene.density=[1, {safe / 4 * 1.5}]")
@@ -62,7 +66,8 @@ def test_masses_that_differ_too_much_are_named_with_what_is_safe() -> None:
 
 
 def test_a_step_that_is_too_long_is_the_cause() -> None:
-    (sentence, *_) = limits("tower", "physics.max_step=0.05")
+    (sentence, *_) = limits("tower", "physics.max_step=0.05", "scene.density=1")
+    assert "fewer heavy bodies" not in sentence
     assert "in steps of 0.0417 s, not even equal masses are safe" in sentence
 
 
