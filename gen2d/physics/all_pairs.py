@@ -193,25 +193,23 @@ class AllPairs(ContactSolver):
             return contact_passes.relax(*of, a, b, self.setup, self.params)
 
         new, relaxed = run_schedule(sides, statics, self.order, play)
-        scenes = late_scenes(new, self.setup.threshold.shape)
-        before, new = ([side._replace(late=None) for side in of] for of in (sides, new))
-        state = new, *self._relaxed(carry, solved.pairs, relaxed, time)
+        warm, events = self._relaxed(carry, solved.pairs, relaxed, time)
         if self.params.late_passes:
+            scenes = late_scenes(new, self.setup.threshold.shape)
 
             def again(*others: Any) -> tuple:
-                sides, pairs = self._late_passes(solved, before, statics)
+                late, pairs = self._late_passes(solved, sides, statics)
                 of_pairs = zip(self.constraints, carry.warm, pairs, strict=True)
                 relaxed = [contact_passes.relaxed_pair(*of, self.setup, self.params.step) for of in of_pairs]
-                new = clamp(sides), *self._relaxed(carry, pairs, relaxed, time)
-                return jax.tree.map(lambda x, y: jnp.where(scenes, x, y), new, others)
+                state = clamp(late), *self._relaxed(carry, pairs, relaxed, time)
+                return jax.tree.map(lambda x, y: jnp.where(scenes, x, y), state, others)
 
-            state = jax.lax.cond(jnp.any(scenes), again, lambda *x: x, *state)
-        sides, warm, events = state
+            new, warm, events = jax.lax.cond(jnp.any(scenes), again, lambda *x: x, new, warm, events)
         observed = dict(carry.observed)
         for depth, began in solved.observed:
             old = observed[size := depth.shape[0]]
             observed[size] = Observed(jnp.maximum(old.depth, depth), old.begins + began)
-        return sides, AllPairsCarry(warm, observed, events)
+        return new, AllPairsCarry(warm, observed, events)
 
     def _relaxed(
         self, carry: AllPairsCarry, pairs: list[SolvedPair], relaxed: list[RelaxedPair], time: Array

@@ -408,7 +408,6 @@ class NearbyPairs(PairBatches, ContactSolver):
         late = carry.late
         if self.params.late_passes and self.batches:
             scenes = late_scenes(new, (self.scenes,))
-            old, new = ([side._replace(late=None) for side in of] for of in (sides, new))
 
             def remember(i: int, memory: PairMemory, own: SceneChunk, contacts: tuple, pair: SolvedPair) -> PairMemory:
                 (constraint, warm, _, setup), buffer = contacts, touches[i]
@@ -416,7 +415,7 @@ class NearbyPairs(PairBatches, ContactSolver):
                 relaxed = contact_passes.relaxed_pair(constraint, warm, pair, setup, self.params.step)
                 return self._remember(carry, i, memory, own.pair, touch, constraint, pair, relaxed, time)
 
-            passes = LatePasses(self, old, statics, solved, clamp, remember)
+            passes = LatePasses(self, sides, statics, solved, clamp, remember)
             late, new, memories = passes.solve(scenes, late, new, memories)
         depth, begins = carry.depth, carry.begins
         for overlap, began in solved.observed:
