@@ -27,6 +27,8 @@ _LONGEST = (
 _CONFIG = tempfile.TemporaryDirectory(prefix="gen2d-test-config-")
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(_CACHE))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.2")
+_COMPILER = "--xla_backend_optimization_level=2 --xla_cpu_use_fusion_emitters=false"  # as gen2d's programs are compiled
+os.environ["XLA_FLAGS"] = f"{_COMPILER} {os.environ.get('XLA_FLAGS', '')}".strip()
 os.environ["XDG_CONFIG_HOME"] = _CONFIG.name  # the user's list of trusted code is not ours
 
 

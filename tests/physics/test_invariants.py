@@ -453,7 +453,7 @@ def printed_hash(lanes: int, flags: str, cores: int) -> str:
     here = Path(__file__).parent
     code = PRINT.format(here=str(here), support=str(here.parent / "support"), root=str(here.parents[1]), lanes=lanes)
     command = ["taskset", "-c", "0" if cores == 1 else f"0-{cores - 1}", sys.executable, "-c", code]
-    env = {**os.environ, "XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu"}
+    env = {**os.environ, "XLA_FLAGS": f"{os.environ['XLA_FLAGS']} {flags}", "JAX_PLATFORMS": "cpu"}
     return subprocess.run(command, env=env, capture_output=True, text=True, check=True).stdout.strip()
 
 

@@ -212,3 +212,13 @@ def test_several_devices_run_one_executable(tmp_path: Path) -> None:
     shared.clear()
     generate(CONFIG, 24, tmp_path / "one", device="cpu")
     same(everything(Path(out)), everything(tmp_path / "one"))
+
+
+def test_a_version_of_xla_without_our_options_compiles_with_others(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(environment, "_CPU_OPTIONS", {"xla_cpu_option_of_no_version": True})
+    environment._cpu_options.cache_clear()
+    try:
+        options = environment.compiler_options(jax.devices("cpu")[0])
+        assert jax.jit(lambda x: x + 1).lower(1.0).compile(options)(2.0) == 3
+    finally:
+        environment._cpu_options.cache_clear()

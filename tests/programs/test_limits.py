@@ -53,9 +53,11 @@ def test_masses_that_differ_too_much_are_named_with_what_is_safe() -> None:
     safe = safe_ratio(0.02, 9.8, 1 / 240)  # of a thickness of 1 m
     assert f"ratios up to {safe:.4g} are" in sentence
     on = "physics.extreme_mass_ratios=true", "physics.relax_iterations=null"
-    assert f"; with {on[0]} and {on[1]}, fewer heavy bodies go through light ones" in sentence
-    assert f"; with {on[1]}, fewer" in limits("bouncing", DENSITIES, on[0])[0]
-    assert "fewer" not in limits("bouncing", DENSITIES, *on)[0]
+    assert f"; with {on[0]}, fewer heavy bodies go through light ones" in sentence
+    one_pass = "physics.relax_iterations=1"
+    assert f"; with {on[0]} and {on[1]}, fewer" in limits("bouncing", DENSITIES, one_pass)[0]
+    assert f"; with {on[1]}, fewer" in limits("bouncing", DENSITIES, one_pass, on[0])[0]
+    assert "fewer" not in limits("bouncing", DENSITIES, on[0])[0]
     narrow = f"scene.density=[1, {safe / 4 * 0.99}]"  # the radii make a factor of 4
     assert limits("bouncing", narrow) == []
     (wider,) = limits("bouncing", f"scene.density=[1, {safe / 4 * 1.5}]")

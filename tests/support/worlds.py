@@ -37,7 +37,7 @@ def rules(step: float = STEP, **changes: Any) -> SolverParams:
         "damping": 0.0,
         "mixing": "product",
         "by_time": False,
-        "relax_iterations": 1,
+        "relax_iterations": None,
         "extreme_mass_ratios": False,
     }
     return SolverParams(step=step, **(numbers | changes))
