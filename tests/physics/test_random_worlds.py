@@ -82,7 +82,7 @@ MANY_BOUNDS: dict[str, Bounds] = {
     "joints, without": {RISING: 0.05},
 }
 EXTREME_BOUNDS: dict[str, Bounds] = {  # with `physics.extreme_mass_ratios`
-    "discs, mass ratios up to 1e6": {RISING: 0.12, ABOVE: None, OVERLAPPING: 0.12},
+    "discs, mass ratios up to 1e6": {RISING: 0.12, DETOURING: None, OVERLAPPING: 0.15},
     "mass ratios up to 1e6": {RISING: 0.05, DETOURING: None, OVERLAPPING: 0.2},
     "fast, mass ratios up to 1e6, e = 0.5": {RISING: None, DETOURING: 0.08, OVERLAPPING: 0.2},
 }
