@@ -26,6 +26,7 @@ from gen2d.core.enums import DYNAMIC, KINEMATIC, STATIC
 from gen2d.physics.inertia import polygon_mass
 from gen2d.physics.params import solver_params
 from gen2d.physics.simulate import SaveAt, simulate
+from gen2d.programs import devices, environment
 from gen2d.records import axes
 from gen2d.space.bodies import hinge_gap
 from gen2d.space.space import Space
@@ -254,7 +255,7 @@ def in_gen2d(space: Space) -> Run:
     ]
     params, frames = solver_params(space.physics, FPS, STEPS), round(SECONDS * FPS) + 1
     program = jax.jit(lambda a, b: simulate(a, b, layout, params, frames, STEPS, SaveAt(0, False), sparse=True).states)
-    program = program.lower(*many).compile()
+    program = program.lower(*many).compile(environment.compiler_options(devices.default()))
     began = time.process_time()
     jax.block_until_ready(program(*many))
     cost = (time.process_time() - began) / BATCH / SECONDS

@@ -141,7 +141,7 @@ def gen2d_program(
     from worlds import rules
 
     from gen2d.physics.simulate import SaveAt, simulate
-    from gen2d.programs import devices
+    from gen2d.programs import devices, environment
     from gen2d.records import axes, trajectory
     from gen2d.records import scene as scene_module
 
@@ -157,7 +157,7 @@ def gen2d_program(
         return axes.to_stored(simulate(*device, layout, params, FRAMES, STEPS, save_at, sparse=sparse))
 
     params, began = rules(STEP, by_time=by_time), time.process_time()
-    program = jax.jit(run).lower(*inputs).compile()
+    program = jax.jit(run).lower(*inputs).compile(environment.compiler_options(devices.default()))
     return program, jax.device_put(inputs), time.process_time() - began
 
 

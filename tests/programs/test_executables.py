@@ -214,6 +214,11 @@ def test_several_devices_run_one_executable(tmp_path: Path) -> None:
     same(everything(Path(out)), everything(tmp_path / "one"))
 
 
+def test_the_tests_compile_with_the_options_of_the_programs() -> None:
+    options = environment.compiler_options(jax.devices("cpu")[0])
+    assert {f"--{name}={str(value).lower()}" for name, value in options.items()} <= {*os.environ["XLA_FLAGS"].split()}
+
+
 def test_a_version_of_xla_without_our_options_compiles_with_others(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(environment, "_CPU_OPTIONS", {"xla_cpu_option_of_no_version": True})
     environment._cpu_options.cache_clear()
