@@ -54,7 +54,6 @@ class SolvedRounds(NamedTuple):
 
     points: list[list[ContactPoint]]
     pairs: list[SolvedPair]
-    observed: list[tuple[Array, Array]]  # in the first pass: overlap, m, and whether the contact began
 
 
 @dataclasses.dataclass(frozen=True)
@@ -132,8 +131,7 @@ class AllPairs(ContactSolver):
 
         sides, pairs = run_schedule(sides, statics, self.order, play)
         sides, pairs = self._later_impacts(contacts, pairs, sides, statics)
-        observed = [contact_passes.observe(*of) for of in zip(pairs, carry.warm, strict=True)]
-        return sides, SolvedRounds(contacts, pairs, observed)
+        return sides, SolvedRounds(contacts, pairs)
 
     def _later_impacts(
         self,
@@ -193,7 +191,7 @@ class AllPairs(ContactSolver):
             return contact_passes.relax(*of, a, b, self.setup, self.params)
 
         new, relaxed = run_schedule(sides, statics, self.order, play)
-        warm, events = self._relaxed(carry, solved.pairs, relaxed, time)
+        ended = self._relaxed(carry, solved.pairs, relaxed, time)
         if self.params.late_passes:
             scenes = late_scenes(new, self.setup.threshold.shape)
 
@@ -201,25 +199,30 @@ class AllPairs(ContactSolver):
                 late, pairs = self._late_passes(solved, sides, statics)
                 of_pairs = zip(self.constraints, carry.warm, pairs, strict=True)
                 relaxed = [contact_passes.relaxed_pair(*of, self.setup, self.params.step) for of in of_pairs]
-                state = clamp(late), *self._relaxed(carry, pairs, relaxed, time)
+                state = clamp(late), self._relaxed(carry, pairs, relaxed, time)
                 return jax.tree.map(lambda x, y: jnp.where(scenes, x, y), state, others)
 
-            new, warm, events = jax.lax.cond(jnp.any(scenes), again, lambda *x: x, new, warm, events)
+            new, ended = jax.lax.cond(jnp.any(scenes), again, lambda *x: x, new, ended)
+        warm, events, begins = ended
         observed = dict(carry.observed)
-        for depth, began in solved.observed:
-            old = observed[size := depth.shape[0]]
-            observed[size] = Observed(jnp.maximum(old.depth, depth), old.begins + began)
+        for pair, began in zip(solved.pairs, begins, strict=True):
+            old = observed[size := began.shape[0]]
+            observed[size] = Observed(jnp.maximum(old.depth, contact_passes.overlap(pair)), old.begins + began)
         return new, AllPairsCarry(warm, observed, events)
 
     def _relaxed(
         self, carry: AllPairsCarry, pairs: list[SolvedPair], relaxed: list[RelaxedPair], time: Array
-    ) -> tuple[list[WarmStart], list[ContactEvent] | None]:
-        """What the next step starts with, and the events after this one."""
+    ) -> tuple[list[WarmStart], list[ContactEvent] | None, list[Array]]:
+        """What the next step starts with, the events after this one, and whether a contact of each pair began."""
         events = carry.events
+        begins = [
+            contact_passes.begins(memory, pair, last.pair)
+            for memory, pair, last in zip(carry.warm, pairs, relaxed, strict=True)
+        ]
         if events is not None:
             of = zip(events, pairs, relaxed, strict=True)
             events = [record_event(event, pair, last.pair, time) for event, pair, last in of]
-        return [last.warm for last in relaxed], events
+        return [last.warm for last in relaxed], events, begins
 
     def _late_passes(
         self, solved: SolvedRounds, sides: list[BodySide], statics: list[BodySide]

@@ -541,10 +541,15 @@ def touching(solved: SolvedPair, last: SolvedPair) -> Array:
     return functools.reduce(jnp.logical_or, pressed)
 
 
-def observe(solved: SolvedPair, warm: WarmStart) -> tuple[Array, Array]:
-    """Deepest overlap of a pair, m, and whether a contact began in this step, as a bounce does."""
+def begins(memory: WarmStart, solved: SolvedPair, last: SolvedPair) -> Array:
+    """Whether a contact began in this step, as a bounce does, from the pair after the first and the relaxing pass."""
+    rested = [impulse.normal != 0 for impulse in memory.impulses]
+    return touching(solved, last) & ~functools.reduce(jnp.logical_or, rested)
+
+
+def overlap(solved: SolvedPair) -> Array:
+    """Deepest overlap of a pair, m."""
     depth = jnp.zeros_like(solved.contacts[0].gap)
     for contact in solved.contacts:
         depth = jnp.maximum(depth, jnp.where(contact.frame.normal_mass > 0, -contact.gap, 0.0))
-    now, before = (sum(i.normal for i in x[1:]) + x[0].normal for x in (solved.impulses, warm.impulses))
-    return depth, (now > 0) & (before == 0)
+    return depth

@@ -76,7 +76,6 @@ from gen2d.xla import materialize, max_bodies
 RELAX_CONSTANTS = *CONSTANTS, "resting", "push"
 
 NEVER = -2  # the step of an event that has not happened
-FOLLOWS = 1 << 20  # added to the contacts of a scene that begin in a step: a pair that an impact may follow
 
 
 class PassBuffers(NamedTuple):
@@ -93,6 +92,7 @@ class PairMemory(NamedTuple):
 
     cache: Array  # a row per pair: see `CachedConstraint`
     touch: Array  # [R P n + 1] see `NearbyCarry`; empty where contacts are not logged
+    begins: Array  # [n + 1] contacts that began in this step
 
 
 class LastTouch(NamedTuple):
@@ -347,28 +347,26 @@ class NearbyPairs(PairBatches, ContactSolver):
         by_time = ordered_batches(contacts) if self.params.by_time else []
 
         def play(i: int, k: Array, indices: GatherIndices, a: BodySide, b: BodySide, carried: tuple) -> tuple:
-            buffer, depth, begins = carried
+            buffer, depth, *follows = carried
             constraint, warm, points, setup = self.unpack_contacts(
                 list(get_row(contacts.packed[i], k)), contacts.specs[i]
             )
             old, (a, b, solved) = (a, b), contact_passes.solve(constraint, warm, points, a, b, setup, self.params)
             values, specs[i] = pack(solved, (self.chunk,), self.dtype, once=True)
-            overlap, began = contact_passes.observe(solved, warm)
-            counted = began.astype(jnp.int32)
             if by_time:
                 a, b, follow = with_clearance(solved, ordered(points), old, a, b, self.params.step)
-                counted = counted + jnp.where(follow, FOLLOWS, 0)
-            depth, begins = depth.at[indices.scene].max(overlap), begins.at[indices.scene].add(counted)
-            return a, b, (self._store(self.batches[i], buffer, k, values), depth, begins)
+                follows = [follows[0].at[indices.scene].max(follow)]
+            depth = depth.at[indices.scene].max(contact_passes.overlap(solved))
+            return a, b, (self._store(self.batches[i], buffer, k, values), depth, *follows)
 
         buffers = [None] * len(self.batches) if carry.buffers is None else [b.solved for b in carry.buffers]
-        zero = jnp.zeros_like(carry.depth), jnp.zeros_like(carry.begins)
+        zero = [jnp.zeros_like(carry.depth), *([jnp.zeros(self.scenes + 1, bool)] if by_time else [])]
         bodies = self.bodies(alone(sides) if by_time else sides, statics, constants)
         rows, carries = self.play(bodies, bodies.rows, contacts, [(buffer, *zero) for buffer in buffers], play)
-        observed = [(depth, begins % FOLLOWS) for _, depth, begins in carries]
-        solved = SolvedChunk(contacts, [packed for packed, *_ in carries], specs, observed)
+        packed, overlaps = [of for of, *_ in carries], [depth for _, depth, *_ in carries]
+        solved = SolvedChunk(contacts, packed, specs, overlaps)
         if by_time:
-            follow = functools.reduce(jnp.logical_or, [begins >= FOLLOWS for *_, begins in carries])[:-1]
+            follow = functools.reduce(jnp.logical_or, [of for *_, of in carries])[:-1]
             rows, packed = LaterImpacts(self, bodies, solved, by_time).solve(rows, follow)
             solved = solved._replace(packed=packed)
         return self.unpacked(bodies, rows), solved
@@ -395,11 +393,14 @@ class NearbyPairs(PairBatches, ContactSolver):
             if keeps_touches:
                 values, specs[i] = pack(old, (self.chunk,), self.dtype)
                 buffer = [self._store(self.batches[i], buffer[0], k, values)]
+            began = contact_passes.begins(warm, pair, relaxed.pair)
+            memory = memory._replace(begins=memory.begins.at[indices.scene].add(began.astype(jnp.int32)))
             memory = self._remember(carry, i, memory, indices.pair, old, constraint, pair, relaxed, time)
             return a, b, (memory, *buffer)
 
         last_touch = carry.last_touch or [jnp.zeros(0, jnp.int32)] * len(self.batches)
-        memories = [PairMemory(*of) for of in zip(carry.cache, last_touch, strict=True)]
+        none = jnp.zeros_like(carry.begins)
+        memories = [PairMemory(*of, none) for of in zip(carry.cache, last_touch, strict=True)]
         buffers = [None] * len(self.batches) if carry.buffers is None else [b.touches for b in carry.buffers]
         starts = [(of, *([buffer] if keeps_touches else [])) for of, buffer in zip(memories, buffers, strict=True)]
         new, carries = self._pass(sides, statics, listed, starts, play, RELAX_CONSTANTS)
@@ -413,13 +414,18 @@ class NearbyPairs(PairBatches, ContactSolver):
                 (constraint, warm, _, setup), buffer = contacts, touches[i]
                 touch = None if buffer is None else unpack(own.columns(buffer), specs[i])
                 relaxed = contact_passes.relaxed_pair(constraint, warm, pair, setup, self.params.step)
+                scene = jnp.where(own.pair < self.batches[i].a.size * self.scenes, own.pair % self.scenes, self.scenes)
+                began = contact_passes.begins(warm, pair, pair).astype(jnp.int32)
+                memory = memory._replace(begins=memory.begins.at[scene].add(began))
                 return self._remember(carry, i, memory, own.pair, touch, constraint, pair, relaxed, time)
 
+            first = jnp.append(~scenes, True)
+            memories = [memory._replace(begins=jnp.where(first, memory.begins, 0)) for memory in memories]
             passes = LatePasses(self, sides, statics, solved, clamp, remember)
             late, new, memories = passes.solve(scenes, late, new, memories)
         depth, begins = carry.depth, carry.begins
-        for overlap, began in solved.observed:
-            depth, begins = jnp.maximum(depth, overlap), begins + began
+        for overlap, memory in zip(solved.overlaps, memories, strict=True):
+            depth, begins = jnp.maximum(depth, overlap), begins + memory.begins
         of_batches = zip(listed.indices, listed.packed, solved.packed, touches, strict=True)
         carry = carry._replace(
             cache=[memory.cache for memory in memories],
@@ -457,7 +463,7 @@ class NearbyPairs(PairBatches, ContactSolver):
             now = 2 * carry.step + jnp.where((event.flags & ON) > 0, 1, 0)
             now = jnp.where(contact_passes.touching(pair, relaxed.pair), now, old.step)
             touch = touch.at[where].set(now, mode=SAFE)
-        return PairMemory(self._cache(i, memory.cache).put(where, new).rows, touch)
+        return memory._replace(cache=self._cache(i, memory.cache).put(where, new).rows, touch=touch)
 
     # ---- Logged contacts
 

@@ -94,7 +94,7 @@ class SolvedChunk(NamedTuple):
     listed: ListedPairs
     packed: list[Array]
     specs: dict[int, TableSpec]
-    observed: list[tuple[Array, Array]]  # [n + 1] each: deepest overlap, m, and contacts that began
+    overlaps: list[Array]  # [n + 1] m, the deepest
 
 
 class BodyTables(NamedTuple):

@@ -182,6 +182,7 @@ def test_tar_files_have_every_field_bit_by_bit(
         assert len(sample) == 3 + (codec != "npz")
 
 
+@pytest.mark.full
 def test_exports_are_not_much_larger_than_the_dataset(tmp_path: Path) -> None:
     """Of videos as they are usually made, as discs of hard rims on few pixels are no measure for codecs."""
     made = gen2d.generate(tiny.tiny_config(video={"frames": 32, "height": 64, "width": 64}), 8, tmp_path / "data")

@@ -7,8 +7,9 @@ from laws import DOWN, GRAVITY, POSES, Case, holds, pose_world, to_double
 from test_invariants import gas
 from worlds import STEP, box, energies, momenta, rules, run, world
 
-from gen2d.core.enums import END, IMPACT, PERSIST
+from gen2d.core.enums import BEGIN, END, IMPACT, PERSIST
 from gen2d.physics.simulate import SaveAt
+from gen2d.records.trajectory import Contacts
 
 FRAMES = 241
 EVERYTHING = SaveAt(contacts=6000, energy=True)
@@ -48,6 +49,19 @@ def test_books_and_rows_agree_with_the_states(relax_iterations):
         assert ((late > -1e-6) & (late < STEP + 1e-6)).all()
         missing = missing_impulses(scene, found, i, 8, DOWN)
         holds("rows: impulses against change of momentum, N s", missing, 1e-5)
+        assert found.quality.contacts[i] == begun(rows, i)
+
+
+def begun(rows: Contacts, i: int) -> int:
+    """Contacts of world i that began, from its rows: each frame is a step."""
+    count, rest = 0, {}  # the last frame in which a pair touched and did not bounce
+    for a, b, kind, frame in zip(
+        *(x[i, : rows.count[i]] for x in (rows.a, rows.b, rows.kind, rows.frame)), strict=True
+    ):
+        count += kind in (IMPACT, BEGIN) and rest.get((a, b)) != frame - 1
+        if kind in (BEGIN, PERSIST):
+            rest[a, b] = frame
+    return count
 
 
 def missing_impulses(scene, found, i, discs, gravity):

@@ -82,7 +82,13 @@ def heavy_on_light(scene: str, ratio: float) -> np.ndarray:
 
 
 @pytest.mark.parametrize("ratio", [10, pytest.param(100, marks=pytest.mark.full)])
-@pytest.mark.parametrize("scene", ["box off the centre of a box", "plank on two boxes", "disc on a box"])
+@pytest.mark.parametrize(
+    "scene",
+    [
+        *(pytest.param(name, marks=pytest.mark.full) for name in ("box off the centre of a box", "disc on a box")),
+        "plank on two boxes",
+    ],
+)
 def test_heavy_bodies_stand_anywhere_on_light_ones(scene, ratio):
     heights = heavy_on_light(scene, ratio)
     holds(f"{scene}, {ratio}:1: sinking in 6 s, m", heights[0] - heights, 5e-4)
@@ -131,9 +137,9 @@ def test_a_heavy_box_that_falls_onto_a_light_one_does_not_enter_it(ratio):
 @pytest.mark.parametrize(
     ("lower", "order"),
     [
-        pytest.param("box", "pairs", id="box"),
+        pytest.param("box", "pairs", id="box", marks=pytest.mark.full),
         pytest.param("disc", "pairs", id="disc"),
-        pytest.param("disc", "time", id="disc, in the order of time"),
+        pytest.param("disc", "time", id="disc, in the order of time", marks=pytest.mark.full),
     ],
 )
 def test_a_heavy_ball_rebounds_from_a_light_body_as_from_the_floor(lower, order):

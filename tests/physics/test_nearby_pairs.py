@@ -59,6 +59,7 @@ def test_both_forms_give_the_same_discs():
     assert_alike(*made, within=2e-3)
 
 
+@pytest.mark.full
 def test_both_forms_give_the_same_impacts_in_the_order_of_their_times():
     worlds = [gas(seed, 5) for seed in range(3)]
     made = [run(worlds, 41, 4, rules(by_time=True), EVERYTHING, sparse=sparse) for sparse in (True, False)]
@@ -85,6 +86,7 @@ def velocities_in_a_step(rows: list[dict], walls: list[dict]) -> np.ndarray:
     return np.array([[v[k, 1:, np.argsort(order)] for k, order in enumerate(orders)] for v in both]).swapaxes(2, 3)
 
 
+@pytest.mark.full
 def test_discs_that_strike_one_into_a_corner_in_a_step_are_struck_back_in_it():
     """Two of the three wait behind the first, along the diagonal; it meets both walls at one time."""
     gap, speed = 0.01, 60.0  # m; m/s along each axis
@@ -111,6 +113,7 @@ def test_an_impact_that_waits_for_one_that_does_not_happen_acts():
     holds("impact that waits for another one: velocities, m/s", found[:, :, 0] - exact, 1e-3)
 
 
+@pytest.mark.full
 def test_relaxing_passes_pass_a_blow_on_through_a_row_of_discs():
     """Six touching discs, in several orders of their slots: without elasticity all move on, with it the last one."""
     count, speed = 6, 6.0  # m/s
@@ -149,7 +152,7 @@ def exact_column(heights: list[float], speeds: list[float], elasticity: float, t
             lower = -elasticity * lower
 
 
-@pytest.mark.parametrize("passes", [8, None])
+@pytest.mark.parametrize("passes", [pytest.param(8, marks=pytest.mark.full), None])
 def test_relaxing_passes_find_impacts_that_others_cause_in_the_same_step(passes):
     """A disc strikes another one over a floor, and meets it again as it comes back, in the same step.
 
@@ -170,7 +173,7 @@ def test_relaxing_passes_find_impacts_that_others_cause_in_the_same_step(passes)
     holds("Impacts that follow each other in a step: speeds, m/s", v[:, ::-1] - [of for _, of in exact], 1e-4)
 
 
-@pytest.mark.parametrize("passes", [8, None])
+@pytest.mark.parametrize("passes", [pytest.param(8, marks=pytest.mark.full), None])
 def test_an_impact_that_another_one_causes_in_the_same_step_is_logged(passes):
     """A disc bounces off a floor and strikes another one above it, in the same step."""
     speed, gaps = 10.0, (0.01, 0.02)
@@ -181,6 +184,7 @@ def test_an_impact_that_another_one_causes_in_the_same_step_is_logged(passes):
     assert_alike(*both, within=1e-5)
     rows = both[0].contacts
     assert rows.count[0] == 2
+    assert both[0].quality.contacts[0] == 2
     assert set(rows.kind[0, :2]) == {IMPACT}
     holds("impact that a bounce causes: approach speeds, m/s", rows.approach_speed[0, :2] - speed, 1e-4)
     holds(

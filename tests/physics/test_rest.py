@@ -72,6 +72,7 @@ def test_column_of_ten_in_a_channel_rests():
     holds("Rest: column of 10, speed, m/s", speed, 1e-3)
 
 
+@pytest.mark.full
 def test_zigzag_channel_of_sixteen_rests():
     """Smooth discs in a channel 1.6 diameters wide press against both walls: the hardest to carry.
 

@@ -52,7 +52,7 @@ def ends(video: Video, number: int, half: float) -> np.ndarray:
     return np.stack([video.position[:, number] - way, video.position[:, number] + way])
 
 
-@pytest.mark.parametrize("kind", ["revolute", "distance"])
+@pytest.mark.parametrize("kind", [pytest.param("revolute", marks=pytest.mark.full), "distance"])
 def test_a_body_swings_through_the_static_box_that_a_joint_ties_it_to(kind):
     """The sides of the box stopped the body, which hung in the air, although the two do not collide."""
     states = []

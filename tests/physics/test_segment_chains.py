@@ -14,6 +14,7 @@ from gen2d.physics.segment_lines import neighbours_of
 from gen2d.space.space import Space
 
 CORNERS = [(-0.4, -0.3), (0.4, -0.3), (0.1, 0.5)]
+SHAPES = ["box", *(pytest.param(name, marks=pytest.mark.full) for name in ("capsule", "triangle"))]
 
 
 def add_body(space: Space, shape: str, position: tuple[float, float], **options: Any) -> int:
@@ -29,7 +30,7 @@ def add_body(space: Space, shape: str, position: tuple[float, float], **options:
 # Straight lines -----------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("shape", ["box", "capsule", "triangle"])
+@pytest.mark.parametrize("shape", SHAPES)
 def test_a_body_bounces_over_joints_as_on_one_segment(shape):
     """The pieces are of any length, some of them point the other way, and they are added in another order."""
     pieces = [(-6.0, -0.7), (-0.7, -0.4), (-0.4, 0.05), (0.05, 0.3), (0.3, 6.0)]
@@ -93,7 +94,7 @@ def test_a_line_of_many_segments_is_known_to_each():
 # Turns --------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("shape", ["box", "capsule", "triangle"])
+@pytest.mark.parametrize("shape", SHAPES)
 def test_a_body_slides_through_a_bowl_of_segments(shape):
     """It rises again almost to its height, and nothing on its way throws it back."""
     angles = np.linspace(-np.pi / 2, np.pi / 2, 41)

@@ -69,7 +69,7 @@ def test_objects_of_a_video_have_distinct_colours_of_the_palette_in_a_random_ord
     assert len(np.unique(crowd[:, 0], axis=0)) == len(entries)
 
 
-@pytest.mark.parametrize("scene", ["chain", "wrecking_ball"])
+@pytest.mark.parametrize("scene", ["chain", pytest.param("wrecking_ball", marks=pytest.mark.full)])
 def test_the_links_of_a_chain_have_one_colour(scene):
     """Which no other moving object has, but for a tower of more blocks than colours are left."""
     config = load_config({"scene": scene, "look": {"name": "flat", "palette": "dusk"}, "video": {"frames": 2}})

@@ -109,6 +109,7 @@ def test_about_half_of_the_towers_stand():
     assert 0.42 < factors["stable"].mean() < 0.58
 
 
+@pytest.mark.full
 def test_dominoes_fall_in_order_in_a_steady_wave_unless_their_gap_is_too_wide():
     options = "scene.dominoes=10", "scene.height=1.5", "scene.gap={choice: [0.6, 1.7]}", "scene.speed=[2, 4]"
     made = film("dominoes", 8, 3.0, 40, *options)
