@@ -249,7 +249,7 @@ CASES = {
     "metal, 128 px, turned": ((("material", "metal"), ("palette", "dusk"), ("azimuth", 0.5)), 128, 0.25),
     "occluders, 80 px, turned": ((("palette", "lab"), ("ambient", 0.2)), 80, 0.25, False, 2),
 }
-TIERED = [pytest.param(case, marks=pytest.mark.full if i not in (1, 4, 6) else ()) for i, case in enumerate(CASES)]
+TIERED = [pytest.param(case, marks=pytest.mark.full if i not in (1, 6) else ()) for i, case in enumerate(CASES)]
 
 
 def errors_of(case):
