@@ -76,7 +76,6 @@ def test_balls_that_meet_again_and_again_are_harder_to_foretell() -> None:
     assert found["meet"] > found["once"] > found["apart"] - 0.1
 
 
-@pytest.mark.full
 def test_it_is_the_difference_of_two_simulations() -> None:
     _, scene, state, run = made()
     way, step = change(), 2e-4
