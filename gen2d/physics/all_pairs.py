@@ -215,14 +215,10 @@ class AllPairs(ContactSolver):
     ) -> tuple[list[WarmStart], list[ContactEvent] | None, list[Array]]:
         """What the next step starts with, the events after this one, and whether a contact of each pair began."""
         events = carry.events
-        begins = [
-            contact_passes.begins(memory, pair, last.pair)
-            for memory, pair, last in zip(carry.warm, pairs, relaxed, strict=True)
-        ]
         if events is not None:
             of = zip(events, pairs, relaxed, strict=True)
             events = [record_event(event, pair, last.pair, time) for event, pair, last in of]
-        return [last.warm for last in relaxed], events, begins
+        return [last.warm for last in relaxed], events, [last.began for last in relaxed]
 
     def _late_passes(
         self, solved: SolvedRounds, sides: list[BodySide], statics: list[BodySide]

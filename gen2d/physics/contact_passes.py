@@ -446,7 +446,8 @@ def relaxed_pair(
 ) -> RelaxedPair:
     """The pair with what the next step starts with, after relaxing passes with late impacts."""
     bounced = [contact.tau >= 0 for contact in pair.contacts]
-    return RelaxedPair(pair, _next_warm_start(constraint, memory, pair, bounced, setup, h))
+    warm = _next_warm_start(constraint, memory, pair, bounced, setup, h)
+    return RelaxedPair(pair, warm, _begins(memory, pair, pair))
 
 
 def _next_warm_start(
@@ -487,7 +488,7 @@ def relax(
         closing = _closing_impacts(constraint, points, solved, a, b, setup, h)
         happens = functools.reduce(jnp.logical_or, [impact.happens for impact in closing])
         new_b = new_b._replace(late=new_b.late | happens)
-    return new_a, new_b, RelaxedPair(last, warm)
+    return new_a, new_b, RelaxedPair(last, warm, _begins(memory, solved, last))
 
 
 def _relaxed(
@@ -541,10 +542,10 @@ def touching(solved: SolvedPair, last: SolvedPair) -> Array:
     return functools.reduce(jnp.logical_or, pressed)
 
 
-def begins(memory: WarmStart, solved: SolvedPair, last: SolvedPair) -> Array:
-    """Whether a contact began in this step, as a bounce does, from the pair after the first and the relaxing pass."""
-    rested = [impulse.normal != 0 for impulse in memory.impulses]
-    return touching(solved, last) & ~functools.reduce(jnp.logical_or, rested)
+def _begins(memory: WarmStart, solved: SolvedPair, last: SolvedPair) -> Array:
+    """See `RelaxedPair.began`; from the pair after the first and the relaxing pass."""
+    before = [impulse.normal != 0 for impulse in memory.impulses]
+    return touching(solved, last) & ~functools.reduce(jnp.logical_or, before)
 
 
 def overlap(solved: SolvedPair) -> Array:

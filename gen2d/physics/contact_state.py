@@ -61,3 +61,4 @@ class RelaxedPair(NamedTuple):
 
     pair: SolvedPair
     warm: WarmStart  # what the next step starts with
+    began: Array  # whether a contact began in this step, as a bounce does

@@ -393,9 +393,7 @@ class NearbyPairs(PairBatches, ContactSolver):
             if keeps_touches:
                 values, specs[i] = pack(old, (self.chunk,), self.dtype)
                 buffer = [self._store(self.batches[i], buffer[0], k, values)]
-            began = contact_passes.begins(warm, pair, relaxed.pair)
-            memory = memory._replace(begins=memory.begins.at[indices.scene].add(began.astype(jnp.int32)))
-            memory = self._remember(carry, i, memory, indices.pair, old, constraint, pair, relaxed, time)
+            memory = self._remember(carry, i, memory, indices, old, constraint, pair, relaxed, time)
             return a, b, (memory, *buffer)
 
         last_touch = carry.last_touch or [jnp.zeros(0, jnp.int32)] * len(self.batches)
@@ -414,13 +412,10 @@ class NearbyPairs(PairBatches, ContactSolver):
                 (constraint, warm, _, setup), buffer = contacts, touches[i]
                 touch = None if buffer is None else unpack(own.columns(buffer), specs[i])
                 relaxed = contact_passes.relaxed_pair(constraint, warm, pair, setup, self.params.step)
-                scene = jnp.where(own.pair < self.batches[i].a.size * self.scenes, own.pair % self.scenes, self.scenes)
-                began = contact_passes.begins(warm, pair, pair).astype(jnp.int32)
-                memory = memory._replace(begins=memory.begins.at[scene].add(began))
-                return self._remember(carry, i, memory, own.pair, touch, constraint, pair, relaxed, time)
+                return self._remember(carry, i, memory, own, touch, constraint, pair, relaxed, time)
 
-            first = jnp.append(~scenes, True)
-            memories = [memory._replace(begins=jnp.where(first, memory.begins, 0)) for memory in memories]
+            others = jnp.append(~scenes, True)
+            memories = [memory._replace(begins=jnp.where(others, memory.begins, 0)) for memory in memories]
             passes = LatePasses(self, sides, statics, solved, clamp, remember)
             late, new, memories = passes.solve(scenes, late, new, memories)
         depth, begins = carry.depth, carry.begins
@@ -447,7 +442,7 @@ class NearbyPairs(PairBatches, ContactSolver):
         carry: NearbyCarry,
         i: int,
         memory: PairMemory,
-        where: Array,
+        where: GatherIndices | SceneChunk,
         old: LastTouch | None,
         constraint: ContactConstraint,
         pair: SolvedPair,
@@ -456,14 +451,15 @@ class NearbyPairs(PairBatches, ContactSolver):
     ) -> PairMemory:
         """Memory of a batch with these pairs after the step; `old` is what is logged of them before it."""
         touch = memory.touch
-        new = CachedConstraint(relaxed.warm, jnp.full(where.shape, carry.step, self.dtype), None, None)
+        new = CachedConstraint(relaxed.warm, jnp.full(where.pair.shape, carry.step, self.dtype), None, None)
         if old is not None:
             event = record_event(old.event, pair, relaxed.pair, time)
             new = new._replace(event=event, elasticity=constraint.elasticity)
             now = 2 * carry.step + jnp.where((event.flags & ON) > 0, 1, 0)
             now = jnp.where(contact_passes.touching(pair, relaxed.pair), now, old.step)
-            touch = touch.at[where].set(now, mode=SAFE)
-        return memory._replace(cache=self._cache(i, memory.cache).put(where, new).rows, touch=touch)
+            touch = touch.at[where.pair].set(now, mode=SAFE)
+        begins = memory.begins.at[where.scene].add(relaxed.began.astype(jnp.int32))
+        return PairMemory(self._cache(i, memory.cache).put(where.pair, new).rows, touch, begins)
 
     # ---- Logged contacts
 

@@ -21,7 +21,7 @@ LATE_CONSTANTS = *(name for name in CONSTANTS if name != "displacement"), "resti
 class LateBuffers(NamedTuple):
     """Listed pairs of a batch, by chunk; kept from step to step, as to fill them with zeros would take longer."""
 
-    indices: Array  # [K, 6, C] see `SceneList`
+    indices: Array  # [K, 7, C] see `SceneList`
     contacts: Array  # [K, F, C]
     pairs: Array
 

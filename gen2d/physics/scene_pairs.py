@@ -24,6 +24,7 @@ class SceneChunk(NamedTuple):
     a: Array  # rows of the bodies' tables; the last ones where there is no pair
     b: Array
     pair: Array  # rows of the pairs' tables
+    scene: Array  # beyond the last one where there is no pair
     chunk: Array  # place in the buffers of the passes; beyond the end where there is no pair
     lane: Array
     member: Array  # number of the scene in its group
@@ -45,7 +46,7 @@ class SceneList(NamedTuple):
     """Pairs of a batch in some scenes."""
 
     chunks: Array  # how many there are
-    indices: Array  # [K, 6, C] `SceneChunk` of each
+    indices: Array  # [K, 7, C] `SceneChunk` of each
 
     def run(self, play: Callable, carry: Any) -> Any:
         """Carry after `play(k, chunk, carry)` of all chunks k."""
@@ -116,6 +117,6 @@ class ScenePairs:
             place = jnp.where(lookup.there, first + rank // solver.chunk, len(self._listed.packed[i]))
             indices = solver.chunk_indices(batch, lookup, batch.pair_of_bit)
             member = jnp.where(lookup.there, member, 0)
-            return put_row(listed, k, jnp.stack(SceneChunk(*indices[:3], place, rank % solver.chunk, member)))
+            return put_row(listed, k, jnp.stack(SceneChunk(*indices, place, rank % solver.chunk, member)))
 
         return SceneList(active.starts[-1], jax.lax.fori_loop(0, active.starts[-1], chunk, buffer))

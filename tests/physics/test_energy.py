@@ -49,10 +49,10 @@ def test_books_and_rows_agree_with_the_states(relax_iterations):
         assert ((late > -1e-6) & (late < STEP + 1e-6)).all()
         missing = missing_impulses(scene, found, i, 8, DOWN)
         holds("rows: impulses against change of momentum, N s", missing, 1e-5)
-        assert found.quality.contacts[i] == begun(rows, i)
+        assert found.quality.contacts[i] == beginnings(rows, i)
 
 
-def begun(rows: Contacts, i: int) -> int:
+def beginnings(rows: Contacts, i: int) -> int:
     """Contacts of world i that began, from its rows: each frame is a step."""
     count, rest = 0, {}  # the last frame in which a pair touched and did not bounce
     for a, b, kind, frame in zip(

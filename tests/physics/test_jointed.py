@@ -34,7 +34,7 @@ def test_disc_that_strikes_a_hinged_plank_at_an_angle_turns_it_as_the_closed_for
     disc = space.add_circle(
         arm * along + 0.5 * across, 0.3, mass=0.7, velocity=-speed * across, elasticity=1.0, friction=0.0
     )
-    video, last = space.simulate(**ONE_PROGRAM), 48
+    video, last = space.simulate(**ONE_PROGRAM), 48  # after .2 s
     moment = space.bodies[plank].moment + 3.0 * (length / 2) ** 2
     impulse = 2 * speed / (1 / 0.7 + arm**2 / moment)
     holds("leaning plank: speed of the disc", video.velocity[last, disc] @ across - (impulse / 0.7 - speed), 1e-4)
@@ -141,7 +141,7 @@ def test_friction_acts_on_the_mass_that_a_hinge_leaves():
     wheel = space.add_circle((0, 0), 0.5, mass=1.0, spin=6.0, elasticity=0.0, friction=1.0)
     space.add_joint("revolute", wheel, anchor_a=(0, 0))
     plank = space.add_box((0, -0.7), 3.0, 0.2, mass=2.0, velocity=(0, 6.0), elasticity=0.0, friction=1.0)
-    video, last = space.simulate(**ONE_PROGRAM), 24
+    video, last = space.simulate(**ONE_PROGRAM), 24  # after .1 s
     rim = 0.5 * video.angular_velocity[last, wheel]
     along = video.velocity[last, plank, 0] + 0.1 * video.angular_velocity[last, plank]
     holds("wheel on a plank: slip of the rim, m/s", rim - along, 2e-2)
