@@ -178,6 +178,10 @@ class _RigidJoints:
         self._schur = self._factored.schur_complements(_motions(sides))
         return self._held(sides)
 
+    def allowed(self, changes: list[Motion]) -> list[Motion]:
+        """What the joints leave of changes that contacts cause."""
+        return changes if self._system is None or not self._contacts else self._factored.allowed(changes)
+
     def move(self, displacements: list[Motion]) -> None:
         """Moves the joints to the end of the step, for the relaxing pass."""
         if self._system is not None:
@@ -306,11 +310,12 @@ def step(world: WorldState, model: Model, params: SolverParams) -> WorldState:
     sides, contacts = solver.warm_start(carry, sides, statics, pulling.speed_bounds(before))
     motions = _motions(sides)
     changes = [jax.tree.map(jnp.subtract, *of) for of in zip(motions, before, strict=True)]
-    drifts = [_scaled(change, -0.5 * h) for change in changes]
+    allowed = rigid.allowed(changes)
+    drifts = [_scaled(change, -0.5 * h) for change in allowed]
 
     motions, forced_drifts = pulling.pull(motions, drifts, free_drifts, accelerations)
     motions = rigid.limit(motions, _sums(drifts, forced_drifts))
-    of_groups = zip(sides, motions, drifts, jax.lax.stop_gradient(changes), pulling.accelerations, strict=True)
+    of_groups = zip(sides, motions, drifts, jax.lax.stop_gradient(allowed), pulling.accelerations, strict=True)
     sides = [_first_pass_side(*of, params) for of in of_groups]
     statics = [BodySide(motion=side.motion) for side in statics]
     sides, solved = solver.solve(carry, contacts, rigid.hold(sides), statics)
