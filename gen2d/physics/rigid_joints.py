@@ -293,8 +293,9 @@ class FactoredSystem:
         error = _error(system, rows, anchors.offset)
         remaining = error - jnp.clip(error, -h * FASTEST, h * FASTEST)
         impulses, now, work = self._stay(table_of(motions, fixed), impulses)
-        works = [work]
-        drift = jax.tree.map(jnp.add, *(table_of_changes(system, x) for x in (self.allowed(drifts), free_drifts)))
+        drift, works = table_of_changes(system, drifts), [work]
+        drift, _ = _apply(system, rows, drift, self._impulses(speeds_along(system, rows, drift)))
+        drift = jax.tree.map(jnp.add, drift, table_of_changes(system, free_drifts))
         for _ in range(NEWTON_ITERATIONS):
             displacement = jax.tree.map(lambda x, y: h * x + y, now, drift)
             error = _error(system, rows, _displace(system, anchors, displacement).offset)
@@ -307,12 +308,6 @@ class FactoredSystem:
         """Motions with which the anchors stay together."""
         impulses, now, work = self._stay(table_of(motions, fixed), impulses)
         return Solved(groups_of(now, motions), impulses, work)
-
-    def allowed(self, changes: list[Motion]) -> list[Motion]:
-        """What the joints leave of changes of the motions, or of drifts, of the groups."""
-        system, rows, table = self._system, self._rows, table_of_changes(self._system, changes)
-        new, _ = _apply(system, rows, table, self._impulses(speeds_along(system, rows, table)))
-        return groups_of(new, changes)
 
     def _stay(self, now: Motion, impulses: Array) -> tuple[Array, Motion, Work]:
         """Accumulated impulses, motions with which the anchors stay together, and the work done."""

@@ -151,7 +151,9 @@ class _RigidJoints:
 
     def __init__(self, model: Model, world: WorldState, statics: list[BodyState], params: SolverParams) -> None:
         self._system, self._limits, self._params = model.joint_system, model.limit_system, params
-        self._contacts = any(group.collides for group in model.groups)  # whether there may be contacts
+        # Whether contacts meet bodies that joints may hold.
+        self._in_contacts = self._system is not None and any(group.collides for group in model.groups)
+        self._moved_again = bool(model.springs) or self._limits is not None  # between warm starting and the first pass
         self._fixed = [body.motion for body in statics]
         self.twists, self.works = world.twists, []
         if self._system is not None:
@@ -171,16 +173,17 @@ class _RigidJoints:
         self.works.append(work)
         return motions
 
+    def stay_warm(self, motions: list[Motion]) -> list[Motion]:
+        """Motions after warm starting with which the anchors stay together."""
+        return self.stay(motions) if self._in_contacts else motions
+
     def hold(self, sides: list[BodySide]) -> list[BodySide]:
         """Sides of the first pass, whose contacts see the joints at the start of the step."""
-        if self._system is None or not self._contacts:
+        if not self._in_contacts:
             return sides
-        self._schur = self._factored.schur_complements(_motions(sides))
-        return self._held(sides)
-
-    def allowed(self, changes: list[Motion]) -> list[Motion]:
-        """What the joints leave of changes that contacts cause."""
-        return changes if self._system is None or not self._contacts else self._factored.allowed(changes)
+        motions = _motions(sides)
+        self._schur = self._factored.schur_complements(motions)
+        return self._held(sides, self.stay(motions) if self._moved_again else motions)
 
     def move(self, displacements: list[Motion]) -> None:
         """Moves the joints to the end of the step, for the relaxing pass."""
@@ -190,15 +193,15 @@ class _RigidJoints:
 
     def hold_again(self, sides: list[BodySide]) -> list[BodySide]:
         """Sides of the relaxing pass."""
-        return sides if self._system is None or not self._contacts else self._held(sides)
+        return self._held(sides, self.stay(_motions(sides))) if self._in_contacts else sides
 
-    def _held(self, sides: list[BodySide]) -> list[BodySide]:
-        """Sides of a pass, whose anchors stay together.
+    def _held(self, sides: list[BodySide], motions: list[Motion]) -> list[BodySide]:
+        """Sides of a pass with motions with which their anchors stay together.
 
         A contact would take a speed along a rod for an approach, and answer it with the little that the rod leaves of
         the inverse mass.
         """
-        of = zip(sides, self.stay(_motions(sides)), self._schur, strict=True)
+        of = zip(sides, motions, self._schur, strict=True)
         return [hold(side._replace(motion=motion), schur) for side, motion, schur in of]
 
     def meet(self, sides: list[BodySide], free_drifts: list[Motion]) -> tuple[list[Motion], list[Motion]]:
@@ -308,14 +311,13 @@ def step(world: WorldState, model: Model, params: SolverParams) -> WorldState:
     if params.by_time:
         sides = not_hit(sides)
     sides, contacts = solver.warm_start(carry, sides, statics, pulling.speed_bounds(before))
-    motions = _motions(sides)
+    motions = rigid.stay_warm(_motions(sides))
     changes = [jax.tree.map(jnp.subtract, *of) for of in zip(motions, before, strict=True)]
-    allowed = rigid.allowed(changes)
-    drifts = [_scaled(change, -0.5 * h) for change in allowed]
+    drifts = [_scaled(change, -0.5 * h) for change in changes]
 
     motions, forced_drifts = pulling.pull(motions, drifts, free_drifts, accelerations)
     motions = rigid.limit(motions, _sums(drifts, forced_drifts))
-    of_groups = zip(sides, motions, drifts, jax.lax.stop_gradient(allowed), pulling.accelerations, strict=True)
+    of_groups = zip(sides, motions, drifts, jax.lax.stop_gradient(changes), pulling.accelerations, strict=True)
     sides = [_first_pass_side(*of, params) for of in of_groups]
     statics = [BodySide(motion=side.motion) for side in statics]
     sides, solved = solver.solve(carry, contacts, rigid.hold(sides), statics)
