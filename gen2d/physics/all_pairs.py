@@ -196,7 +196,7 @@ class AllPairs(ContactSolver):
             scenes = late_scenes(new, self.setup.threshold.shape)
 
             def again(*others: Any) -> tuple:
-                late, pairs = self._late_passes(solved, sides, statics)
+                late, pairs = self._late_passes(scenes, solved, sides, statics)
                 of_pairs = zip(self.constraints, carry.warm, pairs, strict=True)
                 relaxed = [contact_passes.relaxed_pair(*of, self.setup, self.params.step) for of in of_pairs]
                 state = clamp(late), self._relaxed(carry, pairs, relaxed, time)
@@ -221,18 +221,30 @@ class AllPairs(ContactSolver):
         return [last.warm for last in relaxed], events, [last.began for last in relaxed]
 
     def _late_passes(
-        self, solved: SolvedRounds, sides: list[BodySide], statics: list[BodySide]
+        self, scenes: Array, solved: SolvedRounds, sides: list[BodySide], statics: list[BodySide]
     ) -> tuple[list[BodySide], list[SolvedPair]]:
-        """Sides and pairs after relaxing passes with late impacts."""
+        """Sides and pairs after relaxing passes with late impacts in these scenes."""
+        params = self.params
 
-        def one(state: tuple, _: None) -> tuple[tuple, None]:
-            def play(k: int, a: BodySide, b: BodySide) -> tuple[BodySide, BodySide, SolvedPair]:
-                of = self.constraints[k], solved.points[k], state[1][k]
-                return contact_passes.relax_late(*of, a, b, self.setup, self.params)
+        def one(number: Array, unsolved: Array, sides: list[BodySide], pairs: list[SolvedPair]) -> tuple:
+            def play(k: int, a: BodySide, b: BodySide) -> tuple[BodySide, BodySide, tuple[SolvedPair, Array]]:
+                of = self.constraints[k], solved.points[k], pairs[k]
+                a, b, pair, happened = contact_passes.relax_late(*of, a, b, self.setup, params)
+                return a, b, (pair, happened)
 
-            return run_schedule(state[0], statics, self.order, play), None
+            new, of_pairs = run_schedule(sides, statics, self.order, play)
+            solved_again, happened = (list(of) for of in zip(*of_pairs, strict=True))
+            late = functools.reduce(jnp.logical_or, [jnp.any(of, axis=0) for of in happened])
+            of_both = (new, solved_again), (sides, pairs)
+            state = jax.tree.map(lambda x, y: jnp.where(unsolved, x, y), *of_both)
+            return unsolved & (late | (number + 1 < params.fewest_late_passes)), *state
 
-        return jax.lax.scan(one, (sides, solved.pairs), length=self.params.late_passes)[0]
+        def one_if_unsolved(state: tuple, number: Array) -> tuple[tuple, None]:
+            return jax.lax.cond(jnp.any(state[0]), one, lambda _, *x: x, number, *state), None
+
+        start = scenes, sides, solved.pairs
+        (_, sides, pairs), _ = jax.lax.scan(one_if_unsolved, start, jnp.arange(params.late_passes))
+        return sides, pairs
 
     def end_frame(self, carry: AllPairsCarry) -> tuple[AllPairsCarry, PairEvent | None]:
         if carry.events is None:

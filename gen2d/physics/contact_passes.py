@@ -512,8 +512,9 @@ def relax_late(
     b: BodySide,
     setup: PassSetup,
     params: SolverParams,
-) -> tuple[BodySide, BodySide, SolvedPair]:
-    """Both sides and the pair after a relaxing solve with late impacts (relaxing.py), which also displace the sides.
+) -> tuple[BodySide, BodySide, SolvedPair, Array]:
+    """Both sides and the pair after a relaxing solve with late impacts (relaxing.py), which also displace the sides,
+    and whether any happened.
 
     The contacts of the pair stay as the first pass solved them, but for the ones that bounce late.
     """
@@ -533,7 +534,8 @@ def relax_late(
     new_a, new_b = displaced_since(a, new_a, age), displaced_since(b, new_b, age)
     of = zip(points, solved.contacts, contacts, late, strict=True)
     contacts = [_after_late_impact(constraint, *each, *displacements, h) for each in of]
-    return new_a, new_b, last._replace(contacts=contacts)
+    happened = functools.reduce(jnp.logical_or, [impact.happens for impact in late])
+    return new_a, new_b, last._replace(contacts=contacts), happened
 
 
 def touching(solved: SolvedPair, last: SolvedPair) -> Array:

@@ -77,22 +77,30 @@ class LatePasses:
     def _solve_group(self, lists: dict[int, SceneList], scenes: Array, state: tuple) -> tuple:
         """Buffers, sides and memories after all passes over a group of scenes."""
         (listed, sides, memories), solver = state, self._solver.of_scenes(scenes)
+        params = solver.params
         own, statics = (take_scenes(of, scenes) for of in (self._sides, self._statics))
         bodies = solver.bodies(own, statics, LATE_CONSTANTS)
         contacts, buffers = zip(*(self._gathered(i, lists[i], of) for i, of in enumerate(listed)), strict=True)
         group = _Group(solver, bodies, contacts)
 
-        def one(_: Array, state: tuple) -> tuple:
-            rows, buffers = dict(enumerate(state[0])), list(state[1])
+        def one(state: tuple) -> tuple:
+            number, unsolved, rows, buffers = state
+            rows, buffers, late = dict(enumerate(rows)), list(buffers), jnp.zeros_like(unsolved)
             for i, pairs in lists.items():
 
                 def chunk(k: Array, own: SceneChunk, carry: tuple, i: int = i) -> tuple:
-                    return self._solve_chunk(group, i, k, own, *carry)
+                    return self._solve_chunk(group, i, k, own, unsolved, *carry)
 
-                rows, buffers[i] = pairs.run(chunk, (rows, buffers[i]))
-            return list(rows.values()), buffers
+                rows, buffers[i], late = pairs.run(chunk, (rows, buffers[i], late))
+            unsolved = unsolved & (late | (number + 1 < params.fewest_late_passes))
+            return number + 1, unsolved, list(rows.values()), buffers
 
-        rows, buffers = jax.lax.fori_loop(0, solver.params.late_passes, one, (bodies.rows, list(buffers)))
+        def goes_on(state: tuple) -> Array:
+            number, unsolved, *_ = state
+            return (number < params.late_passes) & jnp.any(unsolved)
+
+        start = jnp.zeros((), jnp.int32), scenes < self._solver.scenes, bodies.rows, list(buffers)
+        *_, rows, buffers = jax.lax.while_loop(goes_on, one, start)
         memories = list(memories)
         for i, pairs in lists.items():
 
@@ -121,14 +129,27 @@ class LatePasses:
         return unpack(list(materialize(get_row(pairs, k))), self._solved.specs[i])
 
     def _solve_chunk(
-        self, group: _Group, i: int, k: Array, own: SceneChunk, rows: dict[int, Array], pairs: Array
-    ) -> tuple[dict[int, Array], Array]:
+        self,
+        group: _Group,
+        i: int,
+        k: Array,
+        own: SceneChunk,
+        unsolved: Array,
+        rows: dict[int, Array],
+        pairs: Array,
+        late: Array,
+    ) -> tuple[dict[int, Array], Array, Array]:
+        """Rows and pairs after a pass over a chunk in the unsolved scenes [G], and the scenes [G] with late impacts."""
         solver, bodies = group.solver, group.bodies
         places = own.bodies(self._solver.scenes, solver.scenes)
-        a, b = solver.sides_of(bodies, rows, i, *places)
+        old_a, old_b = solver.sides_of(bodies, rows, i, *places)
         constraint, _, points, setup = self._contacts(i, k, group.contacts[i])
-        pair = self._pair(i, k, pairs)
-        a, b, pair = relax_late(constraint, points, pair, a, b, setup, solver.params)
+        old = self._pair(i, k, pairs)
+        a, b, pair, happened = relax_late(constraint, points, old, old_a, old_b, setup, solver.params)
+        solves = (own.scene < self._solver.scenes) & unsolved[own.member]
+        of_both = (a, b, pair), (old_a, old_b, old)
+        a, b, pair = jax.tree.map(lambda x, y: jnp.where(solves, x, y), *of_both)
         values, _ = pack(pair, own.a.shape, pairs.dtype, once=True)
         rows = rows | solver.put_sides(bodies, rows, i, *places, a, b)
-        return rows, put_row(pairs, k, materialize(jnp.stack(values)))
+        late = late.at[own.member].max(happened & solves)
+        return rows, put_row(pairs, k, materialize(jnp.stack(values))), late

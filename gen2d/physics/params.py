@@ -6,7 +6,8 @@ import math
 from gen2d.config.sections import PhysicsOptions
 from gen2d.records.parameter import minimum
 
-LATE_PASSES = 4  # in scenes with a late impact
+FEWEST_LATE_PASSES = 4  # in scenes with a late impact
+LATE_PASSES = 8  # the most in those where each one finds another late impact
 
 
 @dataclasses.dataclass(frozen=True)
@@ -24,14 +25,19 @@ class SolverParams:
     mixing: str
     by_time: bool  # the impacts of discs in a step act in the order of their times, not of the solver's pairs
     extreme_mass_ratios: bool  # bodies that far heavier ones crush stop these where obstacles stop them
-    relax_iterations: int | None  # passes over all pairs at the end of a step; None: `LATE_PASSES` if an impact is late
+    relax_iterations: int | None  # passes over all pairs at the end of a step; None: more if an impact is late
 
     @property
     def late_passes(self) -> int:
-        """Relaxing passes that find impacts that others have caused in the step; 0: none."""
+        """Most relaxing passes that find impacts that others have caused in the step; 0: none."""
         if self.relax_iterations is None:
             return LATE_PASSES
         return self.relax_iterations if self.relax_iterations > 1 else 0
+
+    @property
+    def fewest_late_passes(self) -> int:
+        """Number of these passes after which a scene is solved if the last one found no impact."""
+        return FEWEST_LATE_PASSES if self.relax_iterations is None else self.late_passes
 
     def bias_rate(self, hertz: float, damping_ratio: float) -> float:
         """Share of an error that an implicit damped spring corrects, 1/s."""

@@ -195,6 +195,27 @@ def test_an_impact_that_another_one_causes_in_the_same_step_is_logged(passes):
     holds("impact that a bounce causes: height of the point, m", rows.point[0, 1, 1] - (1 + sum(gaps)), 1e-5)
 
 
+@pytest.mark.full
+@pytest.mark.parametrize("sparse", [True, False])
+def test_passes_end_in_each_scene_by_itself(sparse):
+    """A disc strikes another one over a floor: with elasticity it soon flies up; without, each pass halves its speed.
+
+    So the first scenes are solved after 4 passes, and the others take 8. A slow row of discs changes in every pass.
+    """
+    speed, floor = -10.0, {"a": (-5, 0), "b": (5, 0)}
+    row = [{"x": (10 + 0.9999 * k, 5), "v": (0.005 * (k == 0), 0), "elasticity": 0.0} for k in (4, 2, 0, 1, 3)]
+    worlds = [
+        world([{"x": (0, 0.504), "elasticity": e}, {"x": (0, 1.508), "v": (0, speed), "elasticity": e}, *row], [floor])
+        for e in [0.9] * 10 + [0.0] * 10
+    ]
+    velocities = [
+        run(worlds, 2, 1, rules(relax_iterations=n), sparse=sparse).states.velocity[:, -1] for n in (4, 8, None)
+    ]
+    few, many, some = velocities
+    assert (abs(few - many)[:, 2:7].max((1, 2)) > 1e-4).all()
+    np.testing.assert_allclose(some, np.concatenate([few[:10], many[10:]]), rtol=0, atol=1e-6)
+
+
 @pytest.mark.slow
 def test_both_forms_give_the_same_of_more_discs_than_a_word_has_bits():
     worlds = [gas(seed, 19) for seed in range(3)]

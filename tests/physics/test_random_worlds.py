@@ -70,7 +70,7 @@ MANY_BOUNDS: dict[str, Bounds] = {
     "discs": {RISING: None},
     "elastic discs": {},
     "discs, mass ratios up to 1e6": {RISING: 0.04, SLIPPING: 2e-5, OVERLAPPING: 0.42},
-    "all shapes": {RISING: 0.012, OVERLAPPING: None},
+    "all shapes": {RISING: 0.012},
     "elastic shapes": {},
     "mass ratios up to 1e6": {RISING: 0.015, SLIPPING: 1e-5, OVERLAPPING: 0.42},
     "smooth elastic boxes": {OVERLAPPING: 0.01},
