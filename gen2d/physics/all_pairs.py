@@ -26,7 +26,7 @@ from gen2d.physics.contact_log import (
 from gen2d.physics.contact_state import BodySide, PassSetup, RelaxedPair, SolvedPair, WarmStart
 from gen2d.physics.impact_order import TURNS, in_order, later_impact, not_hit, takes_part, with_first
 from gen2d.physics.params import SolverParams
-from gen2d.physics.relaxing import late_scenes
+from gen2d.physics.relaxing import late_scenes, unsolved_scenes
 from gen2d.physics.schedule import Match, run_schedule
 from gen2d.physics.solver_protocol import ContactSolver
 from gen2d.physics.support import is_crushed
@@ -237,13 +237,13 @@ class AllPairs(ContactSolver):
             late = functools.reduce(jnp.logical_or, [jnp.any(of, axis=0) for of in happened])
             of_both = (new, solved_again), (sides, pairs)
             state = jax.tree.map(lambda x, y: jnp.where(unsolved, x, y), *of_both)
-            return unsolved & (late | (number + 1 < params.fewest_late_passes)), *state
+            return unsolved_scenes(unsolved, late, number, params), *state
 
         def one_if_unsolved(state: tuple, number: Array) -> tuple[tuple, None]:
             return jax.lax.cond(jnp.any(state[0]), one, lambda _, *x: x, number, *state), None
 
         start = scenes, sides, solved.pairs
-        (_, sides, pairs), _ = jax.lax.scan(one_if_unsolved, start, jnp.arange(params.late_passes))
+        (_, sides, pairs), _ = jax.lax.scan(one_if_unsolved, start, 1 + jnp.arange(params.late_passes))
         return sides, pairs
 
     def end_frame(self, carry: AllPairsCarry) -> tuple[AllPairsCarry, PairEvent | None]:

@@ -10,6 +10,7 @@ from gen2d.physics.contact_passes import relax_late
 from gen2d.physics.contact_state import BodySide
 from gen2d.physics.packing import get_row, pack, put_row, unpack
 from gen2d.physics.pair_batches import CONSTANTS, BodyTables, PairBatches, SolvedChunk
+from gen2d.physics.relaxing import unsolved_scenes
 from gen2d.physics.scene_pairs import CHUNK, SceneChunk, SceneList, ScenePairs
 from gen2d.records.axes import Array, put_scenes, take_scenes
 from gen2d.xla import materialize
@@ -89,17 +90,20 @@ class LatePasses:
             for i, pairs in lists.items():
 
                 def chunk(k: Array, own: SceneChunk, carry: tuple, i: int = i) -> tuple:
-                    return self._solve_chunk(group, i, k, own, unsolved, *carry)
+                    rows, pairs, late = carry
+                    solves = (own.scene < self._solver.scenes) & unsolved[own.member]
+                    rows, pairs, happened = self._solve_chunk(group, i, k, own, solves, rows, pairs)
+                    return rows, pairs, late.at[own.member].max(happened & solves)
 
                 rows, buffers[i], late = pairs.run(chunk, (rows, buffers[i], late))
-            unsolved = unsolved & (late | (number + 1 < params.fewest_late_passes))
+            unsolved = unsolved_scenes(unsolved, late, number, params)
             return number + 1, unsolved, list(rows.values()), buffers
 
         def goes_on(state: tuple) -> Array:
             number, unsolved, *_ = state
-            return (number < params.late_passes) & jnp.any(unsolved)
+            return (number <= params.late_passes) & jnp.any(unsolved)
 
-        start = jnp.zeros((), jnp.int32), scenes < self._solver.scenes, bodies.rows, list(buffers)
+        start = jnp.ones((), jnp.int32), scenes < self._solver.scenes, bodies.rows, list(buffers)
         *_, rows, buffers = jax.lax.while_loop(goes_on, one, start)
         memories = list(memories)
         for i, pairs in lists.items():
@@ -134,22 +138,19 @@ class LatePasses:
         i: int,
         k: Array,
         own: SceneChunk,
-        unsolved: Array,
+        solves: Array,
         rows: dict[int, Array],
         pairs: Array,
-        late: Array,
     ) -> tuple[dict[int, Array], Array, Array]:
-        """Rows and pairs after a pass over a chunk in the unsolved scenes [G], and the scenes [G] with late impacts."""
+        """Rows and pairs after a pass over those pairs [C] of a chunk that `solves` says, and which bounce late."""
         solver, bodies = group.solver, group.bodies
         places = own.bodies(self._solver.scenes, solver.scenes)
         old_a, old_b = solver.sides_of(bodies, rows, i, *places)
         constraint, _, points, setup = self._contacts(i, k, group.contacts[i])
         old = self._pair(i, k, pairs)
         a, b, pair, happened = relax_late(constraint, points, old, old_a, old_b, setup, solver.params)
-        solves = (own.scene < self._solver.scenes) & unsolved[own.member]
         of_both = (a, b, pair), (old_a, old_b, old)
         a, b, pair = jax.tree.map(lambda x, y: jnp.where(solves, x, y), *of_both)
         values, _ = pack(pair, own.a.shape, pairs.dtype, once=True)
         rows = rows | solver.put_sides(bodies, rows, i, *places, a, b)
-        late = late.at[own.member].max(happened & solves)
-        return rows, put_row(pairs, k, materialize(jnp.stack(values))), late
+        return rows, put_row(pairs, k, materialize(jnp.stack(values))), happened

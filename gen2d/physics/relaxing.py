@@ -16,6 +16,7 @@ from gen2d.physics.constraint import ActiveContact, ContactConstraint, ContactPo
 from gen2d.physics.contact_points import displaced_gap, pull_along
 from gen2d.physics.contact_state import BodySide
 from gen2d.physics.normal_impulse import NormalTarget
+from gen2d.physics.params import SolverParams
 from gen2d.records.axes import Array
 
 
@@ -65,6 +66,11 @@ def late_scenes(sides: list[BodySide], scenes: tuple[int, ...]) -> Array:
     """Scenes [...] in which the passes look for late impacts: those that have any, or all if that is not known."""
     flags = [jnp.any(side.late, axis=0) for side in sides if side.late is not None]
     return functools.reduce(jnp.logical_or, flags) if flags else jnp.ones(scenes, bool)
+
+
+def unsolved_scenes(unsolved: Array, late: Array, number: Array, params: SolverParams) -> Array:
+    """Scenes that need another pass after this number of passes; `late` are those with late impacts in the last one."""
+    return unsolved & (late | (number < params.fewest_late_passes))
 
 
 def relaxed_target(
