@@ -58,23 +58,46 @@ from gen2d.xla import materialize
 
 def _supported_contacts(
     supported: SupportedPair | None, pair: SolvedPair, target_of: TargetOf, motions: MotionPair
-) -> tuple[SupportedContacts, list[Array], list[NormalTarget]]:
-    """Contacts with what supports leave of their bodies, their normal speeds, m/s, and targets."""
+) -> tuple[SupportedContacts, list[tuple[Array, Array]], list[NormalTarget]]:
+    """Contacts with what supports leave of their bodies, their normal and tangential speeds, m/s, and targets."""
     seen = SupportedContacts(None, pair.contacts, 0.0) if supported is None else supported.contacts(pair.contacts)
     left = seen.left(motions)
-    speeds = [relative_speed(contact.frame, contact.normal, *left)[0] for contact in seen.contacts]
-    return seen, speeds, [target_of(*of) for of in zip(seen.contacts, speeds, pair.impulses, strict=True)]
+    speeds = [relative_speed(contact.frame, contact.normal, *left) for contact in seen.contacts]
+    of_contacts = zip(seen.contacts, speeds, pair.impulses, strict=True)
+    return seen, speeds, [target_of(contact, speed, old) for contact, (speed, _), old in of_contacts]
 
 
 def _with_pushes(
-    supported: SupportedPair, pair: SolvedPair, normals: list[Array], a: BodySide, b: BodySide
+    constraint: ContactConstraint,
+    supported: SupportedPair,
+    pair: SolvedPair,
+    normals: list[Array],
+    speeds: list[tuple[Array, Array]],
+    a: BodySide,
+    b: BodySide,
 ) -> tuple[BodySide, BodySide]:
-    """Both sides with the push of these normal impulses, so that what bears the lighter body does not see an impact."""
-    assert a.push is not None, "both bodies move"
-    assert b.push is not None, "both bodies move"
+    """Both sides with the push of these normal impulses, so that what bears the lighter body does not see an impact,
+    and with what the contacts that bounce would add to its speed if nothing bore it.
+
+    `speeds` are normal and tangential, before the impulses.
+    """
     changes = [jnp.abs(normal - old.normal) for normal, old in zip(normals, pair.impulses, strict=True)]
-    of_a, of_b = supported.pushes(functools.reduce(jnp.add, changes))
-    return a._replace(push=jnp.maximum(a.push, of_a)), b._replace(push=jnp.maximum(b.push, of_b))
+    pushes = supported.pushes(functools.reduce(jnp.add, changes))
+    of_contacts = zip(pair.contacts, speeds, strict=True)
+    free = [
+        jnp.where(c.tau >= 0, jnp.abs(slip) - (1 + constraint.elasticity) * speed, 0.0)
+        for c, (speed, slip) in of_contacts
+    ]
+    fastest = functools.reduce(jnp.maximum, free)
+
+    def pushed(side: BodySide, push: Array, borne: Array) -> BodySide:
+        assert side.push is not None, "both bodies move"
+        assert side.free_change is not None, "both bodies move"
+        most = jnp.maximum(side.free_change, jnp.where(borne, fastest, 0.0))
+        return side._replace(push=jnp.maximum(side.push, push), free_change=most)
+
+    of_a, of_b = zip((a, b), pushes, supported.lighter, strict=True)
+    return pushed(*of_a), pushed(*of_b)
 
 
 def _apply_pass(
@@ -89,16 +112,17 @@ def _apply_pass(
     assert b.motion is not None, "only static bodies lack a motion"
     before, roll, impulses, jointed = (a.motion, b.motion), pair.roll, [], b.joint_motion is not None
     seen, speeds, targets = _supported_contacts(supported, pair, target_of, before)
-    normals = materialize(solve_normals(constraint, seen.contacts, speeds, pair.impulses, targets, seen.taken))
+    normal_speeds = [speed for speed, _ in speeds]
+    normals = materialize(solve_normals(constraint, seen.contacts, normal_speeds, pair.impulses, targets, seen.taken))
     if supported is not None:
-        a, b = _with_pushes(supported, pair, normals, a, b)
+        a, b = _with_pushes(constraint, supported, pair, normals, speeds, a, b)
     if constraint.frame is not None and roll is None and not jointed:
         # The normal impulse between two discs adds no slip, so both impulses follow from the same velocities.
         (contact,), (borne,), (old,), (normal,), (target,) = (
             pair.contacts, seen.contacts, pair.impulses, normals, targets,
         )  # fmt: skip
         speed, slip = relative_speed(contact.frame, contact.normal, *before)
-        _, seen_slip = relative_speed(borne.frame, borne.normal, *seen.left(before))
+        ((_, seen_slip),) = speeds
         tangent = materialize(friction_impulse(constraint, borne, normal, seen_slip, old, target.apart))
         impulses.append(Impulse(normal, tangent))
         change = impulse_change(impulses[0], old)

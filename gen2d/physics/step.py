@@ -37,16 +37,16 @@ import jax.numpy as jnp
 
 from gen2d.physics import limits_motors, rigid_joints, springs
 from gen2d.physics.collision import Disc, Shape
-from gen2d.physics.constraint import Motion, speed_bound
+from gen2d.physics.constraint import Inertia, Motion, speed_bound
 from gen2d.physics.contact_state import BodySide
-from gen2d.physics.energy import Ledger, Work, accumulate, record_energy, spring_work_over
+from gen2d.physics.energy import Ledger, Work, accumulate, kinetic_energy, record_energy, spring_work_over
 from gen2d.physics.impact_order import not_hit
 from gen2d.physics.jointed import hold, release
 from gen2d.physics.params import SolverParams
 from gen2d.physics.shapes import to_world
 from gen2d.physics.springs import poses_of, table_of
 from gen2d.physics.state import BodyState, Model, WorldState
-from gen2d.physics.support import no_obstacles, no_support
+from gen2d.physics.support import no_obstacles, no_support, share_of_change
 from gen2d.physics.tunnelling import clamp_displacement
 from gen2d.records.axes import Array, take_scenes
 from gen2d.records.parameter import apply
@@ -249,12 +249,31 @@ def _first_pass_side(
         drift=drift,
         resting=None if disc else change,
         push=speed_bound(change.velocity) if disc else jnp.zeros_like(change.spin),
+        free_change=jnp.zeros_like(change.spin),
         work=side.work,
         support=side.support,
         obstacles=no_obstacles(side.support) if params.extreme_mass_ratios and side.support is not None else None,
         first=side.first,
         clock=jnp.zeros_like(change.spin) if params.by_time else None,
     )
+
+
+def _with_bounded_energy(old: BodySide, new: BodySide, inverse: Inertia) -> BodySide:
+    """The new side of the first pass, in which no borne body has an energy that the heavier one has not lost."""
+    assert old.motion is not None, "only moving bodies change"
+    assert new.motion is not None, "only moving bodies change"
+    assert new.free_change is not None, "the first pass knows it"
+    share = share_of_change(inverse, old.motion, new.motion, new.free_change)
+
+    def bounded(x: Array, y: Array) -> Array:
+        return jnp.where(share < 1, x + share * (y - x), y)
+
+    motion, drift = (jax.tree.map(bounded, *of) for of in ((old.motion, new.motion), (old.drift, new.drift)))
+    work = new.work
+    if work is not None:
+        lost = kinetic_energy(inverse, new.motion) - kinetic_energy(inverse, motion)
+        work = work._replace(lost=work.lost + jnp.where(share < 1, lost, 0.0))
+    return new._replace(motion=motion, drift=drift, work=work)
 
 
 def _clamp_late(
@@ -320,7 +339,9 @@ def step(world: WorldState, model: Model, params: SolverParams) -> WorldState:
     of_groups = zip(sides, motions, drifts, jax.lax.stop_gradient(changes), pulling.accelerations, strict=True)
     sides = [_first_pass_side(*of, params) for of in of_groups]
     statics = [BodySide(motion=side.motion) for side in statics]
-    sides, solved = solver.solve(carry, contacts, rigid.hold(sides), statics)
+    sides = rigid.hold(sides)
+    held, (sides, solved) = sides, solver.solve(carry, contacts, sides, statics)
+    sides = [_with_bounded_energy(*of, group.inverse) for *of, group in zip(held, sides, groups, strict=True)]
     motions, drifts = rigid.meet(sides, forced_drifts)
 
     displacements = [jax.tree.map(lambda x, y: h * x + y, *of) for of in zip(motions, drifts, strict=True)]

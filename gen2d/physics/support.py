@@ -14,6 +14,10 @@ contact of a pair that overlaps by more than `CRUSHED` sees the lighter one with
 approaches static bodies and far heavier ones in this step, its obstacles. What the lighter one would do in these
 directions is lost, and the obstacles do not feel it: passed on, it would throw the lighter one where it misses them.
 
+What bears a body need not take up all that a heavy one gives it, as where it slips out of a wedge: it would leave with
+an energy that the heavy one has not lost. So sqrt(2 E / m) of a body that bounces so grows in the first pass by no
+more than in an impact that nothing bears: by 1 + e times the approach speed, and by the speed of sliding.
+
 Source: E. Guendelman, R. Bridson and R. Fedkiw, 'Nonconvex rigid bodies with stacking' (2003), give supported bodies an
 infinite mass.
 """
@@ -37,6 +41,7 @@ from gen2d.physics.constraint import (
     Motion,
     reciprocal,
 )
+from gen2d.physics.energy import kinetic_energy
 from gen2d.records.axes import Array
 from gen2d.xla import materialize
 
@@ -353,3 +358,17 @@ def _stopped(crushed: Array, support: Support, stop: Obstacles) -> Support:
     """Support with the obstacles in its place where the pair is crushed."""
     line = Support(stop.load, stop.torque, jnp.full_like(support.kind, LINE))
     return jax.tree.map(lambda x, y: jnp.where(crushed, x, y), line, support)
+
+
+def share_of_change(inverse: Inertia, old: Motion, new: Motion, speed: Array) -> Array:
+    """Share of a change of motion after which sqrt(2 E / m) has grown by at most this speed, m/s; 1 where that is 0."""
+    first, last = kinetic_energy(inverse, old), kinetic_energy(inverse, new)
+    root, added = jnp.sqrt(jnp.where(first > 0, first, 1.0)) * (first > 0), last - first
+    grown = speed * jnp.sqrt(0.5 * reciprocal(inverse.mass, inverse.mass > 0))  # of the root of the energy
+    most = grown * (2 * root + grown)
+    excess = (speed > 0) & (added > most)
+    # A share s of the change adds s linear + s^2 square.
+    square = jnp.where(excess, kinetic_energy(inverse, jax.tree.map(jnp.subtract, new, old)), 1.0)
+    linear = added - square
+    roots = jnp.sqrt(jnp.where(excess, linear**2 + 4 * square * most, 1.0))
+    return jnp.where(excess, 0.5 * (roots - linear) / square, 1.0)

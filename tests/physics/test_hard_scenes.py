@@ -5,6 +5,7 @@ Each asks for what an exact solver would give; what gen2d owes is marked `asked`
 
 import math
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -12,7 +13,9 @@ from laws import deepest_overlap, holds, total_energy
 from worlds import rules, run, world
 
 from gen2d.physics.constraint import ContactConstraint, ContactFrame, ContactPoint, Inertia, Motion
-from gen2d.physics.support import Support, supported_pair
+from gen2d.physics.energy import kinetic_energy
+from gen2d.physics.simulate import SaveAt
+from gen2d.physics.support import Support, share_of_change, supported_pair
 from gen2d.space.space import Space
 
 GRAVITY = 9.81  # m/s^2
@@ -212,6 +215,43 @@ def test_a_heavy_disc_does_not_go_through_a_light_one_that_bounces_between_it_an
     holds(
         "crushed light disc: energy gained in a step, relative", np.diff(energy.sum(-1)).max() / energy[0].sum(), 1e-5
     )
+
+
+@pytest.mark.parametrize("sparse", [True, pytest.param(False, marks=pytest.mark.full)])
+def test_a_light_disc_that_a_heavy_one_drives_out_of_a_wedge_is_no_faster_than_one_that_nothing_bears(sparse):
+    """It lies on a wall and the end of a segment, which let it through when the heavy one strikes."""
+    walls = [{"a": (-5, -6), "b": (-5, 6), "elasticity": 1}, {"a": (-4.275, -2.92), "b": (-2.33, -3.1)}]
+    light = {"x": (-4.62, -2.776), "radius": 0.377, "elasticity": 0.2, "friction": 0.6}
+    heavy = {"x": (-4.174, -1.103), "v": (-2.3, -8.88), "radius": 0.517, "mass": 12.0, "friction": 1.0}
+    worlds = [world([light | {"mass": mass}, heavy], walls, (0, -GRAVITY)) for mass in (0.05, 0.2, 0.74, 2.0)]
+    of = run(worlds, 40, 1, rules(relax_iterations=1), SaveAt(energy=True), sparse=sparse)
+    speed, energy = 9.17, 6 * 9.17**2  # of the heavy one before
+    name, gain = "light disc driven out of a wedge:", np.diff(total_energy(of)).max()
+    holds(f"{name} energy gained in a step, relative", gain / energy, 1e-4)
+    holds(f"{name} residual of the energy, relative", of.energy.residual / energy, 1e-4)
+    x, v = (np.asarray(of_both)[:, :, 0] for of_both in (of.states.position, of.states.velocity))
+    holds(f"{name} speed, over that of the heavy one before", np.linalg.norm(v, axis=-1) / speed, 1.5)
+    holds(f"{name} way in a step, in the same unit", 240 * np.linalg.norm(np.diff(x, axis=1), axis=-1) / speed, 1.5)
+
+
+@pytest.mark.parametrize("disc", [True, False])
+def test_the_share_of_a_change_bounds_the_energy(disc):
+    rng = np.random.default_rng(0)
+    old, new = (Motion(jnp.asarray(rng.normal(0, s, (2, 500))), jnp.asarray(rng.normal(0, s, 500))) for s in (1, 3))
+    inverse = Inertia(*(jnp.asarray(rng.uniform(0.1, 9, 500)) for _ in range(2)))
+    speed = jnp.asarray(np.where(np.arange(500) % 5, rng.uniform(0, 2, 500), 0.0))
+    if disc:
+        old = jax.tree.map(jnp.zeros_like, old)
+    turned = Motion(jnp.flip(old.velocity, 0), old.spin)  # as much energy, but for rounding
+    assert jnp.isfinite(share_of_change(inverse, old, turned, 1e-12 * speed)).all()
+    share = np.asarray(share_of_change(inverse, old, new, speed))
+    scaled = jax.tree.map(lambda x, y: x + share * (y - x), old, new)
+    first, last, least = (np.sqrt(2 * inverse.mass * kinetic_energy(inverse, of)) for of in (old, new, scaled))
+    grown = last - first, least - first
+    excess = (grown[0] > speed) & (speed > 0)
+    assert 50 < excess.sum() < 450
+    np.testing.assert_allclose(grown[1][excess], speed[excess], rtol=1e-3, atol=1e-4)
+    assert (share[~excess] == 1).all()
 
 
 @pytest.mark.parametrize("torque", [None, 0.0, 0.3])
