@@ -234,6 +234,21 @@ def test_a_light_disc_that_a_heavy_one_drives_out_of_a_wedge_is_no_faster_than_o
     holds(f"{name} way in a step, in the same unit", 240 * np.linalg.norm(np.diff(x, axis=1), axis=-1) / speed, 1.5)
 
 
+@pytest.mark.full
+@pytest.mark.parametrize("speed", [3.0, 30.0])
+def test_a_ball_that_strikes_a_loaded_disc_gives_it_all_of_its_speed(speed):
+    """A heavy disc rests on it, as well balanced as its start; all are smooth and elastic."""
+    space, smooth = Space(gravity=(0, -GRAVITY)), {"elasticity": 1.0, "friction": 0.0}
+    space.add_segment((-30, 0), (30, 0), **smooth)
+    ball = space.add_circle((-1 - 0.1 * speed, 0.5), 0.5, velocity=(speed, 0.0), **smooth)
+    loaded = space.add_circle((0, 0.5), 0.5, **smooth)
+    space.add_circle((0, 1.5), 0.5, density=100, **smooth)
+    v = space.simulate(0.15, fps=240, contacts=0).velocity
+    holds("loaded disc: speed before a ball strikes it, m/s", v[:22, loaded], 1e-6)
+    holds("ball that strikes a loaded disc: speed that it keeps, relative", v[26:, ball, 0] / speed, 1e-3)
+    holds("ball that strikes a loaded disc: speed of the disc, relative", v[26, loaded, 0] / speed - 1, 1e-2)
+
+
 @pytest.mark.parametrize("disc", [True, False])
 def test_the_share_of_a_change_bounds_the_energy(disc):
     rng = np.random.default_rng(0)
