@@ -51,7 +51,7 @@ from gen2d.physics.relaxing import (
     relaxed_target,
     touching_impact,
 )
-from gen2d.physics.support import SupportedContacts, SupportedPair, add_obstacles, add_support, supported_pair
+from gen2d.physics.support import Blow, SupportedContacts, SupportedPair, add_obstacles, add_support, supported_pair
 from gen2d.records.axes import Array
 from gen2d.xla import materialize
 
@@ -77,24 +77,19 @@ def _with_pushes(
     b: BodySide,
 ) -> tuple[BodySide, BodySide]:
     """Both sides with the push of these normal impulses, so that what bears the lighter body does not see an impact,
-    and with what the contacts that bounce would add to its speed if nothing bore it.
+    and with the blow, which that need not take up.
 
     `speeds` are normal and tangential, before the impulses.
     """
     changes = [jnp.abs(normal - old.normal) for normal, old in zip(normals, pair.impulses, strict=True)]
     pushes = supported.pushes(functools.reduce(jnp.add, changes))
-    of_contacts = zip(pair.contacts, speeds, strict=True)
-    free = [
-        jnp.where(c.tau >= 0, jnp.abs(slip) - (1 + constraint.elasticity) * speed, 0.0)
-        for c, (speed, slip) in of_contacts
-    ]
-    fastest = functools.reduce(jnp.maximum, free)
+    blow = supported.blow(pair.contacts, changes, speeds, constraint.elasticity)
 
     def pushed(side: BodySide, push: Array, borne: Array) -> BodySide:
         assert side.push is not None, "both bodies move"
-        assert side.free_change is not None, "both bodies move"
-        most = jnp.maximum(side.free_change, jnp.where(borne, fastest, 0.0))
-        return side._replace(push=jnp.maximum(side.push, push), free_change=most)
+        assert side.blow is not None, "both bodies move"
+        of_body = Blow(*(jnp.where(borne, x, 0.0) for x in blow))
+        return side._replace(push=jnp.maximum(side.push, push), blow=side.blow.add(of_body))
 
     of_a, of_b = zip((a, b), pushes, supported.lighter, strict=True)
     return pushed(*of_a), pushed(*of_b)

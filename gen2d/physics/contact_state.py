@@ -5,7 +5,7 @@ from typing import NamedTuple
 from gen2d.physics.collision import Shape
 from gen2d.physics.constraint import ActiveContact, Impulse, Motion
 from gen2d.physics.energy import Work
-from gen2d.physics.support import Obstacles, Support
+from gen2d.physics.support import Blow, Obstacles, Support
 from gen2d.records.axes import Array
 
 
@@ -28,7 +28,7 @@ class BodySide(NamedTuple):
     displacement: Motion | None = None  # m, rad: where the impulses of a pass act; None: of static bodies
     resting: Motion | None = None  # m/s, rad/s: what contacts at rest have added in the step; None: discs, static
     push: Array | None = None  # [N, ...] m/s: bound on what warm starting added to a disc, or heavier bodies to any
-    free_change: Array | None = None  # [N, ...] m/s: of a borne body's speed in a bounce if nothing bore it; 0: none
+    blow: Blow | None = None  # by heavier bodies in the first pass; None: static bodies, and in other passes
     work: Work | None = None
     schur: Array | None = None  # [6, N, ...] what rigid joints take from the inverse mass (jointed.py)
     joint_motion: Motion | None = None  # m/s, rad/s: what they take from the motion in a pass

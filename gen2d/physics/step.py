@@ -46,7 +46,7 @@ from gen2d.physics.params import SolverParams
 from gen2d.physics.shapes import to_world
 from gen2d.physics.springs import poses_of, table_of
 from gen2d.physics.state import BodyState, Model, WorldState
-from gen2d.physics.support import no_obstacles, no_support, share_of_change
+from gen2d.physics.support import Blow, no_obstacles, no_support
 from gen2d.physics.tunnelling import clamp_displacement
 from gen2d.records.axes import Array, take_scenes
 from gen2d.records.parameter import apply
@@ -249,7 +249,7 @@ def _first_pass_side(
         drift=drift,
         resting=None if disc else change,
         push=speed_bound(change.velocity) if disc else jnp.zeros_like(change.spin),
-        free_change=jnp.zeros_like(change.spin),
+        blow=Blow(jnp.zeros_like(change.spin), jnp.zeros_like(change.spin)),
         work=side.work,
         support=side.support,
         obstacles=no_obstacles(side.support) if params.extreme_mass_ratios and side.support is not None else None,
@@ -262,8 +262,8 @@ def _with_bounded_energy(old: BodySide, new: BodySide, inverse: Inertia) -> Body
     """The new side of the first pass, in which no borne body has an energy that the heavier one has not lost."""
     assert old.motion is not None, "only moving bodies change"
     assert new.motion is not None, "only moving bodies change"
-    assert new.free_change is not None, "the first pass knows it"
-    share = share_of_change(inverse, old.motion, new.motion, new.free_change)
+    assert new.blow is not None, "the first pass knows it"
+    share = new.blow.share(inverse, old.motion, new.motion)
 
     def bounded(x: Array, y: Array) -> Array:
         return jnp.where(share < 1, x + share * (y - x), y)

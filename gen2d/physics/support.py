@@ -15,8 +15,9 @@ approaches static bodies and far heavier ones in this step, its obstacles. What 
 directions is lost, and the obstacles do not feel it: passed on, it would throw the lighter one where it misses them.
 
 What bears a body need not take up all that a heavy one gives it, as where it slips out of a wedge: it would leave with
-an energy that the heavy one has not lost. So sqrt(2 E / m) of a body that bounces so grows in the first pass by no
-more than in an impact that nothing bears: by 1 + e times the approach speed, and by the speed of sliding.
+an energy that the heavy one has not lost. So the first pass leaves out, of the growth of sqrt(2 E / m) of a borne body,
+the part by such blows that exceeds that by an impact that nothing bears: 1 + e times the approach speed, and the speed
+of sliding.
 
 Source: E. Guendelman, R. Bridson and R. Fedkiw, 'Nonconvex rigid bodies with stacking' (2003), give supported bodies an
 infinite mass.
@@ -54,6 +55,7 @@ PRESSED = 0.5  # least cosine of the angle between a contact's normal and the lo
 LARGEST_SPEED = 9.0  # of a point of a uniform triangle after an impulse at a corner, over that of its centre
 LEAST_LEFT = 1e-4  # share of a contact's compliance that a support leaves at least, as the rest would be rounding
 LEAST_COMPLIANCE = 1e-30  # (N s)^2 / kg, of a load that bears anything: a lesser one has no finite reciprocal
+LEAST_SQUARE = 1e-30  # kg^-2: the root of zero, of absent bodies, has no derivative
 CRUSHED = 0.005  # m: least overlap of a pair whose lighter body has obstacles; bodies at rest overlap by far less
 SEVERAL = 0.98  # of the obstacles' impulses: length of their sum over the sum of their lengths, if they act in one line
 
@@ -136,6 +138,37 @@ def add_obstacles(
             lever = None if point.frame.normal_a is None else -point.frame.normal_a
             a = a.add(-point.normal, lever, jnp.where(lighter_a, sign * point.stop, 0.0))
     return a, b
+
+
+class Blow(NamedTuple):
+    """What heavier bodies do in a step to a body that static ones bear, m/s of sqrt(2 E / m)."""
+
+    given: Array  # [N, ...] by their impulses, which what bears it need not take up
+    free: Array  # [N, ...] the most that impulses would give it if nothing bore it
+
+    def add(self, other: "Blow") -> "Blow":
+        """The blow with that of another body."""
+        return Blow(self.given + other.given, jnp.maximum(self.free, other.free))
+
+    def share(self, inverse: Inertia, old: Motion, new: Motion) -> Array:
+        """Share of a change of motion, by the blow and others, that does not come from impulses too large.
+
+        Of the growth of sqrt(2 E / m), `given` is left out as far as it exceeds `free`.
+        """
+
+        def square(motion: Motion) -> Array:
+            return 2 * inverse.mass * kinetic_energy(inverse, motion)
+
+        first, last = square(old), square(new)
+        root, end = (jnp.sqrt(jnp.where(x > 0, x, 1.0)) * (x > 0) for x in (first, last))
+        grown = jnp.maximum(end - root - self.given, self.free)
+        most, added = grown * (2 * root + grown), last - first
+        excess = (self.given > 0) & (added > most)
+        # A share s of the change adds s a + s^2 b to the square.
+        b = jnp.where(excess, square(jax.tree.map(jnp.subtract, new, old)), 1.0)
+        a = added - b
+        roots = jnp.sqrt(jnp.where(excess, a**2 + 4 * b * most, 1.0))
+        return jnp.where(excess, 0.5 * (roots - a) / b, 1.0)
 
 
 class CrushedPair(NamedTuple):
@@ -256,6 +289,21 @@ class SupportedPair(NamedTuple):
             crush=crush,
         )
 
+    def blow(
+        self,
+        contacts: list[ActiveContact],
+        impulses: list[Array],
+        speeds: list[tuple[Array, Array]],
+        elasticity: Array,
+    ) -> Blow:
+        """Blow on the lighter body by normal impulses, N s, at these normal and tangential speeds, m/s."""
+        given = [
+            impulse * jnp.sqrt(jnp.maximum(self.mass * contact.frame.k_normal, LEAST_SQUARE))
+            for contact, impulse in zip(contacts, impulses, strict=True)
+        ]
+        free = [jnp.abs(slip) + (1 + elasticity) * jnp.maximum(-speed, 0.0) for speed, slip in speeds]
+        return Blow(functools.reduce(jnp.add, given), functools.reduce(jnp.maximum, free))
+
     def pushes(self, impulse: Array) -> tuple[Array, Array]:
         """Bounds on the speeds, m/s, of all points of each body, if borne, after normal impulses of this sum, N s."""
         of_a, of_b = (jnp.where(borne, LARGEST_SPEED * self.mass * impulse, 0.0) for borne in self.lighter)
@@ -358,17 +406,3 @@ def _stopped(crushed: Array, support: Support, stop: Obstacles) -> Support:
     """Support with the obstacles in its place where the pair is crushed."""
     line = Support(stop.load, stop.torque, jnp.full_like(support.kind, LINE))
     return jax.tree.map(lambda x, y: jnp.where(crushed, x, y), line, support)
-
-
-def share_of_change(inverse: Inertia, old: Motion, new: Motion, speed: Array) -> Array:
-    """Share of a change of motion after which sqrt(2 E / m) has grown by at most this speed, m/s; 1 where that is 0."""
-    first, last = kinetic_energy(inverse, old), kinetic_energy(inverse, new)
-    root, added = jnp.sqrt(jnp.where(first > 0, first, 1.0)) * (first > 0), last - first
-    grown = speed * jnp.sqrt(0.5 * reciprocal(inverse.mass, inverse.mass > 0))  # of the root of the energy
-    most = grown * (2 * root + grown)
-    excess = (speed > 0) & (added > most)
-    # A share s of the change adds s linear + s^2 square.
-    square = jnp.where(excess, kinetic_energy(inverse, jax.tree.map(jnp.subtract, new, old)), 1.0)
-    linear = added - square
-    roots = jnp.sqrt(jnp.where(excess, linear**2 + 4 * square * most, 1.0))
-    return jnp.where(excess, 0.5 * (roots - linear) / square, 1.0)
