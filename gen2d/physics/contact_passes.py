@@ -83,7 +83,7 @@ def _with_pushes(
     """
     changes = [jnp.abs(normal - old.normal) for normal, old in zip(normals, pair.impulses, strict=True)]
     pushes = supported.pushes(functools.reduce(jnp.add, changes))
-    blow = supported.blow(pair.contacts, changes, speeds, constraint.elasticity)
+    blow = supported.blow(pair.contacts, changes, speeds, constraint)
 
     def pushed(side: BodySide, push: Array, borne: Array) -> BodySide:
         assert side.push is not None, "both bodies move"

@@ -16,8 +16,8 @@ directions is lost, and the obstacles do not feel it: passed on, it would throw 
 
 What bears a body need not take up all that a heavy one gives it, as where it slips out of a wedge: it would leave with
 an energy that the heavy one has not lost. So the first pass leaves out, of the growth of sqrt(2 E / m) of a borne body,
-the part by such blows that exceeds that by an impact that nothing bears: 1 + e times the approach speed, and the speed
-of sliding.
+the part by such blows that exceeds that by an impact that nothing bears: u = 1 + e times the approach speed, and by
+friction 2 mu u (3^(1/2) mu u of a disc), but at most the speed of sliding.
 
 Source: E. Guendelman, R. Bridson and R. Fedkiw, 'Nonconvex rigid bodies with stacking' (2003), give supported bodies an
 infinite mass.
@@ -294,14 +294,17 @@ class SupportedPair(NamedTuple):
         contacts: list[ActiveContact],
         impulses: list[Array],
         speeds: list[tuple[Array, Array]],
-        elasticity: Array,
+        constraint: ContactConstraint,
     ) -> Blow:
         """Blow on the lighter body by normal impulses, N s, at these normal and tangential speeds, m/s."""
+        e, friction = constraint.elasticity, constraint.friction
         given = [
             impulse * jnp.sqrt(jnp.maximum(self.mass * contact.frame.k_normal, LEAST_SQUARE))
             for contact, impulse in zip(contacts, impulses, strict=True)
         ]
-        free = [jnp.abs(slip) + (1 + elasticity) * jnp.maximum(-speed, 0.0) for speed, slip in speeds]
+        normal = [(1 + e) * jnp.maximum(-speed, 0.0) for speed, _ in speeds]
+        sliding = [jnp.minimum(2 * friction * x, jnp.abs(slip)) for x, (_, slip) in zip(normal, speeds, strict=True)]
+        free = [x + y for x, y in zip(normal, sliding, strict=True)]
         return Blow(functools.reduce(jnp.add, given), functools.reduce(jnp.maximum, free))
 
     def pushes(self, impulse: Array) -> tuple[Array, Array]:
