@@ -305,7 +305,10 @@ class SupportedPair(NamedTuple):
         normal = [(1 + e) * jnp.maximum(-speed, 0.0) for speed, _ in speeds]
         sliding = [jnp.minimum(2 * friction * x, jnp.abs(slip)) for x, (_, slip) in zip(normal, speeds, strict=True)]
         free = [x + y for x, y in zip(normal, sliding, strict=True)]
-        return Blow(functools.reduce(jnp.add, given), functools.reduce(jnp.maximum, free))
+        total = functools.reduce(jnp.add, given)
+        if self.crush is not None:  # obstacles take up the rest
+            total = jnp.where(self.crush.crushed, 0.0, total)
+        return Blow(total, functools.reduce(jnp.maximum, free))
 
     def pushes(self, impulse: Array) -> tuple[Array, Array]:
         """Bounds on the speeds, m/s, of all points of each body, if borne, after normal impulses of this sum, N s."""
