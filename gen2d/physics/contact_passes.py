@@ -30,7 +30,7 @@ from gen2d.physics.contact_points import (
     position_of,
 )
 from gen2d.physics.contact_state import BodySide, PassSetup, RelaxedPair, SolvedPair, WarmStart
-from gen2d.physics.energy import MotionPair, Work, add_disc_dissipation, add_dissipation, kinetic_energy
+from gen2d.physics.energy import MotionPair, Work, add_disc_dissipation, add_dissipation, add_loss
 from gen2d.physics.friction import apply_angular_impulse, friction_impulse, rolling_impulse
 from gen2d.physics.impact_order import after_impact, in_order, takes_part, with_first
 from gen2d.physics.jointed import free_motion, jointed_frame, with_joints, with_motions
@@ -83,15 +83,14 @@ def _with_pushes(
     """
     changes = [jnp.abs(normal - old.normal) for normal, old in zip(normals, pair.impulses, strict=True)]
     pushes = supported.pushes(functools.reduce(jnp.add, changes))
-    blow = supported.blow(pair.contacts, changes, speeds, constraint)
+    blows = supported.blows(pair.contacts, changes, speeds, constraint)
 
-    def pushed(side: BodySide, push: Array, borne: Array) -> BodySide:
+    def pushed(side: BodySide, push: Array, blow: Blow) -> BodySide:
         assert side.push is not None, "both bodies move"
         assert side.blow is not None, "both bodies move"
-        of_body = Blow(*(jnp.where(borne, x, 0.0) for x in blow))
-        return side._replace(push=jnp.maximum(side.push, push), blow=side.blow.add(of_body))
+        return side._replace(push=jnp.maximum(side.push, push), blow=side.blow.add(blow))
 
-    of_a, of_b = zip((a, b), pushes, supported.lighter, strict=True)
+    of_a, of_b = zip((a, b), pushes, blows, strict=True)
     return pushed(*of_a), pushed(*of_b)
 
 
@@ -156,11 +155,9 @@ def _without_what_obstacles_take(
 ) -> tuple[MotionPair, Work | None]:
     """Motions that obstacles leave of a crushed body, and the work with its lost energy."""
     kept = seen.kept(motions)
-    if work is None:
-        return kept, None
     for inertia, old, new in zip((constraint.a, constraint.b), motions, kept, strict=True):
         assert inertia is not None, "both bodies move"
-        work = work._replace(lost=work.lost + kinetic_energy(inertia, old) - kinetic_energy(inertia, new))
+        work = add_loss(work, inertia, old, new)
     return kept, work
 
 

@@ -50,6 +50,16 @@ def kinetic_energy(inverse: Inertia, motion: Motion | None) -> Array:
     return 0.5 * (mass * dot(velocity, velocity) + moment * spin**2)
 
 
+def add_loss(
+    work: Work | None, inverse: Inertia, old: Motion | None, new: Motion | None, changed: Array | bool = True
+) -> Work | None:
+    """Work with the kinetic energy that is lost where the new motion of bodies takes the place of the old one."""
+    if work is None:
+        return None
+    lost = kinetic_energy(inverse, old) - kinetic_energy(inverse, new)
+    return work._replace(lost=work.lost + jnp.where(changed, lost, 0.0))  # without rounding errors elsewhere
+
+
 def add_disc_dissipation(
     work: Work | None, frame: ContactFrame, impulse: Impulse, speed: Array, slip: Array
 ) -> Work | None:

@@ -39,7 +39,7 @@ from gen2d.physics import limits_motors, rigid_joints, springs
 from gen2d.physics.collision import Disc, Shape
 from gen2d.physics.constraint import Inertia, Motion, speed_bound
 from gen2d.physics.contact_state import BodySide
-from gen2d.physics.energy import Ledger, Work, accumulate, kinetic_energy, record_energy, spring_work_over
+from gen2d.physics.energy import Ledger, Work, accumulate, add_loss, record_energy, spring_work_over
 from gen2d.physics.impact_order import not_hit
 from gen2d.physics.jointed import hold, release
 from gen2d.physics.params import SolverParams
@@ -259,7 +259,7 @@ def _first_pass_side(
 
 
 def _with_bounded_energy(old: BodySide, new: BodySide, inverse: Inertia) -> BodySide:
-    """The new side of the first pass, in which no borne body has an energy that the heavier one has not lost."""
+    """The new side of the first pass, in which blows give borne bodies no more energy than others (support.py)."""
     assert old.motion is not None, "only moving bodies change"
     assert new.motion is not None, "only moving bodies change"
     assert new.blow is not None, "the first pass knows it"
@@ -269,10 +269,7 @@ def _with_bounded_energy(old: BodySide, new: BodySide, inverse: Inertia) -> Body
         return jnp.where(share < 1, x + share * (y - x), y)
 
     motion, drift = (jax.tree.map(bounded, *of) for of in ((old.motion, new.motion), (old.drift, new.drift)))
-    work = new.work
-    if work is not None:
-        lost = kinetic_energy(inverse, new.motion) - kinetic_energy(inverse, motion)
-        work = work._replace(lost=work.lost + jnp.where(share < 1, lost, 0.0))
+    work = add_loss(new.work, inverse, new.motion, motion, share < 1)
     return new._replace(motion=motion, drift=drift, work=work)
 
 
@@ -337,10 +334,9 @@ def step(world: WorldState, model: Model, params: SolverParams) -> WorldState:
     motions, forced_drifts = pulling.pull(motions, drifts, free_drifts, accelerations)
     motions = rigid.limit(motions, _sums(drifts, forced_drifts))
     of_groups = zip(sides, motions, drifts, jax.lax.stop_gradient(changes), pulling.accelerations, strict=True)
-    sides = [_first_pass_side(*of, params) for of in of_groups]
+    held = rigid.hold([_first_pass_side(*of, params) for of in of_groups])
     statics = [BodySide(motion=side.motion) for side in statics]
-    sides = rigid.hold(sides)
-    held, (sides, solved) = sides, solver.solve(carry, contacts, sides, statics)
+    sides, solved = solver.solve(carry, contacts, held, statics)
     sides = [_with_bounded_energy(*of, group.inverse) for *of, group in zip(held, sides, groups, strict=True)]
     motions, drifts = rigid.meet(sides, forced_drifts)
 

@@ -289,14 +289,14 @@ class SupportedPair(NamedTuple):
             crush=crush,
         )
 
-    def blow(
+    def blows(
         self,
         contacts: list[ActiveContact],
         impulses: list[Array],
         speeds: list[tuple[Array, Array]],
         constraint: ContactConstraint,
-    ) -> Blow:
-        """Blow on the lighter body by normal impulses, N s, at these normal and tangential speeds, m/s."""
+    ) -> tuple[Blow, Blow]:
+        """Blows on both bodies, if borne, by normal impulses, N s, at these normal and tangential speeds, m/s."""
         e, friction = constraint.elasticity, constraint.friction
         given = [
             impulse * jnp.sqrt(jnp.maximum(self.mass * contact.frame.k_normal, LEAST_SQUARE))
@@ -308,7 +308,9 @@ class SupportedPair(NamedTuple):
         total = functools.reduce(jnp.add, given)
         if self.crush is not None:  # obstacles take up the rest
             total = jnp.where(self.crush.crushed, 0.0, total)
-        return Blow(total, functools.reduce(jnp.maximum, free))
+        blow = total, functools.reduce(jnp.maximum, free)
+        of_a, of_b = (Blow(*(jnp.where(borne, x, 0.0) for x in blow)) for borne in self.lighter)
+        return of_a, of_b
 
     def pushes(self, impulse: Array) -> tuple[Array, Array]:
         """Bounds on the speeds, m/s, of all points of each body, if borne, after normal impulses of this sum, N s."""
