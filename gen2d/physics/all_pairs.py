@@ -192,7 +192,7 @@ class AllPairs(ContactSolver):
 
         new, relaxed = run_schedule(sides, statics, self.order, play)
         ended = self._relaxed(carry, solved.pairs, relaxed, time)
-        if self.params.late_passes:
+        if self.params.late_passes and self.constraints:
             scenes = late_scenes(new, self.setup.threshold.shape)
 
             def again(*others: Any) -> tuple:

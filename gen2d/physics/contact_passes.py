@@ -30,7 +30,7 @@ from gen2d.physics.contact_points import (
     position_of,
 )
 from gen2d.physics.contact_state import BodySide, PassSetup, RelaxedPair, SolvedPair, WarmStart
-from gen2d.physics.energy import MotionPair, Work, add_disc_dissipation, add_dissipation, add_loss
+from gen2d.physics.energy import MotionPair, add_disc_dissipation, add_dissipation, add_loss
 from gen2d.physics.friction import apply_angular_impulse, friction_impulse, rolling_impulse
 from gen2d.physics.impact_order import after_impact, in_order, takes_part, with_first
 from gen2d.physics.jointed import free_motion, jointed_frame, with_joints, with_motions
@@ -51,7 +51,7 @@ from gen2d.physics.relaxing import (
     relaxed_target,
     touching_impact,
 )
-from gen2d.physics.support import Blow, SupportedContacts, SupportedPair, add_obstacles, add_support, supported_pair
+from gen2d.physics.support import SupportedContacts, SupportedPair, add_obstacles, add_support, supported_pair
 from gen2d.records.axes import Array
 from gen2d.xla import materialize
 
@@ -67,31 +67,30 @@ def _supported_contacts(
     return seen, speeds, [target_of(contact, speed, old) for contact, (speed, _), old in of_contacts]
 
 
-def _with_pushes(
+def _solve_pending(
     constraint: ContactConstraint,
-    supported: SupportedPair,
     pair: SolvedPair,
     normals: list[Array],
-    speeds: list[tuple[Array, Array]],
     a: BodySide,
     b: BodySide,
-) -> tuple[BodySide, BodySide]:
-    """Both sides with the push of these normal impulses, so that what bears the lighter body does not see an impact,
-    and with the blow, which that need not take up.
+) -> tuple[BodySide, list[Array]]:
+    """The side b, and the normal impulses, N s, with those by which a static body takes up its pending motion.
 
-    `speeds` are normal and tangential, before the impulses.
+    The motion itself gets only the given ones.
     """
-    changes = [jnp.abs(normal - old.normal) for normal, old in zip(normals, pair.impulses, strict=True)]
-    pushes = supported.pushes(functools.reduce(jnp.add, changes))
-    blows = supported.blows(pair.contacts, changes, speeds, constraint)
-
-    def pushed(side: BodySide, push: Array, blow: Blow) -> BodySide:
-        assert side.push is not None, "both bodies move"
-        assert side.blow is not None, "both bodies move"
-        return side._replace(push=jnp.maximum(side.push, push), blow=side.blow.add(blow))
-
-    of_a, of_b = zip((a, b), pushes, blows, strict=True)
-    return pushed(*of_a), pushed(*of_b)
+    if b.pending is None or constraint.a is not None or a.motion is not None:
+        return b, normals
+    pending, rows, none = b.pending, [], jnp.zeros_like(normals[0])
+    for contact, normal, old in zip(pair.contacts, normals, pair.impulses, strict=True):
+        bears = (normal > 0) | (old.normal > 0) | (contact.gap <= 0)
+        active = bears & (contact.frame.normal_mass > 0)
+        speed, _ = relative_speed(contact.frame, contact.normal, None, pending)
+        rows.append((speed, Impulse(normal, none), NormalTarget(active, none, normal, jnp.zeros_like(active))))
+    speeds, olds, targets = zip(*rows, strict=True)
+    totals = materialize(solve_normals(constraint, pair.contacts, speeds, olds, targets))
+    for contact, normal, total in zip(pair.contacts, normals, totals, strict=True):
+        _, pending = apply_impulse(constraint, contact, (total - normal, None), None, pending)
+    return b._replace(pending=pending), totals
 
 
 def _apply_pass(
@@ -108,57 +107,68 @@ def _apply_pass(
     seen, speeds, targets = _supported_contacts(supported, pair, target_of, before)
     normal_speeds = [speed for speed, _ in speeds]
     normals = materialize(solve_normals(constraint, seen.contacts, normal_speeds, pair.impulses, targets, seen.taken))
-    if supported is not None:
-        a, b = _with_pushes(constraint, supported, pair, normals, speeds, a, b)
+    b, totals = _solve_pending(constraint, pair, normals, a, b)
+    changes = [normal - old.normal for normal, old in zip(normals, pair.impulses, strict=True)]
     if constraint.frame is not None and roll is None and not jointed:
-        # The normal impulse between two discs adds no slip, so both impulses follow from the same velocities.
-        (contact,), (borne,), (old,), (normal,), (target,) = (
-            pair.contacts, seen.contacts, pair.impulses, normals, targets,
+        # The normal impulse between two discs adds no slip, but by supports: both follow from the same velocities.
+        (contact,), (borne,), (old,), (normal,), (change,), (target,) = (
+            pair.contacts, seen.contacts, pair.impulses, totals, changes, targets,
         )  # fmt: skip
-        speed, slip = relative_speed(contact.frame, contact.normal, *before)
-        ((_, seen_slip),) = speeds
-        tangent = materialize(friction_impulse(constraint, borne, normal, seen_slip, old, target.apart))
+        ((speed, slip),) = speeds
+        slip = slip if seen.pair is None else slip - seen.pair.taken_slip(contact) * change
+        tangent = materialize(friction_impulse(constraint, borne, normal, slip, old, target.apart))
         impulses.append(Impulse(normal, tangent))
-        change = impulse_change(impulses[0], old)
-        motions = apply_impulse(constraint, contact, change, *before)
-        work = add_disc_dissipation(b.work, contact.frame, change, speed, slip)
+        impulse = Impulse(change, tangent - old.tangent)
+        motions = apply_impulse(constraint, contact, impulse, *before)
+        work = add_disc_dissipation(b.work, borne.frame, impulse, speed, slip)
     else:
         motions = before
-        for contact, old, normal in zip(pair.contacts, pair.impulses, normals, strict=True):
-            motions = apply_impulse(constraint, contact, (normal - old.normal, None), *motions)
-        for contact, old, normal, target in zip(seen.contacts, pair.impulses, normals, targets, strict=True):
+        for contact, change in zip(pair.contacts, changes, strict=True):
+            motions = apply_impulse(constraint, contact, (change, None), *motions)
+        for contact, old, normal, target in zip(seen.contacts, pair.impulses, totals, targets, strict=True):
             _, slip = relative_speed(contact.frame, contact.normal, *seen.left(motions))
             tangent = materialize(friction_impulse(constraint, contact, normal, slip, old, target.apart))
             impulses.append(Impulse(normal, tangent))
             motions = apply_impulse(constraint, contact, (None, tangent - old.tangent), *motions)
         if pair.roll is not None:
-            roll = materialize(rolling_impulse(constraint, functools.reduce(jnp.add, normals), *motions, pair.roll))
+            roll = materialize(rolling_impulse(constraint, functools.reduce(jnp.add, totals), *motions, pair.roll))
             motions = apply_angular_impulse(constraint, roll - pair.roll, *motions)
-        changes = [impulse_change(new, old) for new, old in zip(impulses, pair.impulses, strict=True)]
+        of = zip(changes, impulses, pair.impulses, strict=True)
+        applied = [Impulse(change, new.tangent - old.tangent) for change, new, old in of]
         twist = None if roll is None or pair.roll is None else roll - pair.roll
-        free = _free_motions(constraint, pair.contacts, changes, twist, a, b) if jointed else (before, motions)
-        work = add_dissipation(b.work, constraint, pair.contacts, changes, twist, *free)
+        free = _free_motions(constraint, pair.contacts, applied, twist, a, b) if jointed else (before, motions)
+        work = add_dissipation(b.work, constraint, pair.contacts, applied, twist, *(seen.left(of) for of in free))
         a, b = (with_motions(*of) for of in zip((a, b), motions, free[1], strict=True))
     vectors = pair.vectors
     if vectors is not None:
         more = impulse_vectors(pair.contacts[0].normal, impulse_change(impulses[0], pair.impulses[0]))
         vectors = jax.tree.map(jnp.add, vectors, more)
     solved = SolvedPair(pair.contacts, impulses, roll, vectors)
-    if seen.crush is not None:
-        motions, work = _without_what_obstacles_take(constraint, seen, motions, work)
     a, b = a._replace(motion=motions[0]), b._replace(motion=motions[1], work=work)
+    if seen.pair is not None:
+        acts = [(normal > 0) | (old.normal > 0) for normal, old in zip(normals, pair.impulses, strict=True)]
+        supported = seen.pair.where_acts(functools.reduce(jnp.logical_or, acts))
+        a, b = _with_pending(constraint, supported, before, a, b)
     return a, b, solved, seen
 
 
-def _without_what_obstacles_take(
-    constraint: ContactConstraint, seen: SupportedContacts, motions: MotionPair, work: Work | None
-) -> tuple[MotionPair, Work | None]:
-    """Motions that obstacles leave of a crushed body, and the work with its lost energy."""
-    kept = seen.kept(motions)
-    for inertia, old, new in zip((constraint.a, constraint.b), motions, kept, strict=True):
+def _with_pending(
+    constraint: ContactConstraint, supported: SupportedPair, before: MotionPair, a: BodySide, b: BodySide
+) -> tuple[BodySide, BodySide]:
+    """Both sides after impulses, with what supports leave of their motions; the rest is pending.
+
+    The impulses' own work is that on what supports leave, so the loss is that of the motions `before`.
+    """
+    assert b.motion is not None, "only static bodies lack a motion"
+    work, sides = b.work, []
+    of = zip((constraint.a, constraint.b), before, supported.left(before), supported.lighter, strict=True)
+    for inertia, old, new, borne in of:
         assert inertia is not None, "both bodies move"
-        work = add_loss(work, inertia, old, new)
-    return kept, work
+        work = add_loss(work, inertia, old, new, borne)
+    for side, new in zip((a, b), supported.left((a.motion, b.motion)), strict=True):
+        rest = supported.pending(jax.tree.map(jnp.subtract, side.motion, new))
+        sides.append(side._replace(motion=new, pending=jax.tree.map(jnp.add, side.pending, rest)))
+    return sides[0], sides[1]._replace(work=work)
 
 
 def _free_motions(
@@ -319,9 +329,7 @@ def solve(
         times = tuple(jnp.where(borne, 0.5 * params.step, time) for borne in supported.lighter)
     new_a, new_b = _after_impulses(constraint, (a, b), (new_a, new_b), bounces, time, times)
     new_a, new_b = _with_resting(a, new_a, bounces), _with_resting(b, new_b, bounces)
-    assert new_b.motion is not None, "only static bodies lack a motion"
-    motions = seen.means((new_a.motion, new_b.motion))
-    new_a, new_b = correct_positions(constraint, contacts, seen, motions, acceleration, new_a, new_b, setup, params)
+    new_a, new_b = correct_positions(constraint, contacts, seen, acceleration, new_a, new_b, setup, params)
     if constraint.static:
         new_b = materialize(new_b._replace(work=None))._replace(work=new_b.work)
     return new_a, new_b, solved

@@ -5,7 +5,7 @@ from typing import NamedTuple
 from gen2d.physics.collision import Shape
 from gen2d.physics.constraint import ActiveContact, Impulse, Motion
 from gen2d.physics.energy import Work
-from gen2d.physics.support import Blow, Obstacles, Support
+from gen2d.physics.support import Obstacles, Support
 from gen2d.records.axes import Array
 
 
@@ -27,8 +27,8 @@ class BodySide(NamedTuple):
     drift: Motion | None = None  # m, rad: displacement beyond h times the new velocity, as impulses act at their time
     displacement: Motion | None = None  # m, rad: where the impulses of a pass act; None: of static bodies
     resting: Motion | None = None  # m/s, rad/s: what contacts at rest have added in the step; None: discs, static
-    push: Array | None = None  # [N, ...] m/s: bound on what warm starting added to a disc, or heavier bodies to any
-    blow: Blow | None = None  # by heavier bodies in the first pass; None: static bodies, and in other passes
+    push: Array | None = None  # [N, ...] m/s: bound on what warm starting added; None: not discs
+    pending: Motion | None = None  # m/s, rad/s: what static bodies are to take up (support.py); None: in other passes
     work: Work | None = None
     schur: Array | None = None  # [6, N, ...] what rigid joints take from the inverse mass (jointed.py)
     joint_motion: Motion | None = None  # m/s, rad/s: what they take from the motion in a pass

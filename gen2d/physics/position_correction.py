@@ -28,7 +28,7 @@ from gen2d.physics.constraint import (
     relative_velocity,
 )
 from gen2d.physics.contact_state import BodySide, PassSetup
-from gen2d.physics.energy import MotionPair, Work
+from gen2d.physics.energy import Work
 from gen2d.physics.normal_impulse import NormalTarget, solve_normals
 from gen2d.physics.params import SolverParams
 from gen2d.physics.support import SupportedContacts
@@ -41,7 +41,6 @@ def correct_positions(
     constraint: ContactConstraint,
     contacts: list[ActiveContact],
     seen: SupportedContacts,
-    motions: MotionPair,
     acceleration: Array | None,
     a: BodySide,
     b: BodySide,
@@ -50,15 +49,14 @@ def correct_positions(
 ) -> tuple[BodySide, BodySide]:
     """Both sides with drifts that push the pair apart where it overlaps.
 
-    `motions` are the means of both bodies in the step, as the pair foresees them, `acceleration` is that of b relative
-    to a, and `seen` are the contacts with what supports leave of their bodies. An overlap that speeds below the bounce
-    threshold cause in one step stays, so that contacts at rest do not part.
+    `acceleration` is that of b relative to a, and `seen` are the contacts with what supports leave of their bodies. An
+    overlap that speeds below the bounce threshold cause in one step stays, so that contacts at rest do not part.
     """
+    assert b.motion is not None, "only static bodies lack a motion"
     assert b.drift is not None, "only static bodies lack a drift"
     h, allowed = params.step, 0.5 * params.step * setup.threshold
     rate = params.bias_rate(2 * params.hertz if constraint.static else params.hertz, params.damping_ratio)
-    of_a, of_b = motions
-    ends = seen.kept((None if of_a is None else _end(of_a, a.drift, h), _end(of_b, b.drift, h)))
+    ends = seen.kept((None if a.motion is None else _end(a.motion, a.drift, h), _end(b.motion, b.drift, h)))
     zero, gaps, targets = jnp.zeros_like(contacts[0].gap), [], []
     pushed, taken = seen.pushed(contacts)
     for contact in pushed:
@@ -78,7 +76,6 @@ def correct_positions(
     new_a, new_b = a._replace(drift=drifts[0]), b._replace(drift=drifts[1])
     if constraint.a is None or a.motion is None or constraint.static or b.joint_motion is not None:
         return new_a, new_b
-    assert b.motion is not None, "only static bodies lack a motion"
     push = functools.reduce(jnp.add, pushes)
     if seen.crush is not None:
         push = jnp.where(seen.crush.crushed, 0.0, push)  # obstacles take up the angular momentum

@@ -39,7 +39,7 @@ class ContactSolver(Protocol):
     def solve(
         self, carry: Any, contacts: Any, sides: list[BodySide], statics: list[BodySide]
     ) -> tuple[list[BodySide], Any]:
-        """Sides after the first pass, and the solved contacts; uses motion, drift, resting, push and work."""
+        """Sides after the first pass, and the solved contacts; uses motion, drift, resting, push, pending and work."""
         ...
 
     def relax(

@@ -37,16 +37,16 @@ import jax.numpy as jnp
 
 from gen2d.physics import limits_motors, rigid_joints, springs
 from gen2d.physics.collision import Disc, Shape
-from gen2d.physics.constraint import Inertia, Motion, speed_bound
+from gen2d.physics.constraint import Motion, speed_bound
 from gen2d.physics.contact_state import BodySide
-from gen2d.physics.energy import Ledger, Work, accumulate, add_loss, record_energy, spring_work_over
+from gen2d.physics.energy import Ledger, Work, accumulate, record_energy, spring_work_over
 from gen2d.physics.impact_order import not_hit
 from gen2d.physics.jointed import hold, release
 from gen2d.physics.params import SolverParams
 from gen2d.physics.shapes import to_world
 from gen2d.physics.springs import poses_of, table_of
 from gen2d.physics.state import BodyState, Model, WorldState
-from gen2d.physics.support import Blow, no_obstacles, no_support
+from gen2d.physics.support import no_obstacles, no_support
 from gen2d.physics.tunnelling import clamp_displacement
 from gen2d.records.axes import Array, take_scenes
 from gen2d.records.parameter import apply
@@ -248,29 +248,14 @@ def _first_pass_side(
         pull=pull,
         drift=drift,
         resting=None if disc else change,
-        push=speed_bound(change.velocity) if disc else jnp.zeros_like(change.spin),
-        blow=Blow(jnp.zeros_like(change.spin), jnp.zeros_like(change.spin)),
+        push=speed_bound(change.velocity) if disc else None,
+        pending=jax.tree.map(jnp.zeros_like, change),
         work=side.work,
         support=side.support,
         obstacles=no_obstacles(side.support) if params.extreme_mass_ratios and side.support is not None else None,
         first=side.first,
         clock=jnp.zeros_like(change.spin) if params.by_time else None,
     )
-
-
-def _with_bounded_energy(old: BodySide, new: BodySide, inverse: Inertia) -> BodySide:
-    """The new side of the first pass, in which blows give borne bodies no more energy than others (support.py)."""
-    assert old.motion is not None, "only moving bodies change"
-    assert new.motion is not None, "only moving bodies change"
-    assert new.blow is not None, "the first pass knows it"
-    share = new.blow.share(inverse, old.motion, new.motion)
-
-    def bounded(x: Array, y: Array) -> Array:
-        return jnp.where(share < 1, x + share * (y - x), y)
-
-    motion, drift = (jax.tree.map(bounded, *of) for of in ((old.motion, new.motion), (old.drift, new.drift)))
-    work = add_loss(new.work, inverse, new.motion, motion, share < 1)
-    return new._replace(motion=motion, drift=drift, work=work)
 
 
 def _clamp_late(
@@ -334,10 +319,9 @@ def step(world: WorldState, model: Model, params: SolverParams) -> WorldState:
     motions, forced_drifts = pulling.pull(motions, drifts, free_drifts, accelerations)
     motions = rigid.limit(motions, _sums(drifts, forced_drifts))
     of_groups = zip(sides, motions, drifts, jax.lax.stop_gradient(changes), pulling.accelerations, strict=True)
-    held = rigid.hold([_first_pass_side(*of, params) for of in of_groups])
+    sides = rigid.hold([_first_pass_side(*of, params) for of in of_groups])
     statics = [BodySide(motion=side.motion) for side in statics]
-    sides, solved = solver.solve(carry, contacts, held, statics)
-    sides = [_with_bounded_energy(*of, group.inverse) for *of, group in zip(held, sides, groups, strict=True)]
+    sides, solved = solver.solve(carry, contacts, sides, statics)
     motions, drifts = rigid.meet(sides, forced_drifts)
 
     displacements = [jax.tree.map(lambda x, y: h * x + y, *of) for of in zip(motions, drifts, strict=True)]

@@ -4,20 +4,18 @@ A light body between a heavy one and a floor cannot give way, but sequential imp
 in each pass, which falls with the ratio of the masses. In the first pass, the contact of a body with one of less than a
 third of its mass therefore sees the lighter one as if it could not move along the load that static bodies bore in the
 last step: along the sum of their normal impulses, with its torque. A body that two points of a contact bear cannot turn
-either. Its inverse mass lacks the Schur complement of these directions, and its velocity the part along them. Impulse
-and reaction stay equal, so momentum is conserved. Static bodies come last in a pass and take up what the lighter body
-cannot.
+either. Its inverse mass lacks the Schur complement of these directions, and its velocity the part along them.
+
+What the lighter body cannot do is pending: a velocity beside its own, which only static bodies see. They come last in a
+pass, and their impulses take it up as far as they press against it; the rest of it is lost. So no third body meets a
+speed that the static ones are about to stop, and where these let the lighter one slip, as out of a wedge, it does not
+leave with an energy that the heavier one has not lost.
 
 A light body that a heavy one has pressed onto others need not rest on them: it may bounce between them many times in a
 step, which each contact sees once, and the heavy one goes through it. So, with `physics.extreme_mass_ratios`, the
 contact of a pair that overlaps by more than `CRUSHED` sees the lighter one without the directions in which it
 approaches static bodies and far heavier ones in this step, its obstacles. What the lighter one would do in these
 directions is lost, and the obstacles do not feel it: passed on, it would throw the lighter one where it misses them.
-
-What bears a body need not take up all that a heavy one gives it, as where it slips out of a wedge: it would leave with
-an energy that the heavy one has not lost. So the first pass leaves out, of the growth of sqrt(2 E / m) of a borne body,
-the part by such blows that exceeds that by an impact that nothing bears: u = 1 + e times the approach speed, and by
-friction 2 mu u (3^(1/2) mu u of a disc), but at most the speed of sliding.
 
 Source: E. Guendelman, R. Bridson and R. Fedkiw, 'Nonconvex rigid bodies with stacking' (2003), give supported bodies an
 infinite mass.
@@ -42,7 +40,6 @@ from gen2d.physics.constraint import (
     Motion,
     reciprocal,
 )
-from gen2d.physics.energy import kinetic_energy
 from gen2d.records.axes import Array
 from gen2d.xla import materialize
 
@@ -52,10 +49,8 @@ LARGEST_IN_IMPACTS = 300.0  # beyond, heavy bodies would press too long into lig
 LARGEST_IN_CORNERS = 30.0  # where friction on one wall lifts the lighter body off another
 PARALLEL = 0.2  # sine of the angle between two loads that act in one direction
 PRESSED = 0.5  # least cosine of the angle between a contact's normal and the load of the static bodies
-LARGEST_SPEED = 9.0  # of a point of a uniform triangle after an impulse at a corner, over that of its centre
 LEAST_LEFT = 1e-4  # share of a contact's compliance that a support leaves at least, as the rest would be rounding
 LEAST_COMPLIANCE = 1e-30  # (N s)^2 / kg, of a load that bears anything: a lesser one has no finite reciprocal
-LEAST_SQUARE = 1e-30  # kg^-2: the root of zero, of absent bodies, has no derivative
 CRUSHED = 0.005  # m: least overlap of a pair whose lighter body has obstacles; bodies at rest overlap by far less
 SEVERAL = 0.98  # of the obstacles' impulses: length of their sum over the sum of their lengths, if they act in one line
 
@@ -140,37 +135,6 @@ def add_obstacles(
     return a, b
 
 
-class Blow(NamedTuple):
-    """What heavier bodies do in a step to a body that static ones bear, m/s of sqrt(2 E / m)."""
-
-    given: Array  # [N, ...] by their impulses, which what bears it need not take up
-    free: Array  # [N, ...] the most that impulses would give it if nothing bore it
-
-    def add(self, other: "Blow") -> "Blow":
-        """The blow with that of another body."""
-        return Blow(self.given + other.given, jnp.maximum(self.free, other.free))
-
-    def share(self, inverse: Inertia, old: Motion, new: Motion) -> Array:
-        """Share of a change of motion, by the blow and others, that does not come from impulses too large.
-
-        Of the growth of sqrt(2 E / m), `given` is left out as far as it exceeds `free`.
-        """
-
-        def square(motion: Motion) -> Array:
-            return 2 * inverse.mass * kinetic_energy(inverse, motion)
-
-        first, last = square(old), square(new)
-        root, end = (jnp.sqrt(jnp.where(x > 0, x, 1.0)) * (x > 0) for x in (first, last))
-        grown = jnp.maximum(end - root - self.given, self.free)
-        most, added = grown * (2 * root + grown), last - first
-        excess = (self.given > 0) & (added > most)
-        # A share s of the change adds s a + s^2 b to the square.
-        b = jnp.where(excess, square(jax.tree.map(jnp.subtract, new, old)), 1.0)
-        a = added - b
-        roots = jnp.sqrt(jnp.where(excess, a**2 + 4 * b * most, 1.0))
-        return jnp.where(excess, 0.5 * (roots - a) / b, 1.0)
-
-
 class CrushedPair(NamedTuple):
     """What a pair that may be crushed has beyond others."""
 
@@ -239,6 +203,12 @@ class SupportedPair(NamedTuple):
             return taken
         return jnp.where(self.crush.fixed, self.mass * dot(p[0], q[0]) + self.moment * lever_p * lever_q, taken)
 
+    def taken_slip(self, contact: ActiveContact) -> Array:
+        """What the support takes from the tangential speed that a unit impulse along the normal causes, 1/kg."""
+        frame, unit = contact.frame, perpendicular(contact.normal)
+        along_normal = contact.normal, (frame.normal_a, frame.normal_b)
+        return self._schur_complement(along_normal, (unit, (frame.tangent_a, frame.tangent_b)))
+
     def _frame(self, frame: ContactFrame, normal: Array) -> ContactFrame:
         """Frame of a contact with the effective masses that the support leaves."""
         near = frame.normal_mass > 0
@@ -266,6 +236,18 @@ class SupportedPair(NamedTuple):
         left = [contact._replace(frame=self._frame(contact.frame, contact.normal)) for contact in contacts]
         return SupportedContacts(self, left, taken)
 
+    def where_acts(self, acts: Array) -> "SupportedPair":
+        """The pair without supports where no impulse acts."""
+        lighter_a, lighter_b = self.lighter
+        return self._replace(lighter=(lighter_a & acts, lighter_b & acts))
+
+    def pending(self, taken: Motion) -> Motion:
+        """What static bodies are to take up of a motion that supports do not leave: nothing where obstacles stop it."""
+        if self.crush is None:
+            return taken
+        crushed = self.crush.crushed
+        return jax.tree.map(lambda x: jnp.where(crushed, 0.0, x), taken)
+
     @property
     def bears_impacts(self) -> Array:
         """Whether impacts see what bears the lighter body."""
@@ -288,34 +270,6 @@ class SupportedPair(NamedTuple):
             share=jnp.where(sees, self.share, 0.0),
             crush=crush,
         )
-
-    def blows(
-        self,
-        contacts: list[ActiveContact],
-        impulses: list[Array],
-        speeds: list[tuple[Array, Array]],
-        constraint: ContactConstraint,
-    ) -> tuple[Blow, Blow]:
-        """Blows on both bodies, if borne, by normal impulses, N s, at these normal and tangential speeds, m/s."""
-        e, friction = constraint.elasticity, constraint.friction
-        given = [
-            impulse * jnp.sqrt(jnp.maximum(self.mass * contact.frame.k_normal, LEAST_SQUARE))
-            for contact, impulse in zip(contacts, impulses, strict=True)
-        ]
-        normal = [(1 + e) * jnp.maximum(-speed, 0.0) for speed, _ in speeds]
-        sliding = [jnp.minimum(2 * friction * x, jnp.abs(slip)) for x, (_, slip) in zip(normal, speeds, strict=True)]
-        free = [x + y for x, y in zip(normal, sliding, strict=True)]
-        total = functools.reduce(jnp.add, given)
-        if self.crush is not None:  # obstacles take up the rest
-            total = jnp.where(self.crush.crushed, 0.0, total)
-        blow = total, functools.reduce(jnp.maximum, free)
-        of_a, of_b = (Blow(*(jnp.where(borne, x, 0.0) for x in blow)) for borne in self.lighter)
-        return of_a, of_b
-
-    def pushes(self, impulse: Array) -> tuple[Array, Array]:
-        """Bounds on the speeds, m/s, of all points of each body, if borne, after normal impulses of this sum, N s."""
-        of_a, of_b = (jnp.where(borne, LARGEST_SPEED * self.mass * impulse, 0.0) for borne in self.lighter)
-        return of_a, of_b
 
 
 class SupportedContacts(NamedTuple):
@@ -345,14 +299,6 @@ class SupportedContacts(NamedTuple):
         frames = self.crush.where([c.frame for c in self.contacts], [c.frame for c in contacts])
         contacts = [contact._replace(frame=frame) for contact, frame in zip(contacts, frames, strict=True)]
         return contacts, self.crush.where(self.taken, 0.0)
-
-    def means(self, motions: tuple[Motion | None, Motion]) -> tuple[Motion | None, Motion]:
-        """Mean motions in the step, as the supports' impulses act at its half."""
-        return motions if self.pair is None else jax.tree.map(_mean, motions, self.pair.left(motions))
-
-
-def _mean(x: Array, y: Array) -> Array:
-    return 0.5 * (x + y)
 
 
 def supported_pair(

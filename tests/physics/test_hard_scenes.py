@@ -4,8 +4,8 @@ Each asks for what an exact solver would give; what gen2d owes is marked `asked`
 """
 
 import math
+from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -13,9 +13,8 @@ from laws import deepest_overlap, holds, total_energy
 from worlds import rules, run, world
 
 from gen2d.physics.constraint import ContactConstraint, ContactFrame, ContactPoint, Inertia, Motion
-from gen2d.physics.energy import kinetic_energy
 from gen2d.physics.simulate import SaveAt
-from gen2d.physics.support import Blow, Support, supported_pair
+from gen2d.physics.support import Support, supported_pair
 from gen2d.space.space import Space
 
 GRAVITY = 9.81  # m/s^2
@@ -238,7 +237,8 @@ def test_a_light_disc_that_a_heavy_one_drives_out_of_a_wedge_is_no_faster_than_o
 @pytest.mark.parametrize("speed", [3.0, 30.0])
 def test_a_ball_that_strikes_a_loaded_disc_gives_it_all_of_its_speed(speed):
     """A heavy disc rests on it, as well balanced as its start; all are smooth and elastic."""
-    space, smooth = Space(gravity=(0, -GRAVITY)), {"elasticity": 1.0, "friction": 0.0}
+    space = Space(gravity=(0, -GRAVITY))
+    smooth: dict[str, Any] = {"elasticity": 1.0, "friction": 0.0}
     space.add_segment((-30, 0), (30, 0), **smooth)
     ball = space.add_circle((-1 - 0.1 * speed, 0.5), 0.5, velocity=(speed, 0.0), **smooth)
     loaded = space.add_circle((0, 0.5), 0.5, **smooth)
@@ -247,29 +247,6 @@ def test_a_ball_that_strikes_a_loaded_disc_gives_it_all_of_its_speed(speed):
     holds("loaded disc: speed before a ball strikes it, m/s", v[:22, loaded], 1e-6)
     holds("ball that strikes a loaded disc: speed that it keeps, relative", v[26:, ball, 0] / speed, 1e-3)
     holds("ball that strikes a loaded disc: speed of the disc, relative", v[26, loaded, 0] / speed - 1, 1e-2)
-
-
-@pytest.mark.parametrize("at_rest", [True, False])
-def test_a_blow_gives_a_borne_body_no_more_than_one_that_nothing_bears(at_rest):
-    """Growth of sqrt(2 E / m) in random changes of motion, in part by blows."""
-    rng = np.random.default_rng(0)
-    old, new = (Motion(jnp.asarray(rng.normal(0, s, (2, 500))), jnp.asarray(rng.normal(0, s, 500))) for s in (1, 3))
-    inverse = Inertia(*(jnp.asarray(rng.uniform(0.1, 9, 500)) for _ in range(2)))
-    given, free = (rng.uniform(0, 4, 500) for _ in range(2))
-    given[::5] = 0
-    if at_rest:
-        old = jax.tree.map(jnp.zeros_like, old)
-    turned = Motion(jnp.flip(old.velocity, 0), old.spin)  # as much energy, but for rounding
-    assert jnp.isfinite(Blow(jnp.asarray(given), jnp.asarray(1e-12 * free)).share(inverse, old, turned)).all()
-    share = np.asarray(Blow(jnp.asarray(given), jnp.asarray(free)).share(inverse, old, new))
-    bounded = jax.tree.map(lambda x, y: x + share * (y - x), old, new)
-    first, last, least = (np.sqrt(2 * inverse.mass * kinetic_energy(inverse, of)) for of in (old, new, bounded))
-    most = np.maximum(free, last - first - given)
-    excess = (given > 1e-3) & (last - first > most + 1e-3)
-    assert 50 < excess.sum() < 450
-    np.testing.assert_allclose((least - first)[excess], most[excess], rtol=1e-3, atol=1e-3)
-    np.testing.assert_allclose(share[~excess], 1, atol=2e-3)
-    assert (share[given == 0] == 1).all()
 
 
 @pytest.mark.parametrize("torque", [None, 0.0, 0.3])
