@@ -279,14 +279,12 @@ def _after_impulses(
     new: tuple[BodySide, BodySide],
     bounces: Array,
     time: Array,
-    times: tuple[Array, ...] | None = None,
 ) -> tuple[BodySide, BodySide]:
-    """Both sides with the drift and the clock after impulses at this time, s; at `times` for each body, if given."""
+    """Both sides with the drift and the clock after impulses at this time, s."""
     (a, b), (new_a, new_b) = old, new
-    time_a, time_b = times or (time, time)
-    new_b = _update_drift(b, new_b, time_b)
+    new_b = _update_drift(b, new_b, time)
     if constraint.a is not None and a.drift is not None:
-        new_a = _update_drift(a, new_a, time_a)
+        new_a = _update_drift(a, new_a, time)
     return after_impact(new_a, new_b, bounces, time)
 
 
@@ -324,10 +322,7 @@ def solve(
         vectors = impulse_vectors(contacts[0].normal, warm[0])
     pair = SolvedPair(contacts, warm, memory.roll, vectors)
     new_a, new_b, solved, seen = _apply_pass(constraint, pair, target_of, a, b, supported)
-    times = None
-    if supported is not None:  # what bears a body acts at half of the step
-        times = tuple(jnp.where(borne, 0.5 * params.step, time) for borne in supported.lighter)
-    new_a, new_b = _after_impulses(constraint, (a, b), (new_a, new_b), bounces, time, times)
+    new_a, new_b = _after_impulses(constraint, (a, b), (new_a, new_b), bounces, time)
     new_a, new_b = _with_resting(a, new_a, bounces), _with_resting(b, new_b, bounces)
     new_a, new_b = correct_positions(constraint, contacts, seen, acceleration, new_a, new_b, setup, params)
     if constraint.static:
