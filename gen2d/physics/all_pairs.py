@@ -202,7 +202,9 @@ class AllPairs(ContactSolver):
                 state = clamp(late), self._relaxed(carry, pairs, relaxed, time)
                 return jax.tree.map(lambda x, y: jnp.where(scenes, x, y), state, others)
 
-            new, ended = jax.lax.cond(jnp.any(scenes), again, lambda *x: x, new, ended)
+            new, ended = jax.lax.cond(
+                jnp.any(scenes), jax.checkpoint(again, prevent_cse=False), lambda *x: x, new, ended
+            )
         warm, events, begins = ended
         observed = dict(carry.observed)
         for pair, began in zip(solved.pairs, begins, strict=True):

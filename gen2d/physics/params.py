@@ -7,7 +7,10 @@ from gen2d.config.sections import PhysicsOptions
 from gen2d.records.parameter import minimum
 
 FEWEST_LATE_PASSES = 4  # in scenes with a late impact
-LATE_PASSES = 8  # the most in those where each one finds another late impact
+LATE_PASSES = 16  # the most in those where each one finds another late impact
+FIRST_STEPS = (
+    48  # of a video, with these passes wherever bodies touch: no impulses are known that they could start with
+)
 
 
 @dataclasses.dataclass(frozen=True)

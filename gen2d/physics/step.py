@@ -42,7 +42,7 @@ from gen2d.physics.contact_state import BodySide
 from gen2d.physics.energy import Ledger, Work, accumulate, record_energy, spring_work_over
 from gen2d.physics.impact_order import not_hit
 from gen2d.physics.jointed import hold, release
-from gen2d.physics.params import SolverParams
+from gen2d.physics.params import FIRST_STEPS, SolverParams
 from gen2d.physics.shapes import to_world
 from gen2d.physics.springs import poses_of, table_of
 from gen2d.physics.state import BodyState, Model, WorldState
@@ -258,6 +258,16 @@ def _first_pass_side(
     )
 
 
+def _loaded_at_start(old: BodySide, new: BodySide, time: Array, params: SolverParams) -> Array | None:
+    """Bodies [N, ...] on which impulses acted in one of the first steps; None if passes do not depend on the scene."""
+    if params.relax_iterations is not None:
+        return None
+    assert old.motion is not None, "only moving bodies change"
+    assert new.motion is not None, "only moving bodies change"
+    moved = jnp.any(new.motion.velocity != old.motion.velocity, axis=0)
+    return moved & (time < (FIRST_STEPS - 0.5) * params.step)
+
+
 def _clamp_late(
     sides: list[BodySide],
     scenes: Array | None = None,
@@ -319,9 +329,10 @@ def step(world: WorldState, model: Model, params: SolverParams) -> WorldState:
     motions, forced_drifts = pulling.pull(motions, drifts, free_drifts, accelerations)
     motions = rigid.limit(motions, _sums(drifts, forced_drifts))
     of_groups = zip(sides, motions, drifts, jax.lax.stop_gradient(changes), pulling.accelerations, strict=True)
-    sides = rigid.hold([_first_pass_side(*of, params) for of in of_groups])
+    held = rigid.hold([_first_pass_side(*of, params) for of in of_groups])
     statics = [BodySide(motion=side.motion) for side in statics]
-    sides, solved = solver.solve(carry, contacts, sides, statics)
+    sides, solved = solver.solve(carry, contacts, held, statics)
+    late = [_loaded_at_start(*of, world.time, params) for of in zip(held, sides, strict=True)]
     motions, drifts = rigid.meet(sides, forced_drifts)
 
     displacements = [jax.tree.map(lambda x, y: h * x + y, *of) for of in zip(motions, drifts, strict=True)]
@@ -331,7 +342,7 @@ def step(world: WorldState, model: Model, params: SolverParams) -> WorldState:
 
     rigid.move(displacements)
     motions = rigid.limit(motions)
-    of_groups = zip(sides, motions, displacements, strict=True)
+    of_groups = zip(sides, motions, displacements, late, strict=True)
     sides = [
         BodySide(
             motion=motion,
@@ -339,9 +350,9 @@ def step(world: WorldState, model: Model, params: SolverParams) -> WorldState:
             resting=side.resting,
             push=side.push,
             work=side.work,
-            late=jnp.zeros(motion.spin.shape, bool) if params.relax_iterations is None else None,
+            late=flags,
         )
-        for side, motion, moved in of_groups
+        for side, motion, moved, flags in of_groups
     ]
     clamp = functools.partial(_clamp_late, displacements=displacements, solid=solid, model=model)
     sides, carry = solver.relax(carry, solved, rigid.hold_again(sides), statics, world.time, clamp)

@@ -106,7 +106,7 @@ def test_a_heavy_plank_stands_on_light_boxes_whatever_its_mass(ratio):
 
 @pytest.mark.asked
 @pytest.mark.full
-@pytest.mark.parametrize(("ratio", "bound", "asked"), [(10, 4e-3, 5e-4), (100, 4e-2, 1e-3)])
+@pytest.mark.parametrize(("ratio", "bound", "asked"), [(10, 2.5e-3, 5e-4), (100, 0.025, 1e-3)])
 def test_a_heavy_box_stands_on_a_tower_of_light_ones(ratio, bound, asked):
     heights = heavy_on_light("tower", ratio)
     holds(f"heavy box on two light ones, {ratio}:1: sinking in 6 s, m", heights[0] - heights, bound, asked)
@@ -274,7 +274,7 @@ def test_a_load_that_fades_bears_nothing_in_the_end(torque):
 
 @pytest.mark.full
 @pytest.mark.parametrize(
-    ("ratio", "bound", "asked"), [pytest.param(20, 5e-4, None), pytest.param(100, 1e-2, 1e-3, marks=pytest.mark.asked)]
+    ("ratio", "bound", "asked"), [pytest.param(20, 5e-4, None), pytest.param(100, 6e-3, 1e-3, marks=pytest.mark.asked)]
 )
 def test_a_heavy_disc_stands_on_two_light_ones_in_a_box(ratio, bound, asked):
     """Each of the light ones bears on the floor and on a wall, both rough."""
@@ -302,7 +302,6 @@ def test_the_energy_budget_accounts_for_heavy_discs_on_light_ones(drop, precisio
     holds(f"{name} over its weight times a metre", energy.residual / (space.bodies[heavy].mass * GRAVITY), bound)
 
 
-@pytest.mark.asked
 @pytest.mark.full
 def test_stack_of_ten_boxes_stands():
     space = Space(gravity=(0, -GRAVITY))
@@ -311,7 +310,7 @@ def test_stack_of_ten_boxes_stands():
     video = space.simulate(10, fps=60)
     last = video.position[300:, boxes]
     way = np.linalg.norm(last - last[:1], axis=-1)
-    holds("stack of 10 boxes: overlap, m", deepest_overlap(space, video), 3e-3, 1e-3)
+    holds("stack of 10 boxes: overlap, m", deepest_overlap(space, video), 1e-3)
     holds("stack of 10 boxes: way in the last 5 of 10 s, m", way, 1e-4)
     overlap = np.maximum(1 - np.diff(video.position[60:, boxes, 1], axis=1), 0)
     holds("stack of 10 boxes: overlap after a second, m", overlap, 1e-3)
