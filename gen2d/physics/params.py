@@ -8,9 +8,7 @@ from gen2d.records.parameter import minimum
 
 FEWEST_LATE_PASSES = 4  # in scenes with a late impact
 LATE_PASSES = 16  # the most in those where each one finds another late impact
-FIRST_STEPS = (
-    48  # of a video, with these passes wherever bodies touch: no impulses are known that they could start with
-)
+FIRST_STEPS = 48  # of a video, in which bodies that touch have these passes: no impulses are known before
 
 
 @dataclasses.dataclass(frozen=True)

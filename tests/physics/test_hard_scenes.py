@@ -199,7 +199,7 @@ def test_heavy_discs_stand_on_light_ones():
     holds("heavy discs on light ones: force on the floor, of their weight", load / weight - 1, 1e-2)
 
 
-@pytest.mark.parametrize(("ratio", "deepest"), [(18, 0.06), (400, 0.09), (20000, 0.1)])
+@pytest.mark.parametrize(("ratio", "deepest"), [(18, 0.06), (400, 0.09), (20000, 0.11)])
 @pytest.mark.parametrize("sparse", [True, False])
 def test_a_heavy_disc_does_not_go_through_a_light_one_that_bounces_between_it_and_a_floor(ratio, deepest, sparse):
     """Both fly towards the floor, which the light one strikes several times in a step."""

@@ -31,21 +31,23 @@ def rest_measures(case: Case, slots: int, settle: int, walls: int = 4) -> tuple[
     """Overlap in m, way in m and speed in m/s over the 10 s after `settle` s, at most, by pose; the bodies upright and
     mirrored, at 60 frames per s.
 
-    The way of a disc on the floor is what it slides: nothing ends the rolling of one that no other disc presses.
+    A disc on the floor counts by what it slides: nothing ends the rolling of one that no other disc presses.
     """
     worlds = [pose_world(case, pose, slots, walls) for pose in (QUARTERS[0], POSES[4])]
     made = run(worlds, 60 * (settle + 10) + 1, 4)
     states, count = made.states, len(case.discs)
-    position, velocity, angle = (
-        np.asarray(a, float)[:, 60 * settle :] for a in (states.position, states.velocity, states.angle)
+    position, velocity, angle, spin = (
+        np.asarray(a, float)[:, 60 * settle :, :count]
+        for a in (states.position, states.velocity, states.angle, states.angular_velocity)
     )
-    moved, turned = (a[:, :, :count] - a[:, :1, :count] for a in (position, angle))
+    moved, turned = (a - a[:, :1] for a in (position, angle))
     radius = np.array([disc.get("radius", RADIUS) for disc in case.discs])
-    on_floor = np.abs(position[:, :, :count, 1] - radius) < SLOP
+    on_floor = np.abs(position[..., 1] - radius) < SLOP
     moved[..., 0] += np.where(on_floor, radius * turned, 0.0)
+    velocity[..., 0] += np.where(on_floor, radius * spin, 0.0)
     way = np.linalg.norm(moved, axis=-1)
-    speed = np.linalg.norm(velocity[:, :, :count], axis=-1)
-    depth = [overlaps(one, x) for one, x in zip(worlds, position, strict=True)]
+    speed = np.linalg.norm(velocity, axis=-1)
+    depth = [overlaps(one, x) for one, x in zip(worlds, states.position[:, 60 * settle :], strict=True)]
     return np.max(depth, axis=1), way.max((1, 2)), speed.max((1, 2))
 
 
