@@ -21,8 +21,9 @@ def limits(config: str, *overrides: str) -> list[str]:
 
 @pytest.mark.parametrize("fps", [240, pytest.param(480, marks=pytest.mark.full)])
 def test_a_heavy_box_on_two_light_ones_sinks_as_deep_as_the_law_says_and_rises_again(fps: int) -> None:
+    """With one pass in all steps, as for a load that comes later than the first of a video."""
     ratios = np.array([10.0, 30.0, 100.0])
-    space = Space(gravity=(0, -G), max_step=1 / fps)
+    space = Space(gravity=(0, -G), max_step=1 / fps, relax_iterations=1)
     space.add_segment((-5, 0), (15, 0))
     for place, ratio in enumerate(ratios):
         for height, density in ((0.5, 1.0), (1.5, 1.0), (2.5, ratio)):

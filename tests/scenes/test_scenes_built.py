@@ -136,7 +136,6 @@ def when(angle: np.ndarray, time: np.ndarray) -> np.ndarray:
 # Seesaws ------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.asked
 @pytest.mark.full
 def test_a_seesaw_tips_to_the_side_of_the_larger_torque():
     made = film("seesaw", 32, 1.5, 20, "scene.drop_height=0", "scene.plank_density=0.2", energy=True)
@@ -146,7 +145,7 @@ def test_a_seesaw_tips_to_the_side_of_the_larger_torque():
     np.testing.assert_array_equal(np.sign(angle[clear]), np.sign(torque[clear]))
     assert np.abs(angle[clear]).min() > 0.05
     holds("seesaw: pivot, m", apart(made), 1e-5)
-    holds("seesaw: energy gained, of the largest kinetic energy", gained_of_kinetic(made), 0.05, asked=1e-2)
+    holds("seesaw: energy gained, of the largest kinetic energy", gained_of_kinetic(made), 1e-2)
 
 
 def gained_of_kinetic(made: Film) -> np.ndarray:
@@ -155,15 +154,14 @@ def gained_of_kinetic(made: Film) -> np.ndarray:
     return (made.energy - least).max(1) / made.kinetic.max(1)
 
 
-@pytest.mark.asked
 @pytest.mark.slow
-@pytest.mark.parametrize(("passes", "bound"), [(1, 0.1), (4, 0.05), ("null", 0.02)])
+@pytest.mark.parametrize(("passes", "bound"), [(1, 0.1), (4, 0.05), ("null", 0.01)])
 def test_a_seesaw_gains_less_energy_with_several_relaxing_passes(passes, bound):
     overrides = "scene.drop_height=0", "scene.plank_density=0.2", f"physics.relax_iterations={passes}"
     made = film("seesaw", 32, 1.5, 240, *overrides, energy=True)
     holds(f"seesaw, {passes} passes: pivot, m", apart(made), 1e-5)
     gained = gained_of_kinetic(made)
-    holds(f"seesaw, {passes} passes: energy gained, of the largest kinetic energy", gained, bound, asked=1e-2)
+    holds(f"seesaw, {passes} passes: energy gained, of the largest kinetic energy", gained, bound)
 
 
 # Pendulums ----------------------------------------------------------------------------------------------------------
