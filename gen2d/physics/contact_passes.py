@@ -308,7 +308,7 @@ def solve(
     if takes_part(points, b):
         (tau,) = taus
         taus = [in_order(points[0], tau, a, b)]
-        if supported is not None:  # as what bears a body acts at half of the step
+        if supported is not None:  # those on borne bodies keep the order of the pairs
             taus = [jnp.where(supported.bears_impacts, tau, taus[0])]
     bounces = functools.reduce(jnp.logical_or, [tau >= 0 for tau in taus])
     supported = None if supported is None else supported.seen(bounces)

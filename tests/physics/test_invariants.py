@@ -502,8 +502,8 @@ def test_order_of_convergence_in_double_precision():
     holds("Sliding disc that has stopped in float64, m", stop, 5e-5)
 
 
-@pytest.mark.full
 def test_states_between_frames_lead_to_those_of_the_frames():
+    """In a world without pairs of bodies."""
     scene, state, layout = world([{"v": (3, 4), "spin": 2.0}], gravity=DOWN)
     device = [axes.to_device(jax.tree.map(lambda x: x[None], record)) for record in (scene, state)]
     program = jax.jit(lambda scene, state: simulate(scene, state, layout, rules(), 6, 5, SaveAt(between=True)))
