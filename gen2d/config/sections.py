@@ -58,7 +58,7 @@ class PhysicsOptions:
         False, bool, "", "far heavier bodies do not go through light ones that others stop (slower)", later=True
     )
     relax_iterations: int | None = option(
-        None, int, "passes", "passes over all contacts at the end of a step; null: 1, or 4 to 8 where needed",
+        None, int, "passes", "passes over all contacts at the end of a step; null: 1, or 4 to 16 where needed",
         low=1, high=64, optional=True, later=True,
     )  # fmt: skip
 

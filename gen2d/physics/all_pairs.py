@@ -195,6 +195,7 @@ class AllPairs(ContactSolver):
         if self.params.late_passes and self.constraints:
             scenes = late_scenes(new, self.setup.threshold.shape)
 
+            @functools.partial(jax.checkpoint, prevent_cse=False)  # gradients would keep all passes in memory
             def again(*others: Any) -> tuple:
                 late, pairs = self._late_passes(scenes, solved, sides, statics)
                 of_pairs = zip(self.constraints, carry.warm, pairs, strict=True)
@@ -202,9 +203,7 @@ class AllPairs(ContactSolver):
                 state = clamp(late), self._relaxed(carry, pairs, relaxed, time)
                 return jax.tree.map(lambda x, y: jnp.where(scenes, x, y), state, others)
 
-            new, ended = jax.lax.cond(
-                jnp.any(scenes), jax.checkpoint(again, prevent_cse=False), lambda *x: x, new, ended
-            )
+            new, ended = jax.lax.cond(jnp.any(scenes), again, lambda *x: x, new, ended)
         warm, events, begins = ended
         observed = dict(carry.observed)
         for pair, began in zip(solved.pairs, begins, strict=True):

@@ -38,7 +38,7 @@ class BodySide(NamedTuple):
     first: Array | None = None  # [N, ...] s: least time of impact of a body in the step; infinite without one
     clock: Array | None = None  # [N, ...] s: of a body's last impact in the step so far; 0 without one
     clearance: Array | None = None  # [N, ...] m: least way that leads a body to what it has met in the pass so far
-    late: Array | None = None  # [N, ...] whether the body, as side b, has a late impact (relaxing.py); None: not known
+    late: Array | None = None  # [N, ...] whether its scene takes more passes (relaxing.py); None: all scenes alike
 
 
 class WarmStart(NamedTuple):

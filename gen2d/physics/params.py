@@ -6,9 +6,9 @@ import math
 from gen2d.config.sections import PhysicsOptions
 from gen2d.records.parameter import minimum
 
-FEWEST_LATE_PASSES = 4  # in scenes with a late impact
+FEWEST_LATE_PASSES = 4  # in scenes with a late impact, or with loads in the first steps
 LATE_PASSES = 16  # the most in those where each one finds another late impact
-FIRST_STEPS = 48  # of a video, in which bodies that touch have these passes: no impulses are known before
+FIRST_STEPS = 48  # of a video: no impulses are known that these could start with
 
 
 @dataclasses.dataclass(frozen=True)

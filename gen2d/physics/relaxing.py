@@ -63,7 +63,7 @@ def _approaches(contact: ActiveContact, speed: Array, threshold: Array) -> Array
 
 
 def late_scenes(sides: list[BodySide], scenes: tuple[int, ...]) -> Array:
-    """Scenes [...] in which the passes look for late impacts: those that have any, or all if that is not known."""
+    """Scenes [...] that take the passes with late impacts: those of bodies that ask for them, or all if none can."""
     flags = [jnp.any(side.late, axis=0) for side in sides if side.late is not None]
     return functools.reduce(jnp.logical_or, flags) if flags else jnp.ones(scenes, bool)
 

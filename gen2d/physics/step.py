@@ -332,7 +332,6 @@ def step(world: WorldState, model: Model, params: SolverParams) -> WorldState:
     held = rigid.hold([_first_pass_side(*of, params) for of in of_groups])
     statics = [BodySide(motion=side.motion) for side in statics]
     sides, solved = solver.solve(carry, contacts, held, statics)
-    late = [_loaded_at_start(*of, world.time, params) for of in zip(held, sides, strict=True)]
     motions, drifts = rigid.meet(sides, forced_drifts)
 
     displacements = [jax.tree.map(lambda x, y: h * x + y, *of) for of in zip(motions, drifts, strict=True)]
@@ -342,7 +341,7 @@ def step(world: WorldState, model: Model, params: SolverParams) -> WorldState:
 
     rigid.move(displacements)
     motions = rigid.limit(motions)
-    of_groups = zip(sides, motions, displacements, late, strict=True)
+    of_groups = zip(held, sides, motions, displacements, strict=True)
     sides = [
         BodySide(
             motion=motion,
@@ -350,9 +349,9 @@ def step(world: WorldState, model: Model, params: SolverParams) -> WorldState:
             resting=side.resting,
             push=side.push,
             work=side.work,
-            late=flags,
+            late=_loaded_at_start(old, side, world.time, params),
         )
-        for side, motion, moved, flags in of_groups
+        for old, side, motion, moved in of_groups
     ]
     clamp = functools.partial(_clamp_late, displacements=displacements, solid=solid, model=model)
     sides, carry = solver.relax(carry, solved, rigid.hold_again(sides), statics, world.time, clamp)

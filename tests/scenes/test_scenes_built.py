@@ -155,13 +155,16 @@ def gained_of_kinetic(made: Film) -> np.ndarray:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("passes", "bound"), [(1, 0.1), (4, 0.05), ("null", 0.01)])
+@pytest.mark.parametrize(
+    ("passes", "bound"),
+    [pytest.param(1, 0.1, marks=pytest.mark.asked), pytest.param(4, 0.05, marks=pytest.mark.asked), ("null", 0.01)],
+)
 def test_a_seesaw_gains_less_energy_with_several_relaxing_passes(passes, bound):
     overrides = "scene.drop_height=0", "scene.plank_density=0.2", f"physics.relax_iterations={passes}"
     made = film("seesaw", 32, 1.5, 240, *overrides, energy=True)
     holds(f"seesaw, {passes} passes: pivot, m", apart(made), 1e-5)
     gained = gained_of_kinetic(made)
-    holds(f"seesaw, {passes} passes: energy gained, of the largest kinetic energy", gained, bound)
+    holds(f"seesaw, {passes} passes: energy gained, of the largest kinetic energy", gained, bound, asked=1e-2)
 
 
 # Pendulums ----------------------------------------------------------------------------------------------------------
