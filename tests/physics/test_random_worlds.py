@@ -69,15 +69,15 @@ FEW_BOUNDS: dict[str, Bounds] = {
 MANY_BOUNDS: dict[str, Bounds] = {
     "discs": {RISING: None},
     "elastic discs": {},
-    "discs, mass ratios up to 1e6": {RISING: 0.035, SLIPPING: 2e-5, OVERLAPPING: 0.38},
+    "discs, mass ratios up to 1e6": {RISING: 0.035, OVERLAPPING: 0.38},
     "all shapes": {RISING: 0.012, SLIPPING: 1e-5},
     "elastic shapes": {},
-    "mass ratios up to 1e6": {RISING: 0.012, SLIPPING: 1e-5, OVERLAPPING: 0.4},
+    "mass ratios up to 1e6": {RISING: 0.012, OVERLAPPING: 0.4},
     "smooth elastic boxes": {OVERLAPPING: 0.01},
     "smooth elastic boxes and fast small discs": {DETOURING: None, OVERLAPPING: None},
     "fast, mass ratios up to 1e6, e = 0.0": {RISING: 0.02, DETOURING: None, SLIPPING: 1e-5, OVERLAPPING: 0.8},
     "fast, mass ratios up to 1e6, e = 0.5": {RISING: None, SLIPPING: 2e-5, OVERLAPPING: 0.42},
-    "fast, mass ratios up to 1e6, e = 1.0": {RISING: None, DETOURING: 0.09, SLIPPING: 1e-5, OVERLAPPING: 0.2},
+    "fast, mass ratios up to 1e6, e = 1.0": {RISING: None, DETOURING: 0.09, OVERLAPPING: 0.2},
     "joints, with gravity": {RISING: 0.1},
     "joints, without": {RISING: 0.05},
 }
@@ -92,7 +92,7 @@ PASSES_BOUNDS: dict[int, dict[str, Bounds]] = {  # with one relaxing pass, or wi
         "all shapes": {RISING: None, OVERLAPPING: 0.1},
     },
     4: {
-        "all shapes": {RISING: 0.01},
+        "all shapes": {RISING: 0.01, OVERLAPPING: None},
         "elastic shapes": {},
         "joints, with gravity": {RISING: 0.08},
     },
@@ -217,16 +217,17 @@ CRUSHED: dict[str, Any] = {"extreme_mass_ratios": True}
 BY_RATIO = {  # largest share of worlds with an overlap, with mass ratios up to 10 and 100; 0 where there is none
     "discs, one pass": (ONE_PASS, (0.02, 0.16)),
     "discs": ({}, (0.0, 0.06)),
-    "discs, extreme mass ratios": (CRUSHED, (0.0, 0.02)),
+    "discs, extreme mass ratios": (CRUSHED, (0.0, 0.0)),
     "all shapes, one pass": (ONE_PASS, (0.12, 0.25)),
     "all shapes": ({}, (0.03, 0.1)),
-    "all shapes, extreme mass ratios": (CRUSHED, (0.02, 0.04)),
+    "all shapes, extreme mass ratios": (CRUSHED, (0.0, 0.04)),
 }
 
 
-@pytest.mark.asked
 @pytest.mark.slow
-@pytest.mark.parametrize("name", BY_RATIO)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.asked if any(of) else ()) for name, (_, of) in BY_RATIO.items()]
+)
 def test_overlaps_are_as_rare_as_the_mass_ratio_allows(name):
     changes, bounds = BY_RATIO[name]
     base = RECIPES["discs, mass ratios up to 1e6" if name.startswith("discs") else "mass ratios up to 1e6"]
