@@ -7,7 +7,7 @@ boxes and joints, and under other options of the solver.
 """
 
 import functools
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -101,9 +101,14 @@ PASSES_BOUNDS: dict[int, dict[str, Bounds]] = {  # with one relaxing pass, or wi
 HALF_A_RADIUS = replace(DISCS, radius=(0.45, 0.45), speed=14.0, gravity=0.0, fixed=0.0)
 
 
+def case(name: str, bounds: Iterable[float | None]) -> Any:
+    """Parameter of a test: the name, marked as owed if there is a bound."""
+    return pytest.param(name, marks=pytest.mark.asked if any(bounds) else ())
+
+
 def classes(table: Mapping[str, Bounds]) -> list:
-    """Parameters of a test: the names of the classes, those with bounds marked as owed."""
-    return [pytest.param(name, marks=pytest.mark.asked if any(of.values()) else ()) for name, of in table.items()]
+    """Parameters of a test: the names of the classes."""
+    return [case(name, of.values()) for name, of in table.items()]
 
 
 def check_laws(name: str, batches: list[Measures], bounds: Bounds, rarely: float) -> None:
@@ -225,9 +230,7 @@ BY_RATIO = {  # largest share of worlds with an overlap, with mass ratios up to 
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=pytest.mark.asked if any(of) else ()) for name, (_, of) in BY_RATIO.items()]
-)
+@pytest.mark.parametrize("name", [case(name, bounds) for name, (_, bounds) in BY_RATIO.items()])
 def test_overlaps_are_as_rare_as_the_mass_ratio_allows(name):
     changes, bounds = BY_RATIO[name]
     base = RECIPES["discs, mass ratios up to 1e6" if name.startswith("discs") else "mass ratios up to 1e6"]
